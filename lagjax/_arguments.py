@@ -1,0 +1,75 @@
+"""How a user's function is called: roles by position, extras by name.
+
+Every function a user hands to lagjax takes its main arguments by position, so that they may have any name, and asks
+for the time and the parameters by writing `t` and `params` in its signature:
+
+    def pendulum(q, qdot): ...
+    def driven(q, qdot, t, params): ...
+
+`accept` reads the signature once, when the scene is built, and refuses any other one with a sentence. A function that
+does not ask for `t` is never given it: such a Lagrangian is autonomous by construction, not by inspection.
+"""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+
+_BY_POSITION = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+_BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+
+
+class Function(eqx.Module):
+    """A user's function together with the extras it asks for; called with all of them.
+
+    The function is part of the program, its arrays (the weights of a neural Lagrangian) are data: they are kept apart,
+    so that a scene is a valid argument and result of every JAX transformation.
+    """
+
+    arrays: Any
+    code: Any = eqx.field(static=True)
+    extras: tuple[str, ...] = eqx.field(static=True)
+
+    def __call__(self, *roles: Any, **extras: Any) -> Any:
+        """Pass on the roles, and of the extras those that the function asks for."""
+        function = eqx.combine(self.arrays, self.code)
+        return function(*roles, **{name: extras[name] for name in self.extras})
+
+
+def accept(
+    function: Callable,
+    role: str,
+    roles: tuple[str, ...] = ("q", "qdot"),
+    extras: tuple[str, ...] = ("t", "params"),
+) -> Function:
+    """Check that `function` has the signature of its `role` in a scene, and remember which extras it wants.
+
+    Raises `TypeError` when it is not callable, when its leading positional parameters are not the `roles`, or when it
+    asks by name for anything that is not among the `extras`. Keywords bound with `functools.partial` are left alone.
+    """
+    expected = f"{role}({', '.join(roles)}), which may also ask by name for {' and '.join(f'`{e}`' for e in extras)}"
+    if not callable(function):
+        raise TypeError(f"{role} must be a function {expected}; got {type(function).__name__}.")
+    try:
+        signature = inspect.signature(function)
+    except ValueError:
+        raise TypeError(f"The signature of {role} cannot be read; wrap it in a plain function {expected}.") from None
+
+    parameters = list(signature.parameters.values())
+    leading, rest = parameters[: len(roles)], parameters[len(roles) :]
+    positional = [p for p in leading if p.kind in _BY_POSITION and p.name not in extras]
+    if len(positional) < len(roles):
+        raise TypeError(f"{role} must have the form {expected}; got {role}{signature}.")
+
+    bound = function.keywords if isinstance(function, functools.partial) else {}
+    wanted = [p for p in rest if p.name not in bound]
+    unknown = [str(p) for p in wanted if p.name not in extras or p.kind not in _BY_NAME]
+    if unknown:
+        raise TypeError(
+            f"{role} asks for {', '.join(f'`{name}`' for name in unknown)}, which lagjax does not provide: it must have "
+            f"the form {expected}. Put constants into `params`, or bind them with functools.partial."
+        )
+    arrays, code = eqx.partition(function, eqx.is_array)
+    return Function(arrays, code, tuple(p.name for p in wanted))

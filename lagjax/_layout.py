@@ -1,0 +1,81 @@
+"""The two doors between the user's pytree of coordinates and the flat vector that everything inside works on.
+
+A `Layout` is read off one state (q, qdot): the tree, the shape of every leaf, one floating dtype, and a name for each
+scalar coordinate, such as `q['theta']` or `q.r` or `q[1]`, which is what error messages speak of.
+"""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+PyTree = Any
+
+
+class Layout(eqx.Module):
+    """The structure of one state; flattens it to a vector of `size` coordinates and restores it."""
+
+    tree: Any = eqx.field(static=True)
+    shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    paths: tuple[str, ...] = eqx.field(static=True)
+    dtype: np.dtype = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, q: PyTree, qdot: PyTree) -> "Layout":
+        """Read the layout of a state, or raise a sentence that says why (q, qdot) is not one."""
+        paths, tree, shapes = _structure(q, "q")
+        _, qdot_tree, qdot_shapes = _structure(qdot, "qdot")
+        if tree != qdot_tree:
+            raise ValueError(f"q and qdot must have the same structure; got {tree} for q and {qdot_tree} for qdot.")
+        for path, shape, qdot_shape in zip(paths, shapes, qdot_shapes, strict=True):
+            if shape != qdot_shape:
+                raise ValueError(f"{path} has shape {shape}, but its velocity has shape {qdot_shape}: they must agree.")
+        if not sum(math.prod(shape) for shape in shapes):
+            raise ValueError("q has no coordinates: it must hold at least one number.")
+        dtype = jnp.result_type(*(jnp.asarray(leaf).dtype for leaf in jax.tree.leaves((q, qdot))))
+        if dtype not in (jnp.float32, jnp.float64):
+            raise TypeError(f"Coordinates must be float32 or float64; got {dtype}.")
+        return cls(tree, shapes, paths, np.dtype(dtype))
+
+    @property
+    def size(self) -> int:
+        """The number of scalar coordinates."""
+        return sum(math.prod(shape) for shape in self.shapes)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One name per scalar coordinate, in flat order."""
+        return tuple(
+            path + (f"[{', '.join(map(str, index))}]" if shape else "")
+            for path, shape in zip(self.paths, self.shapes, strict=True)
+            for index in np.ndindex(shape)
+        )
+
+    def flatten(self, tree: PyTree) -> jax.Array:
+        """The leaves of one state's q or qdot, end to end, as a vector of shape (size,)."""
+        leaves = [jnp.ravel(jnp.asarray(leaf, self.dtype)) for leaf in jax.tree.leaves(tree)]
+        return jnp.concatenate(leaves)
+
+    def restore(self, flat: jax.Array) -> PyTree:
+        """The user's pytree, from a vector of shape (size,)."""
+        ends = np.cumsum([math.prod(shape) for shape in self.shapes])[:-1]
+        pieces = jnp.split(flat, ends)
+        leaves = [piece.reshape(shape) for piece, shape in zip(pieces, self.shapes, strict=True)]
+        return jax.tree.unflatten(self.tree, leaves)
+
+
+def _structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tuple[int, ...], ...]]:
+    """Paths, tree and shapes of `tree`, after checking that every leaf is an array of real floats."""
+    leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
+    paths = tuple(name + jax.tree_util.keystr(path) for path, _ in leaves)
+    for path, (_, leaf) in zip(paths, leaves, strict=True):
+        try:
+            dtype = jnp.asarray(leaf).dtype
+        except (TypeError, ValueError):
+            raise TypeError(f"{path} must be a real number or array; got {leaf!r}.") from None
+        if not jnp.issubdtype(dtype, jnp.floating):
+            raise TypeError(f"{path} must hold real floating-point numbers; got {dtype} (write 1.0 instead of 1).")
+    return paths, structure, tuple(jnp.shape(leaf) for _, leaf in leaves)

@@ -1,0 +1,45 @@
+"""What can become of a trajectory: result codes, what to try when one is bad, and the exception that carries it.
+
+The codes are diffrax's own with two more. They travel inside `jit` and `vmap` as arrays, one per member of a batch;
+only `simulate` turns one into an exception.
+"""
+
+import diffrax
+
+
+class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """The result codes of diffrax, extended; compare with `trajectory.result == lagjax.RESULTS.successful`."""
+
+    nonfinite_state = (
+        "The state or its acceleration became NaN or infinite. Look at the Lagrangian, its gradient and the parameters "
+        "there: a square root or norm at zero, a logarithm of a negative number, a branch of `where` that is not taken."
+    )
+    mass_matrix_singular = (
+        "The mass matrix d2L/dqdot2 became singular. Some velocity, or combination of velocities, has no kinetic "
+        "energy there: add it, drop the coordinate, or use coordinates that are regular there (polar coordinates are "
+        "not at r = 0, spherical ones and Euler angles are not at a pole)."
+    )
+
+
+def advice(result: RESULTS) -> str:
+    """What happened and what to try, for one concrete result."""
+    if result == RESULTS.dt_min_reached:
+        return (
+            "The step size shrank to nothing. The motion runs into a singularity or a discontinuity there (a collision, a "
+            "root of a negative number, a force that jumps), or the tolerance is tighter than round-off allows: stop "
+            "before it with event=..., smooth it, or loosen rtol and atol."
+        )
+    if result == RESULTS.max_steps_reached:
+        return (
+            "The budget of steps was spent. Raise max_steps or loosen rtol; if the steps are far shorter than the "
+            "motion needs, it is stiff: use an implicit solver such as diffrax.Kvaerno5()."
+        )
+    return RESULTS[result]
+
+
+class SimulationError(RuntimeError):
+    """A trajectory did not reach its end; `.trajectory` holds what there is of it."""
+
+    def __init__(self, message, trajectory):
+        super().__init__(message)
+        self.trajectory = trajectory

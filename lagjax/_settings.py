@@ -1,0 +1,194 @@
+"""How a motion is to be integrated: the arguments of `simulate` that do not depend on the scene, checked and completed.
+
+Everything that can be wrong with them is found here, before any work is done, and answered with a sentence. Numbers
+become arrays, so that a new value is never a new program. Values that are being traced (inside the user's own `jit`)
+have no number yet: for them only shapes are checked.
+"""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from lagjax._arguments import accept
+
+PyTree = Any
+
+# Defaults by dtype. The absolute tolerance is far below the relative one, so that states in small units keep their
+# digits; it is there for components that pass through zero.
+_RTOL = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
+_ATOL_OVER_RTOL = 1e-3
+
+
+class Settings(eqx.Module):
+    """How to integrate, apart from the scene and its state: numbers are arrays, the rest is part of the program."""
+
+    ts: jax.Array
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController
+    dt0: jax.Array | None
+    event: diffrax.Event | None
+    adjoint: diffrax.AbstractAdjoint
+    max_steps: int = eqx.field(static=True)
+    progress: diffrax.AbstractProgressMeter
+
+    @classmethod
+    def of(cls, layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress) -> "Settings":
+        """Check the arguments of `simulate` that do not depend on the scene, and fill in the defaults."""
+        ts = _output_times(ts, layout.dtype)
+        solver = diffrax.Dopri8() if solver is None else solver
+        _require_solver(solver, adaptive=dt is None)
+        if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+            raise ValueError(f"max_steps must be a positive integer, so that every run ends; got {max_steps!r}.")
+        if isinstance(progress, bool):
+            progress = diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter()
+        if dt is None:
+            controller, dt0 = _adaptive(layout.dtype, ts, rtol, atol), None
+        else:
+            controller, dt0 = diffrax.ConstantStepSize(), _fixed_step(dt, ts, rtol, atol, max_steps)
+        return cls(
+            ts=ts,
+            solver=solver,
+            controller=controller,
+            dt0=dt0,
+            event=_event(event, layout.dtype),
+            adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+            max_steps=max_steps,
+            progress=progress,
+        )
+
+
+def as_arrays(tree: PyTree, dtype) -> PyTree:
+    """Every number as an array, so that a new value is no new program; floats in the dtype of the state."""
+
+    def as_array(leaf):
+        if not eqx.is_array_like(leaf):
+            return leaf  # a function, a string: part of the program
+        array = jnp.asarray(leaf)
+        return array.astype(dtype) if jnp.issubdtype(array.dtype, jnp.floating) else array
+
+    return jax.tree.map(as_array, tree)
+
+
+def is_concrete(value) -> bool:
+    return not isinstance(value, jax.core.Tracer)
+
+
+def require_finite(tree: PyTree, name: str) -> None:
+    """Raise where a number is NaN or infinite, naming it; values that are being traced have none yet."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if not eqx.is_array_like(leaf) or not is_concrete(leaf):
+            continue
+        bad = np.argwhere(~np.isfinite(np.asarray(leaf)))
+        if len(bad):
+            where = name + jax.tree_util.keystr(path) + (str(bad[0].tolist()) if np.ndim(leaf) else "")
+            raise ValueError(f"{where} is {np.asarray(leaf)[tuple(bad[0])]}: every number given must be finite.")
+
+
+def _output_times(ts, dtype) -> jax.Array:
+    try:
+        given = jnp.asarray(ts)
+    except (TypeError, ValueError):
+        raise TypeError(f"ts must be an array of output times; got {type(ts).__name__}.") from None
+    if given.ndim != 1 or given.size < 2:
+        raise ValueError(f"ts must hold at least two output times, ts[0] the start; got shape {given.shape}.")
+    if not (jnp.issubdtype(given.dtype, jnp.floating) or jnp.issubdtype(given.dtype, jnp.integer)):
+        raise TypeError(f"ts must hold real numbers; got {given.dtype}.")
+    given = given.astype(dtype)
+    require_finite(given, "ts")
+    if is_concrete(given):
+        gaps = np.diff(np.asarray(given))
+        if not (np.all(gaps > 0) or np.all(gaps < 0)):
+            raise ValueError(
+                f"ts must be strictly increasing or strictly decreasing, in {np.dtype(dtype).name}; it is not between "
+                f"ts[{_first_bad_gap(gaps)}] and the next."
+            )
+    return given
+
+
+def _first_bad_gap(gaps: np.ndarray) -> int:
+    return int(np.argmax(np.sign(gaps) != np.sign(gaps[0]))) if gaps[0] != 0 else 0
+
+
+def _adaptive(dtype, ts, rtol, atol) -> diffrax.PIDController:
+    """Adaptive steps, with tolerances that the dtype can meet and with an end to shrinking."""
+    eps = float(jnp.finfo(dtype).eps)
+    rtol = _RTOL[dtype] if rtol is None else _tolerance(rtol, "rtol")
+    atol = rtol * _ATOL_OVER_RTOL if atol is None else _tolerance(atol, "atol")
+    if is_concrete(rtol) and float(rtol) < 10 * eps:
+        more = "; call jax.config.update('jax_enable_x64', True) and pass float64 states" if dtype == np.float32 else ""
+        raise ValueError(
+            f"{dtype.name} cannot meet rtol={float(rtol):.3g}: its round-off is {eps:.1e}, "
+            f"so rtol must be at least {10 * eps:.1e}{more}."
+        )
+    return diffrax.PIDController(
+        rtol=jnp.asarray(rtol, dtype),
+        atol=jnp.asarray(atol, dtype),
+        norm=_norm_or_inf,
+        # Below this a step no longer moves the time reliably.
+        dtmin=4 * eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1])),
+        force_dtmin=False,
+    )
+
+
+def _norm_or_inf(error: PyTree) -> jax.Array:
+    """Root mean square, with NaN as infinity: an undefined step is then rejected and shortened like any bad one."""
+    norm = optx.rms_norm(error)
+    return jnp.where(jnp.isnan(norm), jnp.inf, norm)
+
+
+def _tolerance(value, name):
+    if jnp.ndim(value) != 0:
+        raise ValueError(f"{name} must be one number; got shape {jnp.shape(value)}.")
+    if is_concrete(value) and not (np.isfinite(value) and value > 0):
+        raise ValueError(f"{name} must be positive; got {value}.")
+    return value
+
+
+def _fixed_step(dt, ts, rtol, atol, max_steps) -> jax.Array:
+    """`dt`, positive as the user gives it, as a signed array in the direction of time."""
+    if rtol is not None or atol is not None:
+        raise ValueError("dt asks for fixed steps and rtol/atol for adaptive ones: give one or the other.")
+    if jnp.ndim(dt) != 0:
+        raise ValueError(f"dt must be one number; got shape {jnp.shape(dt)}.")
+    if is_concrete(dt) and not (np.isfinite(dt) and dt > 0):
+        raise ValueError(f"dt must be a positive step size, also backward in time; got {dt}.")
+    if is_concrete(dt) and is_concrete(ts):
+        needed = float(abs(ts[-1] - ts[0])) / float(dt)
+        if needed > max_steps + 0.5:
+            raise ValueError(f"dt={dt} needs {needed:.0f} steps, more than max_steps={max_steps}: raise one of them.")
+    return jnp.asarray(dt, ts.dtype) * jnp.sign(ts[-1] - ts[0])
+
+
+def _require_solver(solver, adaptive: bool) -> None:
+    name = type(solver).__name__
+    if not isinstance(solver, diffrax.AbstractSolver):
+        raise TypeError(f"solver must be an instance of a diffrax solver, such as diffrax.Tsit5(); got {solver!r}.")
+    if isinstance(solver.term_structure, tuple) or not _takes_one_term(solver):
+        raise ValueError(
+            f"{name} splits the equations into several terms, which those of a general Lagrangian do not allow; "
+            "use a solver of ordinary differential equations, such as diffrax.Dopri8() or diffrax.ImplicitMidpoint()."
+        )
+    if adaptive and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        raise ValueError(f"{name} has no error estimate to adapt its steps to: give a fixed step with dt=...")
+
+
+def _takes_one_term(solver) -> bool:
+    structure = solver.term_structure
+    return isinstance(structure, type) and issubclass(diffrax.ODETerm, structure)
+
+
+def _event(event, dtype) -> diffrax.Event | None:
+    """The event with its functions' signatures checked, and with a root finder that uses the dtype's digits."""
+    if event is None:
+        return None
+    if not isinstance(event, diffrax.Event):
+        event = diffrax.Event(event)
+    conditions = jax.tree.map(lambda function: accept(function, "event"), event.cond_fn, is_leaf=callable)
+    tolerance = 100 * float(jnp.finfo(dtype).eps)
+    root_finder = event.root_finder or optx.Newton(rtol=tolerance, atol=tolerance)
+    return diffrax.Event(conditions, root_finder, event.direction)

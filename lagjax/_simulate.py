@@ -1,0 +1,305 @@
+"""`simulate` and `simulate_batch`: from a scene and an initial state to a trajectory, by way of diffrax.
+
+Both follow the same four stages: check what can be checked before any work is done, turn numbers into arrays (so that
+a new value never recompiles), integrate inside one compiled function, and dress the result in the user's pytree. A
+batch is the same compiled function under `jax.vmap`. Only this module calls diffrax's integrator, and only it raises
+when a trajectory fails.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
+
+from lagjax import _linear
+from lagjax._layout import Layout
+from lagjax._results import RESULTS, SimulationError, advice
+from lagjax._settings import Settings, as_arrays, is_concrete, require_finite
+from lagjax._system import System
+from lagjax._trajectory import State, Trajectory
+
+PyTree = Any
+
+def simulate(
+    system: System,
+    q0: PyTree,
+    qdot0: PyTree,
+    ts: jax.Array,
+    params: PyTree = None,
+    *,
+    solver: diffrax.AbstractSolver | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
+    dt: float | None = None,
+    max_steps: int = 100_000,
+    event: Callable | diffrax.Event | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    throw: bool = True,
+    progress: bool | diffrax.AbstractProgressMeter = False,
+) -> Trajectory:
+    r"""The motion of `system` from (q0, qdot0) at `ts[0]`, at the times `ts`.
+
+    Integrates q̈ = M⁻¹(∂L/∂q − (∂p/∂q)q̇ − ∂p/∂t + Q) as a first-order system in (q, q̇).
+
+    **Everyday arguments**
+
+    - `q0`, `qdot0`: the initial state, pytrees of real floats of one structure. Their dtype (float32, float64) is that
+      of the whole integration.
+    - `ts`: output times, shape (T,), T ≥ 2, strictly increasing, or strictly decreasing to go back in time.
+    - `params`: whatever the scene's functions ask for; every number in it is traced and differentiable.
+    - `rtol`, `atol`: local error per step, |error| ≤ atol + rtol·|y| in root mean square over the state. By default
+      rtol = 1e-9 in float64 and 1e-5 in float32, and atol = rtol/1000. `atol` is in the units of the state.
+
+    **Rarer ones**
+
+    - `solver`: any diffrax solver for ODEs; `diffrax.Dopri8()` by default.
+    - `dt`: take fixed steps of this size instead of adaptive ones; `rtol` and `atol` then do not apply.
+    - `max_steps`: the budget of steps, rejected ones included.
+    - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued one stops the motion where it
+      changes sign, a Boolean one after the step on which it becomes true. `diffrax.Event` around such functions sets
+      the direction and the root finder. Where the motion starts on the zero itself, give a direction.
+    - `adjoint`: how derivatives are taken. The default, `diffrax.RecursiveCheckpointAdjoint()`, is for reverse mode
+      (`jax.grad`, `jax.vjp`, `jax.jacrev`); pass `diffrax.ForwardMode()` for forward mode (`jax.jvp`, `jax.jacfwd`),
+      which is cheaper for a few parameters.
+    - `throw`: raise when the motion does not reach its end. With `throw=False` look at `trajectory.ok`.
+    - `progress`: print how far the integration has come; or any diffrax progress meter.
+
+    Functions given here (the event, those inside `system`) are compiled once per function *object*: define them once,
+    not in a loop.
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, before anything is integrated;
+    `SimulationError` when the motion cannot be followed to its end. Inside `jit` the same failures raise at run time.
+
+    Source: Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.4-5 (step control, Dopri8).
+
+    ```python
+    import jax, jax.numpy as jnp, lagjax
+    jax.config.update("jax_enable_x64", True)
+
+    scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+    trajectory = lagjax.simulate(scene, q0=1.0, qdot0=0.0, ts=jnp.linspace(0, 10, 101))
+    trajectory.q - jnp.cos(trajectory.ts)
+    ```
+    """
+    layout = Layout.of(q0, qdot0)
+    settings = Settings.of(layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress)
+    params = as_arrays(params, layout.dtype)
+    for name, value in (("q0", q0), ("qdot0", qdot0), ("params", params)):
+        require_finite(value, name)
+
+    q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
+    trajectory = Trajectory(*_integrate(system, settings, q0, qdot0, params), system, params)
+    return _raise_unless_ok(trajectory, layout) if throw else trajectory
+
+
+def simulate_batch(
+    system: System,
+    q0: PyTree,
+    qdot0: PyTree,
+    ts: jax.Array,
+    params: PyTree = None,
+    *,
+    batch_axes: tuple[PyTree, PyTree, PyTree] = (0, 0, None),
+    solver: diffrax.AbstractSolver | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
+    dt: float | None = None,
+    max_steps: int = 100_000,
+    event: Callable | diffrax.Event | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    progress: bool | diffrax.AbstractProgressMeter = False,
+) -> Trajectory:
+    """The motion of many members of one scene at once: the same numbers as `jax.vmap` over `simulate`.
+
+    `batch_axes` says for (q0, qdot0, params) which axis runs over the members, as `in_axes` of `jax.vmap` does: an
+    integer, None for what all share, or a pytree of these. The default is a batch of initial states; a sweep over
+    parameters from one initial state is `batch_axes=(None, None, 0)`. In the result the members are the first axis.
+
+    A member that fails, or starts from NaN, never raises and costs the others nothing: look at `trajectory.ok` and
+    `trajectory.result`. The other arguments, the errors raised for them, and the source are those of `simulate`.
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+    trajectory = lagjax.simulate_batch(scene, jnp.linspace(0, 1, 1000), jnp.zeros(1000), ts=jnp.linspace(0, 10, 101))
+    assert trajectory.q.shape == (1000, 101) and trajectory.ok.all()
+    ```
+    """
+    values = {"q0": q0, "qdot0": qdot0, "params": params}
+    axes = _axes_per_leaf(values, batch_axes)
+    member = {name: _first_member(value, axes[name]) for name, value in values.items()}
+    layout = Layout.of(member["q0"], member["qdot0"])
+    settings = Settings.of(layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress)
+    values = {name: as_arrays(value, layout.dtype) for name, value in values.items()}
+    for name, value in values.items():
+        require_finite(jax.tree.map(lambda leaf, axis: leaf if axis is None else None, value, axes[name]), name)
+
+    q0, qdot0, params = values.values()
+    fields = _integrate_batch(system, settings, q0, qdot0, params, _Static(tuple(batch_axes)))
+    return Trajectory(settings.ts, *fields[1:], system, params, batch_axes[2])
+
+
+class _Static(eqx.Module):
+    """Hands a hashable value to a compiled function as part of its structure."""
+
+    value: Any = eqx.field(static=True)
+
+
+@eqx.filter_jit
+def _integrate_batch(system, settings, q0, qdot0, params, batch_axes: _Static):
+    def member(q0, qdot0, params):
+        return _integrate(system, settings, q0, qdot0, params)
+
+    return jax.vmap(member, in_axes=batch_axes.value)(q0, qdot0, params)
+
+
+@eqx.filter_jit
+def _integrate(system: System, settings: Settings, q0, qdot0, params):
+    """One trajectory: the first six fields of `Trajectory`."""
+    layout = Layout.of(q0, qdot0)
+    motion = system.motion(layout, params)
+    y0 = layout.flatten(q0), layout.flatten(qdot0)
+
+    solved_acceleration = jax.jit(motion.solved_acceleration)  # derived once, however often it is called below
+
+    def accelerate(t, y, params):
+        # ... and compiled once: XLA calls it instead of inlining a copy at every place.
+        with set_xla_metadata(inlineable="false"):
+            return solved_acceleration(*y, t, params)
+
+    def vector_field(t, y, params):
+        return y[1], accelerate(t, y, params)[0]
+
+    # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
+    start = _health(y0, *accelerate(settings.ts[0], y0, params))
+    ts = jnp.where(start == RESULTS.successful, settings.ts, settings.ts[0])
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(vector_field),
+        settings.solver,
+        t0=ts[0],
+        t1=ts[-1],
+        dt0=settings.dt0,
+        y0=y0,
+        args=params,
+        saveat=diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True))),
+        stepsize_controller=settings.controller,
+        adjoint=settings.adjoint,
+        event=None if settings.event is None else _in_coordinates(settings.event, layout),
+        max_steps=settings.max_steps,
+        throw=False,
+        progress_meter=settings.progress,
+    )
+    path, end = solution.ys
+    t_end, y_end = solution.ts[1][0], jax.tree.map(lambda leaf: leaf[0], end)
+
+    result = _explained(RESULTS.promote(solution.result), start, _health(y_end, *accelerate(t_end, y_end, params)))
+    # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start.
+    reached = jnp.isfinite(path[0]).all(axis=1) & jnp.isfinite(path[1]).all(axis=1) & (ts == settings.ts)
+    q, qdot = (jax.vmap(layout.restore)(jnp.where(reached[:, None], leaf, jnp.nan)) for leaf in path)
+    counts = ("num_steps", "num_accepted_steps", "num_rejected_steps")
+    return (
+        settings.ts,
+        q,
+        qdot,
+        result,
+        State(t_end, layout.restore(y_end[0]), layout.restore(y_end[1])),
+        {name: solution.stats[name] for name in counts},
+    )
+
+
+def _health(y, acceleration, singular) -> RESULTS:
+    """Whether a motion can go on from a state with this acceleration, and if not, why."""
+    finite = jnp.isfinite(acceleration).all() & jnp.isfinite(y[0]).all() & jnp.isfinite(y[1]).all()
+    failed = RESULTS.where(singular, RESULTS.mass_matrix_singular, RESULTS.nonfinite_state)
+    return RESULTS.where(finite, RESULTS.successful, failed)
+
+
+def _explained(result: RESULTS, start: RESULTS, end: RESULTS) -> RESULTS:
+    """The most telling of what diffrax reports and of what the first and the last state show."""
+    stopped = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
+    unhealthy = (end != RESULTS.successful) & (stopped | (end == RESULTS.nonfinite_state))
+    result = RESULTS.where(unhealthy, end, result)
+    return RESULTS.where(start == RESULTS.successful, result, start)
+
+
+def _in_coordinates(event: diffrax.Event, layout: Layout) -> diffrax.Event:
+    """The user's event functions, made to read diffrax's flat state."""
+
+    def flat(function):
+        def condition(t, y, args, **_):
+            return function(layout.restore(y[0]), layout.restore(y[1]), t=t, params=args)
+
+        return condition
+
+    conditions = jax.tree.map(flat, event.cond_fn, is_leaf=callable)
+    return diffrax.Event(conditions, event.root_finder, event.direction)
+
+
+def _axes_per_leaf(values: dict[str, PyTree], batch_axes) -> dict[str, PyTree]:
+    """`batch_axes` spread over every leaf, after checking that all members are there everywhere."""
+    if not isinstance(batch_axes, tuple) or len(batch_axes) != 3:
+        raise ValueError(f"batch_axes must be a tuple of three, for (q0, qdot0, params); got {batch_axes!r}.")
+    axes, sizes = {}, {}
+    for (name, value), prefix in zip(values.items(), batch_axes, strict=True):
+        try:
+            axes[name] = jax.tree.broadcast(prefix, value, is_leaf=lambda axis: axis is None)
+        except ValueError:
+            raise ValueError(f"batch_axes for {name} is {prefix!r}, which does not fit its structure.") from None
+        leaves, tree = jax.tree_util.tree_flatten_with_path(value)
+        for (path, leaf), axis in zip(leaves, tree.flatten_up_to(axes[name]), strict=True):
+            label = name + jax.tree_util.keystr(path)
+            if axis is not None:
+                if not -jnp.ndim(leaf) <= axis < jnp.ndim(leaf):
+                    raise ValueError(f"{label} has shape {jnp.shape(leaf)}: it has no axis {axis} for the batch.")
+                sizes[label] = jnp.shape(leaf)[axis]
+    if not sizes:
+        raise ValueError("batch_axes maps over nothing: name the axis of the members in q0, qdot0 or params.")
+    if len(set(sizes.values())) > 1:
+        listed = ", ".join(f"{label} has {size}" for label, size in sizes.items())
+        raise ValueError(f"The batch must have one size everywhere; {listed}.")
+    if 0 in sizes.values():
+        raise ValueError("The batch is empty.")
+    return axes
+
+
+def _first_member(tree: PyTree, axes: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf, axis: leaf if axis is None else jnp.take(leaf, 0, axis), tree, axes)
+
+
+def _raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
+    """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced."""
+    if not is_concrete(trajectory.ok):
+        return trajectory.result.error_if(trajectory, ~trajectory.ok)
+    if bool(trajectory.ok):
+        return trajectory
+    end = trajectory.end
+    q, qdot = np.asarray(layout.flatten(end.q)), np.asarray(layout.flatten(end.qdot))
+    message = (
+        f"The motion could not be followed beyond t = {float(end.t):.9g} of {float(trajectory.ts[-1]):.9g}. "
+        f"{advice(trajectory.result)}"
+    )
+    if trajectory.result == RESULTS.mass_matrix_singular:
+        mass = np.asarray(trajectory.system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
+        message += f"\nSingular there: {_describe_null(mass, layout.names)}."
+    state = ", ".join(f"{name} = {value:.6g}" for name, value in zip(layout.names[:8], q[:8], strict=True))
+    velocity = ", ".join(f"{value:.6g}" for value in qdot[:8])
+    raise SimulationError(f"{message}\nThe last state was {state}; velocities {velocity}.", trajectory)
+
+
+def _describe_null(mass: np.ndarray, names: tuple[str, ...]) -> str:
+    """The coordinates, or their combinations, that carry no kinetic energy."""
+    unused = [name for name, row in zip(names, mass, strict=True) if not row.any()]
+    if unused:
+        return f"L has no kinetic energy in the velocity of {', '.join(unused)} (absent from L, or linear in it)"
+    combinations = []
+    for direction in _linear.null_directions(mass):
+        direction = direction / direction[np.argmax(np.abs(direction))]
+        terms = [f"{c:+.3g} d{name}" for c, name in zip(direction, names, strict=True) if abs(c) > 1e-6]
+        combinations.append(" ".join(terms))
+    return "no kinetic energy along " + "; ".join(combinations)

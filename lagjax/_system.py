@@ -1,0 +1,142 @@
+"""`System`: the scene as its author describes it, and the physics one can ask of a single state.
+
+A `System` holds the user's functions, checked for their signatures when it is built and for what they return when they
+first meet a state. `System.motion(layout)` hands the same scene on, in flat coordinates, to whoever integrates it.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from lagjax._arguments import Function, accept
+from lagjax._layout import Layout
+from lagjax._motion import Motion
+
+PyTree = Any
+
+
+class System(eqx.Module):
+    r"""A mechanical system, described by its Lagrangian.
+
+    The equations of motion are those of Lagrange, with generalised forces Q and a Rayleigh dissipation function D,
+
+        d/dt ∂L/∂q̇ = ∂L/∂q + Q − ∂D/∂q̇.
+
+    **Arguments**
+
+    - `lagrangian(q, qdot)`: a plain JAX function that returns the scalar L. `q` is any pytree of real floats (a number,
+      an array, a dict, a NamedTuple); `qdot` has the same structure. L need not be T − U.
+    - `forces(q, qdot)`: the generalised forces Q that no potential gives, in the structure of `q`.
+    - `dissipation(q, qdot)`: the scalar D, half the power that is dissipated when D is quadratic in `qdot`.
+
+    Each may also ask, by name, for the time `t` and the parameters `params` (any pytree).
+
+    **Units.** Any consistent ones, and coordinates of different units may stand side by side: the momentum of q has
+    units mass·length²·time⁻¹/{q}, its force mass·length²·time⁻²/{q}, so that p q̇, F q and L are energies. A change of
+    units changes nothing but numbers.
+
+    **Raises** `TypeError` when a function has another signature, when coordinates are not real floats or when a
+    function does not return what its role asks for; `ValueError` when `q` and `qdot` differ in structure or shape.
+
+    Source: Landau & Lifshitz, *Mechanics*, §2 (Lagrange's equations), §6 (energy), §25 (dissipation).
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    def pendulum(q, qdot, params):
+        return 0.5 * params["m"] * params["l"]**2 * qdot**2 + params["m"] * 9.81 * params["l"] * jnp.cos(q)
+
+    scene = lagjax.System(pendulum)
+    scene.acceleration(0.1, 0.0, params={"m": 1.0, "l": 0.5})
+    ```
+    """
+
+    lagrangian: Function
+    forces: Function | None
+    dissipation: Function | None
+
+    def __init__(self, lagrangian: Callable, *, forces: Callable | None = None, dissipation: Callable | None = None):
+        self.lagrangian = accept(lagrangian, "lagrangian")
+        self.forces = None if forces is None else accept(forces, "forces")
+        self.dissipation = None if dissipation is None else accept(dissipation, "dissipation")
+
+    def acceleration(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
+        """q̈ from Lagrange's equations, in the structure of `q`; NaN where the mass matrix is singular."""
+        return self._at(Motion.acceleration, q, qdot, t, params, restore=True)
+
+    def mass_matrix(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> jax.Array:
+        """M = ∂²L/∂q̇², shape (n, n), in the order in which the leaves of `q` lie end to end."""
+        return self._at(Motion.mass_matrix, q, qdot, t, params)
+
+    def momentum(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
+        """The conjugate momentum p = ∂L/∂q̇, in the structure of `q`."""
+        return self._at(Motion.momentum, q, qdot, t, params, restore=True)
+
+    def generalized_force(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
+        """∂L/∂q + Q − ∂D/∂q̇, in the structure of `q`: what dp/dt equals along the motion."""
+        return self._at(Motion.generalized_force, q, qdot, t, params, restore=True)
+
+    def energy(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> jax.Array:
+        """h = p·q̇ − L. It changes by dh/dt = −∂L/∂t + (Q − ∂D/∂q̇)·q̇, and need not equal T + U."""
+        return self._at(Motion.energy, q, qdot, t, params)
+
+    def motion(self, layout: Layout, params: PyTree = None) -> Motion:
+        """The scene in the flat coordinates of `layout`, after a look at what its functions return there."""
+        self._check_outputs(layout, params)
+
+        def flat(function):
+            def of_vectors(q, qdot, t, params):
+                return function(layout.restore(q), layout.restore(qdot), t=t, params=params)
+
+            return of_vectors
+
+        forces = flat(self.forces) if self.forces is not None else None
+        return Motion(
+            lagrangian=flat(self.lagrangian),
+            forces=None if forces is None else lambda *state: layout.flatten(forces(*state)),
+            dissipation=flat(self.dissipation) if self.dissipation is not None else None,
+        )
+
+    def _at(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
+        """Evaluate one of `Motion`'s functions at a state given in the user's pytree."""
+        layout = Layout.of(q, qdot)
+        t = jnp.asarray(t, layout.dtype)
+        value = quantity(self.motion(layout, params), layout.flatten(q), layout.flatten(qdot), t, params)
+        return layout.restore(value) if restore else value
+
+    def _check_outputs(self, layout: Layout, params: PyTree) -> None:
+        """Trace each function once, on shapes alone, and say what is wrong with what it returns."""
+
+        def returned(function):
+            state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
+            return jax.eval_shape(lambda q, t, p: function(q, q, t=t, params=p), state, t, params)
+
+        for function, role in ((self.lagrangian, "lagrangian"), (self.dissipation, "dissipation")):
+            if function is not None:
+                _require_scalar(returned(function), role)
+        if self.forces is not None:
+            _require_structure(returned(self.forces), layout)
+
+
+def _require_scalar(value: PyTree, role: str) -> None:
+    if not isinstance(value, jax.ShapeDtypeStruct):
+        raise TypeError(f"{role} must return one scalar; got {value}.")
+    if value.shape != ():
+        raise TypeError(f"{role} must return one scalar; got an array of shape {value.shape} (a missing sum?).")
+    if not jnp.issubdtype(value.dtype, jnp.floating):
+        raise TypeError(f"{role} must return a real floating-point number; got {value.dtype}.")
+
+
+def _require_structure(value: PyTree, layout: Layout) -> None:
+    leaves, tree = jax.tree.flatten(value)
+    shapes = tuple(leaf.shape for leaf in leaves)
+    if tree != layout.tree or shapes != layout.shapes:
+        raise TypeError(
+            f"forces must return the structure of q, one force per coordinate; q is {layout.tree} with shapes "
+            f"{layout.shapes}, forces returned {tree} with shapes {shapes}."
+        )
+    if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
+        raise TypeError("forces must return real floating-point numbers.")

@@ -1,0 +1,97 @@
+"""`Trajectory`: what comes out, in the user's own pytree.
+
+Time is the first axis of `q` and `qdot`; the members of a batch are an axis before it. Quantities derived from the
+states are methods: they cost nothing until they are asked for, and they are differentiable.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._results import RESULTS
+from lagjax._system import System
+
+PyTree = Any
+
+
+class State(NamedTuple):
+    """A time and the state at it."""
+
+    t: jax.Array
+    q: PyTree
+    qdot: PyTree
+
+
+class Trajectory(eqx.Module):
+    """The motion of a system at the times `ts`, one trajectory or a batch of them.
+
+    - `ts`: the output times, shape (T,).
+    - `q`, `qdot`: the structure of the initial state, with the time axis in front of every leaf, and the batch axis,
+      if there is one, in front of that. NaN at times that were not reached.
+    - `result`: how each member ended, one of `lagjax.RESULTS`; `ok`: whether it ended well, at the last time or at an
+      event.
+    - `end`: where each member ended, a `State` of `t`, `q`, `qdot`: at `ts[-1]`, at the event, or at the last accepted
+      step before it failed.
+    - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+    """
+
+    ts: jax.Array
+    q: PyTree
+    qdot: PyTree
+    result: RESULTS
+    end: State
+    stats: dict[str, jax.Array]
+    system: System
+    params: PyTree
+    params_axes: PyTree = eqx.field(static=True, default=None)  # how `simulate_batch` mapped over params
+
+    @property
+    def ok(self) -> jax.Array:
+        """True where a member reached the last time or its event."""
+        return (self.result == RESULTS.successful) | (self.result == RESULTS.event_occurred)
+
+    def energy(self) -> jax.Array:
+        """h = p·q̇ − L at every output time, shape (T,) or (batch, T)."""
+        return self._at_every_time(self.system.energy)
+
+    def momentum(self) -> PyTree:
+        """p = ∂L/∂q̇ at every output time, in the structure of `q`."""
+        return self._at_every_time(self.system.momentum)
+
+    def to_xarray(self):
+        """An `xarray.Dataset` with a variable per leaf of `q` and `qdot` and the dimensions (member,) time, ...
+
+        Raises `ImportError` when xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise ImportError("to_xarray() needs the package xarray: pip install xarray.") from None
+        members = ("member",) * jnp.ndim(self.result._value)
+        variables = {"ok": (members, np.asarray(self.ok))}
+        for name, tree in (("q", self.q), ("qdot", self.qdot)):
+            for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+                label = ".".join([name, *(_key_text(key) for key in path)])
+                inner = tuple(f"{label}_{axis}" for axis in range(leaf.ndim - len(members) - 1))
+                variables[label] = ((*members, "time", *inner), np.asarray(leaf))
+        time = self.ts if self.ts.ndim == 1 else self.ts[(0,) * (self.ts.ndim - 1)]
+        return xarray.Dataset(variables, coords={"time": np.asarray(time)})
+
+    def _at_every_time(self, quantity: Callable) -> PyTree:
+        """Map `quantity(q, qdot, t, params)` over the time axis, and over the batch axes before it."""
+        mapped = jax.vmap(quantity, in_axes=(0, 0, 0, None))
+        for outer in range(jnp.ndim(self.result._value)):
+            # The innermost batch axis of `simulate_batch` shares its times and some parameters; axes that the user's
+            # own `jax.vmap(simulate)` added are on everything.
+            shared = outer == 0 and self.ts.ndim < 1 + jnp.ndim(self.result._value)
+            mapped = jax.vmap(mapped, in_axes=(0, 0, None, self.params_axes) if shared else (0, 0, 0, 0))
+        return mapped(self.q, self.qdot, self.ts, self.params)
+
+
+def _key_text(key: Any) -> str:
+    """A key of a pytree path as plain text: 'theta' for a dict's or a NamedTuple's, '0' for a list's."""
+    return str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", key))))
