@@ -3,10 +3,28 @@
 System(L)  →  simulate(system, q0, qdot0, ts, params)  →  Trajectory
 """
 
+from lagjax import plot, scenes
+from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._simulate import simulate, simulate_batch
+from lagjax._solvers import FineOutput, Unrolled
 from lagjax._system import System
 from lagjax._trajectory import State, Trajectory
 
 __version__ = "0.1.0"
-__all__ = ["RESULTS", "SimulationError", "State", "System", "Trajectory", "simulate", "simulate_batch"]
+__all__ = [
+    "RESULTS",
+    "FineOutput",
+    "SimulationError",
+    "State",
+    "System",
+    "Trajectory",
+    "Unrolled",
+    "WorkPrecision",
+    "WorkPrecisionRow",
+    "plot",
+    "scenes",
+    "simulate",
+    "simulate_batch",
+    "work_precision",
+]

@@ -68,8 +68,8 @@ def accept(
     unknown = [str(p) for p in wanted if p.name not in extras or p.kind not in _BY_NAME]
     if unknown:
         raise TypeError(
-            f"{role} asks for {', '.join(f'`{name}`' for name in unknown)}, which lagjax does not provide: it must have "
-            f"the form {expected}. Put constants into `params`, or bind them with functools.partial."
+            f"{role} asks for {', '.join(f'`{name}`' for name in unknown)}, which lagjax does not provide: it must "
+            f"have the form {expected}. Put constants into `params`, or bind them with functools.partial."
         )
     arrays, code = eqx.partition(function, eqx.is_array)
     return Function(arrays, code, tuple(p.name for p in wanted))

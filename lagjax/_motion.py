@@ -44,16 +44,21 @@ class Motion(eqx.Module):
         """∂L/∂q + Q, which is dp/dt along the motion."""
         return jax.grad(self.lagrangian)(q, qdot, t, params) + self.nonconservative_force(q, qdot, t, params)
 
-    def solved_acceleration(self, q, qdot, t, params) -> tuple[jax.Array, jax.Array]:
-        """q̈, and whether the mass matrix it was solved with is singular (q̈ is NaN where it is)."""
+    def mass_matrix_and_force(self, q, qdot, t, params) -> tuple[jax.Array, jax.Array]:
+        """M and the right-hand side of M q̈ = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q."""
 
         def momentum_along(q, t):
             return self.momentum(q, qdot, t, params)
 
         # (∂p/∂q) q̇ + ∂p/∂t is how p changes while q moves and q̇ does not: one directional derivative.
         _, drift = jax.jvp(momentum_along, (q, t), (qdot, jnp.ones_like(t)))
-        mass = _linear.factorize(self.mass_matrix(q, qdot, t, params))
-        return mass.solve(self.generalized_force(q, qdot, t, params) - drift), mass.singular
+        return self.mass_matrix(q, qdot, t, params), self.generalized_force(q, qdot, t, params) - drift
+
+    def solved_acceleration(self, q, qdot, t, params) -> tuple[jax.Array, jax.Array]:
+        """q̈, and whether the mass matrix it was solved with is singular (q̈ is NaN where it is)."""
+        matrix, force = self.mass_matrix_and_force(q, qdot, t, params)
+        mass = _linear.factorize(matrix)
+        return mass.solve(force), mass.singular
 
     def acceleration(self, q, qdot, t, params) -> jax.Array:
         """q̈ from M q̈ = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q."""

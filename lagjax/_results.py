@@ -25,9 +25,9 @@ def advice(result: RESULTS) -> str:
     """What happened and what to try, for one concrete result."""
     if result == RESULTS.dt_min_reached:
         return (
-            "The step size shrank to nothing. The motion runs into a singularity or a discontinuity there (a collision, a "
-            "root of a negative number, a force that jumps), or the tolerance is tighter than round-off allows: stop "
-            "before it with event=..., smooth it, or loosen rtol and atol."
+            "The step size shrank to nothing. The motion runs into a singularity or a discontinuity there (a "
+            "collision, a root of a negative number, a force that jumps), or the tolerance is tighter than round-off "
+            "allows. Stop before it with event=..., smooth it, or loosen rtol and atol."
         )
     if result == RESULTS.max_steps_reached:
         return (

@@ -15,6 +15,7 @@ import numpy as np
 import optimistix as optx
 
 from lagjax._arguments import accept
+from lagjax._solvers import FineOutput
 
 PyTree = Any
 
@@ -32,7 +33,7 @@ class Settings(eqx.Module):
     controller: diffrax.AbstractStepSizeController
     dt0: jax.Array | None
     event: diffrax.Event | None
-    adjoint: diffrax.AbstractAdjoint
+    adjoint: diffrax.AbstractAdjoint | None
     max_steps: int = eqx.field(static=True)
     progress: diffrax.AbstractProgressMeter
 
@@ -40,7 +41,10 @@ class Settings(eqx.Module):
     def of(cls, layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress) -> "Settings":
         """Check the arguments of `simulate` that do not depend on the scene, and fill in the defaults."""
         ts = _output_times(ts, layout.dtype)
-        solver = diffrax.Dopri8() if solver is None else solver
+        if solver is None:
+            # States between steps are wanted for outputs inside and to locate an event.
+            between = ts.size > 2 or event is not None
+            solver = FineOutput(diffrax.Dopri8()) if between else diffrax.Dopri8()
         _require_solver(solver, adaptive=dt is None)
         if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
             raise ValueError(f"max_steps must be a positive integer, so that every run ends; got {max_steps!r}.")
@@ -56,7 +60,7 @@ class Settings(eqx.Module):
             controller=controller,
             dt0=dt0,
             event=_event(event, layout.dtype),
-            adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+            adjoint=adjoint,
             max_steps=max_steps,
             progress=progress,
         )
@@ -158,7 +162,7 @@ def _fixed_step(dt, ts, rtol, atol, max_steps) -> jax.Array:
     if is_concrete(dt) and not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"dt must be a positive step size, also backward in time; got {dt}.")
     if is_concrete(dt) and is_concrete(ts):
-        needed = float(abs(ts[-1] - ts[0])) / float(dt)
+        needed = float(abs(np.asarray(ts)[-1] - np.asarray(ts)[0])) / float(dt)
         if needed > max_steps + 0.5:
             raise ValueError(f"dt={dt} needs {needed:.0f} steps, more than max_steps={max_steps}: raise one of them.")
     return jnp.asarray(dt, ts.dtype) * jnp.sign(ts[-1] - ts[0])
@@ -189,6 +193,7 @@ def _event(event, dtype) -> diffrax.Event | None:
     if not isinstance(event, diffrax.Event):
         event = diffrax.Event(event)
     conditions = jax.tree.map(lambda function: accept(function, "event"), event.cond_fn, is_leaf=callable)
-    tolerance = 100 * float(jnp.finfo(dtype).eps)
-    root_finder = event.root_finder or optx.Newton(rtol=tolerance, atol=tolerance)
+    # Bisection always arrives, and the sign change that fired the event brackets the root.
+    tolerance = 8 * float(jnp.finfo(dtype).eps)
+    root_finder = event.root_finder or optx.Bisection(rtol=tolerance, atol=tolerance)
     return diffrax.Event(conditions, root_finder, event.direction)

@@ -14,9 +14,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.xla_metadata import set_xla_metadata
 
 from lagjax import _linear
+from lagjax._equations import Equations, equations
+from lagjax._integrate import integrate
 from lagjax._layout import Layout
 from lagjax._results import RESULTS, SimulationError, advice
 from lagjax._settings import Settings, as_arrays, is_concrete, require_finite
@@ -36,7 +37,7 @@ def simulate(
     rtol: float | None = None,
     atol: float | None = None,
     dt: float | None = None,
-    max_steps: int = 100_000,
+    max_steps: int = 65_536,
     event: Callable | diffrax.Event | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     throw: bool = True,
@@ -57,15 +58,18 @@ def simulate(
 
     **Rarer ones**
 
-    - `solver`: any diffrax solver for ODEs; `diffrax.Dopri8()` by default.
+    - `solver`: any diffrax solver for ODEs; by default `lagjax.FineOutput(diffrax.Dopri8())`, order 8, with states
+      between its steps about as good as those at their ends (which diffrax's own interpolation for it is not).
     - `dt`: take fixed steps of this size instead of adaptive ones; `rtol` and `atol` then do not apply.
-    - `max_steps`: the budget of steps, rejected ones included.
+    - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient records that many times for
+      every member: lower it for the gradient of a large batch.
     - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued one stops the motion where it
       changes sign, a Boolean one after the step on which it becomes true. `diffrax.Event` around such functions sets
       the direction and the root finder. Where the motion starts on the zero itself, give a direction.
-    - `adjoint`: how derivatives are taken. The default, `diffrax.RecursiveCheckpointAdjoint()`, is for reverse mode
-      (`jax.grad`, `jax.vjp`, `jax.jacrev`); pass `diffrax.ForwardMode()` for forward mode (`jax.jvp`, `jax.jacfwd`),
-      which is cheaper for a few parameters.
+    - `adjoint`: how derivatives are taken. By default reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`) goes over the
+      steps that were taken. Pass `diffrax.ForwardMode()` for forward mode (`jax.jvp`, `jax.jacfwd`), which is cheaper
+      for a few parameters, or any other diffrax adjoint. With an event the default is
+      `diffrax.RecursiveCheckpointAdjoint()`.
     - `throw`: raise when the motion does not reach its end. With `throw=False` look at `trajectory.ok`.
     - `progress`: print how far the integration has come; or any diffrax progress meter.
 
@@ -109,7 +113,7 @@ def simulate_batch(
     rtol: float | None = None,
     atol: float | None = None,
     dt: float | None = None,
-    max_steps: int = 100_000,
+    max_steps: int = 65_536,
     event: Callable | diffrax.Event | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     progress: bool | diffrax.AbstractProgressMeter = False,
@@ -163,59 +167,34 @@ def _integrate_batch(system, settings, q0, qdot0, params, batch_axes: _Static):
 def _integrate(system: System, settings: Settings, q0, qdot0, params):
     """One trajectory: the first six fields of `Trajectory`."""
     layout = Layout.of(q0, qdot0)
-    motion = system.motion(layout, params)
-    y0 = layout.flatten(q0), layout.flatten(qdot0)
-
-    solved_acceleration = jax.jit(motion.solved_acceleration)  # derived once, however often it is called below
-
-    def accelerate(t, y, params):
-        # ... and compiled once: XLA calls it instead of inlining a copy at every place.
-        with set_xla_metadata(inlineable="false"):
-            return solved_acceleration(*y, t, params)
-
-    def vector_field(t, y, params):
-        return y[1], accelerate(t, y, params)[0]
+    numbers = eqx.filter(params, eqx.is_array)
+    form = equations(system.motion(layout, params), layout, numbers, system.path)
+    y0 = form.pack(layout.flatten(q0), layout.flatten(qdot0))
 
     # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
-    start = _health(y0, *accelerate(settings.ts[0], y0, params))
+    start = _health(y0, *form.acceleration(settings.ts[0], y0, numbers))
     ts = jnp.where(start == RESULTS.successful, settings.ts, settings.ts[0])
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(vector_field),
-        settings.solver,
-        t0=ts[0],
-        t1=ts[-1],
-        dt0=settings.dt0,
-        y0=y0,
-        args=params,
-        saveat=diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True))),
-        stepsize_controller=settings.controller,
-        adjoint=settings.adjoint,
-        event=None if settings.event is None else _in_coordinates(settings.event, layout),
-        max_steps=settings.max_steps,
-        throw=False,
-        progress_meter=settings.progress,
-    )
-    path, end = solution.ys
-    t_end, y_end = solution.ts[1][0], jax.tree.map(lambda leaf: leaf[0], end)
+    event = None if settings.event is None else _in_coordinates(settings.event, layout, form, params)
+    solved = integrate(form, settings, event, ts, y0, numbers)
+    path, end, t_end = form.unpack(solved.path), solved.end, solved.t_end
 
-    result = _explained(RESULTS.promote(solution.result), start, _health(y_end, *accelerate(t_end, y_end, params)))
+    result = _explained(RESULTS.promote(solved.result), start, _health(end, *form.acceleration(t_end, end, numbers)))
     # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start.
     reached = jnp.isfinite(path[0]).all(axis=1) & jnp.isfinite(path[1]).all(axis=1) & (ts == settings.ts)
     q, qdot = (jax.vmap(layout.restore)(jnp.where(reached[:, None], leaf, jnp.nan)) for leaf in path)
-    counts = ("num_steps", "num_accepted_steps", "num_rejected_steps")
     return (
         settings.ts,
         q,
         qdot,
         result,
-        State(t_end, layout.restore(y_end[0]), layout.restore(y_end[1])),
-        {name: solution.stats[name] for name in counts},
+        State(t_end, *map(layout.restore, form.unpack(end))),
+        solved.stats,
     )
 
 
 def _health(y, acceleration, singular) -> RESULTS:
     """Whether a motion can go on from a state with this acceleration, and if not, why."""
-    finite = jnp.isfinite(acceleration).all() & jnp.isfinite(y[0]).all() & jnp.isfinite(y[1]).all()
+    finite = jax.tree.reduce(lambda all_, leaf: all_ & jnp.isfinite(leaf).all(), (y, acceleration), jnp.array(True))
     failed = RESULTS.where(singular, RESULTS.mass_matrix_singular, RESULTS.nonfinite_state)
     return RESULTS.where(finite, RESULTS.successful, failed)
 
@@ -228,12 +207,12 @@ def _explained(result: RESULTS, start: RESULTS, end: RESULTS) -> RESULTS:
     return RESULTS.where(start == RESULTS.successful, result, start)
 
 
-def _in_coordinates(event: diffrax.Event, layout: Layout) -> diffrax.Event:
-    """The user's event functions, made to read diffrax's flat state."""
+def _in_coordinates(event: diffrax.Event, layout: Layout, form: Equations, params: PyTree) -> diffrax.Event:
+    """The user's event functions, made to read the solver's state."""
 
     def flat(function):
         def condition(t, y, args, **_):
-            return function(layout.restore(y[0]), layout.restore(y[1]), t=t, params=args)
+            return function(*map(layout.restore, form.unpack(y)), t=t, params=eqx.combine(args, params))
 
         return condition
 

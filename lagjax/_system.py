@@ -5,7 +5,7 @@ first meet a state. `System.motion(layout)` hands the same scene on, in flat coo
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -34,6 +34,10 @@ class System(eqx.Module):
 
     Each may also ask, by name, for the time `t` and the parameters `params` (any pytree).
 
+    - `path`: how the equations are evaluated. A small scene is reduced to a scalar program that holds only the
+      arithmetic it needs, a large one keeps arrays; "auto" chooses, "scalar" and "array" insist. The motion is the
+      same.
+
     **Units.** Any consistent ones, and coordinates of different units may stand side by side: the momentum of q has
     units mass·length²·time⁻¹/{q}, its force mass·length²·time⁻²/{q}, so that p q̇, F q and L are energies. A change of
     units changes nothing but numbers.
@@ -57,8 +61,19 @@ class System(eqx.Module):
     lagrangian: Function
     forces: Function | None
     dissipation: Function | None
+    path: str = eqx.field(static=True)
 
-    def __init__(self, lagrangian: Callable, *, forces: Callable | None = None, dissipation: Callable | None = None):
+    def __init__(
+        self,
+        lagrangian: Callable,
+        *,
+        forces: Callable | None = None,
+        dissipation: Callable | None = None,
+        path: Literal["auto", "scalar", "array"] = "auto",
+    ):
+        if path not in ("auto", "scalar", "array"):
+            raise ValueError(f"path must be 'auto', 'scalar' or 'array'; got {path!r}.")
+        self.path = path
         self.lagrangian = accept(lagrangian, "lagrangian")
         self.forces = None if forces is None else accept(forces, "forces")
         self.dissipation = None if dissipation is None else accept(dissipation, "dissipation")
@@ -84,12 +99,17 @@ class System(eqx.Module):
         return self._at(Motion.energy, q, qdot, t, params)
 
     def motion(self, layout: Layout, params: PyTree = None) -> Motion:
-        """The scene in the flat coordinates of `layout`, after a look at what its functions return there."""
+        """The scene in the flat coordinates of `layout`, after a look at what its functions return there.
+
+        The functions of the result take the numbers in `params` alone, with None in the place of everything else.
+        """
         self._check_outputs(layout, params)
 
+        code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
+
         def flat(function):
-            def of_vectors(q, qdot, t, params):
-                return function(layout.restore(q), layout.restore(qdot), t=t, params=params)
+            def of_vectors(q, qdot, t, numbers):
+                return function(layout.restore(q), layout.restore(qdot), t=t, params=eqx.combine(numbers, code))
 
             return of_vectors
 
@@ -104,7 +124,8 @@ class System(eqx.Module):
         """Evaluate one of `Motion`'s functions at a state given in the user's pytree."""
         layout = Layout.of(q, qdot)
         t = jnp.asarray(t, layout.dtype)
-        value = quantity(self.motion(layout, params), layout.flatten(q), layout.flatten(qdot), t, params)
+        numbers = eqx.filter(params, eqx.is_array_like)
+        value = quantity(self.motion(layout, params), layout.flatten(q), layout.flatten(qdot), t, numbers)
         return layout.restore(value) if restore else value
 
     def _check_outputs(self, layout: Layout, params: PyTree) -> None:
@@ -112,7 +133,8 @@ class System(eqx.Module):
 
         def returned(function):
             state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
-            return jax.eval_shape(lambda q, t, p: function(q, q, t=t, params=p), state, t, params)
+            numbers, code = eqx.partition(params, eqx.is_array_like)
+            return jax.eval_shape(lambda q, t, p: function(q, q, t=t, params=eqx.combine(p, code)), state, t, numbers)
 
         for function, role in ((self.lagrangian, "lagrangian"), (self.dissipation, "dissipation")):
             if function is not None:

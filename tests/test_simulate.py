@@ -212,7 +212,8 @@ def test_simulate_inside_jit_and_vmap():
 
 
 def run_from(q0):
-    return lagjax.simulate(SCENE, q0, 0.5, TS, PARAMS)
+    # Fixed steps: adaptive ones may differ by a step where a decision hangs on the last digit.
+    return lagjax.simulate(SCENE, q0, 0.5, TS, PARAMS, dt=0.02)
 
 
 # ---- failures that only the integration can find --------------------------------------------------------------------
@@ -250,7 +251,7 @@ def test_nan_with_fixed_steps_is_reported():
 
 
 def test_nan_at_the_start_is_reported():
-    message, _ = failing(lambda q, v: jnp.linalg.norm(v) ** 2, jnp.ones(2), jnp.zeros(2))
+    message, _ = failing(lambda q, v: 0.5 * jnp.sum(v**2) + jnp.linalg.norm(q), jnp.zeros(2), jnp.zeros(2))
     assert "norm at zero" in message and "t = 0 " in message
 
 

@@ -1,0 +1,315 @@
+"""The programs that are compared.
+
+Every contender has one verb, `prepare(case) -> solve`, and `solve(tol)` returns the final states (q, q̇) of shape
+(members, 2n) as a NumPy array, so that a caller who has them has waited for them. What depends on the case alone is
+done by `prepare`; what depends on the tolerance, by the first `solve(tol)`: compile times are read off those two.
+
+A tolerance means rtol = atol = tol, for lagjax too. That is not the same error from program to program (heyoka's is
+far below tol), which is why times are compared at equal error.
+
+Peers are set up the way that was fastest when tried, not the most convenient one: numbers are constants for them, the
+state of plain diffrax is one array (a tuple of scalars is slower in its stage loop), the velocity term of the autodiff
+equations is one `jvp`, heyoka writes its loops out where that compiles.
+"""
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lagjax
+from benchmarks._cases import Case
+
+MAX_STEPS = 100_000
+Solve = Callable[[float], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Contender:
+    """`members` bounds the batch of a program that runs one trajectory after the other: its cost is proportional."""
+
+    name: str
+    prepare: Callable[[Case], Solve]
+    packages: tuple[str, ...] = ()
+    suits: Callable[[Case], str | None] = lambda case: None
+    members: int | None = None
+
+    def available(self, case: Case) -> str | None:
+        """None, or the reason why this contender cannot run this case."""
+        for package in self.packages:
+            if importlib.util.find_spec(package) is None:
+                return f"{package} is not installed"
+        return self.suits(case)
+
+
+# ---- lagjax ----------------------------------------------------------------------------------------------------------
+
+
+def _lagjax(case: Case) -> Solve:
+    scene, ts = case.scene, np.array([0.0, case.duration])
+    q0, qdot0 = case.tree(case.q0), case.tree(case.qdot0)
+
+    def solve(tol):
+        end = lagjax.simulate_batch(
+            scene.system, q0, qdot0, ts, scene.params, rtol=tol, atol=tol, max_steps=MAX_STEPS
+        ).end
+        return np.concatenate([_rows(end.q, case.batch), _rows(end.qdot, case.batch)], axis=1)
+
+    return solve
+
+
+def _lagjax_single(case: Case) -> Solve:
+    scene, ts = case.scene, np.array([0.0, case.duration])
+    q0, qdot0 = case.tree(case.q0[0]), case.tree(case.qdot0[0])
+
+    def solve(tol):
+        end = lagjax.simulate(scene.system, q0, qdot0, ts, scene.params, rtol=tol, atol=tol, max_steps=MAX_STEPS).end
+        return np.concatenate([_rows(end.q, 1), _rows(end.qdot, 1)], axis=1)
+
+    return solve
+
+
+def _rows(tree, batch: int) -> np.ndarray:
+    return np.concatenate([np.asarray(leaf).reshape(batch, -1) for leaf in jax.tree.leaves(tree)], axis=1)
+
+
+# ---- plain diffrax ---------------------------------------------------------------------------------------------------
+
+
+def autodiff_acceleration(case: Case) -> Callable:
+    """q̈ = M⁻¹(∂L/∂q − (∂p/∂q)q̇) of one state, by `jax.grad`, `jax.hessian` and LAPACK, as most people write it."""
+    L = case.lagrangian
+
+    def acceleration(q, v):
+        momentum_rate = jax.jvp(lambda q: jax.grad(L, 1)(q, v), (q,), (v,))[1]
+        return jnp.linalg.solve(jax.hessian(L, 1)(q, v), jax.grad(L, 0)(q, v) - momentum_rate)
+
+    return acceleration
+
+
+def by_hand(case: Case) -> Callable:
+    """The same, in the formulas of `case.acceleration`."""
+    return lambda q, v: jnp.asarray(case.acceleration(q, v))
+
+
+def diffeqsolve(case: Case, acceleration: Callable, max_steps: int = MAX_STEPS, adjoint=None) -> Callable:
+    """`(y0, tol) -> y` at the end, one member, in plain diffrax."""
+    n = case.coordinates
+
+    def field(t, y, args):
+        return jnp.concatenate([y[n:], acceleration(y[:n], y[n:])])
+
+    def solve(y0, tol):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(field),
+            diffrax.Dopri8(),
+            t0=0.0,
+            t1=case.duration,
+            dt0=None,
+            y0=y0,
+            stepsize_controller=diffrax.PIDController(rtol=tol, atol=tol),
+            adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+            max_steps=max_steps,
+            throw=False,
+        )
+        return solution.ys[-1]
+
+    return solve
+
+
+def _diffrax(derive: Callable, batched: bool = True) -> Callable[[Case], Solve]:
+    def prepare(case):
+        one = diffeqsolve(case, derive(case))
+        run = jax.jit(jax.vmap(one, in_axes=(0, None)) if batched else one)
+        y0 = jnp.asarray(case.states if batched else case.states[0])
+        return lambda tol: np.atleast_2d(np.asarray(run(y0, tol)))
+
+    return prepare
+
+
+def _has_formulas(case: Case) -> str | None:
+    return None if case.acceleration else "nobody writes these equations by hand"
+
+
+# ---- heyoka ----------------------------------------------------------------------------------------------------------
+
+
+def heyoka_system(case: Case) -> list:
+    """The equations of motion, derived by heyoka from the symbolic Lagrangian."""
+    import heyoka as hy
+
+    q, v = ([hy.expression(f"{letter}{i}") for i in range(case.coordinates)] for letter in "qv")
+    return hy.lagrangian(case.symbolic(hy, q, v), q, v)
+
+
+def heyoka_width(case: Case) -> int:
+    """How many trajectories share a SIMD lane: what heyoka recommends, or twice that in compact mode (faster there)."""
+    import heyoka as hy
+
+    return hy.recommended_simd_size() * (2 if case.long_formulas else 1)
+
+
+def _heyoka_single(case: Case) -> Solve:
+    import heyoka as hy
+
+    equations, integrators = heyoka_system(case), {}
+
+    def solve(tol):
+        if tol not in integrators:
+            integrators[tol] = hy.taylor_adaptive(
+                equations, case.states[0].copy(), tol=tol, compact_mode=case.long_formulas
+            )
+        ta, final = integrators[tol], np.empty_like(case.states)
+        for state, out in zip(case.states, final, strict=True):
+            ta.time = 0.0
+            ta.state[:] = state
+            ta.propagate_until(case.duration)
+            out[:] = ta.state
+        return final
+
+    return solve
+
+
+def _heyoka_blocks(case: Case) -> np.ndarray:
+    """The states as (blocks, 2n, width), the last block filled up with copies of the last member."""
+    width, states = heyoka_width(case), case.states
+    filled = np.concatenate([states, np.repeat(states[-1:], -len(states) % width, axis=0)])
+    return np.ascontiguousarray(filled.reshape(-1, width, states.shape[1]).transpose(0, 2, 1))
+
+
+def _heyoka_integrator(case: Case, equations: list, blocks: np.ndarray) -> Callable:
+    import heyoka as hy
+
+    return lambda tol: hy.taylor_adaptive_batch(equations, blocks[0].copy(), tol=tol, compact_mode=case.long_formulas)
+
+
+def _heyoka_batch(case: Case) -> Solve:
+    blocks, integrators = _heyoka_blocks(case), {}
+    build = _heyoka_integrator(case, heyoka_system(case), blocks)
+
+    def solve(tol):
+        ta = integrators[tol] if tol in integrators else integrators.setdefault(tol, build(tol))
+        final = np.empty_like(blocks)
+        for block, out in zip(blocks, final, strict=True):
+            ta.set_time(0.0)
+            ta.state[:] = block
+            ta.propagate_until(case.duration)
+            out[:] = ta.state
+        return _members(final, case.batch)
+
+    return solve
+
+
+def _heyoka_ensemble(case: Case) -> Solve:
+    """The batch integrator on all cores, by heyoka's own threads."""
+    import heyoka as hy
+
+    blocks, integrators = _heyoka_blocks(case), {}
+    build = _heyoka_integrator(case, heyoka_system(case), blocks)
+
+    def start(ta, i):
+        ta.set_time(0.0)
+        ta.state[:] = blocks[i]
+        return ta
+
+    def solve(tol):
+        ta = integrators[tol] if tol in integrators else integrators.setdefault(tol, build(tol))
+        ends = hy.ensemble_propagate_until_batch(ta, case.duration, len(blocks), start)
+        return _members(np.stack([end[0].state for end in ends]), case.batch)
+
+    return solve
+
+
+def _members(blocks: np.ndarray, batch: int) -> np.ndarray:
+    return blocks.transpose(0, 2, 1).reshape(-1, blocks.shape[1])[:batch]
+
+
+def reference(case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """Final states from a program and a method other than those measured, and a second, looser one to judge them by.
+
+    heyoka at tol = 1e-18 (its series is then long enough that round-off alone is left) and at 1e-16; without heyoka,
+    DOP853 at 1e-13 and 1e-12 over all members at once, on the autodiff equations.
+    """
+    if importlib.util.find_spec("heyoka") is not None:
+        solve = _heyoka_batch(case)
+        return solve(1e-18), solve(1e-16)
+    return _dop853_of_all(case, 1e-13), _dop853_of_all(case, 1e-12)
+
+
+# ---- SciPy and SymPy -------------------------------------------------------------------------------------------------
+
+
+def sympy_functions(case: Case) -> Callable:
+    """`y -> (M, F)` by SymPy: `LagrangesMethod`, common subexpressions shared, lambdified."""
+    import sympy
+    from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
+
+    n = case.coordinates
+    q = dynamicsymbols(f"q:{n}")
+    v = dynamicsymbols(f"q:{n}", 1)
+    ops = SimpleNamespace(sin=sympy.sin, cos=sympy.cos, sqrt=sympy.sqrt)
+    method = LagrangesMethod(case.symbolic(ops, q, v), q)
+    method.form_lagranges_equations()
+    plain = [sympy.Symbol(f"{letter}{i}") for letter in "qv" for i in range(n)]
+    names = dict(zip([*v, *q], [*plain[n:], *plain[:n]], strict=True))  # velocities first: they contain the q
+    mass, force = (part.xreplace(names) for part in (method.mass_matrix, method.forcing))
+    return sympy.lambdify([plain], [mass, force], "numpy", cse=True)
+
+
+def _scipy(case: Case) -> Solve:
+    from scipy.integrate import solve_ivp
+
+    parts, n = sympy_functions(case), case.coordinates
+
+    def field(t, y):
+        mass, force = parts(y)
+        return np.concatenate([y[n:], np.linalg.solve(mass, force)[:, 0]])
+
+    def solve(tol):
+        runs = [solve_ivp(field, (0.0, case.duration), y, method="DOP853", rtol=tol, atol=tol) for y in case.states]
+        return np.stack([run.y[:, -1] for run in runs])
+
+    return solve
+
+
+def _dop853_of_all(case: Case, tol: float) -> np.ndarray:
+    from scipy.integrate import solve_ivp
+
+    n, derived = case.coordinates, jax.jit(jax.vmap(autodiff_acceleration(case)))
+
+    def field(t, y):
+        y = y.reshape(-1, 2 * n)
+        return np.concatenate([y[:, n:], derived(y[:, :n], y[:, n:])], axis=1).ravel()
+
+    run = solve_ivp(field, (0.0, case.duration), case.states.ravel(), method="DOP853", rtol=tol, atol=tol)
+    return run.y[:, -1].reshape(case.states.shape)
+
+
+def _sympy_copes(case: Case) -> str | None:
+    return "SymPy takes minutes for formulas this long" if case.long_formulas else None
+
+
+# ---- who takes part --------------------------------------------------------------------------------------------------
+
+BATCHED = (
+    Contender("lagjax", _lagjax),
+    Contender("diffrax, by hand", _diffrax(by_hand), suits=_has_formulas),
+    Contender("diffrax, autodiff", _diffrax(autodiff_acceleration)),
+    Contender("heyoka batch", _heyoka_batch, ("heyoka",)),
+    Contender("heyoka ensemble", _heyoka_ensemble, ("heyoka",)),
+    Contender("heyoka", _heyoka_single, ("heyoka",), members=128),
+    Contender("SciPy + SymPy", _scipy, ("scipy", "sympy"), suits=_sympy_copes, members=4),
+)
+
+SINGLE = (
+    Contender("lagjax", _lagjax_single),
+    Contender("diffrax, by hand", _diffrax(by_hand, batched=False), suits=_has_formulas),
+    Contender("diffrax, autodiff", _diffrax(autodiff_acceleration, batched=False)),
+    Contender("heyoka", _heyoka_single, ("heyoka",)),
+    Contender("SciPy + SymPy", _scipy, ("scipy", "sympy"), suits=_sympy_copes),
+)

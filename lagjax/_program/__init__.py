@@ -1,0 +1,215 @@
+"""Scalar programs: a function of a few numbers, reduced to the arithmetic it really needs.
+
+Derivatives of a Lagrangian, as JAX traces them, are mostly padding: products with the zeros and ones of unit vectors,
+arrays built to be taken apart again, the same product in three places. For a small scene all of it can be seen through.
+`lower` traces a function, follows every single number through every array operation, and keeps each distinct operation
+once:
+
+    jaxpr  ──_rules──►  graph of scalars  ──_graph──►  folded, shared  ──_passes──►  Program  ──_emit──►  JAX again
+
+    >>> program = lower(lambda q, v: 0.5 * jnp.sum(v * v) - jnp.cos(q[0]) + 0.0 * q[1], jnp.zeros(2), jnp.zeros(2))
+    >>> program.operations              # v0*v0 + v1*v1, a half of it, cos(q0), the difference
+    6
+    >>> program.depends(0)              # inputs 0, 2 and 3: q[1] is cyclic
+    frozenset({0, 2, 3})
+    >>> program(q0, q1, v0, v1)         # JAX again: under jit, vmap, grad
+
+Structure needs no special cases then. A constant mass matrix is inverted here, a diagonal one becomes divisions, an
+absent term is absent.
+
+The inputs are the elements of the example arrays, leaf by leaf, each in C order; the outputs likewise.
+A `Program` is called with one JAX scalar per input. Each may be an array of lanes instead, all lanes in one call: the
+inputs broadcast, and every output, constants too, has the shape they broadcast to. The precision is that of the inputs.
+
+Derivatives of a program are those of the function it came from, custom rules included: they are traced from that
+function and lowered in turn, when they are first asked for.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+
+from lagjax._program._emit import emit, plain_elementary
+from lagjax._program._graph import FOLD, Node, Unlowerable
+from lagjax._program._passes import finish
+from lagjax._program._rules import Expansion, kind_of
+
+__all__ = ["Program", "Unlowerable", "lower"]
+
+
+def lower(function: Callable, *examples, budget: int = 20_000) -> "Program":
+    """The scalar program of `function` at arguments like `examples` (arrays, `ShapeDtypeStruct`s, or pytrees of them).
+
+    Raises `Unlowerable`, with a sentence, for a primitive without a scalar form, for indices and loops that depend on
+    the values of the inputs, and for more than `budget` scalar operations; the last without doing the work first.
+    """
+    leaves, structure = jax.tree.flatten(examples)
+    shapes = tuple(jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    return _lower_leaves(lambda *xs: jax.tree.leaves(function(*jax.tree.unflatten(structure, xs))), shapes, budget)
+
+
+def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int) -> "Program":
+    with plain_elementary():
+        traced = jax.make_jaxpr(function)(*shapes)
+    expansion, arguments, count = Expansion(budget), [], 0
+    for shape in shapes:
+        expansion.work(shape.size)
+        ids = [expansion.graph.input(count + k, kind_of(shape.dtype)) for k in range(shape.size)]
+        arguments.append(np.array(ids, dtype=np.int64).reshape(shape.shape))
+        count += shape.size
+    with np.errstate(all="ignore"):
+        results = expansion.run_closed(traced, arguments)
+    outputs = [i for result in results for i in result.ravel().tolist()]
+    nodes, kinds, outputs = finish(expansion.graph, outputs)
+    return Program(nodes, kinds, outputs, expansion.traced_operations, function, shapes, budget)
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A straight line of scalar operations; made by `lower`, compared and hashed by identity.
+
+    `nodes` holds the operations in order, as triples `(op, operands, attribute)`, and `outputs` the positions in it
+    of the results. `traced_operations` counts the scalar operations of the function as written.
+    """
+
+    nodes: tuple[Node, ...]
+    kinds: tuple[str, ...]
+    outputs: tuple[int, ...]
+    traced_operations: int
+    function: Callable
+    shapes: tuple[jax.ShapeDtypeStruct, ...]
+    budget: int
+
+    def __call__(self, *scalars) -> tuple:
+        """The outputs, one per scalar; see the module's text for lanes and precision."""
+        if len(scalars) != self.size:
+            raise TypeError(f"this program takes {self.size} scalars, not {len(scalars)}")
+        return self._differentiable(*scalars)
+
+    @property
+    def size(self) -> int:
+        """How many scalars it takes."""
+        return sum(shape.size for shape in self.shapes)
+
+    def evaluate(self, *numbers) -> tuple:
+        """The outputs at these numbers, one after the other in NumPy: to look at a few values without compiling."""
+        values: list = []
+        with np.errstate(all="ignore"):
+            for (op, operands, attribute), kind in zip(self.nodes, self.kinds, strict=True):
+                if op == "input":
+                    value = numbers[attribute]
+                elif op == "constant":
+                    value = attribute
+                else:
+                    extra = () if attribute is None else (attribute,)
+                    value = FOLD[op](*(values[i] for i in operands), *extra)
+                values.append(np.dtype("float64" if kind == "float" else kind).type(value))
+        return tuple(values[i] for i in self.outputs)
+
+    @functools.cached_property
+    def operations(self) -> int:
+        """How many arithmetic operations one evaluation takes."""
+        return sum(op not in ("input", "constant") for op, _, _ in self.nodes)
+
+    def constant(self, output: int) -> float | None:
+        """The value of an output that does not depend on the inputs, else None."""
+        op, _, attribute = self.nodes[self.outputs[output]]
+        return attribute if op == "constant" else None
+
+    def depends(self, output: int) -> frozenset[int]:
+        """The positions of the inputs that an output depends on."""
+        mask = self._dependencies[self.outputs[output]]
+        return frozenset(i for i in range(mask.bit_length()) if mask >> i & 1)
+
+    @functools.cached_property
+    def _dependencies(self) -> list[int]:
+        """For each node the inputs it depends on, as a bit mask."""
+        masks: list[int] = []
+        for op, operands, attribute in self.nodes:
+            masks.append(functools.reduce(int.__or__, (masks[i] for i in operands), 0))
+            if op == "input":
+                masks[-1] = 1 << attribute
+        return masks
+
+    # ---- derivatives: from the function, not from the emitted code ----
+
+    @functools.cached_property
+    def _differentiable(self) -> Callable:
+        run = jax.custom_jvp(lambda *scalars: emit(self.nodes, self.kinds, self.outputs, scalars))
+
+        @functools.partial(run.defjvp, symbolic_zeros=True)
+        def rule(primals, tangents):
+            values = run(*primals)
+            active = tuple(i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero))
+            dots = self._tangents(active, primals, tuple(tangents[i] for i in active))
+            return values, tuple(
+                dots.pop(0).astype(value.dtype) if _is_float(value) else np.zeros(value.shape, jax.dtypes.float0)
+                for value in values
+            )
+
+        return run
+
+    def _tangents(self, active, primals, moving) -> list:
+        """The tangents of the float outputs, when the inputs `active` move."""
+        try:
+            return list(self._tangent_programs(active)(*primals, *moving))
+        except Unlowerable:
+            function = jnp.vectorize(lambda *scalars: tuple(_floats(self._on_scalars(*scalars))))
+
+            def along(*some):
+                replaced = dict(zip(active, some, strict=True))
+                return function(*(replaced.get(i, x) for i, x in enumerate(primals)))
+
+            return list(jax.jvp(along, tuple(primals[i] for i in active), moving)[1])
+
+    @functools.cached_property
+    def _tangent_programs(self) -> Callable:
+        @functools.cache
+        def tangent_program(active):
+            count = len(active)
+            scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
+            return _lower_leaves(
+                lambda *xs: self._push(active, xs[: len(self.shapes)], xs[len(self.shapes) :]),
+                (*self.shapes, *[scalar] * count),
+                4 * self.budget,
+            )
+
+        return tangent_program
+
+    def _push(self, active, leaves, moving) -> list:
+        """The function's own jvp, with `moving` the tangents of the scalars `active` and zero for the others."""
+        tangents, start, given = [], 0, dict(zip(active, moving, strict=True))
+        for leaf in leaves:
+            if _is_float(leaf):
+                zero = jnp.zeros((), leaf.dtype)
+                parts = [given.get(start + k, zero).astype(leaf.dtype) for k in range(leaf.size)]
+                tangents.append(jnp.stack(parts).reshape(leaf.shape) if parts else jnp.zeros_like(leaf))
+            start += leaf.size
+
+        def along(*floats):
+            floats = iter(floats)
+            return _floats(self.function(*(next(floats) if _is_float(leaf) else leaf for leaf in leaves)))
+
+        return jax.jvp(along, tuple(leaf for leaf in leaves if _is_float(leaf)), tuple(tangents))[1]
+
+    def _on_scalars(self, *scalars) -> list:
+        """The function as it was given, on scalars: what the program must agree with."""
+        leaves, start = [], 0
+        for shape in self.shapes:
+            parts = scalars[start : start + shape.size]
+            leaves.append(jnp.stack(parts).reshape(shape.shape) if parts else jnp.zeros(shape.shape, shape.dtype))
+            start += shape.size
+        return [x for leaf in self.function(*leaves) for x in jnp.ravel(leaf)]
+
+
+def _is_float(x) -> bool:
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def _floats(xs) -> list:
+    return [x for x in xs if _is_float(x)]

@@ -1,0 +1,110 @@
+"""From a graph to JAX again: the operations of a program, one after the other, on scalars or on arrays of lanes."""
+
+import contextlib
+import functools
+import threading
+from collections.abc import Callable, Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.experimental.xla_metadata import set_xla_metadata
+
+from lagjax import _elementary
+from lagjax._program._graph import Node
+
+_state = threading.local()
+
+
+@contextlib.contextmanager
+def plain_elementary() -> Iterator[None]:
+    """Inside, programs emit `sin` itself and not the polynomial behind it, so that they can be lowered again.
+
+    The metadata is for `jit`: it keeps what is traced here apart, in its cache, from what is traced elsewhere.
+    """
+    before = getattr(_state, "plain", False)
+    _state.plain = True
+    try:
+        with set_xla_metadata(lagjax="lowering"):
+            yield
+    finally:
+        _state.plain = before
+
+
+NAMES = {"and": lax.bitwise_and, "or": lax.bitwise_or, "xor": lax.bitwise_xor, "not": lax.bitwise_not}
+
+
+def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ...], scalars: tuple) -> tuple:
+    """The outputs for these inputs, all of the shape the inputs broadcast to."""
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in scalars))
+    fast = frozenset() if getattr(_state, "plain", False) else _elementary.FAST.keys()
+    precision = _precision(nodes, kinds, scalars)
+    dtypes = [precision if kind == "float" else np.dtype(kind) for kind in kinds]
+    paired = _paired(nodes) if fast else frozenset()
+    values: list = [None] * len(nodes)
+    pairs: dict[int, tuple] = {}
+
+    for i, (op, operands, attribute) in enumerate(nodes):
+        if op == "constant":
+            values[i] = np.asarray(attribute, dtypes[i])
+        elif op == "input":
+            values[i] = lax.convert_element_type(jnp.asarray(scalars[attribute]), dtypes[i])
+        elif op == "convert":
+            values[i] = lax.convert_element_type(values[operands[0]], dtypes[i])
+        elif op == "round":
+            values[i] = lax.round(values[operands[0]], lax.RoundingMethod(attribute))
+        elif op in ("sin", "cos") and operands[0] in paired:
+            if operands[0] not in pairs:
+                pairs[operands[0]] = _apart("sincos")(values[operands[0]])
+            values[i] = pairs[operands[0]][op == "cos"]
+        else:
+            values[i] = _function(op, fast)(*_aligned([values[operand] for operand in operands]))
+    return tuple(jnp.broadcast_to(jnp.asarray(values[i]), shape) for i in outputs)
+
+
+def _precision(nodes, kinds, scalars):
+    """The float type that the float inputs promote to; the default one where there are none."""
+    positions = [node[2] for node, kind in zip(nodes, kinds, strict=True) if node[0] == "input" and kind == "float"]
+    return jnp.result_type(float, *(scalars[i] for i in positions))
+
+
+def _paired(nodes) -> frozenset[int]:
+    """The angles whose sine and cosine are both wanted."""
+    sines, cosines = ({operands[0] for op, operands, _ in nodes if op == name} for name in ("sin", "cos"))
+    return frozenset(sines & cosines)
+
+
+def _function(op: str, fast) -> Callable:
+    if op == "select":
+        return lax.select_n
+    if op in fast:
+        return _apart(op)
+    return NAMES.get(op) or getattr(lax, op)
+
+
+@functools.cache
+def _apart(op: str) -> Callable:
+    """A fast elementary function as a body of its own where that is quicker.
+
+    XLA's CPU backend fuses operations into one loop per output and repeats in each what they share: a polynomial of
+    thirty operations many times over. A call it may not inline is evaluated once.
+    """
+    function = jax.jit(_elementary.sincos if op == "sincos" else _elementary.FAST[op])
+
+    def call(*xs):
+        if jax.default_backend() != "cpu":
+            return function(*xs)
+        with set_xla_metadata(inlineable="false"):
+            return function(*xs)
+
+    return call
+
+
+def _aligned(values: list) -> list:
+    """Operands of one shape: `lax` does not broadcast, which is why it is quick to trace."""
+    shapes = {value.shape for value in values}
+    if len(shapes) == 1:
+        return values
+    shape = jnp.broadcast_shapes(*shapes)
+    return [value if value.shape == shape else jnp.broadcast_to(value, shape) for value in values]

@@ -1,0 +1,439 @@
+"""From a jaxpr to a graph: what every JAX primitive does to arrays of node ids.
+
+An array in the traced function becomes a NumPy array of ids here. An elementwise primitive maps `Graph.apply` over the
+ids; a primitive that only moves data is NumPy's own function of the ids; a loop or a call runs its body again.
+
+To support another primitive: an elementwise one needs a line in `_graph.FOLD`, one that moves data a line in `MOVES`,
+anything else a function marked `@_lowers("its_name")`, which gets the expansion, the parameters of the equation and the
+id arrays, and returns an id array (or a list of them). Each needs a row in `tests/test_program.py`.
+"""
+
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+from lagjax._program._graph import FOLD, Graph, Unlowerable, power
+
+WORK_PER_OPERATION = 50  # scalars looked at for each one the budget allows; most of a derivative folds away
+
+
+class Expansion:
+    """A jaxpr being turned into a graph, and what that has cost so far."""
+
+    def __init__(self, budget: int):
+        self.graph = Graph(budget)
+        self.traced_operations = 0
+        self._work = 0
+
+    def run(self, jaxpr, constants, arguments) -> list[np.ndarray]:
+        """The outputs of a jaxpr as id arrays; equations nothing depends on are skipped."""
+        scope = dict(zip(jaxpr.constvars, constants, strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
+
+        def read(atom):
+            return self.constants(atom.val) if isinstance(atom, core.Literal) else scope[atom]
+
+        for equation in _live(jaxpr):
+            scope |= zip(
+                equation.outvars, self._equation(equation, [read(atom) for atom in equation.invars]), strict=True
+            )
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def run_closed(self, jaxpr, arguments) -> list[np.ndarray]:
+        return self.run(jaxpr.jaxpr, [self.constants(value) for value in jaxpr.consts], arguments)
+
+    def constants(self, value) -> np.ndarray:
+        if isinstance(value, jax.core.Tracer):
+            raise Unlowerable("the function closes over a traced value; pass it as an argument")
+        kind = kind_of(value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype)
+        value = np.asarray(value)
+        self.work(value.size)
+        return _ids([self.graph.constant(x, kind) for x in value.ravel().tolist()], value.shape)
+
+    def map(self, op: str, *arrays: np.ndarray, attribute=None) -> np.ndarray:
+        """`op` elementwise."""
+        arrays = np.broadcast_arrays(*arrays)
+        shape, size = arrays[0].shape, arrays[0].size
+        self.work(size)
+        self.traced_operations += size
+        apply, columns = self.graph.apply, zip(*(array.ravel().tolist() for array in arrays), strict=True)
+        return _ids([apply(op, *operands, attribute=attribute) for operands in columns], shape)
+
+    def fold(self, op: str, array: np.ndarray) -> np.ndarray:
+        """`op` along the first axis, from the left."""
+        total = array[0]
+        for row in array[1:]:
+            total = self.map(op, total, row)
+        return total
+
+    def known(self, array: np.ndarray, what: str) -> np.ndarray:
+        """The numbers behind an array of constants."""
+        values = [self.graph.value(i) for i in array.ravel().tolist()]
+        if None in values:
+            raise Unlowerable(f"{what} depends on the values of the inputs")
+        return np.array(values, dtype=np.int64).reshape(array.shape)
+
+    def work(self, count: int) -> None:
+        """Give up before the work is done, not after."""
+        self._work += count
+        if self._work > WORK_PER_OPERATION * self.graph.budget:
+            raise Unlowerable(
+                f"expanded to scalars, the function takes far more than the {self.graph.budget} operations allowed by "
+                "`budget`"
+            )
+
+    def _equation(self, equation, arguments) -> list[np.ndarray]:
+        name = equation.primitive.name
+        for variable in equation.outvars:
+            kind_of(variable.aval.dtype)
+            self.work(variable.aval.size)
+        if name in MOVES:
+            result = MOVES[name](equation.params, *arguments)
+        elif name in LOWER:
+            result = LOWER[name](self, equation.params, *arguments)
+        elif name in FOLD:
+            result = self.map(name, *arguments)
+        else:
+            raise Unlowerable(f"the primitive `{name}` has no scalar form here")
+        return list(result) if equation.primitive.multiple_results else [result]
+
+
+def kind_of(dtype) -> str:
+    """The kind of a scalar of this type: floats share one, as the program takes the precision of its inputs."""
+    if jnp.issubdtype(dtype, jnp.floating):
+        return "float"
+    if dtype == np.bool_ or jnp.issubdtype(dtype, jnp.integer):
+        return np.dtype(dtype).name
+    raise Unlowerable(f"values of type {dtype} have no scalar form here")
+
+
+def _ids(ids: list[int], shape) -> np.ndarray:
+    return np.array(ids, dtype=np.int64).reshape(shape)
+
+
+def _live(jaxpr) -> list:
+    needed, equations = {v for v in jaxpr.outvars if isinstance(v, core.Var)}, []
+    for equation in reversed(jaxpr.eqns):
+        if needed.intersection(equation.outvars):
+            equations.append(equation)
+            needed.update(v for v in equation.invars if isinstance(v, core.Var))
+    return equations[::-1]
+
+
+# ---- primitives that only move data ---------------------------------------------------------------------------------
+
+
+def _same(params, x):
+    return x
+
+
+def _slice(params, x):
+    strides = params["strides"] or (1,) * x.ndim
+    return x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
+
+
+def _broadcast_in_dim(params, x):
+    shape = [1] * len(params["shape"])
+    for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
+        shape[axis] = size
+    return np.broadcast_to(x.reshape(shape), params["shape"])
+
+
+def _pad(params, x, value):
+    """Each axis is (before, after, between); a negative margin cuts off."""
+    shape, source, target = [], [], []
+    for size, (before, after, between) in zip(x.shape, params["padding_config"], strict=True):
+        length = before + after + size + max(size - 1, 0) * between
+        places = before + np.arange(size) * (between + 1)
+        kept = (0 <= places) & (places < length)
+        shape.append(max(length, 0)), source.append(np.flatnonzero(kept)), target.append(places[kept])
+    result = np.full(shape, value)
+    result[np.ix_(*target)] = x[np.ix_(*source)]
+    return result
+
+
+MOVES: dict[str, Callable] = {
+    **dict.fromkeys(("copy", "copy_p", "stop_gradient", "reduce_precision", "sharding_constraint"), _same),
+    "optimization_barrier": lambda params, *xs: xs,
+    "slice": _slice,
+    "broadcast_in_dim": _broadcast_in_dim,
+    "pad": _pad,
+    "reshape": lambda params, x: x.reshape(params["new_sizes"]),
+    "squeeze": lambda params, x: np.squeeze(x, params["dimensions"]),
+    "expand_dims": lambda params, x: np.expand_dims(x, params["dimensions"]),
+    "transpose": lambda params, x: np.transpose(x, params["permutation"]),
+    "rev": lambda params, x: np.flip(x, params["dimensions"]),
+    "tile": lambda params, x: np.tile(x, params["reps"]),
+    "concatenate": lambda params, *xs: np.concatenate(xs, params["dimension"]),
+    "stack": lambda params, *xs: np.stack(xs, params["axis"]),
+    "unstack": lambda params, x: list(np.moveaxis(x, params["axis"], 0)),
+    "split": lambda params, x: np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"]),
+}
+
+# ---- primitives that compute ----------------------------------------------------------------------------------------
+
+LOWER: dict[str, Callable] = {}
+
+
+def _lowers(*names):
+    def register(rule):
+        LOWER.update(dict.fromkeys(names, rule))
+        return rule
+
+    return register
+
+
+@_lowers("add_any")
+def _add_any(expansion, params, x, y):
+    return expansion.map("add", x, y)
+
+
+@_lowers("square")
+def _square(expansion, params, x):
+    return expansion.map("mul", x, x)
+
+
+@_lowers("integer_pow")
+def _integer_pow(expansion, params, x):
+    exponent, graph = params["y"], expansion.graph
+    expansion.work(x.size)
+    expansion.traced_operations += x.size
+    result = _ids([power(graph, i, abs(exponent)) for i in x.ravel().tolist()], x.shape)
+    return result if exponent >= 0 else expansion.map("div", expansion.constants(1.0), result)
+
+
+@_lowers("pow")
+def _pow(expansion, params, x, y):
+    return expansion.map("pow", x, expansion.map("convert", y, attribute="float"))
+
+
+@_lowers("round")
+def _round(expansion, params, x):
+    return expansion.map("round", x, attribute=int(params["rounding_method"]))
+
+
+@_lowers("convert_element_type")
+def _convert_element_type(expansion, params, x):
+    kind = kind_of(params["new_dtype"])
+    if kind == "bool":
+        zeros = [expansion.graph.constant(0, expansion.graph.kinds[i]) for i in x.ravel().tolist()]
+        return expansion.map("ne", x, _ids(zeros, x.shape))
+    return expansion.map("convert", x, attribute=kind)
+
+
+@_lowers("clamp")
+def _clamp(expansion, params, low, x, high):
+    return expansion.map("min", expansion.map("max", x, low), high)
+
+
+@_lowers("select_n")
+def _select_n(expansion, params, which, *cases):
+    if len(cases) == 1:
+        return cases[0]
+    if all(expansion.graph.kinds[i] == "bool" for i in which.ravel().tolist()):
+        return expansion.map("select", which, *cases)
+    return _choose(expansion, which, cases)
+
+
+def _choose(expansion, which, cases):
+    """The case an integer counts to; below the first is the first, beyond the last the last."""
+    result = cases[0]
+    for k, case in enumerate(cases[1:], 1):
+        bound = [expansion.graph.constant(k, expansion.graph.kinds[i]) for i in which.ravel().tolist()]
+        result = expansion.map("select", expansion.map("ge", which, _ids(bound, which.shape)), result, case)
+    return result
+
+
+@_lowers("iota")
+def _iota(expansion, params):
+    shape = [1] * len(params["shape"])
+    shape[params["dimension"]] = -1
+    numbers = np.arange(params["shape"][params["dimension"]]).astype(params["dtype"])
+    return np.broadcast_to(expansion.constants(numbers).reshape(shape), params["shape"])
+
+
+@_lowers("dot_general")
+def _dot_general(expansion, params, x, y):
+    (contract_x, contract_y), (batch_x, batch_y) = params["dimension_numbers"]
+    free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
+    free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
+    shape = [x.shape[i] for i in (*batch_x, *free_x)] + [y.shape[i] for i in free_y]
+    length = math.prod(x.shape[i] for i in contract_x)
+    expansion.work(math.prod(shape) * length)
+    left = np.transpose(x, (*contract_x, *batch_x, *free_x)).reshape(
+        length, *(x.shape[i] for i in (*batch_x, *free_x)), *(1 for _ in free_y)
+    )
+    right = np.transpose(y, (*contract_y, *batch_y, *free_y)).reshape(
+        length, *(y.shape[i] for i in batch_y), *(1 for _ in free_x), *(y.shape[i] for i in free_y)
+    )
+    if not length:
+        return np.broadcast_to(expansion.constants(0.0), shape)
+    return expansion.fold("add", expansion.map("mul", left, right))
+
+
+REDUCTIONS = {
+    "reduce_sum": ("add", 0.0), "reduce_prod": ("mul", 1.0), "reduce_max": ("max", -np.inf),
+    "reduce_min": ("min", np.inf), "reduce_and": ("and", True), "reduce_or": ("or", False),
+    "reduce_xor": ("xor", False),
+}  # fmt: skip
+CUMULATIONS = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
+
+
+def _reduction(op, empty):
+    def rule(expansion, params, x):
+        rows = np.moveaxis(x, params["axes"], range(len(params["axes"])))
+        shape = rows.shape[len(params["axes"]) :]
+        rows = rows.reshape(math.prod(rows.shape[: len(params["axes"])]), *shape)
+        return expansion.fold(op, rows) if len(rows) else np.broadcast_to(expansion.constants(empty), shape)
+
+    return rule
+
+
+def _cumulation(op):
+    def rule(expansion, params, x):
+        rows = list(np.moveaxis(x, params["axis"], 0))[:: -1 if params["reverse"] else 1]
+        for k in range(1, len(rows)):
+            rows[k] = expansion.map(op, rows[k - 1], rows[k])
+        rows = rows[:: -1 if params["reverse"] else 1]
+        return np.stack(rows, params["axis"]) if rows else x
+
+    return rule
+
+
+LOWER.update({name: _reduction(*meaning) for name, meaning in REDUCTIONS.items()})
+LOWER.update({name: _cumulation(op) for name, op in CUMULATIONS.items()})
+
+# ---- indexing with arrays: the indices must fold to numbers ---------------------------------------------------------
+
+
+@_lowers("dynamic_slice")
+def _dynamic_slice(expansion, params, x, *starts):
+    sizes = params["slice_sizes"]
+    starts = expansion.known(np.array(starts[: x.ndim]), "the start of a slice")
+    starts = [min(max(start, 0), n - size) for start, n, size in zip(starts, x.shape, sizes, strict=True)]
+    return x[tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))]
+
+
+@_lowers("dynamic_update_slice")
+def _dynamic_update_slice(expansion, params, x, update, *starts):
+    starts = expansion.known(np.array(starts), "the start of a slice")
+    starts = [min(max(start, 0), n - size) for start, n, size in zip(starts, x.shape, update.shape, strict=True)]
+    result = x.copy()
+    result[tuple(slice(start, start + size) for start, size in zip(starts, update.shape, strict=True))] = update
+    return result
+
+
+def _places(indices, shape, offset_dims, collapsed, index_map, operand_batch, indices_batch, sizes, clip):
+    """Where each element of a gather's result lies in the flattened operand; -1 for a window that sticks out.
+
+    The same for a scatter, with the updates in place of the result.
+    """
+    batch_shape = indices.shape[:-1]
+    starts = np.zeros((*batch_shape, len(shape)), dtype=np.int64)
+    starts[..., list(index_map)] = indices
+    for axis, batch_axis in zip(operand_batch, indices_batch, strict=True):
+        starts[..., axis] = np.indices(batch_shape)[batch_axis]
+    room = np.array(shape, dtype=np.int64) - np.array(sizes, dtype=np.int64)
+    inside = ((0 <= starts) & (starts <= room)).all(-1)
+    if clip:
+        starts, inside = np.clip(starts, 0, room), np.ones_like(inside)
+    strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
+    first = (starts * np.array(strides, dtype=np.int64)).sum(-1)
+    window = sum((np.indices(sizes)[axis] * stride for axis, stride in enumerate(strides)), np.zeros(sizes, np.int64))
+    window = window.squeeze((*collapsed, *operand_batch))
+    shape_of_starts = batch_shape + (1,) * window.ndim
+    places = first.reshape(shape_of_starts) + window
+    places = np.where(inside.reshape(shape_of_starts), places, -1)
+    return np.moveaxis(places, range(len(batch_shape), places.ndim), offset_dims)
+
+
+def _clips(mode) -> bool:
+    return jax.lax.GatherScatterMode.from_any(mode) == jax.lax.GatherScatterMode.CLIP
+
+
+@_lowers("gather")
+def _gather(expansion, params, x, indices):
+    indices, d = expansion.known(indices, "an index"), params["dimension_numbers"]
+    places = _places(
+        indices, x.shape, d.offset_dims, d.collapsed_slice_dims, d.start_index_map, d.operand_batching_dims,
+        d.start_indices_batching_dims, params["slice_sizes"], _clips(params["mode"]),
+    )  # fmt: skip
+    if (places >= 0).all():
+        return x.ravel()[places]
+    if x.size and expansion.graph.kinds[x.flat[0]] != "float":
+        raise Unlowerable("an index into an array that is not of floats is out of bounds")
+    missing = np.nan if params["fill_value"] is None else params["fill_value"]
+    return np.append(x.ravel(), expansion.constants(float(missing)))[places]
+
+
+def _scatter(op):
+    def rule(expansion, params, x, indices, updates):
+        indices, d = expansion.known(indices, "an index"), params["dimension_numbers"]
+        window = iter(updates.shape[axis] for axis in d.update_window_dims)
+        fixed = (*d.inserted_window_dims, *d.operand_batching_dims)
+        sizes = [1 if axis in fixed else next(window) for axis in range(x.ndim)]
+        places = _places(
+            indices, x.shape, d.update_window_dims, d.inserted_window_dims, d.scatter_dims_to_operand_dims,
+            d.operand_batching_dims, d.scatter_indices_batching_dims, sizes, _clips(params["mode"]),
+        )  # fmt: skip
+        result = x.ravel().copy()
+        for place, update in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
+            if place >= 0:
+                result[place] = update if op is None else expansion.map(op, result[place], np.array(update))
+        return result.reshape(x.shape)
+
+    return rule
+
+
+SCATTERS = {"scatter": None, "scatter-add": "add", "scatter-sub": "sub", "scatter-mul": "mul"}
+LOWER.update({name: _scatter(op) for name, op in {**SCATTERS, "scatter-min": "min", "scatter-max": "max"}.items()})
+
+# ---- calls, loops and branches --------------------------------------------------------------------------------------
+
+
+@_lowers("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call",
+         "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
+def _call(expansion, params, *arguments):
+    body = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
+    if isinstance(body, core.ClosedJaxpr):
+        return expansion.run_closed(body, arguments)
+    return expansion.run(body, (), arguments)
+
+
+@_lowers("scan")
+def _scan(expansion, params, *arguments):
+    consts, carry = params["num_consts"], params["num_carry"]
+    constants, state, columns = arguments[:consts], arguments[consts : consts + carry], arguments[consts + carry :]
+    order = range(params["length"])[:: -1 if params["reverse"] else 1]
+    rows = {}
+    for k in order:
+        expansion.work(1)
+        results = expansion.run_closed(params["jaxpr"], [*constants, *state, *(column[k] for column in columns)])
+        state, rows[k] = results[:carry], results[carry:]
+    outputs = params["jaxpr"].out_avals[carry:]
+    empty = [np.zeros((0, *aval.shape), dtype=np.int64) for aval in outputs]
+    return [*state, *(map(np.stack, zip(*(rows[k] for k in sorted(rows)), strict=True)) if rows else empty)]
+
+
+@_lowers("while")
+def _while(expansion, params, *arguments):
+    split = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+    condition, body, state = arguments[: split[0]], arguments[split[0] : split[1]], arguments[split[1] :]
+    while True:
+        expansion.work(1)
+        (go_on,) = expansion.run_closed(params["cond_jaxpr"], [*condition, *state])
+        if not expansion.known(go_on, "when a `while` loop ends"):
+            return state
+        state = expansion.run_closed(params["body_jaxpr"], [*body, *state])
+
+
+@_lowers("cond")
+def _cond(expansion, params, which, *operands):
+    branches = params["branches"]
+    if (value := expansion.graph.value(int(which))) is not None:
+        return expansion.run_closed(branches[min(max(int(value), 0), len(branches) - 1)], operands)
+    results = [expansion.run_closed(branch, operands) for branch in branches]
+    return [_choose(expansion, np.broadcast_to(which, cases[0].shape), cases) for cases in zip(*results, strict=True)]

@@ -1,0 +1,264 @@
+"""Two wrappers around the explicit Runge–Kutta solvers of diffrax. Neither changes the steps that are taken.
+
+`FineOutput` makes the states *between* steps better. The interpolant that comes with `diffrax.Dopri8` is of order five
+or six, the method of order eight: at tight tolerances it loses a factor of 30 to 1000 against the ends of the steps.
+
+`Unrolled` writes the stages of a step as one straight line. diffrax goes through them in a loop with a buffer for the
+slopes, which costs more than the arithmetic where the state is small and the batch large. It pays when the right-hand
+side is a call that XLA does not inline (as lagjax's are); otherwise every stage becomes a copy of it.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+PyTree = Any
+
+
+class FineOutput(diffrax.AbstractAdaptiveSolver):
+    r"""The steps of an explicit Runge–Kutta solver of diffrax, with better states between them.
+
+    The solver's own interpolant gives states at four points inside the step, the equations give the slopes there, and
+    the polynomial of degree seven through yₙ, yₙ₊₁, the slopes at both ends and these four slopes is the new
+    interpolant: one order better than the states that the slopes were taken at, and closer than order tells. For
+    `Dopri8` its error is 5 to 70 times smaller than that of the solver's own, and a few times that of the steps. The
+    price is four evaluations of the right-hand side a step: use it where states between steps are wanted.
+
+    `solver` is any explicit one whose last slope is taken at the end of the step (FSAL): `diffrax.Dopri8()`,
+    `diffrax.Tsit5()`. For a single `ODETerm`. Raises `TypeError` for any other.
+
+    Source: Enright, Jackson, Nørsett & Thomsen, *Interpolants for Runge–Kutta formulas*, ACM TOMS 12 (1986) 193–218,
+    §3 (boot-strapping).
+
+    ```python
+    import diffrax, jax.numpy as jnp, lagjax
+
+    diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: -y),
+        lagjax.FineOutput(diffrax.Dopri8()),
+        0.0, 5.0, None, jnp.array(1.0),
+        saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, 5.0, 50)),
+        stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
+    )
+    ```
+    """
+
+    solver: diffrax.AbstractERK
+
+    interpolation_cls: ClassVar[Callable]
+
+    def __check_init__(self):
+        if not isinstance(self.solver, diffrax.AbstractERK) or not self.solver.tableau.fsal:
+            raise TypeError(f"FineOutput takes an explicit FSAL Runge-Kutta solver of diffrax; got {self.solver!r}.")
+
+    @property
+    def term_structure(self):
+        """One term, of an ordinary differential equation."""
+        return diffrax.ODETerm
+
+    def order(self, terms) -> int:
+        """The order of the solver."""
+        return self.solver.order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        """The state of the solver."""
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def func(self, terms, t0, y0, args):
+        """The slope."""
+        return self.solver.func(terms, t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """The solver's step, and the slopes inside it."""
+        y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        rough, h = self.solver.interpolation_cls(t0=t0, t1=t1, **dense), t1 - t0
+
+        def increment(place):
+            t = t0 + place * h
+            return _scale(h, terms.vf(t, rough.evaluate(t), args))
+
+        def correction(y0, y1, k, *inside):
+            cubic = (_hermite_slope(place, y1 - y0, k[0], k[-1]) for place in _INSIDE)
+            missing = [slope - guess for slope, guess in zip(inside, cubic, strict=True)]
+            return jnp.tensordot(jnp.asarray(_CORRECTION, y0.dtype), jnp.stack(missing), axes=1)
+
+        increments = dense["k"]
+        ends = {"first": _pick(increments, 0), "last": _pick(increments, -1)}
+        polynomial = jax.tree.map(correction, y0, y1, increments, *map(increment, _INSIDE))
+        return y1, error, {"y0": y0, "y1": y1, **ends, "correction": polynomial}, state, result
+
+
+# Equal parts: with the nodes of Lobatto the slopes alone would fix yₙ₊₁, and no polynomial would meet it as well.
+_INSIDE = (0.2, 0.4, 0.6, 0.8)
+
+
+def _correction_weights() -> np.ndarray:
+    """Weights that turn missing slopes at `_INSIDE` into the coefficients of C in θ²(1−θ)² C(θ), C of degree three."""
+    places = np.array(_INSIDE)[:, None]
+    powers = np.arange(4)
+    bump, bump_slope = (places * (1 - places)) ** 2, 2 * places * (1 - places) * (1 - 2 * places)
+    return np.linalg.inv(bump_slope * places**powers + bump * powers * places ** np.maximum(powers - 1, 0))
+
+
+_CORRECTION = _correction_weights()
+
+
+def _hermite_slope(place, rise, first, last):
+    """The slope at `place` of the cubic that rises from 0 to `rise` with the slopes `first` and `last` at its ends."""
+    return (
+        6 * place * (1 - place) * rise
+        + (1 - place) * (1 - 3 * place) * first
+        + place * (3 * place - 2) * last
+    )  # fmt: skip
+
+
+class _Polynomial(diffrax.AbstractLocalInterpolation):
+    """Hermite's cubic through both ends of a step, and θ²(1−θ)² C(θ), which leaves the ends alone.
+
+    Written as a sum of single powers the polynomial would lose three digits to cancellation.
+    """
+
+    t0: jax.Array
+    t1: jax.Array
+    y0: PyTree
+    y1: PyTree
+    first: PyTree
+    last: PyTree
+    correction: PyTree
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
+        span = self.t1 - self.t0
+        x = jnp.where(span == 0, 0, (t0 - self.t0) / jnp.where(span == 0, 1, span))
+
+        def value(y0, y1, first, last, c):
+            z = x.astype(y0.dtype)
+            cubic = z * z * (3 - 2 * z) * (y1 - y0) + z * (1 - z) * ((1 - z) * first - z * last)
+            bump = (z * (1 - z)) ** 2 * (((c[3] * z + c[2]) * z + c[1]) * z + c[0])
+            return jnp.where(z == 1, y1, y0 + (cubic + bump))
+
+        return jax.tree.map(value, self.y0, self.y1, self.first, self.last, self.correction)
+
+
+FineOutput.interpolation_cls = _Polynomial
+
+
+def _pick(stacked: PyTree, index: int) -> PyTree:
+    return jax.tree.map(lambda leaf: leaf[index], stacked)
+
+
+class Unrolled(diffrax.AbstractAdaptiveSolver):
+    """The steps, error estimate and interpolation of an explicit Runge–Kutta solver of diffrax, without its stage loop.
+
+    `solver` is any explicit one with an error estimate: `diffrax.Tsit5()`, `diffrax.Dopri5()`, `diffrax.Dopri8()`. For
+    a single `ODETerm`.
+
+    Raises `TypeError` for any other solver.
+
+    Source of the formulas: Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.1 (1.8), §II.4.
+
+    ```python
+    import diffrax, jax.numpy as jnp, lagjax
+
+    term = diffrax.ODETerm(lambda t, y, args: -y)
+    controller = diffrax.PIDController(rtol=1e-6, atol=1e-6)
+    solver = lagjax.Unrolled(diffrax.Dopri8())
+    diffrax.diffeqsolve(term, solver, 0.0, 1.0, 0.1, jnp.array(1.0), stepsize_controller=controller)
+    ```
+    """
+
+    solver: diffrax.AbstractERK
+
+    def __check_init__(self):
+        if not isinstance(self.solver, diffrax.AbstractERK):
+            raise TypeError(f"Unrolled takes an explicit Runge-Kutta solver of diffrax; got {self.solver!r}.")
+
+    @property
+    def term_structure(self):
+        """One term, of an ordinary differential equation."""
+        return diffrax.ODETerm
+
+    @property
+    def interpolation_cls(self) -> Callable:
+        """The interpolation of the solver, with its slopes put together only where it is evaluated."""
+        return eqx.Partial(_Interpolation, self.solver.interpolation_cls)
+
+    def order(self, terms) -> int:
+        """The order of the solver."""
+        return self.solver.order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        """Where the last slope of a step is the first one of the next, that slope; else nothing."""
+        return terms.vf(t0, y0, args) if self._keeps_last_slope else None
+
+    def func(self, terms, t0, y0, args):
+        """The slope."""
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """One step: yₙ₊₁ = yₙ + Σ bᵢ kᵢ with kᵢ = h f(t + cᵢ h, yₙ + Σ aᵢⱼ kⱼ)."""
+        tableau, h = self.solver.tableau, t1 - t0
+        slope = jax.lax.cond(
+            made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state
+        ) if self._keeps_last_slope and made_jump is not False else solver_state  # fmt: skip
+        if slope is None:
+            slope = terms.vf(t0, y0, args)
+        increments = [_scale(h, slope)]
+        for c, row in zip(tableau.c, tableau.a_lower, strict=True):
+            y = _add(y0, _combine(row, increments))
+            slope = terms.vf(t0 + float(c) * h, y, args)
+            increments.append(_scale(h, slope))
+        # Where the last slope is taken at the end point (FSAL), that point is the solution itself.
+        y1 = y if tableau.ssal else _add(y0, _combine(tableau.b_sol, increments))
+        dense = {"y0": y0, "y1": y1, "increments": tuple(increments)}
+        state = slope if self._keeps_last_slope else None
+        return y1, _combine(tableau.b_error, increments), dense, state, diffrax.RESULTS.successful
+
+    @property
+    def _keeps_last_slope(self) -> bool:
+        return self.solver.tableau.fsal
+
+
+class _Interpolation(diffrax.AbstractLocalInterpolation):
+    """The interpolation `kind` of diffrax, which wants the increments stacked, from a tuple of them."""
+
+    kind: Callable
+    t0: jax.Array
+    t1: jax.Array
+    y0: object
+    y1: object
+    increments: tuple
+
+    def __init__(self, kind, *, t0, t1, y0, y1, increments):
+        self.kind, self.t0, self.t1, self.y0, self.y1, self.increments = kind, t0, t1, y0, y1, increments
+
+    def evaluate(self, t0, t1=None, left=True):
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self.increments)
+        return self.kind(t0=self.t0, t1=self.t1, y0=self.y0, y1=self.y1, k=stacked).evaluate(t0, t1, left)
+
+
+def _combine(weights, increments):
+    """Σ wᵢ kᵢ over the weights that are not zero, for every leaf of the state."""
+    terms = [(float(w), k) for w, k in zip(weights, increments, strict=True) if w != 0]
+
+    def total(*leaves):
+        sum_ = terms[0][0] * leaves[0]
+        for (weight, _), leaf in zip(terms[1:], leaves[1:], strict=True):
+            sum_ = sum_ + weight * leaf
+        return sum_
+
+    return jax.tree.map(total, *(k for _, k in terms))
+
+
+def _scale(h, slope):
+    return jax.tree.map(lambda leaf: (h * leaf).astype(leaf.dtype), slope)
+
+
+def _add(y, increment):
+    return jax.tree.map(jnp.add, y, increment)

@@ -1,0 +1,209 @@
+"""Figures of motions and of what they cost. Needs matplotlib: `pip install lagjax[examples]`.
+
+Every function draws into the `ax` it is given, or into a new figure, and returns the Axes: titles, units, limits and
+saving are matplotlib's business, `ax.figure.savefig(...)`. The line colours are those of Okabe & Ito (2008) and the
+colour maps are perceptually uniform, so that all of them can be told apart with any colour vision and in grey.
+
+    import lagjax.plot
+
+    ax = lagjax.plot.trajectory(trajectory)
+    ax.set_xlabel("t [s]")
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._layout import Layout
+from lagjax._precision import WorkPrecision
+from lagjax._trajectory import Trajectory
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+GREY = "0.55"
+
+
+def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, members: int = 30, ax=None):
+    """Coordinates against time, one colour each; or, with a `projection`, curves in the plane.
+
+    - `projection`: a function of one state (q, qdot) that returns (x, y): `lambda q, qdot: (q, qdot)` for the phase
+      portrait of one coordinate, or where a body is in space.
+    - `members`: of a batch, draw this many, evenly chosen.
+
+    >>> lagjax.plot.trajectory(trajectory); lagjax.plot.trajectory(trajectory, lambda q, qdot: (q[0], qdot[0]))
+    """
+    ax = _axes(ax)
+    q, qdot = (
+        jax.tree.map(lambda leaf: _some_members(leaf, trajectory, members), tree)
+        for tree in (trajectory.q, trajectory.qdot)
+    )
+    count = len(jax.tree.leaves(q)[0])
+    opacity = max(0.15, count**-0.5)
+    if projection is not None:
+        x, y = (np.asarray(value) for value in jax.vmap(jax.vmap(projection))(q, qdot))
+        ax.plot(x.T, y.T, color=COLORS[0], alpha=opacity, linewidth=1.2)
+        return ax
+
+    layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0, 0], (q, qdot)))
+    paths = np.asarray(jax.vmap(jax.vmap(layout.flatten))(q))
+    for i, name in enumerate(layout.names):
+        lines = ax.plot(
+            _times(trajectory), paths[:, :, i].T, color=COLORS[i % len(COLORS)], alpha=opacity, linewidth=1.5
+        )
+        lines[0].set_label(name)
+    ax.set_xlabel("t")
+    return _legend(ax) if layout.size <= len(COLORS) else ax
+
+
+def path(x, y, *, values=None, label: str | None = None, cmap: str = "viridis", ax=None):
+    """A curve in the plane, both axes on one scale.
+
+    - `x`, `y`: arrays of shape (T,).
+    - `values`: shape (T,); colours the curve, by time for instance, with a colour bar called `label`. Without it the
+      curve has one colour, and `label` is its entry in a legend.
+
+    >>> lagjax.plot.path(trajectory.q[:, 0], trajectory.q[:, 1], values=trajectory.ts, label="t [s]")
+    """
+    matplotlib = _matplotlib()
+    ax = _axes(ax)
+    ax.set_aspect("equal", adjustable="datalim")
+    if values is None:
+        ax.plot(x, y, linewidth=1.2, label=label)
+        return ax
+    points = np.stack([np.asarray(x), np.asarray(y)], axis=-1)
+    values = np.asarray(values)
+    # The palest end of a map does not show as a line on white.
+    inks = matplotlib.colors.ListedColormap(matplotlib.colormaps[cmap](np.linspace(0.0, 0.9, 256)))
+    lines = matplotlib.collections.LineCollection(np.stack([points[:-1], points[1:]], axis=1), cmap=inks, linewidth=1.4)
+    lines.set(array=(values[:-1] + values[1:]) / 2, capstyle="round")
+    ax.add_collection(lines)
+    ax.autoscale_view()
+    _colorbar(lines, ax, label)
+    return ax
+
+
+def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None):
+    """|h(t) − h(0)| / |h(0)| against time, on a logarithmic axis; of a batch the median, and 5 to 95 % of the members.
+
+    `scale` takes the place of |h(0)|; give it where the energy at the start is zero or close to it. Members that failed
+    are left out.
+
+    >>> lagjax.plot.energy_error(trajectory, scale=params["m"] * params["g"] * params["l"])
+    """
+    h = np.atleast_2d(trajectory.energy())[np.atleast_1d(trajectory.ok)]
+    if not len(h):
+        raise ValueError("None of the members reached its end: there is no energy to draw.")
+    unit = np.abs(h[:, :1]) if scale is None else np.asarray(scale, float)
+    if not np.all(unit > 0):
+        raise ValueError("The energy at the start is zero: say with scale=... which energy counts as one.")
+    ax = _axes(ax)
+    error = np.abs(h - h[:, :1]) / unit
+    known = np.isfinite(error).any(axis=0)  # nothing is left of members that an event has ended
+    known[0] = False  # zero, which has no logarithm
+    times, error = _times(trajectory)[known], error[:, known]
+    low, median, high = np.nanquantile(error, (0.05, 0.5, 0.95), axis=0)
+    if len(h) > 1:
+        ax.fill_between(times, low, high, color=COLORS[0], alpha=0.2, linewidth=0, label="5 to 95 % of the members")
+    ax.plot(times, np.where(median > 0, median, np.nan), color=COLORS[0], linewidth=1.5, label="median")
+    ax.set(yscale="log", xlabel="t", ylabel="relative error of the energy")
+    return _legend(ax) if len(h) > 1 else ax
+
+
+def work_precision(result: WorkPrecision, *, ax=None):
+    """Time for one trajectory against its error, one line per solver, both axes logarithmic: lower left is better.
+
+    Grey is what the reference cannot resolve.
+
+    >>> lagjax.plot.work_precision(lagjax.work_precision(scene, q0, qdot0, ts, params))
+    """
+    ax = _axes(ax)
+    for i, solver in enumerate(dict.fromkeys(row.solver for row in result)):
+        rows = [row for row in result if row.solver == solver]
+        style = {"color": COLORS[i % len(COLORS)], "marker": MARKERS[i % len(MARKERS)]}
+        errors, seconds = [row.error for row in rows], [row.seconds_per_trajectory for row in rows]
+        ax.plot(errors, seconds, label=solver, linewidth=1.5, markersize=5.5, **style)
+    ax.set(xscale="log", yscale="log", xlabel="error", ylabel="time per trajectory [s]")
+    left = min(ax.get_xlim()[0], result.reference_error / 3)
+    ax.axvspan(left, result.reference_error, color="0.92", linewidth=0, zorder=0, label="not resolved")
+    ax.set_xlim(left=left)
+    return _legend(ax)
+
+
+def state_map(x, y, values, *, label: str | None = None, cmap: str = "magma", norm=None, ax=None):
+    """Values over a plane of initial states or parameters; NaN is left white.
+
+    - `x`, `y`: the evenly spaced centres of the columns and rows, shapes (X,) and (Y,).
+    - `values`: shape (Y, X). `label` names the colour bar, `norm` is any of matplotlib's.
+
+    >>> lagjax.plot.state_map(th1, th2, flip_time, label="first flip [s]")
+    """
+    values = np.asarray(values)
+    if values.shape != (len(y), len(x)):
+        raise ValueError(f"values must have shape (len(y), len(x)) = {(len(y), len(x))}; got {values.shape}.")
+    ax = _axes(ax)
+    ax.grid(False)
+    (left, right), (bottom, top) = _edges(x), _edges(y)
+    image = ax.imshow(
+        np.ma.masked_invalid(values),
+        extent=(left, right, bottom, top),
+        origin="lower",
+        aspect="auto",
+        interpolation="nearest",
+        cmap=_matplotlib().colormaps[cmap].with_extremes(bad="white"),
+        norm=norm,
+    )
+    _colorbar(image, ax, label)
+    return ax
+
+
+def _matplotlib():
+    try:
+        import matplotlib.collections
+        import matplotlib.colors
+        import matplotlib.pyplot
+    except ImportError:
+        raise ImportError("lagjax.plot needs the package matplotlib: pip install lagjax[examples].") from None
+    return matplotlib
+
+
+def _axes(ax):
+    """`ax`, or the one of a new figure, with a light grid behind the data and no box around it."""
+    if ax is None:
+        _, ax = _matplotlib().pyplot.subplots(figsize=(6.4, 4.2), layout="constrained")
+    ax.grid(color="0.9", linewidth=0.8)
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color(GREY)
+    ax.tick_params(color=GREY)
+    return ax
+
+
+def _legend(ax):
+    ax.legend(frameon=False)
+    return ax
+
+
+def _colorbar(mappable, ax, label):
+    bar = ax.figure.colorbar(mappable, ax=ax, label=label, pad=0.02)
+    bar.outline.set_visible(False)
+
+
+def _edges(centres) -> tuple[float, float]:
+    """Where the first and the last of evenly spaced cells end."""
+    half = (centres[-1] - centres[0]) / (len(centres) - 1) / 2
+    return float(centres[0] - half), float(centres[-1] + half)
+
+
+def _times(trajectory: Trajectory) -> np.ndarray:
+    """The output times, which all members share."""
+    return np.asarray(trajectory.ts).reshape(-1, trajectory.ts.shape[-1])[0]
+
+
+def _some_members(leaf: Any, trajectory: Trajectory, count: int):
+    """At most `count` members of a leaf, evenly chosen, on a first axis that is there for a single trajectory too."""
+    batch = np.ndim(trajectory.ok)
+    leaf = jnp.reshape(leaf, (-1, *leaf.shape[batch:]))
+    return leaf[np.unique(np.linspace(0, len(leaf) - 1, min(count, len(leaf))).astype(int))]

@@ -1,0 +1,32 @@
+"""What every scene hands over."""
+
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+
+from lagjax._system import System
+
+
+@final
+class Scene(eqx.Module):
+    """A Lagrangian ready to move: the system, its parameters, a natural start, and what is known about the motion.
+
+    `lagjax.simulate(scene.system, scene.q0, scene.qdot0, ts, scene.params)` runs it.
+
+    - `system`: the `lagjax.System`.
+    - `params`: default parameters, a dict.
+    - `q0`, `qdot0`: initial state, in the structure the Lagrangian expects.
+    - `duration`: a time that shows the motion; one period where the motion is periodic.
+    - `exact`: `(t, q0, qdot0, params) -> (q, qdot)`, the closed solution of the state that is `(q0, qdot0)` at t = 0;
+      None where there is none.
+    - `invariants`: `{name: (q, qdot, t, params) -> scalar}`, constants of the motion.
+    """
+
+    system: System
+    params: dict[str, Any]
+    q0: Any
+    qdot0: Any
+    duration: float
+    invariants: dict[str, Callable]
+    exact: Callable | None = None

@@ -1,0 +1,60 @@
+"""The examples run, write their pictures, and find what they claim to find."""
+
+import importlib
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("agg")
+
+import numpy as np
+import pytest
+
+from lagjax.scenes import de421
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+@pytest.fixture(autouse=True)
+def examples_on_path(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+
+
+def assert_pictures(paths, folder, count):
+    assert len(paths) == count
+    for path in paths:
+        assert path.parent == folder and path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 10_000
+
+
+def test_solar_system(tmp_path, capsys):
+    pictures, relativistic, newtonian = importlib.import_module("solar_system").main(["--out", str(tmp_path)])
+    assert_pictures(pictures, tmp_path, 2)
+    mercury = de421.BODIES.index("mercury")
+    assert relativistic[365.25][mercury] < 0.2 and newtonian[365.25][mercury] > 100
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("mercury"))
+    assert float(row.split()[-2]) < 0.2 and float(row.split()[-1]) > 100
+
+
+def test_double_pendulum(tmp_path, capsys):
+    sizes = ["--members", "8", "--duration", "2", "--resolution", "7"]
+    pictures = importlib.import_module("double_pendulum").main([*sizes, "--out", str(tmp_path)])
+    assert_pictures(pictures, tmp_path, 4)
+    printed = capsys.readouterr().out
+    assert "100.00%" in printed and "Dopri8" in printed and "; 0 of the " in printed
+
+
+def test_flip_map_is_symmetric_and_empty_where_pendulums_hang_low():
+    _, times = importlib.import_module("double_pendulum").flip_times(7, 2.0)
+    np.testing.assert_array_equal(times, times[::-1, ::-1])
+    assert 0 < np.isfinite(times).sum() < times.size and np.nanmin(times) > 0 and np.nanmax(times) < 2
+    assert np.isnan(times[2:5, 2:5]).all()
+
+
+def test_tour(tmp_path, monkeypatch, capsys):
+    tour = importlib.import_module("tour")
+    calls = []
+    monkeypatch.setattr(tour.solar_system, "main", lambda argv: (calls.append(argv) or [tmp_path / "a.png"], {}, {}))
+    monkeypatch.setattr(tour.double_pendulum, "main", lambda argv: calls.append(argv) or [tmp_path / "b.png"])
+    assert tour.main(tmp_path) == [tmp_path / "a.png", tmp_path / "b.png"]
+    assert all(argv[:2] == ["--out", str(tmp_path)] for argv in calls) and len(calls) == 2
+    assert str(tmp_path) in capsys.readouterr().out

@@ -1,0 +1,120 @@
+"""`lagjax.plot`: every function draws what it is given, into the axes it is given, and leaves the rest alone."""
+
+import sys
+
+import matplotlib
+
+matplotlib.use("agg")
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+
+import lagjax
+import lagjax.plot
+
+SCENE = lagjax.System(lambda q, qdot: 0.5 * qdot @ qdot - 0.5 * q @ q)
+TS = jnp.linspace(0.0, 5.0, 41)
+
+
+@pytest.fixture(scope="module")
+def single():
+    return lagjax.simulate(SCENE, jnp.array([1.0, 0.0]), jnp.array([0.0, 0.5]), TS)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    q0 = jnp.linspace(0.5, 1.0, 80).reshape(40, 2).at[7].set(jnp.nan)
+    return lagjax.simulate_batch(SCENE, q0, jnp.zeros((40, 2)), TS)
+
+
+@pytest.fixture(autouse=True)
+def closed_figures():
+    settings = dict(matplotlib.rcParams)
+    yield
+    for number in plt.get_fignums():
+        plt.figure(number).canvas.draw()
+    plt.close("all")
+    assert dict(matplotlib.rcParams) == settings
+
+
+def test_coordinates_against_time(single, batch):
+    ax = lagjax.plot.trajectory(single)
+    assert isinstance(ax, Axes)
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["q[0]", "q[1]"]
+    np.testing.assert_array_equal(ax.lines[1].get_ydata(), single.q[:, 1])
+    assert len(lagjax.plot.trajectory(batch, members=5).lines) == 5 * 2
+
+
+def test_projection(single, batch):
+    ax = lagjax.plot.trajectory(single, lambda q, qdot: (q[0], qdot[1]))
+    np.testing.assert_array_equal(ax.lines[0].get_xydata(), np.stack([single.q[:, 0], single.qdot[:, 1]], axis=1))
+    assert len(lagjax.plot.trajectory(batch, lambda q, qdot: (q[0], q[1])).lines) == 30
+
+
+def test_path(single):
+    ax = lagjax.plot.path(single.q[:, 0], single.q[:, 1], values=TS, label="t [s]")
+    assert len(ax.collections) == 1 and len(ax.figure.axes) == 2
+    assert len(lagjax.plot.path(single.q[:, 0], single.q[:, 1], label="orbit").lines) == 1
+
+
+def test_energy_error(single, batch):
+    ax = lagjax.plot.energy_error(single)
+    h = np.asarray(single.energy())
+    expected = np.abs(h - h[0])[1:] / abs(h[0])
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), np.where(expected > 0, expected, np.nan))
+    assert ax.get_yscale() == "log" and not ax.collections
+    banded = lagjax.plot.energy_error(batch, scale=2.0)
+    assert len(banded.collections) == 1 and np.nanmax(banded.lines[0].get_ydata()) < 1e-7
+
+
+def test_energy_error_needs_a_scale_and_a_member():
+    at_rest = lagjax.simulate(SCENE, jnp.zeros(2), jnp.zeros(2), TS)
+    with pytest.raises(ValueError, match="scale="):
+        lagjax.plot.energy_error(at_rest)
+    failed = lagjax.simulate_batch(SCENE, jnp.full((2, 2), jnp.nan), jnp.zeros((2, 2)), TS)
+    with pytest.raises(ValueError, match="None of the members"):
+        lagjax.plot.energy_error(failed)
+
+
+def test_energy_of_members_that_an_event_ends():
+    q0 = jnp.array([[1.0, 0.0], [0.9, 0.1]])
+    ended = lagjax.simulate_batch(SCENE, q0, jnp.zeros((2, 2)), TS, event=lambda q, qdot: q[0] < 0.5)
+    assert ended.ok.all()
+    assert lagjax.plot.energy_error(ended).lines[0].get_xdata().max() < 2.0
+
+
+def test_work_precision():
+    result = lagjax.work_precision(
+        SCENE, jnp.array([1.0, 0.0]), jnp.array([0.0, 0.5]), TS, tolerances=[1e-5, 1e-8], repeats=1
+    )
+    ax = lagjax.plot.work_precision(result)
+    assert [line.get_label() for line in ax.lines] == ["Dopri8", "Tsit5"]
+    np.testing.assert_array_equal(ax.lines[0].get_xdata(), [row.error for row in result.rows[:2]])
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log") and ax.get_xlim()[0] < result.reference_error
+
+
+def test_state_map():
+    values = np.arange(12.0).reshape(3, 4)
+    values[1, 1] = np.nan
+    ax = lagjax.plot.state_map(np.arange(4.0), np.arange(3.0), values, label="v")
+    assert ax.images[0].get_extent() == [-0.5, 3.5, -0.5, 2.5] and ax.images[0].get_array().mask.sum() == 1
+    with pytest.raises(ValueError, match=r"\(3, 4\); got \(4, 3\)"):
+        lagjax.plot.state_map(np.arange(4.0), np.arange(3.0), values.T)
+
+
+def test_draws_into_the_axes_it_is_given(single):
+    _, ax = plt.subplots()
+    before = plt.get_fignums()
+    assert lagjax.plot.trajectory(single, ax=ax) is ax and lagjax.plot.energy_error(single, ax=ax) is ax
+    assert plt.get_fignums() == before
+
+
+def test_without_matplotlib_it_says_what_to_install(single, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r"pip install lagjax\[examples\]"):
+        lagjax.plot.trajectory(single)

@@ -1,0 +1,437 @@
+"""Scalar programs: the same numbers as the function, by fewer operations, in every transformation."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from lagjax._program import Unlowerable, lower
+
+TOLERANCE = 4e-15
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def scalars(*arrays):
+    return [x for array in arrays for x in jnp.ravel(jnp.asarray(array))]
+
+
+def flat(result):
+    return np.concatenate([np.ravel(np.asarray(leaf, dtype=float)) for leaf in jax.tree.leaves(result)])
+
+
+def assert_same(function, *arguments, tolerance=TOLERANCE):
+    """The program agrees with the function: plain, under jit, on lanes in one call, and under vmap."""
+    program = lower(function, *arguments)
+    expected = flat(jax.jit(function)(*arguments))
+    xs = scalars(*jax.tree.leaves(arguments))
+    size = np.max(np.abs(expected), initial=1.0, where=np.isfinite(expected))
+    close = dict(rtol=tolerance, atol=tolerance * size)
+    np.testing.assert_allclose(flat(jax.jit(program.__call__)(*xs)), expected, **close)
+    lanes = [jnp.stack([x, x, x]) for x in xs]
+    for outputs in (jax.jit(program.__call__)(*lanes), jax.vmap(program)(*lanes)):
+        assert all(output.shape == (3,) for output in outputs)
+        np.testing.assert_allclose(flat([output[1] for output in outputs]), expected, **close)
+    return program
+
+
+A = jnp.array([0.3, -0.7, 1.4])
+B = jnp.array([0.9, 0.4, -0.2])
+P = jnp.array([0.2, 0.5, 0.8])
+M = jnp.arange(12.0).reshape(3, 4) / 7 - 0.6
+N = jnp.array([5, -3, 2], dtype=jnp.int32)
+
+
+@jax.custom_vjp
+def cube(x):
+    return x**3
+
+
+cube.defvjp(lambda x: (x**3, x), lambda x, ct: (3 * x**2 * ct,))
+
+FAMILIES = {
+    "arithmetic": (lambda a, b: (a + b, a - b, a * b, a / b, -a, a % b, lax.rem(a, b)), A, B),
+    "constants": (
+        lambda a: (2 * (3 * a), a / 4, a / 3, 0 * a + 1, a - a, 1 - a, jnp.negative(-a), a * -1, 0.5 * (2 * a) * a), A,
+    ),
+    "like terms": (lambda a, b: (a + a, 3 * a - a, -a * -b, a - (-b), (-a) / b + a, b - a + (a - b)), A, B),
+    "integer powers": (lambda a: (a**2, a**3, a**7, a**-2, a**-1, a**0, jnp.square(a)), A),
+    "powers": (lambda p, a: (p**a, p**1.5, p**-2.5, p**0.5, p**2.0, p**0.3, p**N, 2.0**a), P, A),
+    "roots": (lambda p, a: (jnp.sqrt(p), lax.rsqrt(p), jnp.cbrt(a)), P, A),
+    "exponentials": (lambda a: (jnp.exp(a), jnp.exp2(a), jnp.expm1(a), jax.nn.sigmoid(a), jax.nn.softplus(a)), A),
+    "logarithms": (lambda p: (jnp.log(p), jnp.log1p(p), jnp.log(-p)), P),
+    "circular": (lambda a: (jnp.sin(a), jnp.cos(a), jnp.tan(a), jnp.sin(-a), jnp.cos(-a)), A),
+    "inverse circular": (lambda a, b, p: (jnp.asin(p), jnp.acos(p), jnp.atan(a), jnp.atan2(a, b)), A, B, P),
+    "hyperbolic": (lambda a: (jnp.sinh(a), jnp.cosh(a), jnp.tanh(a)), A),
+    "inverse hyperbolic": (lambda a, p: (jnp.asinh(a), jnp.acosh(1 + p), jnp.atanh(p)), A, P),
+    "error function": (lambda a: (lax.erf(a), lax.erfc(a)), A),
+    "pieces": (
+        lambda a, b: (abs(a), jnp.sign(a), jnp.maximum(a, b), jnp.minimum(a, 0.1), jnp.clip(a, -0.5, 0.5)), A, B,
+    ),
+    "rounding": (lambda a: (jnp.floor(a), jnp.ceil(a), jnp.round(2.5 * a), lax.round(a), jnp.trunc(a)), A),
+    "comparison": (lambda a, b: (a < b, a <= b, a > b, a >= b, a == b, a != b, jnp.isfinite(a / (b - b))), A, B),
+    "logic": (lambda a, b: ((a < 0) & (b > 0), (a < 0) | (b > 0), ~(a < 0), (a < 0) ^ (b > 0)), A, B),
+    "where": (lambda a, b: (jnp.where(a > 0, a, b), jnp.where(a > 0, a, a), jnp.where(True, a, b)), A, B),
+    "select of many": (lambda n, a: lax.select_n(jnp.abs(n) % 3, a, 2 * a, 3 * a), N, A),
+    "integers": (lambda n: (n + 1, n * n, n // 2, n % 3, -n, n & 3, n.astype(float) / 2, jnp.sum(n), n > 0), N),
+    "conversion": (lambda a, n: ((a * 3).astype(jnp.int32), n.astype(bool), (a > 0) * a, (a > 0).astype(int)), A, N),
+    "shapes": (lambda m: (m.T, m.reshape(2, 6), m[None], m[:, 0], m[::-1], jnp.tile(m, 2), jnp.rot90(m)), M),
+    "pieces of arrays": (lambda m: (m[1:, ::2], m[-1], *jnp.split(m, 2, axis=1), jnp.roll(m, 1), list(m)), M),
+    "joining": (
+        lambda a, b: (jnp.concatenate([a, b]), jnp.stack([a, b], 1), jnp.pad(a, (2, 1)), jnp.append(a, 1.0)), A, B,
+    ),
+    "padding": (lambda m: lax.pad(m, 9.0, ((1, -1, 1), (-1, 2, 0))), M),
+    "iota": (lambda a: a * jnp.arange(3) + jnp.eye(3)[1] + lax.broadcasted_iota(float, (2, 3), 0), A),
+    "products": (lambda m, a: (a @ m, m.T @ m, jnp.outer(a, a), jnp.cross(a, a[::-1]), m.T @ a), M, A),
+    "einsum": (lambda m: (jnp.einsum("ij,ik->ijk", m, m), jnp.einsum("ij,ij->j", m, m), jnp.trace(m @ m.T)), M),
+    "reductions": (lambda m: (m.sum(), m.sum(0), m.prod(1), m.max(1), m.min(), (m > 0).any(0), (m > 0).all()), M),
+    "cumulations": (lambda m: (m.cumsum(0), jnp.cumprod(m, 1), lax.cummax(m, 1), lax.cummin(m, 0, reverse=True)), M),
+    "norms": (lambda a: (jnp.linalg.norm(a), jnp.hypot(a[0], a[1]), jnp.logaddexp(a[0], a[1]), jnp.sinc(a)), A),
+    "gather": (
+        lambda m: (m[jnp.array([0, 2, 0])], m[:, jnp.array([[1, 3]])], m[jnp.triu_indices(3)], m.at[5, 0].get()), M,
+    ),
+    "gather outside": (lambda a: (a.at[7].get(mode="fill"), a.at[7].get(mode="clip"), a[jnp.array([-1])]), A),
+    "batched gather": (
+        lambda m: (
+            jnp.take_along_axis(m, jnp.array([[0], [3], [1]]), 1), jax.vmap(lambda r, i: r[i])(m, jnp.arange(3)),
+        ),
+        M,
+    ),
+    "scatter": (
+        lambda m, a: (
+            m.at[1].set(0.0), m.at[:, 1].add(a), m.at[jnp.array([0, 0])].add(1.0), m.at[0].multiply(a[0]),
+        ),
+        M, A,
+    ),
+    "scatter extremes": (
+        lambda a: (a.at[jnp.array([0, 1])].max(0.5), a.at[1].min(-2.0), a.at[9].set(1.0, mode="drop")), A,
+    ),
+    "dynamic slices": (lambda a: (lax.dynamic_slice(a, (2,), (2,)), lax.dynamic_update_slice(a, a[:2] * 2, (2,))), A),
+    "calls": (
+        lambda a: (jax.jit(jnp.sin)(a), jax.checkpoint(jnp.sin)(a), cube(a), jax.nn.relu(a), lax.stop_gradient(a)), A,
+    ),
+    "fori_loop": (lambda a: lax.fori_loop(0, 4, lambda i, x: x * a + i, a), A),
+    "while": (lambda a: lax.while_loop(lambda c: c[0] < 5, lambda c: (c[0] + 2, c[1] * a), (0, a))[1], A),
+    "scan": (lambda m: lax.scan(lambda c, row: (c + row.sum(), c * row), 1.0, m), M),
+    "scan backwards": (lambda m: lax.scan(lambda c, row: (c + row.sum(), c * row), 1.0, m, reverse=True), M),
+    "cond": (lambda a: (lax.cond(a[0] > 0, jnp.sin, jnp.cos, a), lax.cond(True, jnp.sin, jnp.cos, a)), A),
+    "switch": (
+        lambda n, a: (lax.switch(n[2], [jnp.sin, jnp.cos, jnp.exp], a), lax.switch(n[1], [jnp.sin, jnp.exp], a)), N, A,
+    ),
+    "pytrees": (lambda d: {"x": d["a"] * d["b"][0], "y": d["b"][1]}, {"a": A, "b": (B, 2.0)}),
+    "gradients": (
+        jax.grad(lambda m: jnp.cumprod(m[0]).sum() + jnp.linalg.norm(m) * jnp.max(m) + m[jnp.array([0, 1]), 1].sum()),
+        M,
+    ),
+    "hessian": (jax.hessian(lambda a: jnp.prod(jnp.sin(a)) + jnp.sum(a) ** 3), A),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_same_as_the_function(family):
+    function, *arguments = FAMILIES[family]
+    assert_same(function, *arguments)
+
+
+# ---- mechanics ------------------------------------------------------------------------------------------------------
+
+
+def chain(q, v):
+    """n-link pendulum, unit masses and lengths, absolute angles."""
+    x, y = jnp.cumsum(jnp.cos(q) * v), jnp.cumsum(jnp.sin(q) * v)
+    return 0.5 * (x @ x + y @ y) + 9.81 * jnp.cumsum(jnp.cos(q)).sum()
+
+
+def chain_in_loop(q, v):
+    def link(carry, angle_and_speed):
+        (angle, speed), (x, y, height) = angle_and_speed, carry
+        carry = (x + jnp.cos(angle) * speed, y + jnp.sin(angle) * speed, height - jnp.cos(angle))
+        return carry, 0.5 * (carry[0] ** 2 + carry[1] ** 2) - 9.81 * carry[2]
+
+    return lax.scan(link, (0.0, 0.0, 0.0), (q, v))[1].sum()
+
+
+def relative_double(q, v):
+    """Double pendulum with a relative second angle and unequal masses."""
+    angle, speed = q[0] + q[1], v[0] + v[1]
+    x = jnp.cos(q[0]) * v[0] * 1.2 + jnp.array([0.0, 0.7]) * jnp.cos(angle) * speed
+    y = jnp.sin(q[0]) * v[0] * 1.2 + jnp.array([0.0, 0.7]) * jnp.sin(angle) * speed
+    heights = -1.2 * jnp.cos(q[0]) - jnp.array([0.0, 0.7]) * jnp.cos(angle)
+    masses = jnp.array([1.3, 0.4])
+    return jnp.sum(masses * (0.5 * (x**2 + y**2) - 9.81 * heights))
+
+
+def kepler(q, v):
+    return 0.5 * (v[0] ** 2 + (q[0] * v[1]) ** 2) + 1.0 / q[0]
+
+
+def kepler_cartesian(q, v):
+    return 0.5 * v @ v + 1.0 / jnp.linalg.norm(q)
+
+
+def spherical(q, v):
+    return 0.5 * (v[0] ** 2 + (jnp.sin(q[0]) * v[1]) ** 2) + 9.81 * jnp.cos(q[0])
+
+
+def wedge(q, v):
+    """A block (mass 1) slides on a wedge (mass 3) of slope 0.5: the mass matrix is constant."""
+    x, y = v[0] + v[1] * np.cos(0.5), -v[1] * np.sin(0.5)
+    return 0.5 * (3 * v[0] ** 2 + x**2 + y**2) + 9.81 * q[1] * np.sin(0.5)
+
+
+def stop_spring(q, v):
+    stretch = jnp.where(q > 0.2, q - 0.2, 0.0)
+    work = lax.fori_loop(0, 3, lambda i, total: total + stretch[i] ** 2 * (i + 1.0), 0.0)
+    return 0.5 * jnp.sum(v**2 * (1 + q**2)) - work
+
+
+def solve(matrix, right):
+    """Gauss-Jordan for a symmetric positive matrix, written out; `right` is a vector."""
+    rows = [list(row) + [b] for row, b in zip(matrix, right, strict=True)]
+    for k in range(len(rows)):
+        for i in range(k + 1, len(rows)):
+            factor = rows[i][k] / rows[k][k]
+            rows[i] = [x - factor * y for x, y in zip(rows[i], rows[k], strict=True)]
+    for k in reversed(range(len(rows))):
+        known = sum(rows[k][j] * rows[j][-1] for j in range(k + 1, len(rows)))
+        rows[k][-1] = (rows[k][-1] - known) / rows[k][k]
+    return jnp.stack([row[-1] for row in rows])
+
+
+def acceleration(lagrangian):
+    def qddot(q, v):
+        momentum = jax.grad(lagrangian, 1)
+        mass = jax.jacfwd(momentum, 1)(q, v)
+        drift = jax.jvp(lambda q: momentum(q, v), (q,), (v,))[1]
+        return solve(mass, jax.grad(lagrangian)(q, v) - drift)
+
+    return qddot
+
+
+def state(n):
+    return jnp.linspace(0.3, 0.9, n), jnp.linspace(-0.5, 0.4, n)
+
+
+SCENES = {  # lagrangian, coordinates, most operations an acceleration may take
+    "pendulum": (chain, 1, 2),
+    "double pendulum": (chain, 2, 45),
+    "relative angles": (relative_double, 2, 114),
+    "chain of 4": (chain, 4, 170),
+    "chain of 4, scan": (chain_in_loop, 4, 170),
+    "Kepler": (kepler, 2, 9),
+    "Kepler, Cartesian": (kepler_cartesian, 3, 16),
+    "spherical pendulum": (spherical, 2, 13),
+    "wedge": (wedge, 2, 0),
+    "stops": (stop_spring, 3, 46),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_accelerations(scene):
+    lagrangian, n, most = SCENES[scene]
+    program = assert_same(acceleration(lagrangian), *state(n), tolerance=2e-13)
+    assert program.operations <= most
+    assert program.operations <= program.traced_operations
+
+
+def test_chain_of_8_is_lean():
+    program = lower(acceleration(chain), *state(8))
+    assert program.operations <= 770 < 2000 < program.traced_operations
+
+
+def test_writing_it_differently_makes_the_same_program():
+    masses = [lower(jax.hessian(L, 1), *state(4)).operations for L in (chain, chain_in_loop)]
+    assert masses[0] == masses[1]
+
+
+# ---- facts read off -------------------------------------------------------------------------------------------------
+
+
+def test_constants_are_found():
+    mass = lower(jax.hessian(wedge, 1), *state(2))
+    assert mass.operations == 0
+    np.testing.assert_allclose([mass.constant(i) for i in range(4)], [4, np.cos(0.5), np.cos(0.5), 1], rtol=1e-15)
+    assert all(mass.depends(i) == frozenset() for i in range(4))
+    assert lower(jax.hessian(chain, 1), *state(2)).constant(1) is None
+
+
+def test_cyclic_coordinates_are_the_inputs_nothing_depends_on():
+    program = lower(spherical, *state(2))
+    assert program.depends(0) == {0, 2, 3}
+    forces = lower(jax.grad(spherical), *state(2))
+    assert forces.constant(1) == 0 and forces.depends(0) == {0, 3}
+
+
+def test_dead_and_repeated_work_is_dropped():
+    def wasteful(x):
+        jnp.linalg.inv(jnp.eye(3) * x)
+        return jnp.sin(x) * jnp.cos(x) + jnp.cos(x) * jnp.sin(x)
+
+    program = lower(wasteful, 0.3)
+    assert program.operations == 4  # sin, cos, their product, twice it
+
+
+def test_a_program_inside_a_lowered_function_dissolves():
+    inner = lower(lambda x, y: (jnp.sin(x) * y, jnp.cos(x)), 0.3, 0.4)
+
+    def outer(x, y):
+        sine, cosine = inner(x, y)
+        return sine**2 + (cosine * y) ** 2
+
+    assert_same(outer, 0.3, 0.4)
+    assert lower(outer, 0.3, 0.4).operations == 1  # y**2
+    jax.block_until_ready(jax.jit(outer)(0.3, 0.4))  # a cached trace must not bring the polynomials back
+    assert lower(jax.jit(outer), 0.3, 0.4).operations == 1
+    assert lower(jax.grad(outer), 0.3, 0.4).operations <= 11
+
+
+def test_identity():
+    program, again = (lower(jnp.sin, 0.3) for _ in range(2))
+    assert program != again and len({program, again, program}) == 2
+    with pytest.raises(AttributeError):
+        program.nodes = ()
+
+
+# ---- refusals -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "function, argument, words",
+    [
+        (jnp.sort, A, "`sort`"),
+        (lambda a: jnp.linalg.cholesky(jnp.outer(a, a)), A, "`cholesky`"),
+        (lambda a: lax.while_loop(lambda x: x.sum() < 9, lambda x: 2 * x, a), A, "`while` loop"),
+        (lambda n: A[n[0]], N, "depends on the values"),
+        (lambda a: a + 1j, A, "complex128"),
+        (lambda a: lax.while_loop(lambda c: c[0] >= 0, lambda c: (c[0] + 0, c[1] * 2), (0, a))[1], A, "budget"),
+    ],
+)
+def test_refusals_say_why(function, argument, words):
+    with pytest.raises(Unlowerable, match=words):
+        lower(function, argument, budget=500)
+
+
+@pytest.mark.parametrize(
+    "function, shape",
+    [
+        (lambda x: x @ x, (1000, 1000)),
+        (lambda x: jnp.sum(jnp.outer(x, x)), (10_000,)),
+        (lambda x: lax.fori_loop(0, 10**9, lambda i, y: jnp.sin(y), x), ()),
+        (lambda x: jnp.zeros(10**8) + x, ()),
+    ],
+)
+def test_too_large_is_refused_at_once(function, shape):
+    start = time.perf_counter()
+    with pytest.raises(Unlowerable, match="budget"):
+        lower(function, jax.ShapeDtypeStruct(shape, float), budget=2000)
+    assert time.perf_counter() - start < 3
+
+
+def test_the_budget_counts_what_is_kept():
+    many = lambda x: jnp.sum(jnp.sin(x * jnp.arange(100.0)))
+    assert lower(many, 0.3, budget=300).operations < 300
+    with pytest.raises(Unlowerable, match="the 200 scalar operations"):
+        lower(many, 0.3, budget=200)
+
+
+def test_closing_over_a_traced_value_is_refused():
+    with pytest.raises(Unlowerable, match="pass it as an argument"):
+        jax.jit(lambda x: lower(lambda y: x * y, 0.3)(0.3))(0.3)
+
+
+# ---- derivatives ----------------------------------------------------------------------------------------------------
+
+
+@jax.custom_jvp
+def safe_norm(x):
+    return jnp.sqrt(jnp.sum(x**2))
+
+
+@safe_norm.defjvp
+def _(primals, tangents):
+    (x,), (dx,) = primals, tangents
+    norm = safe_norm(x)
+    return norm, jnp.where(norm > 0, x @ dx / jnp.where(norm > 0, norm, 1.0), 0.0)
+
+
+def surface(x):
+    return jnp.sin(x[0]) * jnp.exp(x[1] * x[2]) / (1 + x[0] ** 2) + jnp.where(x[1] > 0, x[2] ** 3, jnp.tanh(x[2]))
+
+
+def packed(program):
+    return lambda x: program(*x)[0]
+
+
+@pytest.mark.parametrize("function", [surface, lambda x: safe_norm(x) * jnp.cos(x[0])])
+@pytest.mark.parametrize(
+    "transform",
+    [
+        jax.grad,
+        jax.jacfwd,
+        jax.jacrev,
+        lambda f: jax.grad(lambda x: jax.grad(f)(x) @ B),
+        lambda f: jax.jit(jax.hessian(f)),
+        lambda f: jax.jacfwd(jax.jacfwd(f)),
+        lambda f: lambda x: jax.vmap(jax.grad(f))(jnp.stack([x, 2 * x])),
+        lambda f: lambda x: jax.grad(lambda y: jnp.sum(jax.vmap(f)(y) ** 2))(jnp.stack([x, -x])),
+        lambda f: jax.grad(jax.checkpoint(lambda x: lax.fori_loop(0, 3, lambda i, s: s * f(x * s), 0.9))),
+    ],
+    ids="grad jacfwd jacrev grad-of-grad hessian jacfwd-of-jacfwd vmap-of-grad grad-of-vmap checkpoint".split(),
+)
+def test_derivatives(function, transform):
+    program = lower(function, A)
+    np.testing.assert_allclose(jax.jit(transform(packed(program)))(A), transform(function)(A), rtol=1e-13, atol=1e-14)
+
+
+def test_derivatives_respect_custom_rules():
+    program = lower(safe_norm, jnp.zeros(3))
+    np.testing.assert_array_equal(jax.grad(packed(program))(jnp.zeros(3)), np.zeros(3))
+    np.testing.assert_array_equal(jax.jacfwd(packed(program))(jnp.zeros(3)), np.zeros(3))
+    assert np.isnan(jax.grad(lambda x: jnp.sqrt(jnp.sum(x**2)))(jnp.zeros(3))).all()
+
+
+def test_derivatives_of_some_inputs_and_mixed_outputs():
+    function = lambda n, a: (n + 1, a**3 * n, a > 0, jnp.float64(2.0))
+    program = lower(function, 2, 0.3)
+    value, slope = jax.jvp(lambda a: program(2, a), (0.5,), (1.0,))
+    assert value == (3, 0.25, True, 2.0)
+    assert slope[1] == pytest.approx(1.5) and slope[3] == 0
+
+
+def test_derivatives_on_lanes():
+    program = lower(surface, A)
+    lanes = [jnp.linspace(0.1, 1.0, 4) * a for a in A]
+    slopes = jax.jit(jax.grad(lambda xs: jnp.sum(program(*xs)[0])))(lanes)
+    np.testing.assert_allclose(jnp.stack(slopes, 1), jax.vmap(jax.grad(surface))(jnp.stack(lanes, 1)), rtol=1e-13)
+
+
+def test_derivatives_too_large_to_lower_are_the_functions_own():
+    function = lambda x: jnp.prod(x * jnp.arange(1.0, 4)) + jax.nn.softplus(x[0])
+    program = lower(function, A, budget=lower(function, A).operations)
+    object.__setattr__(program, "budget", 1)
+    np.testing.assert_allclose(jax.grad(packed(program))(A), jax.grad(function)(A), rtol=1e-14)
+
+
+# ---- precision ------------------------------------------------------------------------------------------------------
+
+
+def test_precision_is_that_of_the_inputs():
+    program = lower(lambda x, n: (jnp.sin(x) * 0.1 + x**1.5, x * n, n * 2, 2.0), 0.3, jnp.int32(2))
+    for dtype in (jnp.float32, jnp.float64):
+        x = jnp.asarray(0.3, dtype)
+        assert [y.dtype for y in program(x, 2)] == [dtype, dtype, jnp.int32, dtype]
+        assert jax.grad(lambda x: program(x, 2)[0])(x).dtype == dtype
+        np.testing.assert_allclose(program(x, 2)[0], np.sin(0.3) * 0.1 + 0.3**1.5, rtol=3 * jnp.finfo(dtype).eps)
+
+
+def test_lanes_broadcast():
+    program = lower(lambda x, y: (x * y, x + 1, 3.0), 0.3, 0.4)
+    outputs = program(jnp.ones((2, 1)), jnp.ones(3))
+    assert [output.shape for output in outputs] == [(2, 3)] * 3
