@@ -125,7 +125,7 @@ def links(options) -> Rows:
     rows = []
     for n in (2, 4, 8, 12, 16, 32):
         case = replace(chain(n, min(options.batch, 256)), duration=min(1.0, options.duration or 1.0))
-        names = ["lagjax"] + ["diffrax, autodiff"] * (n <= 16) + ["heyoka batch"] * (n <= 16)
+        names = ["lagjax"] + ["diffrax, autodiff"] * (n <= 16) + ["heyoka, SIMD"] * (n <= 16)
         rows += _rows(compare(case, _named(*names), [TOLERANCE], options.repeats, options.budget), {"links": n})
     return rows
 
@@ -135,7 +135,7 @@ def batches(options) -> Rows:
     rows = []
     for size in (10**k for k in range(6) if 10**k <= 100 * options.batch):
         case = _shortened(double_pendulum(size), options)
-        names = ["lagjax", "diffrax, by hand", "heyoka batch"]
+        names = ["lagjax", "lagjax, in jit", "diffrax, by hand", "heyoka, SIMD"]
         rows += _rows(compare(case, _named(*names), [TOLERANCE], options.repeats, options.budget), {"batch": size})
     return rows
 
@@ -200,7 +200,6 @@ def _peers_derive(case: Case) -> dict[str, float | None]:
 def _heyoka_from_scratch(case: Case):
     import heyoka as hy
 
-    hy.llvm_state.clear_memcache()
     system = _contenders.heyoka_system(case)
     return hy.taylor_adaptive(system, case.states[0].copy(), tol=TOLERANCE, compact_mode=case.long_formulas)
 

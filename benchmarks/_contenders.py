@@ -12,8 +12,11 @@ state of plain diffrax is one array (a tuple of scalars is slower in its stage l
 equations is one `jvp`, heyoka writes its loops out where that compiles.
 """
 
+import copy
 import importlib.util
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -70,6 +73,28 @@ def _lagjax_single(case: Case) -> Solve:
     def solve(tol):
         end = lagjax.simulate(scene.system, q0, qdot0, ts, scene.params, rtol=tol, atol=tol, max_steps=MAX_STEPS).end
         return np.concatenate([_rows(end.q, 1), _rows(end.qdot, 1)], axis=1)
+
+    return solve
+
+
+def _lagjax_jit(case: Case) -> Solve:
+    """The same inside the user's own `jax.jit`: what is left without the checks and the Python of a call."""
+    scene, ts = case.scene, np.array([0.0, case.duration])
+
+    @jax.jit
+    def run(q0, qdot0, tol):
+        options = {"rtol": tol, "atol": tol, "max_steps": MAX_STEPS}
+        if case.batch > 1:
+            end = lagjax.simulate_batch(scene.system, q0, qdot0, ts, scene.params, **options).end
+        else:
+            q0, qdot0 = jax.tree.map(lambda leaf: leaf[0], (q0, qdot0))
+            end = lagjax.simulate(scene.system, q0, qdot0, ts, scene.params, **options, throw=False).end
+        return end.q, end.qdot
+
+    q0, qdot0 = jax.tree.map(jnp.asarray, (case.tree(case.q0), case.tree(case.qdot0)))
+
+    def solve(tol):
+        return np.concatenate([_rows(part, case.batch) for part in run(q0, qdot0, tol)], axis=1)
 
     return solve
 
@@ -140,9 +165,12 @@ def _has_formulas(case: Case) -> str | None:
 
 
 def heyoka_system(case: Case) -> list:
-    """The equations of motion, derived by heyoka from the symbolic Lagrangian."""
+    """The equations of motion, derived by heyoka from the symbolic Lagrangian; what it has compiled is forgotten."""
     import heyoka as hy
 
+    hy.llvm_state.clear_memcache()
+    if hasattr(hy.llvm_state, "set_diskcache_enabled"):  # or compile times would be those of reading a file
+        hy.llvm_state.set_diskcache_enabled(False)
     q, v = ([hy.expression(f"{letter}{i}") for i in range(case.coordinates)] for letter in "qv")
     return hy.lagrangian(case.symbolic(hy, q, v), q, v)
 
@@ -194,35 +222,44 @@ def _heyoka_batch(case: Case) -> Solve:
 
     def solve(tol):
         ta = integrators[tol] if tol in integrators else integrators.setdefault(tol, build(tol))
-        final = np.empty_like(blocks)
-        for block, out in zip(blocks, final, strict=True):
-            ta.set_time(0.0)
-            ta.state[:] = block
-            ta.propagate_until(case.duration)
-            out[:] = ta.state
-        return _members(final, case.batch)
+        return _members(_propagated(ta, blocks, case.duration), case.batch)
 
     return solve
 
 
-def _heyoka_ensemble(case: Case) -> Solve:
-    """The batch integrator on all cores, by heyoka's own threads."""
-    import heyoka as hy
+def _heyoka_threads(case: Case) -> Solve:
+    """The batch integrator on all cores that this process may use, a copy for each: heyoka lets go of Python's lock.
 
-    blocks, integrators = _heyoka_blocks(case), {}
-    build = _heyoka_integrator(case, heyoka_system(case), blocks)
-
-    def start(ta, i):
-        ta.set_time(0.0)
-        ta.state[:] = blocks[i]
-        return ta
+    (heyoka's own `ensemble_propagate_until_batch` copies the integrator for every block, which here costs more.)
+    """
+    workers = cores()
+    shares, integrators = np.array_split(_heyoka_blocks(case), workers), {}
+    shares = [share for share in shares if len(share)]
+    build = _heyoka_integrator(case, heyoka_system(case), shares[0])
+    pool = ThreadPoolExecutor(workers)
 
     def solve(tol):
-        ta = integrators[tol] if tol in integrators else integrators.setdefault(tol, build(tol))
-        ends = hy.ensemble_propagate_until_batch(ta, case.duration, len(blocks), start)
-        return _members(np.stack([end[0].state for end in ends]), case.batch)
+        if tol not in integrators:
+            first = build(tol)
+            integrators[tol] = [first, *(copy.deepcopy(first) for _ in shares[1:])]
+        ends = pool.map(lambda ta, share: _propagated(ta, share, case.duration), integrators[tol], shares)
+        return _members(np.concatenate(list(ends)), case.batch)
 
     return solve
+
+
+def _propagated(ta, blocks: np.ndarray, duration: float) -> np.ndarray:
+    final = np.empty_like(blocks)
+    for block, out in zip(blocks, final, strict=True):
+        ta.set_time(0.0)
+        ta.state[:] = block
+        ta.propagate_until(duration)
+        out[:] = ta.state
+    return final
+
+
+def cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _members(blocks: np.ndarray, batch: int) -> np.ndarray:
@@ -298,16 +335,18 @@ def _sympy_copes(case: Case) -> str | None:
 
 BATCHED = (
     Contender("lagjax", _lagjax),
+    Contender("lagjax, in jit", _lagjax_jit),
     Contender("diffrax, by hand", _diffrax(by_hand), suits=_has_formulas),
     Contender("diffrax, autodiff", _diffrax(autodiff_acceleration)),
-    Contender("heyoka batch", _heyoka_batch, ("heyoka",)),
-    Contender("heyoka ensemble", _heyoka_ensemble, ("heyoka",)),
-    Contender("heyoka", _heyoka_single, ("heyoka",), members=128),
+    Contender("heyoka, SIMD", _heyoka_batch, ("heyoka",)),
+    Contender("heyoka, threads", _heyoka_threads, ("heyoka",)),
+    Contender("heyoka, single", _heyoka_single, ("heyoka",), members=128),
     Contender("SciPy + SymPy", _scipy, ("scipy", "sympy"), suits=_sympy_copes, members=4),
 )
 
 SINGLE = (
     Contender("lagjax", _lagjax_single),
+    Contender("lagjax, in jit", _lagjax_jit),
     Contender("diffrax, by hand", _diffrax(by_hand, batched=False), suits=_has_formulas),
     Contender("diffrax, autodiff", _diffrax(autodiff_acceleration, batched=False)),
     Contender("heyoka", _heyoka_single, ("heyoka",)),

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks._contenders import cores
 from benchmarks._measure import Comparison, at_equal_error
 
 PACKAGES = ("lagjax", "jax", "jaxlib", "diffrax", "equinox", "numpy", "heyoka", "scipy", "sympy")
@@ -30,7 +31,7 @@ def circumstances() -> dict[str, Any]:
         "machine": {
             "cpu": _cpu_model(),
             "cores": os.cpu_count(),
-            "cores_used": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "cores_used": cores(),
             "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
             "system": platform.system(),
             "python": platform.python_version(),

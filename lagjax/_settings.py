@@ -193,7 +193,25 @@ def _event(event, dtype) -> diffrax.Event | None:
     if not isinstance(event, diffrax.Event):
         event = diffrax.Event(event)
     conditions = jax.tree.map(lambda function: accept(function, "event"), event.cond_fn, is_leaf=callable)
-    # Bisection always arrives, and the sign change that fired the event brackets the root.
-    tolerance = 8 * float(jnp.finfo(dtype).eps)
-    root_finder = event.root_finder or optx.Bisection(rtol=tolerance, atol=tolerance)
+    tolerance = 4 * float(jnp.finfo(dtype).eps)
+    root_finder = event.root_finder or _SignChange(rtol=tolerance, atol=tolerance)
     return diffrax.Event(conditions, root_finder, event.direction)
+
+
+class _SignChange(optx.Bisection):
+    """Bisection that stops when the interval is as small as the dtype resolves, whatever the size of the function.
+
+    The sign change that fired an event brackets its root, so that this always arrives. It also does where there is
+    nothing to find, as in the members of a batch that had no event, or in a Boolean one: there diffrax asks for the end
+    of the step.
+    """
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        lower, upper = (jnp.asarray(options[end], f_struct.dtype) for end in ("lower", "upper"))
+        state = optx.Bisection(self.rtol, self.atol, flip=True).init(fn, y, args, options, f_struct, aux_struct, tags)
+        return eqx.tree_at(lambda s: s.flip, state, fn(lower, args)[0] > fn(upper, args)[0])
+
+    def terminate(self, fn, y, args, options, state, tags):
+        scale = jnp.maximum(jnp.abs(state.lower), jnp.abs(state.upper))
+        small = jnp.abs(state.upper - state.lower) <= self.rtol * scale
+        return small & jnp.isfinite(state.error), optx.RESULTS.successful

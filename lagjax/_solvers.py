@@ -76,11 +76,11 @@ class FineOutput(diffrax.AbstractAdaptiveSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """The solver's step, and the slopes inside it."""
         y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        rough, h = self.solver.interpolation_cls(t0=t0, t1=t1, **dense), t1 - t0
+        rough, span = self.solver.interpolation_cls(t0=t0, t1=t1, **dense), terms.contr(t0, t1)
 
         def increment(place):
-            t = t0 + place * h
-            return _scale(h, terms.vf(t, rough.evaluate(t), args))
+            t = t0 + place * (t1 - t0)
+            return _in_dtype_of(y0, terms.vf_prod(t, rough.evaluate(t), args, span))
 
         def correction(y0, y1, k, *inside):
             cubic = (_hermite_slope(place, y1 - y0, k[0], k[-1]) for place in _INSIDE)
@@ -203,17 +203,22 @@ class Unrolled(diffrax.AbstractAdaptiveSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step: yₙ₊₁ = yₙ + Σ bᵢ kᵢ with kᵢ = h f(t + cᵢ h, yₙ + Σ aᵢⱼ kⱼ)."""
-        tableau, h = self.solver.tableau, t1 - t0
-        slope = jax.lax.cond(
-            made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state
-        ) if self._keeps_last_slope and made_jump is not False else solver_state  # fmt: skip
+        # `contr` and `prod` are diffrax's h and h·f: they also know that time may run backward.
+        tableau, h = self.solver.tableau, terms.contr(t0, t1)
+
+        def increment(slope):
+            return _in_dtype_of(y0, terms.prod(slope, h))
+
+        slope = solver_state
         if slope is None:
             slope = terms.vf(t0, y0, args)
-        increments = [_scale(h, slope)]
+        elif made_jump is not False:
+            slope = jax.lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
+        increments = [increment(slope)]
         for c, row in zip(tableau.c, tableau.a_lower, strict=True):
             y = _add(y0, _combine(row, increments))
-            slope = terms.vf(t0 + float(c) * h, y, args)
-            increments.append(_scale(h, slope))
+            slope = terms.vf(t0 + float(c) * (t1 - t0), y, args)
+            increments.append(increment(slope))
         # Where the last slope is taken at the end point (FSAL), that point is the solution itself.
         y1 = y if tableau.ssal else _add(y0, _combine(tableau.b_sol, increments))
         dense = {"y0": y0, "y1": y1, "increments": tuple(increments)}
@@ -256,8 +261,8 @@ def _combine(weights, increments):
     return jax.tree.map(total, *(k for _, k in terms))
 
 
-def _scale(h, slope):
-    return jax.tree.map(lambda leaf: (h * leaf).astype(leaf.dtype), slope)
+def _in_dtype_of(y, increment):
+    return jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), increment, y)
 
 
 def _add(y, increment):
