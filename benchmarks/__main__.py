@@ -60,7 +60,7 @@ def _options() -> argparse.ArgumentParser:
     add("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to run (default: all)")
     add("--cases", nargs="+", choices=tuple(CASES), default=DEFAULT, help="scenes (default: all but chain_16)")
     add("--contenders", nargs="+", choices=names, help="of the part 'errors' (default: all that are installed)")
-    add("--tolerances", nargs="+", type=float, default=[1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
+    add("--tolerances", nargs="+", type=float, default=[1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-13])
     add("--batch", type=int, default=1024, help="members of a batch (default: 1024)")
     add("--duration", type=float, help="instead of each scene's own")
     add("--repeats", type=int, default=5, help="timed runs of each (default: 5)")

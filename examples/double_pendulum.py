@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
-import optimistix as optx
 from matplotlib.colors import LogNorm
 
 import lagjax
@@ -22,10 +21,6 @@ from lagjax import scenes
 SCENE = scenes.double_pendulum()
 START = np.array([2.0, 2.6])  # released from rest, high enough to be chaotic
 NEIGHBOURS = 200
-
-# Bisection stays between the two ends of the step in which an arm goes over the top, however long the step is.
-# Members that never flip have nothing to enclose, which `expand_if_necessary` allows.
-INSIDE_THE_STEP = optx.Bisection(rtol=1e-12, atol=1e-12, expand_if_necessary=True)
 
 
 def second_bob(q, qdot):
@@ -68,7 +63,7 @@ def flip_times(resolution, duration):
         jnp.array([0.0, duration]),
         SCENE.params,
         rtol=1e-6,
-        event=diffrax.Event(before_flip, INSIDE_THE_STEP, direction=False),
+        event=diffrax.Event(before_flip, direction=False),
         progress=True,
     )
     flipped = np.asarray(trajectory.result == lagjax.RESULTS.event_occurred)

@@ -4,6 +4,7 @@ System(L)  →  simulate(system, q0, qdot0, ts, params)  →  Trajectory
 """
 
 from lagjax import plot, scenes
+from lagjax._explain import Explanation
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._simulate import simulate, simulate_batch
@@ -14,6 +15,7 @@ from lagjax._trajectory import State, Trajectory
 __version__ = "0.1.0"
 __all__ = [
     "RESULTS",
+    "Explanation",
     "FineOutput",
     "SimulationError",
     "State",

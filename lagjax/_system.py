@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from lagjax._arguments import Function, accept
+from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
 from lagjax._motion import Motion
 
@@ -97,6 +98,21 @@ class System(eqx.Module):
     def energy(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> jax.Array:
         """h = p·q̇ − L. It changes by dh/dt = −∂L/∂t + (Q − ∂D/∂q̇)·q̇, and need not equal T + U."""
         return self._at(Motion.energy, q, qdot, t, params)
+
+    def explain(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> Explanation:
+        """What this scene contains and what was left out of its equations; print it, or read its fields.
+
+        ```python
+        import lagjax
+
+        scene = lagjax.scenes.wedge()
+        print(scene.system.explain(scene.q0, scene.qdot0, params=scene.params))
+        ```
+        """
+        del t  # facts hold for every time
+        layout = Layout.of(q, qdot)
+        numbers = jax.tree.map(jnp.asarray, eqx.filter(params, eqx.is_array_like))
+        return explain(self.motion(layout, params), layout, numbers, self.path)
 
     def motion(self, layout: Layout, params: PyTree = None) -> Motion:
         """The scene in the flat coordinates of `layout`, after a look at what its functions return there.

@@ -1,0 +1,105 @@
+"""What a scene contains, and what was left out of its equations: facts read off the scalar programs.
+
+Nothing here looks at numbers: a coordinate is cyclic when no operation of the reduced Lagrangian reads it, the energy
+is conserved when none reads the time and no force is given.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from lagjax._equations import OPERATION_BUDGET, ScalarEquations, equations
+from lagjax._layout import Layout
+from lagjax._motion import Motion
+from lagjax._program import Program, Unlowerable, lower
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """The facts about a scene; `str` prints them. Where they could not be read off, they are None.
+
+    - `coordinates`: the name of every scalar coordinate; `cyclic`: those that L does not depend on, whose momenta are
+      conserved where no force acts.
+    - `mass_matrix`: "constant" or "varying", then "diagonal", "block-diagonal" or "dense"; `mass_matrix_depends_on`:
+      the coordinates, velocities (`d` before the name) and `t` that it reads.
+    - `velocity_terms`: whether forces depend on the velocities; `explicit_time`: whether anything depends on `t`.
+    - `energy_conserved`: whether h = p·q̇ − L is constant along every motion.
+    - `operations`: scalar operations of one acceleration; `traced_operations`: of its derivatives before reduction.
+    - `path`: "scalar" or "array"; `reason`: why not "scalar".
+    """
+
+    coordinates: tuple[str, ...]
+    path: str
+    reason: str
+    cyclic: tuple[str, ...] | None = None
+    mass_matrix: str | None = None
+    mass_matrix_depends_on: tuple[str, ...] | None = None
+    velocity_terms: bool | None = None
+    explicit_time: bool | None = None
+    energy_conserved: bool | None = None
+    operations: int | None = None
+    traced_operations: int | None = None
+
+    def __str__(self) -> str:
+        rows = [("coordinates", f"{len(self.coordinates)}: {_listed(self.coordinates)}")]
+        if self.cyclic is not None:
+            reads = _listed(self.mass_matrix_depends_on or ())
+            rows += [
+                ("cyclic", _listed(self.cyclic)),
+                ("mass matrix", f"{self.mass_matrix}; depends on {reads}"),
+                ("velocity terms", "yes" if self.velocity_terms else "no"),
+                ("explicit time", "yes" if self.explicit_time else "no"),
+                ("energy conserved", "yes" if self.energy_conserved else "no"),
+            ]
+        if self.operations is not None:
+            rows.append(("operations", f"{self.operations} per acceleration, {self.traced_operations} as derived"))
+        rows.append(("path", self.path + (f", because {self.reason}" if self.reason else "")))
+        return "\n".join(f"{name:17s} {value}" for name, value in rows)
+
+
+def explain(motion: Motion, layout: Layout, params, path: str) -> Explanation:
+    """Read the facts off the programs of L, of M and the forces, and of the acceleration."""
+    names, n = layout.names, layout.size
+    form = equations(motion, layout, params, path)
+    scalar = isinstance(form, ScalarEquations)
+    known = {"coordinates": names, "path": "scalar" if scalar else "array", "reason": "" if scalar else form.reason}
+    if scalar:
+        known["operations"] = form.program.operations
+
+    q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
+    try:
+        lagrangian = lower(motion.lagrangian, q, q, t, params, budget=OPERATION_BUDGET)
+        parts = lower(motion.mass_matrix_and_force, q, q, t, params, budget=OPERATION_BUDGET)
+    except Unlowerable:
+        return Explanation(**known)
+
+    inputs = (*names, *(f"d{name}" for name in names), "t")
+    reads = [frozenset(inputs[i] for i in parts.depends(k) if i < len(inputs)) for k in range(n * n + n)]
+    mass, force = frozenset().union(*reads[: n * n]), frozenset().union(*reads[n * n :])
+    of_lagrangian = {inputs[i] for i in lagrangian.depends(0) if i < len(inputs)}
+    timed = "t" in mass | force | of_lagrangian
+    return Explanation(
+        **known,
+        cyclic=tuple(name for name in names if name not in of_lagrangian),
+        mass_matrix=f"{'varying' if mass else 'constant'}, {_pattern(parts, n)}",
+        mass_matrix_depends_on=tuple(name for name in inputs if name in mass),
+        velocity_terms=any(name in force for name in inputs[n : 2 * n]),
+        explicit_time=timed,
+        energy_conserved=not timed and motion.forces is None and motion.dissipation is None,
+        traced_operations=parts.traced_operations,
+    )
+
+
+def _pattern(parts: Program, n: int) -> str:
+    """Diagonal, block-diagonal or dense: the connected parts of the graph of entries that are not zero."""
+    filled = np.array([[parts.constant(n * i + j) != 0 for j in range(n)] for i in range(n)])
+    if not (filled & ~np.eye(n, dtype=bool)).any():
+        return "diagonal"
+    connected = np.linalg.matrix_power((filled | np.eye(n, dtype=bool)).astype(float), n) > 0
+    return "dense" if connected.all() else "block-diagonal"
+
+
+def _listed(names: tuple[str, ...], longest: int = 12) -> str:
+    shown = ", ".join(names[:longest]) or "none"
+    return shown + (f", … ({len(names) - longest} more)" if len(names) > longest else "")

@@ -1,0 +1,132 @@
+"""The scalar and the array form of the equations give one motion; what `explain` says of them is true."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import scenes
+from lagjax._equations import LARGEST_SCALAR_SCENE, ArrayEquations, ScalarEquations, equations
+from lagjax._layout import Layout
+
+
+def forms(scene, *paths):
+    layout = Layout.of(scene.q0, scene.qdot0)
+    params = jax.tree.map(jnp.asarray, scene.params)
+    motion = scene.system.motion(layout, params)
+    return layout, params, [equations(motion, layout, params, path) for path in paths]
+
+
+@pytest.mark.parametrize("make", scenes.ALL, ids=lambda make: make.__name__)
+def test_both_forms_of_every_scene_agree(make):
+    scene = make()
+    layout, params, (auto, array) = forms(scene, "auto", "array")
+    assert isinstance(auto, ScalarEquations) == (layout.size <= LARGEST_SCALAR_SCENE)
+    if isinstance(auto, ArrayEquations):
+        assert str(LARGEST_SCALAR_SCENE) in auto.reason
+        return
+    rng = np.random.default_rng(0)
+    shift = 0.1 * rng.uniform(-1, 1, (2, 5, layout.size))
+
+    def accelerations(form, q, qdot):
+        acceleration, singular = form.acceleration(jnp.asarray(0.3), form.pack(q, qdot), params)
+        return jnp.stack(list(acceleration)), singular
+
+    q, qdot = layout.flatten(scene.q0) + shift[0], layout.flatten(scene.qdot0) + shift[1]
+    fast, plain = (jax.jit(jax.vmap(lambda a, b, f=form: accelerations(f, a, b)))(q, qdot) for form in (auto, array))
+    # Round-off times the condition of M (at most some hundreds here) on the scale of the accelerations.
+    np.testing.assert_allclose(fast[0], plain[0], rtol=1e-12, atol=1e-13 * np.abs(plain[0]).max())
+    assert not fast[1].any() and not plain[1].any()
+
+
+def test_both_forms_follow_one_motion_and_one_gradient():
+    double = scenes.double_pendulum()
+    ts = jnp.linspace(0.0, 2.0, 5)
+
+    def final(path, params):
+        system = lagjax.System(double.system.lagrangian.code, path=path)
+        return lagjax.simulate(system, double.q0, double.qdot0, ts, params, rtol=1e-11).q[-1, 1]
+
+    values, gradients = zip(
+        *(jax.value_and_grad(lambda p, path=path: final(path, p))(double.params) for path in ("scalar", "array")),
+        strict=True,
+    )
+    np.testing.assert_allclose(*values, rtol=1e-9)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-9), *gradients)
+
+
+@pytest.mark.parametrize(
+    "lagrangian",
+    [
+        lambda q, v: 0.5 * v[0] ** 2 - q[1] ** 2,
+        lambda q, v: 0.5 * (v[0] + 0.3 * v[1]) ** 2 - q[0],
+        lambda q, v: 0.5 * (v[0] + 0.3 * v[1] + 0.7 * v[2]) ** 2 + (v[1] - 0.1 * v[2]) ** 2,
+        lambda q, v: 0.5 * v[0] ** 2 + 0.5 * q[0] ** 2 * v[1] ** 2 + 0.5 * v[2] ** 2 + q[2] * v[1] * v[2],
+    ],
+)
+def test_both_forms_find_a_singular_mass_matrix(lagrangian):
+    n = 3
+    layout = Layout.of(jnp.zeros(n), jnp.zeros(n))
+    motion = lagjax.System(lagrangian).motion(layout)
+    for path in ("scalar", "array"):
+        form = equations(motion, layout, None, path)
+        acceleration, singular = form.acceleration(jnp.asarray(0.0), form.pack(jnp.zeros(n), jnp.ones(n)), None)
+        assert singular and not np.isfinite(jnp.stack(list(acceleration))).all()
+
+
+def test_a_mass_matrix_that_needs_pivoting_takes_the_array_path():
+    # L = ẋẏ + żẋ + ½ ż² − U: regular, with a zero on the diagonal of M.
+    scene = lagjax.System(lambda q, v: v[0] * v[1] + v[2] * v[0] + 0.5 * v[2] ** 2 - 0.5 * jnp.sum(q**2))
+    q = jnp.array([0.3, 0.7, 0.2])
+    assert scene.explain(q, q).path == "array" and "pivoting" in scene.explain(q, q).reason
+    mass = np.array([[0, 1, 1], [1, 0, 0], [1, 0, 1]])
+    end = lagjax.simulate(scene, q, jnp.zeros(3), jnp.array([0.0, 1e-3]))
+    np.testing.assert_allclose(end.qdot[-1] / 1e-3, -np.linalg.solve(mass, q), rtol=1e-5)
+
+
+def test_forcing_a_path():
+    big = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2), path="scalar")
+    with pytest.raises(ValueError, match="no scalar program: it has 20 coordinates"):
+        lagjax.simulate(big, jnp.zeros(20), jnp.zeros(20), jnp.array([0.0, 1.0]))
+    with pytest.raises(ValueError, match="path must be"):
+        lagjax.System(lambda q, v: 0.5 * v**2, path="fast")
+
+
+def test_a_closed_over_parameter_is_differentiated_like_a_passed_one():
+    ts = jnp.linspace(0.0, 3.0, 4)
+    closed = lambda k: lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * k * q**2), 1.0, 0.0, ts).q[-1]
+    for k in (4.0, 5.0):
+        exact = -1.5 / np.sqrt(k) * np.sin(3 * np.sqrt(k))  # d cos(√k t)/dk at t = 3
+        np.testing.assert_allclose(jax.grad(closed)(k), exact, rtol=1e-7)
+    batched = jax.vmap(jax.grad(closed))(jnp.array([4.0, 5.0]))
+    np.testing.assert_allclose(batched[1], exact, rtol=1e-7)
+
+
+# ---- explain --------------------------------------------------------------------------------------------------------
+
+
+def explained(make):
+    scene = make()
+    return scene.system.explain(scene.q0, scene.qdot0, params=scene.params)
+
+
+def test_explain_reads_the_facts():
+    wedge = explained(scenes.wedge)
+    assert wedge.cyclic == ("q.X",) and wedge.mass_matrix == "constant, dense" and not wedge.velocity_terms
+    central = explained(scenes.central_force)
+    assert central.cyclic == ("q.phi",) and central.mass_matrix == "varying, diagonal"
+    assert central.mass_matrix_depends_on == ("q.rho",) and central.velocity_terms and central.energy_conserved
+    driven = explained(scenes.driven_pendulum)
+    assert driven.explicit_time and not driven.energy_conserved
+    damped = explained(scenes.damped_driven_oscillator)
+    assert not damped.energy_conserved
+    for facts in (wedge, central, driven, damped):
+        assert facts.path == "scalar" and facts.operations < facts.traced_operations
+
+
+def test_explain_prints():
+    text = str(explained(scenes.double_pendulum))
+    assert "varying, dense; depends on q[0], q[1]" in text and "path              scalar" in text
+    large = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2)).explain(jnp.zeros(20), jnp.zeros(20))
+    assert large.path == "array" and large.cyclic == large.coordinates and "(8 more)" in str(large)
