@@ -88,7 +88,7 @@ def derived_equations(case: Case) -> tuple[Equations, Any]:
 
 def _derived(case: Case):
     form, params = derived_equations(case)
-    y = jax.vmap(form.pack)(jnp.asarray(case.q0), jnp.asarray(case.qdot0))
+    y = jnp.asarray(case.q0), jnp.asarray(case.qdot0)
     return (lambda y: form.vector_field(0.0, y, params)), y
 
 
@@ -175,7 +175,7 @@ def derivation(options) -> Rows:
         case = CASES[name](1)
         jax.clear_caches()
         derive, (form, params) = seconds(lambda case=case: derived_equations(case))
-        state = form.pack(jnp.asarray(case.q0[0]), jnp.asarray(case.qdot0[0]))
+        state = (jnp.asarray(case.q0[0]), jnp.asarray(case.qdot0[0]))
         row = {"case": name, "form": type(form).__name__.removesuffix("Equations").lower(), "lagjax derives": derive}
         row["lagjax compiles"] = _compile_seconds(lambda y, form=form, p=params: form.vector_field(0.0, y, p), state)
         field, states = _autodiff(case)

@@ -1,9 +1,8 @@
 """The first-order system ẏ = f(t, y) that a solver sees, in the form that suits the scene.
 
-A small scene becomes a *scalar program*: the state is a tuple of scalars, the mass matrix is eliminated by formulas
-written out for exactly its pattern of zeros, and nothing is left that this scene does not need. Any other scene keeps
-the derivatives as JAX arrays. Both forms have the same four parts, give the same motion to round-off, and are tested
-against each other.
+A small scene becomes a *scalar program*: the mass matrix is eliminated by formulas written out for exactly its pattern
+of zeros, and nothing is left that this scene does not need. Any other scene keeps the derivatives as JAX arrays. Both
+forms give the same motion to round-off, and are tested against each other.
 """
 
 import abc
@@ -21,6 +20,7 @@ from lagjax._motion import Motion
 from lagjax._program import Program, Unlowerable, lower
 
 PyTree = Any
+State = tuple[jax.Array, jax.Array]
 
 # Beyond these a program takes longer to compile than it saves, and batched Cholesky or LU overtakes written-out
 # elimination (measured on chains of pendulums).
@@ -29,43 +29,26 @@ OPERATION_BUDGET = 20_000
 
 
 class Equations(eqx.Module):
-    """ẏ = f(t, y, params) with y = (q, qdot)."""
+    """ẏ = f(t, y, params) with y = (q, qdot), two vectors."""
 
     @abc.abstractmethod
-    def pack(self, q: jax.Array, qdot: jax.Array) -> PyTree:
-        """The solver's state from the flat vectors q, qdot."""
+    def acceleration(self, t: jax.Array, y: State, params: PyTree) -> tuple[jax.Array, jax.Array]:
+        """q̈, and whether the mass matrix is singular there (q̈ is then not finite)."""
 
-    @abc.abstractmethod
-    def unpack(self, y: PyTree) -> tuple[jax.Array, jax.Array]:
-        """The vectors q, qdot, on the last axis, from the solver's state."""
-
-    @abc.abstractmethod
-    def acceleration(self, t: jax.Array, y: PyTree, params: PyTree) -> tuple[PyTree, jax.Array]:
-        """q̈ in the form of q in the state, and whether the mass matrix is singular there (q̈ is then not finite)."""
-
-    def vector_field(self, t: jax.Array, y: PyTree, params: PyTree) -> PyTree:
+    def vector_field(self, t: jax.Array, y: State, params: PyTree) -> State:
         """(q̇, q̈)."""
         return y[1], self.acceleration(t, y, params)[0]
 
 
 class ArrayEquations(Equations):
-    """Derivatives as JAX arrays."""
+    """Derivatives as JAX arrays; `reason` says why."""
 
-    motion: Motion = eqx.field(static=True)
     derived: Any = eqx.field(static=True)
     reason: str = eqx.field(static=True)
 
     def __init__(self, motion: Motion, reason: str):
-        self.motion, self.reason = motion, reason
         self.derived = jax.jit(motion.solved_acceleration)  # traced once, however often it is called
-
-    def pack(self, q, qdot):
-        """The vectors themselves."""
-        return q, qdot
-
-    def unpack(self, y):
-        """The vectors themselves."""
-        return y
+        self.reason = reason
 
     def acceleration(self, t, y, params):
         """By `Motion.solved_acceleration`."""
@@ -81,18 +64,10 @@ class ScalarEquations(Equations):
     def __init__(self, program: Program):
         self.program, self.called = program, jax.jit(program.__call__)
 
-    def pack(self, q, qdot):
-        """Tuples of scalars: under `vmap` each is one contiguous row of lanes."""
-        return tuple(q), tuple(qdot)
-
-    def unpack(self, y):
-        """Stacked again."""
-        return jnp.stack(y[0], axis=-1), jnp.stack(y[1], axis=-1)
-
     def acceleration(self, t, y, params):
         """By the program."""
         *acceleration, singular = _compiled_once(self.called, *y[0], *y[1], t, *_scalars(params))
-        return tuple(acceleration), singular
+        return jnp.stack(acceleration), singular
 
 
 def equations(motion: Motion, layout: Layout, params: PyTree, path: str = "auto") -> Equations:

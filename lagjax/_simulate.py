@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import _linear
-from lagjax._equations import Equations, equations
+from lagjax._equations import equations
 from lagjax._integrate import integrate
 from lagjax._layout import Layout
 from lagjax._results import RESULTS, SimulationError, advice
@@ -169,14 +169,14 @@ def _integrate(system: System, settings: Settings, q0, qdot0, params):
     layout = Layout.of(q0, qdot0)
     numbers = eqx.filter(params, eqx.is_array)
     form = equations(system.motion(layout, params), layout, numbers, system.path)
-    y0 = form.pack(layout.flatten(q0), layout.flatten(qdot0))
+    y0 = layout.flatten(q0), layout.flatten(qdot0)
 
     # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
     start = _health(y0, *form.acceleration(settings.ts[0], y0, numbers))
     ts = jnp.where(start == RESULTS.successful, settings.ts, settings.ts[0])
-    event = None if settings.event is None else _in_coordinates(settings.event, layout, form, params)
+    event = None if settings.event is None else _in_coordinates(settings.event, layout, params)
     solved = integrate(form, settings, event, ts, y0, numbers)
-    path, end, t_end = form.unpack(solved.path), solved.end, solved.t_end
+    path, end, t_end = solved.path, solved.end, solved.t_end
 
     result = _explained(RESULTS.promote(solved.result), start, _health(end, *form.acceleration(t_end, end, numbers)))
     # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start.
@@ -187,7 +187,7 @@ def _integrate(system: System, settings: Settings, q0, qdot0, params):
         q,
         qdot,
         result,
-        State(t_end, *map(layout.restore, form.unpack(end))),
+        State(t_end, *map(layout.restore, end)),
         solved.stats,
     )
 
@@ -207,12 +207,12 @@ def _explained(result: RESULTS, start: RESULTS, end: RESULTS) -> RESULTS:
     return RESULTS.where(start == RESULTS.successful, result, start)
 
 
-def _in_coordinates(event: diffrax.Event, layout: Layout, form: Equations, params: PyTree) -> diffrax.Event:
+def _in_coordinates(event: diffrax.Event, layout: Layout, params: PyTree) -> diffrax.Event:
     """The user's event functions, made to read the solver's state."""
 
     def flat(function):
         def condition(t, y, args, **_):
-            return function(*map(layout.restore, form.unpack(y)), t=t, params=eqx.combine(args, params))
+            return function(*map(layout.restore, y), t=t, params=eqx.combine(args, params))
 
         return condition
 

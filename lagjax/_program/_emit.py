@@ -85,20 +85,35 @@ def _function(op: str, fast) -> Callable:
 
 @functools.cache
 def _apart(op: str) -> Callable:
-    """A fast elementary function as a body of its own where that is quicker.
+    """A fast elementary function, in the form that suits what it is given.
 
-    XLA's CPU backend fuses operations into one loop per output and repeats in each what they share: a polynomial of
-    thirty operations many times over. A call it may not inline is evaluated once.
+    For lanes: a body of its own. XLA's CPU backend fuses operations into one loop per output and repeats in each what
+    they share, a polynomial of thirty operations many times over; a call it may not inline is evaluated once. For a
+    single number such a call costs more than the C library's function, which stays in the loop.
     """
     function = jax.jit(_elementary.sincos if op == "sincos" else _elementary.FAST[op])
+
+    def on_lanes(*xs):
+        with set_xla_metadata(inlineable="false"):
+            return function(*xs)
+
+    single = jax.custom_batching.custom_vmap(_sine_and_cosine if op == "sincos" else getattr(lax, op))
+
+    @single.def_vmap
+    def lanes_of(size, batched, *xs):
+        whole = [x if has else jnp.broadcast_to(x, (size, *jnp.shape(x))) for x, has in zip(xs, batched, strict=True)]
+        return on_lanes(*whole), (True, True) if op == "sincos" else True
 
     def call(*xs):
         if jax.default_backend() != "cpu":
             return function(*xs)
-        with set_xla_metadata(inlineable="false"):
-            return function(*xs)
+        return on_lanes(*xs) if any(jnp.ndim(x) for x in xs) else single(*xs)
 
     return call
+
+
+def _sine_and_cosine(x):
+    return lax.sin(x), lax.cos(x)
 
 
 def _aligned(values: list) -> list:
