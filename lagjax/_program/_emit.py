@@ -97,12 +97,23 @@ def _apart(op: str) -> Callable:
         with set_xla_metadata(inlineable="false"):
             return function(*xs)
 
-    single = jax.custom_batching.custom_vmap(_sine_and_cosine if op == "sincos" else getattr(lax, op))
+    plain = _sine_and_cosine if op == "sincos" else getattr(lax, op)
+    of_number = jax.custom_batching.custom_vmap(plain)
 
-    @single.def_vmap
+    @of_number.def_vmap
     def lanes_of(size, batched, *xs):
         whole = [x if has else jnp.broadcast_to(x, (size, *jnp.shape(x))) for x, has in zip(xs, batched, strict=True)]
         return on_lanes(*whole), (True, True) if op == "sincos" else True
+
+    # `custom_vmap` has no derivative of every order of its own.
+    single = jax.custom_jvp(of_number)
+
+    @single.defjvp
+    def slope(xs, moving):
+        if op == "sincos":
+            sine, cosine = single(*xs)
+            return (sine, cosine), (cosine * moving[0], -sine * moving[0])
+        return single(*xs), jax.jvp(plain, xs, moving)[1]
 
     def call(*xs):
         if jax.default_backend() != "cpu":
