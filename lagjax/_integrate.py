@@ -46,7 +46,9 @@ def integrate(form: Equations, settings: Settings, event: diffrax.Event | None, 
     if settings.adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if settings.adjoint is None else settings.adjoint
         return _solve((field, ts, y0, params), settings, settings.controller, adjoint, event)
-    return _over_recorded_steps((field, ts, y0, params), settings)
+    # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
+    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, settings)
+    return _over_recorded_steps((field, ts, y0, params), frozen)
 
 
 def _solve(moving, settings: Settings, controller, adjoint, event=None, record: bool = False):
@@ -114,14 +116,13 @@ def _backward(residuals, cotangents, perturbed, moving, settings):
         reached = jnp.where(forward, jnp.minimum(ts, t_end), jnp.maximum(ts, t_end))
         ts = jnp.where(whole, ts, reached)
         # The last step ends at ts[-1] itself, which may be differentiated, not at its recorded value.
-        controller = _Replay(jnp.where(times == t_end, jnp.inf, times), jnp.where(forward, 1, -1))
+        controller = _Replay(jnp.where(times == t_end, jnp.inf, times))
         solved = _solve((field, ts, y0, params), settings, controller, diffrax.RecursiveCheckpointAdjoint())
         return solved.path, solved.end, solved.t_end
 
-    _, pull_back = eqx.filter_vjp(replay, moving)
+    replayed, pull_back = eqx.filter_vjp(replay, moving)
     given = (cotangents.path, cotangents.end, cotangents.t_end)
-    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(lambda: replay(moving)))
-    filled = jax.tree.map(lambda z, c: z if c is None else c, zeros, given, is_leaf=lambda leaf: leaf is None)
+    filled = jax.tree.map(lambda x, c: jnp.zeros_like(x) if c is None else c, replayed, given)
     return pull_back(filled)[0]
 
 
@@ -129,11 +130,10 @@ class _Replay(diffrax.AbstractStepSizeController):
     """Steps that end at given times, padded with inf (after which the end of the integration is the next)."""
 
     times: jax.Array
-    direction: jax.Array
 
     def wrap(self, direction):
         """diffrax integrates backward motion with its time reversed."""
-        return _Replay(jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction), self.direction)
+        return _Replay(jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction))
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The first time; the state counts the steps."""

@@ -180,6 +180,24 @@ def test_gradient_with_more_steps_than_checkpoints():
     np.testing.assert_allclose(reverse, forward, rtol=1e-6)
 
 
+def test_reverse_mode_backward_in_time_by_the_output_times_and_beside_a_failure():
+    # q(T) = q0 cos ωT + q̇0/ω sin ωT and dq(T)/dT = q̇(T), in either direction of time.
+    final = lambda k, t1: run(params={"m": 2.0, "k": k}, ts=jnp.array([0.0, 1.0]) * t1, rtol=1e-11)
+    for end in (3.0, -3.0):
+        by_k, by_t = jax.grad(lambda k, t1: final(k, t1).q[-1], argnums=(0, 1))(8.0, end)
+        of_omega = jax.grad(lambda w, t=end: jnp.cos(t * w) + 0.5 / w * jnp.sin(t * w))(2.0)
+        np.testing.assert_allclose(by_k, of_omega / 8.0, rtol=1e-7)
+        np.testing.assert_allclose(by_t, final(8.0, end).qdot[-1], rtol=1e-7)
+
+    def first_output(q0):  # the second member runs into the wall at q = 0
+        scene = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.sqrt(q))
+        return lagjax.simulate_batch(scene, q0, -jnp.ones(2), jnp.array([0.0, 0.5, 2.0])).q[:, 1].sum()
+
+    q0, step = jnp.array([9.0, 1.0]), 1e-5
+    central = [(first_output(q0.at[i].add(step)) - first_output(q0.at[i].add(-step))) / (2 * step) for i in (0, 1)]
+    np.testing.assert_allclose(jax.grad(first_output)(q0), central, rtol=1e-6)
+
+
 # ---- compile counts -------------------------------------------------------------------------------------------------
 
 
