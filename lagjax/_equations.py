@@ -22,10 +22,12 @@ from lagjax._program import Program, Unlowerable, lower
 PyTree = Any
 State = tuple[jax.Array, jax.Array]
 
-# Beyond these a program takes longer to compile than it saves, and batched Cholesky or LU overtakes written-out
-# elimination (measured on chains of pendulums).
-LARGEST_SCALAR_SCENE = 12
+# A larger scene is not even looked at: most of the work of reducing it would be thrown away.
+LARGEST_SCALAR_SCENE = 64
 OPERATION_BUDGET = 20_000
+# Beyond this XLA takes longer to compile a program than it saves, and batched Cholesky or LU overtakes written-out
+# elimination (measured on chains of pendulums, where it lies at 12 links).
+LARGEST_XLA_PROGRAM = 2_000
 
 
 class Equations(eqx.Module):
@@ -78,15 +80,22 @@ def equations(motion: Motion, layout: Layout, params: PyTree, path: str = "auto"
     if path == "array":
         return ArrayEquations(motion, "asked for")
     try:
-        return ScalarEquations(_scalar_program(motion, layout, params))
+        program = scalar_program(motion, layout, params)
     except Unlowerable as reason:
         if path == "scalar":
             raise ValueError(f"This scene has no scalar program: {reason}.") from None
         return ArrayEquations(motion, str(reason))
+    if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:
+        reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
+        return ArrayEquations(motion, reason)
+    return ScalarEquations(program)
 
 
-def _scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
-    """q̈ and the singularity of M as one program: first M and the forces, then the elimination their zeros allow."""
+def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
+    """q̈ and the singularity of M as one program: first M and the forces, then the elimination their zeros allow.
+
+    Its inputs are q, q̇, t and every number in params. Raises `Unlowerable` with the reason.
+    """
     n = layout.size
     if n > LARGEST_SCALAR_SCENE:
         raise Unlowerable(f"it has {n} coordinates, more than {LARGEST_SCALAR_SCENE}")

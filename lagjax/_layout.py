@@ -60,10 +60,12 @@ class Layout(eqx.Module):
         return jnp.concatenate(leaves)
 
     def restore(self, flat: jax.Array) -> PyTree:
-        """The user's pytree, from a vector of shape (size,)."""
-        ends = np.cumsum([math.prod(shape) for shape in self.shapes])[:-1]
-        pieces = jnp.split(flat, ends)
-        leaves = [piece.reshape(shape) for piece, shape in zip(pieces, self.shapes, strict=True)]
+        """The user's pytree, from a vector of shape (size,), or from an array of them, shape (..., size)."""
+        ends = np.cumsum([math.prod(shape) for shape in self.shapes])
+        leaves = [
+            flat[..., end - math.prod(shape) : end].reshape(flat.shape[:-1] + shape)
+            for end, shape in zip(ends.tolist(), self.shapes, strict=True)
+        ]
         return jax.tree.unflatten(self.tree, leaves)
 
 

@@ -36,11 +36,13 @@ class Settings(eqx.Module):
     adjoint: diffrax.AbstractAdjoint | None
     max_steps: int = eqx.field(static=True)
     progress: diffrax.AbstractProgressMeter
+    by_default: bool = eqx.field(static=True)  # nothing was asked for that only diffrax can do
 
     @classmethod
     def of(cls, layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress) -> "Settings":
         """Check the arguments of `simulate` that do not depend on the scene, and fill in the defaults."""
         ts = _output_times(ts, layout.dtype)
+        by_default = solver is None and adjoint is None and dt is None and event is None
         if solver is None:
             # States between steps are wanted for outputs inside and to locate an event.
             between = ts.size > 2 or event is not None
@@ -63,6 +65,7 @@ class Settings(eqx.Module):
             adjoint=adjoint,
             max_steps=max_steps,
             progress=progress,
+            by_default=by_default,
         )
 
 

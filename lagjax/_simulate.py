@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import _linear
+from lagjax import _engine, _linear
 from lagjax._equations import equations
 from lagjax._integrate import integrate
 from lagjax._layout import Layout
@@ -97,7 +97,12 @@ def simulate(
         require_finite(value, name)
 
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
-    trajectory = Trajectory(*_integrate(system, settings, q0, qdot0, params), system, params)
+    kernel = _engine.kernel_for(system, settings, layout, params, q0, qdot0)
+    if isinstance(kernel, str):
+        fields = _integrate(system, settings, q0, qdot0, params)
+    else:
+        fields = _engine.run(kernel, settings, layout, q0, qdot0, params)
+    trajectory = Trajectory(*fields, system, params)
     return _raise_unless_ok(trajectory, layout) if throw else trajectory
 
 
@@ -145,6 +150,11 @@ def simulate_batch(
         require_finite(jax.tree.map(lambda leaf, axis: leaf if axis is None else None, value, axes[name]), name)
 
     q0, qdot0, params = values.values()
+    kernel = _engine.kernel_for(system, settings, layout, member["params"], q0, qdot0, params)
+    if not isinstance(kernel, str):
+        each = tuple(axes[name] for name in values)
+        fields = _engine.run(kernel, settings, layout, q0, qdot0, params, each, _batch_size(values, axes))
+        return Trajectory(*fields, system, params, batch_axes[2])
     fields = _integrate_batch(system, settings, q0, qdot0, params, _Static(tuple(batch_axes)))
     return Trajectory(settings.ts, *fields[1:], system, params, batch_axes[2])
 
@@ -245,6 +255,16 @@ def _axes_per_leaf(values: dict[str, PyTree], batch_axes) -> dict[str, PyTree]:
     if 0 in sizes.values():
         raise ValueError("The batch is empty.")
     return axes
+
+
+def _batch_size(values: dict[str, PyTree], axes: dict[str, PyTree]) -> int:
+    sizes = (
+        jnp.shape(leaf)[axis]
+        for name, value in values.items()
+        for leaf, axis in zip(jax.tree.leaves(value), jax.tree.structure(value).flatten_up_to(axes[name]), strict=True)
+        if axis is not None
+    )
+    return next(sizes)
 
 
 def _first_member(tree: PyTree, axes: PyTree) -> PyTree:

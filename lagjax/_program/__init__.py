@@ -38,8 +38,9 @@ from lagjax._program._emit import emit, plain_elementary
 from lagjax._program._graph import FOLD, Node, Unlowerable
 from lagjax._program._passes import finish
 from lagjax._program._rules import Expansion, kind_of
+from lagjax._program._series import Series, StraightLine, series
 
-__all__ = ["Program", "Unlowerable", "lower"]
+__all__ = ["Program", "Series", "StraightLine", "Unlowerable", "lower", "series"]
 
 
 def lower(function: Callable, *examples, budget: int = 20_000) -> "Program":

@@ -1,0 +1,101 @@
+"""Integration of batches in machine code made for one scene: the processor's vectors and all its cores.
+
+    Program ──_program._series──► recurrences ──_integrator──► LLVM ──_ir──► Kernel(arrays) → arrays
+
+XLA compiles one operation after the other for all members of a batch; here one member after the other goes through all
+operations, four or eight side by side in the lanes of vector registers, and nothing leaves the first caches. A step is
+one Taylor series, of the order that the tolerance asks for.
+"""
+
+import ctypes
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._native import _integrator
+from lagjax._native._integrator import DONE, NOT_FINITE, OUT_OF_STEPS, SINGULAR, STEP_TOO_SMALL
+from lagjax._native._ir import compiled
+from lagjax._program import Program, series
+
+__all__ = ["DONE", "NOT_FINITE", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Kernel", "Outcome", "cores"]
+
+
+class Outcome(NamedTuple):
+    """For N members, T times and 2n states: what `Kernel` returns. `path` is NaN where a member did not come."""
+
+    path: np.ndarray
+    y_end: np.ndarray
+    t_end: np.ndarray
+    code: np.ndarray
+    steps: np.ndarray
+    rejected: np.ndarray
+    idle: int
+
+
+class Kernel:
+    """The integration of (q, q̇) with q̈ from a program, whose inputs are q, q̇, t and numbers that stay constant.
+
+    The outputs of the program are q̈, then whether the mass matrix is singular. Raises `Unlowerable` where an operation
+    has no Taylor series or is not one of doubles.
+    """
+
+    def __init__(self, program: Program, size: int):
+        integrator = _integrator.Integrator(program, series(program, size))
+        self.states, self.numbers, self.width = 2 * size, integrator.numbers, integrator.width
+        self._memory = integrator.memory
+        self._engine = compiled(integrator.module)  # holds the code that the next line points to
+        address = self._engine.get_function_address("run")
+        self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(address)
+
+    def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int, smallest_step: float) -> Outcome:
+        """`y0` (N, 2n); `params` (N, P), or (1, P) for all; all float64."""
+        ts, y0, params = (np.ascontiguousarray(x, dtype=np.float64) for x in (ts, y0, params))
+        members, times = len(y0), len(ts)
+        path = np.full((members, times, self.states), np.nan)
+        y_end, t_end = np.empty((members, self.states)), np.empty(members)
+        code, steps, rejected = (np.empty(members) for _ in range(3))
+        counter = np.zeros(1, np.int64)
+        job = _integrator.Job(
+            *(array.ctypes.data for array in (counter, ts, y0, params, path, y_end, t_end, code, steps, rejected)),
+            members, times, 0 if len(params) == 1 else self.numbers, order_for(rtol), max_steps,
+            rtol, atol, smallest_step,
+        )  # fmt: skip
+
+        def work(_) -> int:
+            memory = _aligned(self._memory)
+            lanes, idle = np.zeros(len(_integrator.LANE) * self.width, np.int64), np.zeros(1, np.int64)
+            self._run(ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data, idle.ctypes.data)
+            return int(idle[0])
+
+        threads = min(cores(), max(1, members // (4 * self.width)))
+        idle = sum(_pool().map(work, range(threads))) if threads > 1 else work(0)
+        return Outcome(path, y_end, t_end, *(counts.astype(int) for counts in (code, steps, rejected)), idle)
+
+
+def order_for(rtol: float) -> int:
+    """The order whose series costs least: at the step that it allows, terms fall by e² each (Jorba & Zou, §3.2)."""
+    return min(_integrator.MAX_ORDER, max(7, math.ceil(2 - math.log(rtol) / 2)))
+
+
+def cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _aligned(size: int) -> np.ndarray:
+    """Zeros on the boundary of a cache line, which vectors need."""
+    memory = np.zeros(size + 8)
+    return memory[(-memory.ctypes.data // 8) % 8 :]
+
+
+_pools: list[ThreadPoolExecutor] = []
+
+
+def _pool() -> ThreadPoolExecutor:
+    """Threads for all kernels, started when first needed."""
+    if not _pools:
+        _pools.append(ThreadPoolExecutor(cores(), thread_name_prefix="lagjax"))
+    return _pools[0]

@@ -1,0 +1,302 @@
+"""LLVM's intermediate representation, written like arithmetic.
+
+`Code` appends instructions to one function; a `Value` is what one of them yields, with the operators of Python:
+
+    with code.loop(n) as i:
+        y = code.load(row + i * width, VECTOR)
+        code.store(y * y + 1.0, row + i * width)
+
+emits the loop. A number is a double, an integer (64 bits) or a vector of doubles, one for each lane. A sum of products
+may be contracted to fused multiply-adds; nothing else about the arithmetic is loosened.
+"""
+
+import ctypes
+import ctypes.util
+import functools
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import llvmlite.binding as llvm
+from llvmlite import ir
+
+DOUBLE, INTEGER, BIT, POINTER = ir.DoubleType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
+_CONTRACT = ("contract",)
+# Functions of the C library, called lane by lane: one evaluation a step, which the series multiplies.
+_LIBRARY = {
+    "sin": 1, "cos": 1, "tan": 1, "asin": 1, "acos": 1, "atan": 1, "atan2": 2, "sinh": 1, "cosh": 1, "tanh": 1,
+    "asinh": 1, "acosh": 1, "atanh": 1, "exp": 1, "exp2": 1, "expm1": 1, "log": 1, "log1p": 1, "cbrt": 1, "erf": 1,
+    "erfc": 1, "pow": 2, "fmod": 2, "rint": 1, "round": 1, "floor": 1, "ceil": 1, "fma": 3,
+}  # fmt: skip
+
+
+@functools.cache
+def machine() -> llvm.TargetMachine:
+    """This processor."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    if os.name == "nt":
+        library = ctypes.CDLL("ucrtbase")
+    else:
+        library = ctypes.CDLL(ctypes.util.find_library("m"))  # None, the process itself, serves as well
+    for name in _LIBRARY:
+        llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2
+    )
+
+
+def lanes() -> int:
+    """Doubles in a vector register; two registers' worth where those are short, to hide latencies."""
+    machine()
+    return 8 if llvm.get_host_cpu_features().get("avx512f", False) else 4
+
+
+def compiled(module: ir.Module) -> llvm.ExecutionEngine:
+    """Machine code for a module. It lives as long as the engine."""
+    parsed = llvm.parse_assembly(str(module))
+    parsed.verify()
+    # The loops are vectorised by hand, over lanes.
+    tuning = llvm.create_pipeline_tuning_options(speed_level=2)
+    tuning.loop_vectorization = tuning.slp_vectorization = tuning.loop_unrolling = False
+    passes = llvm.create_pass_builder(machine(), tuning)
+    passes.getModulePassManager().run(parsed, passes)
+    engine = llvm.create_mcjit_compiler(parsed, machine())
+    engine.finalize_object()
+    return engine
+
+
+@dataclass(frozen=True, eq=False)
+class Value:
+    """What an instruction yields."""
+
+    code: "Code"
+    it: ir.Value
+
+    def __add__(self, other):
+        return self.code.arithmetic("add", self, other)
+
+    def __sub__(self, other):
+        return self.code.arithmetic("sub", self, other)
+
+    def __mul__(self, other):
+        return self.code.arithmetic("mul", self, other)
+
+    def __truediv__(self, other):
+        return self.code.arithmetic("div", self, other)
+
+    def __radd__(self, other):
+        return self.code.arithmetic("add", other, self)
+
+    def __rsub__(self, other):
+        return self.code.arithmetic("sub", other, self)
+
+    def __rmul__(self, other):
+        return self.code.arithmetic("mul", other, self)
+
+    def __rtruediv__(self, other):
+        return self.code.arithmetic("div", other, self)
+
+    def __neg__(self):
+        return Value(self.code, self.code.builder.fneg(self.it))
+
+    def __lt__(self, other):
+        return self.code.compare("<", self, other)
+
+    def __le__(self, other):
+        return self.code.compare("<=", self, other)
+
+    def __gt__(self, other):
+        return self.code.compare(">", self, other)
+
+    def __ge__(self, other):
+        return self.code.compare(">=", self, other)
+
+    def __and__(self, other):
+        return Value(self.code, self.code.builder.and_(self.it, other.it))
+
+    def __or__(self, other):
+        return Value(self.code, self.code.builder.or_(self.it, other.it))
+
+    def __invert__(self):
+        return Value(self.code, self.code.builder.not_(self.it))
+
+
+class Code:
+    """The body of one function, growing at its end."""
+
+    def __init__(self, module: ir.Module, name: str, arguments: list[ir.Type], lanes: int, result=None, public=False):
+        self.lanes, self.vector = lanes, ir.VectorType(DOUBLE, lanes)
+        self.module = module
+        function = ir.Function(module, ir.FunctionType(result or ir.VoidType(), arguments), name)
+        if not public:
+            function.linkage = "internal"
+        self.function = function
+        self.builder = ir.IRBuilder(function.append_basic_block("entry"))
+        self.arguments = [Value(self, argument) for argument in function.args]
+
+    # ---- numbers ----
+
+    def as_value(self, x, like: ir.Type) -> Value:
+        """A Python number, or a value, in the type `like`; a double becomes a vector of equal lanes."""
+        if not isinstance(x, Value):
+            return Value(self, self._constant(x, like))
+        if isinstance(like, ir.VectorType) and not isinstance(x.it.type, ir.VectorType):
+            undefined = ir.Constant(ir.VectorType(x.it.type, self.lanes), ir.Undefined)
+            first = self.builder.insert_element(undefined, x.it, ir.Constant(INTEGER, 0))
+            zeros = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
+            return Value(self, self.builder.shuffle_vector(first, undefined, zeros))
+        return x
+
+    def _constant(self, x, like):
+        if isinstance(like, ir.VectorType):
+            scalar = bool if like.element == BIT else float
+            return ir.Constant(like, [ir.Constant(like.element, scalar(x))] * like.count)
+        return ir.Constant(like, int(x) if isinstance(like, ir.IntType) else float(x))
+
+    def lanes_of(self, x) -> Value:
+        """The same double in every lane."""
+        return self.as_value(x, self.vector)
+
+    def arithmetic(self, op: str, a, b) -> Value:
+        """a op b for doubles, vectors or integers; a mixed pair becomes vectors."""
+        a, b = self._alike(a, b)
+        if isinstance(a.it.type, ir.IntType):
+            return Value(self, getattr(self.builder, {"div": "sdiv"}.get(op, op))(a.it, b.it))
+        flags = _CONTRACT if op != "div" else ()
+        return Value(self, getattr(self.builder, "f" + op)(a.it, b.it, flags=flags))
+
+    def compare(self, op: str, a, b) -> Value:
+        """False where a NaN is compared (except `!=`)."""
+        a, b = self._alike(a, b)
+        if isinstance(a.it.type, ir.IntType):
+            return Value(self, self.builder.icmp_signed(op, a.it, b.it))
+        ordered = self.builder.fcmp_unordered if op == "!=" else self.builder.fcmp_ordered
+        return Value(self, ordered(op, a.it, b.it))
+
+    def _alike(self, a, b) -> tuple[Value, Value]:
+        types = [x.it.type for x in (a, b) if isinstance(x, Value)]
+        like = next((t for t in types if isinstance(t, ir.VectorType)), types[0])
+        return self.as_value(a, like), self.as_value(b, like)
+
+    def select(self, condition: Value, yes, no) -> Value:
+        """`yes` where the condition holds, else `no`."""
+        yes, no = self._alike(yes, no)
+        return Value(self, self.builder.select(condition.it, yes.it, no.it))
+
+    def maximum(self, a, b) -> Value:
+        """The larger; `b` where they cannot be compared."""
+        a, b = self._alike(a, b)
+        return self.select(a > b, a, b)
+
+    def as_double(self, i: Value) -> Value:
+        """Integers, or bits, as doubles."""
+        if isinstance(i.it.type, ir.VectorType):
+            convert = self.builder.uitofp if i.it.type.element == BIT else self.builder.sitofp
+            return Value(self, convert(i.it, self.vector))
+        return Value(self, self.builder.sitofp(i.it, DOUBLE))
+
+    def bits(self, x: Value) -> Value:
+        """The bits of doubles as integers."""
+        return Value(self, self.builder.bitcast(x.it, ir.VectorType(INTEGER, self.lanes)))
+
+    def from_bits(self, x: Value) -> Value:
+        """Doubles whose bits are these whole numbers."""
+        whole = self.builder.fptosi(x.it, ir.VectorType(INTEGER, self.lanes))
+        return Value(self, self.builder.bitcast(whole, self.vector))
+
+    # ---- memory ----
+
+    def element(self, base: Value, index, kind: ir.Type = DOUBLE) -> Value:
+        """The address of `base[index]`."""
+        index = self.as_value(index, INTEGER)
+        return Value(self, self.builder.gep(base.it, [index.it], source_etype=kind))
+
+    def load(self, address: Value, kind: ir.Type) -> Value:
+        """What lies there."""
+        return Value(self, self.builder.load(address.it, typ=kind, align=self._alignment(kind)))
+
+    def store(self, x: Value, address: Value) -> None:
+        """Put it there."""
+        self.builder.store(x.it, address.it, align=self._alignment(x.it.type))
+
+    def variable(self, start: Value) -> Value:
+        """A place for a value that changes; registers, after LLVM's passes."""
+        with self.builder.goto_entry_block():
+            place = self.builder.alloca(start.it.type)
+        place.align = self._alignment(start.it.type)
+        self.store(start, Value(self, place))
+        return Value(self, place)
+
+    def _alignment(self, kind) -> int:
+        return 8 * self.lanes if kind == self.vector else 8
+
+    # ---- flow ----
+
+    @contextmanager
+    def loop(self, stop, start=0) -> Iterator[Value]:
+        """Integers from `start` up to, without, `stop`."""
+        counter = self.variable(self.as_value(start, INTEGER))
+        with self.repeat_while(lambda: self.load(counter, INTEGER) < stop):
+            i = self.load(counter, INTEGER)
+            yield i
+            self.store(i + 1, counter)
+
+    @contextmanager
+    def repeat_while(self, condition) -> Iterator[None]:
+        """The body again and again, as long as `condition()` holds before it."""
+        head, body, done = (self.function.append_basic_block(name) for name in ("head", "body", "done"))
+        self.builder.branch(head)
+        self.builder.position_at_end(head)
+        self.builder.cbranch(condition().it, body, done)
+        self.builder.position_at_end(body)
+        yield
+        self.builder.branch(head)
+        self.builder.position_at_end(done)
+
+    def only_if(self, condition: Value):
+        """A context: its body runs where the bit is set."""
+        return self.builder.if_then(condition.it)
+
+    def call(self, other: "Code", *arguments: Value) -> Value:
+        """Another function of the module."""
+        return Value(self, self.builder.call(other.function, [argument.it for argument in arguments]))
+
+    def finish(self, result: Value | None = None) -> "Code":
+        """End the function."""
+        self.builder.ret_void() if result is None else self.builder.ret(result.it)
+        return self
+
+    # ---- functions ----
+
+    def intrinsic(self, name: str, *xs: Value) -> Value:
+        """One of LLVM's own functions, on doubles or on whole vectors."""
+        kind = xs[0].it.type
+        full = f"llvm.{name}." + (f"v{self.lanes}f64" if isinstance(kind, ir.VectorType) else "f64")
+        return self._call_by_name(full, kind, xs)
+
+    def library(self, name: str, *xs: Value) -> Value:
+        """A function of the C library, on doubles or lane by lane."""
+        if not isinstance(xs[0].it.type, ir.VectorType):
+            return self._call_by_name(name, DOUBLE, xs)
+        result = ir.Constant(self.vector, ir.Undefined)
+        for lane in range(self.lanes):
+            index = ir.Constant(INTEGER, lane)
+            elements = [Value(self, self.builder.extract_element(x.it, index)) for x in xs]
+            result = self.builder.insert_element(result, self._call_by_name(name, DOUBLE, elements).it, index)
+        return Value(self, result)
+
+    def _call_by_name(self, name, kind, xs):
+        function = self.module.globals.get(name)
+        if function is None:
+            function = ir.Function(self.module, ir.FunctionType(kind, [kind] * len(xs)), name)
+        return Value(self, self.builder.call(function, [x.it for x in xs]))
+
+    def any_lane(self, bits: Value) -> Value:
+        """Whether the bit is set in any lane."""
+        found = None
+        for lane in range(self.lanes):
+            bit = Value(self, self.builder.extract_element(bits.it, ir.Constant(INTEGER, lane)))
+            found = bit if found is None else found | bit
+        return found

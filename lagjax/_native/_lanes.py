@@ -1,0 +1,149 @@
+"""The operations of a scalar program on vectors, one lane for each member of a batch."""
+
+from collections.abc import Callable
+
+from llvmlite import ir
+
+from lagjax import _elementary
+from lagjax._native._ir import BIT, Code, Value
+from lagjax._program import StraightLine, Unlowerable
+
+# Beyond this an angle is left to the C library, which knows enough digits of π.
+LARGEST_ANGLE = 2.0**20
+
+
+def emit(code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos: Code | None) -> list[Value]:
+    """The outputs of a straight line; `inputs(i)` is its i-th input, as a vector."""
+    values: list[Value] = []
+    turns: dict[int, tuple[Value, Value]] = {}
+    for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
+        xs = [values[i] for i in operands]
+        if op == "input":
+            value = inputs(attribute)
+        elif op == "constant":
+            value = code.as_value(attribute, code.vector if kind != "bool" else ir.VectorType(BIT, code.lanes))
+        elif kind not in ("float", "bool") and op != "convert":
+            raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
+        elif op in ("sin", "cos") and sincos is not None:
+            if operands[0] not in turns:
+                turns[operands[0]] = _both(code, sincos, xs[0])
+            value = turns[operands[0]][op == "cos"]
+        elif op == "convert":
+            value = _convert(code, xs[0], line.kinds[operands[0]], kind)
+        elif op == "round":
+            value = code.intrinsic("rint" if attribute == 1 else "round", *xs)
+        elif op in _OPERATIONS:
+            value = _OPERATIONS[op](code, *xs)
+        else:
+            value = code.library(op, *xs)
+        values.append(value)
+    return [values[i] for i in line.outputs]
+
+
+def _convert(code, x, before, after):
+    if before == "bool":
+        return code.as_double(x)
+    if after == "bool":
+        return code.compare("!=", x, 0.0)
+    return code.intrinsic("trunc", x) if before == "float" and after != "float" else x  # integers are doubles here
+
+
+def _sign(code, x):
+    return code.select(x > 0.0, 1.0 + 0.0 * x, code.select(x < 0.0, -1.0 + 0.0 * x, x))
+
+
+def _logical_not(code, x):
+    return ~x
+
+
+def _not_unordered(comparison: str) -> Callable:
+    return lambda code, a, b: code.compare(comparison, a, b)
+
+
+def _finite(code, x):
+    return code.intrinsic("fabs", x) < float("inf")
+
+
+_OPERATIONS: dict[str, Callable] = {
+    "add": lambda code, a, b: a + b,
+    "sub": lambda code, a, b: a - b,
+    "mul": lambda code, a, b: a * b,
+    "div": lambda code, a, b: a / b,
+    "neg": lambda code, a: -a,
+    "sqrt": lambda code, a: code.intrinsic("sqrt", a),
+    "rsqrt": lambda code, a: 1.0 / code.intrinsic("sqrt", a),
+    "abs": lambda code, a: code.intrinsic("fabs", a),
+    "floor": lambda code, a: code.intrinsic("floor", a),
+    "ceil": lambda code, a: code.intrinsic("ceil", a),
+    "max": lambda code, a, b: code.intrinsic("maximum", a, b),
+    "min": lambda code, a, b: code.intrinsic("minimum", a, b),
+    "rem": lambda code, a, b: code.library("fmod", a, b),
+    "logistic": lambda code, a: 1.0 / (1.0 + code.library("exp", -a)),
+    "sign": _sign,
+    "is_finite": _finite,
+    "and": lambda code, a, b: a & b,
+    "or": lambda code, a, b: a | b,
+    "xor": lambda code, a, b: (a | b) & ~(a & b),
+    "not": _logical_not,
+    "select": lambda code, predicate, no, yes: code.select(predicate, yes, no),
+    **{name: _not_unordered(symbol) for name, symbol in
+       {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}.items()},
+}  # fmt: skip
+
+
+def sincos_function(module: ir.Module, lanes: int) -> Code:
+    """`(x, address)`: sin x and cos x, stored one after the other.
+
+    The method is that of `_elementary`: Cody and Waite's reduction, fdlibm's polynomials; 1 ulp. A vector with an angle
+    beyond `LARGEST_ANGLE` goes to the C library.
+    """
+    vector = ir.VectorType(ir.DoubleType(), lanes)
+    code = Code(module, "sincos", [vector, ir.PointerType()], lanes)
+    x, address = code.arguments
+    far = code.any_lane(~(code.intrinsic("fabs", x) <= LARGEST_ANGLE))
+    with code.builder.if_else(far.it) as (libm, polynomial):
+        with libm:
+            code.store(code.library("sin", x), address)
+            code.store(code.library("cos", x), code.element(address, lanes))
+        with polynomial:
+            sine, cosine = _polynomials(code, x)
+            code.store(sine, address)
+            code.store(cosine, code.element(address, lanes))
+    return code.finish()
+
+
+def _polynomials(code: Code, x: Value) -> tuple[Value, Value]:
+    # k times a part of π/2 is exact, so contraction into a fused multiply-add changes nothing.
+    first, second, third, _ = _elementary.PI_2
+    k = code.intrinsic("rint", x * (1 / _elementary.PI_2_ROUNDED[0]))
+    head = x - k * first
+    r = head - k * second
+    tail = ((head - r) - k * second) - k * third
+    reduced = r + tail
+    r, tail = reduced, (r - reduced) + tail
+    z = r * r
+    sine = r + (r * z * _horner(z, _elementary.SIN) + tail)
+    half = 0.5 * z
+    one_less = 1.0 - half
+    cosine = one_less + (((1.0 - one_less) - half) + (z * z * _horner(z, _elementary.COS) - r * tail))
+    quadrant = k - 4.0 * code.intrinsic("floor", 0.25 * k)  # 0, 1, 2, 3
+    odd = code.compare("==", quadrant, 1.0) | code.compare("==", quadrant, 3.0)
+    s, c = code.select(odd, cosine, sine), code.select(odd, sine, cosine)
+    middle = code.compare("==", quadrant, 1.0) | code.compare("==", quadrant, 2.0)
+    return code.select(quadrant > 1.5, -s, s), code.select(middle, -c, c)
+
+
+def _horner(z, coefficients):
+    total = coefficients[-1]
+    for coefficient in coefficients[-2::-1]:
+        total = coefficient + z * total
+    return total
+
+
+def _both(code: Code, sincos: Code, x: Value) -> tuple[Value, Value]:
+    with code.builder.goto_entry_block():
+        place = code.builder.alloca(ir.ArrayType(code.vector, 2))
+    place.align = 8 * code.lanes
+    address = Value(code, place)
+    code.call(sincos, x, address)
+    return code.load(address, code.vector), code.load(code.element(address, code.lanes), code.vector)

@@ -1,0 +1,352 @@
+"""The Taylor series of a motion, from its scalar program.
+
+Along a motion every number of the program is a power series in time, w(t₀ + s) = Σ wₖ sᵏ. The coefficient wₖ of a
+result follows from the coefficients of its operands by a recurrence, one for each operation:
+
+    w = u ± v    wₖ = uₖ ± vₖ
+    w = u v      wₖ = u₀ vₖ + uₖ v₀ + Σ' uⱼ vₖ₋ⱼ
+    w = u / v    wₖ = (uₖ − w₀ vₖ − Σ' wⱼ vₖ₋ⱼ) / v₀
+    w = √u       wₖ = (uₖ − Σ' wⱼ wₖ₋ⱼ) / 2 w₀
+    w = f(u)     wₖ = uₖ g₀ + 1/k Σ' j uⱼ gₖ₋ⱼ       with g = f′(u), itself a program: cos u for sin u
+
+where Σ' runs over 0 < j < k. Two kinds of work come out of this. The sums Σ' need lower orders only, so all of them can
+be taken at once, product after product; nearly all the arithmetic is there, and it is the same for every scene. What is
+left is *linear* in the coefficients of order k: a straight line of about as many operations as the program itself,
+the same for every k. So the coefficients of a motion to any order take one run of `start`, and for each order the
+`products` and one run of `sweep`.
+
+The series of q and q̇ themselves are closed by q̇ₖ = (k+1) qₖ₊₁ and q̈ₖ = (k+1) q̇ₖ₊₁.
+
+A piecewise operation (`abs`, `select`, `floor` …) has the series of the piece that the state is on: whoever takes steps
+must notice when one crosses the border.
+
+Source: Moore, *Interval Analysis* (1966) §11.2; Jorba & Zou, *A software package for the numerical integration of ODEs
+by means of high-order Taylor methods*, Exp. Math. 14 (2005) 99–117, §2.1; Griewank & Walther, *Evaluating Derivatives*
+(2008), ch. 13.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from lagjax._program._graph import Graph, Node, Unlowerable
+from lagjax._program._passes import finish
+
+
+class StraightLine(NamedTuple):
+    """Operations in order, as in `Program`."""
+
+    nodes: tuple[Node, ...]
+    kinds: tuple[str, ...]
+    outputs: tuple[int, ...]
+
+
+class Series(NamedTuple):
+    """The recurrences of q̈(q, q̇, t, parameters) with n coordinates.
+
+    `start` takes the inputs of the program and gives q̈, the remaining outputs of the program, and `values` numbers.
+    `sweep` takes qₖ, q̇ₖ and tₖ, then k and 1/k, these values, and one sum for each pair in `products`; it gives q̈ₖ and
+    the coefficient of order k of each of the `rows` that the products are made of.
+    """
+
+    size: int
+    start: StraightLine
+    sweep: StraightLine
+    values: int
+    products: tuple[tuple[int, int], ...]
+    rows: int
+
+
+def series(program, size: int) -> Series:
+    """The recurrences of a program whose first `size` outputs are q̈, and whose inputs begin with q, q̇, t.
+
+    Raises `Unlowerable` for an operation whose series is not known here.
+    """
+    return _Recurrences(program, size).finished()
+
+
+class _Recurrences:
+    """Two graphs grow side by side: `start`, the program and the derivatives g; and `sweep`, linear in order k."""
+
+    def __init__(self, program, size: int):
+        self.size, self.moving = size, 2 * size + 1
+        self.start, self.sweep = Graph(10 * program.budget), Graph(20 * program.budget)
+        for (op, operands, attribute), kind in zip(program.nodes, program.kinds, strict=True):
+            if op == "input":
+                self.start.input(attribute, kind)
+            elif op == "constant":
+                self.start.constant(attribute, kind)
+            else:
+                self.start.node(op, *operands, attribute=attribute)
+        self.outputs = list(program.outputs)
+        self.order_k = [self.sweep.input(i, "float") for i in range(self.moving)]
+        self.k, self.inverse_k = (self.sweep.input(self.moving + i, "float") for i in range(2))
+        self._given: dict[tuple, int] = {}  # what else the sweep reads: ("value", node) or ("product", row, row)
+        self._rows: dict[tuple[int, bool], int] = {}
+        self.coefficients: list[int | _Unknown | None] = []  # None: constant along the motion
+        while len(self.coefficients) < len(self.start.nodes):  # the rules add derivatives at the end
+            self.coefficients.append(self._coefficient(len(self.coefficients)))
+
+    # ---- what the sweep reads ----
+
+    def value(self, node: int) -> int:
+        """The value of a node at order zero."""
+        number = self.start.value(node)
+        return self._input("value", node) if number is None else self.sweep.constant(number, "float")
+
+    def product(self, a: int, b: int, by_order: bool = False) -> int:
+        """Σ' aⱼ bₖ₋ⱼ, or Σ' j aⱼ bₖ₋ⱼ."""
+        first, second = self._row(a, by_order), self._row(b, False)
+        return self._input("product", min(first, second), max(first, second))
+
+    def _row(self, node: int, by_order: bool) -> int:
+        return self._rows.setdefault((node, by_order), len(self._rows))
+
+    def _input(self, *key) -> int:
+        if key not in self._given:
+            self._given[key] = self.sweep.input(self.moving + 2 + len(self._given), "float")
+        return self._given[key]
+
+    # ---- the recurrences ----
+
+    def _coefficient(self, i: int) -> "int | _Unknown | None":
+        op, operands, attribute = self.start.nodes[i]
+        if op == "input":
+            return self.order_k[attribute] if attribute < self.moving else None
+        if op == "constant" or self.start.kinds[i] != "float" or op in _STEPS:
+            return None
+        of = [self.coefficients[operand] for operand in operands]
+        used = of[1:] if op == "select" else of
+        if all(c is None for c in used):
+            return None
+        unknown = [c for c in used if isinstance(c, _Unknown)]
+        if unknown:
+            return unknown[0]
+        if op in _RULES:
+            return _RULES[op](self, i, operands, of)
+        return self._by_slopes(i, operands, of) if op in _SLOPES else _Unknown(op)
+
+    def _by_slopes(self, i, operands, of):
+        """w = f(u, …) by its partial derivatives."""
+        op = self.start.nodes[i][0]
+        total, apply = None, self.sweep.apply
+        for u, c, slope in zip(operands, of, _SLOPES[op], strict=True):
+            if c is None:
+                continue
+            g = slope(self.start.apply, self._number, i, *operands)
+            inner = self.start.operand_of("neg", g)
+            sign, g = ("sub", inner) if inner is not None else ("add", g)
+            term = apply("mul", c, self.value(g))
+            if self.start.value(g) is None:
+                term = apply("add", term, apply("mul", self.inverse_k, self.product(u, g, by_order=True)))
+            if total is None:
+                total = term if sign == "add" else apply("neg", term)
+            else:
+                total = apply(sign, total, term)
+        return total
+
+    def _number(self, x: float) -> int:
+        return self.start.constant(x, "float")
+
+    # ---- the end: only what the accelerations need ----
+
+    def finished(self) -> Series:
+        """Both graphs, without the products and values that nothing needs."""
+        accelerations = [self._of_output(i) for i in self.outputs[: self.size]]
+        rows = list(self._rows)
+        needed: set[int] = set()
+        while True:
+            wanted = self._reached([*accelerations, *(self._of_row(*rows[r]) for r in needed)])
+            found = {row for kind, *which in wanted if kind == "product" for row in which}
+            if found == needed:
+                break
+            needed = found
+        values = [key[1] for key in wanted if key[0] == "value"]
+        # Distinct factors first, squares last: a square needs half the work.
+        products = sorted((key for key in wanted if key[0] == "product"), key=lambda key: (key[1] == key[2], key[1:]))
+        place = {row: k for k, row in enumerate(sorted(needed))}
+        order = [("value", node) for node in values] + products
+        self._renumber({self._given[key]: self.moving + 2 + k for k, key in enumerate(order)})
+        return Series(
+            self.size,
+            StraightLine(*finish(self.start, self.outputs + values)),
+            StraightLine(*finish(self.sweep, accelerations + [self._of_row(*rows[r]) for r in sorted(needed)])),
+            len(values),
+            tuple((place[a], place[b]) for _, a, b in products),
+            len(needed),
+        )
+
+    def _of_output(self, node: int) -> int:
+        c = self.coefficients[node]
+        if isinstance(c, _Unknown):
+            raise Unlowerable(f"`{c.op}` has no Taylor series here")
+        return self.sweep.constant(0.0, "float") if c is None else c
+
+    def _of_row(self, node: int, by_order: bool) -> int:
+        c = self._of_output(node)
+        return self.sweep.apply("mul", self.k, c) if by_order else c
+
+    def _reached(self, roots: list[int]) -> list[tuple]:
+        """The keys of `_given` that these nodes of the sweep depend on, in the order they were first asked for."""
+        seen, stack = set(), list(roots)
+        while stack:
+            node = stack.pop()
+            if node not in seen:
+                seen.add(node)
+                stack.extend(self.sweep.nodes[node][1])
+        return [key for key, node in self._given.items() if node in seen]
+
+    def _renumber(self, positions: dict[int, int]) -> None:
+        for node, position in positions.items():
+            self.sweep.nodes[node] = ("input", (), position)
+
+
+class _Unknown(NamedTuple):
+    """No series: which operation is to blame."""
+
+    op: str
+
+
+# ---- rules: (recurrences, node, operands, their coefficients) -> coefficient; not every coefficient is None ----------
+
+
+def _add(r, i, operands, of):
+    op, (a, b) = r.start.nodes[i][0], of
+    if b is None:
+        return a
+    if a is None:
+        return b if op == "add" else r.sweep.apply("neg", b)
+    return r.sweep.apply(op, a, b)
+
+
+def _neg(r, i, operands, of):
+    return r.sweep.apply("neg", of[0])
+
+
+def _mul(r, i, operands, of):
+    (u, v), (a, b), apply = operands, of, r.sweep.apply
+    if a is None:
+        return apply("mul", r.value(u), b)
+    if b is None:
+        return apply("mul", r.value(v), a)
+    if u == v:
+        outer = apply("mul", r.value(r.start.apply("mul", r.start.constant(2.0, "float"), u)), a)
+    else:
+        outer = apply("add", apply("mul", r.value(u), b), apply("mul", r.value(v), a))
+    return apply("add", outer, r.product(u, v))
+
+
+def _div(r, i, operands, of):
+    (_, v), (a, b), apply = operands, of, r.sweep.apply
+    inverse = r.value(r.start.apply("div", r.start.constant(1.0, "float"), v))
+    if b is None:
+        return apply("mul", a, inverse)
+    taken = apply("add", apply("mul", r.value(i), b), r.product(i, v))
+    return apply("mul", apply("neg", taken) if a is None else apply("sub", a, taken), inverse)
+
+
+def _sqrt(r, i, operands, of):
+    half_inverse = r.value(r.start.apply("div", r.start.constant(0.5, "float"), i))
+    return r.sweep.apply("mul", r.sweep.apply("sub", of[0], r.product(i, i)), half_inverse)
+
+
+def _select(r, i, operands, of):
+    predicate, no, yes = operands
+    for branch, other in ((no, yes), (yes, no)):
+        number = r.start.value(other)
+        if number is not None and math.isnan(number):  # a guard: NaN shows at order zero
+            return of[1:][branch == yes]
+    zero = r.sweep.constant(0.0, "float")
+    return _choose(r, predicate, *(zero if c is None else c for c in of[1:]))
+
+
+def _choose(r, predicate: int, no: int, yes: int) -> int:
+    """`yes` where the predicate, a node of the program, holds at order zero, else `no`."""
+    flag = r.start.apply("select", predicate, r.start.constant(0.0, "float"), r.start.constant(1.0, "float"))
+    holds = r.sweep.apply("gt", r.value(flag), r.sweep.constant(0.5, "float"))
+    return r.sweep.apply("select", holds, no, yes)
+
+
+def _abs(r, i, operands, of):
+    below = r.start.apply("lt", operands[0], r.start.constant(0.0, "float"))
+    return _choose(r, below, of[0], r.sweep.apply("neg", of[0]))
+
+
+def _extremum(comparison: str) -> Callable:
+    def rule(r, i, operands, of):
+        zero = r.sweep.constant(0.0, "float")
+        a, b = (zero if c is None else c for c in of)
+        return _choose(r, r.start.apply(comparison, *operands), b, a)
+
+    return rule
+
+
+_RULES: dict[str, Callable] = {
+    "add": _add, "sub": _add, "neg": _neg, "mul": _mul, "div": _div, "sqrt": _sqrt, "select": _select, "abs": _abs,
+    "max": _extremum("gt"), "min": _extremum("lt"),
+}  # fmt: skip
+_STEPS = {"floor", "ceil", "round", "sign"}  # constant between their jumps
+
+
+# ---- slopes: partial derivatives as nodes of `start`; f applies an operation, c makes a constant, w is the result ----
+
+
+def _one_plus(f, c, x):
+    return f("add", c(1.0), x)
+
+
+def _one_minus_square(f, c, x):
+    return f("sub", c(1.0), f("mul", x, x))
+
+
+def _over(f, c, x):
+    return f("div", c(1.0), x)
+
+
+def _square(f, x):
+    return f("mul", x, x)
+
+
+def _gauss(sign: float) -> Callable:
+    def slope(f, c, w, u):
+        return f("mul", c(sign * 2 / math.sqrt(math.pi)), f("exp", f("neg", _square(f, u))))
+
+    return slope
+
+
+def _radius_squared(f, y, x):
+    return f("add", _square(f, x), _square(f, y))
+
+
+_SLOPES: dict[str, tuple[Callable, ...]] = {
+    "sin": (lambda f, c, w, u: f("cos", u),),
+    "cos": (lambda f, c, w, u: f("neg", f("sin", u)),),
+    "tan": (lambda f, c, w, u: _one_plus(f, c, _square(f, w)),),
+    "asin": (lambda f, c, w, u: _over(f, c, f("sqrt", _one_minus_square(f, c, u))),),
+    "acos": (lambda f, c, w, u: f("neg", _over(f, c, f("sqrt", _one_minus_square(f, c, u)))),),
+    "atan": (lambda f, c, w, u: _over(f, c, _one_plus(f, c, _square(f, u))),),
+    "atan2": (
+        lambda f, c, w, y, x: f("div", x, _radius_squared(f, y, x)),
+        lambda f, c, w, y, x: f("neg", f("div", y, _radius_squared(f, y, x))),
+    ),
+    "exp": (lambda f, c, w, u: w,),
+    "exp2": (lambda f, c, w, u: f("mul", c(math.log(2.0)), w),),
+    "expm1": (lambda f, c, w, u: _one_plus(f, c, w),),
+    "log": (lambda f, c, w, u: _over(f, c, u),),
+    "log1p": (lambda f, c, w, u: _over(f, c, _one_plus(f, c, u)),),
+    "logistic": (lambda f, c, w, u: f("sub", w, _square(f, w)),),
+    "sinh": (lambda f, c, w, u: f("cosh", u),),
+    "cosh": (lambda f, c, w, u: f("sinh", u),),
+    "tanh": (lambda f, c, w, u: _one_minus_square(f, c, w),),
+    "asinh": (lambda f, c, w, u: _over(f, c, f("sqrt", _one_plus(f, c, _square(f, u)))),),
+    "acosh": (lambda f, c, w, u: _over(f, c, f("sqrt", f("sub", _square(f, u), c(1.0)))),),
+    "atanh": (lambda f, c, w, u: _over(f, c, _one_minus_square(f, c, u)),),
+    "erf": (_gauss(1.0),),
+    "erfc": (_gauss(-1.0),),
+    "rsqrt": (lambda f, c, w, u: f("div", f("mul", c(-0.5), w), u),),
+    "cbrt": (lambda f, c, w, u: f("div", w, f("mul", c(3.0), u)),),
+    "pow": (
+        lambda f, c, w, u, v: f("div", f("mul", v, w), u),
+        lambda f, c, w, u, v: f("mul", w, f("log", u)),
+    ),
+}
