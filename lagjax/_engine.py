@@ -1,12 +1,11 @@
-"""Where a run needs nothing but numbers, on the CPU, in float64: machine code made for the scene.
+"""Which runs go to machine code, and the way there and back: pytrees of a scene to rows of numbers.
 
-`kernel_for` says whether that is so; `run` turns the user's pytrees into rows of numbers, one for each member, and the
-outcome back. All else (tracing by `jit`, `vmap` or `grad`, another solver, fixed steps, an event, float32, a GPU, a
-scene without a scalar program) is diffrax's, in `_integrate`. Both follow the same motion within the tolerance.
+On the CPU, in float64, everything that was left to its default goes there, inside and outside the transformations of
+JAX. All else (another solver or adjoint, fixed steps, an event, float32, a GPU, a scene that is too large or has no
+scalar program) is diffrax's, in `_integrate`. Both follow the same motion within the tolerance.
 """
 
 import functools
-import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,6 +15,7 @@ import numpy as np
 
 from lagjax import _native
 from lagjax._equations import scalar_program
+from lagjax._flow import Flow, Outcome, Tolerances, unfit
 from lagjax._layout import Layout
 from lagjax._program import Unlowerable
 from lagjax._results import RESULTS
@@ -25,11 +25,42 @@ from lagjax._trajectory import State
 
 PyTree = Any
 
-LARGEST_SCENE = 6_000  # operations of an acceleration, beyond which LLVM takes too long
+# Entries of ∂q̈/∂(q, q̇, parameters) beyond which sensitivities cost more than going back over recorded steps. Whether
+# a run that is being traced will be differentiated cannot be known.
+LARGEST_JACOBIAN = 150
+
+
+def flow_for(system: System, settings: Settings, layout: Layout, *values: PyTree) -> "Flow | str":
+    """The flow for a run from the values (q0, qdot0, params) of one member, or a sentence that says why it has none."""
+    if not settings.by_default:
+        return "a solver, an adjoint, fixed steps, an event or a progress meter was asked for"
+    if not all(is_concrete(x) for x in (settings.controller.rtol, settings.controller.atol)):
+        return "the tolerances are being traced"
+    flow = scene_flow(system, layout, values[-1])
+    if isinstance(flow, str) or all(is_concrete(leaf) for leaf in jax.tree.leaves((settings.ts, values))):
+        return flow
+    entries = flow.size * (flow.program.size - 1)
+    if entries > LARGEST_JACOBIAN:
+        return f"the run is being traced, and {entries} sensitivities are more than {LARGEST_JACOBIAN}"
+    return flow
+
+
+def scene_flow(system: System, layout: Layout, params: PyTree) -> "Flow | str":
+    """The flow of a scene, or a sentence that says why it has none. Made once."""
+    if system.path == "array":
+        return "the array path was asked for"
+    if jax.tree.leaves(system):
+        return "the functions of the scene hold arrays of their own"
+    try:
+        return _made(_Scene.of(system, layout, params))
+    except TypeError as reason:
+        if "unhashable" in str(reason):
+            return f"the scene cannot be remembered: {reason}"
+        raise
 
 
 class _Scene(NamedTuple):
-    """All that decides what a kernel looks like; hashable. The scene and its layout hold no arrays, only structure."""
+    """All that decides what machine code looks like; hashable. The scene and its layout are structure alone."""
 
     system: Any
     layout: Any
@@ -54,100 +85,86 @@ class _Scene(NamedTuple):
         return jax.tree.unflatten(self.system, []), jax.tree.unflatten(self.layout, []), params
 
 
-def kernel_for(system: System, settings: Settings, layout: Layout, params: PyTree, *states) -> "_native.Kernel | str":
-    """The machine code for a run, or a sentence that says why it is not for it."""
-    if not settings.by_default:
-        return "the solver, the adjoint, fixed steps or an event were asked for"
-    if not all(is_concrete(leaf) for leaf in jax.tree.leaves((settings, states, params, system))):
-        return "the run is being traced by a transformation of JAX"
-    return scene_kernel(system, layout, params)
-
-
-def scene_kernel(system: System, layout: Layout, params: PyTree) -> "_native.Kernel | str":
-    """The machine code for a scene, or a sentence that says why there is none. Made once."""
-    if jax.default_backend() != "cpu":
-        return f"the default device is a {jax.default_backend()}"
-    if layout.dtype != np.float64:
-        return f"the coordinates are {layout.dtype.name}, not float64"
-    if system.path == "array":
-        return "the array path was asked for"
-    if jax.tree.leaves(system):
-        return "the functions of the scene hold arrays of their own"
-    try:
-        return _made(_Scene.of(system, layout, params))
-    except TypeError as reason:
-        if "unhashable" in str(reason):
-            return f"the scene cannot be remembered: {reason}"
-        raise
-
-
 @functools.lru_cache(maxsize=64)
-def _made(scene: _Scene) -> "_native.Kernel | str":
+def _made(scene: _Scene) -> "Flow | str":
     system, layout, params = scene.rebuilt()
     try:
         program = scalar_program(system.motion(layout, params), layout, eqx.filter(params, eqx.is_array_like))
-        if program.operations > LARGEST_SCENE:
-            return f"its acceleration takes {program.operations} operations, more than {LARGEST_SCENE}"
-        return _native.Kernel(program, layout.size)
     except Unlowerable as reason:
         return str(reason)
+    return unfit(program, layout.size, layout.dtype) or Flow(program, layout.size)
 
 
-def run(kernel, settings: Settings, layout: Layout, q0, qdot0, params, axes=None, size: int | None = None) -> tuple:
-    """The first six fields of `Trajectory`; `axes` are those of the batch for each leaf of (q0, qdot0, params)."""
-    numbers = eqx.filter(params, eqx.is_array_like)
-    axes_of = (None, None, None) if axes is None else axes
-    y0 = np.concatenate([_rows(q0, axes_of[0], size), _rows(qdot0, axes_of[1], size)], axis=1)
-    shared = axes is None or all(axis is None for axis in jax.tree.leaves(axes[2], is_leaf=lambda x: x is None))
-    given = _rows(numbers, None if shared else axes_of[2], None if shared else size)
-    ts, controller = np.asarray(settings.ts), settings.controller
-    rtol, atol, smallest = (float(x) for x in (controller.rtol, controller.atol, controller.dtmin))
-    outcome = kernel(ts, y0, given, rtol, atol, settings.max_steps, smallest)
-
-    single, n = axes is None, layout.size
-
-    def back(rows):
-        return jax.tree.map(jnp.asarray, layout.restore(rows[0] if single else rows))
-
-    def counts(x):
-        return jnp.asarray(x[0] if single else x)
-
-    stats = {
-        "num_steps": counts(outcome.steps + outcome.rejected),
-        "num_accepted_steps": counts(outcome.steps),
-        "num_rejected_steps": counts(outcome.rejected),
-    }
-    end = State(counts(outcome.t_end), back(outcome.y_end[:, :n]), back(outcome.y_end[:, n:]))
-    q, qdot = back(outcome.path[..., :n]), back(outcome.path[..., n:])
-    return settings.ts, q, qdot, _results(counts(_told(outcome))), end, stats
+# ---- one trajectory --------------------------------------------------------------------------------------------------
 
 
-def _rows(tree: PyTree, axes: PyTree, size: int | None) -> np.ndarray:
-    """The numbers of every member end to end, shape (members, numbers); one row where `size` is None."""
+def run(flow: Flow, settings: Settings, layout: Layout, q0: PyTree, qdot0: PyTree, params: PyTree) -> tuple:
+    """The first six fields of `Trajectory`, for one member."""
+    numbers = jax.tree.leaves(eqx.filter(params, eqx.is_array_like))
+    if all(is_concrete(leaf) for leaf in jax.tree.leaves((settings.ts, q0, qdot0, numbers))):
+        ts, state, given = np.asarray(settings.ts)[None], _rows((q0, qdot0)), _rows(numbers)
+        outcome = Outcome(*(x[0] for x in flow.run(ts, state, given, _tolerances(settings))[0]))
+    else:
+        state = jnp.concatenate([layout.flatten(q0), layout.flatten(qdot0)])
+        scalars = [x.astype(state.dtype) for leaf in numbers for x in jnp.ravel(jnp.asarray(leaf))]
+        outcome = flow.traceable(_tolerances(settings))(settings.ts, state, *scalars)
+    return _fields(settings, layout, outcome)
+
+
+def run_batch(flow: Flow, settings: Settings, layout: Layout, values: dict, axes: dict, size: int) -> tuple:
+    """The same for a batch of numbers; `axes` are those of the members, leaf by leaf."""
+    numbers = eqx.filter(values["params"], eqx.is_array_like)
+    spread = [axis for axis in jax.tree.leaves(axes["params"])]  # None is no leaf: those that all share
+    y0 = _rows((values["q0"], values["qdot0"]), (axes["q0"], axes["qdot0"]), size)
+    given = _rows(numbers, axes["params"], size) if spread else _rows(numbers)
+    outcome, idle = flow.run(np.asarray(settings.ts)[None], y0, given, _tolerances(settings))
+    return _fields(settings, layout, outcome, idle)
+
+
+def _tolerances(settings: Settings) -> Tolerances:
+    return Tolerances(float(settings.controller.rtol), float(settings.controller.atol), settings.max_steps)
+
+
+def _rows(tree: PyTree, axes: PyTree = None, size: int = 1) -> np.ndarray:
+    """The numbers of every member end to end, shape (members, numbers)."""
     leaves, structure = jax.tree.flatten(tree)
-    flat_axes = [None] * len(leaves) if axes is None else structure.flatten_up_to(axes)
-    columns = [np.zeros((size or 1, 0))]
-    for leaf, axis in zip(leaves, flat_axes, strict=True):
-        leaf = np.asarray(leaf, np.float64)
+    each = [None] * len(leaves) if axes is None else structure.flatten_up_to(axes)
+    columns = [np.zeros((size, 0))]
+    for leaf, axis in zip(leaves, each, strict=True):
+        array = np.asarray(leaf, np.float64)
         if axis is None:
-            columns.append(np.broadcast_to(leaf.reshape(1, -1), (size or 1, leaf.size)))
+            columns.append(np.broadcast_to(array.reshape(1, -1), (size, array.size)))
         else:
-            columns.append(np.moveaxis(leaf, axis, 0).reshape(size, math.prod(leaf.shape) // size))
+            columns.append(np.moveaxis(array, axis, 0).reshape(size, array.size // size))
     return np.concatenate(columns, axis=1)
 
 
-def _told(outcome) -> np.ndarray:
-    """The kernel's codes; a last state that overflowed is not a success."""
-    return np.where(np.isfinite(outcome.y_end).all(axis=1), outcome.code, _native.NOT_FINITE)
-
-
-def _results(codes) -> RESULTS:
-    meaning = {
-        _native.DONE: RESULTS.successful,
-        _native.OUT_OF_STEPS: RESULTS.max_steps_reached,
-        _native.STEP_TOO_SMALL: RESULTS.dt_min_reached,
-        _native.NOT_FINITE: RESULTS.nonfinite_state,
-        _native.SINGULAR: RESULTS.mass_matrix_singular,
+def _fields(settings: Settings, layout: Layout, outcome: Outcome, idle: int | None = None) -> tuple:
+    n = layout.size
+    library = np if isinstance(outcome.y_end, np.ndarray) else jnp  # NumPy costs less where nothing is traced
+    finite = library.isfinite(outcome.y_end).all(axis=-1)  # a last state that overflowed is not a success
+    result = jnp.asarray(library.asarray(_RESULT)[library.where(finite, outcome.code, _native.NOT_FINITE)])
+    stats = {
+        "num_steps": jnp.asarray(outcome.accepted + outcome.rejected),
+        "num_accepted_steps": jnp.asarray(outcome.accepted),
+        "num_rejected_steps": jnp.asarray(outcome.rejected),
     }
-    table = np.array([int(meaning[code]._value) for code in range(len(meaning))], np.int32)
-    return eqx.tree_at(lambda result: result._value, RESULTS.successful, jnp.asarray(table[np.asarray(codes)]))
+    if idle is not None:
+        stats["num_wasted_lane_steps"] = jnp.asarray(idle)
+
+    def half(y, part):
+        return jax.tree.map(jnp.asarray, layout.restore(y[..., part * n : (part + 1) * n]))
+
+    end = State(jnp.asarray(outcome.t_end), half(outcome.y_end, 0), half(outcome.y_end, 1))
+    result = eqx.tree_at(lambda r: r._value, RESULTS.successful, result)
+    return jnp.asarray(settings.ts), half(outcome.path, 0), half(outcome.path, 1), result, end, stats
+
+
+# The codes of the kernel, in their order, as those of `RESULTS`.
+_RESULT = np.array([
+    int(result._value)
+    for result in (
+        RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,
+        RESULTS.mass_matrix_singular,
+    )
+], np.int32)  # fmt: skip

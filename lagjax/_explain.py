@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from lagjax._equations import OPERATION_BUDGET, ScalarEquations, equations
+from lagjax._equations import OPERATION_BUDGET, ScalarEquations, equations, scalar_program
+from lagjax._flow import unfit
 from lagjax._layout import Layout
 from lagjax._motion import Motion
 from lagjax._program import Program, Unlowerable, lower
@@ -27,11 +28,13 @@ class Explanation:
     - `energy_conserved`: whether h = p·q̇ − L is constant along every motion.
     - `operations`: scalar operations of one acceleration; `traced_operations`: of its derivatives before reduction.
     - `path`: "scalar" or "array"; `reason`: why not "scalar".
+    - `solver`: what integrates the motion by default, and where it is not machine code, why not.
     """
 
     coordinates: tuple[str, ...]
     path: str
     reason: str
+    solver: str
     cyclic: tuple[str, ...] | None = None
     mass_matrix: str | None = None
     mass_matrix_depends_on: tuple[str, ...] | None = None
@@ -55,6 +58,7 @@ class Explanation:
         if self.operations is not None:
             rows.append(("operations", f"{self.operations} per acceleration, {self.traced_operations} as derived"))
         rows.append(("path", self.path + (f", because {self.reason}" if self.reason else "")))
+        rows.append(("solver", self.solver))
         return "\n".join(f"{name:17s} {value}" for name, value in rows)
 
 
@@ -64,6 +68,7 @@ def explain(motion: Motion, layout: Layout, params, path: str) -> Explanation:
     form = equations(motion, layout, params, path)
     scalar = isinstance(form, ScalarEquations)
     known = {"coordinates": names, "path": "scalar" if scalar else "array", "reason": "" if scalar else form.reason}
+    known["solver"] = _solver(motion, layout, params, path)
     if scalar:
         known["operations"] = form.program.operations
 
@@ -89,6 +94,15 @@ def explain(motion: Motion, layout: Layout, params, path: str) -> Explanation:
         energy_conserved=not timed and motion.forces is None and motion.dissipation is None,
         traced_operations=parts.traced_operations,
     )
+
+
+def _solver(motion: Motion, layout: Layout, params, path: str) -> str:
+    try:
+        reason = "the array path was asked for" if path == "array" else None
+        reason = reason or unfit(scalar_program(motion, layout, params), layout.size, layout.dtype)
+    except Unlowerable as why:
+        reason = str(why)
+    return "Taylor series in machine code" if reason is None else f"diffrax.Dopri8, because {reason}"
 
 
 def _pattern(parts: Program, n: int) -> str:

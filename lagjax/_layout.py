@@ -35,7 +35,7 @@ class Layout(eqx.Module):
                 raise ValueError(f"{path} has shape {shape}, but its velocity has shape {qdot_shape}: they must agree.")
         if not sum(math.prod(shape) for shape in shapes):
             raise ValueError("q has no coordinates: it must hold at least one number.")
-        dtype = jnp.result_type(*(jnp.asarray(leaf).dtype for leaf in jax.tree.leaves((q, qdot))))
+        dtype = jnp.result_type(*(jnp.result_type(leaf) for leaf in jax.tree.leaves((q, qdot))))
         if dtype not in (jnp.float32, jnp.float64):
             raise TypeError(f"Coordinates must be float32 or float64; got {dtype}.")
         return cls(tree, shapes, paths, np.dtype(dtype))
@@ -75,7 +75,7 @@ def _structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tup
     paths = tuple(name + jax.tree_util.keystr(path) for path, _ in leaves)
     for path, (_, leaf) in zip(paths, leaves, strict=True):
         try:
-            dtype = jnp.asarray(leaf).dtype
+            dtype = jnp.result_type(leaf)
         except (TypeError, ValueError):
             raise TypeError(f"{path} must be a real number or array; got {leaf!r}.") from None
         if not jnp.issubdtype(dtype, jnp.floating):

@@ -42,7 +42,7 @@ class Settings(eqx.Module):
     def of(cls, layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress) -> "Settings":
         """Check the arguments of `simulate` that do not depend on the scene, and fill in the defaults."""
         ts = _output_times(ts, layout.dtype)
-        by_default = solver is None and adjoint is None and dt is None and event is None
+        by_default = solver is None and adjoint is None and dt is None and event is None and progress is False
         if solver is None:
             # States between steps are wanted for outputs inside and to locate an event.
             between = ts.size > 2 or event is not None
@@ -72,13 +72,19 @@ class Settings(eqx.Module):
 def as_arrays(tree: PyTree, dtype) -> PyTree:
     """Every number as an array, so that a new value is no new program; floats in the dtype of the state."""
 
-    def as_array(leaf):
+    def convert(leaf):
         if not eqx.is_array_like(leaf):
             return leaf  # a function, a string: part of the program
-        array = jnp.asarray(leaf)
-        return array.astype(dtype) if jnp.issubdtype(array.dtype, jnp.floating) else array
+        return _as_array(leaf, dtype if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else None)
 
-    return jax.tree.map(as_array, tree)
+    return jax.tree.map(convert, tree)
+
+
+def _as_array(x, dtype=None):
+    """An array of JAX if it is one already, else one of NumPy, which costs nothing and stays a number inside `jit`."""
+    if isinstance(x, jax.Array):
+        return x if dtype is None or x.dtype == dtype else x.astype(dtype)
+    return np.asarray(x, jnp.result_type(x) if dtype is None else dtype)
 
 
 def is_concrete(value) -> bool:
@@ -98,14 +104,14 @@ def require_finite(tree: PyTree, name: str) -> None:
 
 def _output_times(ts, dtype) -> jax.Array:
     try:
-        given = jnp.asarray(ts)
+        kind = jnp.result_type(ts if isinstance(ts, jax.Array) else np.asarray(ts))
     except (TypeError, ValueError):
         raise TypeError(f"ts must be an array of output times; got {type(ts).__name__}.") from None
-    if given.ndim != 1 or given.size < 2:
-        raise ValueError(f"ts must hold at least two output times, ts[0] the start; got shape {given.shape}.")
-    if not (jnp.issubdtype(given.dtype, jnp.floating) or jnp.issubdtype(given.dtype, jnp.integer)):
-        raise TypeError(f"ts must hold real numbers; got {given.dtype}.")
-    given = given.astype(dtype)
+    if jnp.ndim(ts) != 1 or np.size(ts) < 2:
+        raise ValueError(f"ts must hold at least two output times, ts[0] the start; got shape {jnp.shape(ts)}.")
+    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+        raise TypeError(f"ts must hold real numbers; got {kind}.")
+    given = _as_array(ts, dtype)
     require_finite(given, "ts")
     if is_concrete(given):
         gaps = np.diff(np.asarray(given))
@@ -132,12 +138,13 @@ def _adaptive(dtype, ts, rtol, atol) -> diffrax.PIDController:
             f"{dtype.name} cannot meet rtol={float(rtol):.3g}: its round-off is {eps:.1e}, "
             f"so rtol must be at least {10 * eps:.1e}{more}."
         )
+    ts, library = (np.asarray(ts), np) if is_concrete(ts) else (ts, jnp)
     return diffrax.PIDController(
-        rtol=jnp.asarray(rtol, dtype),
-        atol=jnp.asarray(atol, dtype),
+        rtol=_as_array(rtol, dtype),
+        atol=_as_array(atol, dtype),
         norm=_norm_or_inf,
         # Below this a step no longer moves the time reliably.
-        dtmin=4 * eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1])),
+        dtmin=np.asarray(4 * eps, dtype) * library.maximum(abs(ts[0]), abs(ts[-1])),
         force_dtmin=False,
     )
 
@@ -168,7 +175,8 @@ def _fixed_step(dt, ts, rtol, atol, max_steps) -> jax.Array:
         needed = float(abs(np.asarray(ts)[-1] - np.asarray(ts)[0])) / float(dt)
         if needed > max_steps + 0.5:
             raise ValueError(f"dt={dt} needs {needed:.0f} steps, more than max_steps={max_steps}: raise one of them.")
-    return jnp.asarray(dt, ts.dtype) * jnp.sign(ts[-1] - ts[0])
+    ts, library = (np.asarray(ts), np) if is_concrete(ts) else (ts, jnp)
+    return _as_array(dt, ts.dtype) * library.sign(ts[-1] - ts[0])
 
 
 def _require_solver(solver, adaptive: bool) -> None:

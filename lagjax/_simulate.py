@@ -97,11 +97,11 @@ def simulate(
         require_finite(value, name)
 
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
-    kernel = _engine.kernel_for(system, settings, layout, params, q0, qdot0)
-    if isinstance(kernel, str):
+    flow = _engine.flow_for(system, settings, layout, q0, qdot0, params)
+    if isinstance(flow, str):
         fields = _integrate(system, settings, q0, qdot0, params)
     else:
-        fields = _engine.run(kernel, settings, layout, q0, qdot0, params)
+        fields = _engine.run(flow, settings, layout, q0, qdot0, params)
     trajectory = Trajectory(*fields, system, params)
     return _raise_unless_ok(trajectory, layout) if throw else trajectory
 
@@ -141,7 +141,7 @@ def simulate_batch(
     ```
     """
     values = {"q0": q0, "qdot0": qdot0, "params": params}
-    axes = _axes_per_leaf(values, batch_axes)
+    axes, size = _axes_per_leaf(values, batch_axes)
     member = {name: _first_member(value, axes[name]) for name, value in values.items()}
     layout = Layout.of(member["q0"], member["qdot0"])
     settings = Settings.of(layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress)
@@ -149,14 +149,17 @@ def simulate_batch(
     for name, value in values.items():
         require_finite(jax.tree.map(lambda leaf, axis: leaf if axis is None else None, value, axes[name]), name)
 
-    q0, qdot0, params = values.values()
-    kernel = _engine.kernel_for(system, settings, layout, member["params"], q0, qdot0, params)
-    if not isinstance(kernel, str):
-        each = tuple(axes[name] for name in values)
-        fields = _engine.run(kernel, settings, layout, q0, qdot0, params, each, _batch_size(values, axes))
-        return Trajectory(*fields, system, params, batch_axes[2])
-    fields = _integrate_batch(system, settings, q0, qdot0, params, _Static(tuple(batch_axes)))
-    return Trajectory(settings.ts, *fields[1:], system, params, batch_axes[2])
+    flow = _engine.flow_for(system, settings, layout, *member.values())
+    if isinstance(flow, str):
+        fields = _integrate_batch(system, settings, *values.values(), _Static(tuple(batch_axes)))
+        steps = fields[5]["num_steps"]  # every lane waits for the slowest
+        fields[5]["num_wasted_lane_steps"] = steps.size * jnp.max(steps) - jnp.sum(steps)
+    elif all(is_concrete(leaf) for leaf in jax.tree.leaves((settings.ts, values))):
+        fields = _engine.run_batch(flow, settings, layout, values, axes, size)
+    else:
+        run = jax.vmap(lambda *one: _engine.run(flow, settings, layout, *one), in_axes=tuple(batch_axes))
+        fields = run(*values.values())
+    return Trajectory(jnp.asarray(settings.ts), *fields[1:], system, values["params"], batch_axes[2])
 
 
 class _Static(eqx.Module):
@@ -230,8 +233,8 @@ def _in_coordinates(event: diffrax.Event, layout: Layout, params: PyTree) -> dif
     return diffrax.Event(conditions, event.root_finder, event.direction)
 
 
-def _axes_per_leaf(values: dict[str, PyTree], batch_axes) -> dict[str, PyTree]:
-    """`batch_axes` spread over every leaf, after checking that all members are there everywhere."""
+def _axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTree], int]:
+    """`batch_axes` spread over every leaf, and the size of the batch, which must be the same everywhere."""
     if not isinstance(batch_axes, tuple) or len(batch_axes) != 3:
         raise ValueError(f"batch_axes must be a tuple of three, for (q0, qdot0, params); got {batch_axes!r}.")
     axes, sizes = {}, {}
@@ -254,17 +257,7 @@ def _axes_per_leaf(values: dict[str, PyTree], batch_axes) -> dict[str, PyTree]:
         raise ValueError(f"The batch must have one size everywhere; {listed}.")
     if 0 in sizes.values():
         raise ValueError("The batch is empty.")
-    return axes
-
-
-def _batch_size(values: dict[str, PyTree], axes: dict[str, PyTree]) -> int:
-    sizes = (
-        jnp.shape(leaf)[axis]
-        for name, value in values.items()
-        for leaf, axis in zip(jax.tree.leaves(value), jax.tree.structure(value).flatten_up_to(axes[name]), strict=True)
-        if axis is not None
-    )
-    return next(sizes)
+    return axes, next(iter(sizes.values()))
 
 
 def _first_member(tree: PyTree, axes: PyTree) -> PyTree:

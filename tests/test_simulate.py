@@ -174,7 +174,7 @@ def test_gradient_with_more_steps_than_checkpoints():
     long = lambda k, adjoint: lagjax.simulate(
         SCENE, 1.0, 0.5, jnp.array([0.0, 100.0]), {"m": 2.0, "k": k}, adjoint=adjoint, rtol=1e-10
     )
-    assert long(8.0, None).stats["num_steps"] > 300
+    assert long(8.0, None).stats["num_steps"] > 200
     reverse = jax.grad(lambda k: long(k, adjoint).q[-1])(8.0)
     forward = jax.jacfwd(lambda k: long(k, diffrax.ForwardMode()).q[-1])(8.0)
     np.testing.assert_allclose(reverse, forward, rtol=1e-6)
@@ -217,8 +217,8 @@ def test_a_new_value_never_recompiles():
     solve(1.1, TS, 2.0, 1e-8, lagjax.System(counted))  # an equal System is the same System
     solve(1.0, 2 * TS, 3.0, 1e-9, lagjax.System(counted))
     assert len(traces) == first
-    solve(1.0, TS[:-1], 2.0, 1e-8, lagjax.System(counted))  # a new shape is a new program
-    assert len(traces) > first
+    solve(1.0, TS[:-1], 2.0, 1e-8, lagjax.System(counted))  # machine code serves any number of output times
+    assert len(traces) == first
 
 
 def test_simulate_inside_jit_and_vmap():

@@ -18,9 +18,9 @@ import numpy as np
 from lagjax._native import _integrator
 from lagjax._native._integrator import DONE, NOT_FINITE, OUT_OF_STEPS, SINGULAR, STEP_TOO_SMALL
 from lagjax._native._ir import compiled
-from lagjax._program import Program, series
+from lagjax._program import Program, Series, Unlowerable, series
 
-__all__ = ["DONE", "NOT_FINITE", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Kernel", "Outcome", "cores"]
+__all__ = ["DONE", "NOT_FINITE", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Kernel", "cores", "recurrences"]
 
 
 class Outcome(NamedTuple):
@@ -43,25 +43,25 @@ class Kernel:
     """
 
     def __init__(self, program: Program, size: int):
-        integrator = _integrator.Integrator(program, series(program, size))
+        integrator = _integrator.Integrator(program, recurrences(program, size))
         self.states, self.numbers, self.width = 2 * size, integrator.numbers, integrator.width
         self._memory = integrator.memory
         self._engine = compiled(integrator.module)  # holds the code that the next line points to
         address = self._engine.get_function_address("run")
         self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(address)
 
-    def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int, smallest_step: float) -> Outcome:
-        """`y0` (N, 2n); `params` (N, P), or (1, P) for all; all float64."""
+    def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int) -> Outcome:
+        """`y0` (N, 2n); `ts` (N, T) and `params` (N, P), or one row for all; all float64."""
         ts, y0, params = (np.ascontiguousarray(x, dtype=np.float64) for x in (ts, y0, params))
-        members, times = len(y0), len(ts)
+        members, times = len(y0), ts.shape[1]
         path = np.full((members, times, self.states), np.nan)
         y_end, t_end = np.empty((members, self.states)), np.empty(members)
         code, steps, rejected = (np.empty(members) for _ in range(3))
         counter = np.zeros(1, np.int64)
         job = _integrator.Job(
             *(array.ctypes.data for array in (counter, ts, y0, params, path, y_end, t_end, code, steps, rejected)),
-            members, times, 0 if len(params) == 1 else self.numbers, order_for(rtol), max_steps,
-            rtol, atol, smallest_step,
+            times if len(ts) > 1 else 0, self.numbers if len(params) > 1 else 0,
+            members, times, order_for(rtol), max_steps, rtol, atol,
         )  # fmt: skip
 
         def work(_) -> int:
@@ -72,7 +72,19 @@ class Kernel:
 
         threads = min(cores(), max(1, members // (4 * self.width)))
         idle = sum(_pool().map(work, range(threads))) if threads > 1 else work(0)
+        ended_badly = code != DONE
+        if ended_badly.any():  # a start that is infinite was not reached either
+            reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
+            path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
         return Outcome(path, y_end, t_end, *(counts.astype(int) for counts in (code, steps, rejected)), idle)
+
+
+def recurrences(program: Program, size: int) -> Series:
+    """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
+    for (op, _, _), kind in zip(program.nodes, program.kinds, strict=True):
+        if kind not in ("float", "bool") and op not in ("input", "constant", "convert"):
+            raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
+    return series(program, size, moving=2 * size + 1)
 
 
 def order_for(rtol: float) -> int:

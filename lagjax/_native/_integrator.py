@@ -31,6 +31,7 @@ from lagjax._program import Program, Series, StraightLine
 
 MAX_ORDER = 20
 SAFETY = 0.9
+SMALLEST_STEP = 4 * 2.0**-52  # of the largest time: below this a step no longer moves the time reliably
 CHECKS = (0.5, 1.0)  # where in the step its series is held against the equations
 
 # How a member ended.
@@ -45,14 +46,17 @@ class Job(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in (
             "next_member", "ts", "y0", "params", "path", "y_end", "t_end", "code", "steps", "rejected",
         )),
-        *((name, ctypes.c_int64) for name in ("members", "times", "stride", "order", "max_steps")),
-        *((name, ctypes.c_double) for name in ("rtol", "atol", "smallest_step")),
+        # From one member to the next: 0 where all share the output times, or the parameters.
+        *((name, ctypes.c_int64) for name in ("ts_stride", "params_stride")),
+        *((name, ctypes.c_int64) for name in ("members", "times", "order", "max_steps")),
+        *((name, ctypes.c_double) for name in ("rtol", "atol")),
     ]  # fmt: skip
 
 
 # Doubles of a lane. `due` and `reached` are times in the direction of time; `active`, `last`, `singular` are 1 or 0.
 _OF_A_LANE = (
-    "t", "t_low", "h", "due", "reached", "worst", "active", "last", "singular", "code", "steps", "rejected",
+    "t", "t_low", "t_end", "forward", "smallest", "h", "due", "reached", "worst", "active", "last", "singular", "code",
+    "steps", "rejected",
 )  # fmt: skip
 _KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
 # Integers of a lane: which member it carries (-1: none), and which output comes next.
@@ -277,7 +281,12 @@ class Integrator:
         self._set(code, memory, "code", lane, float(_RUNNING))
         self._set(code, memory, "due", lane, float("inf"))
         with code.only_if(there):
-            self._set(code, memory, "t", lane, self._read(code, job, "ts", 0))
+            begin, end = (self._time(code, job, member, i) for i in (0, self._job(code, job, "times") - 1))
+            self._set(code, memory, "t", lane, begin)
+            self._set(code, memory, "t_end", lane, end)
+            self._set(code, memory, "forward", lane, code.select(end > begin, _double(code, 1.0), -1.0))
+            largest = code.maximum(code.intrinsic("fabs", begin), code.intrinsic("fabs", end))
+            self._set(code, memory, "smallest", lane, SMALLEST_STEP * largest)
             self._await_output(code, memory, lane_data, job, lane, _integer(code, 1))
             for i in range(self.states):
                 x = self._read(code, job, "y0", member * self.states + i)
@@ -285,7 +294,7 @@ class Integrator:
                 code.store(x, self._output(code, job, member, 0, i))
                 code.store(_double(code, 0.0), self.place(code, memory, "low", i, lane))
             with code.loop(self.numbers) as i:
-                x = self._read(code, job, "params", member * self._job(code, job, "stride") + i)
+                x = self._read(code, job, "params", member * self._job(code, job, "params_stride") + i)
                 code.store(x, self.place(code, memory, "params", i, lane))
         return code.finish()
 
@@ -293,7 +302,8 @@ class Integrator:
         """`due` is the next output time before the end, in the direction of time; infinite after the last one."""
         code.store(index, self._lane(code, lane_data, "output", lane))
         inside = index < self._job(code, job, "times") - 1
-        time = self._read(code, job, "ts", code.select(inside, index, 0)) * self._forward(code, job)
+        member = code.load(self._lane(code, lane_data, "member", lane), INTEGER)
+        time = self._time(code, job, member, code.select(inside, index, 0)) * self._get(code, memory, "forward", lane)
         self._set(code, memory, "due", lane, code.select(inside, time, float("inf")))
 
     def _run(self) -> None:
@@ -318,15 +328,14 @@ class Integrator:
         p = code.as_double(order)
         a, b = _power(code, last, -1.0 / p), _power(code, before, -1.0 / (p - 1.0))
         size = SAFETY * code.select(a < b, a, b)
-        forward = code.lanes_of(self._forward(code, job))
-        end = code.lanes_of(self._read(code, job, "ts", self._job(code, job, "times") - 1))
+        forward, end = self._vector(code, memory, "forward"), self._vector(code, memory, "t_end")
         left = ((end - self._vector(code, memory, "t")) - self._vector(code, memory, "t_low")) * forward
         is_last = size >= left
         step = code.select(is_last, left, size)
         active = self._vector(code, memory, "active") > 0.0
-        sound = (last < float("inf")) & (before < float("inf"))
         singular = self._vector(code, memory, "singular") > 0.0
-        small = ~is_last & (step < self._job(code, job, "smallest_step"))
+        sound = (last < float("inf")) & (before < float("inf")) & ~singular
+        small = ~is_last & (step < self._vector(code, memory, "smallest"))
         going = active & sound & ~small
         ending = code.select(small, _lanes(code, STEP_TOO_SMALL), float(_RUNNING))
         ending = code.select(sound, ending, code.select(singular, _lanes(code, SINGULAR), float(NOT_FINITE)))
@@ -350,6 +359,8 @@ class Integrator:
                 c = code.load(self.state(code, memory, i, order - k), self.vector)
                 error = code.intrinsic("fabs", c) * scale
                 errors[k] = code.select(error <= errors[k], errors[k], error)  # NaN goes through
+            # An infinite slope may leave no trace in the last coefficients.
+            errors[0] = code.select(rate < float("inf"), errors[0], float("nan"))
         return errors[0], errors[1]
 
     def _halve_until_sound(self, code, memory, job, order) -> None:
@@ -365,7 +376,7 @@ class Integrator:
             with code.only_if(code.any_lane(bad)):
                 code.store(_integer(code, 1), again)
                 half = 0.5 * h
-                small = bad & (code.intrinsic("fabs", half) < self._job(code, job, "smallest_step"))
+                small = bad & (code.intrinsic("fabs", half) < self._vector(code, memory, "smallest"))
                 rejected = self._vector(code, memory, "rejected")
                 ending = self._vector(code, memory, "code")
                 self._keep(code, memory, "h", code.select(small, 0.0, code.select(bad, half, h)))
@@ -383,10 +394,9 @@ class Integrator:
         after = rough + rest
         rest = rest - (after - rough)
         is_last = self._vector(code, memory, "last") > 0.0
-        end = self._read(code, job, "ts", self._job(code, job, "times") - 1)
+        end, forward = self._vector(code, memory, "t_end"), self._vector(code, memory, "forward")
         after, rest = code.select(is_last, end, after), code.select(is_last, 0.0, rest)
         moving = code.compare("!=", h, 0.0)
-        forward = code.lanes_of(self._forward(code, job))
         self._keep(code, memory, "reached", after * forward)
         with code.only_if(code.any_lane(moving & (self._vector(code, memory, "due") <= after * forward))):
             with code.loop(self.width) as lane:
@@ -404,7 +414,7 @@ class Integrator:
 
         with code.repeat_while(due):
             index = code.load(self._lane(code, lane_data, "output", lane), INTEGER)
-            s = (self._read(code, job, "ts", index) - t) - low
+            s = (self._time(code, job, member, index) - t) - low
             values = [code.variable(code.load(self.state(code, memory, i, order, lane), DOUBLE)) for i in
                       range(self.states)]  # fmt: skip
             with code.loop(order + 1, start=1) as j:
@@ -482,10 +492,8 @@ class Integrator:
     def _read(self, code, job, name: str, index) -> Value:
         return code.load(code.element(self._job(code, job, name), index), DOUBLE)
 
-    def _forward(self, code, job) -> Value:
-        """The direction of time."""
-        begin, end = self._read(code, job, "ts", 0), self._read(code, job, "ts", self._job(code, job, "times") - 1)
-        return code.select(end > begin, _double(code, 1.0), -1.0)
+    def _time(self, code, job, member, index) -> Value:
+        return self._read(code, job, "ts", member * self._job(code, job, "ts_stride") + index)
 
     def _output(self, code, job, member, time_index, i: int) -> Value:
         row = member * self._job(code, job, "times") + time_index

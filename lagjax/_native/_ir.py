@@ -32,8 +32,8 @@ _LIBRARY = {
 
 
 @functools.cache
-def machine() -> llvm.TargetMachine:
-    """This processor."""
+def _target() -> llvm.Target:
+    """This kind of processor, after LLVM and the C library are made ready."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     if os.name == "nt":
@@ -42,14 +42,18 @@ def machine() -> llvm.TargetMachine:
         library = ctypes.CDLL(ctypes.util.find_library("m"))  # None, the process itself, serves as well
     for name in _LIBRARY:
         llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
-    return llvm.Target.from_default_triple().create_target_machine(
+    return llvm.Target.from_default_triple()
+
+
+def _machine() -> llvm.TargetMachine:
+    """This processor. Not kept: the engine that is given it owns it, and frees it in the end."""
+    return _target().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2
     )
 
 
 def lanes() -> int:
     """Doubles in a vector register; two registers' worth where those are short, to hide latencies."""
-    machine()
     return 8 if llvm.get_host_cpu_features().get("avx512f", False) else 4
 
 
@@ -60,9 +64,10 @@ def compiled(module: ir.Module) -> llvm.ExecutionEngine:
     # The loops are vectorised by hand, over lanes.
     tuning = llvm.create_pipeline_tuning_options(speed_level=2)
     tuning.loop_vectorization = tuning.slp_vectorization = tuning.loop_unrolling = False
-    passes = llvm.create_pass_builder(machine(), tuning)
+    machine = _machine()
+    passes = llvm.create_pass_builder(machine, tuning)
     passes.getModulePassManager().run(parsed, passes)
-    engine = llvm.create_mcjit_compiler(parsed, machine())
+    engine = llvm.create_mcjit_compiler(parsed, machine)
     engine.finalize_object()
     return engine
 
@@ -172,6 +177,8 @@ class Code:
         a, b = self._alike(a, b)
         if isinstance(a.it.type, ir.IntType):
             return Value(self, self.builder.icmp_signed(op, a.it, b.it))
+        if isinstance(a.it.type, ir.VectorType) and a.it.type.element == BIT:
+            return Value(self, self.builder.icmp_unsigned(op, a.it, b.it))
         ordered = self.builder.fcmp_unordered if op == "!=" else self.builder.fcmp_ordered
         return Value(self, ordered(op, a.it, b.it))
 

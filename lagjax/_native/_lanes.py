@@ -6,14 +6,14 @@ from llvmlite import ir
 
 from lagjax import _elementary
 from lagjax._native._ir import BIT, Code, Value
-from lagjax._program import StraightLine, Unlowerable
+from lagjax._program import StraightLine
 
 # Beyond this an angle is left to the C library, which knows enough digits of π.
 LARGEST_ANGLE = 2.0**20
 
 
 def emit(code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos: Code | None) -> list[Value]:
-    """The outputs of a straight line; `inputs(i)` is its i-th input, as a vector."""
+    """The outputs of a straight line; `inputs(i)` is its i-th input, as a vector. Integers are doubles here."""
     values: list[Value] = []
     turns: dict[int, tuple[Value, Value]] = {}
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
@@ -22,8 +22,6 @@ def emit(code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos:
             value = inputs(attribute)
         elif op == "constant":
             value = code.as_value(attribute, code.vector if kind != "bool" else ir.VectorType(BIT, code.lanes))
-        elif kind not in ("float", "bool") and op != "convert":
-            raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
         elif op in ("sin", "cos") and sincos is not None:
             if operands[0] not in turns:
                 turns[operands[0]] = _both(code, sincos, xs[0])
@@ -45,11 +43,11 @@ def _convert(code, x, before, after):
         return code.as_double(x)
     if after == "bool":
         return code.compare("!=", x, 0.0)
-    return code.intrinsic("trunc", x) if before == "float" and after != "float" else x  # integers are doubles here
+    return code.intrinsic("trunc", x) if before == "float" and after != "float" else x
 
 
 def _sign(code, x):
-    return code.select(x > 0.0, 1.0 + 0.0 * x, code.select(x < 0.0, -1.0 + 0.0 * x, x))
+    return code.select(x > 0.0, 1.0, code.select(x < 0.0, -1.0, x))
 
 
 def _logical_not(code, x):
@@ -95,32 +93,32 @@ def sincos_function(module: ir.Module, lanes: int) -> Code:
     """`(x, address)`: sin x and cos x, stored one after the other.
 
     The method is that of `_elementary`: Cody and Waite's reduction, fdlibm's polynomials; 1 ulp. A vector with an angle
-    beyond `LARGEST_ANGLE` goes to the C library.
+    beyond `LARGEST_ANGLE` asks the C library as well.
     """
     vector = ir.VectorType(ir.DoubleType(), lanes)
     code = Code(module, "sincos", [vector, ir.PointerType()], lanes)
     x, address = code.arguments
-    far = code.any_lane(~(code.intrinsic("fabs", x) <= LARGEST_ANGLE))
-    with code.builder.if_else(far.it) as (libm, polynomial):
-        with libm:
-            code.store(code.library("sin", x), address)
-            code.store(code.library("cos", x), code.element(address, lanes))
-        with polynomial:
-            sine, cosine = _polynomials(code, x)
-            code.store(sine, address)
-            code.store(cosine, code.element(address, lanes))
+    near = code.intrinsic("fabs", x) <= LARGEST_ANGLE
+    sine, cosine = _polynomials(code, code.select(near, x, 0.0))
+    code.store(sine, address)
+    code.store(cosine, code.element(address, lanes))
+    # A lane must not depend on its neighbours: only the far ones are replaced.
+    with code.only_if(code.any_lane(~near)):
+        code.store(code.select(near, sine, code.library("sin", x)), address)
+        code.store(code.select(near, cosine, code.library("cos", x)), code.element(address, lanes))
     return code.finish()
 
 
 def _polynomials(code: Code, x: Value) -> tuple[Value, Value]:
     # k times a part of π/2 is exact, so contraction into a fused multiply-add changes nothing.
-    first, second, third, _ = _elementary.PI_2
+    first, second, third, fourth = _elementary.PI_2
     k = code.intrinsic("rint", x * (1 / _elementary.PI_2_ROUNDED[0]))
     head = x - k * first
     r = head - k * second
-    tail = ((head - r) - k * second) - k * third
-    reduced = r + tail
-    r, tail = reduced, (r - reduced) + tail
+    tail = (head - r) - k * second
+    # Once more, for angles next to a multiple of π/2, where r is all cancellation.
+    head, r = r, r - k * third
+    tail = tail + ((head - r) - k * third) - k * fourth
     z = r * r
     sine = r + (r * z * _horner(z, _elementary.SIN) + tail)
     half = 0.5 * z

@@ -15,7 +15,8 @@ left is *linear* in the coefficients of order k: a straight line of about as man
 the same for every k. So the coefficients of a motion to any order take one run of `start`, and for each order the
 `products` and one run of `sweep`.
 
-The series of q and q̇ themselves are closed by q̇ₖ = (k+1) qₖ₊₁ and q̈ₖ = (k+1) q̇ₖ₊₁.
+The circle is closed by whoever knows what the outputs are the rates of: by yₖ₊₁ = fₖ / (k+1) for ẏ = f(t, y), by
+qₖ₊₁ = q̇ₖ / (k+1) and q̇ₖ₊₁ = q̈ₖ / (k+1) for q̈(q, q̇, t).
 
 A piecewise operation (`abs`, `select`, `floor` …) has the series of the piece that the state is on: whoever takes steps
 must notice when one crosses the border.
@@ -42,14 +43,15 @@ class StraightLine(NamedTuple):
 
 
 class Series(NamedTuple):
-    """The recurrences of q̈(q, q̇, t, parameters) with n coordinates.
+    """The recurrences of the first `size` outputs of a program, along a motion of its first `moving` inputs.
 
-    `start` takes the inputs of the program and gives q̈, the remaining outputs of the program, and `values` numbers.
-    `sweep` takes qₖ, q̇ₖ and tₖ, then k and 1/k, these values, and one sum for each pair in `products`; it gives q̈ₖ and
-    the coefficient of order k of each of the `rows` that the products are made of.
+    `start` takes the inputs of the program and gives all its outputs, and `values` numbers. `sweep` takes the
+    coefficients of order k of the moving inputs, then k and 1/k, these values, and one sum for each pair in `products`;
+    it gives the coefficients of order k of the outputs, and of each of the `rows` that the products are made of.
     """
 
     size: int
+    moving: int
     start: StraightLine
     sweep: StraightLine
     values: int
@@ -57,19 +59,20 @@ class Series(NamedTuple):
     rows: int
 
 
-def series(program, size: int) -> Series:
-    """The recurrences of a program whose first `size` outputs are q̈, and whose inputs begin with q, q̇, t.
+def series(program, size: int, moving: int) -> Series:
+    """The recurrences of the first `size` outputs; all inputs but the first `moving` are constant along the motion.
 
-    Raises `Unlowerable` for an operation whose series is not known here.
+    For ẏ = f(t, y) with m components these are m outputs and m + 1 inputs (y and t, in any order); for q̈(q, q̇, t) with
+    n coordinates, n and 2n + 1. Raises `Unlowerable` for an operation whose series is not known here.
     """
-    return _Recurrences(program, size).finished()
+    return _Recurrences(program, size, moving).finished()
 
 
 class _Recurrences:
     """Two graphs grow side by side: `start`, the program and the derivatives g; and `sweep`, linear in order k."""
 
-    def __init__(self, program, size: int):
-        self.size, self.moving = size, 2 * size + 1
+    def __init__(self, program, size: int, moving: int):
+        self.size, self.moving = size, moving
         self.start, self.sweep = Graph(10 * program.budget), Graph(20 * program.budget)
         for (op, operands, attribute), kind in zip(program.nodes, program.kinds, strict=True):
             if op == "input":
@@ -133,7 +136,7 @@ class _Recurrences:
         for u, c, slope in zip(operands, of, _SLOPES[op], strict=True):
             if c is None:
                 continue
-            g = slope(self.start.apply, self._number, i, *operands)
+            g = slope(self.start.apply, self.number, i, *operands)
             inner = self.start.operand_of("neg", g)
             sign, g = ("sub", inner) if inner is not None else ("add", g)
             term = apply("mul", c, self.value(g))
@@ -145,18 +148,18 @@ class _Recurrences:
                 total = apply(sign, total, term)
         return total
 
-    def _number(self, x: float) -> int:
+    def number(self, x: float) -> int:
         return self.start.constant(x, "float")
 
-    # ---- the end: only what the accelerations need ----
+    # ---- the end: only what the outputs need ----
 
     def finished(self) -> Series:
         """Both graphs, without the products and values that nothing needs."""
-        accelerations = [self._of_output(i) for i in self.outputs[: self.size]]
+        rates = [self._of_output(i) for i in self.outputs[: self.size]]
         rows = list(self._rows)
         needed: set[int] = set()
         while True:
-            wanted = self._reached([*accelerations, *(self._of_row(*rows[r]) for r in needed)])
+            wanted = self._reached([*rates, *(self._of_row(*rows[r]) for r in needed)])
             found = {row for kind, *which in wanted if kind == "product" for row in which}
             if found == needed:
                 break
@@ -169,8 +172,9 @@ class _Recurrences:
         self._renumber({self._given[key]: self.moving + 2 + k for k, key in enumerate(order)})
         return Series(
             self.size,
+            self.moving,
             StraightLine(*finish(self.start, self.outputs + values)),
-            StraightLine(*finish(self.sweep, accelerations + [self._of_row(*rows[r]) for r in sorted(needed)])),
+            StraightLine(*finish(self.sweep, rates + [self._of_row(*rows[r]) for r in sorted(needed)])),
             len(values),
             tuple((place[a], place[b]) for _, a, b in products),
             len(needed),
@@ -230,7 +234,7 @@ def _mul(r, i, operands, of):
     if b is None:
         return apply("mul", r.value(v), a)
     if u == v:
-        outer = apply("mul", r.value(r.start.apply("mul", r.start.constant(2.0, "float"), u)), a)
+        outer = apply("mul", r.value(r.start.apply("mul", r.number(2.0), u)), a)
     else:
         outer = apply("add", apply("mul", r.value(u), b), apply("mul", r.value(v), a))
     return apply("add", outer, r.product(u, v))
@@ -238,7 +242,7 @@ def _mul(r, i, operands, of):
 
 def _div(r, i, operands, of):
     (_, v), (a, b), apply = operands, of, r.sweep.apply
-    inverse = r.value(r.start.apply("div", r.start.constant(1.0, "float"), v))
+    inverse = r.value(r.start.apply("div", r.number(1.0), v))
     if b is None:
         return apply("mul", a, inverse)
     taken = apply("add", apply("mul", r.value(i), b), r.product(i, v))
@@ -246,8 +250,17 @@ def _div(r, i, operands, of):
 
 
 def _sqrt(r, i, operands, of):
-    half_inverse = r.value(r.start.apply("div", r.start.constant(0.5, "float"), i))
+    half_inverse = r.value(_finite(r.start.apply, r.number, r.start.apply("div", r.number(0.5), i)))
     return r.sweep.apply("mul", r.sweep.apply("sub", of[0], r.product(i, i)), half_inverse)
+
+
+def _rem(r, i, operands, of):
+    """u − n v, with the whole number n that is right at order zero."""
+    (u, v), (a, b), f = operands, of, r.start.apply
+    if b is None:
+        return a
+    taken = r.sweep.apply("mul", r.value(f("round", f("div", f("sub", u, i), v), attribute=1)), b)
+    return r.sweep.apply("neg", taken) if a is None else r.sweep.apply("sub", a, taken)
 
 
 def _select(r, i, operands, of):
@@ -262,13 +275,13 @@ def _select(r, i, operands, of):
 
 def _choose(r, predicate: int, no: int, yes: int) -> int:
     """`yes` where the predicate, a node of the program, holds at order zero, else `no`."""
-    flag = r.start.apply("select", predicate, r.start.constant(0.0, "float"), r.start.constant(1.0, "float"))
+    flag = r.start.apply("select", predicate, r.number(0.0), r.number(1.0))
     holds = r.sweep.apply("gt", r.value(flag), r.sweep.constant(0.5, "float"))
     return r.sweep.apply("select", holds, no, yes)
 
 
 def _abs(r, i, operands, of):
-    below = r.start.apply("lt", operands[0], r.start.constant(0.0, "float"))
+    below = r.start.apply("lt", operands[0], r.number(0.0))
     return _choose(r, below, of[0], r.sweep.apply("neg", of[0]))
 
 
@@ -283,7 +296,7 @@ def _extremum(comparison: str) -> Callable:
 
 _RULES: dict[str, Callable] = {
     "add": _add, "sub": _add, "neg": _neg, "mul": _mul, "div": _div, "sqrt": _sqrt, "select": _select, "abs": _abs,
-    "max": _extremum("gt"), "min": _extremum("lt"),
+    "rem": _rem, "max": _extremum("gt"), "min": _extremum("lt"),
 }  # fmt: skip
 _STEPS = {"floor", "ceil", "round", "sign"}  # constant between their jumps
 
@@ -307,6 +320,18 @@ def _square(f, x):
     return f("mul", x, x)
 
 
+def _finite(f, c, slope):
+    """0 for a slope that is infinite, or 0/0, where the function itself is not: there is no series there.
+
+    It may not be needed, as on the flat side of max(q, 0)**1.5; where it is, the step fails its check.
+    """
+    return f("select", f("is_finite", slope), c(0.0), slope)
+
+
+def _over_root(f, c, x):
+    return _finite(f, c, _over(f, c, f("sqrt", x)))
+
+
 def _gauss(sign: float) -> Callable:
     def slope(f, c, w, u):
         return f("mul", c(sign * 2 / math.sqrt(math.pi)), f("exp", f("neg", _square(f, u))))
@@ -322,12 +347,12 @@ _SLOPES: dict[str, tuple[Callable, ...]] = {
     "sin": (lambda f, c, w, u: f("cos", u),),
     "cos": (lambda f, c, w, u: f("neg", f("sin", u)),),
     "tan": (lambda f, c, w, u: _one_plus(f, c, _square(f, w)),),
-    "asin": (lambda f, c, w, u: _over(f, c, f("sqrt", _one_minus_square(f, c, u))),),
-    "acos": (lambda f, c, w, u: f("neg", _over(f, c, f("sqrt", _one_minus_square(f, c, u)))),),
+    "asin": (lambda f, c, w, u: _over_root(f, c, _one_minus_square(f, c, u)),),
+    "acos": (lambda f, c, w, u: f("neg", _over_root(f, c, _one_minus_square(f, c, u))),),
     "atan": (lambda f, c, w, u: _over(f, c, _one_plus(f, c, _square(f, u))),),
     "atan2": (
-        lambda f, c, w, y, x: f("div", x, _radius_squared(f, y, x)),
-        lambda f, c, w, y, x: f("neg", f("div", y, _radius_squared(f, y, x))),
+        lambda f, c, w, y, x: _finite(f, c, f("div", x, _radius_squared(f, y, x))),
+        lambda f, c, w, y, x: f("neg", _finite(f, c, f("div", y, _radius_squared(f, y, x)))),
     ),
     "exp": (lambda f, c, w, u: w,),
     "exp2": (lambda f, c, w, u: f("mul", c(math.log(2.0)), w),),
@@ -339,14 +364,14 @@ _SLOPES: dict[str, tuple[Callable, ...]] = {
     "cosh": (lambda f, c, w, u: f("sinh", u),),
     "tanh": (lambda f, c, w, u: _one_minus_square(f, c, w),),
     "asinh": (lambda f, c, w, u: _over(f, c, f("sqrt", _one_plus(f, c, _square(f, u)))),),
-    "acosh": (lambda f, c, w, u: _over(f, c, f("sqrt", f("sub", _square(f, u), c(1.0)))),),
+    "acosh": (lambda f, c, w, u: _over_root(f, c, f("sub", _square(f, u), c(1.0))),),
     "atanh": (lambda f, c, w, u: _over(f, c, _one_minus_square(f, c, u)),),
     "erf": (_gauss(1.0),),
     "erfc": (_gauss(-1.0),),
     "rsqrt": (lambda f, c, w, u: f("div", f("mul", c(-0.5), w), u),),
-    "cbrt": (lambda f, c, w, u: f("div", w, f("mul", c(3.0), u)),),
+    "cbrt": (lambda f, c, w, u: _finite(f, c, f("div", w, f("mul", c(3.0), u))),),
     "pow": (
-        lambda f, c, w, u, v: f("div", f("mul", v, w), u),
-        lambda f, c, w, u, v: f("mul", w, f("log", u)),
+        lambda f, c, w, u, v: _finite(f, c, f("div", f("mul", v, w), u)),
+        lambda f, c, w, u, v: _finite(f, c, f("mul", w, f("log", u))),
     ),
 }
