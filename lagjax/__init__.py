@@ -10,6 +10,7 @@ from lagjax._results import RESULTS, SimulationError
 from lagjax._simulate import simulate, simulate_batch
 from lagjax._solvers import FineOutput, Unrolled
 from lagjax._system import System
+from lagjax._taylor import Taylor
 from lagjax._trajectory import State, Trajectory
 
 __version__ = "0.1.0"
@@ -20,6 +21,7 @@ __all__ = [
     "SimulationError",
     "State",
     "System",
+    "Taylor",
     "Trajectory",
     "Unrolled",
     "WorkPrecision",

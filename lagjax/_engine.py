@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import _native
-from lagjax._equations import scalar_program
+from lagjax._equations import projection_program, scalar_program
 from lagjax._flow import Flow, Outcome, Tolerances, unfit
 from lagjax._layout import Layout
 from lagjax._program import Unlowerable
@@ -89,10 +89,12 @@ class _Scene(NamedTuple):
 def _made(scene: _Scene) -> "Flow | str":
     system, layout, params = scene.rebuilt()
     try:
-        program = scalar_program(system.motion(layout, params), layout, eqx.filter(params, eqx.is_array_like))
+        motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
+        program = scalar_program(motion, layout, numbers)
+        projection = projection_program(motion, layout, numbers)
     except Unlowerable as reason:
         return str(reason)
-    return unfit(program, layout.size, layout.dtype) or Flow(program, layout.size)
+    return unfit(program, layout.size, layout.dtype) or Flow(program, layout.size, projection)
 
 
 # ---- one trajectory --------------------------------------------------------------------------------------------------

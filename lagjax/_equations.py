@@ -6,6 +6,7 @@ forms give the same motion to round-off, and are tested against each other.
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -41,16 +42,35 @@ class Equations(eqx.Module):
         """(q̇, q̈)."""
         return y[1], self.acceleration(t, y, params)[0]
 
+    @property
+    @abc.abstractmethod
+    def constrained(self) -> bool:
+        """Whether there is anything to project to."""
+
+    @abc.abstractmethod
+    def projected(self, t: jax.Array, y: State, params: PyTree) -> State:
+        """y after one Newton step back to the constraints."""
+
 
 class ArrayEquations(Equations):
     """Derivatives as JAX arrays; `reason` says why."""
 
+    motion: Motion = eqx.field(static=True)
     derived: Any = eqx.field(static=True)
     reason: str = eqx.field(static=True)
 
     def __init__(self, motion: Motion, reason: str):
+        self.motion, self.reason = motion, reason
         self.derived = jax.jit(motion.solved_acceleration)  # traced once, however often it is called
-        self.reason = reason
+
+    @property
+    def constrained(self) -> bool:
+        """Whether the scene has constraints."""
+        return self.motion.constrained
+
+    def projected(self, t, y, params):
+        """By `Motion.projected`."""
+        return self.motion.projected(*y, t, params)
 
     def acceleration(self, t, y, params):
         """By `Motion.solved_acceleration`."""
@@ -61,10 +81,21 @@ class ScalarEquations(Equations):
     """A scalar program for q̈: inputs q, q̇, t and every number in params; outputs q̈ and whether M is singular."""
 
     program: Program = eqx.field(static=True)
+    projection: Program | None = eqx.field(static=True)
     called: Any = eqx.field(static=True)
 
-    def __init__(self, program: Program):
-        self.program, self.called = program, jax.jit(program.__call__)
+    def __init__(self, program: Program, projection: Program | None = None):
+        self.program, self.projection, self.called = program, projection, jax.jit(program.__call__)
+
+    @property
+    def constrained(self) -> bool:
+        """Whether the scene has constraints."""
+        return self.projection is not None
+
+    def projected(self, t, y, params):
+        """By the second program."""
+        state = self.projection(*y[0], *y[1], t, *_scalars(params))
+        return jnp.stack(state[: len(state) // 2]), jnp.stack(state[len(state) // 2 :])
 
     def acceleration(self, t, y, params):
         """By the program."""
@@ -88,7 +119,7 @@ def equations(motion: Motion, layout: Layout, params: PyTree, path: str = "auto"
     if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:
         reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
         return ArrayEquations(motion, reason)
-    return ScalarEquations(program)
+    return ScalarEquations(program, projection_program(motion, layout, params))
 
 
 def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
@@ -96,41 +127,96 @@ def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
 
     Its inputs are q, q̇, t and every number in params. Raises `Unlowerable` with the reason.
     """
-    n = layout.size
-    if n > LARGEST_SCALAR_SCENE:
-        raise Unlowerable(f"it has {n} coordinates, more than {LARGEST_SCALAR_SCENE}")
-    q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
-    parts = lower(motion.mass_matrix_and_force, q, q, t, params, budget=OPERATION_BUDGET)
+    _require_small(layout)
+    if not motion.constrained:
+        return _eliminated(motion.mass_matrix_and_force, motion, layout, params)
 
-    def accelerations(*scalars):
-        values = parts(*scalars)
-        matrix = [[values[n * i + j] for j in range(n)] for i in range(n)]
-        x, singular = _linear.eliminate(matrix, list(values[n * n :]), _zeros(parts, n), layout.dtype)
+    def saddle(*state):
+        return *motion.mass_matrix_and_force(*state), *motion.rows_and_targets(*state)
+
+    return _eliminated(saddle, motion, layout, params)
+
+
+def projection_program(motion: Motion, layout: Layout, params: PyTree) -> Program | None:
+    """`Motion.projected` as a program, from q, q̇, t and the numbers in params to q and q̇; None without constraints."""
+    if not motion.constrained:
+        return None
+    n = layout.size
+
+    def step(parts):
+        def with_no_force(*state):
+            matrix, rows, target = parts(*state)
+            return matrix, jnp.zeros(n, layout.dtype), rows, target
+
+        return _eliminated(with_no_force, motion, layout, params)
+
+    velocity = step(motion.velocity_saddle)
+    position = None if motion.constraints is None else step(motion.position_saddle)
+
+    def projected(*scalars):
+        q, rest = list(scalars[:n]), scalars[n:]
+        if position is not None:
+            q = [x + dx for x, dx in zip(q, position(*scalars), strict=False)]
+        v = [x + dx for x, dx in zip(rest, velocity(*q, *rest), strict=False)]
+        return *q, *v[:n]
+
+    return lower(projected, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
+
+
+def _require_small(layout: Layout) -> None:
+    if layout.size > LARGEST_SCALAR_SCENE:
+        raise Unlowerable(f"it has {layout.size} coordinates, more than {LARGEST_SCALAR_SCENE}")
+
+
+def _eliminated(parts_of: Callable, motion: Motion, layout: Layout, params: PyTree) -> Program:
+    """x with M x = b, or with M x − Gᵀλ = b and G x = c, from a function that returns (M, b) or (M, b, G, c)."""
+    n = layout.size
+    q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
+    parts = lower(parts_of, q, q, t, params, budget=OPERATION_BUDGET)
+    m = (len(parts.outputs) - n * n - n) // (n + 1)  # rows of G
+    regular = _require_definite(parts, n, m)
+    zeros = np.array([parts.constant(i) == 0 for i in range(len(parts.outputs))])
+    mass_zeros, row_zeros = zeros[: n * n].reshape(n, n), zeros[n * n + n : n * n + n + m * n].reshape(m, n)
+
+    def solved(*scalars):
+        values = list(parts(*scalars))
+        matrix = [values[n * i : n * i + n] for i in range(n)]
+        b, values = values[n * n : n * n + n], values[n * n + n :]
+        if not motion.constrained:
+            x, singular = _linear.eliminate(matrix, b, mass_zeros, layout.dtype)
+        else:
+            rows, c = [values[n * i : n * i + n] for i in range(m)], values[m * n :]
+            zeros = (mass_zeros, row_zeros)
+            x, _, singular = _linear.eliminate_saddle(matrix, b, rows, c, zeros, regular, layout.dtype)
         return *x, singular
 
-    _require_definite(parts, n)
-    scalars = [jax.ShapeDtypeStruct((), layout.dtype)] * (2 * n + 1) + [
-        jax.ShapeDtypeStruct((), leaf.dtype) for leaf in jax.tree.leaves(params) for _ in range(leaf.size)
-    ]
-    return lower(accelerations, *scalars, budget=OPERATION_BUDGET)
+    return lower(solved, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
 
 
-def _zeros(parts: Program, n: int) -> np.ndarray:
-    """Which entries of M are zero whatever the state."""
-    return np.array([[parts.constant(n * i + j) == 0 for j in range(n)] for i in range(n)])
+def _scalar_shapes(layout: Layout, params: PyTree) -> list[jax.ShapeDtypeStruct]:
+    """q, q̇, t and every number in params, one by one."""
+    numbers = [jnp.result_type(leaf) for leaf in jax.tree.leaves(params) for _ in range(np.size(leaf))]
+    return [jax.ShapeDtypeStruct((), dtype) for dtype in [layout.dtype] * (2 * layout.size + 1) + numbers]
 
 
-def _require_definite(parts: Program, n: int) -> None:
+def _require_definite(parts: Program, n: int, m: int) -> bool:
     """Elimination without pivoting is for positive definite M; look at a few states whether this M can be.
 
-    The choice is between two right answers: a wrong guess here is caught by the test on the pivots.
+    With constraints it may be singular, and is then helped by GᵀG. Returns whether it needs no help. The choice is
+    between right answers: a wrong guess here is caught by the test on the pivots.
     """
-    rng = np.random.default_rng(0)
+    rng, regular = np.random.default_rng(0), True
     for _ in range(3):
-        values = parts.evaluate(*rng.uniform(0.3, 1.2, parts.size))
-        matrix = np.array(values[: n * n], float).reshape(n, n)
-        if n > 2 and np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] < -1e-12 * np.abs(matrix).max():
-            raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
+        values = np.array(parts.evaluate(*rng.uniform(0.3, 1.2, parts.size)), float)
+        matrix = values[: n * n].reshape(n, n)
+        if np.isfinite(values).all():
+            lowest, size = np.linalg.eigvalsh(matrix)[0], np.abs(matrix).max()
+            regular = regular and lowest > 1e-10 * size
+            rows = values[n * n + n : n * n + n + m * n].reshape(m, n)
+            helped = np.linalg.eigvalsh(matrix + rows.T @ rows)[0] if m else lowest
+            if (n > 2 or m) and helped < -1e-12 * size:
+                raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
+    return regular
 
 
 def _scalars(params: PyTree) -> list[jax.Array]:

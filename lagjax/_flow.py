@@ -66,12 +66,12 @@ class Flow:
     """The map of one program for q̈ with n coordinates.
 
     `program` takes q, q̇, t and then the parameters, number by number; it gives q̈ and whether the mass matrix is
-    singular.
+    singular. `projection`, from the same to (q, q̇), keeps the motion on its constraints.
     """
 
-    def __init__(self, program: Program, size: int):
-        self.program, self.size = program, size
-        self.kernel = _native.Kernel(program, size)
+    def __init__(self, program: Program, size: int, projection: Program | None = None):
+        self.program, self.size, self.projection = program, size, projection
+        self.kernel = _native.Kernel(program, size, projection)
         self.traceable = functools.lru_cache(maxsize=16)(self._traceable)
         self.varied = functools.lru_cache(maxsize=16)(self._varied)
 
@@ -112,24 +112,30 @@ class Flow:
     def _varied(self, by_state: bool, params: tuple[int, ...]) -> "Flow":
         """The flow of q and of ∂q/∂x, for x in y0 (if asked for) and in these parameters; (1 + x's, n) coordinates."""
         n, free = self.size, self.states * by_state  # an initial state has no ∂q̈/∂x
-        rows, numbers = 1 + free + len(params), self.program.size - self.states - 1
+        rows, numbers, chosen = 1 + free + len(params), self.program.size - self.states - 1, jnp.array(params, int)
+
+        def derivative(function, q, v, t, p):
+            """`function(q, v, t, p)` at the first rows, and for the others how it varies with them."""
+            def of_varied(q, v, x):
+                return function(q, v, t, p.at[chosen].set(x))
+
+            by_q, by_v, by_x = jax.jacfwd(of_varied, argnums=(0, 1, 2))(q[0], v[0], p[chosen])
+            varied = (q[1:] @ by_q.T + v[1:] @ by_v.T).at[free:].add(by_x.T)
+            return jnp.concatenate([function(q[0], v[0], t, p)[None], varied])
 
         def accelerations(q, v, t, p):
-            *a, singular = self.program(*q, *v, t, *p)
-            return jnp.stack(a), singular
+            return jnp.stack(self.program(*q, *v, t, *p)[:n])
 
-        def varied(q, v, t, p):
-            def with_chosen(q, v, chosen):
-                return accelerations(q, v, t, p.at[jnp.array(params, int)].set(chosen))[0]
+        def moving(q, v, t, p):
+            return derivative(accelerations, q, v, t, p), self.program(*q[0], *v[0], t, *p)[n]
 
-            chosen = p[jnp.array(params, int)]
-            by_q, by_v, by_x = jax.jacfwd(with_chosen, argnums=(0, 1, 2))(q[0], v[0], chosen)
-            a, singular = accelerations(q[0], v[0], t, p)
-            return a, (q[1:] @ by_q.T + v[1:] @ by_v.T).at[free:].add(by_x.T), singular
+        def projected(q, v, t, p):
+            both = derivative(lambda *state: jnp.stack(self.projection(*state[0], *state[1], t, *state[3])), q, v, t, p)
+            return both[:, :n], both[:, n:]
 
-        shapes = ((rows, n), (rows, n), (), (numbers,))
-        program = lower(varied, *(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes), budget=_BUDGET)
-        return Flow(program, rows * n)
+        shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((rows, n), (rows, n), (), (numbers,))]
+        projection = None if self.projection is None else lower(projected, *shapes, budget=_BUDGET)
+        return Flow(lower(moving, *shapes, budget=_BUDGET), rows * n, projection)
 
 
 def _push(flow: Flow, tolerances: Tolerances, primals, tangents) -> tuple[Outcome, Outcome]:

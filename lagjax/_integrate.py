@@ -11,6 +11,7 @@ first ones, differ from them in the last digit, and then accept or reject otherw
 a word. This is the only module that calls diffrax's integrator.
 """
 
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import diffrax
@@ -19,8 +20,10 @@ import jax
 import jax.numpy as jnp
 
 from lagjax._equations import Equations
+from lagjax._program import plain_elementary
 from lagjax._settings import Settings
-from lagjax._solvers import FineOutput
+from lagjax._solvers import FineOutput, Projected
+from lagjax._taylor import Taylor
 
 PyTree = Any
 
@@ -42,25 +45,36 @@ def integrate(form: Equations, settings: Settings, event: diffrax.Event | None, 
     those of the diffrax adjoint.
     """
     # What f closes over (a parameter from outside, the weights of a neural Lagrangian) becomes an argument.
-    field = eqx.filter_closure_convert(form.vector_field, ts[0], y0, params)
+    # A Taylor solver takes the equations apart once more, and must find sin and not the polynomial behind it.
+    with plain_elementary() if isinstance(settings.solver, Taylor) else nullcontext():
+        field = eqx.filter_closure_convert(form.vector_field, ts[0], y0, params)
+    project = eqx.filter_closure_convert(form.projected, ts[0], y0, params) if form.constrained else None
+    solved = _differentiable((field, project, ts, y0, params), settings, event)
+    if project is not None:
+        solved = solved._replace(path=jax.vmap(project, in_axes=(0, 0, None))(ts, solved.path, params))
+    return solved
+
+
+def _differentiable(moving, settings: Settings, event) -> Solved:
     if settings.adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if settings.adjoint is None else settings.adjoint
-        return _solve((field, ts, y0, params), settings, settings.controller, adjoint, event)
+        return _solve(moving, settings, settings.controller, adjoint, event)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
     frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, settings)
-    return _over_recorded_steps((field, ts, y0, params), frozen)
+    return _over_recorded_steps(moving, frozen)
 
 
 def _solve(moving, settings: Settings, controller, adjoint, event=None, record: bool = False):
     """Call diffrax; `moving` is all that can be differentiated. With `record`, the accepted times come along."""
-    field, ts, y0, params = moving
+    field, project, ts, y0, params = moving
+    solver = _looping(settings.solver, adjoint)
     fixed_dt = settings.dt0 if controller is settings.controller else None
     saved = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]
     if record:
         saved.append(diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t))
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
-        _looping(settings.solver, adjoint),
+        solver if project is None else Projected(solver, project),
         t0=ts[0],
         t1=ts[-1],
         dt0=fixed_dt,
@@ -109,7 +123,7 @@ def _backward(residuals, cotangents, perturbed, moving, settings):
     times, t_end, result = residuals
 
     def replay(moving):
-        field, ts, y0, params = moving
+        field, project, ts, y0, params = moving
         # A member that stopped early is replayed as far as it came; nothing flows back from beyond.
         whole = result == diffrax.RESULTS.successful
         forward = ts[-1] > ts[0]
@@ -117,7 +131,7 @@ def _backward(residuals, cotangents, perturbed, moving, settings):
         ts = jnp.where(whole, ts, reached)
         # The last step ends at ts[-1] itself, which may be differentiated, not at its recorded value.
         controller = _Replay(jnp.where(times == t_end, jnp.inf, times))
-        solved = _solve((field, ts, y0, params), settings, controller, diffrax.RecursiveCheckpointAdjoint())
+        solved = _solve((field, project, ts, y0, params), settings, controller, diffrax.RecursiveCheckpointAdjoint())
         return solved.path, solved.end, solved.t_end
 
     replayed, pull_back = eqx.filter_vjp(replay, moving)

@@ -83,20 +83,29 @@ def _cramer(matrix, b, zeros, small):
 
 
 def _ldl(matrix, b, zeros, small):
-    n, singular = len(b), jnp.zeros((), bool)
-    filled = ~zeros  # where L has entries: those of M and what elimination fills in
+    factors, singular = _ldl_factors(matrix, ~zeros, small)
+    return _ldl_solve(factors, b), singular
+
+
+def _ldl_factors(matrix, filled, small, drop: bool = False):
+    """L, D⁻¹ and where L has entries, and whether a pivot was lost to round-off.
+
+    A lost pivot becomes NaN; with `drop` its row is left out instead, which for a consistent system changes nothing.
+    """
+    n, singular, filled = len(matrix), jnp.zeros((), bool), filled.copy()
     lower, scaled, inverse = {}, {}, [None] * n  # L, L D and D⁻¹, column by column
     for j in range(n):
         before = [k for k in range(j) if filled[j, k]]
         pivot = matrix[j][j]
         for k in before:
             pivot = pivot - lower[j, k] * scaled[j, k]
-        if before or zeros[j, j]:
-            lost = pivot <= small * matrix[j][j]
-            singular, pivot = singular | lost, jnp.where(lost, jnp.nan, pivot)
+        lost = pivot <= small * matrix[j][j] if before or not filled[j, j] else pivot == 0
+        singular = singular | lost
+        if drop:
+            inverse[j] = jnp.where(lost, 0.0, 1 / jnp.where(lost, 1.0, pivot))
         else:
-            singular = singular | (pivot == 0)
-        inverse[j] = 1 / pivot
+            guarded = before or not filled[j, j]
+            inverse[j] = 1 / (jnp.where(lost, jnp.nan, pivot) if guarded else pivot)
         for i in range(j + 1, n):
             shared = [k for k in before if filled[i, k]]
             if filled[i, j] or shared:
@@ -106,7 +115,12 @@ def _ldl(matrix, b, zeros, small):
                     entry = entry - lower[i, k] * scaled[j, k]
                 scaled[i, j] = entry
                 lower[i, j] = entry * inverse[j]
-    x = list(b)
+    return (lower, inverse, filled), singular
+
+
+def _ldl_solve(factors, b) -> list:
+    lower, inverse, filled = factors
+    x, n = list(b), len(b)
     for i in range(n):
         for k in range(i):
             if filled[i, k]:
@@ -116,7 +130,104 @@ def _ldl(matrix, b, zeros, small):
         for k in range(i + 1, n):
             if filled[k, i]:
                 x[i] = x[i] - lower[k, i] * x[k]
-    return x, singular
+    return x
+
+
+# ---- with constraints: the saddle point ------------------------------------------------------------------------------
+#
+#     M x − Gᵀλ = b,   G x = c
+#
+# M may be singular where the constraints hold what it does not: adding GᵀG x = Gᵀc to the first line changes neither x
+# nor λ and makes the matrix K = M + GᵀG regular whenever the saddle point is.
+
+
+def saddle(matrix: jax.Array, b: jax.Array, rows: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """x, λ of least norm, and whether the saddle point is singular, for arrays."""
+    weight = jax.lax.stop_gradient(_weights(matrix, rows))
+    held = factorize(matrix + rows.T @ (weight[:, None] * rows))
+    solve = jax.vmap(held.solve, in_axes=1, out_axes=1)
+    free, responses = held.solve(b + rows.T @ (weight * c)), solve(rows.T)
+    multipliers = least_norm(rows @ responses, c - rows @ free)
+    return free + responses @ multipliers, multipliers, held.singular
+
+
+def _weights(matrix, rows):
+    """Weights that make every row of G as heavy as M."""
+    size = jnp.sum(rows**2, axis=1)
+    return jnp.max(jnp.abs(jnp.diagonal(matrix))) / jnp.where(size > 0, size, 1)
+
+
+def rank_tolerance(dtype) -> float:
+    """The part of a constraint, scaled to 1, below which it counts as a combination of the others: eps^(2/3)."""
+    return float(jnp.finfo(dtype).eps) ** (2 / 3)
+
+
+@jax.custom_jvp
+def least_norm(matrix: jax.Array, b: jax.Array) -> jax.Array:
+    """The shortest x with S x = b for a positive semi-definite S of any rank and b in its range.
+
+    The rank is that of S scaled to a unit diagonal, where an eigenvalue below `rank_tolerance` counts as zero.
+    """
+    return _inverse_on_range(matrix) @ b
+
+
+def _inverse_on_range(matrix):
+    scale = _diagonal_scale(matrix)
+    values, vectors = jnp.linalg.eigh(_scaled(matrix, scale))
+    kept = values > rank_tolerance(matrix.dtype)
+    half = jnp.where(kept, jax.lax.rsqrt(jnp.where(kept, values, 1)), 0) * vectors
+    some = scale[:, None] * (half @ half.T) * scale  # solves S x = b, but its x need not be the shortest
+    # What of x lies in the kernel of S is taken out: the kernel of the scaled matrix, scaled back.
+    kernel = jnp.where(kept, 0, 1) * scale[:, None] * vectors
+    gram = kernel.T @ kernel + jnp.diag(jnp.where(kept, 1.0, 0.0))
+    outside = jnp.eye(len(matrix)) - kernel @ jnp.linalg.solve(gram, kernel.T)
+    return outside @ some @ outside
+
+
+@least_norm.defjvp
+def _least_norm_jvp(primals, tangents):
+    # Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973) 413, for a symmetric matrix of constant rank and b in its range.
+    (matrix, b), (d_matrix, d_b) = primals, tangents
+    inverse = _inverse_on_range(matrix)
+    x = inverse @ b
+    outside = jnp.eye(len(matrix)) - inverse @ matrix
+    return x, inverse @ (d_b - d_matrix @ x) + outside @ (d_matrix @ (inverse @ x))
+
+
+def eliminate_saddle(matrix, b, rows, c, zeros, regular: bool, dtype) -> tuple[list, list, jax.Array]:
+    """The same as `saddle` on scalars, without pivoting: M positive (semi)definite, `rows` a list of lists.
+
+    `zeros` marks what is zero in (M, G) whatever the state; `regular` says that M needs no help. Redundant rows are
+    left out of λ: the motion is the same, the multipliers are a solution but not the shortest.
+    """
+    n, m = len(matrix), len(rows)
+    mass_zeros, row_zeros = zeros
+    small = singular_threshold(n, dtype)
+    if not regular:
+        touched = ~row_zeros
+        mass_zeros = mass_zeros & ~((touched.T.astype(int) @ touched.astype(int)) > 0)
+        matrix = [
+            [matrix[i][j] + _dot((rows[k][i], rows[k][j]) for k in range(m) if touched[k, i] and touched[k, j])
+             for j in range(n)] for i in range(n)
+        ]  # fmt: skip
+        b = [b[i] + _dot((rows[k][i], c[k]) for k in range(m) if touched[k, i]) for i in range(n)]
+    factors, singular = _ldl_factors(matrix, ~mass_zeros, small)
+    free = _ldl_solve(factors, b)
+    responses = [_ldl_solve(factors, row) for row in rows]
+    schur = [[_dot((rows[i][k], responses[j][k]) for k in range(n) if not row_zeros[i, k]) for j in range(m)]
+             for i in range(m)]  # fmt: skip
+    missing = [c[i] - _dot((rows[i][k], free[k]) for k in range(n) if not row_zeros[i, k]) for i in range(m)]
+    kept, _ = _ldl_factors(schur, np.ones((m, m), bool), rank_tolerance(dtype), drop=True)
+    multipliers = _ldl_solve(kept, missing)
+    x = [free[k] + _dot((responses[i][k], multipliers[i]) for i in range(m)) for k in range(n)]
+    return x, multipliers, singular
+
+
+def _dot(pairs):
+    total = 0.0
+    for a, b in pairs:
+        total = total + a * b
+    return total
 
 
 def _diagonal_scale(matrix: jax.Array) -> jax.Array:

@@ -14,6 +14,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The state or its acceleration became NaN or infinite. Look at the Lagrangian, its gradient and the parameters "
         "there: a square root or norm at zero, a logarithm of a negative number, a branch of `where` that is not taken."
     )
+    inconsistent_start = (
+        "The initial state does not satisfy the constraints. Put it there first: system.project(q0, qdot0, t, params)."
+    )
     mass_matrix_singular = (
         "The mass matrix d2L/dqdot2 became singular. Some velocity, or combination of velocities, has no kinetic "
         "energy there: add it, drop the coordinate, or use coordinates that are regular there (polar coordinates are "

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import _engine, _linear
+from lagjax._consistent import inconsistent_members, require_consistent
 from lagjax._equations import equations
 from lagjax._integrate import integrate
 from lagjax._layout import Layout
@@ -97,6 +98,7 @@ def simulate(
         require_finite(value, name)
 
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
+    require_consistent(system, layout, settings.ts, q0, qdot0, params)
     flow = _engine.flow_for(system, settings, layout, q0, qdot0, params)
     if isinstance(flow, str):
         fields = _integrate(system, settings, q0, qdot0, params)
@@ -149,6 +151,7 @@ def simulate_batch(
     for name, value in values.items():
         require_finite(jax.tree.map(lambda leaf, axis: leaf if axis is None else None, value, axes[name]), name)
 
+    astray = inconsistent_members(system, layout, settings.ts, values, axes)
     flow = _engine.flow_for(system, settings, layout, *member.values())
     if isinstance(flow, str):
         fields = _integrate_batch(system, settings, *values.values(), _Static(tuple(batch_axes)))
@@ -159,7 +162,8 @@ def simulate_batch(
     else:
         run = jax.vmap(lambda *one: _engine.run(flow, settings, layout, *one), in_axes=tuple(batch_axes))
         fields = run(*values.values())
-    return Trajectory(jnp.asarray(settings.ts), *fields[1:], system, values["params"], batch_axes[2])
+    trajectory = Trajectory(jnp.asarray(settings.ts), *fields[1:], system, values["params"], batch_axes[2])
+    return trajectory if astray is None else _refused(trajectory, astray)
 
 
 class _Static(eqx.Module):
@@ -258,6 +262,18 @@ def _axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyT
     if 0 in sizes.values():
         raise ValueError("The batch is empty.")
     return axes, next(iter(sizes.values()))
+
+
+def _refused(trajectory: Trajectory, astray: jax.Array) -> Trajectory:
+    """The same without the members that did not start on their constraints: they are NaN, and say so."""
+
+    def without(leaf):
+        return jnp.where(astray.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.nan, leaf)
+
+    codes = jnp.where(astray, RESULTS.inconsistent_start._value, trajectory.result._value)
+    result = eqx.tree_at(lambda r: r._value, trajectory.result, codes)
+    q, qdot = jax.tree.map(without, (trajectory.q, trajectory.qdot))
+    return eqx.tree_at(lambda t: (t.q, t.qdot, t.result), trajectory, (q, qdot, result))
 
 
 def _first_member(tree: PyTree, axes: PyTree) -> PyTree:

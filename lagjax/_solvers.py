@@ -153,6 +153,43 @@ def _pick(stacked: PyTree, index: int) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[index], stacked)
 
 
+class Projected(diffrax.AbstractAdaptiveSolver):
+    """The steps of a solver, each followed by a projection of the state: `project(t, y, args)` → y.
+
+    The error estimate and the states inside a step are those of the solver.
+    """
+
+    solver: diffrax.AbstractSolver
+    project: Callable
+
+    @property
+    def term_structure(self):
+        """That of the solver."""
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self) -> Callable:
+        """That of the solver."""
+        return self.solver.interpolation_cls
+
+    def order(self, terms) -> int:
+        """The order of the solver."""
+        return self.solver.order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        """The state of the solver."""
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def func(self, terms, t0, y0, args):
+        """The slope."""
+        return self.solver.func(terms, t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """The solver's step, then the projection. A slope kept from the step before belongs to another state."""
+        y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, True)
+        return self.project(t1, y1, args), error, dense, state, result
+
+
 class Unrolled(diffrax.AbstractAdaptiveSolver):
     """The steps, error estimate and interpolation of an explicit Runge–Kutta solver of diffrax, without its stage loop.
 

@@ -4,17 +4,19 @@ A `System` holds the user's functions, checked for their signatures when it is b
 first meet a state. `System.motion(layout)` hands the same scene on, in flat coordinates, to whoever integrates it.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lagjax._arguments import Function, accept
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
-from lagjax._motion import Motion
+from lagjax._motion import Motion, projected_until_consistent
 
 PyTree = Any
 
@@ -24,7 +26,12 @@ class System(eqx.Module):
 
     The equations of motion are those of Lagrange, with generalised forces Q and a Rayleigh dissipation function D,
 
-        d/dt ∂L/∂q̇ = ∂L/∂q + Q − ∂D/∂q̇.
+        d/dt ∂L/∂q̇ = ∂L/∂q + Q − ∂D/∂q̇ + (∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ.
+
+    The multipliers λ, μ are those for which f and a stay zero. Their sign is that of L̄ = L + Σ λ f, so that (∂f/∂q)ᵀλ
+    is the force that the constraint exerts. Constraints on velocities act by the principle of d'Alembert and Lagrange:
+    their force does no work on the velocities they allow. They are not added to L. M may be singular where constraints
+    hold what L does not; redundant constraints change nothing but the multipliers, of which the shortest are given.
 
     **Arguments**
 
@@ -32,6 +39,8 @@ class System(eqx.Module):
       an array, a dict, a NamedTuple); `qdot` has the same structure. L need not be T − U.
     - `forces(q, qdot)`: the generalised forces Q that no potential gives, in the structure of `q`.
     - `dissipation(q, qdot)`: the scalar D, half the power that is dissipated when D is quadratic in `qdot`.
+    - `constraints(q)`: what must stay zero, f(q, t) = 0: a number, an array, or a dict of named ones.
+    - `velocity_constraints(q, qdot)`: a(q, q̇, t) = 0 that cannot be integrated to such an f: rolling, skates.
 
     Each may also ask, by name, for the time `t` and the parameters `params` (any pytree).
 
@@ -62,6 +71,8 @@ class System(eqx.Module):
     lagrangian: Function
     forces: Function | None
     dissipation: Function | None
+    constraints: Function | None
+    velocity_constraints: Function | None
     path: str = eqx.field(static=True)
 
     def __init__(
@@ -70,6 +81,8 @@ class System(eqx.Module):
         *,
         forces: Callable | None = None,
         dissipation: Callable | None = None,
+        constraints: Callable | None = None,
+        velocity_constraints: Callable | None = None,
         path: Literal["auto", "scalar", "array"] = "auto",
     ):
         if path not in ("auto", "scalar", "array"):
@@ -78,6 +91,10 @@ class System(eqx.Module):
         self.lagrangian = accept(lagrangian, "lagrangian")
         self.forces = None if forces is None else accept(forces, "forces")
         self.dissipation = None if dissipation is None else accept(dissipation, "dissipation")
+        self.constraints = None if constraints is None else accept(constraints, "constraints", ("q",))
+        self.velocity_constraints = (
+            None if velocity_constraints is None else accept(velocity_constraints, "velocity_constraints")
+        )
 
     def acceleration(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
         """q̈ from Lagrange's equations, in the structure of `q`; NaN where the mass matrix is singular."""
@@ -98,6 +115,35 @@ class System(eqx.Module):
     def energy(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> jax.Array:
         """h = p·q̇ − L. It changes by dh/dt = −∂L/∂t + (Q − ∂D/∂q̇)·q̇, and need not equal T + U."""
         return self._at(Motion.energy, q, qdot, t, params)
+
+    def multipliers(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
+        """λ, in the structure that the constraint functions return: a dict by name if they return dicts.
+
+        With both kinds of constraints: one dict if both return dicts, else the pair (λ, μ).
+        """
+        return self._of_constraints(Motion.multipliers, q, qdot, t, params)
+
+    def constraint_residual(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
+        """f and a, in the structure of `multipliers`: zero where the constraints hold."""
+        return self._of_constraints(Motion.residual, q, qdot, t, params)
+
+    def constraint_force(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
+        """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ, in the structure of `q`."""
+        self._require_constraints()
+        return self._at(Motion.constraint_force, q, qdot, t, params, restore=True)
+
+    def project(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> tuple[PyTree, PyTree]:
+        """The nearest consistent state: f = 0 for q, in the metric of M; then J q̇ + ∂f/∂t = 0 and a = 0 for q̇.
+
+        By Newton's method, differentiable (of the last step). The result is NaN where it does not arrive in 50 steps.
+        """
+        self._require_constraints()
+        layout = Layout.of(q, qdot)
+        t, numbers = jnp.asarray(t, layout.dtype), eqx.filter(params, eqx.is_array_like)
+        state = projected_until_consistent(
+            self.motion(layout, params), layout.flatten(q), layout.flatten(qdot), t, numbers
+        )
+        return layout.restore(state[0]), layout.restore(state[1])
 
     def explain(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> Explanation:
         """What this scene contains and what was left out of its equations; print it, or read its fields.
@@ -129,12 +175,51 @@ class System(eqx.Module):
 
             return of_vectors
 
+        def held(q, t, numbers):
+            return _end_to_end(self.constraints(layout.restore(q), t=t, params=eqx.combine(numbers, code)))
+
+        velocities = flat(self.velocity_constraints)
+
         forces = flat(self.forces) if self.forces is not None else None
         return Motion(
             lagrangian=flat(self.lagrangian),
             forces=None if forces is None else lambda *state: layout.flatten(forces(*state)),
             dissipation=flat(self.dissipation) if self.dissipation is not None else None,
+            constraints=held if self.constraints is not None else None,
+            velocity_constraints=None
+            if self.velocity_constraints is None
+            else lambda *state: _end_to_end(velocities(*state)),
         )
+
+    def _require_constraints(self) -> None:
+        if self.constraints is None and self.velocity_constraints is None:
+            raise ValueError("This system has no constraints: give constraints=... or velocity_constraints=... to it.")
+
+    def _of_constraints(self, quantity: Callable, q, qdot, t, params) -> PyTree:
+        self._require_constraints()
+        flat, structure = self._at(quantity, q, qdot, t, params), self.constraint_structure(Layout.of(q, qdot), params)
+        ends = np.cumsum([0, *(math.prod(leaf.shape) for leaf in jax.tree.leaves(structure))]).tolist()
+        pieces = [
+            flat[start:end].reshape(leaf.shape)
+            for start, end, leaf in zip(ends[:-1], ends[1:], jax.tree.leaves(structure), strict=True)
+        ]
+        held = jax.tree.unflatten(jax.tree.structure(structure), pieces)
+        if len(held) == 1:
+            return held[0]
+        return {**held[0], **held[1]} if all(isinstance(part, dict) for part in held) else held
+
+    def constraint_structure(self, layout: Layout, params: PyTree) -> tuple:
+        """The shapes that the constraint functions return, a tuple of one or two pytrees."""
+        numbers, code = eqx.partition(params, eqx.is_array_like)
+
+        def returned(q, t, p):
+            extras = {"t": t, "params": eqx.combine(p, code)}
+            held = [] if self.constraints is None else [self.constraints(q, **extras)]
+            held += [] if self.velocity_constraints is None else [self.velocity_constraints(q, q, **extras)]
+            return tuple(held)
+
+        state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
+        return jax.eval_shape(returned, state, t, numbers)
 
     def _at(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
         """Evaluate one of `Motion`'s functions at a state given in the user's pytree."""
@@ -157,6 +242,8 @@ class System(eqx.Module):
                 _require_scalar(returned(function), role)
         if self.forces is not None:
             _require_structure(returned(self.forces), layout)
+        if self.constraints is not None or self.velocity_constraints is not None:
+            _require_constraints(self.constraint_structure(layout, params), layout)
 
 
 def _require_scalar(value: PyTree, role: str) -> None:
@@ -166,6 +253,22 @@ def _require_scalar(value: PyTree, role: str) -> None:
         raise TypeError(f"{role} must return one scalar; got an array of shape {value.shape} (a missing sum?).")
     if not jnp.issubdtype(value.dtype, jnp.floating):
         raise TypeError(f"{role} must return a real floating-point number; got {value.dtype}.")
+
+
+def _end_to_end(tree: PyTree) -> jax.Array:
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)])
+
+
+def _require_constraints(structure: tuple, layout: Layout) -> None:
+    leaves = jax.tree.leaves(structure)
+    if not leaves or not sum(math.prod(leaf.shape) for leaf in leaves):
+        raise TypeError("constraints must return at least one number that is to be zero.")
+    if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
+        raise TypeError("constraints must return real floating-point numbers.")
+    names = [set(part) for part in structure if isinstance(part, dict)]
+    if len(names) == 2 and names[0] & names[1]:
+        shared = ", ".join(sorted(names[0] & names[1]))
+        raise ValueError(f"A constraint and a velocity constraint have the same name: {shared}.")
 
 
 def _require_structure(value: PyTree, layout: Layout) -> None:

@@ -62,6 +62,19 @@ class Trajectory(eqx.Module):
         """p = ∂L/∂q̇ at every output time, in the structure of `q`."""
         return self._at_every_time(self.system.momentum)
 
+    @property
+    def multipliers(self) -> PyTree:
+        """λ at every output time, in the structure that the constraint functions return."""
+        return self._at_every_time(self.system.multipliers)
+
+    def constraint_force(self) -> PyTree:
+        """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ at every output time, in the structure of `q`."""
+        return self._at_every_time(self.system.constraint_force)
+
+    def constraint_residual(self) -> PyTree:
+        """f and a at every output time, in the structure of `multipliers`: how far the motion has drifted."""
+        return self._at_every_time(self.system.constraint_residual)
+
     def to_xarray(self):
         """An `xarray.Dataset` with a variable per leaf of `q` and `qdot` and the dimensions (member,) time, ...
 

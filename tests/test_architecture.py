@@ -27,6 +27,7 @@ STREET = [
     "_explain",
     "_system",
     "_integrate",
+    "_consistent",
     "_trajectory",
     "_engine",
     "_simulate",

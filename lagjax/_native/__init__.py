@@ -38,17 +38,23 @@ class Outcome(NamedTuple):
 class Kernel:
     """The integration of (q, q̇) with q̈ from a program, whose inputs are q, q̇, t and numbers that stay constant.
 
-    The outputs of the program are q̈, then whether the mass matrix is singular. Raises `Unlowerable` where an operation
-    has no Taylor series or is not one of doubles.
+    The outputs of the program are q̈, then whether the mass matrix is singular. `projection`, from the same inputs to
+    (q, q̇), is applied to the state after every step, and to the outputs. Raises `Unlowerable` where an operation has no
+    Taylor series or is not one of doubles.
     """
 
-    def __init__(self, program: Program, size: int):
-        integrator = _integrator.Integrator(program, recurrences(program, size))
+    def __init__(self, program: Program, size: int, projection: Program | None = None):
+        integrator = _integrator.Integrator(program, recurrences(program, size), projection)
         self.states, self.numbers, self.width = 2 * size, integrator.numbers, integrator.width
         self._memory = integrator.memory
-        self._engine = compiled(integrator.module)  # holds the code that the next line points to
-        address = self._engine.get_function_address("run")
-        self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(address)
+        self._engine = compiled(integrator.module)  # holds the code that the next lines point to
+        self._run = self._function("run", *[ctypes.c_void_p] * 4)
+        self._project = None
+        if projection is not None:
+            self._project = self._function("project_rows", *[ctypes.c_void_p] * 3, ctypes.c_int64)
+
+    def _function(self, name: str, *types):
+        return ctypes.CFUNCTYPE(None, *types)(self._engine.get_function_address(name))
 
     def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int) -> Outcome:
         """`y0` (N, 2n); `ts` (N, T) and `params` (N, P), or one row for all; all float64."""
@@ -64,19 +70,29 @@ class Kernel:
             members, times, order_for(rtol), max_steps, rtol, atol,
         )  # fmt: skip
 
-        def work(_) -> int:
+        def integrate(_) -> int:
             memory = _aligned(self._memory)
             lanes, idle = np.zeros(len(_integrator.LANE) * self.width, np.int64), np.zeros(1, np.int64)
             self._run(ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data, idle.ctypes.data)
             return int(idle[0])
 
-        threads = min(cores(), max(1, members // (4 * self.width)))
-        idle = sum(_pool().map(work, range(threads))) if threads > 1 else work(0)
+        def project(_) -> None:
+            memory = _aligned(self._memory)  # a name keeps it alive
+            self._project(ctypes.addressof(job), memory.ctypes.data, path.ctypes.data, times)
+
+        idle = sum(self._on_all_cores(integrate, members))
+        if self._project is not None and times > 2:
+            counter[0] = 0
+            self._on_all_cores(project, members)
         ended_badly = code != DONE
         if ended_badly.any():  # a start that is infinite was not reached either
             reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
             path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
         return Outcome(path, y_end, t_end, *(counts.astype(int) for counts in (code, steps, rejected)), idle)
+
+    def _on_all_cores(self, work, members: int) -> list:
+        threads = min(cores(), max(1, members // (4 * self.width)))
+        return list(_pool().map(work, range(threads))) if threads > 1 else [work(0)]
 
 
 def recurrences(program: Program, size: int) -> Series:

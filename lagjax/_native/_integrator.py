@@ -31,6 +31,8 @@ from lagjax._program import Program, Series, StraightLine
 
 MAX_ORDER = 20
 SAFETY = 0.9
+# A series that ends (free flight) allows any step, and a step that is too long sees nothing of what lies inside it.
+FIRST_STEP, GROWTH, GROWTH_AFTER_REJECTION = 1 / 16, 5.0, 2.0  # of the whole time; of the step before
 SMALLEST_STEP = 4 * 2.0**-52  # of the largest time: below this a step no longer moves the time reliably
 CHECKS = (0.5, 1.0)  # where in the step its series is held against the equations
 
@@ -56,7 +58,7 @@ class Job(ctypes.Structure):
 # Doubles of a lane. `due` and `reached` are times in the direction of time; `active`, `last`, `singular` are 1 or 0.
 _OF_A_LANE = (
     "t", "t_low", "t_end", "forward", "smallest", "h", "due", "reached", "worst", "active", "last", "singular", "code",
-    "steps", "rejected",
+    "steps", "rejected", "longest", "growth",
 )  # fmt: skip
 _KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
 # Integers of a lane: which member it carries (-1: none), and which output comes next.
@@ -66,8 +68,9 @@ LANE = ("member", "output")
 class Integrator:
     """Builds the module. `memory` is what a thread needs, in doubles; `lanes` the width."""
 
-    def __init__(self, program: Program, series: Series):
+    def __init__(self, program: Program, series: Series, projection: Program | None = None):
         self.program, self.series, self.n = program, series, series.size
+        self.projection = projection
         self.states, self.width = 2 * series.size, lanes()
         self.module = ir.Module("motion")
         self.module.triple = ""
@@ -79,7 +82,10 @@ class Integrator:
         self.coefficients = self._coefficients()
         self.defect = self._defect()
         self.start_next = self._start_next()
+        self.project = None if projection is None else self._project()
         self._run()
+        if projection is not None:
+            self._project_rows()
 
     # ---- the memory of a thread: vectors, one element for each lane ----
 
@@ -287,6 +293,7 @@ class Integrator:
             self._set(code, memory, "forward", lane, code.select(end > begin, _double(code, 1.0), -1.0))
             largest = code.maximum(code.intrinsic("fabs", begin), code.intrinsic("fabs", end))
             self._set(code, memory, "smallest", lane, SMALLEST_STEP * largest)
+            self._set(code, memory, "longest", lane, code.intrinsic("fabs", end - begin) * FIRST_STEP)
             self._await_output(code, memory, lane_data, job, lane, _integer(code, 1))
             for i in range(self.states):
                 x = self._read(code, job, "y0", member * self.states + i)
@@ -319,6 +326,8 @@ class Integrator:
             self._halve_until_sound(code, memory, job, order)
             self._move_time(code, memory, lane_data, job, order)
             self._advance(code, memory)
+            if self.project is not None:
+                code.call(self.project, memory)
             self._end_or_go_on(code, memory, lane_data, job, idle)
         code.finish()
 
@@ -327,7 +336,9 @@ class Integrator:
         last, before = self._errors(code, memory, job, order)
         p = code.as_double(order)
         a, b = _power(code, last, -1.0 / p), _power(code, before, -1.0 / (p - 1.0))
-        size = SAFETY * code.select(a < b, a, b)
+        size, longest = SAFETY * code.select(a < b, a, b), self._vector(code, memory, "longest")
+        size = code.select(size < longest, size, longest)
+        self._keep(code, memory, "growth", code.lanes_of(GROWTH))
         forward, end = self._vector(code, memory, "forward"), self._vector(code, memory, "t_end")
         left = ((end - self._vector(code, memory, "t")) - self._vector(code, memory, "t_low")) * forward
         is_last = size >= left
@@ -384,6 +395,8 @@ class Integrator:
                 self._keep(code, memory, "rejected", rejected + code.select(bad, _lanes(code, 1), 0.0))
                 last = self._vector(code, memory, "last")
                 self._keep(code, memory, "last", code.select(bad, 0.0, last))
+                growth = self._vector(code, memory, "growth")
+                self._keep(code, memory, "growth", code.select(bad, GROWTH_AFTER_REJECTION, growth))
 
     def _move_time(self, code, memory, lane_data, job, order) -> None:
         """The time at the end of the step, and the states at the output times before it."""
@@ -427,7 +440,9 @@ class Integrator:
 
     def _advance(self, code, memory) -> None:
         """y + h y₁ + …, with what rounding takes carried to the next step; and one step more on the count."""
-        moving = code.compare("!=", self._vector(code, memory, "h"), 0.0)
+        h = self._vector(code, memory, "h")
+        moving = code.compare("!=", h, 0.0)
+        self._keep(code, memory, "longest", code.intrinsic("fabs", h) * self._vector(code, memory, "growth"))
         for i in range(self.states):
             y = code.load(self.state(code, memory, i), self.vector)
             low = self._vector(code, memory, "low", i)
@@ -469,6 +484,50 @@ class Integrator:
             code.store(x, code.element(self._job(code, job, "y_end"), member * self.states + i))
             with code.only_if(done):
                 code.store(x, self._output(code, job, member, last_time, i))
+
+    # ---- constraints ----
+
+    def _project(self) -> Code:
+        """`(memory)`: the state of every lane back to the constraints."""
+        code = Code(self.module, "project", [POINTER], self.width)
+        (memory,) = code.arguments
+        line = StraightLine(self.projection.nodes, self.projection.kinds, self.projection.outputs)
+        for i, y in enumerate(emit(code, line, self._now(code, memory), self.sincos)):
+            code.store(y, self.state(code, memory, i))
+        return code.finish()
+
+    def _project_rows(self) -> None:
+        """`(job, memory, rows, times)`: states, `times` of them for each member, back to the constraints."""
+        code = Code(self.module, "project_rows", [POINTER, POINTER, POINTER, INTEGER], self.width, public=True)
+        job, memory, rows, times = code.arguments
+        total = self._job(code, job, "members") * times
+        counter = self._job(code, job, "next_member")
+
+        def take() -> Value:
+            width = ir.Constant(INTEGER, self.width)
+            return Value(code, code.builder.atomic_rmw("add", counter.it, width, "monotonic"))
+
+        first = code.variable(take())
+        with code.repeat_while(lambda: code.load(first, INTEGER) < total):
+            for load in (True, False):
+                with code.loop(self.width) as lane:
+                    row = code.load(first, INTEGER) + lane
+                    row = code.select(row < total, row, total - 1)
+                    member = row / times
+                    for i in range(self.states):
+                        inside = self.state(code, memory, i, 0, lane)
+                        outside = code.element(rows, row * self.states + i)
+                        source, target = (outside, inside) if load else (inside, outside)
+                        code.store(code.load(source, DOUBLE), target)
+                    if load:
+                        self._set(code, memory, "t", lane, self._time(code, job, member, row - member * times))
+                        with code.loop(self.numbers) as i:
+                            x = self._read(code, job, "params", member * self._job(code, job, "params_stride") + i)
+                            code.store(x, self.place(code, memory, "params", i, lane))
+                if load:
+                    code.call(self.project, memory)
+            code.store(take(), first)
+        code.finish()
 
     # ---- access to the memory, the job and the lanes ----
 

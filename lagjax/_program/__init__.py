@@ -40,7 +40,7 @@ from lagjax._program._passes import finish
 from lagjax._program._rules import Expansion, kind_of
 from lagjax._program._series import Series, StraightLine, series
 
-__all__ = ["Program", "Series", "StraightLine", "Unlowerable", "lower", "series"]
+__all__ = ["Program", "Series", "StraightLine", "Unlowerable", "emit", "lower", "plain_elementary", "series"]
 
 
 def lower(function: Callable, *examples, budget: int = 20_000) -> "Program":

@@ -1,0 +1,362 @@
+"""Taylor recurrences: every operation, moved in every way, against derivatives that know nothing of them."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from jax import lax
+
+from lagjax._program import Program, Unlowerable, _series, lower, series
+from lagjax._program._graph import COMPARISONS, FOLD
+
+ORDER = 10
+NAN = float("nan")
+
+
+@pytest.fixture(autouse=True)
+def _precision():
+    with jax.enable_x64(True), mpmath.workdps(40):
+        yield
+
+
+def recurrences(function, q, *rest):
+    """The program of q̈ (and what else `function` gives) and its recurrences."""
+    program = lower(function, *map(jnp.asarray, (q, *rest)))
+    return program, series(program, len(q), 2 * len(q) + 1)
+
+
+def coefficients(function, order, q, v, t, *params):
+    """The series of q, shape (n, order + 1), by one run of `start` and one of `sweep` for each order."""
+    n = len(q)
+    program, found = recurrences(function, q, v, t, *params)
+    numbers = [*q, *v, t, *np.concatenate([np.ravel(p) for p in params] or [[]])]
+    out = Program.evaluate(found.start, *numbers)
+    values = out[len(program.outputs) :]
+    np.testing.assert_array_equal(out[:n], program.evaluate(*numbers)[:n])
+    y, rows = np.zeros((2 * n, order + 1)), np.zeros((found.rows, order + 1))
+    y[:, 0], y[:n, 1], y[n:, 1] = [*q, *v], v, out[:n]
+    for k in range(1, order):
+        sums = [sum(rows[a, j] * rows[b, k - j] for j in range(1, k)) for a, b in found.products]
+        out = Program.evaluate(found.sweep, *y[:, k], float(k == 1), float(k), 1.0 / k, *values, *sums)
+        rows[:, k] = out[n:]
+        y[:n, k + 1], y[n:, k + 1] = y[n:, k] / (k + 1), np.array(out[:n]) / (k + 1)
+    return y[:n]
+
+
+def close(found, exact):
+    """To round-off: the terms of a sum are as large as the largest coefficients, and some hundred roundings add up."""
+    np.testing.assert_allclose(found, exact, rtol=2e-13, atol=2e-14 * np.max(np.abs(exact)))
+
+
+# ---- one operation on known curves ----------------------------------------------------------------------------------
+
+T0 = 0.25
+SHAPE = {"u": (0.5, -0.4, 0.7), "w": (-0.3, 0.6, 0.2)}
+
+
+def curve(name, start):
+    """A cubic through `start` at T0."""
+    b, c, d = SHAPE[name]
+    return lambda t: start + (t - T0) * (b + (t - T0) * (c + (t - T0) * d))
+
+
+def check(operation, reference, *operands, order=ORDER):
+    """`operation` of curves (functions of t), parameters (lists of one number) and constants, against `reference`."""
+    params = [np.array(x) for x in operands if isinstance(x, list)]
+
+    def acceleration(q, v, t, *params):
+        params = iter(params)
+        xs = [x(t) if callable(x) else next(params)[0] if isinstance(x, list) else x for x in operands]
+        return operation(*xs)
+
+    def exact(t):
+        return reference(*(x(t) if callable(x) else mpmath.mpf(x[0] if isinstance(x, list) else x) for x in operands))
+
+    (found,) = coefficients(acceleration, order + 2, [0.0], [0.0], T0, *params)
+    k = np.arange(order + 1)
+    close(found[2:] * (k + 1) * (k + 2), [float(c) for c in mpmath.taylor(exact, mpmath.mpf(T0), order)])
+
+
+def real_cbrt(x):
+    return mpmath.sign(x) * mpmath.cbrt(abs(x))
+
+
+UNARY = {  # in JAX, in mpmath, where
+    "neg": (jnp.negative, lambda x: -x, (0.4,)),
+    "sqrt": (jnp.sqrt, mpmath.sqrt, (0.6, 3.0)),
+    "rsqrt": (lax.rsqrt, lambda x: 1 / mpmath.sqrt(x), (0.6, 3.0)),
+    "cbrt": (jnp.cbrt, real_cbrt, (0.6, -0.8)),
+    "sin": (jnp.sin, mpmath.sin, (0.4, -7.0)),
+    "cos": (jnp.cos, mpmath.cos, (0.4, -7.0)),
+    "tan": (jnp.tan, mpmath.tan, (0.4, -2.8)),
+    "asin": (jnp.asin, mpmath.asin, (0.2, -0.3)),
+    "acos": (jnp.acos, mpmath.acos, (0.2, -0.3)),
+    "atan": (jnp.atan, mpmath.atan, (0.4, -2.0)),
+    "exp": (jnp.exp, mpmath.exp, (0.4, -3.0)),
+    "exp2": (jnp.exp2, lambda x: mpmath.mpf(2) ** x, (0.4, -3.0)),
+    "expm1": (jnp.expm1, mpmath.expm1, (1e-9, -3.0)),
+    "log": (jnp.log, mpmath.log, (0.6, 20.0)),
+    "log1p": (jnp.log1p, mpmath.log1p, (1e-9, -0.3)),
+    "logistic": (jax.nn.sigmoid, lambda x: 1 / (1 + mpmath.exp(-x)), (0.4, -4.0)),
+    "sinh": (jnp.sinh, mpmath.sinh, (0.4, -2.0)),
+    "cosh": (jnp.cosh, mpmath.cosh, (0.4, -2.0)),
+    "tanh": (jnp.tanh, mpmath.tanh, (0.4, -2.0)),
+    "asinh": (jnp.asinh, mpmath.asinh, (0.4, -2.0)),
+    "acosh": (jnp.acosh, mpmath.acosh, (1.8, 5.0)),
+    "atanh": (jnp.atanh, mpmath.atanh, (0.2, -0.3)),
+    "erf": (lax.erf, mpmath.erf, (0.4, -1.5)),
+    "erfc": (lax.erfc, mpmath.erfc, (0.4, -1.5)),
+    "abs": (jnp.abs, abs, (0.7, -0.7)),
+    "square": (jnp.square, lambda x: x * x, (0.4, 0.0)),
+    "cube": (lambda x: x**3, lambda x: x**3, (0.4, 0.0)),
+    "inverse cube": (lambda x: x**-3, lambda x: x**-3, (0.6, -0.8)),
+    "20th power": (lambda x: x**20, lambda x: x**20, (0.9,)),
+    "to the 1.5": (lambda x: x**1.5, lambda x: x ** mpmath.mpf(1.5), (0.6,)),
+    "hypotenuse": (lambda x: jnp.hypot(x, 1.0), lambda x: mpmath.sqrt(x * x + 1), (0.4, 0.0)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNARY)
+def test_functions_of_one_number(name):
+    operation, reference, starts = UNARY[name]
+    for start in starts:
+        check(operation, reference, curve("u", start))
+
+
+BINARY = {  # in JAX, in mpmath, pairs of values
+    "add": (jnp.add, lambda a, b: a + b, [(0.4, -0.9)]),
+    "sub": (jnp.subtract, lambda a, b: a - b, [(0.4, -0.9)]),
+    "mul": (jnp.multiply, lambda a, b: a * b, [(0.4, -0.9), (0.4, 0.0)]),
+    "div": (jnp.divide, lambda a, b: a / b, [(0.4, -0.9), (0.0, 0.7)]),
+    "pow": (jnp.power, mpmath.power, [(0.6, 1.7), (1.3, -0.7)]),
+    "atan2": (jnp.atan2, mpmath.atan2, [(0.7, 0.5), (0.7, -0.5), (-0.7, -0.5), (-0.7, 0.5), (0.7, 1e-3), (1e-3, -2.0)]),
+    "max": (jnp.maximum, max, [(0.4, -0.9), (-0.4, 0.9)]),
+    "min": (jnp.minimum, min, [(0.4, -0.9), (-0.4, 0.9)]),
+    "rem": (lax.rem, lambda a, b: a - b * int(a / b), [(7.5, 2.0), (-7.5, 2.0), (7.5, -2.0), (0.5, 2.0)]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BINARY)
+@pytest.mark.parametrize("moves", ["both", "first", "second"])
+@pytest.mark.parametrize("still", ["constant", "parameter"])
+def test_functions_of_two_numbers(name, moves, still):
+    operation, reference, points = BINARY[name]
+    rest = (lambda x: x) if still == "constant" else (lambda x: [x])
+    for a, b in points:
+        first = rest(a) if moves == "second" else curve("u", a)
+        second = rest(b) if moves == "first" else curve("w", b)
+        check(operation, reference, first, second)
+
+
+def test_operands_that_are_one_and_the_same():
+    u = curve("u", 0.7)
+    check(lambda x: x * x + x / (x * x * x), lambda x: x * x + 1 / x**2, u)
+    check(lambda x: jnp.atan2(x, x + 1), lambda x: mpmath.atan2(x, x + 1), u)
+    check(lambda x: x**x, lambda x: x**x, u)
+
+
+PIECES = {  # in JAX, what it is on the piece, where
+    "select yes": (lambda x: jnp.where(x > 0, jnp.sin(x), x**2), mpmath.sin, 0.7),
+    "select no": (lambda x: jnp.where(x > 0, jnp.sin(x), x**2), lambda x: x**2, -0.7),
+    "select a constant": (lambda x: jnp.where(x > 0, jnp.sin(x), 2.0), lambda x: mpmath.mpf(2), -0.7),
+    "select not": (lambda x: jnp.where(~(x > 0), 2.0, jnp.sin(x)), mpmath.sin, 0.7),
+    "both conditions": (lambda x: jnp.where((x > 0) & (x < 1), x**3, -x), lambda x: x**3, 0.7),
+    "sign": (lambda x: jnp.sign(x) * x**2, lambda x: -(x**2), -0.7),
+    "floor": (lambda x: jnp.floor(x) * x, lambda x: -2 * x, -1.3),
+    "ceil": (lambda x: jnp.ceil(x) * x, lambda x: -x, -1.3),
+    "round": (lambda x: jnp.round(x) * x, lambda x: 2 * x, 1.6),
+    "as integer": (lambda x: x.astype(int) * x, lambda x: 2 * x, 2.6),
+    "clip below": (lambda x: jnp.clip(x, 1.0, 2.0) * x, lambda x: x, 0.5),
+    "clip inside": (lambda x: jnp.clip(x, 1.0, 2.0) * x, lambda x: x**2, 1.5),
+    "mod": (lambda x: jnp.mod(x, 2 * np.pi) ** 2, lambda x: (x + 2 * mpmath.mpf(np.pi)) ** 2, -1.0),
+    "guarded yes": (lambda x: jnp.where(x > 0, jnp.sin(x), NAN), mpmath.sin, 0.7),
+    "guarded no": (lambda x: jnp.where(x < 0, NAN, jnp.sin(x)), mpmath.sin, 0.7),
+    "NaN not taken": (lambda x: jnp.where(x > 0, jnp.sqrt(x), x**2), lambda x: x**2, -0.7),
+    # Flat where the outer function has no slope:
+    "Hertz": (lambda x: jnp.maximum(x, 0.0) ** 1.5 + x, lambda x: x, -0.7),
+    "power": (lambda x: jnp.maximum(x, 0.0) ** 1.7 + x, lambda x: x, -0.7),
+    "cube root": (lambda x: jnp.cbrt(jnp.maximum(x, 0.0)) + x, lambda x: x, -0.7),
+    "asin": (lambda x: jnp.asin(jnp.clip(x, -1.0, 1.0)) + x, lambda x: mpmath.pi / 2 + x, 1.7),
+    "acos": (lambda x: jnp.acos(jnp.clip(x, -1.0, 1.0)) + x, lambda x: mpmath.pi + x, -1.7),
+    "acosh": (lambda x: jnp.acosh(jnp.maximum(x, 1.0)) + x, lambda x: x, 0.3),
+    "atan2": (lambda x: jnp.atan2(jnp.maximum(x, 0.0), jnp.maximum(x, 0.0)) + x, lambda x: x, -0.7),
+    "20th power at zero": (lambda x: jnp.maximum(x, 0.0) ** 20 + x, lambda x: x, -0.7),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PIECES)
+def test_pieces(name):
+    operation, reference, start = PIECES[name]
+    check(operation, reference, curve("u", start))
+
+
+def test_a_guard_that_strikes_shows():
+    values = coefficients(lambda q, v, t: jnp.where(q > 0, q, NAN), 3, [-1.0], [0.0], 0.0)
+    assert np.isnan(values[0, 2])
+
+
+def test_compositions():
+    check(
+        lambda u, w, p: jnp.exp(jnp.sin(u) * jnp.log1p(w * w)) / jnp.sqrt(1 + (u - p) ** 2) - jnp.tanh(w / (2 + u)),
+        lambda u, w, p: mpmath.exp(mpmath.sin(u) * mpmath.log1p(w * w)) / mpmath.sqrt(1 + (u - p) ** 2)
+        - mpmath.tanh(w / (2 + u)),
+        curve("u", 0.7), curve("w", -0.4), [0.3],
+    )  # fmt: skip
+
+
+def test_every_operation_has_a_series_and_a_test():
+    known = set(_series._RULES) | set(_series._SLOPES)
+    assert known - {"select"} == (set(UNARY) | set(BINARY)) & known - {"select"}
+    whole = {"and", "or", "xor", "not", "is_finite", "convert"} | COMPARISONS  # no doubles come out, or by a rounding
+    assert set(FOLD) == known | _series._STEPS | whole
+
+
+# ---- motions --------------------------------------------------------------------------------------------------------
+
+
+def kepler(q, v, t, gm):
+    return -gm * q / jnp.sum(q**2) ** 1.5
+
+
+def pendulum(q, v, t):
+    return -jnp.sin(q)
+
+
+def driven(q, v, t, k, w):
+    """Damped, driven, with a mass that depends on the place: q, v and t all at work."""
+    return (k * jnp.cos(w * t) - q * v**2 - q * jnp.exp(-t) * v) / (1 + q**2)
+
+
+def charge(q, v, t):
+    """In a magnetic field that grows with time and distance, beside a soft wall."""
+    field = (1 + t) * jnp.array([0.3, q[0] * q[1], jnp.cos(q[2])])
+    return jnp.cross(v, field) + jnp.array([jnp.maximum(-q[0], 0.0) ** 1.5, 0.0, jnp.tanh(q[1])])
+
+
+def double_pendulum(q, v, t):
+    c, s = jnp.cos(q[0] - q[1]), jnp.sin(q[0] - q[1])
+    a, b = -s * v[1] ** 2 - 2 * 9.81 * jnp.sin(q[0]), s * v[0] ** 2 - 9.81 * jnp.sin(q[1])
+    return jnp.stack([a - c * b, 2 * b - c * a]) / (2 - c**2)
+
+
+MOTIONS = {
+    "pendulum": (pendulum, [2.0], [0.3]),
+    "Kepler": (kepler, [0.8, -0.3], [0.2, 1.1], 1.3),
+    "driven": (driven, [0.4], [0.9], 0.7, 1.9),
+    "charge": (charge, [-0.7, -0.5, 0.2], [-0.3, 0.8, 0.5]),
+    "double pendulum": (double_pendulum, [1.0, -0.6], [0.4, -0.9]),
+}
+
+
+def total_derivatives(function, q, v, t, *params, count):
+    """q⁽²⁾, q⁽³⁾ …: d/dt g = ∂g/∂q v + ∂g/∂v f + ∂g/∂t, again and again."""
+    q, v, t = map(jnp.asarray, (q, v, t))
+    f = lambda q, v, t: function(q, v, t, *params)
+
+    def along(g):
+        return lambda q, v, t: jax.jvp(g, (q, v, t), (v, f(q, v, t), jnp.ones(())))[1]
+
+    found, g = [], f
+    for _ in range(count):
+        found.append(g(q, v, t))
+        g = along(g)
+    return jnp.stack(found, axis=1)
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_motions(name):
+    function, q, v, *params = MOTIONS[name]
+    exact = jax.jit(lambda *state: total_derivatives(function, *state, count=5))(
+        *map(jnp.asarray, (q, v, 0.4, *params))
+    )
+    found = coefficients(function, 6, q, v, 0.4, *params)
+    factorials = np.cumprod(np.arange(1.0, 7))[1:]
+    close(found[:, 2:], np.asarray(exact) / factorials)
+
+
+def test_high_orders_of_a_closed_form():
+    # q' = q², q(0) = 1/2 is 1 / (2 − t): q'' = 2 q q'.
+    (found,) = coefficients(lambda q, v, t: 2 * q * v, 30, [0.5], [0.25], 0.0)
+    np.testing.assert_allclose(found, 0.5 ** np.arange(1, 32), rtol=1e-14)
+    (found,) = coefficients(lambda q, v, t: -q, 20, [1.0], [0.0], 0.0)
+    np.testing.assert_allclose(found[::2], [(-1) ** k / float(mpmath.factorial(2 * k)) for k in range(11)], rtol=1e-15)
+
+
+# ---- what is kept ---------------------------------------------------------------------------------------------------
+
+
+def operations(line):
+    return sum(op not in ("input", "constant") for op, _, _ in line.nodes)
+
+
+def test_a_linear_motion_needs_no_products():
+    _, found = recurrences(lambda q, v, t, k: -k * q - 0.1 * v + 2 * t, [0.1], [0.2], 0.0, 3.0)
+    assert found.products == () and found.rows == 0
+    assert operations(found.sweep) == 5
+
+
+@pytest.mark.parametrize(
+    ("function", "products", "rows"),
+    [
+        (pendulum, 2, 3),  # Σ j qⱼ cₖ₋ⱼ and Σ j qⱼ sₖ₋ⱼ
+        (lambda q, v, t: q * q, 1, 1),
+        (lambda q, v, t: q * v + jnp.exp(t) * 0, 1, 2),
+        (lambda q, v, t: (q * v) * (q * v) + q * v, 2, 3),  # one q v, and its square
+        (lambda q, v, t: jnp.exp(q), 1, 2),
+        (lambda q, v, t: q * jnp.sin(3.0) + jnp.abs(v), 0, 0),
+        (lambda q, v, t: jnp.where(q > v * t, q, v), 0, 0),  # the product decides, but does not move
+    ],
+)
+def test_products_are_shared_and_counted(function, products, rows):
+    _, found = recurrences(function, [0.3], [0.4], 0.1)
+    assert (len(found.products), found.rows) == (products, rows)
+    assert all(a < found.rows and b < found.rows for a, b in found.products)
+
+
+def test_squares_come_last():
+    _, found = recurrences(lambda q, v, t: q * q + v * v + q * v, [0.3], [0.4], 0.1)
+    assert [a == b for a, b in found.products] == [False, True, True]
+
+
+def test_what_only_other_outputs_need_is_dropped():
+    plain = recurrences(pendulum, [0.3], [0.4], 0.1)[1]
+    _, more = recurrences(lambda q, v, t: (pendulum(q, v, t), jnp.exp(q * v) > 3, q * v * t), [0.3], [0.4], 0.1)
+    assert (more.products, more.rows, more.values) == (plain.products, plain.rows, plain.values)
+    assert operations(more.sweep) == operations(plain.sweep)
+
+
+def test_the_state_may_be_of_first_order():
+    # ẏ = f(t, y), with time first, as the inputs come: e^{t²/2} by y' = t y
+    program = lower(lambda t, y, p: p * t * y, 0.0, 1.0, 1.0)
+    found = series(program, 1, 2)
+    start = Program.evaluate(found.start, 0.0, 1.0, 1.0)
+    values, y, rows = start[1:], [1.0, start[0]], np.zeros((found.rows, 12))
+    for k in range(1, 12):
+        sums = [sum(rows[a, j] * rows[b, k - j] for j in range(1, k)) for a, b in found.products]
+        out = Program.evaluate(found.sweep, float(k == 1), y[k], float(k), 1.0 / k, *values, *sums)
+        rows[:, k] = out[1:]
+        y.append(out[0] / (k + 1))
+    expected = [0.5 ** (k // 2) / float(mpmath.factorial(k // 2)) if k % 2 == 0 else 0.0 for k in range(13)]
+    np.testing.assert_allclose(y, expected, rtol=1e-14)
+
+
+def test_an_operation_without_a_series_is_named(monkeypatch):
+    monkeypatch.delitem(_series._SLOPES, "erf")
+    with pytest.raises(Unlowerable, match="`erf` has no Taylor series"):
+        recurrences(lambda q, v, t: lax.erf(q) * v, [0.3], [0.4], 0.1)
+    for harmless in (lambda q, v, t: lax.erf(jnp.sin(2.0) + 0 * q) * v, lambda q, v, t: (v, lax.erf(q))):
+        recurrences(harmless, [0.3], [0.4], 0.1)
+
+
+def test_all_moving_inputs_may_be_any_mixture():
+    # Each of q, v, t alone, in pairs, and all: what does not move has no coefficients, and the rest stays right.
+    for which in itertools.chain.from_iterable(itertools.combinations("qvt", r) for r in range(4)):
+        function = lambda q, v, t, which=which: jnp.sin(
+            sum(c * x for c, x, name in ((0.7, q, "q"), (1.1, v, "v"), (0.4, t, "t")) if name in which) + 0.3
+        ) + jnp.zeros(1)
+        exact = total_derivatives(function, [0.4], [0.9], 0.2, count=4)
+        found = coefficients(function, 5, [0.4], [0.9], 0.2)
+        close(found[:, 2:], np.asarray(exact) / [2, 6, 24, 120])
