@@ -1,56 +1,141 @@
 """The command line: `python -m benchmarks --help`."""
 
 import argparse
+import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 
-from benchmarks import _comparisons, _report
-from benchmarks._cases import CASES, DEFAULT
-from benchmarks._contenders import BATCHED
-from benchmarks._measure import compare
+from benchmarks import _comparisons, _derivation, _figures, _goals, _gradient, _mixed, _report
+from benchmarks._cases import CASES
+from benchmarks._contenders import BATCHED, SINGLE
+from benchmarks._measure import Comparison, compare
 
-PARTS = ("errors", *_comparisons.COMPARISONS)
+SINGLE_MEMBERS = 16
 
 
-def main(arguments: list[str] | None = None) -> dict:
-    """Run what is asked for, print it, write it to `results.json`, and return what was written."""
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    """Run what is asked for, print it, write it to `results.json`, and return what is there.
+
+    Parts and cases that were not asked for stay as they are in that file, each with its own commit and machine.
+    """
     options = _options().parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
-    record = {"circumstances": _report.circumstances(), "options": {k: str(v) for k, v in vars(options).items()}}
+    if options.device == "cpu":
+        jax.config.update("jax_platforms", "cpu")  # also where there is a GPU, which is for the part `gpu`
+    path = options.output / options.file
+    record = _report.read_json(path)
     for part in options.only:
         print(f"\n==== {part} ".ljust(80, "="), flush=True)
-        record[part] = _errors(options) if part == "errors" else _other(part, options)
-        _report.write_json(options.output / options.file, record)  # after every part: a long run may be interrupted
-    print(f"\n{options.output / options.file}")
+        kept = record.get(part, {}).get("rows", []) if part in COMPARISONS else []
+        record[part] = _origin(options) | {"rows": kept}
+        for row in _rows_of(part, options, record):
+            others = [
+                other for other in record[part]["rows"] if part not in COMPARISONS or other["case"] != row["case"]
+            ]
+            record[part]["rows"] = [*others, row]
+            _report.write_json(path, record)  # a long run may be interrupted
+        if part not in COMPARISONS:
+            print(_report.table(record[part]["rows"]), flush=True)
+        _figures.draw(part, record, options.output)
+    print(f"\n{path}")
     return record
 
 
-def _errors(options: argparse.Namespace) -> list[dict]:
+def _origin(options: argparse.Namespace) -> dict[str, Any]:
+    settings = {key: str(value) for key, value in vars(options).items()}
+    return {"circumstances": _report.circumstances(), "options": settings}
+
+
+def _commits(record: dict[str, Any]) -> set[str | None]:
+    found = [place for part in record.values() for place in (part, *part["rows"]) if "circumstances" in place]
+    return {place["circumstances"]["commit"] for place in found}
+
+
+def _rows_of(part: str, options: argparse.Namespace, record: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    if part == "goals":
+        if len(_commits(record)) > 1:
+            print("The numbers below are of several commits: run all parts again for one.")
+        yield from _goals.goals(record)
+    elif part in TABLES:
+        yield from TABLES[part](options)
+    else:
+        for comparison in COMPARISONS[part](options):
+            _report.print_comparison(comparison)
+            sys.stdout.flush()
+            yield comparison.as_dict() | {"equal_error": _report.equal_error(comparison)} | _origin(options)
+
+
+# ---- parts that are errors against times -----------------------------------------------------------------------------
+
+
+def _errors(options: argparse.Namespace) -> Iterator[Comparison]:
+    """Batches of every scene."""
     contenders = [c for c in BATCHED if not options.contenders or c.name in options.contenders]
-    results = []
+    for case in _cases(options):
+        yield compare(case, contenders, options.tolerances, options.repeats, options.budget, _progress)
+
+
+def _single(options: argparse.Namespace) -> Iterator[Comparison]:
+    """Latency: sixteen members of every scene, one after the other."""
+    for case in _cases(options):
+        few = case.first(SINGLE_MEMBERS)
+        yield compare(few, SINGLE, options.tolerances, options.repeats, options.budget, _progress)
+
+
+def _mixed_batch(options: argparse.Namespace) -> Iterator[Comparison]:
+    for comparison in _mixed.mixed(options):
+        print(f"\n{comparison.case}: the busiest member takes {_mixed.waiting(comparison):.2g} times the mean steps")
+        yield comparison
+
+
+def _cases(options: argparse.Namespace):
     for name in options.cases:
         case = CASES[name](options.batch)
-        if options.duration is not None:
-            case = replace(case, duration=options.duration)
-        comparison = compare(case, contenders, options.tolerances, options.repeats, options.budget, _progress)
-        _report.print_comparison(comparison)
-        sys.stdout.flush()
-        _report.draw(comparison, options.output / f"{name}.png")
-        results.append(comparison.as_dict() | {"equal_error": _report.equal_error(comparison)})
-    return results
-
-
-def _other(part: str, options: argparse.Namespace) -> list[dict]:
-    rows = _comparisons.COMPARISONS[part](options)
-    print(_report.table(rows), flush=True)
-    return rows
+        yield case if options.duration is None else replace(case, duration=options.duration)
 
 
 def _progress(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
+
+
+# ---- the GPU ---------------------------------------------------------------------------------------------------------
+
+
+def _gpu(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """The part `batches` again in a process of its own, with JAX on the GPU; the other programs stay on the CPU."""
+    child = [sys.executable, "-m", "benchmarks", "--device", "gpu", "--only", "batches", "--file", "gpu.json"]
+    child += ["--batch", str(options.batch), "--repeats", str(options.repeats), "--budget", str(options.budget)]
+    child += ["--output", str(options.output.absolute())]
+    root = Path(__file__).parent.parent
+    found = subprocess.run(
+        [sys.executable, "-c", "import jax; print(jax.devices('gpu')[0].device_kind)"], capture_output=True, text=True
+    )
+    if found.returncode:
+        print("This machine has no GPU that JAX can use.")
+        return []
+    subprocess.run(child, cwd=root, check=True)
+    record = _report.read_json(options.output / "gpu.json")
+    return [{"device": found.stdout.strip()} | row for row in record["batches"]["rows"]]
+
+
+# ---- all parts -------------------------------------------------------------------------------------------------------
+
+COMPARISONS: dict[str, Callable] = {"errors": _errors, "single": _single, "mixed": _mixed_batch}
+TABLES: dict[str, Callable] = {
+    "right_hand_sides": _comparisons.right_hand_sides,
+    "derivation": _derivation.derivation,
+    "sizes": _comparisons.sizes,
+    "batches": _comparisons.batches,
+    "cores": _comparisons.cores,
+    "gradient": _gradient.gradient,
+    "gpu": _gpu,
+}
+PARTS = (*COMPARISONS, *TABLES, "goals")  # the last reads what the others wrote
 
 
 def _options() -> argparse.ArgumentParser:
@@ -58,13 +143,15 @@ def _options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Time and error, beside those of others.")
     add = parser.add_argument
     add("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to run (default: all)")
-    add("--cases", nargs="+", choices=tuple(CASES), default=DEFAULT, help="scenes (default: all but chain_16)")
+    add("--cases", nargs="+", choices=tuple(CASES), default=tuple(CASES), help="scenes (default: all)")
     add("--contenders", nargs="+", choices=names, help="of the part 'errors' (default: all that are installed)")
-    add("--tolerances", nargs="+", type=float, default=[1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-13])
-    add("--batch", type=int, default=1024, help="members of a batch (default: 1024)")
+    add("--tolerances", nargs="+", type=float, default=[1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-13])
+    add("--batch", type=int, default=4096, help="members of a batch (default: 4096)")
+    add("--links", type=int, default=128, help="longest chain of 'sizes' and 'derivation' (default: 128)")
     add("--duration", type=float, help="instead of each scene's own")
     add("--repeats", type=int, default=5, help="timed runs of each (default: 5)")
     add("--budget", type=float, default=30.0, help="seconds after which one contender is not repeated (default: 30)")
+    add("--device", choices=("cpu", "gpu"), default="cpu", help="where JAX computes (default: cpu)")
     add("--output", type=Path, default=Path(__file__).parent / "results", help="folder for results and figures")
     add("--file", default="results.json", help="name of the results in that folder (default: results.json)")
     return parser

@@ -1,20 +1,21 @@
 """The programs that are compared.
 
 Every contender has one verb, `prepare(case) -> solve`, and `solve(tol)` returns the final states (q, q̇) of shape
-(members, 2n) as a NumPy array, so that a caller who has them has waited for them. What depends on the case alone is
-done by `prepare`; what depends on the tolerance, by the first `solve(tol)`: compile times are read off those two.
+(members, 2n) as a NumPy array, so that a caller who has them has waited for them, and the steps of each member (or one
+number for all). What depends on the case alone is done by `prepare`; what depends on the tolerance, by the first
+`solve(tol)`: compile times are read off those two.
 
 A tolerance means rtol = atol = tol, for lagjax too. That is not the same error from program to program (heyoka's is
 far below tol), which is why times are compared at equal error.
 
-Peers are set up the way that was fastest when tried, not the most convenient one: numbers are constants for them, the
-state of plain diffrax is one array (a tuple of scalars is slower in its stage loop), the velocity term of the autodiff
-equations is one `jvp`, heyoka writes its loops out where that compiles.
+Peers are set up the way that was fastest when tried, not the most convenient one: the state of plain diffrax is one
+array (a tuple of scalars is slower in its stage loop), the velocity term of the autodiff equations is one `jvp`, heyoka
+writes its loops out where that compiles. And masses, lengths and the like are constants for all peers, which may fold
+them, while lagjax gets them as inputs, as in any call of `simulate`.
 """
 
 import copy
 import importlib.util
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,10 +27,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import lagjax
+from benchmarks import _mujoco, _numba
 from benchmarks._cases import Case
+from lagjax._native import cores
 
 MAX_STEPS = 100_000
-Solve = Callable[[float], np.ndarray]
+Solve = Callable[[float], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -45,62 +48,63 @@ class Contender:
     def available(self, case: Case) -> str | None:
         """None, or the reason why this contender cannot run this case."""
         for package in self.packages:
-            if importlib.util.find_spec(package) is None:
+            if not installed(package):
                 return f"{package} is not installed"
         return self.suits(case)
+
+
+def installed(package: str) -> bool:
+    return importlib.util.find_spec(package) is not None
 
 
 # ---- lagjax ----------------------------------------------------------------------------------------------------------
 
 
-def _lagjax(case: Case) -> Solve:
-    scene, ts = case.scene, np.array([0.0, case.duration])
-    q0, qdot0 = case.tree(case.q0), case.tree(case.qdot0)
+def _lagjax(**options) -> Callable[[Case], Solve]:
+    """`lagjax.simulate_batch`, called as a user does."""
 
-    def solve(tol):
-        end = lagjax.simulate_batch(
-            scene.system, q0, qdot0, ts, scene.params, rtol=tol, atol=tol, max_steps=MAX_STEPS
-        ).end
-        return np.concatenate([_rows(end.q, case.batch), _rows(end.qdot, case.batch)], axis=1)
+    def prepare(case):
+        scene, ts = case.scene, np.array([0.0, case.duration])
+        q0, qdot0 = case.tree(case.q0), case.tree(case.qdot0)
 
-    return solve
+        def solve(tol):
+            run = lagjax.simulate_batch(
+                scene.system, q0, qdot0, ts, scene.params, rtol=tol, atol=tol, max_steps=MAX_STEPS, **options
+            )
+            return rows_of(run.end, case.batch), np.asarray(run.stats["num_steps"])
 
+        return solve
 
-def _lagjax_single(case: Case) -> Solve:
-    scene, ts = case.scene, np.array([0.0, case.duration])
-    q0, qdot0 = case.tree(case.q0[0]), case.tree(case.qdot0[0])
-
-    def solve(tol):
-        end = lagjax.simulate(scene.system, q0, qdot0, ts, scene.params, rtol=tol, atol=tol, max_steps=MAX_STEPS).end
-        return np.concatenate([_rows(end.q, 1), _rows(end.qdot, 1)], axis=1)
-
-    return solve
+    return prepare
 
 
-def _lagjax_jit(case: Case) -> Solve:
-    """The same inside the user's own `jax.jit`: what is left without the checks and the Python of a call."""
-    scene, ts = case.scene, np.array([0.0, case.duration])
+def _lagjax_single(**options) -> Callable[[Case], Solve]:
+    """`lagjax.simulate`, for one member after the other."""
 
-    @jax.jit
-    def run(q0, qdot0, tol):
-        options = {"rtol": tol, "atol": tol, "max_steps": MAX_STEPS}
-        if case.batch > 1:
-            end = lagjax.simulate_batch(scene.system, q0, qdot0, ts, scene.params, **options).end
-        else:
-            q0, qdot0 = jax.tree.map(lambda leaf: leaf[0], (q0, qdot0))
-            end = lagjax.simulate(scene.system, q0, qdot0, ts, scene.params, **options, throw=False).end
-        return end.q, end.qdot
+    def prepare(case):
+        scene, ts = case.scene, np.array([0.0, case.duration])
+        starts = [(case.tree(q), case.tree(v)) for q, v in zip(case.q0, case.qdot0, strict=True)]
 
-    q0, qdot0 = jax.tree.map(jnp.asarray, (case.tree(case.q0), case.tree(case.qdot0)))
+        def one(start, tol):
+            run = lagjax.simulate(
+                scene.system, *start, ts, scene.params, rtol=tol, atol=tol, max_steps=MAX_STEPS, **options
+            )
+            return rows_of(run.end, 1)[0], run.stats["num_steps"]
 
-    def solve(tol):
-        return np.concatenate([_rows(part, case.batch) for part in run(q0, qdot0, tol)], axis=1)
+        return lambda tol: _one_by_one(one, starts, tol)
 
-    return solve
+    return prepare
 
 
-def _rows(tree, batch: int) -> np.ndarray:
-    return np.concatenate([np.asarray(leaf).reshape(batch, -1) for leaf in jax.tree.leaves(tree)], axis=1)
+def rows_of(end, batch: int) -> np.ndarray:
+    """(q, q̇) of every member, shape (batch, 2n)."""
+    leaves = jax.tree.leaves((end.q, end.qdot))
+    return np.concatenate([np.asarray(leaf).reshape(batch, -1) for leaf in leaves], axis=1)
+
+
+def _one_by_one(solve: Callable, starts, tol: float) -> tuple[np.ndarray, np.ndarray]:
+    final, steps = zip(*(solve(start, tol) for start in starts), strict=True)
+    return np.stack(final), np.array(steps)
 
 
 # ---- plain diffrax ---------------------------------------------------------------------------------------------------
@@ -123,7 +127,7 @@ def by_hand(case: Case) -> Callable:
 
 
 def diffeqsolve(case: Case, acceleration: Callable, max_steps: int = MAX_STEPS, adjoint=None) -> Callable:
-    """`(y0, tol) -> y` at the end, one member, in plain diffrax."""
+    """`(y0, tol) -> y` at the end and the number of steps, one member, in plain diffrax."""
     n = case.coordinates
 
     def field(t, y, args):
@@ -142,7 +146,7 @@ def diffeqsolve(case: Case, acceleration: Callable, max_steps: int = MAX_STEPS, 
             max_steps=max_steps,
             throw=False,
         )
-        return solution.ys[-1]
+        return solution.ys[-1], solution.stats["num_steps"]
 
     return solve
 
@@ -150,9 +154,10 @@ def diffeqsolve(case: Case, acceleration: Callable, max_steps: int = MAX_STEPS, 
 def _diffrax(derive: Callable, batched: bool = True) -> Callable[[Case], Solve]:
     def prepare(case):
         one = diffeqsolve(case, derive(case))
-        run = jax.jit(jax.vmap(one, in_axes=(0, None)) if batched else one)
-        y0 = jnp.asarray(case.states if batched else case.states[0])
-        return lambda tol: np.atleast_2d(np.asarray(run(y0, tol)))
+        run, y0 = jax.jit(jax.vmap(one, in_axes=(0, None)) if batched else one), jnp.asarray(case.states)
+        if batched:
+            return lambda tol: tuple(map(np.asarray, run(y0, tol)))
+        return lambda tol: _one_by_one(lambda y, tol: tuple(map(np.asarray, run(y, tol))), y0, tol)
 
     return prepare
 
@@ -187,18 +192,19 @@ def _heyoka_single(case: Case) -> Solve:
 
     equations, integrators = heyoka_system(case), {}
 
+    def one(state, tol):
+        ta = integrators[tol]
+        ta.time = 0.0
+        ta.state[:] = state
+        steps = ta.propagate_until(case.duration)[3]
+        return ta.state.copy(), steps
+
     def solve(tol):
         if tol not in integrators:
             integrators[tol] = hy.taylor_adaptive(
                 equations, case.states[0].copy(), tol=tol, compact_mode=case.long_formulas
             )
-        ta, final = integrators[tol], np.empty_like(case.states)
-        for state, out in zip(case.states, final, strict=True):
-            ta.time = 0.0
-            ta.state[:] = state
-            ta.propagate_until(case.duration)
-            out[:] = ta.state
-        return final
+        return _one_by_one(one, case.states, tol)
 
     return solve
 
@@ -222,7 +228,7 @@ def _heyoka_batch(case: Case) -> Solve:
 
     def solve(tol):
         ta = integrators[tol] if tol in integrators else integrators.setdefault(tol, build(tol))
-        return _members(_propagated(ta, blocks, case.duration), case.batch)
+        return _members(*_propagated(ta, blocks, case.duration), case.batch)
 
     return solve
 
@@ -242,40 +248,42 @@ def _heyoka_threads(case: Case) -> Solve:
         if tol not in integrators:
             first = build(tol)
             integrators[tol] = [first, *(copy.deepcopy(first) for _ in shares[1:])]
-        ends = pool.map(lambda ta, share: _propagated(ta, share, case.duration), integrators[tol], shares)
-        return _members(np.concatenate(list(ends)), case.batch)
+        runs = pool.map(lambda ta, share: _propagated(ta, share, case.duration), integrators[tol], shares)
+        return _members(*map(np.concatenate, zip(*runs, strict=True)), case.batch)
 
     return solve
 
 
-def _propagated(ta, blocks: np.ndarray, duration: float) -> np.ndarray:
-    final = np.empty_like(blocks)
-    for block, out in zip(blocks, final, strict=True):
+def _propagated(ta, blocks: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    final, steps = np.empty_like(blocks), np.empty((len(blocks), blocks.shape[2]), int)
+    for block, out, count in zip(blocks, final, steps, strict=True):
         ta.set_time(0.0)
         ta.state[:] = block
         ta.propagate_until(duration)
-        out[:] = ta.state
-    return final
+        out[:], count[:] = ta.state, [result[3] for result in ta.propagate_res]
+    return final, steps
 
 
-def cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _members(blocks: np.ndarray, batch: int) -> np.ndarray:
-    return blocks.transpose(0, 2, 1).reshape(-1, blocks.shape[1])[:batch]
+def _members(blocks: np.ndarray, steps: np.ndarray, batch: int) -> tuple[np.ndarray, np.ndarray]:
+    return blocks.transpose(0, 2, 1).reshape(-1, blocks.shape[1])[:batch], steps.ravel()[:batch]
 
 
 def reference(case: Case) -> tuple[np.ndarray, np.ndarray]:
     """Final states from a program and a method other than those measured, and a second, looser one to judge them by.
 
-    heyoka at tol = 1e-18 (its series is then long enough that round-off alone is left) and at 1e-16; without heyoka,
-    DOP853 at 1e-13 and 1e-12 over all members at once, on the autodiff equations.
+    heyoka at tol = 1e-18 (its series is then long enough that round-off alone is left) and at 1e-16. Without heyoka,
+    and where it compiles for minutes, DOP853 at 1e-13 and 1e-12 over all members at once, on the autodiff equations.
     """
-    if importlib.util.find_spec("heyoka") is not None:
+    if installed("heyoka") and _heyoka_compiles(case) is None:
         solve = _heyoka_batch(case)
-        return solve(1e-18), solve(1e-16)
-    return _dop853_of_all(case, 1e-13), _dop853_of_all(case, 1e-12)
+        return solve(1e-18)[0], solve(1e-16)[0]
+    few = case.first(8)
+    return _dop853_of_all(few, 1e-13), _dop853_of_all(few, 1e-12)
+
+
+def _heyoka_compiles(case: Case) -> str | None:
+    long = case.long_formulas and case.coordinates > 16
+    return "heyoka takes minutes to compile formulas this long" if long else None
 
 
 # ---- SciPy and SymPy -------------------------------------------------------------------------------------------------
@@ -309,7 +317,7 @@ def _scipy(case: Case) -> Solve:
 
     def solve(tol):
         runs = [solve_ivp(field, (0.0, case.duration), y, method="DOP853", rtol=tol, atol=tol) for y in case.states]
-        return np.stack([run.y[:, -1] for run in runs])
+        return np.stack([run.y[:, -1] for run in runs]), np.array([len(run.t) - 1 for run in runs])
 
     return solve
 
@@ -333,22 +341,30 @@ def _sympy_copes(case: Case) -> str | None:
 
 # ---- who takes part --------------------------------------------------------------------------------------------------
 
+HEYOKA = {"packages": ("heyoka",), "suits": _heyoka_compiles}
+
 BATCHED = (
-    Contender("lagjax", _lagjax),
-    Contender("lagjax, in jit", _lagjax_jit),
+    Contender("lagjax", _lagjax()),
+    Contender("lagjax, diffrax", _lagjax(solver=diffrax.Dopri8())),
     Contender("diffrax, by hand", _diffrax(by_hand), suits=_has_formulas),
     Contender("diffrax, autodiff", _diffrax(autodiff_acceleration)),
-    Contender("heyoka, SIMD", _heyoka_batch, ("heyoka",)),
-    Contender("heyoka, threads", _heyoka_threads, ("heyoka",)),
-    Contender("heyoka, single", _heyoka_single, ("heyoka",), members=128),
+    Contender("heyoka, SIMD", _heyoka_batch, **HEYOKA),
+    Contender("heyoka, threads", _heyoka_threads, **HEYOKA),
+    Contender("heyoka, single", _heyoka_single, **HEYOKA, members=128),
+    Contender("numba", _numba.prepare, ("numba", "scipy"), suits=_numba.why_not),
+    Contender("MuJoCo", _mujoco.prepare, ("mujoco",), suits=_mujoco.why_not, members=32),
     Contender("SciPy + SymPy", _scipy, ("scipy", "sympy"), suits=_sympy_copes, members=4),
 )
 
-SINGLE = (
-    Contender("lagjax", _lagjax_single),
-    Contender("lagjax, in jit", _lagjax_jit),
+SINGLE = (  # one trajectory after the other
+    Contender("lagjax", _lagjax_single()),
+    Contender("lagjax, diffrax", _lagjax_single(solver=diffrax.Dopri8())),
     Contender("diffrax, by hand", _diffrax(by_hand, batched=False), suits=_has_formulas),
     Contender("diffrax, autodiff", _diffrax(autodiff_acceleration, batched=False)),
-    Contender("heyoka", _heyoka_single, ("heyoka",)),
-    Contender("SciPy + SymPy", _scipy, ("scipy", "sympy"), suits=_sympy_copes),
+    Contender("heyoka, single", _heyoka_single, **HEYOKA),
+    Contender("SciPy + SymPy", _scipy, ("scipy", "sympy"), suits=_sympy_copes, members=4),
 )
+
+
+def named(*names: str) -> list[Contender]:
+    return [contender for contender in BATCHED if contender.name in names]

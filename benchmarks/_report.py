@@ -1,4 +1,4 @@
-"""What remains of a run: tables on the screen, a JSON file with everything needed to judge it, and figures."""
+"""What remains of a run: tables on the screen, and a JSON file with everything needed to judge it."""
 
 import datetime
 import importlib.metadata
@@ -12,11 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._contenders import cores
-from benchmarks._measure import Comparison, at_equal_error
+from benchmarks._measure import Comparison, at_equal_error, ratio_at_equal_error
+from lagjax._native import cores
 
-PACKAGES = ("lagjax", "jax", "jaxlib", "diffrax", "equinox", "numpy", "heyoka", "scipy", "sympy")
-EQUAL_ERRORS = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+PACKAGES = (
+    *("lagjax", "jax", "jaxlib", "diffrax", "equinox", "llvmlite", "numpy"),
+    *("heyoka", "numba", "mujoco", "scipy", "sympy"),
+)
+EQUAL_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 OURS = "lagjax"
 
 
@@ -94,9 +97,9 @@ def error_against_time(comparison: Comparison) -> list[dict[str, Any]]:
             "contender": row.contender,
             "tol": row.tol,
             "µs/trajectory": 1e6 * row.seconds,
-            "least": 1e6 * row.least_seconds,
             "median error": row.median_error,
             "worst": row.worst_error,
+            "steps": row.steps,
             "compile s": row.compile_seconds,
         }
         for row in comparison.rows
@@ -105,23 +108,25 @@ def error_against_time(comparison: Comparison) -> list[dict[str, Any]]:
 
 def equal_error(comparison: Comparison) -> list[dict[str, Any]]:
     """For each contender and error: seconds per trajectory, and how many times those of lagjax that is."""
-    names = list(dict.fromkeys(row.contender for row in comparison.rows))
-    found = {
-        name: [at_equal_error((r for r in comparison.rows if r.contender == name), error) for error in EQUAL_ERRORS]
-        for name in names
-    }
-    ours = found.get(OURS, [None] * len(EQUAL_ERRORS))
-    return [
-        {
-            "contender": name,
-            "error": error,
-            "seconds": time and time[0],
-            "upper_bound": bool(time and time[1]),
-            "times_lagjax": time[0] / own[0] if time and own else None,
-        }
-        for name in names
-        for error, time, own in zip(EQUAL_ERRORS, found[name], ours, strict=True)
-    ]
+    rows = {name: [r for r in comparison.rows if r.contender == name] for name in _contenders(comparison)}
+    entries = []
+    for name, theirs in rows.items():
+        for error in EQUAL_ERRORS:
+            time = at_equal_error(theirs, error)
+            entries.append(
+                {
+                    "contender": name,
+                    "error": error,
+                    "seconds": time and time[0],
+                    "upper_bound": bool(time and time[1]),
+                    "times_lagjax": ratio_at_equal_error(rows.get(OURS, []), theirs, error),
+                }
+            )
+    return entries
+
+
+def _contenders(comparison: Comparison) -> list[str]:
+    return list(dict.fromkeys(row.contender for row in comparison.rows))
 
 
 def equal_error_table(comparison: Comparison) -> list[dict[str, Any]]:
@@ -152,6 +157,12 @@ def print_comparison(comparison: Comparison) -> None:
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
+def read_json(path: Path) -> dict[str, Any]:
+    """The parts that were written before."""
+    record = json.loads(path.read_text()) if path.exists() else {}
+    return {part: value for part, value in record.items() if "rows" in value}
+
+
 def write_json(path: Path, record: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(_finite(record), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
@@ -166,27 +177,3 @@ def _finite(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def draw(comparison: Comparison, path: Path) -> bool:
-    """Error against time, one line a contender; False without matplotlib."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        return False
-    figure = Figure(figsize=(7, 5), layout="constrained")
-    axes = figure.add_subplot()
-    for name in dict.fromkeys(row.contender for row in comparison.rows):
-        rows = [row for row in comparison.rows if row.contender == name]
-        errors, times = [max(row.median_error, 1e-17) for row in rows], [1e6 * row.seconds for row in rows]
-        axes.loglog(errors, times, marker="o", label=name, linewidth=2.5 if name == OURS else 1.2)
-    axes.axvline(comparison.reference_error, color="0.6", linestyle=":", label="error of the reference")
-    axes.invert_xaxis()
-    axes.set_xlabel(f"median error at T = {comparison.duration:.4g}")
-    axes.set_ylabel("µs per trajectory")
-    axes.set_title(f"{comparison.case.replace('_', ' ')}, {comparison.batch} members")
-    axes.grid(True, which="major", alpha=0.3)
-    axes.legend(fontsize="small")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
-    return True

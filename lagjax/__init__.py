@@ -5,13 +5,14 @@ System(L)  →  simulate(system, q0, qdot0, ts, params)  →  Trajectory
 
 from lagjax import plot, scenes
 from lagjax._explain import Explanation
+from lagjax._hybrid import Transition, simulate_hybrid
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._simulate import simulate, simulate_batch
 from lagjax._solvers import FineOutput, Unrolled
 from lagjax._system import System
 from lagjax._taylor import Taylor
-from lagjax._trajectory import State, Trajectory
+from lagjax._trajectory import State, Trajectory, Transitions
 
 __version__ = "0.1.0"
 __all__ = [
@@ -23,6 +24,8 @@ __all__ = [
     "System",
     "Taylor",
     "Trajectory",
+    "Transition",
+    "Transitions",
     "Unrolled",
     "WorkPrecision",
     "WorkPrecisionRow",
@@ -30,5 +33,6 @@ __all__ = [
     "scenes",
     "simulate",
     "simulate_batch",
+    "simulate_hybrid",
     "work_precision",
 ]

@@ -145,7 +145,7 @@ def _fields(settings: Settings, layout: Layout, outcome: Outcome, idle: int | No
     n = layout.size
     library = np if isinstance(outcome.y_end, np.ndarray) else jnp  # NumPy costs less where nothing is traced
     finite = library.isfinite(outcome.y_end).all(axis=-1)  # a last state that overflowed is not a success
-    result = jnp.asarray(library.asarray(_RESULT)[library.where(finite, outcome.code, _native.NOT_FINITE)])
+    result = jnp.asarray(library.asarray(RESULT_OF_CODE)[library.where(finite, outcome.code, _native.NOT_FINITE)])
     stats = {
         "num_steps": jnp.asarray(outcome.accepted + outcome.rejected),
         "num_accepted_steps": jnp.asarray(outcome.accepted),
@@ -163,7 +163,7 @@ def _fields(settings: Settings, layout: Layout, outcome: Outcome, idle: int | No
 
 
 # The codes of the kernel, in their order, as those of `RESULTS`.
-_RESULT = np.array([
+RESULT_OF_CODE = np.array([
     int(result._value)
     for result in (
         RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,

@@ -163,13 +163,23 @@ def projection_program(motion: Motion, layout: Layout, params: PyTree) -> Progra
     return lower(projected, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
 
 
+def multiplier_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
+    """λ as a program, those of `constraints` first; redundant ones are zero."""
+    _require_small(layout)
+
+    def saddle(*state):
+        return *motion.mass_matrix_and_force(*state), *motion.rows_and_targets(*state)
+
+    return _eliminated(saddle, motion, layout, params, wanted="multipliers")
+
+
 def _require_small(layout: Layout) -> None:
     if layout.size > LARGEST_SCALAR_SCENE:
         raise Unlowerable(f"it has {layout.size} coordinates, more than {LARGEST_SCALAR_SCENE}")
 
 
-def _eliminated(parts_of: Callable, motion: Motion, layout: Layout, params: PyTree) -> Program:
-    """x with M x = b, or with M x − Gᵀλ = b and G x = c, from a function that returns (M, b) or (M, b, G, c)."""
+def _eliminated(parts_of: Callable, motion: Motion, layout: Layout, params: PyTree, wanted: str = "x") -> Program:
+    """x (or λ) with M x = b, or with M x − Gᵀλ = b and G x = c, from a function that returns (M, b) or (M, b, G, c)."""
     n = layout.size
     q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
     parts = lower(parts_of, q, q, t, params, budget=OPERATION_BUDGET)
@@ -187,7 +197,9 @@ def _eliminated(parts_of: Callable, motion: Motion, layout: Layout, params: PyTr
         else:
             rows, c = [values[n * i : n * i + n] for i in range(m)], values[m * n :]
             zeros = (mass_zeros, row_zeros)
-            x, _, singular = _linear.eliminate_saddle(matrix, b, rows, c, zeros, regular, layout.dtype)
+            x, multipliers, singular = _linear.eliminate_saddle(matrix, b, rows, c, zeros, regular, layout.dtype)
+            if wanted == "multipliers":
+                return tuple(multipliers)
         return *x, singular
 
     return lower(solved, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
@@ -202,10 +214,12 @@ def _scalar_shapes(layout: Layout, params: PyTree) -> list[jax.ShapeDtypeStruct]
 def _require_definite(parts: Program, n: int, m: int) -> bool:
     """Elimination without pivoting is for positive definite M; look at a few states whether this M can be.
 
-    With constraints it may be singular, and is then helped by GᵀG. Returns whether it needs no help. The choice is
-    between right answers: a wrong guess here is caught by the test on the pivots.
+    With constraints it may be singular, and is then helped by GᵀG. Returns whether it never needs help, which nobody
+    knows where it depends on parameters: one of them may be zero. The choice is between right answers: a wrong guess
+    here is caught by the test on the pivots.
     """
-    rng, regular = np.random.default_rng(0), True
+    rng = np.random.default_rng(0)
+    regular = not any(position > 2 * n for i in range(n * n) for position in parts.depends(i))
     for _ in range(3):
         values = np.array(parts.evaluate(*rng.uniform(0.3, 1.2, parts.size)), float)
         matrix = values[: n * n].reshape(n, n)

@@ -66,12 +66,15 @@ class Flow:
     """The map of one program for q̈ with n coordinates.
 
     `program` takes q, q̇, t and then the parameters, number by number; it gives q̈ and whether the mass matrix is
-    singular. `projection`, from the same to (q, q̇), keeps the motion on its constraints.
+    singular. `projection`, from the same to (q, q̇), keeps the motion on its constraints. `guards` end the motion early:
+    then the outcome is a plain number, without derivatives.
     """
 
-    def __init__(self, program: Program, size: int, projection: Program | None = None):
-        self.program, self.size, self.projection = program, size, projection
-        self.kernel = _native.Kernel(program, size, projection)
+    def __init__(
+        self, program: Program, size: int, projection: Program | None = None, guards: _native.Guards | None = None
+    ):
+        self.program, self.size, self.projection, self.guards = program, size, projection, guards
+        self.kernel = _native.Kernel(program, size, projection, guards)
         self.traceable = functools.lru_cache(maxsize=16)(self._traceable)
         self.varied = functools.lru_cache(maxsize=16)(self._varied)
 
@@ -94,12 +97,15 @@ class Flow:
         def on_host(*arrays):
             return _over_batch(lambda *rows: self.run(*rows, tolerances)[0], *arrays)
 
-        @jax.custom_jvp
         def run(ts, y0, *params):
             shapes = [(*ts.shape, self.states), (self.states,), (), (), (), ()]
             dtypes = [np.float64] * 3 + [np.int64] * 3
             outcome = [jax.ShapeDtypeStruct(*of) for of in zip(shapes, dtypes, strict=True)]
             return Outcome(*jax.pure_callback(on_host, tuple(outcome), ts, y0, *params, vmap_method="expand_dims"))
+
+        if self.guards is not None:
+            return lambda *arrays: run(*map(jax.lax.stop_gradient, arrays))
+        run = jax.custom_jvp(run)
 
         @functools.partial(run.defjvp, symbolic_zeros=True)
         def rule(primals, tangents):
@@ -112,7 +118,7 @@ class Flow:
     def _varied(self, by_state: bool, params: tuple[int, ...]) -> "Flow":
         """The flow of q and of ∂q/∂x, for x in y0 (if asked for) and in these parameters; (1 + x's, n) coordinates."""
         n, free = self.size, self.states * by_state  # an initial state has no ∂q̈/∂x
-        rows, numbers, chosen = 1 + free + len(params), self.program.size - self.states - 1, jnp.array(params, int)
+        rows, numbers, chosen = 1 + free + len(params), self.program.size - self.states - 1, np.array(params, int)
 
         def derivative(function, q, v, t, p):
             """`function(q, v, t, p)` at the first rows, and for the others how it varies with them."""
@@ -159,7 +165,8 @@ def _push(flow: Flow, tolerances: Tolerances, primals, tangents) -> tuple[Outcom
     (path, *path_by), (y_end, *end_by) = by_rows(outcome.path), by_rows(outcome.y_end)
 
     def slope(t, y):
-        return jnp.concatenate([y[n:], jnp.stack(flow.program(*y, t, *params)[:-1])])
+        rate = jnp.concatenate([y[n:], jnp.stack(flow.program(*y, t, *params)[:-1])])
+        return jnp.where(jnp.isfinite(rate), rate, 0.0)  # where it is not, the motion has ended
 
     varied = (dy0 if moved else jnp.zeros_like(y0)) - (slope(ts[0], y0) * dts[0] if by_time else 0.0)
     weights = [*(varied if by_state else ()), *(dparams[i] for i in active)]

@@ -137,8 +137,8 @@ def _ldl_solve(factors, b) -> list:
 #
 #     M x − Gᵀλ = b,   G x = c
 #
-# M may be singular where the constraints hold what it does not: adding GᵀG x = Gᵀc to the first line changes neither x
-# nor λ and makes the matrix K = M + GᵀG regular whenever the saddle point is.
+# M may be singular where the constraints hold what it does not: adding GᵀW G x = GᵀW c to the first line, W diagonal,
+# changes neither x nor λ and makes the matrix K = M + GᵀW G regular whenever the saddle point is.
 
 
 def saddle(matrix: jax.Array, b: jax.Array, rows: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -205,12 +205,17 @@ def eliminate_saddle(matrix, b, rows, c, zeros, regular: bool, dtype) -> tuple[l
     small = singular_threshold(n, dtype)
     if not regular:
         touched = ~row_zeros
+        total = _dot((matrix[i][i], 1.0) for i in range(n))
+        sizes = [_dot((rows[k][i], rows[k][i]) for i in range(n) if touched[k, i]) for k in range(m)]
+        # Weights that make every row of G as heavy as M.
+        heavy = [total / jnp.where(size > 0, size, 1.0) for size in sizes]
+        pulled = [[heavy[k] * rows[k][i] for i in range(n)] for k in range(m)]
         mass_zeros = mass_zeros & ~((touched.T.astype(int) @ touched.astype(int)) > 0)
         matrix = [
-            [matrix[i][j] + _dot((rows[k][i], rows[k][j]) for k in range(m) if touched[k, i] and touched[k, j])
+            [matrix[i][j] + _dot((pulled[k][i], rows[k][j]) for k in range(m) if touched[k, i] and touched[k, j])
              for j in range(n)] for i in range(n)
         ]  # fmt: skip
-        b = [b[i] + _dot((rows[k][i], c[k]) for k in range(m) if touched[k, i]) for i in range(n)]
+        b = [b[i] + _dot((pulled[k][i], c[k]) for k in range(m) if touched[k, i]) for i in range(n)]
     factors, singular = _ldl_factors(matrix, ~mass_zeros, small)
     free = _ldl_solve(factors, b)
     responses = [_ldl_solve(factors, row) for row in rows]

@@ -14,6 +14,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The state or its acceleration became NaN or infinite. Look at the Lagrangian, its gradient and the parameters "
         "there: a square root or norm at zero, a logarithm of a negative number, a branch of `where` that is not taken."
     )
+    max_transitions_reached = (
+        "The budget of transitions was spent. Raise max_transitions; if their times pile up (as the bounces of a ball "
+        "do), no budget is enough: let the motion end, or go over to a mode at rest."
+    )
     inconsistent_start = (
         "The initial state does not satisfy the constraints. Put it there first: system.project(q0, qdot0, t, params)."
     )

@@ -105,7 +105,7 @@ def simulate(
     else:
         fields = _engine.run(flow, settings, layout, q0, qdot0, params)
     trajectory = Trajectory(*fields, system, params)
-    return _raise_unless_ok(trajectory, layout) if throw else trajectory
+    return raise_unless_ok(trajectory, layout) if throw else trajectory
 
 
 def simulate_batch(
@@ -280,7 +280,7 @@ def _first_member(tree: PyTree, axes: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf, axis: leaf if axis is None else jnp.take(leaf, 0, axis), tree, axes)
 
 
-def _raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
+def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced."""
     if not is_concrete(trajectory.ok):
         return trajectory.result.error_if(trajectory, ~trajectory.ok)

@@ -197,7 +197,11 @@ class System(eqx.Module):
 
     def _of_constraints(self, quantity: Callable, q, qdot, t, params) -> PyTree:
         self._require_constraints()
-        flat, structure = self._at(quantity, q, qdot, t, params), self.constraint_structure(Layout.of(q, qdot), params)
+        return self.by_constraint(self._at(quantity, q, qdot, t, params), Layout.of(q, qdot), params)
+
+    def by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
+        """A number for each constraint, end to end, in the structure of `multipliers`."""
+        structure = self.constraint_structure(layout, params)
         ends = np.cumsum([0, *(math.prod(leaf.shape) for leaf in jax.tree.leaves(structure))]).tolist()
         pieces = [
             flat[start:end].reshape(leaf.shape)

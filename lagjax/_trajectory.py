@@ -26,6 +26,20 @@ class State(NamedTuple):
     qdot: PyTree
 
 
+class Transitions(NamedTuple):
+    """The changes of mode of a hybrid motion, in order: NaN or −1 beyond the last of `count`.
+
+    `t`, `q`, `qdot` are those just before the reset; `source` and `target` are places in the dict of modes.
+    """
+
+    t: jax.Array
+    q: PyTree
+    qdot: PyTree
+    source: jax.Array
+    target: jax.Array
+    count: jax.Array
+
+
 class Trajectory(eqx.Module):
     """The motion of a system at the times `ts`, one trajectory or a batch of them.
 
@@ -37,6 +51,7 @@ class Trajectory(eqx.Module):
     - `end`: where each member ended, a `State` of `t`, `q`, `qdot`: at `ts[-1]`, at the event, or at the last accepted
       step before it failed.
     - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+    - `mode`, `transitions`: of a hybrid motion (`simulate_hybrid`), else None. `system` is then the dict of its modes.
     """
 
     ts: jax.Array
@@ -48,6 +63,8 @@ class Trajectory(eqx.Module):
     system: System
     params: PyTree
     params_axes: PyTree = eqx.field(static=True, default=None)  # how `simulate_batch` mapped over params
+    mode: jax.Array | None = None
+    transitions: "Transitions | None" = None
 
     @property
     def ok(self) -> jax.Array:

@@ -31,6 +31,7 @@ STREET = [
     "_trajectory",
     "_engine",
     "_simulate",
+    "_hybrid",
     "_precision",
     "scenes",
     "plot",

@@ -2,7 +2,10 @@
 
 import importlib
 import json
+import os
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -29,19 +32,21 @@ def record(tmp_path):
         arguments = ["--only", "errors", "--cases", "double_pendulum", "--contenders", contender, "--batch", "4"]
         arguments += ["--duration", "0.5", "--repeats", "1", "--output", str(tmp_path), "--tolerances"]
         main([*arguments, *map(str, TOLERANCES)])
-        return json.loads((tmp_path / "results.json").read_text())
+        return json.loads((tmp_path / "results.json").read_text())["errors"]
 
     return run
 
 
 CONTENDERS = {
     "lagjax": (),
-    "lagjax, in jit": (),
+    "lagjax, diffrax": (),
     "diffrax, by hand": (),
     "diffrax, autodiff": (),
     "heyoka, SIMD": ("heyoka",),
     "heyoka, threads": ("heyoka",),
     "heyoka, single": ("heyoka",),
+    "numba": ("numba", "scipy"),
+    "MuJoCo": ("mujoco",),
     "SciPy + SymPy": ("scipy", "sympy"),
 }
 
@@ -52,13 +57,13 @@ def test_error_against_time(record, tmp_path, contender, packages):
         pytest.importorskip(package, reason=f"{contender} needs {package}")
     pytest.importorskip("scipy", reason="the reference needs SciPy or heyoka")
     written = record(contender)
-    (comparison,) = written["errors"]
+    (comparison,) = written["rows"]
     assert not comparison["absent"]
     loose, tight = comparison["rows"]
     assert (loose["tol"], tight["tol"]) == TOLERANCES
     assert tight["median_error"] < loose["median_error"] < 1e-3
     assert tight["median_error"] < 1e-7
-    assert loose["members"] == 4 and loose["seconds"] > 0
+    assert loose["members"] == 4 and loose["seconds"] > 0 and loose["most_steps"] >= loose["steps"] > 1
     assert comparison["reference_error"] < 1e-10
     circumstances = written["circumstances"]
     assert {"commit", "dirty", "versions", "machine", "date"} <= circumstances.keys()
@@ -66,13 +71,138 @@ def test_error_against_time(record, tmp_path, contender, packages):
     assert circumstances["machine"]["cpu"] and circumstances["machine"]["cores"] >= 1
 
 
-def test_figure(tmp_path):
+def test_one_trajectory_after_the_other():
+    contenders, measure = of_benchmarks("_contenders"), of_benchmarks("_measure")
+    pytest.importorskip("scipy", reason="the reference needs SciPy or heyoka")
+    case = of_benchmarks("_cases").double_pendulum(2)
+    single = [contender for contender in contenders.SINGLE if "lagjax" in contender.name]
+    for row in measure.compare(replace(case, duration=0.5), single, [1e-8], repeats=1).rows:
+        assert row.members == 2 and row.worst_error < 1e-6
+
+
+OPTIONS = SimpleNamespace(
+    batch=4, links=2, duration=0.2, repeats=1, budget=1e3, tolerances=[1e-6, 1e-10], cases=["wedge"], contenders=None
+)
+
+
+@pytest.fixture
+def lagjax_alone(monkeypatch):
+    """The parts that measure series, without peers."""
+    pytest.importorskip("scipy", reason="the reference needs SciPy or heyoka")
+    comparisons = of_benchmarks("_comparisons")
+    ours = of_benchmarks("_contenders").named("lagjax")
+    monkeypatch.setattr(comparisons, "named", lambda *names: list(ours))
+    return comparisons
+
+
+@pytest.mark.parametrize(("part", "key", "values"), [("sizes", "links", [2]), ("batches", "batch", [1, 10, 100, 1000])])
+def test_series(lagjax_alone, part, key, values):
+    rows = getattr(lagjax_alone, part)(OPTIONS)
+    assert [row[key] for row in rows] == values
+    assert all(row["median error"] < 1e-7 and row["µs/step"] < row["µs/trajectory"] for row in rows)
+
+
+def test_a_series_ends_with_a_reason(lagjax_alone, capsys):
+    rows = lagjax_alone.batches(SimpleNamespace(**vars(OPTIONS) | {"budget": 1e-9}))
+    assert [row["batch"] for row in rows] == [1]
+    assert "lagjax ends with 1 members of double_pendulum" in capsys.readouterr().out
+
+
+def test_cores(lagjax_alone):
+    if not hasattr(os, "sched_setaffinity"):
+        pytest.skip("this system does not confine a thread to a core")
+    before = os.sched_getaffinity(0)
+    rows = lagjax_alone.cores(OPTIONS)
+    assert os.sched_getaffinity(0) == before
+    assert [row["cores"] for row in rows if row["case"] == "chain_8"][-1] == len(before)
+    assert all(row["times faster than one"] == 1 for row in rows if row["cores"] == 1)
+
+
+def test_right_hand_sides():
+    (row,) = of_benchmarks("_comparisons").right_hand_sides(OPTIONS)
+    assert row["case"] == "wedge" and row["lagjax/by hand"] > 0 and row["autodiff/lagjax"] > 0
+
+
+def test_first_result_of_a_new_process():
+    derivation = of_benchmarks("_derivation")
+    found = derivation._in_new_process("lagjax", 2, budget=60)
+    assert found["first result s"] > found["second s"] > 0
+    assert all(stage > 0 for stage in derivation._stages(of_benchmarks("_cases").chain(2, 1)))
+
+
+def test_gradient():
+    gradient = of_benchmarks("_gradient")
+    case = replace(of_benchmarks("_cases").chain(2, 3), duration=1.0)
+    row, derivative = gradient._measured("lagjax", gradient._with_lagjax(case), case, OPTIONS)
+    assert derivative.shape == (3, 8) and row["largest"] < 1e-8 and row["steps"] > 5
+
+
+def test_mixed():
+    mixed = of_benchmarks("_mixed")
+    comparison = next(iter(mixed.mixed(SimpleNamespace(**vars(OPTIONS) | {"batch": 64}))))
+    assert mixed.waiting(comparison) > 2
+    assert {row.contender for row in comparison.rows} == set(mixed.CONTENDERS)
+    assert all(row.median_error < 1e-4 for row in comparison.rows if row.tol == 1e-10)
+
+
+def comparison_of(times):
+    """Programs with straight lines in the figure of errors against times; the record as it is stored."""
+    measure, report = of_benchmarks("_measure"), of_benchmarks("_report")
+    rows = [
+        measure.Row(name, tol, 4, 0.0, tol, tol, [4 * time * scale * slower for scale in (1.0, 3.0, 2.0)], 10.0, 12)
+        for name, time in times.items()
+        for tol, slower in ((1e-4, 1.0), (1e-12, 2.0))
+    ]
+    comparison = measure.Comparison("double_pendulum", 4, 2, 1.0, 1e-15, rows, {})
+    return {"rows": [comparison.as_dict() | {"equal_error": report.equal_error(comparison)}]}
+
+
+def test_goals():
+    record = {"errors": comparison_of({"lagjax": 1.0, "heyoka, SIMD": 1.2, "heyoka, single": 9.0})}
+    record["gradient"] = {"rows": [{"contender": "lagjax", "reverse/solve": 7.0, "largest": 0.0}]}
+    found = {row["work"]: (row["reached"], row["met"]) for row in of_benchmarks("_goals").goals(record)}
+    assert found["heyoka's best / lagjax, 2 links, 1e-6…1e-12"] == (pytest.approx(1.2), "yes")
+    assert found["heyoka's best / lagjax, 2 links, 1e-6…1e-8"] == (pytest.approx(1.2), "no")
+    assert found["heyoka's best / lagjax, 4 links, 1e-6…1e-10"] == (None, "–")
+    assert found["reverse gradient / solve, 8 parameters"] == (7.0, "no")
+    assert found["reverse against forward mode"] == (0.0, "yes")
+
+
+def test_parts_that_were_not_run_again_are_kept(tmp_path):
+    pytest.importorskip("scipy", reason="the reference needs SciPy or heyoka")
+    main = of_benchmarks("__main__").main
+    of_benchmarks("_report").write_json(tmp_path / "results.json", {"errors": comparison_of({"lagjax": 1.0})})
+    tiny = ["--cases", "wedge", "--contenders", "lagjax", "--batch", "2", "--repeats", "1", "--tolerances", "1e-6"]
+    for _ in range(2):
+        record = main(["--only", "errors", "goals", *tiny, "--output", str(tmp_path)])
+    assert [row["case"] for row in record["errors"]["rows"]] == ["double_pendulum", "wedge"]
+    assert record["goals"]["rows"] and record["errors"]["rows"][1]["circumstances"]["versions"]
+
+
+SERIES = [{"contender": name, "x": x, "y": x} for name in ("lagjax", "numba") for x in (1, 10)]
+RECORD = {
+    "sizes": [{"links": r["x"], "µs/trajectory": r["y"], "µs/step": r["y"], **r} for r in SERIES],
+    "batches": [{"batch": r["x"], "µs/trajectory": r["y"], **r} for r in SERIES],
+    "derivation": [{"links": r["x"], "first result s": r["y"], **r} for r in SERIES],
+    "cores": [{"case": "chain_8", "cores": r["x"], "times faster than one": r["y"], **r} for r in SERIES],
+    "right_hand_sides": [{"case": "wedge", "lagjax ns": 1.0, "by hand ns": None, "autodiff ns": 9.0}],
+    "gradient": [{"contender": "lagjax", "steps": 500.0, "reverse/solve": 3.0, "forward/solve": 4.0}],
+    "goals": [{"work": w, "goal": "≤ 5", "reached": r, "met": "yes"} for w, r in (("a", 1.0), ("b", 0.0), ("c", None))],
+}
+
+
+@pytest.mark.parametrize("part", ["errors", "mixed", *RECORD])
+def test_figure(tmp_path, part):
     pytest.importorskip("matplotlib", reason="figures need matplotlib")
-    measure = of_benchmarks("_measure")
-    rows = [measure.Row("lagjax", tol, 4, 0.0, tol, tol, [1.0 / tol]) for tol in TOLERANCES]
-    comparison = measure.Comparison("anything", 4, 2, 1.0, 1e-15, rows, {})
-    assert of_benchmarks("_report").draw(comparison, tmp_path / "anything.png")
-    assert (tmp_path / "anything.png").stat().st_size > 1000
+    record = {part: {"rows": RECORD[part]} if part in RECORD else comparison_of({"lagjax": 1.0, "numba": 1.01})}
+    (path,) = of_benchmarks("_figures").draw(part, record, tmp_path)
+    assert path.stat().st_size > 1000
+
+
+def test_names_beside_lines_do_not_overlap():
+    places = of_benchmarks("_figures")._apart(np.array([0.5, 0.1, 0.52, 0.49]), gap=0.1)
+    assert np.diff(np.sort(places)).min() > 0.1 - 1e-12
+    assert places[1] == 0.1 and places[2] > places[0] > places[3]
 
 
 CASES = ("double_pendulum", "chain_4", "wedge", "kepler", "outer_planets", "fermi_pasta_ulam", "spherical_pendulum")

@@ -16,11 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._native import _integrator
-from lagjax._native._integrator import DONE, NOT_FINITE, OUT_OF_STEPS, SINGULAR, STEP_TOO_SMALL
+from lagjax._native._integrator import DONE, EVENT, NOT_FINITE, OUT_OF_STEPS, SINGULAR, STEP_TOO_SMALL
 from lagjax._native._ir import compiled
 from lagjax._program import Program, Series, Unlowerable, series
 
-__all__ = ["DONE", "NOT_FINITE", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Kernel", "cores", "recurrences"]
+__all__ = [
+    "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Guards", "Kernel", "cores",
+    "recurrences",
+]  # fmt: skip
 
 
 class Outcome(NamedTuple):
@@ -35,16 +38,26 @@ class Outcome(NamedTuple):
     idle: int
 
 
+class Guards(NamedTuple):
+    """Functions of the state that end the motion where they change sign: a program, and for each −1, 0 or +1."""
+
+    program: Program
+    directions: tuple[int, ...]
+
+
 class Kernel:
     """The integration of (q, q̇) with q̈ from a program, whose inputs are q, q̇, t and numbers that stay constant.
 
     The outputs of the program are q̈, then whether the mass matrix is singular. `projection`, from the same inputs to
-    (q, q̇), is applied to the state after every step, and to the outputs. Raises `Unlowerable` where an operation has no
+    (q, q̇), is applied to the state after every step, and to the outputs. `guards`, again from the same inputs, end the
+    motion of a member with the code `EVENT` + k. Raises `Unlowerable` where an operation has no
     Taylor series or is not one of doubles.
     """
 
-    def __init__(self, program: Program, size: int, projection: Program | None = None):
-        integrator = _integrator.Integrator(program, recurrences(program, size), projection)
+    def __init__(
+        self, program: Program, size: int, projection: Program | None = None, guards: Guards | None = None
+    ):
+        integrator = _integrator.Integrator(program, recurrences(program, size), projection, guards)
         self.states, self.numbers, self.width = 2 * size, integrator.numbers, integrator.width
         self._memory = integrator.memory
         self._engine = compiled(integrator.module)  # holds the code that the next lines point to

@@ -22,6 +22,7 @@ narrow feature ahead.
 """
 
 import ctypes
+import functools
 
 from llvmlite import ir
 
@@ -31,13 +32,14 @@ from lagjax._program import Program, Series, StraightLine
 
 MAX_ORDER = 20
 SAFETY = 0.9
+BISECTIONS = 60  # of a step, to find an event: beyond the digits of a double
 # A series that ends (free flight) allows any step, and a step that is too long sees nothing of what lies inside it.
 FIRST_STEP, GROWTH, GROWTH_AFTER_REJECTION = 1 / 16, 5.0, 2.0  # of the whole time; of the step before
 SMALLEST_STEP = 4 * 2.0**-52  # of the largest time: below this a step no longer moves the time reliably
 CHECKS = (0.5, 1.0)  # where in the step its series is held against the equations
 
 # How a member ended.
-DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR = range(5)
+DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, EVENT = range(6)  # EVENT + k: the k-th guard
 _RUNNING = -1
 
 
@@ -58,7 +60,7 @@ class Job(ctypes.Structure):
 # Doubles of a lane. `due` and `reached` are times in the direction of time; `active`, `last`, `singular` are 1 or 0.
 _OF_A_LANE = (
     "t", "t_low", "t_end", "forward", "smallest", "h", "due", "reached", "worst", "active", "last", "singular", "code",
-    "steps", "rejected", "longest", "growth",
+    "steps", "rejected", "longest", "growth", "event",
 )  # fmt: skip
 _KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
 # Integers of a lane: which member it carries (-1: none), and which output comes next.
@@ -68,9 +70,10 @@ LANE = ("member", "output")
 class Integrator:
     """Builds the module. `memory` is what a thread needs, in doubles; `lanes` the width."""
 
-    def __init__(self, program: Program, series: Series, projection: Program | None = None):
+    def __init__(self, program: Program, series: Series, projection: Program | None = None, guards=None):
         self.program, self.series, self.n = program, series, series.size
-        self.projection = projection
+        self.projection, self.guards = projection, guards
+        self.directions = () if guards is None else guards.directions
         self.states, self.width = 2 * series.size, lanes()
         self.module = ir.Module("motion")
         self.module.triple = ""
@@ -83,6 +86,7 @@ class Integrator:
         self.defect = self._defect()
         self.start_next = self._start_next()
         self.project = None if projection is None else self._project()
+        self.guard = None if guards is None else self._guard()
         self._run()
         if projection is not None:
             self._project_rows()
@@ -100,6 +104,7 @@ class Integrator:
             "sums": len(series.products),
             "values": series.values,
             "params": self.numbers,
+            **dict.fromkeys(("guard", "guard_before", "guard_middle"), len(self.directions)),
             **dict.fromkeys(_OF_A_LANE, 1),
         }
         for name, size in sizes.items():
@@ -286,6 +291,7 @@ class Integrator:
         self._set(code, memory, "active", lane, code.select(there, _double(code, 1.0), 0.0))
         self._set(code, memory, "code", lane, float(_RUNNING))
         self._set(code, memory, "due", lane, float("inf"))
+        self._set(code, memory, "event", lane, -1.0)
         with code.only_if(there):
             begin, end = (self._time(code, job, member, i) for i in (0, self._job(code, job, "times") - 1))
             self._set(code, memory, "t", lane, begin)
@@ -324,6 +330,8 @@ class Integrator:
             code.call(self.coefficients, memory, order)
             self._choose(code, memory, job, order)
             self._halve_until_sound(code, memory, job, order)
+            if self.guard is not None:
+                self._stop_at_events(code, memory, order)
             self._move_time(code, memory, lane_data, job, order)
             self._advance(code, memory)
             if self.project is not None:
@@ -463,6 +471,8 @@ class Integrator:
         is_last = self._vector(code, memory, "last") > 0.0
         ending = code.select(running & (steps + rejected >= limit), _lanes(code, OUT_OF_STEPS), ending)
         ending = code.select(is_last, _lanes(code, DONE), ending)
+        event = self._vector(code, memory, "event")
+        ending = code.select(event >= 0.0, event + float(EVENT), ending)
         self._keep(code, memory, "code", ending)
         active = self._vector(code, memory, "active") > 0.0
         with code.only_if(code.any_lane(~(active & (ending < 0.0)))), code.loop(self.width) as lane:
@@ -484,6 +494,83 @@ class Integrator:
             code.store(x, code.element(self._job(code, job, "y_end"), member * self.states + i))
             with code.only_if(done):
                 code.store(x, self._output(code, job, member, last_time, i))
+
+    # ---- events ----
+
+    def _guard(self) -> Code:
+        """`(memory, order, s)`: the guards at that time after the present one, lane by lane, into `guard`."""
+        code = Code(self.module, "guard", [POINTER, INTEGER, self.vector], self.width)
+        memory, order, s = code.arguments
+        increments, _ = self._increments(code, memory, order, s)
+        moved = [code.load(self.state(code, memory, i), self.vector) + dy for i, dy in enumerate(increments)]
+        now = self._now(code, memory)
+
+        def then(i):
+            return moved[i] if i < self.states else now(i) + s if i == self.states else now(i)
+
+        program = self.guards.program
+        values = emit(code, StraightLine(program.nodes, program.kinds, program.outputs), then, self.sincos)
+        for i, value in enumerate(values):
+            self._keep(code, memory, "guard", value, i)
+        return code.finish()
+
+    def _stop_at_events(self, code, memory, order) -> None:
+        """Where a guard changes sign along the step, the step ends there: at the earliest change of all guards.
+
+        Signs are compared at the beginning, in the middle and at the end. A motion that begins on the surface of a
+        guard has left it, or not, a millionth of the first step later: that is the sign it begins with.
+        """
+        h, count = self._vector(code, memory, "h"), len(self.directions)
+        fresh = code.compare("==", self._vector(code, memory, "steps"), 0.0)
+        with code.only_if(code.any_lane(fresh)):
+            code.call(self.guard, memory, order, 1e-6 * h)
+            for i in range(count):
+                before, first = (self._vector(code, memory, name, i) for name in ("guard_before", "guard"))
+                self._keep(code, memory, "guard_before", code.select(fresh, first, before), i)
+        code.call(self.guard, memory, order, 0.5 * h)
+        for i in range(count):
+            self._keep(code, memory, "guard_middle", self._vector(code, memory, "guard", i), i)
+        code.call(self.guard, memory, order, h)
+        moving = code.compare("!=", h, 0.0)
+        crossed = []
+        for i, direction in enumerate(self.directions):
+            before, middle, after = (
+                self._vector(code, memory, name, i) for name in ("guard_before", "guard_middle", "guard")
+            )
+            early, late = _crosses(before, middle, direction), _crosses(middle, after, direction)
+            crossed.append(((early | late) & moving, early))
+        any_crossed = functools.reduce(Value.__or__, (hit for hit, _ in crossed))
+        nearest = code.variable(h)
+        after = [self._vector(code, memory, "guard", i) for i in range(count)]
+        with code.only_if(code.any_lane(any_crossed)):
+            for i, (hit, early) in enumerate(crossed):
+                root = self._root(code, memory, order, i, h, hit, early)
+                best = code.load(nearest, self.vector)
+                sooner = hit & (code.intrinsic("fabs", root) <= code.intrinsic("fabs", best))
+                code.store(code.select(sooner, root, best), nearest)
+                event = self._vector(code, memory, "event")
+                self._keep(code, memory, "event", code.select(sooner, _lanes(code, i), event))
+            last = self._vector(code, memory, "last")
+            self._keep(code, memory, "last", code.select(any_crossed, 0.0, last))
+            self._keep(code, memory, "h", code.load(nearest, self.vector))
+            code.call(self.defect, memory, order, _double(code, 1.0))  # leaves the increment of the new step
+        for i in range(count):
+            self._keep(code, memory, "guard_before", after[i], i)
+
+    def _root(self, code, memory, order, i: int, h, hit, early) -> Value:
+        """Where guard i changes sign, by bisection: the end of the bracket, where it has changed."""
+        low = code.variable(code.select(early, 0.0, 0.5 * h))
+        high = code.variable(code.select(early, 0.5 * h, h))
+        first, second = (self._vector(code, memory, name, i) for name in ("guard_before", "guard_middle"))
+        sign = code.select(early, first, second)
+        with code.loop(BISECTIONS):
+            a, b = code.load(low, self.vector), code.load(high, self.vector)
+            middle = 0.5 * (a + b)
+            code.call(self.guard, memory, order, middle)
+            same = self._vector(code, memory, "guard", i) * sign > 0.0
+            code.store(code.select(same, middle, a), low)
+            code.store(code.select(same, b, middle), high)
+        return code.select(hit, code.load(high, self.vector), h)
 
     # ---- constraints ----
 
@@ -560,6 +647,11 @@ class Integrator:
 
     def _lane(self, code, lane_data, name: str, lane) -> Value:
         return code.element(lane_data, lane + LANE.index(name) * self.width, INTEGER)
+
+
+def _crosses(before: Value, after: Value, direction: int) -> Value:
+    falls, rises = (before > 0.0) & (after <= 0.0), (before < 0.0) & (after >= 0.0)
+    return falls if direction < 0 else rises if direction > 0 else falls | rises
 
 
 def _power(code, x: Value, exponent: Value) -> Value:

@@ -1,0 +1,314 @@
+"""A figure for each comparison, drawn from the stored record. A program has the same colour in all of them."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Record = dict[str, Any]
+
+COLOURS = {
+    "lagjax": "#c1121f",
+    "lagjax, diffrax": "#ef8d7a",
+    "lagjax, plain vmap": "#b07aa1",
+    "diffrax, by hand": "#1d4e89",
+    "diffrax, autodiff": "#6fa8dc",
+    "heyoka, SIMD": "#3a9d5d",
+    "heyoka, threads": "#14532d",
+    "heyoka, single": "#9bc995",
+    "numba": "#e09f3e",
+    "MuJoCo": "#7b4fa3",
+    "SciPy + SymPy": "#7a6c5d",
+}
+GREY = "0.55"
+STYLE = {
+    "font.size": 10,
+    "axes.titlesize": 12,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "0.4",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.8,
+    "xtick.color": "0.3",
+    "ytick.color": "0.3",
+    "xtick.minor.size": 0,
+    "ytick.minor.size": 0,
+    "lines.markersize": 4.5,
+}
+
+
+def draw(part: str, record: Record, folder: Path) -> list[Path]:
+    """The figures of one part; none without matplotlib, or where there is nothing to show."""
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError:
+        return []
+    paths = []
+    with matplotlib.rc_context(STYLE):
+        for name, size, fill in _figures_of(part, record[part]["rows"]):
+            figure = Figure(figsize=size, layout="constrained")
+            fill(figure)
+            paths.append(folder / f"{name}.png")
+            figure.savefig(paths[-1], dpi=150)
+    return paths
+
+
+def _figures_of(part: str, rows: list[dict]) -> Iterable[tuple[str, tuple[float, float], Callable]]:
+    if not rows:
+        return
+    if part in ("errors", "single", "mixed"):
+        for row in rows:
+            name = row["case"] if part in ("errors", row["case"]) else f"{part}_{row['case']}"
+            yield name, (8, 5), lambda figure, row=row: _error_against_time(figure.add_subplot(), row, part)
+    if part == "errors" and len(rows) > 1:
+        yield "errors", (12, 3.4 * -(-len(rows) // 3)), lambda figure: _overview(figure, rows)
+    elif part in PLOTS:
+        fill, size = PLOTS[part]
+        yield part, size(rows) if callable(size) else size, lambda figure: fill(figure, rows)
+
+
+# ---- errors against times --------------------------------------------------------------------------------------------
+
+
+def _error_against_time(axes, row: dict, part: str) -> None:
+    _curves(axes, row)
+    axes.set_xlabel(f"median error at T = {row['duration']:.4g}")
+    axes.set_ylabel("µs per trajectory")
+    which = "one trajectory after the other" if part == "single" else f"{row['batch']} members"
+    axes.set_title(f"{_title(row['case'])}, {which}")
+    _name_the_lines(axes)
+
+
+def _overview(figure, rows: list[dict]) -> None:
+    """All scenes beside each other, with one legend."""
+    grid = figure.subplots(-(-len(rows) // 3), 3, squeeze=False).ravel()
+    for axes, row in zip(grid, rows, strict=False):
+        _curves(axes, row)
+        axes.set_title(f"{_title(row['case'])}", fontsize=10)
+    for axes in grid[len(rows) :]:
+        axes.set_visible(False)
+    figure.supxlabel("median error at the end", fontsize=10)
+    figure.supylabel("µs per trajectory", fontsize=10)
+    lines = {line.get_label(): line for axes in grid for line in axes.get_lines() if line.get_label() in COLOURS}
+    names = [name for name in COLOURS if name in lines]
+    figure.legend([lines[name] for name in names], names, loc="outside upper center", ncols=5, frameon=False)
+
+
+def _curves(axes, row: dict) -> None:
+    for name in dict.fromkeys(point["contender"] for point in row["rows"]):
+        points = [p for p in row["rows"] if p["contender"] == name and p["median_error"] is not None]
+        errors = [max(p["median_error"], 1e-17) for p in points]
+        _line(axes, name, errors, [1e6 * p["seconds"] for p in points])
+    if row["reference_error"]:
+        axes.axvline(row["reference_error"], color=GREY, linestyle=":", linewidth=1, zorder=0)
+    axes.set_xscale("log")
+    axes.invert_xaxis()
+    _log(axes.yaxis)
+
+
+# ---- series ----------------------------------------------------------------------------------------------------------
+
+
+def _sizes(figure, rows: list[dict]) -> None:
+    left, right = figure.subplots(1, 2)
+    for axes, column in ((left, "µs/trajectory"), (right, "µs/step")):
+        _series(axes, rows, "links", column)
+        axes.set_xlabel("links of the chain")
+        _ticks_at(axes, rows, "links")
+        _log(axes.yaxis)
+    left.set(title="One second of a chain of pendulums", ylabel="µs per trajectory")
+    right.set(title="One step of it", ylabel="µs per trajectory and step")
+    _name_the_lines(left)
+    _name_the_lines(right)
+
+
+def _batches(figure, rows: list[dict]) -> None:
+    axes = figure.add_subplot()
+    _series(axes, rows, "batch", "µs/trajectory")
+    device = f" ({rows[0]['device']} for JAX)" if "device" in rows[0] else ""
+    axes.set(xscale="log", xlabel="members of the batch", ylabel="µs per trajectory")
+    _log(axes.yaxis)
+    axes.set_title(f"Double pendulum, tolerance 1e-9{device}")
+    _name_the_lines(axes)
+
+
+def _derivation(figure, rows: list[dict]) -> None:
+    axes = figure.add_subplot()
+    _series(axes, rows, "links", "first result s")
+    axes.set(xlabel="links of the chain", ylabel="seconds", title="First result of a new process")
+    axes.plot([2, 4, 8], [3, 6, 12], "_", color=GREY, markersize=14, markeredgewidth=2)
+    axes.annotate("goal", (2, 3), (0, 5), textcoords="offset points", ha="center", color=GREY, fontsize=9)
+    _ticks_at(axes, rows, "links")
+    _log(axes.yaxis)
+    _name_the_lines(axes)
+
+
+def _cores(figure, rows: list[dict]) -> None:
+    cases = list(dict.fromkeys(row["case"] for row in rows))
+    most = max(row["cores"] for row in rows)
+    for axes, case in zip(figure.subplots(1, len(cases), sharey=True, squeeze=False)[0], cases, strict=True):
+        axes.plot([1, most], [1, most], color=GREY, linestyle=":", linewidth=1)
+        _series(axes, [row for row in rows if row["case"] == case], "cores", "times faster than one")
+        axes.set(xlabel="cores", ylabel="times faster than one core", title=_title(case))
+        axes.set_xticks(sorted({row["cores"] for row in rows}))
+        axes.label_outer()
+        _name_the_lines(axes)
+
+
+def _series(axes, rows: list[dict], x: str, y: str) -> None:
+    for name in dict.fromkeys(row["contender"] for row in rows):
+        points = [row for row in rows if row["contender"] == name and row[y] is not None]
+        _line(axes, name, [p[x] for p in points], [p[y] for p in points])
+
+
+def _ticks_at(axes, rows: list[dict], column: str) -> None:
+    values = sorted({row[column] for row in rows})
+    axes.set_xscale("log")
+    axes.set_xticks(values, [str(value) for value in values], minor=False)
+    axes.set_xticks([], minor=True)
+
+
+def _log(axis) -> None:
+    """A logarithmic axis with plain numbers, and with some between the powers of ten where there are few of those."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    (axis.axes.set_xscale if axis.axis_name == "x" else axis.axes.set_yscale)("log")
+    low, high = np.log10(axis.get_view_interval())
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if abs(high - low) < 2 else (1,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+# ---- rows of dots ----------------------------------------------------------------------------------------------------
+
+
+def _right_hand_sides(figure, rows: list[dict]) -> None:
+    axes = figure.add_subplot()
+    columns = {"lagjax ns": "lagjax", "by hand ns": "diffrax, by hand", "autodiff ns": "diffrax, autodiff"}
+    labels = {"lagjax ns": "derived by lagjax", "by hand ns": "best by hand", "autodiff ns": "autodiff and LAPACK"}
+    for column, name in columns.items():
+        _dots(axes, [row[column] for row in rows], COLOURS[name], labels[column])
+    _rungs(axes, [_title(row["case"]) for row in rows])
+    axes.set_xlabel("ns per evaluation and member")
+    _log(axes.xaxis)
+    _legend_above(axes, "Right-hand sides, all compiled by XLA")
+
+
+def _gradient(figure, rows: list[dict]) -> None:
+    axes = figure.add_subplot()
+    columns = {"reverse/solve": "reverse mode", "forward/solve": "forward mode"}
+    for (column, label), colour in zip(columns.items(), ("#c1121f", "#1d4e89"), strict=True):
+        _dots(axes, [row[column] for row in rows], colour, label)
+    axes.axvline(5, color=GREY, linestyle=":", linewidth=1)
+    axes.annotate(" goal", (5, 0), (2, 0), xycoords=("data", "axes fraction"), textcoords="offset points",
+                  va="bottom", color=GREY, fontsize=9)  # fmt: skip
+    _rungs(axes, [row["contender"] for row in rows])
+    axes.set_xlabel("times a solve")
+    _log(axes.xaxis)
+    _legend_above(axes, f"Gradient by 8 parameters, {rows[0]['steps']:.0f} steps")
+
+
+def _goals(figure, rows: list[dict]) -> None:
+    """How many times better than its goal each is; to the right of the line it is met."""
+    axes = figure.add_subplot()
+    for y, row in enumerate(rows):
+        colour = {"yes": "#2f855a", "no": "#c1121f"}.get(row["met"], GREY)
+        if margin := _margin(row):
+            axes.plot([1, margin], [y, y], color=colour, linewidth=2, solid_capstyle="round")
+            axes.plot(margin, y, "o", color=colour, markersize=7)
+        reached = "–" if row["reached"] is None else f"{row['reached']:.3g}"
+        beside = axes.get_yaxis_transform()
+        axes.text(1.02, y, reached, color=colour, fontweight="bold", va="center", fontsize=9, transform=beside)
+    axes.axvline(1, color="0.3", linewidth=1)
+    _rungs(axes, [f"{row['work']}   {row['goal']}" for row in rows])
+    axes.set_xlabel("times better than the goal")
+    axes.set_title("Goals, and what was reached")
+    _log(axes.xaxis)
+
+
+def _margin(row: dict) -> float | None:
+    sign, goal = row["goal"].split()
+    if not row["reached"]:
+        return None
+    return row["reached"] / float(goal) if sign == "≥" else float(goal) / row["reached"]
+
+
+def _dots(axes, values: list[float | None], colour: str, label: str) -> None:
+    known = [(value, y) for y, value in enumerate(values) if value is not None]
+    axes.plot(*zip(*known, strict=True), "o", color=colour, markersize=8, label=label, markeredgecolor="white")
+
+
+def _rungs(axes, names: list[str]) -> None:
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.grid(True, axis="x")
+    axes.tick_params(axis="y", length=0)
+
+
+def _legend_above(axes, title: str) -> None:
+    axes.set_title(title, pad=26)
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=3, frameon=False, handletextpad=0.2, fontsize=9)
+
+
+# ---- lines and their names -------------------------------------------------------------------------------------------
+
+
+def _line(axes, name: str, x: list[float], y: list[float]) -> None:
+    ours = name == "lagjax"
+    axes.plot(
+        x, y, "o-", color=COLOURS.get(name, GREY), label=name, linewidth=2.6 if ours else 1.4, zorder=3 if ours else 2
+    )
+
+
+def _name_the_lines(axes) -> None:
+    """The name of each line beside its last point, moved apart where they would overlap."""
+    lines = [line for line in axes.get_lines() if line.get_label() in COLOURS and len(line.get_xdata())]
+    if not lines:
+        return
+    axes.autoscale_view()
+    to_axes = axes.transData + axes.transAxes.inverted()
+    ends = np.array([to_axes.transform((line.get_xdata()[-1], line.get_ydata()[-1])) for line in lines])
+    for line, (x, y), place in zip(lines, ends, _apart(ends[:, 1]), strict=True):
+        colour = line.get_color()
+        axes.plot(
+            [x, 1.02], [y, place], ":", color=colour, alpha=0.6, linewidth=1, transform=axes.transAxes, clip_on=False
+        )
+        weight = "bold" if line.get_label() == "lagjax" else "normal"
+        axes.text(1.03, place, line.get_label(), color=colour, transform=axes.transAxes, va="center", fontsize=9,
+                  fontweight=weight)  # fmt: skip
+
+
+def _apart(heights: np.ndarray, gap: float = 0.055) -> np.ndarray:
+    """The heights, moved as little as need be for neighbours to be `gap` apart: those that overlap share their mean."""
+    order = np.argsort(heights)
+    groups = []  # (height of the lowest, members, index of the lowest)
+    for k, wish in enumerate(heights[order]):
+        groups.append([wish, 1, k])
+        while len(groups) > 1 and groups[-2][0] + gap * groups[-2][1] > groups[-1][0]:
+            (low, m, start), (high, n, _) = groups[-2], groups.pop()
+            groups[-1] = [(m * low + n * (high - gap * m)) / (m + n), m + n, start]
+    places = np.empty_like(heights)
+    for low, members, start in groups:
+        places[order[start : start + members]] = low + gap * np.arange(members)
+    return places
+
+
+def _title(case: str) -> str:
+    return case.replace("_", " ").capitalize()
+
+
+PLOTS: dict[str, tuple[Callable, Any]] = {
+    "sizes": (_sizes, (13, 5)),
+    "batches": (_batches, (8, 5)),
+    "gpu": (_batches, (8, 5)),
+    "derivation": (_derivation, (8, 5)),
+    "cores": (_cores, (11, 4.5)),
+    "right_hand_sides": (_right_hand_sides, (8, 4.5)),
+    "gradient": (_gradient, (7, 2.6)),
+    "goals": (_goals, lambda rows: (11, 1 + 0.36 * len(rows))),
+}
