@@ -83,9 +83,11 @@ class ScalarEquations(Equations):
     program: Program = eqx.field(static=True)
     projection: Program | None = eqx.field(static=True)
     called: Any = eqx.field(static=True)
+    projected_by: Any = eqx.field(static=True)
 
     def __init__(self, program: Program, projection: Program | None = None):
         self.program, self.projection, self.called = program, projection, jax.jit(program.__call__)
+        self.projected_by = None if projection is None else jax.jit(projection.__call__)
 
     @property
     def constrained(self) -> bool:
@@ -94,7 +96,7 @@ class ScalarEquations(Equations):
 
     def projected(self, t, y, params):
         """By the second program."""
-        state = self.projection(*y[0], *y[1], t, *_scalars(params))
+        state = _compiled_once(self.projected_by, *y[0], *y[1], t, *_scalars(params))
         return jnp.stack(state[: len(state) // 2]), jnp.stack(state[len(state) // 2 :])
 
     def acceleration(self, t, y, params):

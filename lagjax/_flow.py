@@ -71,10 +71,16 @@ class Flow:
     """
 
     def __init__(
-        self, program: Program, size: int, projection: Program | None = None, guards: _native.Guards | None = None
+        self,
+        program: Program,
+        size: int,
+        projection: Program | None = None,
+        guards: _native.Guards | None = None,
+        groups: tuple[int, ...] | None = None,
     ):
         self.program, self.size, self.projection, self.guards = program, size, projection, guards
-        self.kernel = _native.Kernel(program, size, projection, guards)
+        self.groups = tuple(range(size)) if groups is None else groups
+        self.kernel = _native.Kernel(program, size, projection, guards, self.groups)
         self.traceable = functools.lru_cache(maxsize=16)(self._traceable)
         self.varied = functools.lru_cache(maxsize=16)(self._varied)
 
@@ -141,7 +147,9 @@ class Flow:
 
         shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((rows, n), (rows, n), (), (numbers,))]
         projection = None if self.projection is None else lower(projected, *shapes, budget=_BUDGET)
-        return Flow(lower(moving, *shapes, budget=_BUDGET), rows * n, projection)
+        # A sensitivity that is zero by symmetry is as exact as the others in its row, not exact relative to itself.
+        groups = self.groups + tuple(n + row for row in range(rows - 1) for _ in range(n))
+        return Flow(lower(moving, *shapes, budget=_BUDGET), rows * n, projection, None, groups)
 
 
 def _push(flow: Flow, tolerances: Tolerances, primals, tangents) -> tuple[Outcome, Outcome]:

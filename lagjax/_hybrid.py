@@ -322,12 +322,9 @@ class _Rounds(NamedTuple):
         slope = self._slope(index, t, y)
         for k, transition in enumerate(self.plan.leaving(index)):
             taken = happens & (which == k)
-            g, rate = jax.jvp(
-                lambda t, y, transition=transition: self._guard(index, transition, t, y),
-                (t, jnp.where(taken, y, jax.lax.stop_gradient(y))),
-                (jnp.ones_like(t), jax.lax.stop_gradient(slope)),
-            )
-            rate = jax.lax.stop_gradient(jnp.where(taken & (rate != 0), rate, 1.0))
+            g = self._guard(index, transition, t, jnp.where(taken, y, jax.lax.stop_gradient(y)))
+            rate = jax.lax.stop_gradient(self._guard_rate(index, transition, t, y, slope))
+            rate = jnp.where(taken & (rate != 0), rate, 1.0)
             later = jnp.where(taken, -(g - jax.lax.stop_gradient(g)) / rate, 0.0)
             moved_t, moved_y = t + later, y + slope * later
             new = self._reset(transition, moved_t, jnp.where(taken, moved_y, jax.lax.stop_gradient(y)))
@@ -346,6 +343,10 @@ class _Rounds(NamedTuple):
         if "multipliers" in transition.guard.extras:
             given["multipliers"] = self.plan.systems[index].multipliers(q, v, t, self.params)
         return _scalar(transition.guard, q, v, given)
+
+    def _guard_rate(self, index: int, transition: Transition, t, y, slope):
+        along = (jnp.ones_like(t), slope)
+        return jax.jvp(lambda t, y: self._guard(index, transition, t, y), (t, y), along)[1]
 
     def _reset(self, transition: Transition, t, y):
         if transition.reset is None:

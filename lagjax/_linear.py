@@ -162,7 +162,6 @@ def rank_tolerance(dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** (2 / 3)
 
 
-@jax.custom_jvp
 def least_norm(matrix: jax.Array, b: jax.Array) -> jax.Array:
     """The shortest x with S x = b for a positive semi-definite S of any rank and b in its range.
 
@@ -171,7 +170,8 @@ def least_norm(matrix: jax.Array, b: jax.Array) -> jax.Array:
     return _inverse_on_range(matrix) @ b
 
 
-def _inverse_on_range(matrix):
+@jax.custom_jvp
+def _inverse_on_range(matrix: jax.Array) -> jax.Array:
     scale = _diagonal_scale(matrix)
     values, vectors = jnp.linalg.eigh(_scaled(matrix, scale))
     kept = values > rank_tolerance(matrix.dtype)
@@ -179,19 +179,20 @@ def _inverse_on_range(matrix):
     some = scale[:, None] * (half @ half.T) * scale  # solves S x = b, but its x need not be the shortest
     # What of x lies in the kernel of S is taken out: the kernel of the scaled matrix, scaled back.
     kernel = jnp.where(kept, 0, 1) * scale[:, None] * vectors
-    gram = kernel.T @ kernel + jnp.diag(jnp.where(kept, 1.0, 0.0))
-    outside = jnp.eye(len(matrix)) - kernel @ jnp.linalg.solve(gram, kernel.T)
+    gram = kernel.T @ kernel + jnp.diag(jnp.where(kept, 1.0, 0.0)).astype(matrix.dtype)
+    outside = jnp.eye(len(matrix), dtype=matrix.dtype) - kernel @ jnp.linalg.solve(gram, kernel.T)
     return outside @ some @ outside
 
 
-@least_norm.defjvp
-def _least_norm_jvp(primals, tangents):
-    # Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973) 413, for a symmetric matrix of constant rank and b in its range.
-    (matrix, b), (d_matrix, d_b) = primals, tangents
+@_inverse_on_range.defjvp
+def _inverse_on_range_jvp(primals, tangents):
+    # Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973) 413, eq. (4.12), for a symmetric matrix of constant rank. Not by
+    # way of the eigenvectors, which have no derivative where eigenvalues meet.
+    (matrix,), (moving,) = primals, tangents
     inverse = _inverse_on_range(matrix)
-    x = inverse @ b
-    outside = jnp.eye(len(matrix)) - inverse @ matrix
-    return x, inverse @ (d_b - d_matrix @ x) + outside @ (d_matrix @ (inverse @ x))
+    outside = jnp.eye(len(matrix), dtype=matrix.dtype) - inverse @ matrix
+    turned = outside @ moving @ inverse @ inverse
+    return inverse, turned + turned.T - inverse @ moving @ inverse
 
 
 def eliminate_saddle(matrix, b, rows, c, zeros, regular: bool, dtype) -> tuple[list, list, jax.Array]:

@@ -139,30 +139,56 @@ class Motion(eqx.Module):
 _NEWTON_STEPS = 50
 
 
-def projected_until_consistent(motion: Motion, q, qdot, t, params) -> tuple[jax.Array, jax.Array]:
-    """`Motion.projected` from anywhere near; NaN where Newton's method does not arrive.
+def nearest_consistent(motion: Motion, q, qdot, t, params) -> tuple[jax.Array, jax.Array]:
+    """The state with f = 0 that is nearest in the metric of M there, and of its velocities those nearest to q̇.
 
-    The loop finds the place; its last step is taken once more outside of it, which is where derivatives come from: one
-    Newton step from a root has the derivative of the implicit function.
+    Nearest to q0 in the metric of M = M(q0, q̇0) is where M (q − q0) = Jᵀμ and f = 0, found by Newton's method for both
+    (sequential quadratic programming: Nocedal & Wright, *Numerical Optimization*, §18.1) from where shortest steps to
+    f = 0 alone arrive. NaN where either does not. The loops find the place; one more step outside of them has the
+    derivative of the implicit function.
     """
-    held = jax.lax.stop_gradient((q, qdot))
+    if motion.constraints is not None:
+        held = jax.lax.stop_gradient((q, qdot, t, params))
+        place = jax.lax.stop_gradient(_nearest(motion, *held))
+        q = _step_to_nearest(motion, place, q, qdot, t, params)[0]
+    matrix, rows, target = motion.velocity_saddle(q, qdot, t, params)
+    return q, qdot + _linear.saddle(matrix, jnp.zeros_like(q), rows, target)[0]
 
-    def small(q, qdot):
-        eps = jnp.finfo(q.dtype).eps
-        return 16 * eps * (1 + jnp.sqrt(jnp.sum(q**2) + jnp.sum(qdot**2)))
+
+def _nearest(motion: Motion, q0, *state):
+    """q and μ."""
+    nothing = jnp.zeros_like(motion.constraints(q0, *state[1:]))
+    on_it, _ = _repeated(lambda place: _step_to_nearest(motion, (place[0], nothing), place[0], *state), (q0, nothing))
+    return _repeated(lambda place: _step_to_nearest(motion, place, q0, *state), (on_it, nothing))
+
+
+def _repeated(step, place):
+    """`step` until q does not move any more; NaN where that does not come about."""
+
+    def small(q):
+        return 16 * jnp.finfo(q.dtype).eps * (1 + jnp.max(jnp.abs(q)))
 
     def going(carry):
-        state, step, count = carry
-        return (step > small(*state)) & (count < _NEWTON_STEPS)
+        (q, _), moved, count = carry
+        return (moved > small(q)) & (count < _NEWTON_STEPS)
 
     def once(carry):
-        state, _, count = carry
-        new = motion.projected(*state, t, jax.lax.stop_gradient(params))
-        step = jnp.sqrt(sum(jnp.sum((a - b) ** 2) for a, b in zip(new, state, strict=True)))
-        return new, step, count + 1
+        place, _, count = carry
+        new = step(place)
+        return new, jnp.max(jnp.abs(new[0] - place[0])), count + 1
 
-    found, step, _ = jax.lax.while_loop(going, once, (held, jnp.asarray(jnp.inf, q.dtype), 0))
-    arrived = step <= small(*found)
-    # Where the loop went is a constant; how it depends on the start is kept by adding what stop_gradient took.
-    start = (found[0] + (q - held[0]), found[1] + (qdot - held[1]))
-    return tuple(jnp.where(arrived, x, jnp.nan) for x in motion.projected(*start, t, params))
+    start = place, jnp.asarray(jnp.inf, place[0].dtype), 0
+    (q, multipliers), moved, _ = jax.lax.while_loop(going, once, start)
+    return jnp.where(moved <= small(q), q, jnp.nan), multipliers
+
+
+def _step_to_nearest(motion: Motion, place, q0, qdot, t, params):
+    """(q, μ) after one step of Newton's method for M (q − q0) = Jᵀμ, f = 0."""
+
+    def work(q):
+        return motion.constraints(q, t, params) @ place[1]
+
+    q, metric = place[0], motion.mass_matrix(q0, qdot, t, params)
+    rows, off = jax.jacfwd(motion.constraints)(q, t, params), motion.constraints(q, t, params)
+    step, multipliers, _ = _linear.saddle(metric - jax.hessian(work)(q), metric @ (q0 - q), rows, -off)
+    return q + step, multipliers

@@ -16,7 +16,7 @@ import numpy as np
 from lagjax._arguments import Function, accept
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
-from lagjax._motion import Motion, projected_until_consistent
+from lagjax._motion import Motion, nearest_consistent
 
 PyTree = Any
 
@@ -140,9 +140,8 @@ class System(eqx.Module):
         self._require_constraints()
         layout = Layout.of(q, qdot)
         t, numbers = jnp.asarray(t, layout.dtype), eqx.filter(params, eqx.is_array_like)
-        state = projected_until_consistent(
-            self.motion(layout, params), layout.flatten(q), layout.flatten(qdot), t, numbers
-        )
+        flat = layout.flatten(q), layout.flatten(qdot), t, numbers
+        state = nearest_consistent(self.motion(layout, params), *flat)
         return layout.restore(state[0]), layout.restore(state[1])
 
     def explain(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> Explanation:

@@ -50,14 +50,20 @@ class Kernel:
 
     The outputs of the program are q̈, then whether the mass matrix is singular. `projection`, from the same inputs to
     (q, q̇), is applied to the state after every step, and to the outputs. `guards`, again from the same inputs, end the
-    motion of a member with the code `EVENT` + k. Raises `Unlowerable` where an operation has no
+    motion of a member with the code `EVENT` + k. Errors are relative to each coordinate, or to the largest one of its
+    group. Raises `Unlowerable` where an operation has no
     Taylor series or is not one of doubles.
     """
 
     def __init__(
-        self, program: Program, size: int, projection: Program | None = None, guards: Guards | None = None
+        self,
+        program: Program,
+        size: int,
+        projection: Program | None = None,
+        guards: Guards | None = None,
+        groups: tuple[int, ...] | None = None,
     ):
-        integrator = _integrator.Integrator(program, recurrences(program, size), projection, guards)
+        integrator = _integrator.Integrator(program, recurrences(program, size), projection, guards, groups)
         self.states, self.numbers, self.width = 2 * size, integrator.numbers, integrator.width
         self._memory = integrator.memory
         self._engine = compiled(integrator.module)  # holds the code that the next lines point to

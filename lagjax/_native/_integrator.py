@@ -32,6 +32,7 @@ from lagjax._program import Program, Series, StraightLine
 
 MAX_ORDER = 20
 SAFETY = 0.9
+ROUND_OFF = 256 * 2.0**-52  # of an acceleration
 BISECTIONS = 60  # of a step, to find an event: beyond the digits of a double
 # A series that ends (free flight) allows any step, and a step that is too long sees nothing of what lies inside it.
 FIRST_STEP, GROWTH, GROWTH_AFTER_REJECTION = 1 / 16, 5.0, 2.0  # of the whole time; of the step before
@@ -70,8 +71,12 @@ LANE = ("member", "output")
 class Integrator:
     """Builds the module. `memory` is what a thread needs, in doubles; `lanes` the width."""
 
-    def __init__(self, program: Program, series: Series, projection: Program | None = None, guards=None):
+    def __init__(
+        self, program: Program, series: Series, projection: Program | None = None, guards=None, groups=None
+    ):
         self.program, self.series, self.n = program, series, series.size
+        # Coordinates of one group are measured by the largest of them.
+        self.groups = tuple(range(series.size)) if groups is None else groups
         self.projection, self.guards = projection, guards
         self.directions = () if guards is None else guards.directions
         self.states, self.width = 2 * series.size, lanes()
@@ -245,9 +250,11 @@ class Integrator:
         acceleration = emit(code, line, then, self.sincos)
         worst = self._vector(code, memory, "worst")
         weight = code.intrinsic("fabs", h) / code.as_double(order + 1)
+        size = self._by_group(code, [code.intrinsic("fabs", a) for a in acceleration])
         for i in range(n):
-            difference = code.intrinsic("fabs", acceleration[i] - slopes[i])
-            error = weight * difference * self._vector(code, memory, "scale", n + i)
+            # What rounding leaves of an acceleration is not a defect of the series.
+            excess = code.intrinsic("fabs", acceleration[i] - slopes[i]) - ROUND_OFF * size[i]
+            error = weight * excess * self._vector(code, memory, "scale", n + i)
             worst = code.select(error <= worst, worst, error)  # NaN goes through
         self._keep(code, memory, "worst", worst)
         return code.finish()
@@ -367,12 +374,19 @@ class Integrator:
         rtol, atol = (code.lanes_of(self._job(code, job, name)) for name in ("rtol", "atol"))
         before = code.intrinsic("fabs", self._vector(code, memory, "h"))
         errors = [code.lanes_of(0.0), code.lanes_of(0.0)]
-        for i in range(self.states):
+
+        def largest(i):
+            # A component that passes through zero is as large as it will be a step away.
             y, rate = (
                 code.intrinsic("fabs", code.load(self.state(code, memory, i, k), self.vector)) for k in range(2)
             )
-            # A component that passes through zero is as large as it will be a step away.
-            scale = 1.0 / (atol + rtol * code.maximum(y, rate * before))
+            return code.maximum(y, rate * before)
+
+        n = self.n
+        sizes = [x for half in (range(n), range(n, 2 * n)) for x in self._by_group(code, [largest(i) for i in half])]
+        for i, size in enumerate(sizes):
+            rate = code.intrinsic("fabs", code.load(self.state(code, memory, i, 1), self.vector))
+            scale = 1.0 / (atol + rtol * size)
             self._keep(code, memory, "scale", scale, i)
             for k in range(2):
                 c = code.load(self.state(code, memory, i, order - k), self.vector)
@@ -381,6 +395,13 @@ class Integrator:
             # An infinite slope may leave no trace in the last coefficients.
             errors[0] = code.select(rate < float("inf"), errors[0], float("nan"))
         return errors[0], errors[1]
+
+    def _by_group(self, code, values: list[Value]) -> list[Value]:
+        """For every coordinate the largest value in its group."""
+        largest: dict[int, Value] = {}
+        for group, value in zip(self.groups, values, strict=True):
+            largest[group] = code.maximum(largest[group], value) if group in largest else value
+        return [largest[group] for group in self.groups]
 
     def _halve_until_sound(self, code, memory, job, order) -> None:
         """Check the steps of all lanes, and halve those that fail, until none does."""
