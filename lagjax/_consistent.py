@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._layout import Layout
+from lagjax._linear import dependent_rows
 from lagjax._motion import Motion
 from lagjax._settings import is_concrete
 from lagjax._system import System
@@ -26,24 +27,41 @@ def require_consistent(system: System, layout: Layout, ts, q0: PyTree, qdot0: Py
     """Raise `ValueError`, naming the constraint, where a single start is off. Values being traced are not looked at."""
     if _free(system) or not _known((ts, q0, qdot0, params, system)):
         return
-    names = _names(system, layout, params)
+    names = system.constraint_names(layout, params)
     if len(names) > layout.size:
         raise ValueError(
             f"There are {len(names)} constraints ({', '.join(names)}) for {layout.size} coordinates: no more than "
             f"{layout.size} can be independent. Drop those that follow from the others."
         )
-    positions, velocities, lengths = map(np.asarray, _compiled(system, ts, q0, qdot0, params))
+    positions, velocities, demands, lengths, coupling = map(np.asarray, _compiled(system, ts, q0, qdot0, params))
     tolerance = TOLERANCE[layout.dtype]
-    for name, position, velocity, length in zip(names, positions, velocities, lengths, strict=True):
-        if not np.isfinite(position + velocity + length):
-            raise ValueError(f"{name} is not finite at the initial state (value {position}, gradient {length}).")
+    for name, *found, length in zip(names, positions, velocities, demands, lengths, strict=True):
+        if not np.isfinite([*found, length]).all():
+            raise ValueError(f"{name} is not finite at the initial state (value {found[0]}, gradient {length}).")
         if length == 0:
             raise ValueError(f"{name} has zero gradient at the initial state, where it holds nothing.")
+    _require_compatible(names, (positions, velocities, demands), lengths, coupling, tolerance)
+    for name, position, velocity, length in zip(names, positions, velocities, lengths, strict=True):
         for off, what, state in ((position, "q0", "it"), (velocity, "qdot0", "its rate of change")):
-            if off / length > tolerance:
+            if abs(off) / length > tolerance:
                 raise ValueError(
-                    f"{what} does not satisfy {name}: {state} is {off:.3g} there, a distance of {off / length:.3g}. "
+                    f"{what} does not satisfy {name}: {state} is {off:.3g} there, a distance of {abs(off) / length:.3g}. "
                     "Put the state on the constraints first: q0, qdot0 = system.project(q0, qdot0, t, params)."
+                )
+
+
+def _require_compatible(names, asked, lengths, coupling, tolerance) -> None:
+    """Where one constraint is a combination of others, it must ask for the same combination, of q, q̇ and q̈."""
+    for row, factors in dependent_rows(coupling).items():
+        weights = np.abs(factors) * lengths
+        for values, what in zip(asked, ("q0", "qdot0", "the acceleration"), strict=True):
+            size = np.max(np.abs(values) / lengths)
+            off = abs(values[row] - factors @ values) / (lengths[row] + weights.sum())
+            if off > tolerance * max(1, size):
+                others = [name for name, weight in zip(names, weights, strict=True) if weight]
+                raise ValueError(
+                    f"{names[row]} contradicts {', '.join(others)}: at the initial state it is a combination of them, "
+                    f"but asks for another value of {what}. Both cannot hold: drop or correct one."
                 )
 
 
@@ -52,14 +70,14 @@ def inconsistent_members(system: System, layout: Layout, ts, values: dict, axes:
     if _free(system) or not _known((ts, values, system)):
         return None
     each = jax.vmap(lambda *one: _compiled(system, ts, *one), in_axes=tuple(axes.values()))
-    positions, velocities, lengths = each(*values.values())
-    off = jnp.maximum(positions, velocities) / lengths
+    positions, velocities, _, lengths, _ = each(*values.values())
+    off = jnp.maximum(jnp.abs(positions), jnp.abs(velocities)) / lengths
     return ~(off <= TOLERANCE[layout.dtype]).all(axis=1)
 
 
 @eqx.filter_jit
 def _compiled(system: System, ts, q0: PyTree, qdot0: PyTree, params: PyTree):
-    """For every constraint |value|, |rate| over the size of the state, and |gradient|."""
+    """For every constraint its value and rate over the size of the state, what it asks of q̈, |gradient|; and S."""
     layout = Layout.of(q0, qdot0)
     numbers = eqx.filter(params, eqx.is_array_like)
     motion = system.motion(layout, params)
@@ -68,14 +86,15 @@ def _compiled(system: System, ts, q0: PyTree, qdot0: PyTree, params: PyTree):
 
 
 def _off(motion: Motion, q, qdot, t, params):
-    rows, _ = motion.rows_and_targets(q, qdot, t, params)
+    rows, demands = motion.rows_and_targets(q, qdot, t, params)
     lengths = jnp.sqrt(jnp.sum(rows**2, axis=1))
     rates = -motion.velocity_saddle(q, qdot, t, params)[2]
     values = jnp.zeros_like(rates)
     if motion.constraints is not None:
         held = motion.constraints(q, t, params)
         values = values.at[: len(held)].set(held)
-    return jnp.abs(values) / (1 + jnp.max(jnp.abs(q))), jnp.abs(rates) / (1 + jnp.max(jnp.abs(qdot))), lengths
+    sizes = 1 + jnp.max(jnp.abs(q)), 1 + jnp.max(jnp.abs(qdot))
+    return values / sizes[0], rates / sizes[1], demands, lengths, motion.coupling(q, qdot, t, params)
 
 
 def _free(system: System) -> bool:
@@ -84,14 +103,3 @@ def _free(system: System) -> bool:
 
 def _known(tree: PyTree) -> bool:
     return all(is_concrete(leaf) for leaf in jax.tree.leaves(tree))
-
-
-def _names(system: System, layout: Layout, params: PyTree) -> list[str]:
-    """One for every number that is to be zero: constraints['rod'], velocity_constraints[1]."""
-    roles = [role for role in ("constraints", "velocity_constraints") if getattr(system, role) is not None]
-    names = []
-    for role, part in zip(roles, system.constraint_structure(layout, params), strict=True):
-        for path, leaf in jax.tree_util.tree_leaves_with_path(part):
-            label = role + jax.tree_util.keystr(path)
-            names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
-    return names

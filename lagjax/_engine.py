@@ -142,26 +142,32 @@ def _rows(tree: PyTree, axes: PyTree = None, size: int = 1) -> np.ndarray:
 
 
 def _fields(settings: Settings, layout: Layout, outcome: Outcome, idle: int | None = None) -> tuple:
-    n = layout.size
-    library = np if isinstance(outcome.y_end, np.ndarray) else jnp  # NumPy costs less where nothing is traced
+    """Where nothing is traced, the few numbers stay in NumPy: each one sent to JAX costs as much as a hundred steps."""
+    n, library = layout.size, np if isinstance(outcome.y_end, np.ndarray) else jnp
     finite = library.isfinite(outcome.y_end).all(axis=-1)  # a last state that overflowed is not a success
-    result = jnp.asarray(library.asarray(RESULT_OF_CODE)[library.where(finite, outcome.code, _native.NOT_FINITE)])
+    result = library.asarray(RESULT_OF_CODE)[library.where(finite, outcome.code, _native.NOT_FINITE)]
     stats = {
-        "num_steps": jnp.asarray(outcome.accepted + outcome.rejected),
-        "num_accepted_steps": jnp.asarray(outcome.accepted),
-        "num_rejected_steps": jnp.asarray(outcome.rejected),
+        "num_steps": outcome.accepted + outcome.rejected,
+        "num_accepted_steps": outcome.accepted,
+        "num_rejected_steps": outcome.rejected,
     }
     if idle is not None:
-        stats["num_wasted_lane_steps"] = jnp.asarray(idle)
+        stats["num_wasted_lane_steps"] = idle
 
     def half(y, part):
-        return jax.tree.map(jnp.asarray, layout.restore(y[..., part * n : (part + 1) * n]))
+        return layout.restore(y[..., part * n : (part + 1) * n])
 
-    end = State(jnp.asarray(outcome.t_end), half(outcome.y_end, 0), half(outcome.y_end, 1))
-    result = eqx.tree_at(lambda r: r._value, RESULTS.successful, result)
-    return jnp.asarray(settings.ts), half(outcome.path, 0), half(outcome.path, 1), result, end, stats
+    end = State(outcome.t_end, half(outcome.y_end, 0), half(outcome.y_end, 1))
+    q, qdot = (jax.tree.map(jnp.asarray, half(outcome.path, part)) for part in range(2))
+    return jnp.asarray(settings.ts), q, qdot, result_from(result), end, stats
 
 
+def result_from(values) -> RESULTS:
+    """The result codes with these values, integers of any shape."""
+    return jax.tree.unflatten(_RESULT_STRUCTURE, [values])
+
+
+_RESULT_STRUCTURE = jax.tree.structure(RESULTS.successful)
 # The codes of the kernel, in their order, as those of `RESULTS`.
 RESULT_OF_CODE = np.array([
     int(result._value)

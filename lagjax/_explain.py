@@ -1,10 +1,11 @@
 """What a scene contains, and what was left out of its equations: facts read off the scalar programs.
 
 Nothing here looks at numbers: a coordinate is cyclic when no operation of the reduced Lagrangian reads it, the energy
-is conserved when none reads the time and no force is given.
+is conserved when none reads the time, no force is given, and the constraints do no work: f does not read the time, and
+a(q, q̇) is zero at rest. Only which constraints depend on which is asked of one state.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import jax
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from lagjax._equations import OPERATION_BUDGET, ScalarEquations, equations, scalar_program
 from lagjax._flow import unfit
 from lagjax._layout import Layout
+from lagjax._linear import dependent_rows
 from lagjax._motion import Motion
 from lagjax._program import Program, Unlowerable, lower
 
@@ -21,12 +23,16 @@ class Explanation:
     """The facts about a scene; `str` prints them. Where they could not be read off, they are None.
 
     - `coordinates`: the name of every scalar coordinate; `cyclic`: those that L does not depend on, whose momenta are
-      conserved where no force acts.
+      conserved where no force acts, that of a constraint included.
     - `mass_matrix`: "constant" or "varying", then "diagonal", "block-diagonal" or "dense"; `mass_matrix_depends_on`:
       the coordinates, velocities (`d` before the name) and `t` that it reads.
     - `velocity_terms`: whether forces depend on the velocities; `explicit_time`: whether anything depends on `t`.
     - `energy_conserved`: whether h = p·q̇ − L is constant along every motion.
     - `operations`: scalar operations of one acceleration; `traced_operations`: of its derivatives before reduction.
+    - `constraints`: the name of every number that is to be zero; `dependent_constraints`: those that, at the state
+      asked about, are combinations of others before them, and of which (up to the part eps^(2/3) of the square of the
+      gradient). They change nothing but the multipliers.
+    - `projection_operations`: scalar operations of one way back to the constraints, taken after every step.
     - `path`: "scalar" or "array"; `reason`: why not "scalar".
     - `solver`: what integrates the motion by default, and where it is not machine code, why not.
     """
@@ -43,6 +49,19 @@ class Explanation:
     energy_conserved: bool | None = None
     operations: int | None = None
     traced_operations: int | None = None
+    constraints: tuple[str, ...] = ()
+    dependent_constraints: dict[str, tuple[str, ...]] | None = field(default_factory=dict)
+    projection_operations: int | None = None
+
+    def with_constraints(self, names: list[str], coupling: np.ndarray | None) -> "Explanation":
+        """The same with the names of constraints, and what depends on what where their `coupling` is known."""
+        dependent = None
+        if coupling is not None:
+            dependent = {
+                names[row]: tuple(name for name, factor in zip(names, factors, strict=True) if factor)
+                for row, factors in dependent_rows(coupling).items()
+            }
+        return replace(self, constraints=tuple(names), dependent_constraints=dependent)
 
     def __str__(self) -> str:
         rows = [("coordinates", f"{len(self.coordinates)}: {_listed(self.coordinates)}")]
@@ -55,8 +74,14 @@ class Explanation:
                 ("explicit time", "yes" if self.explicit_time else "no"),
                 ("energy conserved", "yes" if self.energy_conserved else "no"),
             ]
+        if self.constraints:
+            rows.append(("constraints", f"{len(self.constraints)}: {_listed(self.constraints)}"))
+        for name, others in (self.dependent_constraints or {}).items():
+            rows.append(("dependent", f"{name} on {_listed(others)}"))
         if self.operations is not None:
             rows.append(("operations", f"{self.operations} per acceleration, {self.traced_operations} as derived"))
+        if self.projection_operations is not None:
+            rows.append(("", f"{self.projection_operations} per projection to the constraints"))
         rows.append(("path", self.path + (f", because {self.reason}" if self.reason else "")))
         rows.append(("solver", self.solver))
         return "\n".join(f"{name:17s} {value}" for name, value in rows)
@@ -71,11 +96,15 @@ def explain(motion: Motion, layout: Layout, params, path: str) -> Explanation:
     known["solver"] = _solver(motion, layout, params, path)
     if scalar:
         known["operations"] = form.program.operations
+        if form.projection is not None:
+            known["projection_operations"] = form.projection.operations
 
     q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
     try:
         lagrangian = lower(motion.lagrangian, q, q, t, params, budget=OPERATION_BUDGET)
         parts = lower(motion.mass_matrix_and_force, q, q, t, params, budget=OPERATION_BUDGET)
+        held = lower(motion.rows_and_targets, q, q, t, params, budget=OPERATION_BUDGET) if motion.constrained else None
+        held_in_time, working = _moving_constraints(motion, q, t, params)
     except Unlowerable:
         return Explanation(**known)
 
@@ -83,7 +112,7 @@ def explain(motion: Motion, layout: Layout, params, path: str) -> Explanation:
     reads = [frozenset(inputs[i] for i in parts.depends(k) if i < len(inputs)) for k in range(n * n + n)]
     mass, force = frozenset().union(*reads[: n * n]), frozenset().union(*reads[n * n :])
     of_lagrangian = {inputs[i] for i in lagrangian.depends(0) if i < len(inputs)}
-    timed = "t" in mass | force | of_lagrangian
+    timed = held_in_time or "t" in mass | force | of_lagrangian
     return Explanation(
         **known,
         cyclic=tuple(name for name in names if name not in of_lagrangian),
@@ -91,9 +120,25 @@ def explain(motion: Motion, layout: Layout, params, path: str) -> Explanation:
         mass_matrix_depends_on=tuple(name for name in inputs if name in mass),
         velocity_terms=any(name in force for name in inputs[n : 2 * n]),
         explicit_time=timed,
-        energy_conserved=not timed and motion.forces is None and motion.dissipation is None,
-        traced_operations=parts.traced_operations,
+        energy_conserved=not timed and not working and motion.forces is None and motion.dissipation is None,
+        traced_operations=parts.traced_operations + (0 if held is None else held.traced_operations),
     )
+
+
+def _moving_constraints(motion: Motion, q, t, params) -> tuple[bool, bool]:
+    """Whether constraints read the time, and whether those on velocities do work: they are not zero at rest."""
+    if not motion.constrained:
+        return False, False
+    held = lower(motion.residual, q, q, t, params, budget=OPERATION_BUDGET)
+    timed = any(2 * q.size in held.depends(k) for k in range(len(held.outputs)))
+    if motion.velocity_constraints is None:
+        return timed, False
+
+    def at_rest(q, t, params):
+        return motion.velocity_constraints(q, jax.numpy.zeros_like(q), t, params)
+
+    rest = lower(at_rest, q, t, params, budget=OPERATION_BUDGET)
+    return timed, any(rest.constant(k) != 0 for k in range(len(rest.outputs)))
 
 
 def _solver(motion: Motion, layout: Layout, params, path: str) -> str:

@@ -5,9 +5,9 @@ scalar coordinate, such as `q['theta']` or `q.r` or `q[1]`, which is what error 
 """
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,13 +15,15 @@ import numpy as np
 PyTree = Any
 
 
-class Layout(eqx.Module):
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Layout:
     """The structure of one state; flattens it to a vector of `size` coordinates and restores it."""
 
-    tree: Any = eqx.field(static=True)
-    shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    paths: tuple[str, ...] = eqx.field(static=True)
-    dtype: np.dtype = eqx.field(static=True)
+    tree: Any
+    shapes: tuple[tuple[int, ...], ...]
+    paths: tuple[str, ...]
+    dtype: np.dtype
 
     @classmethod
     def of(cls, q: PyTree, qdot: PyTree) -> "Layout":

@@ -151,6 +151,33 @@ def saddle(matrix: jax.Array, b: jax.Array, rows: jax.Array, c: jax.Array) -> tu
     return free + responses @ multipliers, multipliers, held.singular
 
 
+def coupling(matrix: jax.Array, rows: jax.Array) -> jax.Array:
+    """S = G K⁻¹ Gᵀ of `saddle`, whose rank is the number of independent constraints."""
+    held = factorize(matrix + rows.T @ (_weights(matrix, rows)[:, None] * rows))
+    return rows @ jax.vmap(held.solve, in_axes=1, out_axes=1)(rows.T)
+
+
+def dependent_rows(matrix: np.ndarray) -> dict[int, np.ndarray]:
+    """The rows of G that are combinations of rows before them, with the factors, from S = G K⁻¹ Gᵀ.
+
+    A row is one where its part outside of those before it is below `rank_tolerance` of its own size, squared as S is.
+    """
+    independent, found = [], {}
+    for row in range(len(matrix)):
+        among = matrix[np.ix_(independent, independent)]
+        scale = 1 / np.sqrt(np.diagonal(among))
+        factors = scale * np.linalg.solve(scale[:, None] * among * scale, scale * matrix[independent, row])
+        outside = matrix[row, row] - factors @ matrix[independent, row]
+        if outside <= rank_tolerance(matrix.dtype) * matrix[row, row]:
+            weight = factors / scale  # how much of the row each of them makes up
+            factors = np.where(np.abs(weight) > 1e-6 * np.sqrt(matrix[row, row]), factors, 0)
+            found[row] = np.zeros(len(matrix))
+            found[row][independent] = factors
+        else:
+            independent.append(row)
+    return found
+
+
 def _weights(matrix, rows):
     """Weights that make every row of G as heavy as M."""
     size = jnp.sum(rows**2, axis=1)

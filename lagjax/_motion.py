@@ -97,6 +97,10 @@ class Motion(eqx.Module):
         """Gᵀλ."""
         return self.rows_and_targets(q, qdot, t, params)[0].T @ self.multipliers(q, qdot, t, params)
 
+    def coupling(self, q, qdot, t, params) -> jax.Array:
+        """G M⁻¹ Gᵀ, or another matrix of the same rank where M is singular: which constraints are independent."""
+        return _linear.coupling(self.mass_matrix(q, qdot, t, params), self.rows_and_targets(q, qdot, t, params)[0])
+
     def residual(self, q, qdot, t, params) -> jax.Array:
         """f, then a."""
         held = [] if self.constraints is None else [self.constraints(q, t, params)]
@@ -144,8 +148,8 @@ def nearest_consistent(motion: Motion, q, qdot, t, params) -> tuple[jax.Array, j
 
     Nearest to q0 in the metric of M = M(q0, q̇0) is where M (q − q0) = Jᵀμ and f = 0, found by Newton's method for both
     (sequential quadratic programming: Nocedal & Wright, *Numerical Optimization*, §18.1) from where shortest steps to
-    f = 0 alone arrive. NaN where either does not. The loops find the place; one more step outside of them has the
-    derivative of the implicit function.
+    f = 0 alone arrive. NaN where either does not, or where it arrives farther away. The loops find the place; one more
+    step outside of them has the derivative of the implicit function.
     """
     if motion.constraints is not None:
         held = jax.lax.stop_gradient((q, qdot, t, params))
@@ -156,21 +160,25 @@ def nearest_consistent(motion: Motion, q, qdot, t, params) -> tuple[jax.Array, j
 
 
 def _nearest(motion: Motion, q0, *state):
-    """q and μ."""
-    nothing = jnp.zeros_like(motion.constraints(q0, *state[1:]))
+    """q and μ, as numbers."""
+
+    def distance(q):
+        return jnp.sqrt((q - q0) @ metric @ (q - q0))
+
+    metric, nothing = motion.mass_matrix(q0, *state), jnp.zeros_like(motion.constraints(q0, *state[1:]))
     on_it, _ = _repeated(lambda place: _step_to_nearest(motion, (place[0], nothing), place[0], *state), (q0, nothing))
-    return _repeated(lambda place: _step_to_nearest(motion, place, q0, *state), (on_it, nothing))
+    q, multipliers = _repeated(lambda place: _step_to_nearest(motion, place, q0, *state), (on_it, nothing))
+    # Another stationary point is no answer. On the constraints both distances are round-off.
+    farther = distance(q) > 1.001 * distance(on_it) + distance(q0 + _small(q0))
+    return jnp.where(farther, jnp.nan, q), multipliers
 
 
 def _repeated(step, place):
     """`step` until q does not move any more; NaN where that does not come about."""
 
-    def small(q):
-        return 16 * jnp.finfo(q.dtype).eps * (1 + jnp.max(jnp.abs(q)))
-
     def going(carry):
         (q, _), moved, count = carry
-        return (moved > small(q)) & (count < _NEWTON_STEPS)
+        return (moved > _small(q)) & (count < _NEWTON_STEPS)
 
     def once(carry):
         place, _, count = carry
@@ -179,7 +187,11 @@ def _repeated(step, place):
 
     start = place, jnp.asarray(jnp.inf, place[0].dtype), 0
     (q, multipliers), moved, _ = jax.lax.while_loop(going, once, start)
-    return jnp.where(moved <= small(q), q, jnp.nan), multipliers
+    return jnp.where(moved <= _small(q), q, jnp.nan), multipliers
+
+
+def _small(q):
+    return 16 * jnp.finfo(q.dtype).eps * (1 + jnp.max(jnp.abs(q)))
 
 
 def _step_to_nearest(motion: Motion, place, q0, qdot, t, params):

@@ -270,8 +270,7 @@ def _refused(trajectory: Trajectory, astray: jax.Array) -> Trajectory:
     def without(leaf):
         return jnp.where(astray.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.nan, leaf)
 
-    codes = jnp.where(astray, RESULTS.inconsistent_start._value, trajectory.result._value)
-    result = eqx.tree_at(lambda r: r._value, trajectory.result, codes)
+    result = _engine.result_from(jnp.where(astray, RESULTS.inconsistent_start._value, trajectory.result._value))
     q, qdot = jax.tree.map(without, (trajectory.q, trajectory.qdot))
     return eqx.tree_at(lambda t: (t.q, t.qdot, t.result), trajectory, (q, qdot, result))
 
@@ -282,9 +281,10 @@ def _first_member(tree: PyTree, axes: PyTree) -> PyTree:
 
 def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced."""
-    if not is_concrete(trajectory.ok):
-        return trajectory.result.error_if(trajectory, ~trajectory.ok)
-    if bool(trajectory.ok):
+    ok = trajectory.ok
+    if not is_concrete(ok):
+        return trajectory.result.error_if(trajectory, ~ok)
+    if bool(ok):
         return trajectory
     end = trajectory.end
     q, qdot = np.asarray(layout.flatten(end.q)), np.asarray(layout.flatten(end.qdot))

@@ -133,9 +133,11 @@ class System(eqx.Module):
         return self._at(Motion.constraint_force, q, qdot, t, params, restore=True)
 
     def project(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> tuple[PyTree, PyTree]:
-        """The nearest consistent state: f = 0 for q, in the metric of M; then J q̇ + ∂f/∂t = 0 and a = 0 for q̇.
+        """The nearest consistent state.
 
-        By Newton's method, differentiable (of the last step). The result is NaN where it does not arrive in 50 steps.
+        Of all q with f = 0 the one nearest in the metric of M(q, q̇), then of all velocities with J q̇ + ∂f/∂t = 0 and
+        a = 0 those nearest in that of M there. Differentiable as that function of the state and of the parameters. NaN
+        where Newton's method does not find it; contradictory constraints have none.
         """
         self._require_constraints()
         layout = Layout.of(q, qdot)
@@ -147,6 +149,8 @@ class System(eqx.Module):
     def explain(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> Explanation:
         """What this scene contains and what was left out of its equations; print it, or read its fields.
 
+        All of it holds for every state and time, except which constraints depend on which.
+
         ```python
         import lagjax
 
@@ -154,10 +158,14 @@ class System(eqx.Module):
         print(scene.system.explain(scene.q0, scene.qdot0, params=scene.params))
         ```
         """
-        del t  # facts hold for every time
         layout = Layout.of(q, qdot)
         numbers = jax.tree.map(jnp.asarray, eqx.filter(params, eqx.is_array_like))
-        return explain(self.motion(layout, params), layout, numbers, self.path)
+        facts = explain(self.motion(layout, params), layout, numbers, self.path)
+        if self.constraints is None and self.velocity_constraints is None:
+            return facts
+        names = self.constraint_names(layout, params)
+        coupling = self._at(Motion.coupling, q, qdot, t, params)
+        return facts.with_constraints(names, None if isinstance(coupling, jax.core.Tracer) else np.asarray(coupling))
 
     def motion(self, layout: Layout, params: PyTree = None) -> Motion:
         """The scene in the flat coordinates of `layout`, after a look at what its functions return there.
@@ -223,6 +231,16 @@ class System(eqx.Module):
 
         state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
         return jax.eval_shape(returned, state, t, numbers)
+
+    def constraint_names(self, layout: Layout, params: PyTree) -> list[str]:
+        """One for every number that is to be zero: constraints['rod'], velocity_constraints[1]."""
+        roles = [role for role in ("constraints", "velocity_constraints") if getattr(self, role) is not None]
+        names = []
+        for role, part in zip(roles, self.constraint_structure(layout, params), strict=True):
+            for path, leaf in jax.tree_util.tree_leaves_with_path(part):
+                label = role + jax.tree_util.keystr(path)
+                names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
+        return names
 
     def _at(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
         """Evaluate one of `Motion`'s functions at a state given in the user's pytree."""

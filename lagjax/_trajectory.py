@@ -69,7 +69,8 @@ class Trajectory(eqx.Module):
     @property
     def ok(self) -> jax.Array:
         """True where a member reached the last time or its event."""
-        return (self.result == RESULTS.successful) | (self.result == RESULTS.event_occurred)
+        code = self.result._value
+        return (code == RESULTS.successful._value) | (code == RESULTS.event_occurred._value)
 
     def energy(self) -> jax.Array:
         """h = p·q̇ − L at every output time, shape (T,) or (batch, T)."""

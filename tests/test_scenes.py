@@ -9,7 +9,6 @@ import doctest
 import inspect
 import itertools
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,11 +29,9 @@ def ends(scene, ts, q0=None, qdot0=None, params=None, rtol=TOLERANCE, atol=TOLER
     """The states (q, qdot) at `ts`, each the end of a run from the one before."""
     q, qdot = (scene.q0, scene.qdot0) if q0 is None else (q0, qdot0)
     params = scene.params if params is None else params
-    # No derivatives of a run are taken here, and without reverse mode it compiles faster.
-    options = {"rtol": rtol, "atol": atol, "adjoint": diffrax.ForwardMode()}
     states = [(q, qdot)]
     for start, stop in itertools.pairwise(np.asarray(ts)):
-        run = lagjax.simulate(scene.system, q, qdot, np.array([start, stop]), params, **options)
+        run = lagjax.simulate(scene.system, q, qdot, np.array([start, stop]), params, rtol=rtol, atol=atol)
         q, qdot = jax.tree.map(lambda leaf: leaf[-1], (run.q, run.qdot))
         states.append((q, qdot))
     return states
