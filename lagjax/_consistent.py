@@ -40,29 +40,39 @@ def require_consistent(system: System, layout: Layout, ts, q0: PyTree, qdot0: Py
             raise ValueError(f"{name} is not finite at the initial state (value {found[0]}, gradient {length}).")
         if length == 0:
             raise ValueError(f"{name} has zero gradient at the initial state, where it holds nothing.")
-    _require_compatible(names, (positions, velocities, demands), lengths, coupling, tolerance)
-    for name, position, velocity, length in zip(names, positions, velocities, lengths, strict=True):
-        for off, what, state in ((position, "q0", "it"), (velocity, "qdot0", "its rate of change")):
+    dependent = dependent_rows(coupling)
+    for values, what, state in ((positions, "q0", "it"), (velocities, "qdot0", "its rate of change")):
+        clash = _contradiction(names, values, what, lengths, dependent, tolerance)
+        if clash and (what == "qdot0" or _nowhere(system, q0, qdot0, ts[0], params)):
+            raise ValueError(clash)
+        for name, off, length in zip(names, values, lengths, strict=True):
             if abs(off) / length > tolerance:
                 raise ValueError(
                     f"{what} does not satisfy {name}: {state} is {off:.3g} there, a distance of {abs(off) / length:.3g}. "
                     "Put the state on the constraints first: q0, qdot0 = system.project(q0, qdot0, t, params)."
                 )
+    if clash := _contradiction(names, demands, "the acceleration", lengths, dependent, tolerance):
+        raise ValueError(clash)
 
 
-def _require_compatible(names, asked, lengths, coupling, tolerance) -> None:
-    """Where one constraint is a combination of others, it must ask for the same combination, of q, q̇ and q̈."""
-    for row, factors in dependent_rows(coupling).items():
+def _contradiction(names, values, what, lengths, dependent, tolerance) -> str | None:
+    """A sentence where a constraint is a combination of others, but does not ask for the same combination."""
+    size = max(1, np.max(np.abs(values) / lengths))
+    for row, factors in dependent.items():
         weights = np.abs(factors) * lengths
-        for values, what in zip(asked, ("q0", "qdot0", "the acceleration"), strict=True):
-            size = np.max(np.abs(values) / lengths)
-            off = abs(values[row] - factors @ values) / (lengths[row] + weights.sum())
-            if off > tolerance * max(1, size):
-                others = [name for name, weight in zip(names, weights, strict=True) if weight]
-                raise ValueError(
-                    f"{names[row]} contradicts {', '.join(others)}: at the initial state it is a combination of them, "
-                    f"but asks for another value of {what}. Both cannot hold: drop or correct one."
-                )
+        if abs(values[row] - factors @ values) > tolerance * size * (lengths[row] + weights.sum()):
+            others = ", ".join(name for name, weight in zip(names, weights, strict=True) if weight)
+            return (
+                f"{names[row]} contradicts {others}: at the initial state it is a combination of them, but asks for "
+                f"another value of {what}. They cannot all hold: drop or correct one."
+            )
+    return None
+
+
+def _nowhere(system: System, q0, qdot0, t, params) -> bool:
+    """Whether no state on the constraints is found: what asks for different steps may still meet somewhere."""
+    found = jax.tree.leaves(eqx.filter_jit(system.project)(q0, qdot0, t, params)[0])
+    return not all(np.isfinite(leaf).all() for leaf in found)
 
 
 def inconsistent_members(system: System, layout: Layout, ts, values: dict, axes: dict) -> jax.Array | None:

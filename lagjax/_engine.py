@@ -164,7 +164,7 @@ def _fields(settings: Settings, layout: Layout, outcome: Outcome, idle: int | No
 
 def result_from(values) -> RESULTS:
     """The result codes with these values, integers of any shape."""
-    return jax.tree.unflatten(_RESULT_STRUCTURE, [values])
+    return jax.tree.unflatten(_RESULT_STRUCTURE, [jnp.asarray(values)])
 
 
 _RESULT_STRUCTURE = jax.tree.structure(RESULTS.successful)

@@ -156,7 +156,9 @@ def nearest_consistent(motion: Motion, q, qdot, t, params) -> tuple[jax.Array, j
         place = jax.lax.stop_gradient(_nearest(motion, *held))
         q = _step_to_nearest(motion, place, q, qdot, t, params)[0]
     matrix, rows, target = motion.velocity_saddle(q, qdot, t, params)
-    return q, qdot + _linear.saddle(matrix, jnp.zeros_like(q), rows, target)[0]
+    step = _linear.saddle(matrix, jnp.zeros_like(q), rows, target)[0]
+    met = _met(target - rows @ step, rows, qdot + step)
+    return q, jnp.where(met, qdot + step, jnp.nan)
 
 
 def _nearest(motion: Motion, q0, *state):
@@ -170,7 +172,8 @@ def _nearest(motion: Motion, q0, *state):
     q, multipliers = _repeated(lambda place: _step_to_nearest(motion, place, q0, *state), (on_it, nothing))
     # Another stationary point is no answer. On the constraints both distances are round-off.
     farther = distance(q) > 1.001 * distance(on_it) + distance(q0 + _small(q0))
-    return jnp.where(farther, jnp.nan, q), multipliers
+    met = _met(motion.constraints(q, *state[1:]), jax.jacfwd(motion.constraints)(q, *state[1:]), q)
+    return jnp.where(met & ~farther, q, jnp.nan), multipliers
 
 
 def _repeated(step, place):
@@ -188,6 +191,13 @@ def _repeated(step, place):
     start = place, jnp.asarray(jnp.inf, place[0].dtype), 0
     (q, multipliers), moved, _ = jax.lax.while_loop(going, once, start)
     return jnp.where(moved <= _small(q), q, jnp.nan), multipliers
+
+
+def _met(left, rows, state):
+    """Whether constraints hold, and steps did not just become small between some that contradict each other."""
+    lengths, eps = jnp.sqrt(jnp.sum(rows**2, axis=1)), jnp.finfo(left.dtype).eps
+    allowed = jnp.sqrt(eps) * lengths + 100 * eps * jnp.max(lengths)  # the second where a gradient vanishes
+    return jnp.all(jnp.abs(left) <= allowed * (1 + jnp.max(jnp.abs(state))))
 
 
 def _small(q):

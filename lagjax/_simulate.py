@@ -1,9 +1,8 @@
-"""`simulate` and `simulate_batch`: from a scene and an initial state to a trajectory, by way of diffrax.
+"""`simulate` and `simulate_batch`: from a scene and an initial state to a trajectory.
 
 Both follow the same four stages: check what can be checked before any work is done, turn numbers into arrays (so that
-a new value never recompiles), integrate inside one compiled function, and dress the result in the user's pytree. A
-batch is the same compiled function under `jax.vmap`. Only this module calls diffrax's integrator, and only it raises
-when a trajectory fails.
+a new value never recompiles), integrate in machine code (`_engine`) or by diffrax (`_integrate`), and dress the result
+in the user's pytree. Only this module raises when a trajectory fails.
 """
 
 from collections.abc import Callable
@@ -54,23 +53,27 @@ def simulate(
       of the whole integration.
     - `ts`: output times, shape (T,), T ≥ 2, strictly increasing, or strictly decreasing to go back in time.
     - `params`: whatever the scene's functions ask for; every number in it is traced and differentiable.
-    - `rtol`, `atol`: local error per step, |error| ≤ atol + rtol·|y| in root mean square over the state. By default
-      rtol = 1e-9 in float64 and 1e-5 in float32, and atol = rtol/1000. `atol` is in the units of the state.
+    - `rtol`, `atol`: local error per step, |error| ≤ atol + rtol·|y|, in every component of the state (with diffrax, in
+      root mean square over them). By default rtol = 1e-9 in float64 and 1e-5 in float32, and atol = rtol/1000. `atol`
+      is in the units of the state.
 
     **Rarer ones**
 
-    - `solver`: any diffrax solver for ODEs; by default `lagjax.FineOutput(diffrax.Dopri8())`, order 8, with states
-      between its steps about as good as those at their ends (which diffrax's own interpolation for it is not).
+    - `solver`: any diffrax solver for ODEs. By default, in float64 on a CPU, Taylor series in machine code made for the
+      scene, of an order that suits `rtol`; `System.explain` says where that cannot be. Then it is
+      `lagjax.FineOutput(diffrax.Dopri8())`, order 8, with states between its steps about as good as those at their ends
+      (which diffrax's own interpolation for it is not).
     - `dt`: take fixed steps of this size instead of adaptive ones; `rtol` and `atol` then do not apply.
     - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient records that many times for
       every member: lower it for the gradient of a large batch.
     - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued one stops the motion where it
       changes sign, a Boolean one after the step on which it becomes true. `diffrax.Event` around such functions sets
       the direction and the root finder. Where the motion starts on the zero itself, give a direction.
-    - `adjoint`: how derivatives are taken. By default reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`) goes over the
-      steps that were taken. Pass `diffrax.ForwardMode()` for forward mode (`jax.jvp`, `jax.jacfwd`), which is cheaper
-      for a few parameters, or any other diffrax adjoint. With an event the default is
-      `diffrax.RecursiveCheckpointAdjoint()`.
+    - `adjoint`: how derivatives are taken. By default machine code integrates the sensitivities along with the motion,
+      for both modes and every order of derivatives; a scene with many parameters, and all that diffrax integrates, goes
+      back over the steps that were taken, in reverse mode only (`jax.grad`, `jax.vjp`, `jax.jacrev`). Pass
+      `diffrax.ForwardMode()` for forward mode (`jax.jvp`, `jax.jacfwd`) there, or any other diffrax adjoint. With an
+      event the default is `diffrax.RecursiveCheckpointAdjoint()`.
     - `throw`: raise when the motion does not reach its end. With `throw=False` look at `trajectory.ok`.
     - `progress`: print how far the integration has come; or any diffrax progress meter.
 
@@ -80,7 +83,8 @@ def simulate(
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, before anything is integrated;
     `SimulationError` when the motion cannot be followed to its end. Inside `jit` the same failures raise at run time.
 
-    Source: Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.4-5 (step control, Dopri8).
+    Source: Jorba & Zou, *A software package for the numerical integration of ODEs by means of high-order Taylor
+    methods*, Exp. Math. 14 (2005) 99; Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.4-5.
 
     ```python
     import jax, jax.numpy as jnp, lagjax

@@ -144,5 +144,7 @@ _pools: list[ThreadPoolExecutor] = []
 def _pool() -> ThreadPoolExecutor:
     """Threads for all kernels, started when first needed."""
     if not _pools:
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=_pools.clear)  # a child process has none of its parent's threads
         _pools.append(ThreadPoolExecutor(cores(), thread_name_prefix="lagjax"))
     return _pools[0]

@@ -30,6 +30,8 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from lagjax._program._graph import Graph, Node, Unlowerable
 from lagjax._program._passes import finish
 
@@ -65,7 +67,8 @@ def series(program, size: int, moving: int) -> Series:
     For ẏ = f(t, y) with m components these are m outputs and m + 1 inputs (y and t, in any order); for q̈(q, q̇, t) with
     n coordinates, n and 2n + 1. Raises `Unlowerable` for an operation whose series is not known here.
     """
-    return _Recurrences(program, size, moving).finished()
+    with np.errstate(all="ignore"):  # a constant may be 1/0, where the mass matrix is singular: that is found later
+        return _Recurrences(program, size, moving).finished()
 
 
 class _Recurrences:
