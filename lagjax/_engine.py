@@ -6,8 +6,10 @@ scalar program) is diffrax's, in `_integrate`. Both follow the same motion withi
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,7 @@ import numpy as np
 from lagjax import _native
 from lagjax._equations import projection_program, scalar_program
 from lagjax._flow import Flow, Outcome, Tolerances, unfit
+from lagjax._integrate import Solved
 from lagjax._layout import Layout
 from lagjax._program import Unlowerable
 from lagjax._results import RESULTS
@@ -36,13 +39,38 @@ def flow_for(system: System, settings: Settings, layout: Layout, *values: PyTree
         return "a solver, an adjoint, fixed steps, an event or a progress meter was asked for"
     if not all(is_concrete(x) for x in (settings.controller.rtol, settings.controller.atol)):
         return "the tolerances are being traced"
-    flow = scene_flow(system, layout, values[-1])
-    if isinstance(flow, str) or all(is_concrete(leaf) for leaf in jax.tree.leaves((settings.ts, values))):
-        return flow
-    entries = flow.size * (flow.program.size - 1)
-    if entries > LARGEST_JACOBIAN:
-        return f"the run is being traced, and {entries} sensitivities are more than {LARGEST_JACOBIAN}"
-    return flow
+    return scene_flow(system, layout, values[-1])
+
+
+def has_sensitivities(flow: Flow, *values: PyTree) -> bool:
+    """Whether derivatives of this run, should they be asked for, come from sensitivities."""
+    few = flow.size * (flow.program.size - 1) <= LARGEST_JACOBIAN
+    return few or all(is_concrete(leaf) for leaf in jax.tree.leaves(values))
+
+
+def primal(flow: Flow, settings: Settings) -> Callable:
+    """`(ts, (q, qdot), params)` → `Solved`: a run for which only diffrax has derivatives, where none is taken."""
+    return _primal(flow, _tolerances(settings))
+
+
+@functools.lru_cache(maxsize=64)  # one function object for one program: it becomes part of what XLA compiles
+def _primal(flow: Flow, tolerances: Tolerances) -> Callable:
+    run, n = flow.undifferentiated(tolerances), flow.size
+
+    def solved(ts, y0, params):
+        scalars = [x.astype(y0[0].dtype) for leaf in jax.tree.leaves(params) for x in jnp.ravel(leaf)]
+        outcome = run(ts, jnp.concatenate(y0), *scalars)
+        stats = {
+            "num_steps": outcome.accepted + outcome.rejected,
+            "num_accepted_steps": outcome.accepted,
+            "num_rejected_steps": outcome.rejected,
+        }
+        code = jnp.asarray(_AS_DIFFRAX)[outcome.code]
+        result = jax.tree.unflatten(jax.tree.structure(diffrax.RESULTS.successful), [code])
+        halves = [(y[..., :n], y[..., n:]) for y in (outcome.path, outcome.y_end)]
+        return Solved(*halves, outcome.t_end, result, stats)
+
+    return solved
 
 
 def scene_flow(system: System, layout: Layout, params: PyTree) -> "Flow | str":
@@ -168,6 +196,11 @@ def result_from(values) -> RESULTS:
 
 
 _RESULT_STRUCTURE = jax.tree.structure(RESULTS.successful)
+# What diffrax calls them; the state at the end tells the rest.
+_AS_DIFFRAX = np.array([
+    int(result._value)
+    for result in (diffrax.RESULTS.successful, diffrax.RESULTS.max_steps_reached, *[diffrax.RESULTS.dt_min_reached] * 3)
+], np.int32)  # fmt: skip
 # The codes of the kernel, in their order, as those of `RESULTS`.
 RESULT_OF_CODE = np.array([
     int(result._value)

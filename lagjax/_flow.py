@@ -100,6 +100,20 @@ class Flow:
     def _traceable(self, tolerances: Tolerances) -> Callable:
         """`(ts, y0, *params)` → `Outcome` of one member, under every transformation of JAX."""
 
+        if self.guards is not None:
+            run = self.undifferentiated(tolerances)
+            return lambda *arrays: run(*map(jax.lax.stop_gradient, arrays))
+        run = jax.custom_jvp(self.undifferentiated(tolerances))
+
+        @functools.partial(run.defjvp, symbolic_zeros=True)
+        def rule(primals, tangents):
+            return _push(self, tolerances, primals, tangents)
+
+        return run
+
+    def undifferentiated(self, tolerances: Tolerances) -> Callable:
+        """The same without derivatives."""
+
         def on_host(*arrays):
             return _over_batch(lambda *rows: self.run(*rows, tolerances)[0], *arrays)
 
@@ -108,14 +122,6 @@ class Flow:
             dtypes = [np.float64] * 3 + [np.int64] * 3
             outcome = [jax.ShapeDtypeStruct(*of) for of in zip(shapes, dtypes, strict=True)]
             return Outcome(*jax.pure_callback(on_host, tuple(outcome), ts, y0, *params, vmap_method="expand_dims"))
-
-        if self.guards is not None:
-            return lambda *arrays: run(*map(jax.lax.stop_gradient, arrays))
-        run = jax.custom_jvp(run)
-
-        @functools.partial(run.defjvp, symbolic_zeros=True)
-        def rule(primals, tangents):
-            return _push(self, tolerances, primals, tangents)
 
         return run
 

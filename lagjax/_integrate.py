@@ -38,8 +38,10 @@ class Solved(NamedTuple):
     stats: dict[str, jax.Array]
 
 
-def integrate(form: Equations, settings: Settings, event: diffrax.Event | None, ts, y0, params) -> Solved:
+def integrate(form: Equations, settings: Settings, event: diffrax.Event | None, ts, y0, params, primal=None) -> Solved:
     """ẏ = f(t, y) from y0 at ts[0] to ts[-1], or to the event.
+
+    `primal(ts, y0, params)` → `Solved` takes the place of diffrax where nothing is differentiated.
 
     With the default adjoint, and without an event, reverse mode goes over the recorded steps; otherwise derivatives are
     those of the diffrax adjoint.
@@ -49,19 +51,19 @@ def integrate(form: Equations, settings: Settings, event: diffrax.Event | None, 
     with plain_elementary() if isinstance(settings.solver, Taylor) else nullcontext():
         field = eqx.filter_closure_convert(form.vector_field, ts[0], y0, params)
     project = eqx.filter_closure_convert(form.projected, ts[0], y0, params) if form.constrained else None
-    solved = _differentiable((field, project, ts, y0, params), settings, event)
+    solved = _differentiable((field, project, ts, y0, params), settings, event, primal)
     if project is not None:
         solved = solved._replace(path=jax.vmap(project, in_axes=(0, 0, None))(ts, solved.path, params))
     return solved
 
 
-def _differentiable(moving, settings: Settings, event) -> Solved:
+def _differentiable(moving, settings: Settings, event, primal) -> Solved:
     if settings.adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if settings.adjoint is None else settings.adjoint
         return _solve(moving, settings, settings.controller, adjoint, event)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
     frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, settings)
-    return _over_recorded_steps(moving, frozen)
+    return _over_recorded_steps(moving, frozen, primal)
 
 
 def _solve(moving, settings: Settings, controller, adjoint, event=None, record: bool = False):
@@ -105,21 +107,23 @@ def _looping(solver, adjoint):
 
 
 @eqx.filter_custom_vjp
-def _over_recorded_steps(moving, settings):
+def _over_recorded_steps(moving, settings, primal):
     """The plain loop: `diffrax.ForwardMode` is the one that keeps nothing for a backward pass."""
+    if primal is not None:
+        return primal(*moving[2:])
     return _solve(moving, settings, settings.controller, diffrax.ForwardMode())
 
 
 @_over_recorded_steps.def_fwd
-def _forward(perturbed, moving, settings):
-    del perturbed
+def _forward(perturbed, moving, settings, primal):
+    del perturbed, primal
     solved, times = _solve(moving, settings, settings.controller, diffrax.ForwardMode(), record=True)
     return solved, (times, solved.t_end, solved.result)
 
 
 @_over_recorded_steps.def_bwd
-def _backward(residuals, cotangents, perturbed, moving, settings):
-    del perturbed
+def _backward(residuals, cotangents, perturbed, moving, settings, primal):
+    del perturbed, primal
     times, t_end, result = residuals
 
     def replay(moving):

@@ -106,6 +106,8 @@ def simulate(
     flow = _engine.flow_for(system, settings, layout, q0, qdot0, params)
     if isinstance(flow, str):
         fields = _integrate(system, settings, q0, qdot0, params)
+    elif not _engine.has_sensitivities(flow, settings.ts, q0, qdot0, params):
+        fields = _integrate(system, settings, q0, qdot0, params, _engine.primal(flow, settings))
     else:
         fields = _engine.run(flow, settings, layout, q0, qdot0, params)
     trajectory = Trajectory(*fields, system, params)
@@ -163,9 +165,12 @@ def simulate_batch(
         fields[5]["num_wasted_lane_steps"] = steps.size * jnp.max(steps) - jnp.sum(steps)
     elif all(is_concrete(leaf) for leaf in jax.tree.leaves((settings.ts, values))):
         fields = _engine.run_batch(flow, settings, layout, values, axes, size)
-    else:
+    elif _engine.has_sensitivities(flow, settings.ts, *values.values()):
         run = jax.vmap(lambda *one: _engine.run(flow, settings, layout, *one), in_axes=tuple(batch_axes))
         fields = run(*values.values())
+    else:
+        primal = _engine.primal(flow, settings)
+        fields = _integrate_batch(system, settings, *values.values(), _Static(tuple(batch_axes)), primal)
     trajectory = Trajectory(jnp.asarray(settings.ts), *fields[1:], system, values["params"], batch_axes[2])
     return trajectory if astray is None else _refused(trajectory, astray)
 
@@ -177,16 +182,16 @@ class _Static(eqx.Module):
 
 
 @eqx.filter_jit
-def _integrate_batch(system, settings, q0, qdot0, params, batch_axes: _Static):
+def _integrate_batch(system, settings, q0, qdot0, params, batch_axes: _Static, primal=None):
     def member(q0, qdot0, params):
-        return _integrate(system, settings, q0, qdot0, params)
+        return _integrate(system, settings, q0, qdot0, params, primal)
 
     return jax.vmap(member, in_axes=batch_axes.value)(q0, qdot0, params)
 
 
 @eqx.filter_jit
-def _integrate(system: System, settings: Settings, q0, qdot0, params):
-    """One trajectory: the first six fields of `Trajectory`."""
+def _integrate(system: System, settings: Settings, q0, qdot0, params, primal=None):
+    """One trajectory by diffrax, the first six fields of `Trajectory`; with `primal` diffrax only differentiates."""
     layout = Layout.of(q0, qdot0)
     numbers = eqx.filter(params, eqx.is_array)
     form = equations(system.motion(layout, params), layout, numbers, system.path)
@@ -196,7 +201,7 @@ def _integrate(system: System, settings: Settings, q0, qdot0, params):
     start = _health(y0, *form.acceleration(settings.ts[0], y0, numbers))
     ts = jnp.where(start == RESULTS.successful, settings.ts, settings.ts[0])
     event = None if settings.event is None else _in_coordinates(settings.event, layout, params)
-    solved = integrate(form, settings, event, ts, y0, numbers)
+    solved = integrate(form, settings, event, ts, y0, numbers, primal)
     path, end, t_end = solved.path, solved.end, solved.t_end
 
     result = _explained(RESULTS.promote(solved.result), start, _health(end, *form.acceleration(t_end, end, numbers)))

@@ -335,3 +335,26 @@ def test_bad_input_gets_a_sentence(changes, error, sentence):
 def test_a_misspelt_parameter_is_a_key_error():
     with pytest.raises(KeyError, match="k"):
         run(params={"m": 1.0, "K": 1.0})
+
+
+def test_many_parameters_go_back_over_recorded_steps():
+    # Too many for sensitivities: the motion is that of machine code all the same, its derivative diffrax's.
+    def wavy(q, qdot, params):
+        return 0.5 * qdot**2 + jnp.sum(params * jnp.cos(jnp.arange(1.0, 161.0) * q)) / 160
+
+    scene, weights = lagjax.System(wavy), jnp.linspace(1.0, 0.0, 160) ** 8
+    end = lambda w: lagjax.simulate(scene, 0.3, 0.0, jnp.array([0.0, 1.0]), w, rtol=1e-10).q[-1]
+    np.testing.assert_array_equal(jax.jit(end)(weights), end(weights))
+    gradient, step = jax.grad(end)(weights), 1e-5
+    for k in (0, 3):
+        central = (end(weights.at[k].add(step)) - end(weights.at[k].add(-step))) / (2 * step)
+        np.testing.assert_allclose(gradient[k], central, rtol=1e-6)
+
+
+def test_sensitivities_of_second_order():
+    # q = cos √k t from rest at 1: d²q/dk² by sensitivities of sensitivities.
+    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params * q**2)
+    end = lambda k: lagjax.simulate(scene, 1.0, 0.0, jnp.array([0.0, 3.0]), k, rtol=1e-11).q[-1]
+    exact = jax.grad(jax.grad(lambda k: jnp.cos(3.0 * jnp.sqrt(k))))(2.0)
+    np.testing.assert_allclose(jax.grad(jax.grad(end))(2.0), exact, rtol=1e-8)
+    np.testing.assert_allclose(jax.jacfwd(jax.jacrev(end))(2.0), exact, rtol=1e-8)
