@@ -20,6 +20,8 @@ def emit(code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos:
         xs = [values[i] for i in operands]
         if op == "input":
             value = inputs(attribute)
+            if kind == "bool":
+                value = code.compare("!=", value, 0.0)
         elif op == "constant":
             value = code.as_value(attribute, code.vector if kind != "bool" else ir.VectorType(BIT, code.lanes))
         elif op in ("sin", "cos") and sincos is not None:
