@@ -46,9 +46,10 @@ def require_consistent(system: System, layout: Layout, ts, q0: PyTree, qdot0: Py
         if clash and (what == "qdot0" or _nowhere(system, q0, qdot0, ts[0], params)):
             raise ValueError(clash)
         for name, off, length in zip(names, values, lengths, strict=True):
-            if abs(off) / length > tolerance:
+            distance = abs(off) / length
+            if distance > tolerance:
                 raise ValueError(
-                    f"{what} does not satisfy {name}: {state} is {off:.3g} there, a distance of {abs(off) / length:.3g}. "
+                    f"{what} does not satisfy {name}: {state} is {off:.3g} there, a distance of {distance:.3g}. "
                     "Put the state on the constraints first: q0, qdot0 = system.project(q0, qdot0, t, params)."
                 )
     if clash := _contradiction(names, demands, "the acceleration", lengths, dependent, tolerance):

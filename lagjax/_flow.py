@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jax.experimental.buffer_callback import buffer_callback
 
 from lagjax import _native
 from lagjax._program import Program, Unlowerable, lower
@@ -114,14 +115,18 @@ class Flow:
     def undifferentiated(self, tolerances: Tolerances) -> Callable:
         """The same without derivatives."""
 
-        def on_host(*arrays):
-            return _over_batch(lambda *rows: self.run(*rows, tolerances)[0], *arrays)
+        # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
+        # the callbacks themselves may occupy.
+        def on_host(_, places, *arrays):
+            outcome = _over_batch(lambda *rows: self.run(*rows, tolerances)[0], *map(np.asarray, arrays))
+            for place, values in zip(places, outcome, strict=True):
+                np.asarray(place)[...] = values
 
         def run(ts, y0, *params):
             shapes = [(*ts.shape, self.states), (self.states,), (), (), (), ()]
             dtypes = [np.float64] * 3 + [np.int64] * 3
-            outcome = [jax.ShapeDtypeStruct(*of) for of in zip(shapes, dtypes, strict=True)]
-            return Outcome(*jax.pure_callback(on_host, tuple(outcome), ts, y0, *params, vmap_method="expand_dims"))
+            places = tuple(jax.ShapeDtypeStruct(*of) for of in zip(shapes, dtypes, strict=True))
+            return Outcome(*buffer_callback(on_host, places, vmap_method="expand_dims")(ts, y0, *params))
 
         return run
 

@@ -12,6 +12,8 @@ after which the reset is differentiated like any function. Together these are th
 Circuits Syst. I 47 (2000) 204, §III.
 """
 
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -22,13 +24,14 @@ import numpy as np
 
 from lagjax import _native
 from lagjax._arguments import Function, accept
-from lagjax._consistent import require_consistent
-from lagjax._engine import RESULT_OF_CODE
+from lagjax._consistent import TOLERANCE, require_consistent
+from lagjax._engine import RESULT_OF_CODE, result_from
 from lagjax._equations import multiplier_program, projection_program, scalar_program
 from lagjax._flow import Flow, Tolerances, unfit
 from lagjax._layout import Layout
-from lagjax._program import Unlowerable, lower
-from lagjax._results import RESULTS
+from lagjax._motion import Motion
+from lagjax._program import Program, Unlowerable, lower
+from lagjax._results import RESULTS, SimulationError
 from lagjax._settings import Settings, as_arrays, is_concrete, require_finite
 from lagjax._simulate import raise_unless_ok
 from lagjax._system import System
@@ -92,7 +95,7 @@ def simulate_hybrid(
 
     - `modes`: a `System` for each name; all share the structure of `q0` and `params`.
     - `transitions`: which mode gives way to which, and where; the earliest one wins, the first listed of several at one
-      instant.
+      instant. The others then follow at once if the mode is the same and the reset has not changed their guards.
     - `max_transitions`: the budget of transitions. A motion that needs more (infinitely many, where they pile up as the
       bounces of a ball do) ends there and says so.
 
@@ -103,7 +106,11 @@ def simulate_hybrid(
     the last, and their `count`.
 
     Every member of a batch switches at its own time: use `jax.vmap`, `jax.jit` and `jax.grad` around it. Times and
-    states of transitions have their derivatives by the initial state and by params.
+    states of transitions have their first derivatives by the initial state and by params; second ones are not right.
+
+    A guard is looked at along the whole of every step, and a step is shortened until it is smooth there: one that
+    touches zero, or crosses it and comes back between two steps, is seen for what it is. A state that a reset leaves
+    off the constraints of its new mode ends the motion with the result `inconsistent_start`.
 
     **Raises** `TypeError`, `ValueError` for arguments that cannot be right, `SimulationError` as `simulate` does. It
     needs scenes that have machine code (see `System.explain`): float64, on the CPU.
@@ -132,14 +139,29 @@ def simulate_hybrid(
     controller = settings.controller
     tolerances = Tolerances(float(controller.rtol), float(controller.atol), max_steps)
     plan = _Plan(tuple(modes), tuple(modes.values()), tuple(transitions), start, max_transitions, tolerances)
-    fields = _run(plan, settings.ts, q0, qdot0, params)
+    *fields, last = _run(plan, settings.ts, q0, qdot0, params)
     trajectory = Trajectory(*fields[:6], dict(modes), params, None, *fields[6:])
-    return raise_unless_ok(trajectory, layout) if throw else trajectory
+    return _raise_unless_ok(trajectory, layout, last) if throw else trajectory
+
+
+def _raise_unless_ok(trajectory: Trajectory, layout: Layout, last) -> Trajectory:
+    """The same as for one scene, naming the mode in which it ended."""
+    if not is_concrete(trajectory.ok) or trajectory.ok:
+        return raise_unless_ok(trajectory, layout)
+    name = list(trajectory.system)[int(last)]
+    try:
+        raise_unless_ok(dataclasses.replace(trajectory, system=trajectory.system[name]), layout)
+    except SimulationError as error:
+        raise SimulationError(f"{error}\nIt was in the mode {name!r}.", trajectory) from None
 
 
 def _require_modes(modes, transitions, start, max_transitions) -> None:
     if not isinstance(modes, dict) or not modes or not all(isinstance(m, System) for m in modes.values()):
         raise TypeError("modes must be a dict of lagjax.System by name.")
+    if not isinstance(transitions, list | tuple):
+        raise TypeError(f"transitions must be a list of lagjax.Transition; got {type(transitions).__name__}.")
+    if jax.tree.leaves((modes, transitions)):
+        raise ValueError("A function of a mode or a transition holds arrays of its own: give them as params.")
     known = ", ".join(map(repr, modes))
     if start not in modes:
         raise ValueError(f"The motion is to start in the mode {start!r}, which does not exist; there are {known}.")
@@ -170,15 +192,18 @@ class _Plan(eqx.Module):
     max_transitions: int = eqx.field(static=True)
     tolerances: Tolerances = eqx.field(static=True)
 
-    def leaving(self, mode: int) -> list[Transition]:
-        return [t for t in self.transitions if t.source == self.names[mode]]
+    def leaving(self, mode: int) -> list[tuple[int, Transition]]:
+        """The transitions from a mode, with their places among all."""
+        return [(k, t) for k, t in enumerate(self.transitions) if t.source == self.names[mode]]
 
 
 class _Mode(NamedTuple):
-    """One mode, ready to run: with derivatives, and with its guards."""
+    """One mode, ready to run: with derivatives, and with its guards; these as programs, alone and as `Guards` wants."""
 
     flow: Flow
     watched: Flow
+    surfaces: Program | None
+    guards: Program | None
 
 
 # ---- one run ---------------------------------------------------------------------------------------------------------
@@ -194,49 +219,89 @@ def _run(plan: _Plan, ts, q0, qdot0, params):
     modes = [_mode(plan, i, layout, eqx.combine(shapes, code)) for i in range(len(plan.systems))]
     rounds = _Rounds(plan, layout, modes, ts, params, scalars)
     y0 = jnp.concatenate([layout.flatten(q0), layout.flatten(qdot0)])
-    start = _Carry(
-        t=ts[0], y=y0, mode=jnp.asarray(plan.names.index(plan.start)), going=jnp.asarray(True),
-        code=jnp.asarray(_native.DONE), path=jnp.full((ts.size, y0.size), jnp.nan), modes=jnp.full(ts.size, -1),
-        steps=jnp.zeros(2, int),
+    start = plan.names.index(plan.start)
+    astray = rounds.astray(start, ts[0], y0)
+    first = _Carry(
+        t=ts[0], y=y0, mode=jnp.asarray(start), going=~astray, code=jnp.where(astray, INCONSISTENT, _native.DONE),
+        path=jnp.full((ts.size, y0.size), jnp.nan), modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int),
+        latest=jnp.asarray(-1), waiting=jnp.asarray(0),
     )  # fmt: skip
-    last, seen = jax.lax.scan(rounds.one, start, jnp.arange(plan.max_transitions + 1))
+    last, seen = jax.lax.scan(rounds.one, first, jnp.arange(plan.max_transitions + 1))
     return _fields(layout, ts, last, jax.tree.map(lambda x: x[: plan.max_transitions], seen))
 
 
 def _mode(plan: _Plan, index: int, layout: Layout, params: PyTree) -> _Mode:
-    """Machine code for a mode. Raises `ValueError` where there is none."""
-    system, n = plan.systems[index], layout.size
-    numbers = eqx.filter(params, eqx.is_array_like)
+    """Machine code for a mode, made once. Raises `ValueError` where there is none."""
+    leaving = tuple(transition for _, transition in plan.leaving(index))
+    leaves, structure = jax.tree.flatten(params)
+    known = tuple(_Shape(np.shape(x), np.result_type(x)) if eqx.is_array_like(x) else x for x in leaves)
+    try:
+        return _made(plan.names[index], plan.systems[index], leaving, layout, known, structure)
+    except TypeError as reason:
+        if "unhashable" not in str(reason):
+            raise
+        return _made.__wrapped__(plan.names[index], plan.systems[index], leaving, layout, known, structure)
+
+
+class _Shape(NamedTuple):
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+@functools.lru_cache(maxsize=64)
+def _made(name: str, system: System, leaving: tuple[Transition, ...], layout: Layout, known, structure) -> _Mode:
+    params = structure.unflatten([np.zeros(*x) if isinstance(x, _Shape) else x for x in known])
+    n, numbers = layout.size, eqx.filter(params, eqx.is_array_like)
     motion = system.motion(layout, params)
     try:
         program = scalar_program(motion, layout, numbers)
         projection = projection_program(motion, layout, numbers)
         multipliers = multiplier_program(motion, layout, numbers) if motion.constrained else None
 
-        def values(q, v, t, numbers):
+        def surfaces(y, numbers):
+            q, v, t = y[:n], y[n:-1], y[-1]
             given = {"t": t, "params": eqx.combine(numbers, eqx.filter(params, eqx.is_array_like, inverse=True))}
             if multipliers is not None:
-                scalars = [x for leaf in jax.tree.leaves(numbers) for x in jnp.ravel(leaf)]
-                flat = jnp.stack(multipliers(*q, *v, t, *scalars))
+                flat = jnp.stack(multipliers(*y, *_scalars(numbers)))
                 given["multipliers"] = system.by_constraint(flat, layout, params)
-            return [_scalar(s.guard, layout.restore(q), layout.restore(v), given) for s in plan.leaving(index)]
+            return jnp.stack([_scalar(one.guard, layout.restore(q), layout.restore(v), given) for one in leaving])
 
-        vector, scalar = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
-        guards = lower(values, vector, vector, scalar, numbers)
+        def guards(y, numbers):
+            slope = jnp.stack(program(*y, *_scalars(numbers))[:n])
+            along = jnp.concatenate([y[n:-1], slope, jnp.ones(1)])
+            by_y = jax.jacfwd(surfaces)(y, numbers)
+            terms, moving = by_y * y, by_y * along
+            return surfaces(y, numbers), moving.sum(1), jnp.abs(terms).sum(1), jnp.abs(moving).sum(1)
+
+        y = jax.ShapeDtypeStruct((2 * n + 1,), layout.dtype)
+        programs = [lower(of, y, numbers) for of in (surfaces, guards)] if leaving else [None, None]
     except Unlowerable as why:
-        raise ValueError(f"The mode {plan.names[index]!r} has no machine code: {why}.") from None
+        raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
     if reason := unfit(program, n, layout.dtype):
-        raise ValueError(f"The mode {plan.names[index]!r} has no machine code: {reason}.")
+        raise ValueError(f"The mode {name!r} has no machine code: {reason}.")
     flow = Flow(program, n, projection)
-    directions = tuple(transition.direction for transition in plan.leaving(index))
-    watched = Flow(program, n, projection, _native.Guards(guards, directions)) if directions else flow
-    return _Mode(flow, watched)
+    if not leaving:
+        return _Mode(flow, flow, *programs)
+    if len(leaving) > MOST_GUARDS:
+        raise ValueError(f"{len(leaving)} transitions leave the mode {name!r}, more than {MOST_GUARDS}.")
+    directions = tuple(transition.direction for transition in leaving)
+    return _Mode(flow, Flow(program, n, projection, _native.Guards(programs[1], directions)), *programs)
+
+
+MOST_GUARDS = 24  # two bits each in the code of an event, which is a double
+
+
+def _scalars(numbers: PyTree) -> list[jax.Array]:
+    return [x for leaf in jax.tree.leaves(numbers) for x in jnp.ravel(leaf)]
 
 
 def _scalar(guard: Function, q, qdot, given) -> jax.Array:
     if "multipliers" in guard.extras and "multipliers" not in given:
         raise ValueError("A guard asks for `multipliers`, but its mode has no constraints.")
-    value = jnp.asarray(guard(q, qdot, **given))
+    value = guard(q, qdot, **given)
+    if len(jax.tree.leaves(value)) != 1 or value is not jax.tree.leaves(value)[0]:
+        raise TypeError(f"A guard must return one real number; got {type(value).__name__}.")
+    value = jnp.asarray(value)
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise TypeError(f"A guard must return one real number; got shape {value.shape} of {value.dtype}.")
     return value
@@ -251,6 +316,8 @@ class _Carry(NamedTuple):
     path: jax.Array
     modes: jax.Array
     steps: jax.Array
+    latest: jax.Array  # the transition before, −1 at the beginning
+    waiting: jax.Array  # guards that vanished at the same instant and have not been followed
 
 
 class _Seen(NamedTuple):
@@ -287,71 +354,102 @@ class _Rounds(NamedTuple):
         return after, seen
 
     def _in_mode(self, index: int, carry: _Carry, here) -> tuple[_Carry, jax.Array, _Seen]:
-        mode, tolerances, end = self.modes[index], self.plan.tolerances, self.ts[-1]
+        mode, tolerances = self.modes[index], self.plan.tolerances
         held_t = jax.lax.stop_gradient(carry.t)
-        horizon = jnp.where(here, end, held_t)
+        runs = here & (carry.waiting == 0)
+        horizon = jnp.where(runs, self.ts[-1], held_t)
         found = mode.watched.traceable(tolerances)(jnp.stack([held_t, horizon]), carry.y, *self.scalars)
         found = jax.tree.map(jax.lax.stop_gradient, found)
-        event = found.code >= _native.EVENT
-        t_end = found.t_end
+        changes = jnp.where(runs, jnp.maximum(found.code - _native.EVENT, 0), jnp.where(here, carry.waiting, 0))
+        t_end = jnp.where(runs & (found.code == _native.DONE), self.ts[-1], found.t_end)
 
-        # The same stretch once more, with derivatives and outputs.
-        inside = jnp.clip(self.ts, held_t, t_end)
+        # The same stretch once more, with derivatives and outputs; where it ends is known better already.
+        covered = here & ((self.ts > held_t) | (self.ts == jnp.where(held_t == self.ts[0], held_t, jnp.nan)))
+        covered = covered & (self.ts <= t_end)
+        inside = jnp.where(covered, self.ts, jax.lax.stop_gradient(jnp.clip(self.ts, held_t, t_end)))
         times = jnp.concatenate([carry.t[None], inside, t_end[None]])
         run = mode.flow.traceable(tolerances)(times, carry.y, *self.scalars)
-        first = carry.t == self.ts[0]
-        covered = here & ((self.ts > held_t) | (first & (self.ts == held_t))) & (self.ts <= t_end)
-        y_end = jnp.where(here, run.y_end, jax.lax.stop_gradient(carry.y))
-        which = jnp.where(event, found.code - _native.EVENT, -1)
-        t_star, y_star, y_next, target = self._through(index, which, here & event, t_end, y_end)
+        y_end = found.y_end + jnp.where(here, run.y_end - jax.lax.stop_gradient(run.y_end), 0.0)
+
+        exit = self._through(index, changes, carry.latest, t_end, y_end)
+        event = (changes > 0) & ~exit.piled
+        failed = jnp.where(exit.piled, TOO_MANY_TRANSITIONS, jnp.where(runs & ~event, found.code, carry.code))
         state = carry._replace(
-            t=jnp.where(event, t_star, t_end),
-            y=jnp.where(event, y_next, y_end),
-            mode=jnp.where(event, target, index),
-            going=event,
-            code=jnp.where(event, carry.code, found.code),
+            t=jnp.where(event, exit.t, t_end),
+            y=jnp.where(event, exit.y_next, y_end),
+            mode=jnp.where(event, exit.target, index),
+            going=event & ~exit.astray,
+            code=jnp.where(event & exit.astray, INCONSISTENT, failed),
             path=jnp.where(covered[:, None], run.path[1:-1], carry.path),
             modes=jnp.where(covered, index, carry.modes),
             steps=carry.steps + jnp.stack([found.accepted, found.rejected]),
+            latest=exit.number,
+            waiting=exit.waiting,
         )
-        return state, event, _Seen(t_star, y_star, jnp.asarray(index), target)
+        return state, event, _Seen(exit.t, exit.y, jnp.asarray(index), exit.target)
 
-    def _through(self, index: int, which, happens, t, y):
-        """Time and state of the transition with their derivatives, the state after it, and its mode."""
-        t_star, y_star, y_next, target = t, y, y, jnp.asarray(index)
-        slope = self._slope(index, t, y)
-        for k, transition in enumerate(self.plan.leaving(index)):
-            taken = happens & (which == k)
-            g = self._guard(index, transition, t, jnp.where(taken, y, jax.lax.stop_gradient(y)))
-            rate = jax.lax.stop_gradient(self._guard_rate(index, transition, t, y, slope))
-            rate = jnp.where(taken & (rate != 0), rate, 1.0)
-            later = jnp.where(taken, -(g - jax.lax.stop_gradient(g)) / rate, 0.0)
-            moved_t, moved_y = t + later, y + slope * later
-            new = self._reset(transition, moved_t, jnp.where(taken, moved_y, jax.lax.stop_gradient(y)))
-            t_star, y_star = jnp.where(taken, moved_t, t_star), jnp.where(taken, moved_y, y_star)
-            y_next = jnp.where(taken, new, y_next)
-            target = jnp.where(taken, self.plan.names.index(transition.target), target)
-        return t_star, y_star, y_next, target
+    def _through(self, index: int, changes, latest, t, y) -> "_Exit":
+        """Through the first transition whose bits in `changes` say that its guard falls (1) or rises (2)."""
+        leaving = self.plan.leaving(index)
+        exit = _Exit(t, y, y, jnp.asarray(index), *[jnp.asarray(-1), jnp.asarray(0)], *[jnp.asarray(False)] * 2)
+        if not leaving:
+            return exit
+        kinds = [(changes >> (2 * k)) & 3 for k in range(len(leaving))]
+        y_here, scalars = _held(changes > 0, (y, self.scalars))
+        values = self.modes[index].surfaces(*y_here, t, *scalars)
+        _, rates, sizes, slope = self._at_guards(index, t, y)
+        before = jnp.asarray(False)
+        for k, (number, transition) in enumerate(leaving):
+            taken = (kinds[k] > 0) & ~before
+            before = before | taken
+            # It changes sign against its rate: the motion since the last time is lost in rounding.
+            against = jnp.where(kinds[k] == 2, rates[k] < 0, rates[k] > 0) & (latest == number)
+            rate = jnp.where(taken & (rates[k] != 0), rates[k], 1.0)
+            later = jnp.where(taken, -(values[k] - jax.lax.stop_gradient(values[k])) / rate, 0.0)
+            moved_t, moved_y = t + later, y_here + slope * later
+            given = _held(taken, (moved_t, moved_y, self.params))
+            y_next, target = self._reset(transition, *given), self.plan.names.index(transition.target)
+            here = _Exit(
+                moved_t, moved_y, y_next, jnp.asarray(target), jnp.asarray(number),
+                self._waiting(index, kinds, k, t, y_next, values, sizes) if target == index else jnp.asarray(0),
+                against, self.astray(target, moved_t, y_next),
+            )  # fmt: skip
+            exit = jax.tree.map(lambda new, old, taken=taken: jnp.where(taken, new, old), here, exit)
+        return exit
 
-    def _slope(self, index: int, t, y):
-        n = self.layout.size
-        return jnp.concatenate([y[n:], jnp.stack(self.modes[index].flow.program(*y, t, *self.scalars)[:n])])
+    def _waiting(self, index: int, kinds, taken: int, t, y_next, values, sizes):
+        """Which other guards changed sign at that instant and go on to, unmoved by the reset."""
+        waiting = jnp.asarray(0)
+        if len(kinds) == 1:
+            return waiting
+        after, rates, _, _ = self._at_guards(index, t, y_next)
+        for k, kind in enumerate(kinds):
+            unmoved = jnp.abs(after[k] - jax.lax.stop_gradient(values[k])) <= SAME * sizes[k]
+            goes_on = jnp.where(kind == 2, rates[k] > 0, rates[k] < 0)
+            waiting = waiting + jnp.where((kind > 0) & unmoved & goes_on & (k != taken), kind << (2 * k), 0)
+        return waiting
 
-    def _guard(self, index: int, transition: Transition, t, y):
-        q, v = self._restored(y)
-        given = {"t": t, "params": self.params}
-        if "multipliers" in transition.guard.extras:
-            given["multipliers"] = self.plan.systems[index].multipliers(q, v, t, self.params)
-        return _scalar(transition.guard, q, v, given)
+    def _at_guards(self, index: int, t, y):
+        """Guards, their rates and their sizes as numbers, and the slope of the state."""
+        t, y, scalars = jax.lax.stop_gradient((t, y, self.scalars))
+        n, out = self.layout.size, self.modes[index].guards(*y, t, *scalars)
+        count = len(out) // 4
+        slope = jnp.concatenate([y[n:], jnp.stack(self.modes[index].flow.program(*y, t, *scalars)[:n])])
+        return out[:count], out[count : 2 * count], out[2 * count : 3 * count], slope
 
-    def _guard_rate(self, index: int, transition: Transition, t, y, slope):
-        along = (jnp.ones_like(t), slope)
-        return jax.jvp(lambda t, y: self._guard(index, transition, t, y), (t, y), along)[1]
+    def astray(self, index: int, t, y):
+        """Whether a state is off the constraints of a mode."""
+        motion = self.plan.systems[index].motion(self.layout, self.params)
+        if not motion.constrained:
+            return jnp.asarray(False)
+        t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(self.params, eqx.is_array_like)))
+        return ~(_distance(motion, *jnp.split(y, 2), t, numbers) <= TOLERANCE[self.layout.dtype])
 
-    def _reset(self, transition: Transition, t, y):
+    def _reset(self, transition: Transition, t, y, params):
         if transition.reset is None:
             return y
-        result = transition.reset(*self._restored(y), t=t, params=self.params)
+        n = self.layout.size
+        result = transition.reset(self.layout.restore(y[:n]), self.layout.restore(y[n:]), t=t, params=params)
         where = f"The reset from {transition.source!r} to {transition.target!r}"
         if not isinstance(result, tuple) or len(result) != 2:
             raise TypeError(f"{where} must return the pair (q, qdot); got {type(result).__name__}.")
@@ -363,18 +461,52 @@ class _Rounds(NamedTuple):
             raise TypeError(f"{where} must return q and qdot in the structure and the shapes of the initial state.")
         return jnp.concatenate([self.layout.flatten(part) for part in result])
 
-    def _restored(self, y):
-        n = self.layout.size
-        return self.layout.restore(y[:n]), self.layout.restore(y[n:])
+
+class _Exit(NamedTuple):
+    """A transition: when and where, the state after it and its mode, and what becomes of the motion."""
+
+    t: jax.Array
+    y: jax.Array
+    y_next: jax.Array
+    target: jax.Array
+    number: jax.Array
+    waiting: jax.Array
+    piled: jax.Array
+    astray: jax.Array
 
 
-TOO_MANY_TRANSITIONS = len(RESULT_OF_CODE)
+def _held(varies, tree: PyTree) -> PyTree:
+    """The same numbers, without derivatives where they are not to vary."""
+
+    def hold(x):
+        return jnp.where(varies, x, jax.lax.stop_gradient(x)) if eqx.is_array_like(x) else x
+
+    return jax.tree.map(hold, tree)
+
+
+def _distance(motion: Motion, q, v, t, numbers):
+    """From the constraints to the state, over its size, the longest of all (see `_consistent`)."""
+    rows, _ = motion.rows_and_targets(q, v, t, numbers)
+    lengths = jnp.sqrt(jnp.sum(rows**2, axis=1))
+    rates = motion.velocity_saddle(q, v, t, numbers)[2] / (1 + jnp.max(jnp.abs(v)))
+    off = jnp.max(jnp.abs(rates) / lengths)
+    if motion.constraints is not None:
+        held = motion.constraints(q, t, numbers) / (1 + jnp.max(jnp.abs(q)))
+        off = jnp.maximum(off, jnp.max(jnp.abs(held) / lengths[: len(held)]))
+    return off
+
+
+SAME = 64 * np.finfo(np.float64).eps  # of a guard's size
+# Codes beyond those of the kernel.
+TOO_MANY_TRANSITIONS, INCONSISTENT = len(RESULT_OF_CODE), len(RESULT_OF_CODE) + 1
+_RESULT_OF_CODE = np.array(
+    [*RESULT_OF_CODE, RESULTS.max_transitions_reached._value, RESULTS.inconsistent_start._value], np.int32
+)
 
 
 def _fields(layout: Layout, ts, last: _Carry, seen: _Seen):
     n = layout.size
-    codes = jnp.concatenate([jnp.asarray(RESULT_OF_CODE), jnp.asarray([RESULTS.max_transitions_reached._value])])
-    result = eqx.tree_at(lambda r: r._value, RESULTS.successful, codes[last.code].astype(np.int32))
+    result = result_from(jnp.asarray(_RESULT_OF_CODE)[last.code])
     accepted, rejected = last.steps
     stats = {
         "num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected,
@@ -385,4 +517,5 @@ def _fields(layout: Layout, ts, last: _Carry, seen: _Seen):
         target=seen.target, count=jnp.sum(seen.source >= 0),
     )  # fmt: skip
     path = last.path
-    return ts, layout.restore(path[:, :n]), layout.restore(path[:, n:]), result, end, stats, last.modes, transitions
+    q, qdot = layout.restore(path[:, :n]), layout.restore(path[:, n:])
+    return ts, q, qdot, result, end, stats, last.modes, transitions, last.mode

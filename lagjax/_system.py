@@ -17,6 +17,7 @@ from lagjax._arguments import Function, accept
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
 from lagjax._motion import Motion, nearest_consistent
+from lagjax._settings import as_arrays
 
 PyTree = Any
 
@@ -141,10 +142,8 @@ class System(eqx.Module):
         """
         self._require_constraints()
         layout = Layout.of(q, qdot)
-        t, numbers = jnp.asarray(t, layout.dtype), eqx.filter(params, eqx.is_array_like)
-        flat = layout.flatten(q), layout.flatten(qdot), t, numbers
-        state = nearest_consistent(self.motion(layout, params), *flat)
-        return layout.restore(state[0]), layout.restore(state[1])
+        q, qdot = self._at(nearest_consistent, q, qdot, t, params)
+        return layout.restore(q), layout.restore(qdot)
 
     def explain(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> Explanation:
         """What this scene contains and what was left out of its equations; print it, or read its fields.
@@ -245,9 +244,7 @@ class System(eqx.Module):
     def _at(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
         """Evaluate one of `Motion`'s functions at a state given in the user's pytree."""
         layout = Layout.of(q, qdot)
-        t = jnp.asarray(t, layout.dtype)
-        numbers = eqx.filter(params, eqx.is_array_like)
-        value = quantity(self.motion(layout, params), layout.flatten(q), layout.flatten(qdot), t, numbers)
+        value = _evaluate(self, quantity, *as_arrays((q, qdot, t, params), layout.dtype))
         return layout.restore(value) if restore else value
 
     def _check_outputs(self, layout: Layout, params: PyTree) -> None:
@@ -265,6 +262,14 @@ class System(eqx.Module):
             _require_structure(returned(self.forces), layout)
         if self.constraints is not None or self.velocity_constraints is not None:
             _require_constraints(self.constraint_structure(layout, params), layout)
+
+
+@eqx.filter_jit
+def _evaluate(system: System, quantity: Callable, q, qdot, t, params):
+    """One of `Motion`'s functions, compiled: one by one, its operations would take seconds to prepare."""
+    layout = Layout.of(q, qdot)
+    numbers = eqx.filter(params, eqx.is_array)
+    return quantity(system.motion(layout, params), layout.flatten(q), layout.flatten(qdot), t, numbers)
 
 
 def _require_scalar(value: PyTree, role: str) -> None:

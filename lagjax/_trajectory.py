@@ -4,7 +4,6 @@ Time is the first axis of `q` and `qdot`; the members of a batch are an axis bef
 states are methods: they cost nothing until they are asked for, and they are differentiable.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._layout import Layout
 from lagjax._results import RESULTS
 from lagjax._system import System
 
@@ -51,7 +51,8 @@ class Trajectory(eqx.Module):
     - `end`: where each member ended, a `State` of `t`, `q`, `qdot`: at `ts[-1]`, at the event, or at the last accepted
       step before it failed.
     - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
-    - `mode`, `transitions`: of a hybrid motion (`simulate_hybrid`), else None. `system` is then the dict of its modes.
+    - `mode`, `transitions`: of a hybrid motion (`simulate_hybrid`), else None. `system` is then the dict of its modes,
+      and quantities are those of the mode at every time, NaN where it is −1.
     """
 
     ts: jax.Array
@@ -60,7 +61,7 @@ class Trajectory(eqx.Module):
     result: RESULTS
     end: State
     stats: dict[str, jax.Array]
-    system: System
+    system: System | dict[str, System]
     params: PyTree
     params_axes: PyTree = eqx.field(static=True, default=None)  # how `simulate_batch` mapped over params
     mode: jax.Array | None = None
@@ -74,24 +75,24 @@ class Trajectory(eqx.Module):
 
     def energy(self) -> jax.Array:
         """h = p·q̇ − L at every output time, shape (T,) or (batch, T)."""
-        return self._at_every_time(self.system.energy)
+        return self._at_every_time("energy")
 
     def momentum(self) -> PyTree:
         """p = ∂L/∂q̇ at every output time, in the structure of `q`."""
-        return self._at_every_time(self.system.momentum)
+        return self._at_every_time("momentum")
 
     @property
     def multipliers(self) -> PyTree:
         """λ at every output time, in the structure that the constraint functions return."""
-        return self._at_every_time(self.system.multipliers)
+        return self._at_every_time("multipliers")
 
     def constraint_force(self) -> PyTree:
         """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ at every output time, in the structure of `q`."""
-        return self._at_every_time(self.system.constraint_force)
+        return self._at_every_time("constraint_force")
 
     def constraint_residual(self) -> PyTree:
         """f and a at every output time, in the structure of `multipliers`: how far the motion has drifted."""
-        return self._at_every_time(self.system.constraint_residual)
+        return self._at_every_time("constraint_residual")
 
     def to_xarray(self):
         """An `xarray.Dataset` with a variable per leaf of `q` and `qdot` and the dimensions (member,) time, ...
@@ -109,18 +110,50 @@ class Trajectory(eqx.Module):
                 label = ".".join([name, *(_key_text(key) for key in path)])
                 inner = tuple(f"{label}_{axis}" for axis in range(leaf.ndim - len(members) - 1))
                 variables[label] = ((*members, "time", *inner), np.asarray(leaf))
+        if self.mode is not None:
+            variables["mode"] = ((*members, "time"), np.asarray(self.mode))
         time = self.ts if self.ts.ndim == 1 else self.ts[(0,) * (self.ts.ndim - 1)]
         return xarray.Dataset(variables, coords={"time": np.asarray(time)})
 
-    def _at_every_time(self, quantity: Callable) -> PyTree:
-        """Map `quantity(q, qdot, t, params)` over the time axis, and over the batch axes before it."""
-        mapped = jax.vmap(quantity, in_axes=(0, 0, 0, None))
+    def _at_every_time(self, name: str) -> PyTree:
+        """Map a method (q, qdot, t, params) of the system over the time axis, and over the batch axes before it."""
+        mapped = jax.vmap(lambda *at: self._at_one_time(name, *at), in_axes=(0, 0, 0, None, 0))
         for outer in range(jnp.ndim(self.result._value)):
             # The innermost batch axis of `simulate_batch` shares its times and some parameters; axes that the user's
             # own `jax.vmap(simulate)` added are on everything.
             shared = outer == 0 and self.ts.ndim < 1 + jnp.ndim(self.result._value)
-            mapped = jax.vmap(mapped, in_axes=(0, 0, None, self.params_axes) if shared else (0, 0, 0, 0))
-        return mapped(self.q, self.qdot, self.ts, self.params)
+            mapped = jax.vmap(mapped, in_axes=(0, 0, None, self.params_axes, 0) if shared else 0)
+        return mapped(self.q, self.qdot, self.ts, self.params, self.mode)
+
+    def _at_one_time(self, name: str, q, qdot, t, params, mode) -> PyTree:
+        if isinstance(self.system, System):
+            return getattr(self.system, name)(q, qdot, t, params)
+        if name not in ("energy", "momentum"):  # which every mode has
+            _require_like_constraints(self.system, name, q, qdot, params)
+        total = None
+        for index, system in enumerate(self.system.values()):
+            # Laws of another mode may be singular here: their NaN must not reach a derivative.
+            given = jax.tree.map(lambda x, here=mode == index: _varied_where(here, x), (q, qdot, t, params))
+            value = getattr(system, name)(*given)
+            total = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), value) if total is None else total
+            total = jax.tree.map(lambda new, old, here=mode == index: jnp.where(here, new, old), value, total)
+        return total
+
+
+def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, params) -> None:
+    """Raise where modes do not have the same constraints, so that there is no one structure to return."""
+    held = [which for which, s in modes.items() if s.constraints is not None or s.velocity_constraints is not None]
+    structures = [modes[which].constraint_structure(Layout.of(q, qdot), params) for which in held]
+    if len(held) < len(modes) or any(structure != structures[0] for structure in structures):
+        one = held[0] if held else next(iter(modes))
+        raise ValueError(
+            f"The modes differ in their constraints, so there is no {name} of the whole motion: take the times of one "
+            f"mode and jax.vmap(trajectory.system[{one!r}].{name}, (0, 0, 0, None))(q, qdot, t, params)."
+        )
+
+
+def _varied_where(here, x):
+    return jnp.where(here, x, jax.lax.stop_gradient(x)) if eqx.is_array_like(x) else x
 
 
 def _key_text(key: Any) -> str:

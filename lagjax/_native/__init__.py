@@ -39,7 +39,11 @@ class Outcome(NamedTuple):
 
 
 class Guards(NamedTuple):
-    """Functions of the state that end the motion where they change sign: a program, and for each −1, 0 or +1."""
+    """Functions of the state that end the motion where they change sign, and for each −1, 0 or +1: when it counts.
+
+    With y the state and the time, the outputs of the program are all g; their rates ġ = Σ ∂g/∂yᵢ ẏᵢ; then Σ |∂g/∂yᵢ yᵢ|
+    and Σ |∂g/∂yᵢ ẏᵢ|, of which round-off is a part.
+    """
 
     program: Program
     directions: tuple[int, ...]
@@ -50,9 +54,9 @@ class Kernel:
 
     The outputs of the program are q̈, then whether the mass matrix is singular. `projection`, from the same inputs to
     (q, q̇), is applied to the state after every step, and to the outputs. `guards`, again from the same inputs, end the
-    motion of a member with the code `EVENT` + k. Errors are relative to each coordinate, or to the largest one of its
-    group. Raises `Unlowerable` where an operation has no
-    Taylor series or is not one of doubles.
+    motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are relative to
+    each coordinate, or to the largest one of its group. Raises `Unlowerable` where an operation has no Taylor series or
+    is not one of doubles.
     """
 
     def __init__(

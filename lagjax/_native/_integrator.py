@@ -33,14 +33,24 @@ from lagjax._program import Program, Series, StraightLine
 MAX_ORDER = 20
 SAFETY = 0.9
 ROUND_OFF = 256 * 2.0**-52  # of an acceleration
-BISECTIONS = 60  # of a step, to find an event: beyond the digits of a double
+
+# Guards, and where they change sign.
+INTERVALS = 8  # of a step, at whose ends they are looked at
+BETWEEN = (1.382, 5.236)  # two places more, in intervals
+_SAMPLES = INTERVALS + 3 + len(BETWEEN)
+GUARD_HALVINGS = 10  # of a step that is too long for them
+BISECTIONS = 60  # of an interval, to find the zero: beyond the digits of a double
+SECTIONS, GOLDEN = 32, 0.6180339887498949  # to find where it is least: to half of the digits
+TOUCHING = 1e-13  # of its size nearby: what goes no further through the surface has touched it
+GUARD_NOISE, LITTLE = 64 * 2.0**-52, 1e-4  # rounding; of the step
 # A series that ends (free flight) allows any step, and a step that is too long sees nothing of what lies inside it.
 FIRST_STEP, GROWTH, GROWTH_AFTER_REJECTION = 1 / 16, 5.0, 2.0  # of the whole time; of the step before
 SMALLEST_STEP = 4 * 2.0**-52  # of the largest time: below this a step no longer moves the time reliably
 CHECKS = (0.5, 1.0)  # where in the step its series is held against the equations
 
 # How a member ended.
-DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, EVENT = range(6)  # EVENT + k: the k-th guard
+DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, EVENT = range(6)
+# EVENT + Σ 4ᵏ (1 where guard k falls, 2 where it rises), over those that do so at that instant.
 _RUNNING = -1
 
 
@@ -61,7 +71,7 @@ class Job(ctypes.Structure):
 # Doubles of a lane. `due` and `reached` are times in the direction of time; `active`, `last`, `singular` are 1 or 0.
 _OF_A_LANE = (
     "t", "t_low", "t_end", "forward", "smallest", "h", "due", "reached", "worst", "active", "last", "singular", "code",
-    "steps", "rejected", "longest", "growth", "event",
+    "steps", "rejected", "longest", "growth", "planned", "event",
 )  # fmt: skip
 _KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
 # Integers of a lane: which member it carries (-1: none), and which output comes next.
@@ -91,7 +101,9 @@ class Integrator:
         self.defect = self._defect()
         self.start_next = self._start_next()
         self.project = None if projection is None else self._project()
-        self.guard = None if guards is None else self._guard()
+        if guards is not None:
+            self.guard = self._guard()
+            self.begin_sides = self._begin_sides()
         self._run()
         if projection is not None:
             self._project_rows()
@@ -109,7 +121,8 @@ class Integrator:
             "sums": len(series.products),
             "values": series.values,
             "params": self.numbers,
-            **dict.fromkeys(("guard", "guard_before", "guard_middle"), len(self.directions)),
+            **dict.fromkeys(("guard", "side", "noise", "root", "change"), len(self.directions)),
+            "samples": _SAMPLES * len(self.directions),
             **dict.fromkeys(_OF_A_LANE, 1),
         }
         for name, size in sizes.items():
@@ -337,7 +350,7 @@ class Integrator:
             code.call(self.coefficients, memory, order)
             self._choose(code, memory, job, order)
             self._halve_until_sound(code, memory, job, order)
-            if self.guard is not None:
+            if self.guards is not None:
                 self._stop_at_events(code, memory, order)
             self._move_time(code, memory, lane_data, job, order)
             self._advance(code, memory)
@@ -530,68 +543,195 @@ class Integrator:
             return moved[i] if i < self.states else now(i) + s if i == self.states else now(i)
 
         program = self.guards.program
-        values = emit(code, StraightLine(program.nodes, program.kinds, program.outputs), then, self.sincos)
-        for i, value in enumerate(values):
+        line = StraightLine(program.nodes, program.kinds, program.outputs[: len(self.directions)])
+        for i, value in enumerate(emit(code, line, then, self.sincos)):
             self._keep(code, memory, "guard", value, i)
         return code.finish()
 
-    def _stop_at_events(self, code, memory, order) -> None:
-        """Where a guard changes sign along the step, the step ends there: at the earliest change of all guards.
+    def _begin_sides(self) -> Code:
+        """`(memory, order)`: for lanes at the start of a run, the side of each surface they are on, into `side`;
+        and what rounding makes of a guard, into `noise`.
 
-        Signs are compared at the beginning, in the middle and at the end. A motion that begins on the surface of a
-        guard has left it, or not, a millionth of the first step later: that is the sign it begins with.
+        On the surface, to rounding, it is the side that the motion goes to: by its rate or, where that is zero to
+        rounding too, by where it is a little later.
         """
-        h, count = self._vector(code, memory, "h"), len(self.directions)
+        code = Code(self.module, "begin_sides", [POINTER, INTEGER], self.width)
+        memory, order = code.arguments
+        count, program = len(self.directions), self.guards.program
         fresh = code.compare("==", self._vector(code, memory, "steps"), 0.0)
         with code.only_if(code.any_lane(fresh)):
-            code.call(self.guard, memory, order, 1e-6 * h)
+            code.call(self.guard, memory, order, LITTLE * self._vector(code, memory, "h"))
+            instant = 16.0 * self._vector(code, memory, "smallest")
+            line = StraightLine(program.nodes, program.kinds, program.outputs)
+            out = emit(code, line, self._now(code, memory), self.sincos)
             for i in range(count):
-                before, first = (self._vector(code, memory, name, i) for name in ("guard_before", "guard"))
-                self._keep(code, memory, "guard_before", code.select(fresh, first, before), i)
-        code.call(self.guard, memory, order, 0.5 * h)
-        for i in range(count):
-            self._keep(code, memory, "guard_middle", self._vector(code, memory, "guard", i), i)
-        code.call(self.guard, memory, order, h)
-        moving = code.compare("!=", h, 0.0)
-        crossed = []
-        for i, direction in enumerate(self.directions):
-            before, middle, after = (
-                self._vector(code, memory, name, i) for name in ("guard_before", "guard_middle", "guard")
-            )
-            early, late = _crosses(before, middle, direction), _crosses(middle, after, direction)
-            crossed.append(((early | late) & moving, early))
-        any_crossed = functools.reduce(Value.__or__, (hit for hit, _ in crossed))
-        nearest = code.variable(h)
-        after = [self._vector(code, memory, "guard", i) for i in range(count)]
-        with code.only_if(code.any_lane(any_crossed)):
-            for i, (hit, early) in enumerate(crossed):
-                root = self._root(code, memory, order, i, h, hit, early)
-                best = code.load(nearest, self.vector)
-                sooner = hit & (code.intrinsic("fabs", root) <= code.intrinsic("fabs", best))
-                code.store(code.select(sooner, root, best), nearest)
-                event = self._vector(code, memory, "event")
-                self._keep(code, memory, "event", code.select(sooner, _lanes(code, i), event))
-            last = self._vector(code, memory, "last")
-            self._keep(code, memory, "last", code.select(any_crossed, 0.0, last))
-            self._keep(code, memory, "h", code.load(nearest, self.vector))
-            code.call(self.defect, memory, order, _double(code, 1.0))  # leaves the increment of the new step
-        for i in range(count):
-            self._keep(code, memory, "guard_before", after[i], i)
+                value, rate, size, rate_size = out[i::count]
+                moved = code.intrinsic("fabs", rate)
+                on_it = code.intrinsic("fabs", value) <= GUARD_NOISE * size + moved * instant
+                going = code.select(moved > GUARD_NOISE * rate_size, rate, self._vector(code, memory, "guard", i))
+                for name, first in (("side", code.select(on_it, going, value)), ("noise", GUARD_NOISE * size)):
+                    kept = self._vector(code, memory, name, i)
+                    self._keep(code, memory, name, code.select(fresh, first, kept), i)
+        return code.finish()
 
-    def _root(self, code, memory, order, i: int, h, hit, early) -> Value:
+    def _stop_at_events(self, code, memory, order) -> None:
+        """Where a guard changes sign along the step, the step ends there: at the earliest change of all guards."""
+        code.call(self.begin_sides, memory, order)
+        self._sample(code, memory, order)
+        for i, direction in enumerate(self.directions):
+            self._first_change(code, memory, order, i, direction)
+        nearest = self._vector(code, memory, "h")
+        changes = [self._vector(code, memory, "change", i) for i in range(len(self.directions))]
+        roots = [self._vector(code, memory, "root", i) for i in range(len(self.directions))]
+        for change, root in zip(changes, roots, strict=True):
+            sooner = (change > 0.0) & (code.intrinsic("fabs", root) < code.intrinsic("fabs", nearest))
+            nearest = code.select(sooner, root, nearest)
+        latest = code.intrinsic("fabs", nearest) + self._vector(code, memory, "smallest")  # the same instant
+        event = code.lanes_of(0.0)
+        for i, (change, root) in enumerate(zip(changes, roots, strict=True)):
+            event = event + code.select(code.intrinsic("fabs", root) <= latest, change * float(4**i), 0.0)
+        stops = event > 0.0
+        self._keep(code, memory, "event", code.select(stops, event, -1.0))
+        self._keep(code, memory, "last", code.select(stops, 0.0, self._vector(code, memory, "last")))
+        self._keep(code, memory, "h", nearest)
+        with code.only_if(code.any_lane(code.compare("!=", nearest, self._vector(code, memory, "planned")))):
+            code.call(self.defect, memory, order, _double(code, 1.0))  # leaves the increment of the new step
+
+    def _sample(self, code, memory, order) -> None:
+        """The guards at equal distances along the step and one beyond either end, into `samples`.
+
+        Two more between them must be where the others say, or the step is too long to see what its guards do: it is
+        halved. A guard that jumps is let through after a while.
+        """
+        self._keep(code, memory, "planned", self._vector(code, memory, "h"))
+        again, rounds = code.variable(_integer(code, 1)), code.variable(_integer(code, 0))
+        with code.repeat_while(lambda: code.load(again, INTEGER) > 0):
+            h = self._vector(code, memory, "h")
+
+            def keep(k, place, h=h):
+                code.call(self.guard, memory, order, code.lanes_of(place / INTERVALS) * h)
+                for i in range(len(self.directions)):
+                    self._keep(code, memory, "samples", self._vector(code, memory, "guard", i), k + i * _SAMPLES)
+
+            with code.loop(INTERVALS + 3) as k:
+                keep(k, code.as_double(k) - 1.0)
+            for k, place in enumerate(BETWEEN):
+                keep(_integer(code, INTERVALS + 3 + k), _double(code, place))
+            unseen = code.compare("!=", h, 0.0) & self._unseen(code, memory)
+            count = code.load(rounds, INTEGER) + 1
+            code.store(count, rounds)
+            code.store(_integer(code, 0), again)
+            with code.only_if(code.any_lane(unseen) & (count <= GUARD_HALVINGS)):
+                code.store(_integer(code, 1), again)
+                self._keep(code, memory, "h", code.select(unseen, 0.5 * h, h))
+                self._keep(code, memory, "last", code.select(unseen, 0.0, self._vector(code, memory, "last")))
+                growth = self._vector(code, memory, "growth")
+                self._keep(code, memory, "growth", code.select(unseen, GROWTH_AFTER_REJECTION, growth))
+
+    def _unseen(self, code, memory) -> Value:
+        """Where a guard is not what the cubic through four samples says, by more than a part of what it varies."""
+        unseen = code.lanes_of(0.0) > 1.0
+        for i in range(len(self.directions)):
+            for k, place in enumerate(BETWEEN):
+                first, x = int(place), place - int(place)
+                four = [self._vector(code, memory, "samples", first + j + i * _SAMPLES) for j in range(4)]
+                weights = (
+                    -x * (x - 1) * (x - 2) / 6, (x + 1) * (x - 1) * (x - 2) / 2, -x * (x + 1) * (x - 2) / 2,
+                    x * (x + 1) * (x - 1) / 6,
+                )  # fmt: skip
+                between = self._vector(code, memory, "samples", INTERVALS + 3 + k + i * _SAMPLES)
+                said = functools.reduce(Value.__add__, (w * y for w, y in zip(weights, four, strict=True)))
+                highest, lowest = four[0], four[0]
+                for y in four[1:]:
+                    highest, lowest = code.select(highest > y, highest, y), code.select(lowest < y, lowest, y)
+                far, noise = code.intrinsic("fabs", between - said), self._vector(code, memory, "noise", i)
+                matters = (far > 0.01 * code.intrinsic("fabs", between)) & (far > noise)
+                unseen = unseen | (matters & (far > 0.05 * (highest - lowest)))
+        return unseen
+
+    def _first_change(self, code, memory, order, i: int, direction: int) -> None:
+        """The first allowed change of sign of guard i: its time into `root`, and 1 (falls) or 2 (rises) into `change`.
+
+        `change` is 0 where there is none. Signs of neighbouring samples differ where it crosses once; between samples
+        of one sign it can still cross twice, about the least of them.
+        """
+        h = self._vector(code, memory, "h")
+        moving, spacing = code.compare("!=", h, 0.0), h * (1.0 / INTERVALS)
+        begin = self._vector(code, memory, "side", i)
+        side, change, low, high = (
+            code.variable(x) for x in (begin, code.lanes_of(0.0), code.lanes_of(0.0), code.lanes_of(0.0))
+        )
+
+        def found(where: Value, falls: Value, start: Value, end: Value) -> None:
+            """Note the first one; `falls` where the sign before is positive."""
+            allowed = falls if direction < 0 else ~falls if direction > 0 else code.lanes_of(0.0) <= 0.0
+            new = where & allowed & (code.load(change, self.vector) <= 0.0) & moving
+            code.store(code.select(new, start, code.load(low, self.vector)), low)
+            code.store(code.select(new, end, code.load(high, self.vector)), high)
+            kind = code.select(falls, _lanes(code, 1), 2.0)
+            code.store(code.select(new, kind, code.load(change, self.vector)), change)
+
+        with code.loop(INTERVALS + 1) as k:
+            place = code.lanes_of(code.as_double(k))
+            before, here, after = (self._vector(code, memory, "samples", k + (j + i * _SAMPLES)) for j in range(3))
+            sign = code.load(side, self.vector)
+            above = sign > 0.0
+            values = [code.select(above, x, 0.0 - x) for x in (before, here, after)]
+            noise, sided = self._vector(code, memory, "noise", i), above | (sign < 0.0)
+            bend, tilt = values[0] - 2.0 * values[1] + values[2], values[2] - values[0]
+            # The parabola through them comes down to half of the least, or so near that its error matters.
+            deep = (4.0 * bend * values[1] < tilt * tilt) | (values[1] < 0.02 * bend)
+            least = sided & deep & (values[1] > noise) & (values[1] < values[0]) & (values[1] <= values[2])
+            least = least & moving & (code.load(change, self.vector) <= 0.0)
+            with code.only_if(code.any_lane(least)):
+                start = code.select(place > 0.0, place - 1.0, 0.0) * spacing
+                end = code.select(place < float(INTERVALS), place + 1.0, float(INTERVALS)) * spacing
+                bottom = self._bottom(code, memory, order, i, above, start, end)
+                code.call(self.guard, memory, order, bottom)
+                depth = self._vector(code, memory, "guard", i)
+                depth = code.select(above, 0.0 - depth, depth)
+                through = least & (depth > TOUCHING * (values[0] + values[2])) & (depth > noise)
+                found(through, above, start, bottom)
+                found(through, ~above, bottom, end)
+            inside = place < float(INTERVALS)
+            crosses = inside & ((above & (after < 0.0)) | (sided & ~above & (after > 0.0)))
+            found(crosses, above, place * spacing, (place + 1.0) * spacing)
+            passed = inside & (code.intrinsic("fabs", after) > 0.0)  # a zero, or a NaN, is on no side
+            code.store(code.select(passed, after, sign), side)
+        self._keep(code, memory, "side", code.load(side, self.vector), i)
+        kind = code.load(change, self.vector)
+        self._keep(code, memory, "change", kind, i)
+        with code.only_if(code.any_lane(kind > 0.0)):
+            root = self._root(code, memory, order, i, code.load(low, self.vector), code.load(high, self.vector), kind)
+            self._keep(code, memory, "root", root, i)
+
+    def _bottom(self, code, memory, order, i: int, above: Value, start: Value, end: Value) -> Value:
+        """Where the size of guard i is least between two times, by golden sections."""
+        low, high = code.variable(start), code.variable(end)
+        with code.loop(SECTIONS):
+            a, b = code.load(low, self.vector), code.load(high, self.vector)
+            sizes, places = [], [b - (b - a) * GOLDEN, a + (b - a) * GOLDEN]
+            for place in places:
+                code.call(self.guard, memory, order, place)
+                value = self._vector(code, memory, "guard", i)
+                sizes.append(code.select(above, value, 0.0 - value))
+            left = sizes[0] < sizes[1]
+            code.store(code.select(left, a, places[0]), low)
+            code.store(code.select(left, places[1], b), high)
+        return 0.5 * (code.load(low, self.vector) + code.load(high, self.vector))
+
+    def _root(self, code, memory, order, i: int, start: Value, end: Value, kind: Value) -> Value:
         """Where guard i changes sign, by bisection: the end of the bracket, where it has changed."""
-        low = code.variable(code.select(early, 0.0, 0.5 * h))
-        high = code.variable(code.select(early, 0.5 * h, h))
-        first, second = (self._vector(code, memory, name, i) for name in ("guard_before", "guard_middle"))
-        sign = code.select(early, first, second)
+        low, high, falls = code.variable(start), code.variable(end), kind < 1.5
         with code.loop(BISECTIONS):
             a, b = code.load(low, self.vector), code.load(high, self.vector)
             middle = 0.5 * (a + b)
             code.call(self.guard, memory, order, middle)
-            same = self._vector(code, memory, "guard", i) * sign > 0.0
+            value = self._vector(code, memory, "guard", i)
+            same = code.select(falls, value, 0.0 - value) > 0.0
             code.store(code.select(same, middle, a), low)
             code.store(code.select(same, b, middle), high)
-        return code.select(hit, code.load(high, self.vector), h)
+        return code.load(high, self.vector)
 
     # ---- constraints ----
 
@@ -668,11 +808,6 @@ class Integrator:
 
     def _lane(self, code, lane_data, name: str, lane) -> Value:
         return code.element(lane_data, lane + LANE.index(name) * self.width, INTEGER)
-
-
-def _crosses(before: Value, after: Value, direction: int) -> Value:
-    falls, rises = (before > 0.0) & (after <= 0.0), (before < 0.0) & (after >= 0.0)
-    return falls if direction < 0 else rises if direction > 0 else falls | rises
 
 
 def _power(code, x: Value, exponent: Value) -> Value:

@@ -67,7 +67,7 @@ def rolling_cylinder_multipliers(theta1, theta1_start, params):
 
 
 def rolling_cylinder() -> Scene:
-    """A cylinder of radius a that rolls off a fixed half-cylinder of radius R; coordinates `Rolling(r, theta1, theta2)`,
+    """A cylinder of radius a that rolls off a fixed half-cylinder of radius R; `Rolling(r, theta1, theta2)`,
 
     L = ½ M (ṙ² + r² θ̇1²) + ½ I θ̇2² − M g r cos θ1 with I = α M a², f1 = r − R − a, f2 = R θ1 − a (θ2 − θ1),
 
@@ -112,7 +112,7 @@ def _two_rods(q, params):
 
 
 def cartesian_of_angles(theta, theta_dot, l):
-    """Positions and velocities, shape (n, 2), of the masses of a chain of rods `l` at `theta` from the downward vertical.
+    """Positions and velocities, shape (n, 2), of masses on a chain of rods `l` at `theta` from the downward vertical.
 
     >>> q, qdot = cartesian_of_angles(jnp.array([0.3, 0.5]), jnp.array([0.0, 1.0]), jnp.array([1.0, 2.0]))
     """
@@ -324,9 +324,9 @@ def rolling_disc(slope=0.3) -> Scene:
 
     L = ½ m (ẋ² + ẏ²) + ½ J φ̇² + ½ I ψ̇² + m g x sin(slope), ẋ = R ψ̇ cos φ, ẏ = R ψ̇ sin φ.
 
-    The velocity constraints "along" and "across" cannot be integrated. φ̇ is constant and, where it is not zero, the disc
-    does not go down but sideways. Neimark & Fufaev, Dynamics of Nonholonomic Systems, ch. III; Bloch, Nonholonomic
-    Mechanics and Control, §1.4.
+    The velocity constraints "along" and "across" cannot be integrated. φ̇ is constant and, where it is not zero, the
+    disc does not go down but sideways. Neimark & Fufaev, Dynamics of Nonholonomic Systems, ch. III; Bloch,
+    Nonholonomic Mechanics and Control, §1.4.
 
     >>> scene = rolling_disc(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
@@ -516,7 +516,7 @@ def _squeezer_kinetic(q, qdot, p):
     arm, lever4, lever6 = p["da"] * p["rr"] * jnp.cos(q.Theta), zt * e * jnp.sin(q.Phi), u * f * jnp.sin(q.Omega)
     bodies = (
         (m[0] * p["ra"] ** 2 + I[0]) * be**2,
-        m[1] * (p["rr"] ** 2 * be**2 - 2 * arm * be * (be + Th) + p["da"] ** 2 * (be + Th) ** 2) + I[1] * (be + Th) ** 2,
+        m[1] * (p["rr"] ** 2 * be**2 - 2 * arm * be * (be + Th)) + (m[1] * p["da"] ** 2 + I[1]) * (be + Th) ** 2,
         (m[2] * (p["sa"] ** 2 + p["sb"] ** 2) + I[2]) * ga**2,
         m[3] * (e**2 * (Ph + de) ** 2 + 2 * lever4 * de * (Ph + de) + zt**2 * de**2) + I[3] * (Ph + de) ** 2,
         (m[4] * (p["ta"] ** 2 + p["tb"] ** 2) + I[4]) * de**2,
@@ -561,7 +561,7 @@ _SQUEEZER_START = Squeezer(
 
 
 def andrews_squeezer() -> Scene:
-    """Andrews' squeezing mechanism: seven bodies in a plane, closed in three loops; coordinates `Squeezer`, seven angles.
+    """Andrews' squeezing mechanism: seven bodies in a plane, closed in three loops; `Squeezer`, seven angles.
 
     A motor of constant torque turns the crank β against a spring; kilograms, metres, seconds. Seven coordinates and six
     constraints leave one way to move. The parameters bear the names of the source: Hairer & Wanner, Solving Ordinary
