@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
 
 
 def _origin(options: argparse.Namespace) -> dict[str, Any]:
-    settings = {key: str(value) for key, value in vars(options).items()}
+    settings = {key: str(value) for key, value in vars(options).items() if key != "output"}
     return {"circumstances": _report.circumstances(), "options": settings}
 
 
