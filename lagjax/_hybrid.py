@@ -140,7 +140,7 @@ def simulate_hybrid(
     tolerances = Tolerances(float(controller.rtol), float(controller.atol), max_steps)
     plan = _Plan(tuple(modes), tuple(modes.values()), tuple(transitions), start, max_transitions, tolerances)
     *fields, last = _run(plan, settings.ts, q0, qdot0, params)
-    trajectory = Trajectory(*fields[:6], dict(modes), params, None, *fields[6:])
+    trajectory = Trajectory(*fields[:6], dict(modes), params, None, *fields[6:], tuple(modes))
     return _raise_unless_ok(trajectory, layout, last) if throw else trajectory
 
 
@@ -148,7 +148,7 @@ def _raise_unless_ok(trajectory: Trajectory, layout: Layout, last) -> Trajectory
     """The same as for one scene, naming the mode in which it ended."""
     if not is_concrete(trajectory.ok) or trajectory.ok:
         return raise_unless_ok(trajectory, layout)
-    name = list(trajectory.system)[int(last)]
+    name = trajectory.mode_names[int(last)]
     try:
         raise_unless_ok(dataclasses.replace(trajectory, system=trajectory.system[name]), layout)
     except SimulationError as error:
@@ -160,8 +160,6 @@ def _require_modes(modes, transitions, start, max_transitions) -> None:
         raise TypeError("modes must be a dict of lagjax.System by name.")
     if not isinstance(transitions, list | tuple):
         raise TypeError(f"transitions must be a list of lagjax.Transition; got {type(transitions).__name__}.")
-    if jax.tree.leaves((modes, transitions)):
-        raise ValueError("A function of a mode or a transition holds arrays of its own: give them as params.")
     known = ", ".join(map(repr, modes))
     if start not in modes:
         raise ValueError(f"The motion is to start in the mode {start!r}, which does not exist; there are {known}.")
@@ -172,6 +170,8 @@ def _require_modes(modes, transitions, start, max_transitions) -> None:
             if getattr(transition, role) not in modes:
                 name = getattr(transition, role)
                 raise ValueError(f"A transition has the {role} {name!r}, which does not exist; there are {known}.")
+    if jax.tree.leaves((modes, transitions)):
+        raise ValueError("A function of a mode or a transition holds arrays of its own: give them as params.")
     reached, growing = {start}, True
     while growing:
         more = {t.target for t in transitions if t.source in reached} - reached
@@ -439,9 +439,10 @@ class _Rounds(NamedTuple):
 
     def astray(self, index: int, t, y):
         """Whether a state is off the constraints of a mode."""
-        motion = self.plan.systems[index].motion(self.layout, self.params)
-        if not motion.constrained:
+        system = self.plan.systems[index]
+        if system.constraints is None and system.velocity_constraints is None:
             return jnp.asarray(False)
+        motion = system.motion(self.layout, self.params)
         t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(self.params, eqx.is_array_like)))
         return ~(_distance(motion, *jnp.split(y, 2), t, numbers) <= TOLERANCE[self.layout.dtype])
 

@@ -29,7 +29,7 @@ class State(NamedTuple):
 class Transitions(NamedTuple):
     """The changes of mode of a hybrid motion, in order: NaN or −1 beyond the last of `count`.
 
-    `t`, `q`, `qdot` are those just before the reset; `source` and `target` are places in the dict of modes.
+    `t`, `q`, `qdot` are those just before the reset; `source` and `target` are places in `Trajectory.mode_names`.
     """
 
     t: jax.Array
@@ -52,7 +52,8 @@ class Trajectory(eqx.Module):
       step before it failed.
     - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
     - `mode`, `transitions`: of a hybrid motion (`simulate_hybrid`), else None. `system` is then the dict of its modes,
-      and quantities are those of the mode at every time, NaN where it is −1.
+      and quantities are those of the mode at every time, NaN where it is −1. A mode is a place in `mode_names`: the
+      dict itself loses its order in `jax.jit`.
     """
 
     ts: jax.Array
@@ -66,6 +67,7 @@ class Trajectory(eqx.Module):
     params_axes: PyTree = eqx.field(static=True, default=None)  # how `simulate_batch` mapped over params
     mode: jax.Array | None = None
     transitions: "Transitions | None" = None
+    mode_names: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def ok(self) -> jax.Array:
@@ -111,7 +113,7 @@ class Trajectory(eqx.Module):
                 inner = tuple(f"{label}_{axis}" for axis in range(leaf.ndim - len(members) - 1))
                 variables[label] = ((*members, "time", *inner), np.asarray(leaf))
         if self.mode is not None:
-            variables["mode"] = ((*members, "time"), np.asarray(self.mode))
+            variables["mode"] = ((*members, "time"), np.asarray(self.mode), {"names": list(self.mode_names)})
         time = self.ts if self.ts.ndim == 1 else self.ts[(0,) * (self.ts.ndim - 1)]
         return xarray.Dataset(variables, coords={"time": np.asarray(time)})
 
@@ -131,10 +133,10 @@ class Trajectory(eqx.Module):
         if name not in ("energy", "momentum"):  # which every mode has
             _require_like_constraints(self.system, name, q, qdot, params)
         total = None
-        for index, system in enumerate(self.system.values()):
+        for index, which in enumerate(self.mode_names):
             # Laws of another mode may be singular here: their NaN must not reach a derivative.
             given = jax.tree.map(lambda x, here=mode == index: _varied_where(here, x), (q, qdot, t, params))
-            value = getattr(system, name)(*given)
+            value = getattr(self.system[which], name)(*given)
             total = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), value) if total is None else total
             total = jax.tree.map(lambda new, old, here=mode == index: jnp.where(here, new, old), value, total)
         return total

@@ -38,7 +38,7 @@ ROUND_OFF = 256 * 2.0**-52  # of an acceleration
 INTERVALS = 8  # of a step, at whose ends they are looked at
 BETWEEN = (1.382, 5.236)  # two places more, in intervals
 _SAMPLES = INTERVALS + 3 + len(BETWEEN)
-GUARD_HALVINGS = 10  # of a step that is too long for them
+JUMP = 2.0**20  # smallest steps: where a guard varies too fast for so short a step, it jumps
 BISECTIONS = 60  # of an interval, to find the zero: beyond the digits of a double
 SECTIONS, GOLDEN = 32, 0.6180339887498949  # to find where it is least: to half of the digits
 TOUCHING = 1e-13  # of its size nearby: what goes no further through the surface has touched it
@@ -601,10 +601,10 @@ class Integrator:
         """The guards at equal distances along the step and one beyond either end, into `samples`.
 
         Two more between them must be where the others say, or the step is too long to see what its guards do: it is
-        halved. A guard that jumps is let through after a while.
+        halved.
         """
         self._keep(code, memory, "planned", self._vector(code, memory, "h"))
-        again, rounds = code.variable(_integer(code, 1)), code.variable(_integer(code, 0))
+        again = code.variable(_integer(code, 1))
         with code.repeat_while(lambda: code.load(again, INTEGER) > 0):
             h = self._vector(code, memory, "h")
 
@@ -617,11 +617,10 @@ class Integrator:
                 keep(k, code.as_double(k) - 1.0)
             for k, place in enumerate(BETWEEN):
                 keep(_integer(code, INTERVALS + 3 + k), _double(code, place))
-            unseen = code.compare("!=", h, 0.0) & self._unseen(code, memory)
-            count = code.load(rounds, INTEGER) + 1
-            code.store(count, rounds)
+            shortest = JUMP * self._vector(code, memory, "smallest")
+            unseen = (code.intrinsic("fabs", h) > shortest) & self._unseen(code, memory)
             code.store(_integer(code, 0), again)
-            with code.only_if(code.any_lane(unseen) & (count <= GUARD_HALVINGS)):
+            with code.only_if(code.any_lane(unseen)):
                 code.store(_integer(code, 1), again)
                 self._keep(code, memory, "h", code.select(unseen, 0.5 * h, h))
                 self._keep(code, memory, "last", code.select(unseen, 0.0, self._vector(code, memory, "last")))

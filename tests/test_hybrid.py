@@ -1,0 +1,679 @@
+"""Hybrid motion: transitions where and when they are in closed form, their derivatives, and what must not happen."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+G = 9.81
+BALL = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q)
+BOUNCE = lagjax.Transition(
+    "flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v, params: (q, -params["e"] * v)
+)
+FREE = lagjax.System(lambda q, v: 0.5 * v**2)
+OSCILLATOR = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2)
+
+
+def bouncing(h, e, g=G, v=0.0, ts=None, **options):
+    ts = jnp.linspace(0.0, 2.0, 9) if ts is None else ts
+    return lagjax.simulate_hybrid({"flight": BALL}, [BOUNCE], "flight", h, v, ts, {"e": e, "g": g}, **options)
+
+
+def hybrid(modes, transitions, q0=0.0, v0=1.0, ts=(0.0, 1.0), params=None, **options):
+    """From the first mode."""
+    ts = jnp.asarray(ts, float)
+    return lagjax.simulate_hybrid(modes, transitions, next(iter(modes)), q0, v0, ts, params, **options)
+
+
+def times(run):
+    return np.asarray(run.transitions.t[: int(run.transitions.count)])
+
+
+def central(function, x, step=1e-5):
+    """∂f/∂x by differences: truncation ~ step², and what an integration to 1e-12 leaves, ~ 1e-12/step."""
+    moved = step * jnp.eye(x.size)
+    up, down = jax.jit(jax.vmap(function))(jnp.concatenate([x + moved, x - moved])).reshape(2, x.size, -1)
+    return ((up - down) / (2 * step)).T
+
+
+# ---- a cylinder rolls off a cylinder --------------------------------------------------------------------------------
+#
+# Radius a on radius R, moment of inertia α M a². It leaves where cos θ = 2 cos θ⁰ / (3 + α). (r, θ, its own angle)
+
+M, R, A = 1.3, 1.0, 0.3
+
+
+def cylinder(q, v, params):
+    r, theta, _ = q
+    inertia = params["alpha"] * M * A**2
+    return 0.5 * M * (v[0] ** 2 + r**2 * v[1] ** 2) + 0.5 * inertia * v[2] ** 2 - M * G * r * jnp.cos(theta)
+
+
+ROLLING = {
+    "rolling": lagjax.System(
+        cylinder, constraints=lambda q: {"contact": q[0] - R - A, "rolling": R * q[1] - A * (q[2] - q[1])}
+    ),
+    "flight": lagjax.System(cylinder),
+}
+LEAVE = lagjax.Transition("rolling", "flight", lambda q, v, multipliers: multipliers["contact"], direction=-1)
+ROLL_TS = jnp.linspace(0.0, 3.0, 13)
+
+
+def rolling(alpha, theta, **options):
+    q0 = jnp.stack([jnp.asarray(R + A), theta, theta * (R + A) / A])
+    options = {"rtol": 1e-12, "max_transitions": 1, "throw": False} | options
+    return lagjax.simulate_hybrid(ROLLING, [LEAVE], "rolling", q0, jnp.zeros(3), ROLL_TS, {"alpha": alpha}, **options)
+
+
+def place(q, v):
+    """x, y and their rates, in the last axis."""
+    r, theta, rd, thetad = q[..., 0], q[..., 1], v[..., 0], v[..., 1]
+    s, c = np.sin(theta), np.cos(theta)
+    return np.stack([r * s, r * c], -1), np.stack([rd * s + r * thetad * c, rd * c - r * thetad * s], -1)
+
+
+def members(count):
+    rng = np.random.default_rng(0)
+    return np.concatenate([[0.0, 1.0], rng.uniform(0, 1, count - 2)]), rng.uniform(0.1, 0.8, count)
+
+
+def test_rolling_cylinder_leaves_where_it_must_and_then_flies():
+    alpha, theta = members(1000)
+    runs = jax.jit(jax.vmap(rolling))(alpha, theta)
+    assert runs.ok[1:].all() and (runs.transitions.count == 1).all() and runs.ok.shape == (1000,)
+    # A cylinder without inertia leaves like any other, and then nothing says how it turns.
+    assert runs.result._value[0] == lagjax.RESULTS.mass_matrix_singular._value
+    event = jax.tree.map(np.asarray, runs.transitions)
+    # Tolerances: 1e-12 a step over some tens of steps.
+    np.testing.assert_allclose(event.q[:, 0, 1], np.arccos(2 * np.cos(theta) / (3 + alpha)), atol=1e-12)
+    np.testing.assert_allclose(event.q[:, 0, 0], R + A, atol=1e-14)
+    energy = M * G * (R + A) * np.cos(theta)
+    np.testing.assert_allclose(runs.energy()[1:], np.broadcast_to(energy[1:, None], (999, 13)), rtol=1e-10)
+
+    modes, q, v, ts = np.asarray(runs.mode), np.asarray(runs.q), np.asarray(runs.qdot), np.asarray(ROLL_TS)
+    flying = ts > event.t
+    assert (modes[1:] == flying[1:]).all() and (modes[0] == np.where(flying[0], -1, 0)).all()
+    flying[0] = False
+    elapsed = (ts - event.t)[..., None]
+    at, rate = place(event.q, event.qdot)
+    ballistic = at + rate * elapsed - 0.5 * G * elapsed**2 * np.array([0.0, 1.0])
+    np.testing.assert_allclose(place(q, v)[0][flying], ballistic[flying], atol=1e-10)
+    turned = event.q[:, :, 2] + event.qdot[:, :, 2] * elapsed[..., 0]
+    np.testing.assert_allclose(q[..., 2][flying], turned[flying], rtol=1e-11)
+
+    # λ = M g / (1 + α) ((3 + α) cos θ − 2 cos θ⁰) as long as it rolls.
+    with pytest.raises(ValueError, match=r"trajectory.system\['rolling'\].multipliers"):
+        _ = runs.multipliers
+    which, when = np.nonzero(modes == 0)
+    at = q[which, when], v[which, when], 0.0, {"alpha": alpha[which]}
+    given = jax.vmap(runs.system["rolling"].multipliers, (0, 0, None, 0))(*at)
+    expected = M * G / (1 + alpha) * ((3 + alpha) * np.cos(q[..., 1].T) - 2 * np.cos(theta))
+    np.testing.assert_allclose(given["contact"], expected.T[which, when], atol=1e-10)
+
+
+def test_the_departure_and_the_flight_vary_as_they_must():
+    alpha, theta = members(20)
+
+    def outcome(x):
+        run = rolling(x[0], x[1])
+        return jnp.stack([run.transitions.q[0, 1], run.transitions.t[0], run.q[-1, 0], run.end.q[1], run.q[1, 1]])
+
+    places = jnp.stack([alpha, theta], 1)
+    slopes = jax.jit(jax.vmap(jax.jacrev(outcome)))(places)
+    # cos θ* = x = 2 cos θ⁰ / (3 + α).
+    x = 2 * np.cos(theta) / (3 + alpha)
+    by_alpha, by_theta = x / (3 + alpha) / np.sqrt(1 - x**2), 2 * np.sin(theta) / (3 + alpha) / np.sqrt(1 - x**2)
+    np.testing.assert_allclose(slopes[:, 0], np.stack([by_alpha, by_theta], 1), atol=1e-10)
+    np.testing.assert_allclose(slopes[5], central(outcome, places[5]), rtol=1e-6, atol=1e-6)
+
+
+# ---- a bouncing ball ------------------------------------------------------------------------------------------------
+
+
+def bounce_times(h, e, g, count):
+    first = np.sqrt(2 * h / g)
+    return first * np.concatenate([[1.0], 1 + 2 * np.cumsum(e ** np.arange(1.0, count))])
+
+
+def test_every_bounce_of_a_ball():
+    h, e = np.array([1.0, 0.4, 2.5]), np.array([0.9, 1.0, 0.5])
+    ts = jnp.linspace(0.0, 2.0, 45)
+    runs = jax.jit(jax.vmap(lambda h, e: bouncing(h, e, ts=ts, rtol=1e-12)))(h, e)
+    assert runs.ok.all()
+    for i in range(3):
+        count = int(runs.transitions.count[i])
+        expected = bounce_times(h[i], e[i], G, count + 1)
+        assert expected[count - 1] <= 2.0 < expected[count]
+        # Rounding and the tolerance, once for every flight.
+        np.testing.assert_allclose(runs.transitions.t[i, :count], expected[:-1], rtol=1e-12)
+        impact = np.sqrt(2 * G * h[i]) * e[i] ** np.arange(count)
+        np.testing.assert_allclose(runs.transitions.qdot[i, :count], -impact, rtol=1e-11)
+        assert abs(runs.transitions.q[i, :count]).max() < 1e-14
+        assert np.isnan(runs.transitions.t[i, count:]).all() and np.isnan(runs.transitions.q[i, count:]).all()
+        assert (runs.transitions.source[i, :count] == 0).all() and (runs.transitions.target[i, count:] == -1).all()
+        # Between bounces energy is that with which it left the floor.
+        bounces = np.searchsorted(expected[:count], ts, side="left")
+        np.testing.assert_allclose(runs.energy()[i], G * h[i] * e[i] ** (2.0 * bounces), rtol=1e-10)
+        left = np.where(bounces > 0, expected[bounces - 1], 0)
+        speed = np.where(bounces > 0, np.sqrt(2 * G * h[i]) * e[i] ** bounces, 0)
+        flown = np.asarray(ts) - left
+        height = np.where(bounces > 0, 0, h[i]) + speed * flown - 0.5 * G * flown**2
+        np.testing.assert_allclose(runs.q[i], height, atol=1e-11)
+
+
+@pytest.mark.parametrize("direction", [-1, 0])
+def test_bounces_that_pile_up_are_reported_and_never_fall_through(direction):
+    # Heights shrink beyond the digits that a position at 0.37 has, times beyond those that a time has.
+    bounce = lagjax.Transition(
+        "flight", "flight", lambda q, v, params: q - params["floor"], direction,
+        reset=lambda q, v, params: (q, -params["e"] * v),
+    )  # fmt: skip
+    ts, floor, e = jnp.linspace(0.0, 6.0, 25), np.array([0.0, 0.0, 0.37, 0.37]), np.array([0.5, 0.8, 0.5, 0.8])
+    run = lambda floor, e: hybrid(
+        {"flight": BALL}, [bounce], 1.0 + floor, 0.0, ts, {"e": e, "g": G, "floor": floor},
+        max_transitions=200, throw=False,
+    )  # fmt: skip
+    runs = jax.vmap(run)(floor, e)
+    assert (runs.result._value == lagjax.RESULTS.max_transitions_reached._value).all() and not runs.ok.any()
+    still = np.sqrt(2 / G) * (1 + 2 * e / (1 - e))
+    np.testing.assert_allclose(runs.end.t, still, atol=1e-6)
+    for i in range(4):
+        np.testing.assert_allclose(runs.transitions.t[i, :20], bounce_times(1.0, e[i], G, 20), rtol=1e-8)
+    beyond = np.asarray(ts) > still[:, None]
+    np.testing.assert_array_equal(np.isnan(runs.q), beyond)
+    np.testing.assert_array_equal(runs.mode, np.where(beyond, -1, 0))
+    np.testing.assert_array_equal(np.isnan(runs.energy()), beyond)
+    assert np.nanmin(runs.q - floor[:, None]) > -1e-9
+
+
+def test_the_budget_of_transitions():
+    with pytest.raises(lagjax.SimulationError, match="max_transitions") as caught:
+        bouncing(1.0, 0.9, max_transitions=2)
+    run = caught.value.trajectory
+    assert "mode 'flight'" in str(caught.value) and run.transitions.count == 2
+    third = bounce_times(1.0, 0.9, G, 3)[2]
+    np.testing.assert_allclose(run.end.t, third, rtol=1e-12)
+    assert (np.isnan(run.q) == (np.asarray(run.ts) > third)).all()
+    assert bouncing(1.0, 0.9, max_transitions=3).ok
+    with pytest.raises(Exception, match="max_transitions"):
+        jax.block_until_ready(jax.jit(lambda h: bouncing(h, 0.9, max_transitions=2).q)(1.0))
+
+
+def test_derivatives_of_the_bouncing_ball():
+    # After three bounces: times, states before them, outputs on the way, the end. By height, speed, e and g.
+    ts = jnp.linspace(0.5, 2.7, 9)
+
+    def outcome(x):
+        h, v, e, g = x
+        run = bouncing(h, e, g, v, ts, rtol=1e-12)
+        t, impact = run.transitions.t[:3], run.transitions.qdot[:3]
+        return jnp.concatenate([t, impact, run.q[1:], run.qdot[1:], run.end.q[None]])
+
+    def closed(x):
+        h, v, e, g = x
+        down = jnp.sqrt(v**2 + 2 * g * h)
+        t = 0.5 + (v + down) / g + 2 * down / g * jnp.stack([0 * e, e, e + e**2])
+        impact = down * e ** jnp.arange(3)
+        after = jnp.sum(ts[1:, None] > t, axis=1)
+        left = jnp.where(after > 0, t[after - 1], 0.5)
+        speed, start = jnp.where(after > 0, e * impact[after - 1], v), jnp.where(after > 0, 0, h)
+        s = ts[1:] - left
+        q = start + speed * s - 0.5 * g * s**2
+        return jnp.concatenate([t, -impact, q, speed - g * s, q[-1:]])
+
+    x = jnp.array([1.1, 0.7, 0.8, G])
+    batch = jnp.stack([x, x.at[0].set(1.0), x.at[2].set(0.82)])
+    outcomes = jax.vmap(lambda x: (outcome(x), jax.jacrev(outcome)(x), jax.jacfwd(outcome)(x)))
+    values, reverse, forward = jax.jit(outcomes)(batch)
+    np.testing.assert_allclose(values, jax.vmap(closed)(batch), atol=1e-11)
+    np.testing.assert_allclose(reverse, jax.vmap(jax.jacfwd(closed))(batch), atol=1e-10)
+    np.testing.assert_allclose(forward, reverse, atol=1e-12)
+    np.testing.assert_allclose(reverse[0], central(outcome, x), atol=1e-6)
+
+
+def test_derivatives_by_the_times():
+    # By output times a state changes at its rate, by the start of the motion everything is later.
+    def outcome(ts):
+        run = bouncing(1.0, 0.9, ts=ts, rtol=1e-12)
+        return jnp.concatenate([run.q, run.end.q[None], run.transitions.t[:1], run.end.t[None]]), run.qdot
+
+    slopes, rates = jax.jit(jax.jacrev(outcome, has_aux=True))(jnp.linspace(0.2, 1.7, 4))
+    expected = np.diag(rates)
+    expected[:, 0] -= rates
+    expected = np.concatenate([expected, [[-rates[-1], 0, 0, rates[-1]], [1, 0, 0, 0], [0, 0, 0, 1]]])
+    np.testing.assert_allclose(slopes, expected, atol=1e-9)
+
+
+# ---- other scenes ---------------------------------------------------------------------------------------------------
+
+
+def test_a_particle_leaves_a_smooth_sphere():
+    # From rest on top at cos θ = 2/3; from θ⁰ with speed v at cos θ = (2 cos θ⁰ + v²/(g R)) / 3. Cartesian coordinates.
+    radius = 0.7
+    fall = lambda q, v: 0.5 * jnp.sum(v**2) - G * q[1]
+    modes = {"on": lagjax.System(fall, constraints=lambda q: q @ q - radius**2), "off": lagjax.System(fall)}
+    leave = lagjax.Transition("on", "off", lambda q, v, multipliers: multipliers, direction=-1)
+
+    def departure(angle, speed):
+        q0 = radius * jnp.stack([jnp.sin(angle), jnp.cos(angle)])
+        v0 = speed * jnp.stack([jnp.cos(angle), -jnp.sin(angle)])
+        return hybrid(modes, [leave], q0, v0, (0.0, 4.0), rtol=1e-12, max_transitions=2).transitions.q[0] / radius
+
+    angle, speed = np.array([1e-3, 0.2, 0.5]), np.array([0.0, 0.0, 0.8])
+    cosine = (2 * np.cos(angle) + speed**2 / (G * radius)) / 3
+    found = jax.vmap(departure)(angle, speed)
+    np.testing.assert_allclose(found[:, 1], cosine, atol=1e-9)  # slow at the top: errors grow e^(ωt), here by 10³
+    assert abs(found[0, 1] - 2 / 3) < 1e-6
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-14)
+
+
+def test_poincare_section_of_henon_heiles():
+    scene = lagjax.System(
+        lambda q, v: 0.5 * (v @ v) - 0.5 * (q @ q) - q[0] ** 2 * q[1] + q[1] ** 3 / 3,
+    )
+    section = lagjax.Transition("all", "all", lambda q, v: q[0], direction=1)
+    q0, v0 = jnp.array([0.0, 0.1]), jnp.array([0.4, 0.05])
+    run = hybrid({"all": scene}, [section], q0, v0, (0.0, 60.0), rtol=1e-12)
+    # All of them, and no other; the start on the section is none.
+    dense = lagjax.simulate(scene, q0, v0, jnp.linspace(0.0, 60.0, 3001), rtol=1e-12)
+    x = np.asarray(dense.q[1:, 0])
+    assert run.transitions.count == np.sum((x[:-1] < 0) & (x[1:] >= 0)) > 5
+    ts = np.concatenate([[0.0], times(run), [60.0]])
+    plain = lagjax.simulate(scene, q0, v0, jnp.asarray(ts), rtol=1e-12)
+    count = int(run.transitions.count)
+    np.testing.assert_allclose(run.transitions.q[:count], plain.q[1:-1], atol=1e-10)
+    np.testing.assert_allclose(run.transitions.qdot[:count], plain.qdot[1:-1], atol=1e-10)
+    assert abs(run.transitions.q[:count, 0]).max() < 1e-15 and run.transitions.qdot[:count, 0].min() > 0
+    np.testing.assert_allclose(run.q[-1], plain.q[-1], atol=1e-9)  # a reset that changes nothing changes nothing
+
+
+def test_a_kicked_rotor_is_the_standard_map():
+    # Kicks by the clock: p → p + K sin θ at t = 1, 2, …, free between. The first free step would be of six periods.
+    kick = lagjax.Transition(
+        "free", "free", lambda q, v, t: jnp.sin(2 * jnp.pi * t), 1, lambda q, v, params: (q, v + params * jnp.sin(q))
+    )
+    ts = jnp.arange(0.5, 100.0)
+    run = hybrid({"free": FREE}, [kick], 0.3, 0.2, ts, 0.9, max_transitions=100)
+    q, p, expected = 0.3 + 0.5 * 0.2, 0.2, []
+    for _ in range(99):
+        expected.append(q)
+        p = p + 0.9 * np.sin(q)
+        q = q + p
+    np.testing.assert_allclose(times(run), np.arange(1.0, 100.0), rtol=1e-14)
+    np.testing.assert_allclose(run.transitions.q[:40], expected[:40], atol=1e-9)  # then chaos takes the digits
+
+
+def test_a_guard_that_jumps():
+    # mod(t, 1) falls to zero at every second, which is not asked for, and rises through a half after it.
+    half = lagjax.Transition("free", "free", lambda q, v, t: jnp.mod(t, 1.0) - 0.5, 1, lambda q, v: (q, v + 1.0))
+    run = hybrid({"free": FREE}, [half], ts=(0.0, 9.9))
+    np.testing.assert_allclose(times(run), np.arange(10) + 0.5, rtol=1e-15)
+
+
+def test_two_balls_that_land_at_the_same_instant_both_bounce():
+    scene = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - G * jnp.sum(q))
+    first = lagjax.Transition("f", "f", lambda q, v: q[0], -1, lambda q, v: (q, v.at[0].multiply(-0.8)))
+    second = lagjax.Transition("f", "f", lambda q, v: q[1], -1, lambda q, v: (q, v.at[1].multiply(-0.8)))
+    run = hybrid({"f": scene}, [first, second], jnp.ones(2), jnp.zeros(2), (0.0, 1.0, 1.8))
+    one = bounce_times(1.0, 0.8, G, 3)
+    np.testing.assert_allclose(times(run), np.repeat(one[one < 1.8], 2), rtol=1e-12)
+    np.testing.assert_allclose(run.q[:, 0], run.q[:, 1], rtol=1e-12)
+    np.testing.assert_allclose(run.q[-1, 0], bouncing(1.0, 0.8, ts=jnp.array([0.0, 1.8])).q[-1], rtol=1e-9)
+
+
+# ---- which transitions, and when ------------------------------------------------------------------------------------
+
+
+def test_directions():
+    # cos πt falls twice and rises twice; q[1] counts 1 for what only falls, 100 for what only rises, 10 for both.
+    counter = lambda weight: lambda q, v: (q.at[1].add(weight), v)
+    guard = lambda q, v: jnp.cos(jnp.pi * q[0])
+    sections = [lagjax.Transition("a", "a", guard, d, counter(w)) for d, w in ((-1, 1.0), (0, 10.0), (1, 100.0))]
+    plane = lagjax.System(lambda q, v: 0.5 * v @ v)
+    run = hybrid({"a": plane}, sections, jnp.zeros(2), jnp.array([1.0, 0.0]), (0.0, 1.0, 2.0, 4.0))
+    np.testing.assert_allclose(times(run), np.repeat([0.5, 1.5, 2.5, 3.5], 2), rtol=1e-14)
+    assert run.q[:, 1].tolist() == [0.0, 11.0, 121.0, 242.0]
+
+
+THREE = {"a": FREE, "b": FREE, "c": FREE}
+
+
+def at(name, source, target, scale=1.0, **options):
+    """Where q is params[name]."""
+    return lagjax.Transition(source, target, lambda q, v, params: scale * (q - params[name]), **options)
+
+
+def test_the_earliest_wins_and_of_several_at_once_the_first_listed():
+    # Within what would be one step; the last two at one instant, to rounding.
+    places = {"x": jnp.array([0.5, 0.3, 0.3, 0.2]), "y": jnp.array([0.3, 0.5, 0.3, 0.2 + 1e-16])}
+    both = [at("x", "a", "b"), at("y", "a", "c", -1 / 3)]
+    runs = jax.vmap(lambda p: hybrid(THREE, both, params=p))(places)
+    np.testing.assert_allclose(runs.transitions.t[:, 0], [0.3, 0.3, 0.3, 0.2], rtol=1e-15)
+    assert runs.transitions.target[:, 0].tolist() == [2, 1, 1, 1] and (runs.transitions.count == 1).all()
+    # One after the other, and not back again: on the surface of x in b, the motion has left it.
+    chain = [at("x", "a", "b"), at("y", "b", "c"), at("z", "c", "a"), at("x", "b", "a")]
+    run = hybrid(THREE, chain, params={"x": 0.1, "y": 0.1 + 1e-9, "z": 0.2}, max_transitions=4)
+    np.testing.assert_allclose(times(run), [0.1, 0.1 + 1e-9, 0.2], rtol=1e-15)
+    assert run.transitions.source.tolist() == [0, 1, 2, -1] and run.transitions.target.tolist() == [1, 2, 0, -1]
+
+
+@pytest.mark.parametrize("direction", [-1, 0, 1])
+def test_a_surface_crossed_twice_within_a_step(direction):
+    # Two crossings 2e-3, 2e-6 apart in a step of 0.06: between them the guard has the other sign.
+    band = lambda q, v, params: (q - params["middle"]) ** 2 - params["half"] ** 2
+    half, middle = jnp.array([1e-3, 1e-6, 1e-3, 1e-6]), jnp.array([0.47, 0.47, 0.499, 1e-4])
+    run = lambda half, middle: hybrid(
+        {"a": FREE, "b": FREE}, [lagjax.Transition("a", "b", band, direction)], params={"half": half, "middle": middle}
+    )
+    found = jax.vmap(run)(half, middle).transitions
+    np.testing.assert_allclose(found.t[:, 0], middle + (half if direction > 0 else -half), rtol=1e-12)
+    assert (found.count == 1).all()
+
+
+def test_touching_is_not_crossing():
+    guards = [
+        lambda q, v: (q - 0.47) ** 2, lambda q, v: -((q - 0.5) ** 2), lambda q, v: 1e-9 + (q - 0.47) ** 2,
+        lambda q, v, t: 1 + jnp.cos(3 * jnp.pi * t), lambda q, v: 0.0 * q, lambda q, v: v - 1.0,
+    ]  # fmt: skip
+    run = hybrid({"a": FREE, "b": FREE}, [lagjax.Transition("a", "b", guard) for guard in guards])
+    assert run.ok and run.transitions.count == 0 and (run.mode == 0).all()
+    assert run.stats["num_steps"] < 50
+
+
+@pytest.mark.parametrize("direction", [-1, 0, 1])
+def test_a_start_on_the_surface_does_not_fire(direction):
+    section = at("x", "all", "all", direction=direction)
+    run = lambda q, v, x: hybrid({"all": OSCILLATOR}, [section], q, v, (0.0, 5.0), {"x": x}, max_transitions=3)
+    # q = v⁰ sin t from q = 0, exactly or off by rounding: the first crossing is at π, whichever way it starts. Very
+    # near is not on it. And at rest on it, to whichever side it then goes: q = ±0.3 cos t.
+    q = jnp.array([0.0, 0.0, 1e-17, 1e-17, -1e-17, -1e-17, 0.0, 0.3, -0.3])
+    v = jnp.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 0.0, 0.0])
+    x = jnp.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1e-10, 0.3, -0.3])
+    found = jax.vmap(run)(q, v, x).transitions
+    falls = v[:6] > 0  # at π
+    fires = (direction == 0) | (falls == (direction < 0))
+    assert found.count[:6].tolist() == fires.astype(int).tolist()
+    np.testing.assert_allclose(found.t[:6, 0], np.where(fires, np.pi, np.nan), rtol=1e-8)
+    assert found.count[6] == (2 if direction == 0 else 1) and found.count[7:].tolist() == [0, 0]
+    if direction < 1:
+        np.testing.assert_allclose(found.t[6, 0], 1e-10, rtol=1e-5)
+
+
+def test_a_start_along_the_surface_does_not_fire():
+    plane = lagjax.System(lambda q, v: 0.5 * v @ v)
+    circle = lagjax.Transition("all", "all", lambda q, v: q @ q - 1)
+    angle = jnp.linspace(0.0, 6.0, 50)
+    q0, v0 = jnp.stack([jnp.cos(angle), jnp.sin(angle)], 1), jnp.stack([-jnp.sin(angle), jnp.cos(angle)], 1)
+    runs = jax.vmap(lambda q, v: hybrid({"all": plane}, [circle], q, v, max_transitions=2))(q0, v0)
+    assert (runs.transitions.count == 0).all()
+
+
+# ---- members in different modes -------------------------------------------------------------------------------------
+#
+# A spring of stiffness k on the left and another on the right: half periods π/√k of one and the other.
+
+SPRING = lambda name: lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params[name] * q**2)
+SIDES = {"right": SPRING("right"), "left": SPRING("left")}
+CROSS = [
+    lagjax.Transition("right", "left", lambda q, v: q, -1),
+    lagjax.Transition("left", "right", lambda q, v: q, 1),
+]
+SIDE_TS = jnp.linspace(0.0, 6.0, 25)
+
+
+def two_springs(right, left, v=1.0):
+    params = {"right": right, "left": left}
+    return lagjax.simulate_hybrid(SIDES, CROSS, "right", 0.0, v, SIDE_TS, params, rtol=1e-12)
+
+
+def exact_springs(right, left, v=1.0):
+    a, b = jnp.sqrt(right), jnp.sqrt(left)
+    half, period = jnp.pi / a, jnp.pi / a + jnp.pi / b
+    s = SIDE_TS % period
+    return jnp.where(s <= half, v / a * jnp.sin(a * s), -v / b * jnp.sin(b * (s - half)))
+
+
+def test_every_member_switches_at_its_own_time_in_its_own_order():
+    right, left = np.array([1.0, 9.0, 0.2, 0.01]), np.array([4.0, 0.3, 25.0, 1.0])
+    runs = jax.jit(jax.vmap(two_springs))(right, left)
+    assert runs.ok.all()
+    modes = np.asarray(runs.mode)
+    assert (modes.min(axis=0) != modes.max(axis=0)).any()  # different modes at one time
+    for i in range(4):
+        np.testing.assert_allclose(runs.q[i], exact_springs(right[i], left[i]), atol=1e-10)
+        halves = np.tile(np.pi / np.sqrt([right[i], left[i]]), 20).cumsum()
+        count = int(runs.transitions.count[i])
+        np.testing.assert_allclose(runs.transitions.t[i, :count], halves[halves < 6.0], rtol=1e-11)
+        assert runs.transitions.source[i, :count].tolist() == [k % 2 for k in range(count)]
+        alone = two_springs(right[i], left[i])
+        np.testing.assert_allclose(runs.q[i], alone.q, atol=1e-12)
+        np.testing.assert_array_equal(runs.mode[i], alone.mode)
+    # The energy is that of the mode.
+    stiffness = np.where(modes == 0, right[:, None], left[:, None])
+    np.testing.assert_allclose(runs.energy(), 0.5 * runs.qdot**2 + 0.5 * stiffness * runs.q**2, rtol=1e-14)
+    np.testing.assert_allclose(runs.energy(), 0.5, rtol=1e-10)
+    np.testing.assert_allclose(runs.momentum(), runs.qdot, rtol=1e-15)
+    data = runs.to_xarray()
+    assert data["mode"].dims == ("member", "time") and (data["mode"].values == modes).all()
+
+
+def test_derivatives_through_different_modes_in_a_batch():
+    x = jnp.array([[1.0, 4.0, 1.0], [9.0, 0.3, 0.7], [0.2, 25.0, 1.3]])
+
+    def outcome(x):
+        run = two_springs(*x)
+        return run.q, jnp.sum(run.energy())
+
+    states, energy = jax.jit(jax.vmap(jax.jacfwd(outcome)))(x)
+    np.testing.assert_allclose(states, jax.vmap(jax.jacfwd(lambda x: exact_springs(*x)))(x), atol=1e-9)
+    np.testing.assert_allclose(energy, [[0, 0, 25 * v] for v in x[:, 2]], atol=1e-8)
+
+
+def test_laws_that_are_singular_elsewhere_leave_no_nan_in_derivatives():
+    # The first mode has a pole at q = 1, which the motion passes in the second.
+    pole = lagjax.System(lambda q, v, params: 0.5 * v**2 + params / (1 - q))
+    transition = lagjax.Transition("pole", "free", lambda q, v, params: q - 0.5)
+
+    def outcome(p):
+        ts = (0.0, 0.25, 1.0, 2.0)
+        run = hybrid({"pole": pole, "free": FREE}, [transition], 0.0, 0.5, ts, p[0], rtol=1e-12, max_transitions=2)
+        return jnp.stack([run.q[-1], jnp.sum(run.energy()), run.transitions.t[0], run.end.q])
+
+    p = jnp.array([0.1])
+    assert outcome(p)[0] > 1
+    np.testing.assert_allclose(jax.jit(jax.jacrev(outcome))(p), central(outcome, p), rtol=1e-6, atol=1e-9)
+    late = lagjax.Transition("free", "pole", lambda q, v: q - 2.0)
+
+    def energy(p):  # at q = 1, where the mode with the pole is not
+        run = hybrid({"free": FREE, "pole": pole}, [late], 0.0, 1.0, (0.0, 1.0, 1.5), p, max_transitions=1)
+        return jnp.sum(run.energy()) + run.q[1]
+
+    assert jax.jit(jax.grad(energy))(0.1) == 0.0
+
+
+# ---- times ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_output_at_the_instant_of_a_transition_belongs_to_the_mode_before():
+    push = lagjax.Transition("a", "b", lambda q, v, t: t - 3.0, reset=lambda q, v: (q + 10.0, 2 * v))
+    run = hybrid({"a": FREE, "b": FREE}, [push], 0.0, 1.0, (2.0, 2.5, 3.0, 3.5), max_transitions=3)
+    np.testing.assert_allclose(run.q, [0.0, 0.5, 1.0, 12.0], rtol=1e-15)
+    assert run.mode.tolist() == [0, 0, 0, 1]
+    np.testing.assert_allclose(run.transitions.t, [3.0, np.nan, np.nan], rtol=1e-15)
+    np.testing.assert_allclose(run.transitions.q, [1.0, np.nan, np.nan], rtol=1e-15)
+    assert run.transitions.source.tolist() == [0, -1, -1] and run.transitions.target.tolist() == [1, -1, -1]
+    assert run.transitions.count == 1 and run.end.q == run.q[-1] and run.end.t == 3.5
+    np.testing.assert_array_equal(run.energy(), [0.5, 0.5, 0.5, 2.0])
+
+
+def test_pytrees_and_quantities_of_like_constraints():
+    # A pendulum on a rod that is caught by a nail: another length from then on. Named coordinates and constraints.
+    fall = lambda q, v: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * q["y"]
+    modes = {
+        "long": lagjax.System(fall, constraints=lambda q: {"rod": q["x"] ** 2 + q["y"] ** 2 - 1.0}),
+        "short": lagjax.System(fall, constraints=lambda q: {"rod": q["x"] ** 2 + (q["y"] + 0.5) ** 2 - 0.25}),
+    }
+    catch = lagjax.Transition("long", "short", lambda q, v: q["x"], -1)
+    angle = 0.4
+    q0 = {"x": jnp.sin(angle), "y": -jnp.cos(angle)}
+    run = hybrid(modes, [catch], q0, {"x": 0.0, "y": 0.0}, jnp.linspace(0.0, 0.9, 10), rtol=1e-12, max_transitions=1)
+    quantities = lambda run: (run.energy(), run.multipliers["rod"], run.constraint_residual(), run.constraint_force())
+    energy, multiplier, residual, force = jax.jit(quantities)(run)
+    assert run.transitions.count == 1 and set(run.mode.tolist()) == {0, 1}
+    np.testing.assert_allclose(energy, -G * np.cos(angle), rtol=1e-10)
+    np.testing.assert_allclose(run.transitions.qdot["x"][0] ** 2, 2 * G * (1 - np.cos(angle)), rtol=1e-10)
+    # Tension over length: λ = −(v² / l + g cos φ) / 2l, for a constraint of gradient 2l.
+    length = np.where(run.mode == 0, 1.0, 0.5)
+    cosine = -(run.q["y"] + np.where(run.mode == 0, 0.0, 0.5)) / length
+    tension = (run.qdot["x"] ** 2 + run.qdot["y"] ** 2) / length + G * cosine
+    np.testing.assert_allclose(multiplier, -tension / (2 * length), rtol=1e-9)
+    assert abs(residual["rod"]).max() < 1e-13
+    np.testing.assert_allclose(np.hypot(force["x"], force["y"]), tension, rtol=1e-9)
+    assert set(run.to_xarray()) == {"ok", "q.x", "q.y", "qdot.x", "qdot.y", "mode"}
+
+
+# ---- bad input ------------------------------------------------------------------------------------------------------
+
+
+def stay(source="a", target="a", guard=lambda q, v: q - 0.5, **options):
+    return lagjax.Transition(source, target, guard, **options)
+
+
+ROD = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q[1])
+PLANE = lagjax.System(lambda q, v: 0.5 * v @ v)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "sentence"),
+    [
+        ({"start": "z"}, ValueError, "start in the mode 'z', which does not exist; there are 'a'"),
+        ({"transitions": [stay("y")]}, ValueError, "source 'y', which does not exist"),
+        ({"transitions": [stay("a", "y")]}, ValueError, "target 'y', which does not exist"),
+        ({"modes": THREE, "transitions": [stay("a", "c"), stay("b", "a")]}, ValueError, "'a' to 'b': unreachable"),
+        ({"transitions": [lambda q, v: q]}, TypeError, "must be lagjax.Transition"),
+        ({"transitions": stay()}, TypeError, "must be a list of lagjax.Transition"),
+        ({"modes": FREE}, TypeError, "modes must be a dict of lagjax.System"),
+        ({"modes": {"a": lambda q, v: v}}, TypeError, "modes must be a dict of lagjax.System"),
+        ({"modes": {}}, TypeError, "modes must be a dict"),
+        ({"max_transitions": 0}, ValueError, "max_transitions must be a positive integer"),
+        ({"max_transitions": 2.0}, ValueError, "max_transitions must be a positive integer"),
+        ({"ts": [1.0, 0.0]}, ValueError, "ts must increase"),
+        ({"ts": [0.0, 2.0, 1.0]}, ValueError, "strictly increasing"),
+        ({"q0": np.nan}, ValueError, "q0 is nan"),
+        ({"q0": jnp.float32(0), "qdot0": jnp.float32(1)}, ValueError, "'a' has no machine code: .*, not float64"),
+        (
+            {"modes": {"a": lagjax.System(lambda q, v: v @ v)}, "q0": jnp.zeros(99), "qdot0": jnp.zeros(99),
+             "transitions": [stay(guard=lambda q, v: q[0])]},
+            ValueError, "'a' has no machine code: it has 99 coordinates",
+        ),
+        ({"transitions": [stay(guard=lambda q, v: jnp.stack([q, v]))]}, TypeError, "one real number; got shape .2,."),
+        ({"transitions": [stay(guard=lambda q, v: (q, v))]}, TypeError, "one real number; got tuple"),
+        ({"transitions": [stay(guard=lambda q, v: q > 0)]}, TypeError, "one real number; got shape .* bool"),
+        ({"transitions": [stay(guard=lambda q, v, multipliers: q)]}, ValueError, "mode has no constraints"),
+        ({"transitions": [stay(reset=lambda q, v: q)]}, TypeError, r"from 'a' to 'a' must return the pair \(q, qdot\)"),
+        ({"transitions": [stay(reset=lambda q, v: (q, v, v))]}, TypeError, "must return the pair"),
+        ({"transitions": [stay(reset=lambda q, v: (jnp.stack([q, q]), v))]}, TypeError, "must agree"),
+        ({"transitions": [stay(reset=lambda q, v: (q[None], v[None]))]}, TypeError, "the shapes of the initial state"),
+        ({"transitions": [stay(reset=lambda q, v: ({"x": q}, {"x": v}))]}, TypeError, "structure and the shapes"),
+        ({"modes": {"a": ROD}, "q0": jnp.ones(2), "qdot0": jnp.zeros(2)}, ValueError, "q0 does not satisfy constr"),
+        (
+            {"transitions": [stay(guard=jax.tree_util.Partial(lambda w, q, v: q - w, jnp.ones(())))]},
+            ValueError, "holds arrays of its own",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_input_gets_a_sentence(changes, error, sentence):
+    given = {"modes": {"a": FREE}, "transitions": [stay()], "start": "a", "q0": 0.0, "qdot0": 1.0, "ts": [0.0, 1.0]}
+    with pytest.raises(error, match=sentence):
+        lagjax.simulate_hybrid(**(given | changes))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "sentence"),
+    [
+        (("a", "b", None), TypeError, "from 'a' to 'b' has no guard"),
+        (("a", "b", 1.0), TypeError, "guard must be a function"),
+        (("a", "b", lambda q: q), TypeError, "guard must have the form"),
+        (("a", "b", lambda q, v, mass: q), TypeError, "guard asks for `mass`"),
+        (("a", "b", lambda q, v: q, 2), ValueError, "direction must be"),
+        (("a", "b", lambda q, v: q, 0, lambda q, v, multipliers: (q, v)), TypeError, "reset asks for `multipliers`"),
+    ],
+)
+def test_what_cannot_be_a_transition(arguments, error, sentence):
+    with pytest.raises(error, match=sentence):
+        lagjax.Transition(*arguments)
+
+
+def test_a_reset_that_leaves_the_constraints_of_the_mode_is_not_repaired():
+    # Onto the rod y = 0: with a velocity across it, to a place beside it, or rightly.
+    flight = {"flight": PLANE, "rod": ROD}
+    q0, v0 = jnp.array([0.0, 1.0]), jnp.array([1.0, -1.0])
+
+    landing = lagjax.Transition(
+        "flight", "rod", lambda q, v: q[1], -1,
+        lambda q, v, params: (q.at[1].set(params["off"]), v.at[1].set(params["speed"])),
+    )  # fmt: skip
+
+    def land(off, speed):
+        params = {"off": off, "speed": speed}
+        return hybrid(flight, [landing], q0, v0, (0.0, 0.5, 2.0), params, throw=False, max_transitions=2)
+
+    off, speed = jnp.array([0.0, 1e-3, 0.0, 1e-9]), jnp.array([0.0, 0.0, 0.3, 0.0])
+    runs = jax.vmap(land)(off, speed)
+    assert runs.ok.tolist() == [True, False, False, True]
+    for i in (1, 2):
+        assert runs.result._value[i] == lagjax.RESULTS.inconsistent_start._value
+        assert runs.transitions.count[i] == 1 and runs.mode[i].tolist() == [0, 0, -1] and np.isnan(runs.q[i, -1]).all()
+        np.testing.assert_allclose([runs.end.t[i], *runs.end.q[i]], [1.0, 1.0, off[i]], atol=1e-14)
+    np.testing.assert_allclose(runs.q[0, -1], [2.0, 0.0], atol=1e-14)
+    with pytest.raises(lagjax.SimulationError, match=r"does not satisfy the constraints[^$]*mode 'rod'"):
+        stuck = lagjax.Transition("flight", "rod", lambda q, v: q[1], -1)
+        hybrid(flight, [stuck], q0, v0, (0.0, 2.0), max_transitions=1)
+
+    # A start that is off, where it is not a number yet.
+    start = lambda y: hybrid({"a": ROD}, [], jnp.stack([0.0, y]), jnp.array([1.0, 0.0]), throw=False)
+    runs = jax.vmap(start)(jnp.array([0.0, 0.1]))
+    assert runs.ok.tolist() == [True, False] and np.isnan(runs.q[1]).all() and (runs.mode[1] == -1).all()
+    assert runs.result._value[1] == lagjax.RESULTS.inconsistent_start._value
+
+
+def test_a_failure_names_the_mode():
+    wall = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.sqrt(q))
+    with pytest.raises(lagjax.SimulationError, match=r"step size shrank[^$]*mode 'wall'") as caught:
+        hybrid({"a": FREE, "wall": wall}, [lagjax.Transition("a", "wall", lambda q, v: q - 1.0)], 2.0, -1.0, (0.0, 3.0))
+    assert caught.value.trajectory.system["wall"] is wall
+    massless = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1] ** 2)
+    with pytest.raises(lagjax.SimulationError, match=r"q\[1\][^$]*mode 'b'"):
+        pass_on = lagjax.Transition("a", "b", lambda q, v: q[0] - 0.5)
+        hybrid({"a": PLANE, "b": massless}, [pass_on], jnp.zeros(2), jnp.array([1.0, 0.0]))
+
+
+# ---- compile counts -------------------------------------------------------------------------------------------------
+
+
+def test_a_new_value_never_recompiles():
+    traces = []
+
+    def counted(q, v, params):
+        traces.append(None)
+        return 0.5 * v**2 - params["g"] * q
+
+    def guard(q, v):
+        traces.append(None)
+        return q
+
+    reset = lambda q, v, params: (q, -params["e"] * v)
+
+    def fall(h, e, ts=jnp.linspace(0.0, 2.0, 9)):  # noqa: B008
+        modes, bounce = {"flight": lagjax.System(counted)}, lagjax.Transition("flight", "flight", guard, -1, reset)
+        return hybrid(modes, [bounce], h, 0.0, ts, {"e": e, "g": G})
+
+    first = fall(1.0, 0.9)
+    count = len(traces)
+    np.testing.assert_array_equal(first.q, fall(1.0, 0.9).q)
+    fall(1.1, 0.5, ts=jnp.linspace(0.1, 1.0, 9))
+    assert len(traces) == count > 0
+    fall(1.0, 0.9, ts=jnp.array([0.0, 1.0]))  # machine code serves any number of output times
+    assert len(traces) == count
