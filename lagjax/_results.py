@@ -1,6 +1,6 @@
 """What can become of a trajectory: result codes, what to try when one is bad, and the exception that carries it.
 
-The codes are diffrax's own with two more. They travel inside `jit` and `vmap` as arrays, one per member of a batch;
+The codes are diffrax's own and ours. They travel inside `jit` and `vmap` as arrays, one per member of a batch;
 only `simulate` turns one into an exception.
 """
 
@@ -14,12 +14,23 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The state or its acceleration became NaN or infinite. Look at the Lagrangian, its gradient and the parameters "
         "there: a square root or norm at zero, a logarithm of a negative number, a branch of `where` that is not taken."
     )
-    max_transitions_reached = (
-        "The budget of transitions was spent. Raise max_transitions; if their times pile up (as the bounces of a ball "
-        "do), no budget is enough: let the motion end, or go over to a mode at rest."
+    max_transitions_reached = "The budget of transitions was spent. Raise max_transitions, or end ts earlier."
+    zeno = (
+        "Transitions follow each other at ever shorter times that add up to a finite one (Zeno), as the bounces of a "
+        "ball do: no budget of transitions leads beyond it. End ts before that time, or add a transition to a mode at "
+        "rest, its guard a speed or an energy that has become small."
     )
     inconsistent_start = (
         "The initial state does not satisfy the constraints. Put it there first: system.project(q0, qdot0, t, params)."
+    )
+    constraint_rank_lost = (
+        "The constraints became dependent on each other, and no longer determine how the motion goes on: a dead point "
+        "or a branching of the mechanism, or a constraint whose gradient vanishes. Stop before it with event=..., give "
+        "the constraint a form whose gradient stays away from zero, or drop one that follows from the others."
+    )
+    projection_failed = (
+        "The state could not be brought back to its constraints. Take shorter steps (a tighter rtol, a smaller dt), "
+        "and look whether the constraints can still be met there: a rod that is too short, a wire that ends."
     )
     mass_matrix_singular = (
         "The mass matrix d2L/dqdot2 became singular. Some velocity, or combination of velocities, has no kinetic "
