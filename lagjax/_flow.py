@@ -1,14 +1,18 @@
 """The motion of a scalar program as a function that JAX can transform, computed by machine code on the CPU.
 
 A `Flow` is the map from (output times, initial state, parameters) to the states at those times. While JAX traces it, it
-is one callback, and under `vmap` one callback for the whole batch. Its derivative is the flow of a larger system: to q
-belong the sensitivities ∂q/∂x by every number x that is being varied, and they move by
+is one callback, and under `vmap` one callback for the whole batch. It has derivatives of every order, in two ways.
+
+Forward mode is the flow of a larger system: to q belong the sensitivities ∂q/∂x by every number x that is being varied,
+and they move by
 
     d²/dt² ∂q/∂x = ∂q̈/∂q ∂q/∂x + ∂q̈/∂q̇ ∂q̇/∂x + ∂q̈/∂x
 
-which is a program like any other. So forward and reverse mode have the same cost and the same digits, a sensitivity is
-as accurate as the motion, and derivatives of every order exist. Source: Hairer, Nørsett & Wanner, *Solving Ordinary
-Differential Equations I*, §I.14.
+which is a program like any other: a sensitivity is as accurate as the motion. Source: Hairer, Nørsett & Wanner,
+*Solving Ordinary Differential Equations I*, §I.14.
+
+Reverse mode goes back over the steps of the motion itself, each transposed (`_native._adjoint`): its cost does not grow
+with the number of parameters. The two agree within the tolerance.
 """
 
 import functools
@@ -27,6 +31,9 @@ from lagjax._program import Program, Unlowerable, lower
 
 LARGEST_PROGRAM = 6_000  # operations of an acceleration, beyond which LLVM takes too long
 _BUDGET = 100_000  # operations of a program with sensitivities
+MORE_STEPS = 4  # than a motion, for its sensitivities
+# How a motion ends that its program cannot follow.
+GIVEN_UP = (_native.SINGULAR, _native.NOT_FINITE, _native.STEP_TOO_SMALL)
 
 
 class Outcome(NamedTuple):
@@ -68,7 +75,8 @@ class Flow:
 
     `program` takes q, q̇, t and then the parameters, number by number; it gives q̈ and whether the mass matrix is
     singular. `projection`, from the same to (q, q̇), keeps the motion on its constraints. `guards` end the motion early:
-    then the outcome is a plain number, without derivatives.
+    then the outcome is a plain number, without derivatives. `careful()` is the flow for members that a program which
+    does not hold everywhere cannot follow: they start again, from the beginning.
     """
 
     def __init__(
@@ -78,12 +86,33 @@ class Flow:
         projection: Program | None = None,
         guards: _native.Guards | None = None,
         groups: tuple[int, ...] | None = None,
+        careful: Callable[[], "Flow | None"] | None = None,
     ):
-        self.program, self.size, self.projection, self.guards = program, size, projection, guards
+        self.size, self.guards = size, guards
         self.groups = tuple(range(size)) if groups is None else groups
-        self.kernel = _native.Kernel(program, size, projection, guards, self.groups)
+        self._given = program, projection
+        self.careful = functools.cache(self._careful if careful is None else careful)
         self.traceable = functools.lru_cache(maxsize=16)(self._traceable)
         self.varied = functools.lru_cache(maxsize=16)(self._varied)
+
+    @functools.cached_property
+    def _programs(self):
+        return self._given
+
+    @property
+    def program(self) -> Program:
+        """q̈ and whether the mass matrix is singular."""
+        return self._programs[0]
+
+    @property
+    def projection(self) -> Program | None:
+        """(q, q̇) on the constraints, where there are some."""
+        return self._programs[1]
+
+    @functools.cached_property
+    def kernel(self) -> _native.Kernel:
+        """The machine code."""
+        return _native.Kernel(self.program, self.size, self.projection, self.guards, self.groups)
 
     @property
     def states(self) -> int:
@@ -96,7 +125,39 @@ class Flow:
         The second result counts the steps for which lanes stood empty.
         """
         *outcome, idle = self.kernel(ts, y0, params, *tolerances)
-        return Outcome(*outcome), idle
+        outcome, again = Outcome(*outcome), np.isin(outcome[3], GIVEN_UP)
+        if not again.any() or (careful := self.careful()) is None:
+            return outcome, idle
+        better, more = careful.run(*(x[again] if len(x) > 1 else x for x in (ts, y0, params)), tolerances)
+        for values, new in zip(outcome, better, strict=True):
+            values[again] = new
+        return outcome, idle + more
+
+    def pull(self, ts, y0, params, steps, path_bar, y_bar, tolerances: Tolerances) -> _native.Cotangents:
+        """The transpose of the derivative of `run`, which took so many `steps`; see `Kernel.pull`."""
+        cotangents = self.kernel.pull(ts, y0, params, steps, path_bar, y_bar, *tolerances)
+        again = np.isin(cotangents.code, GIVEN_UP)
+        if again.any() and (careful := self.careful()) is not None:
+            shared = (x[again] if len(x) > 1 else x for x in (ts, y0, params))
+            better = careful.pull(*shared, steps[again], path_bar[again], y_bar[again], tolerances)
+            for values, new in zip(cotangents, better, strict=True):
+                values[again] = new
+        return cotangents
+
+    def _careful(self) -> "Flow | None":
+        """With the program that holds everywhere; None where this is it, or where that is too large."""
+        program = self.everywhere
+        if program is self.program or program.operations > LARGEST_PROGRAM:
+            return None
+        return Flow(program, self.size, self.projection, self.guards, self.groups)
+
+    @property
+    def everywhere(self) -> Program:
+        """The program that holds everywhere, if there is one."""
+        try:
+            return self.program.complete
+        except Unlowerable:
+            return self.program
 
     def _traceable(self, tolerances: Tolerances) -> Callable:
         """`(ts, y0, *params)` → `Outcome` of one member, under every transformation of JAX."""
@@ -110,7 +171,7 @@ class Flow:
         def rule(primals, tangents):
             return _push(self, tolerances, primals, tangents)
 
-        return run
+        return jax.jit(run)  # a derivative outside of `jit` compiles as one, not operation by operation
 
     def undifferentiated(self, tolerances: Tolerances) -> Callable:
         """The same without derivatives."""
@@ -130,77 +191,201 @@ class Flow:
 
         return run
 
-    # ---- sensitivities ----
-
     def _varied(self, by_state: bool, params: tuple[int, ...]) -> "Flow":
-        """The flow of q and of ∂q/∂x, for x in y0 (if asked for) and in these parameters; (1 + x's, n) coordinates."""
-        n, free = self.size, self.states * by_state  # an initial state has no ∂q̈/∂x
-        rows, numbers, chosen = 1 + free + len(params), self.program.size - self.states - 1, np.array(params, int)
+        return _Varied(self, by_state, params)
+
+
+# ---- derivatives -----------------------------------------------------------------------------------------------------
+
+
+class _Varied(Flow):
+    """The flow of q and of ∂q/∂x, for x in y0 (if asked for) and in these parameters; (1 + x's, n) coordinates.
+
+    Its program is made when it is first needed: whoever only asks for reverse mode does not wait for it.
+    """
+
+    def __init__(self, base: Flow, by_state: bool, params: tuple[int, ...]):
+        self.base, self.free, self.chosen = base, base.states * by_state, params  # an initial state has no ∂q̈/∂x
+        self.rows = 1 + self.free + len(params)
+        n = base.size
+        # A sensitivity that is zero by symmetry is as exact as the others in its row, not exact relative to itself.
+        groups = base.groups + tuple(n + row for row in range(self.rows - 1) for _ in range(n))
+
+        def careful():
+            return flow.varied(by_state, params) if (flow := base.careful()) else None
+
+        super().__init__(None, self.rows * n, None, None, groups, careful)
+
+    @functools.cached_property
+    def _programs(self):
+        base, n, rows = self.base, self.base.size, self.rows
+        numbers, chosen = base.program.size - base.states - 1, np.array(self.chosen, int)
 
         def derivative(function, q, v, t, p):
             """`function(q, v, t, p)` at the first rows, and for the others how it varies with them."""
+
             def of_varied(q, v, x):
                 return function(q, v, t, p.at[chosen].set(x))
 
             by_q, by_v, by_x = jax.jacfwd(of_varied, argnums=(0, 1, 2))(q[0], v[0], p[chosen])
-            varied = (q[1:] @ by_q.T + v[1:] @ by_v.T).at[free:].add(by_x.T)
+            varied = (q[1:] @ by_q.T + v[1:] @ by_v.T).at[self.free :].add(by_x.T)
             return jnp.concatenate([function(q[0], v[0], t, p)[None], varied])
 
         def accelerations(q, v, t, p):
-            return jnp.stack(self.program(*q, *v, t, *p)[:n])
+            return jnp.stack(base.program(*q, *v, t, *p)[:n])
 
         def moving(q, v, t, p):
-            return derivative(accelerations, q, v, t, p), self.program(*q[0], *v[0], t, *p)[n]
+            return derivative(accelerations, q, v, t, p), base.program(*q[0], *v[0], t, *p)[n]
 
         def projected(q, v, t, p):
-            both = derivative(lambda *state: jnp.stack(self.projection(*state[0], *state[1], t, *state[3])), q, v, t, p)
+            both = derivative(lambda *state: jnp.stack(base.projection(*state[0], *state[1], t, *state[3])), q, v, t, p)
             return both[:, :n], both[:, n:]
 
         shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((rows, n), (rows, n), (), (numbers,))]
-        projection = None if self.projection is None else lower(projected, *shapes, budget=_BUDGET)
-        # A sensitivity that is zero by symmetry is as exact as the others in its row, not exact relative to itself.
-        groups = self.groups + tuple(n + row for row in range(rows - 1) for _ in range(n))
-        return Flow(lower(moving, *shapes, budget=_BUDGET), rows * n, projection, None, groups)
+        projection = None if base.projection is None else lower(projected, *shapes, budget=_BUDGET)
+        return lower(moving, *shapes, budget=_BUDGET), projection
 
 
 def _push(flow: Flow, tolerances: Tolerances, primals, tangents) -> tuple[Outcome, Outcome]:
-    """The outcome, and its tangent: sensitivities times what varies, and slopes times the output times."""
+    """The outcome, and its tangent: that of the motion between fixed times, and slopes times the output times."""
     (ts, y0, *params), (dts, dy0, *dparams) = primals, tangents
     by_time, moved = not isinstance(dts, SymbolicZero), not isinstance(dy0, SymbolicZero)
     by_state = moved or by_time  # to start later from the same state is to start from another state
     active = tuple(i for i, dx in enumerate(dparams) if not isinstance(dx, SymbolicZero))
-    n, free = flow.size, flow.states * by_state
-    rows = 1 + free + len(active)
-
-    # (rows, states) to the coordinates of the larger system, (2, rows, n) end to end, and back.
-    start = jnp.asarray(np.eye(rows, flow.states, -1) * by_state).at[0].set(y0)
-    larger = flow.varied(by_state, active).traceable(tolerances)
-    outcome = larger(ts, start.reshape(rows, 2, n).swapaxes(0, 1).ravel(), *params)
-
-    def by_rows(y):
-        y = y.reshape(*y.shape[:-1], 2, rows, n)
-        return jnp.moveaxis(y, -2, 0).reshape(rows, *y.shape[:-3], flow.states)
-
-    (path, *path_by), (y_end, *end_by) = by_rows(outcome.path), by_rows(outcome.y_end)
+    outcome, n = flow.traceable(tolerances)(*primals), flow.size
 
     def slope(t, y):
-        rate = jnp.concatenate([y[n:], jnp.stack(flow.program(*y, t, *params)[:-1])])
+        rate = jnp.concatenate([y[n:], jnp.stack(flow.everywhere(*y, t, *params)[:-1])])
         return jnp.where(jnp.isfinite(rate), rate, 0.0)  # where it is not, the motion has ended
 
     varied = (dy0 if moved else jnp.zeros_like(y0)) - (slope(ts[0], y0) * dts[0] if by_time else 0.0)
-    weights = [*(varied if by_state else ()), *(dparams[i] for i in active)]
-    # What was not reached is NaN, which must not meet the zero cotangent of an output that nobody uses.
-    reached, done = jnp.isfinite(path), outcome.code == _native.DONE
-    d_path = sum(w * jnp.where(reached, dy, 0.0) for w, dy in zip(weights, path_by, strict=True))
-    d_end = sum(w * dy for w, dy in zip(weights, end_by, strict=True))
+    moving = jnp.concatenate([*([varied] if by_state else []), *(dparams[i][None] for i in active)])
+    d_path, d_end = _Response(flow, tolerances, primals, outcome, by_state, active)(moving)
     d_t_end = jnp.zeros_like(outcome.t_end)
     if by_time:
-        moving = jax.vmap(slope)(ts, jnp.where(reached, path, y0)) * dts[:, None]
-        d_path = d_path + jnp.where(reached, moving, 0.0)
-        d_end = d_end + jnp.where(done, moving[-1], 0.0)
+        reached, done = jnp.isfinite(outcome.path), outcome.code == _native.DONE
+        rates = jax.vmap(slope)(ts, jnp.where(reached, outcome.path, y0)) * dts[:, None]
+        d_path = d_path + jnp.where(reached, rates, 0.0)
+        d_end = d_end + jnp.where(done, rates[-1], 0.0)
         d_t_end = jnp.where(done, dts[-1], 0.0)
     counts = [np.zeros((), jax.dtypes.float0)] * 3
-    return outcome._replace(path=path, y_end=y_end), Outcome(d_path, d_end, d_t_end, *counts)
+    return outcome, Outcome(d_path, d_end, d_t_end, *counts)
+
+
+class _Response(NamedTuple):
+    """The linear map from what varies, (δy0, δparams), to (δpath, δy_end): the derivative between fixed times.
+
+    There are two programs for it: sensitivities, which give the map, and the transpose of the steps, which gives the
+    transposed map at once. JAX learns of both as the solution x of A x = b with A (u, w) = (u, w − R u): x is
+    (u, w + R u), and the transposed equation has (u + Rᵀw, w).
+    """
+
+    flow: Flow
+    tolerances: Tolerances
+    primals: tuple
+    outcome: Outcome
+    by_state: bool
+    active: tuple[int, ...]
+
+    def __call__(self, moving):
+        """(δpath, δy_end) from the numbers that vary, end to end."""
+        count = len(moving)
+
+        def with_response(sign):
+            return lambda x: jnp.concatenate([x[:count], x[count:] + sign * self.push(x[:count])])
+
+        def transposed(_, b):
+            return jnp.concatenate([b[:count] + self.pull(b[count:]), b[count:]])
+
+        shape = self.outcome.path.shape
+        b = jnp.pad(moving, (0, shape[0] * shape[1] + shape[1]))
+        x = jax.lax.custom_linear_solve(with_response(-1.0), b, lambda _, b: with_response(1.0)(b), transposed)
+        return self._apart(x[count:])
+
+    def _apart(self, flat):
+        """What belongs to the path and to the end."""
+        shape = self.outcome.path.shape
+        return flat[: -shape[1]].reshape(shape), flat[-shape[1] :]
+
+    @property
+    def reached(self):
+        """What was not reached is NaN, which must not meet the zero cotangent of an output that nobody uses."""
+        return jnp.isfinite(self.outcome.path)
+
+    def push(self, moving):
+        """By sensitivities."""
+        ts, y0, *params = self.primals
+        larger, n, states = self.flow.varied(self.by_state, self.active), self.flow.size, self.flow.states
+        rows = larger.rows
+
+        # (rows, states) to the coordinates of the larger system, (2, rows, n) end to end, and back.
+        start = jnp.asarray(np.eye(rows, states, -1) * self.by_state).at[0].set(y0)
+        steps = self.tolerances.max_steps * MORE_STEPS
+        run = larger.traceable(self.tolerances._replace(max_steps=steps))
+        found = run(ts, start.reshape(rows, 2, n).swapaxes(0, 1).ravel(), *params)
+
+        def by_rows(y):
+            y = y.reshape(*y.shape[:-1], 2, rows, n)
+            return jnp.moveaxis(y, -2, 0).reshape(rows, *y.shape[:-3], states)[1:]
+
+        d_path = jnp.tensordot(moving, jnp.where(self.reached, by_rows(found.path), 0.0), 1)
+        return jnp.concatenate([d_path.ravel(), moving @ by_rows(found.y_end)])
+
+    def pull(self, bars):
+        """By the transpose of the steps."""
+        ts, _, *params = self.primals
+        path_bar, end_bar = self._apart(bars)
+        path_bar = jnp.where(self.reached, path_bar, 0.0)
+        params_bar = jnp.zeros(len(params))
+        if self.flow.projection is not None and len(ts) > 2:  # outputs were put on the constraints
+            path_bar, more = jax.vmap(self._back_on_constraints)(ts, self.outcome.path, path_bar)
+            params_bar = params_bar + more.sum(axis=0)
+        done = self.outcome.code == _native.DONE
+        end_bar = end_bar + jnp.where(done, path_bar[-1], 0.0)
+        y0_bar, more = self._on_host(path_bar.at[-1].set(0.0), end_bar)
+        params_bar = params_bar + more
+        chosen = params_bar[np.array(self.active, int)]
+        return jnp.concatenate([y0_bar, chosen]) if self.by_state else chosen
+
+    def _back_on_constraints(self, t, y, bar):
+        y = jnp.where(jnp.isfinite(y), y, self.primals[1])
+        projection = self.flow.projection
+        y_bar, *params_bar = jax.vjp(lambda y, *p: jnp.stack(projection(*y, t, *p)), y, *self.primals[2:])[1](bar)
+        return y_bar, jnp.stack(params_bar) if params_bar else jnp.zeros(0)
+
+    def _on_host(self, path_bar, end_bar):
+        ts, y0, *params = self.primals
+        shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in (y0.shape, (len(params),))]
+
+        def on_host(_, places, *arrays):
+            with jax.enable_x64(True):  # another thread; the program may be made here
+                found = _pull_batch(self.flow, self.tolerances, *map(np.asarray, arrays))
+            for place, values in zip(places, found, strict=True):
+                np.asarray(place)[...] = values
+
+        numbers = jnp.stack(params) if params else jnp.zeros(0)
+        callback = buffer_callback(on_host, tuple(shapes), vmap_method="expand_dims")
+        return callback(ts, y0, numbers, self.outcome.accepted, path_bar, end_bar)
+
+
+def _pull_batch(flow: Flow, tolerances: Tolerances, *arrays) -> list[np.ndarray]:
+    """`flow.pull` for arrays with any batch axes in front, of length one where they share."""
+    inner = [1, 1, 1, 0, 2, 1]
+    batch = np.broadcast_shapes(*(x.shape[: x.ndim - k] for x, k in zip(arrays, inner, strict=True)))
+    members = math.prod(batch)
+
+    def rows(x, k, shared):
+        own = x.shape[x.ndim - k :]
+        if shared and x.size == math.prod(own):
+            return x.reshape(1, *own)
+        return np.broadcast_to(x, batch + own).reshape(members, *own)
+
+    given = [rows(x, k, i in (0, 2)) for i, (x, k) in enumerate(zip(arrays, inner, strict=True))]
+    found = flow.pull(*given, tolerances)
+    return [x.reshape(*batch, x.shape[-1]) for x in (found.y0, found.params)]
+
+
+# ---- arrays with any batch axes --------------------------------------------------------------------------------------
 
 
 def _over_batch(run: Callable, ts, y0, *params) -> tuple[np.ndarray, ...]:

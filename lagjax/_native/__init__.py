@@ -8,6 +8,7 @@ one Taylor series, of the order that the tolerance asks for.
 """
 
 import ctypes
+import functools
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -15,15 +16,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._native import _integrator
+from lagjax._native import _adjoint, _integrator
 from lagjax._native._integrator import DONE, EVENT, NOT_FINITE, OUT_OF_STEPS, SINGULAR, STEP_TOO_SMALL
 from lagjax._native._ir import compiled
+from lagjax._native._series_code import LANE, MAX_ORDER
 from lagjax._program import Program, Series, Unlowerable, series
 
 __all__ = [
-    "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Guards", "Kernel", "cores",
-    "recurrences",
+    "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Cotangents", "Guards", "Kernel",
+    "cores", "recurrences",
 ]  # fmt: skip
+
+LARGEST_RECORD = 2**23  # numbers of the steps that are kept at once: 64 MiB
 
 
 class Outcome(NamedTuple):
@@ -36,6 +40,14 @@ class Outcome(NamedTuple):
     steps: np.ndarray
     rejected: np.ndarray
     idle: int
+
+
+class Cotangents(NamedTuple):
+    """Of the initial states (N, 2n) and of the parameters (N, P); and how the motions ended."""
+
+    y0: np.ndarray
+    params: np.ndarray
+    code: np.ndarray
 
 
 class Guards(NamedTuple):
@@ -67,35 +79,35 @@ class Kernel:
         guards: Guards | None = None,
         groups: tuple[int, ...] | None = None,
     ):
-        integrator = _integrator.Integrator(program, recurrences(program, size), projection, guards, groups)
+        self._parts = program, recurrences(program, size), projection
+        integrator = _integrator.Integrator(*self._parts, guards, groups)
         self.states, self.numbers, self.width = 2 * size, integrator.numbers, integrator.width
         self._memory = integrator.memory
         self._engine = compiled(integrator.module)  # holds the code that the next lines point to
-        self._run = self._function("run", *[ctypes.c_void_p] * 4)
+        self._run = _function(self._engine, "run", *[ctypes.c_void_p] * 4)
         self._project = None
         if projection is not None:
-            self._project = self._function("project_rows", *[ctypes.c_void_p] * 3, ctypes.c_int64)
-
-    def _function(self, name: str, *types):
-        return ctypes.CFUNCTYPE(None, *types)(self._engine.get_function_address(name))
+            self._project = _function(self._engine, "project_rows", *[ctypes.c_void_p] * 3, ctypes.c_int64)
 
     def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int) -> Outcome:
         """`y0` (N, 2n); `ts` (N, T) and `params` (N, P), or one row for all; all float64."""
-        ts, y0, params = (np.ascontiguousarray(x, dtype=np.float64) for x in (ts, y0, params))
+        return self._integrate(*_contiguous(ts, y0, params), rtol, atol, max_steps)
+
+    def _integrate(self, ts, y0, params, rtol, atol, max_steps, record=None, first_step=None) -> Outcome:
         members, times = len(y0), ts.shape[1]
         path = np.full((members, times, self.states), np.nan)
         y_end, t_end = np.empty((members, self.states)), np.empty(members)
         code, steps, rejected = (np.empty(members) for _ in range(3))
-        counter = np.zeros(1, np.int64)
+        counter, recording = np.zeros(1, np.int64), record is not None
         job = _integrator.Job(
-            *(array.ctypes.data for array in (counter, ts, y0, params, path, y_end, t_end, code, steps, rejected)),
+            *_addresses(counter, ts, y0, params, path, y_end, t_end, code, steps, rejected, record, first_step),
             times if len(ts) > 1 else 0, self.numbers if len(params) > 1 else 0,
-            members, times, order_for(rtol), max_steps, rtol, atol,
+            members, times, order_for(rtol), max_steps, recording, rtol, atol,
         )  # fmt: skip
 
         def integrate(_) -> int:
             memory = _aligned(self._memory)
-            lanes, idle = np.zeros(len(_integrator.LANE) * self.width, np.int64), np.zeros(1, np.int64)
+            lanes, idle = np.zeros(len(LANE) * self.width, np.int64), np.zeros(1, np.int64)
             self._run(ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data, idle.ctypes.data)
             return int(idle[0])
 
@@ -113,9 +125,72 @@ class Kernel:
             path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
         return Outcome(path, y_end, t_end, *(counts.astype(int) for counts in (code, steps, rejected)), idle)
 
+    def pull(self, ts, y0, params, steps, path_bar, y_bar, rtol: float, atol: float, max_steps: int) -> Cotangents:
+        """The transposed derivative of a run that took so many `steps`, integers (N,).
+
+        From the cotangents of the outputs, `path_bar` (N, T, 2n), and of the states at the end, `y_bar` (N, 2n), to
+        those of the initial states and of the parameters. The motion is followed once more to find its steps.
+        """
+        ts, y0, params = _contiguous(ts, y0, params)
+        steps = np.ascontiguousarray(steps, np.int64)
+        shared = len(ts) == 1, len(params) == 1
+        y_bar, params_bar = np.array(y_bar, np.float64), np.zeros((len(y0), self.numbers))
+        code = np.empty(len(y0), int)
+        for some in _portions(steps * (self.states + 2)):
+            rows = [x if one else x[some] for x, one in zip((ts, params), shared, strict=True)]
+            given = rows[0], y0[some], rows[1], steps[some], *_contiguous(path_bar[some])
+            code[some] = self._pull(*given, y_bar[some], params_bar[some], rtol, atol, max_steps)
+        y_bar += path_bar[:, 0]  # the first output is the initial state
+        return Cotangents(y_bar, params_bar, code)
+
+    def _pull(self, ts, y0, params, steps, path_bar, y_bar, params_bar, rtol, atol, max_steps) -> np.ndarray:
+        """Of one portion; the last two arrays are changed in place."""
+        first_step = np.concatenate([[0], np.cumsum(steps)])
+        record = np.empty((first_step[-1], self.states + 2))
+        code = self._integrate(ts, y0, params, rtol, atol, max_steps, record, first_step).code
+        counter, (members, times) = np.zeros(1, np.int64), path_bar.shape[:2]
+        job = _adjoint.Job(
+            *_addresses(counter, ts, params, record, first_step, steps, path_bar, y_bar, params_bar),
+            times if len(ts) > 1 else 0, self.numbers if len(params) > 1 else 0, members, times, order_for(rtol),
+        )  # fmt: skip
+        engine, size = self._adjoint
+        run = _function(engine, "pull", *[ctypes.c_void_p] * 3)
+
+        def pull(_) -> None:
+            memory, lanes = _aligned(size), np.zeros(len(LANE) * self.width, np.int64)
+            run(ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data)
+
+        self._on_all_cores(pull, members)
+        return code
+
+    @functools.cached_property
+    def _adjoint(self):
+        """The engine that holds the code of `pull`, and what a thread needs; compiled when it is first asked for."""
+        adjoint = _adjoint.Adjoint(*self._parts)
+        return compiled(adjoint.module), adjoint.memory
+
     def _on_all_cores(self, work, members: int) -> list:
         threads = min(cores(), max(1, members // (4 * self.width)))
         return list(_pool().map(work, range(threads))) if threads > 1 else [work(0)]
+
+
+def _function(engine, name: str, *types):
+    return ctypes.CFUNCTYPE(None, *types)(engine.get_function_address(name))
+
+
+def _contiguous(*arrays) -> list[np.ndarray]:
+    return [np.ascontiguousarray(x, dtype=np.float64) for x in arrays]
+
+
+def _addresses(*arrays) -> list[int | None]:
+    return [None if array is None else array.ctypes.data for array in arrays]
+
+
+def _portions(numbers: np.ndarray) -> list[slice]:
+    """Members in portions that need no more than `LARGEST_RECORD` numbers together, or just one."""
+    place = np.cumsum(numbers) // LARGEST_RECORD
+    ends = [*(np.flatnonzero(np.diff(place)) + 1).tolist(), len(numbers)]
+    return [slice(first, end) for first, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
 def recurrences(program: Program, size: int) -> Series:
@@ -128,7 +203,7 @@ def recurrences(program: Program, size: int) -> Series:
 
 def order_for(rtol: float) -> int:
     """The order whose series costs least: at the step that it allows, terms fall by e² each (Jorba & Zou, §3.2)."""
-    return min(_integrator.MAX_ORDER, max(7, math.ceil(2 - math.log(rtol) / 2)))
+    return min(MAX_ORDER, max(7, math.ceil(2 - math.log(rtol) / 2)))
 
 
 def cores() -> int:

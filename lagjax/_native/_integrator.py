@@ -26,11 +26,11 @@ import functools
 
 from llvmlite import ir
 
-from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, lanes
-from lagjax._native._lanes import emit, sincos_function
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
+from lagjax._native._lanes import emit
+from lagjax._native._series_code import SeriesCode, double, integer
 from lagjax._program import Program, Series, StraightLine
 
-MAX_ORDER = 20
 SAFETY = 0.9
 ROUND_OFF = 256 * 2.0**-52  # of an acceleration
 
@@ -59,45 +59,40 @@ class Job(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in (
-            "next_member", "ts", "y0", "params", "path", "y_end", "t_end", "code", "steps", "rejected",
+            "next_member", "ts", "y0", "params", "path", "y_end", "t_end", "code", "steps", "rejected", "record",
+            "first_step",
         )),
         # From one member to the next: 0 where all share the output times, or the parameters.
         *((name, ctypes.c_int64) for name in ("ts_stride", "params_stride")),
-        *((name, ctypes.c_int64) for name in ("members", "times", "order", "max_steps")),
+        *((name, ctypes.c_int64) for name in ("members", "times", "order", "max_steps", "recording")),
         *((name, ctypes.c_double) for name in ("rtol", "atol")),
     ]  # fmt: skip
 
 
 # Doubles of a lane. `due` and `reached` are times in the direction of time; `active`, `last`, `singular` are 1 or 0.
 _OF_A_LANE = (
-    "t", "t_low", "t_end", "forward", "smallest", "h", "due", "reached", "worst", "active", "last", "singular", "code",
-    "steps", "rejected", "longest", "growth", "planned", "event",
+    "t_low", "t_end", "forward", "smallest", "due", "reached", "worst", "active", "last", "code", "steps", "rejected",
+    "longest", "growth", "planned", "event",
 )  # fmt: skip
-_KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
-# Integers of a lane: which member it carries (-1: none), and which output comes next.
-LANE = ("member", "output")
 
 
-class Integrator:
-    """Builds the module. `memory` is what a thread needs, in doubles; `lanes` the width."""
+class Integrator(SeriesCode):
+    """Builds the module. `memory` is what a thread needs, in doubles; `width` the lanes."""
 
-    def __init__(
-        self, program: Program, series: Series, projection: Program | None = None, guards=None, groups=None
-    ):
-        self.program, self.series, self.n = program, series, series.size
+    def __init__(self, program: Program, series: Series, projection: Program | None = None, guards=None, groups=None):
         # Coordinates of one group are measured by the largest of them.
         self.groups = tuple(range(series.size)) if groups is None else groups
         self.projection, self.guards = projection, guards
         self.directions = () if guards is None else guards.directions
-        self.states, self.width = 2 * series.size, lanes()
-        self.module = ir.Module("motion")
-        self.module.triple = ""
-        self.vector = ir.VectorType(DOUBLE, self.width)
-        self.numbers = program.size - self.states - 1  # parameters
-        self._lay_out()
-        self.sincos = sincos_function(self.module, self.width)
-        self.sums = self._sums()
-        self.coefficients = self._coefficients()
+        sizes = {
+            "low": 2 * series.size,  # what rounding took from the state
+            "scale": 2 * series.size,
+            "increment": 2 * series.size,
+            **dict.fromkeys(("guard", "side", "noise", "root", "change"), len(self.directions)),
+            "samples": _SAMPLES * len(self.directions),
+            **dict.fromkeys(_OF_A_LANE, 1),
+        }
+        super().__init__("motion", program, series, Job, sizes)
         self.defect = self._defect()
         self.start_next = self._start_next()
         self.project = None if projection is None else self._project()
@@ -107,136 +102,6 @@ class Integrator:
         self._run()
         if projection is not None:
             self._project_rows()
-
-    # ---- the memory of a thread: vectors, one element for each lane ----
-
-    def _lay_out(self) -> None:
-        series, self.offsets, total = self.series, {}, 0
-        sizes = {
-            "y": self.states * (MAX_ORDER + 1),  # the series of the state, component by component
-            "low": self.states,  # what rounding took from the state
-            "scale": self.states,
-            "increment": self.states,
-            "rows": series.rows * MAX_ORDER,
-            "sums": len(series.products),
-            "values": series.values,
-            "params": self.numbers,
-            **dict.fromkeys(("guard", "side", "noise", "root", "change"), len(self.directions)),
-            "samples": _SAMPLES * len(self.directions),
-            **dict.fromkeys(_OF_A_LANE, 1),
-        }
-        for name, size in sizes.items():
-            self.offsets[name], total = total, total + size
-        self.memory = total * self.width
-
-    def place(self, code: Code, memory: Value, name: str, index=0, lane=None) -> Value:
-        """The address of a vector, or of one lane of it."""
-        offset = (index + self.offsets[name]) * self.width
-        return code.element(memory, offset if lane is None else lane + offset)
-
-    def state(self, code: Code, memory: Value, i: int, order=0, lane=None) -> Value:
-        """The address of the coefficient of a component of the state."""
-        return self.place(code, memory, "y", order + i * (MAX_ORDER + 1), lane)
-
-    # ---- the coefficients ----
-
-    def _sums(self) -> Code:
-        """`(memory, k)`: Σ' aⱼ bₖ₋ⱼ for every product, 0 < j < k."""
-        code = Code(self.module, "sums", [POINTER, INTEGER], self.width)
-        memory, k = code.arguments
-        mixed = [pair for pair in self.series.products if pair[0] != pair[1]]
-        squares = [(a,) for a, b in self.series.products if a == b]
-        tables = [self._table(name, pairs) for name, pairs in (("mixed", mixed), ("squares", squares))]
-        end = code.function.append_basic_block("end")
-        switch = code.builder.switch(k.it, end)
-        for order in range(2, MAX_ORDER):
-            block = code.function.append_basic_block(f"order{order}")
-            switch.add_case(ir.Constant(INTEGER, order), block)
-            code.builder.position_at_end(block)
-            for table, pairs, first, total in zip(
-                tables, (mixed, squares), (0, len(mixed)), (_mixed_sum, _square_sum), strict=True
-            ):
-                if pairs:
-                    with code.loop(len(pairs)) as i:
-                        rows = [self._row(code, memory, table, i * len(pairs[0]) + k) for k in range(len(pairs[0]))]
-                        at = self._reader(code)
-                        code.store(total(order, at, *rows), self.place(code, memory, "sums", i + first))
-            code.builder.branch(end)
-        code.builder.position_at_end(end)
-        return code.finish()
-
-    def _table(self, name: str, pairs) -> ir.GlobalVariable:
-        flat = [row * MAX_ORDER * self.width for pair in pairs for row in pair]
-        kind = ir.ArrayType(INTEGER, max(1, len(flat)))
-        table = ir.GlobalVariable(self.module, kind, name)
-        table.global_constant, table.linkage = True, "internal"
-        table.initializer = ir.Constant(kind, [ir.Constant(INTEGER, x) for x in flat or [0]])
-        return table
-
-    def _row(self, code, memory, table, index) -> Value:
-        offset = code.load(code.element(Value(code, table), index, INTEGER), INTEGER)
-        return code.element(self.place(code, memory, "rows"), offset)
-
-    def _reader(self, code):
-        return lambda row, j: code.load(code.element(row, j * self.width), self.vector)
-
-    def _coefficients(self) -> Code:
-        """`(memory, order)`: the series of the state, to that order, from its values."""
-        code = Code(self.module, "coefficients", [POINTER, INTEGER], self.width)
-        memory, order = code.arguments
-        series, n = self.series, self.n
-        *acceleration, singular = (out := emit(code, series.start, self._now(code, memory), self.sincos))[: n + 1]
-        code.store(code.as_double(singular), self.place(code, memory, "singular"))
-        for i in range(n):
-            code.store(code.load(self.state(code, memory, n + i), self.vector), self.state(code, memory, i, 1))
-            code.store(acceleration[i], self.state(code, memory, n + i, 1))
-        for i, value in enumerate(out[n + 1 :]):
-            code.store(value, self.place(code, memory, "values", i))
-        for i in range(len(series.products)):
-            code.store(code.lanes_of(0.0), self.place(code, memory, "sums", i))
-
-        with code.loop(order, start=1) as k:
-            with code.only_if(k > 1):
-                code.call(self.sums, memory, k)
-            inverse = 1.0 / code.as_double(k + 1)
-            out = emit(code, series.sweep, self._at_order(code, memory, k), None)
-            for row, value in enumerate(out[n:]):
-                code.store(value, self.place(code, memory, "rows", k + row * MAX_ORDER))
-            for i in range(n):
-                velocity = code.load(self.state(code, memory, n + i, k), self.vector)
-                code.store(velocity * inverse, self.state(code, memory, i, k + 1))
-                code.store(out[i] * inverse, self.state(code, memory, n + i, k + 1))
-        return code.finish()
-
-    def _now(self, code, memory):
-        """The inputs of the program: q, q̇, t, parameters."""
-
-        def read(i):
-            if i < self.states:
-                return code.load(self.state(code, memory, i), self.vector)
-            name, i = ("t", 0) if i == self.states else ("params", i - self.states - 1)
-            return code.load(self.place(code, memory, name, i), self.vector)
-
-        return read
-
-    def _at_order(self, code, memory, k):
-        """The inputs of the sweep."""
-        time, order, inverse, given = range(self.states, self.states + 4)
-
-        def read(i):
-            if i < time:
-                return code.load(self.state(code, memory, i, k), self.vector)
-            if i == time:
-                return code.lanes_of(code.select(code.compare("==", k, 1), code.as_double(k), 0.0))
-            if i in (order, inverse):
-                number = code.as_double(k)
-                return code.lanes_of(number if i == order else 1.0 / number)
-            i -= given
-            if i < self.series.values:
-                return code.load(self.place(code, memory, "values", i), self.vector)
-            return code.load(self.place(code, memory, "sums", i - self.series.values), self.vector)
-
-        return read
 
     # ---- along the step ----
 
@@ -249,12 +114,12 @@ class Integrator:
         memory, order, place = code.arguments
         h, n = self._vector(code, memory, "h"), self.n
         s = code.lanes_of(place) * h
-        increments, slopes = self._increments(code, memory, order, s)
+        increments, slopes = self.increments(code, memory, order, s)
         moved = []
         for i, increment in enumerate(increments):
             code.store(increment, self.place(code, memory, "increment", i))
             moved.append(code.load(self.state(code, memory, i), self.vector) + increment)
-        now = self._now(code, memory)
+        now = self.now(code, memory)
 
         def then(i):
             return moved[i] if i < self.states else now(i) + s if i == self.states else now(i)
@@ -272,30 +137,6 @@ class Integrator:
         self._keep(code, memory, "worst", worst)
         return code.finish()
 
-    def _increments(self, code, memory, order, s) -> tuple[list[Value], list[Value]]:
-        """P(s) − y for every component, and P′(s) for the velocities, by Horner's scheme.
-
-        A few components at a time, so that none waits for the other.
-        """
-        increments, slopes = [], []
-        for first in range(0, self.states, 4):
-            some = range(first, min(first + 4, self.states))
-            fast = [i for i in some if i >= self.n]
-            highest = {i: code.load(self.state(code, memory, i, order), self.vector) for i in some}
-            value = {i: code.variable(highest[i]) for i in some}
-            slope = {i: code.variable(code.as_double(order) * highest[i]) for i in fast}
-            with code.loop(order, start=1) as j:
-                k = order - j
-                weight = code.lanes_of(code.as_double(k))
-                for i in some:
-                    c = code.load(self.state(code, memory, i, k), self.vector)
-                    code.store(code.load(value[i], self.vector) * s + c, value[i])
-                    if i in slope:
-                        code.store(code.load(slope[i], self.vector) * s + c * weight, slope[i])
-            increments += [code.load(value[i], self.vector) * s for i in some]
-            slopes += [code.load(slope[i], self.vector) for i in fast]
-        return increments, slopes
-
     # ---- the rounds ----
 
     def _start_next(self) -> Code:
@@ -308,7 +149,7 @@ class Integrator:
         code.store(code.select(there, member, -1), self._lane(code, lane_data, "member", lane))
         for name in ("h", "t_low", "steps", "rejected"):
             self._set(code, memory, name, lane, 0.0)
-        self._set(code, memory, "active", lane, code.select(there, _double(code, 1.0), 0.0))
+        self._set(code, memory, "active", lane, code.select(there, double(code, 1.0), 0.0))
         self._set(code, memory, "code", lane, float(_RUNNING))
         self._set(code, memory, "due", lane, float("inf"))
         self._set(code, memory, "event", lane, -1.0)
@@ -316,16 +157,16 @@ class Integrator:
             begin, end = (self._time(code, job, member, i) for i in (0, self._job(code, job, "times") - 1))
             self._set(code, memory, "t", lane, begin)
             self._set(code, memory, "t_end", lane, end)
-            self._set(code, memory, "forward", lane, code.select(end > begin, _double(code, 1.0), -1.0))
+            self._set(code, memory, "forward", lane, code.select(end > begin, double(code, 1.0), -1.0))
             largest = code.maximum(code.intrinsic("fabs", begin), code.intrinsic("fabs", end))
             self._set(code, memory, "smallest", lane, SMALLEST_STEP * largest)
             self._set(code, memory, "longest", lane, code.intrinsic("fabs", end - begin) * FIRST_STEP)
-            self._await_output(code, memory, lane_data, job, lane, _integer(code, 1))
+            self._await_output(code, memory, lane_data, job, lane, integer(code, 1))
             for i in range(self.states):
                 x = self._read(code, job, "y0", member * self.states + i)
                 code.store(x, self.state(code, memory, i, 0, lane))
                 code.store(x, self._output(code, job, member, 0, i))
-                code.store(_double(code, 0.0), self.place(code, memory, "low", i, lane))
+                code.store(double(code, 0.0), self.place(code, memory, "low", i, lane))
             with code.loop(self.numbers) as i:
                 x = self._read(code, job, "params", member * self._job(code, job, "params_stride") + i)
                 code.store(x, self.place(code, memory, "params", i, lane))
@@ -352,6 +193,8 @@ class Integrator:
             self._halve_until_sound(code, memory, job, order)
             if self.guards is not None:
                 self._stop_at_events(code, memory, order)
+            with code.only_if(self._job(code, job, "recording") > 0), code.loop(self.width) as lane:
+                self._record(code, memory, lane_data, job, lane)
             self._move_time(code, memory, lane_data, job, order)
             self._advance(code, memory)
             if self.project is not None:
@@ -376,11 +219,11 @@ class Integrator:
         sound = (last < float("inf")) & (before < float("inf")) & ~singular
         small = ~is_last & (step < self._vector(code, memory, "smallest"))
         going = active & sound & ~small
-        ending = code.select(small, _lanes(code, STEP_TOO_SMALL), float(_RUNNING))
-        ending = code.select(sound, ending, code.select(singular, _lanes(code, SINGULAR), float(NOT_FINITE)))
+        ending = code.select(small, code.lanes_of(STEP_TOO_SMALL), float(_RUNNING))
+        ending = code.select(sound, ending, code.select(singular, code.lanes_of(SINGULAR), float(NOT_FINITE)))
         self._keep(code, memory, "code", ending)
         self._keep(code, memory, "h", code.select(going, step * forward, 0.0))
-        self._keep(code, memory, "last", code.select(going & is_last, _lanes(code, 1), 0.0))
+        self._keep(code, memory, "last", code.select(going & is_last, code.lanes_of(1), 0.0))
 
     def _errors(self, code, memory, job, order) -> tuple[Value, Value]:
         """The scaled norms of the last two coefficients; `scale` keeps 1 / (atol + rtol·size)."""
@@ -390,9 +233,7 @@ class Integrator:
 
         def largest(i):
             # A component that passes through zero is as large as it will be a step away.
-            y, rate = (
-                code.intrinsic("fabs", code.load(self.state(code, memory, i, k), self.vector)) for k in range(2)
-            )
+            y, rate = (code.intrinsic("fabs", code.load(self.state(code, memory, i, k), self.vector)) for k in range(2))
             return code.maximum(y, rate * before)
 
         n = self.n
@@ -418,27 +259,43 @@ class Integrator:
 
     def _halve_until_sound(self, code, memory, job, order) -> None:
         """Check the steps of all lanes, and halve those that fail, until none does."""
-        again = code.variable(_integer(code, 1))
+        again = code.variable(integer(code, 1))
         with code.repeat_while(lambda: code.load(again, INTEGER) > 0):
-            code.store(_integer(code, 0), again)
+            code.store(integer(code, 0), again)
             self._keep(code, memory, "worst", code.lanes_of(0.0))
             for place in CHECKS:
-                code.call(self.defect, memory, order, _double(code, place))
+                code.call(self.defect, memory, order, double(code, place))
             h = self._vector(code, memory, "h")
             bad = ~(self._vector(code, memory, "worst") <= 1.0) & code.compare("!=", h, 0.0)
             with code.only_if(code.any_lane(bad)):
-                code.store(_integer(code, 1), again)
+                code.store(integer(code, 1), again)
                 half = 0.5 * h
                 small = bad & (code.intrinsic("fabs", half) < self._vector(code, memory, "smallest"))
                 rejected = self._vector(code, memory, "rejected")
                 ending = self._vector(code, memory, "code")
                 self._keep(code, memory, "h", code.select(small, 0.0, code.select(bad, half, h)))
-                self._keep(code, memory, "code", code.select(small, _lanes(code, STEP_TOO_SMALL), ending))
-                self._keep(code, memory, "rejected", rejected + code.select(bad, _lanes(code, 1), 0.0))
+                self._keep(code, memory, "code", code.select(small, code.lanes_of(STEP_TOO_SMALL), ending))
+                self._keep(code, memory, "rejected", rejected + code.select(bad, code.lanes_of(1), 0.0))
                 last = self._vector(code, memory, "last")
                 self._keep(code, memory, "last", code.select(bad, 0.0, last))
                 growth = self._vector(code, memory, "growth")
                 self._keep(code, memory, "growth", code.select(bad, GROWTH_AFTER_REJECTION, growth))
+
+    def _record(self, code, memory, lane_data, job, lane) -> None:
+        """Time, size and first state of the step, where a member has room for it."""
+        member = code.load(self._lane(code, lane_data, "member", lane), INTEGER)
+        with code.only_if((member >= 0) & code.compare("!=", self._get(code, memory, "h", lane), 0.0)):
+            steps = code.as_integer(self._get(code, memory, "steps", lane))
+            first, after = (
+                code.load(code.element(self._job(code, job, "first_step"), member + k, INTEGER), INTEGER)
+                for k in range(2)
+            )
+            with code.only_if(first + steps < after):
+                places = [self.place(code, memory, name, 0, lane) for name in ("t", "h")]
+                places += [self.state(code, memory, i, 0, lane) for i in range(self.states)]
+                for k, place in enumerate(places):
+                    row = (first + steps) * len(places) + k
+                    code.store(code.load(place, DOUBLE), code.element(self._job(code, job, "record"), row))
 
     def _move_time(self, code, memory, lane_data, job, order) -> None:
         """The time at the end of the step, and the states at the output times before it."""
@@ -495,7 +352,7 @@ class Integrator:
             code.store(code.select(moving, total, y), self.state(code, memory, i))
             self._keep(code, memory, "low", code.select(moving, rest, low), i)
         steps = self._vector(code, memory, "steps")
-        self._keep(code, memory, "steps", steps + code.select(moving, _lanes(code, 1), 0.0))
+        self._keep(code, memory, "steps", steps + code.select(moving, code.lanes_of(1), 0.0))
 
     def _end_or_go_on(self, code, memory, lane_data, job, idle) -> None:
         """Write down the members that have ended, and take the next ones."""
@@ -503,8 +360,8 @@ class Integrator:
         limit = code.as_double(self._job(code, job, "max_steps"))
         running = ending < 0.0
         is_last = self._vector(code, memory, "last") > 0.0
-        ending = code.select(running & (steps + rejected >= limit), _lanes(code, OUT_OF_STEPS), ending)
-        ending = code.select(is_last, _lanes(code, DONE), ending)
+        ending = code.select(running & (steps + rejected >= limit), code.lanes_of(OUT_OF_STEPS), ending)
+        ending = code.select(is_last, code.lanes_of(DONE), ending)
         event = self._vector(code, memory, "event")
         ending = code.select(event >= 0.0, event + float(EVENT), ending)
         self._keep(code, memory, "code", ending)
@@ -535,9 +392,9 @@ class Integrator:
         """`(memory, order, s)`: the guards at that time after the present one, lane by lane, into `guard`."""
         code = Code(self.module, "guard", [POINTER, INTEGER, self.vector], self.width)
         memory, order, s = code.arguments
-        increments, _ = self._increments(code, memory, order, s)
+        increments, _ = self.increments(code, memory, order, s)
         moved = [code.load(self.state(code, memory, i), self.vector) + dy for i, dy in enumerate(increments)]
-        now = self._now(code, memory)
+        now = self.now(code, memory)
 
         def then(i):
             return moved[i] if i < self.states else now(i) + s if i == self.states else now(i)
@@ -563,7 +420,7 @@ class Integrator:
             code.call(self.guard, memory, order, LITTLE * self._vector(code, memory, "h"))
             instant = 16.0 * self._vector(code, memory, "smallest")
             line = StraightLine(program.nodes, program.kinds, program.outputs)
-            out = emit(code, line, self._now(code, memory), self.sincos)
+            out = emit(code, line, self.now(code, memory), self.sincos)
             for i in range(count):
                 value, rate, size, rate_size = out[i::count]
                 moved = code.intrinsic("fabs", rate)
@@ -595,7 +452,7 @@ class Integrator:
         self._keep(code, memory, "last", code.select(stops, 0.0, self._vector(code, memory, "last")))
         self._keep(code, memory, "h", nearest)
         with code.only_if(code.any_lane(code.compare("!=", nearest, self._vector(code, memory, "planned")))):
-            code.call(self.defect, memory, order, _double(code, 1.0))  # leaves the increment of the new step
+            code.call(self.defect, memory, order, double(code, 1.0))  # leaves the increment of the new step
 
     def _sample(self, code, memory, order) -> None:
         """The guards at equal distances along the step and one beyond either end, into `samples`.
@@ -604,7 +461,7 @@ class Integrator:
         halved.
         """
         self._keep(code, memory, "planned", self._vector(code, memory, "h"))
-        again = code.variable(_integer(code, 1))
+        again = code.variable(integer(code, 1))
         with code.repeat_while(lambda: code.load(again, INTEGER) > 0):
             h = self._vector(code, memory, "h")
 
@@ -616,12 +473,12 @@ class Integrator:
             with code.loop(INTERVALS + 3) as k:
                 keep(k, code.as_double(k) - 1.0)
             for k, place in enumerate(BETWEEN):
-                keep(_integer(code, INTERVALS + 3 + k), _double(code, place))
+                keep(integer(code, INTERVALS + 3 + k), double(code, place))
             shortest = JUMP * self._vector(code, memory, "smallest")
             unseen = (code.intrinsic("fabs", h) > shortest) & self._unseen(code, memory)
-            code.store(_integer(code, 0), again)
+            code.store(integer(code, 0), again)
             with code.only_if(code.any_lane(unseen)):
-                code.store(_integer(code, 1), again)
+                code.store(integer(code, 1), again)
                 self._keep(code, memory, "h", code.select(unseen, 0.5 * h, h))
                 self._keep(code, memory, "last", code.select(unseen, 0.0, self._vector(code, memory, "last")))
                 growth = self._vector(code, memory, "growth")
@@ -667,7 +524,7 @@ class Integrator:
             new = where & allowed & (code.load(change, self.vector) <= 0.0) & moving
             code.store(code.select(new, start, code.load(low, self.vector)), low)
             code.store(code.select(new, end, code.load(high, self.vector)), high)
-            kind = code.select(falls, _lanes(code, 1), 2.0)
+            kind = code.select(falls, code.lanes_of(1), 2.0)
             code.store(code.select(new, kind, code.load(change, self.vector)), change)
 
         with code.loop(INTERVALS + 1) as k:
@@ -739,7 +596,7 @@ class Integrator:
         code = Code(self.module, "project", [POINTER], self.width)
         (memory,) = code.arguments
         line = StraightLine(self.projection.nodes, self.projection.kinds, self.projection.outputs)
-        for i, y in enumerate(emit(code, line, self._now(code, memory), self.sincos)):
+        for i, y in enumerate(emit(code, line, self.now(code, memory), self.sincos)):
             code.store(y, self.state(code, memory, i))
         return code.finish()
 
@@ -776,38 +633,6 @@ class Integrator:
             code.store(take(), first)
         code.finish()
 
-    # ---- access to the memory, the job and the lanes ----
-
-    def _vector(self, code, memory, name: str, index=0) -> Value:
-        return code.load(self.place(code, memory, name, index), self.vector)
-
-    def _keep(self, code, memory, name: str, value: Value, index=0) -> None:
-        code.store(value, self.place(code, memory, name, index))
-
-    def _get(self, code, memory, name: str, lane) -> Value:
-        return code.load(self.place(code, memory, name, 0, lane), DOUBLE)
-
-    def _set(self, code, memory, name: str, lane, value) -> None:
-        code.store(code.as_value(value, DOUBLE), self.place(code, memory, name, 0, lane))
-
-    def _job(self, code, job, name: str) -> Value:
-        position = [field for field, _ in Job._fields_].index(name)
-        kind = _KINDS[dict(Job._fields_)[name]]
-        return code.load(code.element(job, position, INTEGER), kind)
-
-    def _read(self, code, job, name: str, index) -> Value:
-        return code.load(code.element(self._job(code, job, name), index), DOUBLE)
-
-    def _time(self, code, job, member, index) -> Value:
-        return self._read(code, job, "ts", member * self._job(code, job, "ts_stride") + index)
-
-    def _output(self, code, job, member, time_index, i: int) -> Value:
-        row = member * self._job(code, job, "times") + time_index
-        return code.element(self._job(code, job, "path"), row * self.states + i)
-
-    def _lane(self, code, lane_data, name: str, lane) -> Value:
-        return code.element(lane_data, lane + LANE.index(name) * self.width, INTEGER)
-
 
 def _power(code, x: Value, exponent: Value) -> Value:
     """x**exponent to one per cent, for 0 < −exponent < 1/4, which is all that the size of a step needs.
@@ -823,35 +648,3 @@ def _power(code, x: Value, exponent: Value) -> Value:
     whole = code.intrinsic("floor", target)
     part = target - whole
     return code.from_bits((whole + part * (0.66 + 0.34 * part) + 1023.0) * unit)
-
-
-def _integer(code, x: int) -> Value:
-    return code.as_value(x, INTEGER)
-
-
-def _double(code, x: float) -> Value:
-    return code.as_value(x, DOUBLE)
-
-
-def _lanes(code, x: float) -> Value:
-    return code.lanes_of(float(x))
-
-
-def _mixed_sum(order: int, at, a, b) -> Value:
-    """Σ aⱼ bₖ₋ⱼ, in two strands that do not wait for each other."""
-    strands = [at(a, j) * at(b, order - j) for j in range(1, min(3, order))]
-    for j in range(3, order):
-        strands[j % 2 == 0] = at(a, j) * at(b, order - j) + strands[j % 2 == 0]
-    return strands[0] if len(strands) == 1 else strands[0] + strands[1]
-
-
-def _square_sum(order: int, at, a) -> Value:
-    """Σ aⱼ aₖ₋ⱼ: every product but the middle one comes twice."""
-    half = None
-    for j in range(1, (order + 1) // 2):
-        term = at(a, j) * at(a, order - j)
-        half = term if half is None else half + term
-    if order % 2:
-        return half + half
-    middle = at(a, order // 2) * at(a, order // 2)
-    return middle if half is None else half + half + middle

@@ -204,6 +204,10 @@ class Code:
             return Value(self, convert(i.it, self.vector))
         return Value(self, self.builder.sitofp(i.it, DOUBLE))
 
+    def as_integer(self, x: Value) -> Value:
+        """A double that is a whole number, as an integer."""
+        return Value(self, self.builder.fptosi(x.it, INTEGER))
+
     def bits(self, x: Value) -> Value:
         """The bits of doubles as integers."""
         return Value(self, self.builder.bitcast(x.it, ir.VectorType(INTEGER, self.lanes)))

@@ -40,7 +40,19 @@ from lagjax._program._passes import finish
 from lagjax._program._rules import Expansion, kind_of
 from lagjax._program._series import Series, StraightLine, series
 
-__all__ = ["Program", "Series", "StraightLine", "Unlowerable", "emit", "lower", "plain_elementary", "series"]
+__all__ = [
+    "Program",
+    "Series",
+    "StraightLine",
+    "Unlowerable",
+    "emit",
+    "lower",
+    "plain_elementary",
+    "pullback",
+    "series",
+]
+
+_TRANSPOSED = 100  # operations that one may become when it is differentiated
 
 
 def lower(function: Callable, *examples, budget: int = 20_000) -> "Program":
@@ -70,12 +82,31 @@ def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], 
     return Program(nodes, kinds, outputs, expansion.traced_operations, function, shapes, budget)
 
 
+def pullback(line: StraightLine, dtypes, by, of) -> StraightLine:
+    """The transposed derivative: from the inputs and the cotangents of the outputs `of` to those of the inputs `by`."""
+
+    def pulled(*scalars):
+        inputs, bars = scalars[: len(dtypes)], scalars[len(dtypes) :]
+
+        def moving(*some):
+            given = dict(zip(by, some, strict=True))
+            results = emit(*line, tuple(given.get(i, x) for i, x in enumerate(inputs)))
+            return tuple(results[i] for i in of)
+
+        return jax.vjp(moving, *(inputs[i] for i in by))[1](bars)
+
+    shapes = [jax.ShapeDtypeStruct((), dtype) for dtype in (*dtypes, *[jnp.result_type(float)] * len(of))]
+    program = lower(pulled, *shapes, budget=_TRANSPOSED * len(line.nodes) + 1000)
+    return StraightLine(program.nodes, program.kinds, program.outputs)
+
+
 @dataclass(frozen=True, eq=False)
 class Program:
     """A straight line of scalar operations; made by `lower`, compared and hashed by identity.
 
     `nodes` holds the operations in order, as triples `(op, operands, attribute)`, and `outputs` the positions in it
-    of the results. `traced_operations` counts the scalar operations of the function as written.
+    of the results. `traced_operations` counts the scalar operations of the function as written. A program that does not
+    hold for all inputs says so in its last output, and `otherwise()` is the one for those.
     """
 
     nodes: tuple[Node, ...]
@@ -85,6 +116,12 @@ class Program:
     function: Callable
     shapes: tuple[jax.ShapeDtypeStruct, ...]
     budget: int
+    otherwise: "Callable[[], Program] | None" = None
+
+    @property
+    def complete(self) -> "Program":
+        """The program that holds for all inputs."""
+        return self if self.otherwise is None else self.otherwise()
 
     def __call__(self, *scalars) -> tuple:
         """The outputs, one per scalar; see the module's text for lanes and precision."""
