@@ -28,9 +28,9 @@ from lagjax._trajectory import State
 
 PyTree = Any
 
-# Entries of ∂q̈/∂(q, q̇, parameters) beyond which sensitivities cost more than going back over recorded steps. Whether
-# a run that is being traced will be differentiated cannot be known.
-LARGEST_JACOBIAN = 150
+# Operations of an acceleration beyond which LLVM takes too long over its transpose: derivatives are then diffrax's.
+# Whether a run that is being traced will be differentiated cannot be known.
+LARGEST_DIFFERENTIATED = 2000
 
 
 def flow_for(system: System, settings: Settings, layout: Layout, *values: PyTree) -> "Flow | str":
@@ -42,9 +42,9 @@ def flow_for(system: System, settings: Settings, layout: Layout, *values: PyTree
     return scene_flow(system, layout, values[-1])
 
 
-def has_sensitivities(flow: Flow, *values: PyTree) -> bool:
-    """Whether derivatives of this run, should they be asked for, come from sensitivities."""
-    few = flow.size * (flow.program.size - 1) <= LARGEST_JACOBIAN
+def has_derivatives(flow: Flow, *values: PyTree) -> bool:
+    """Whether derivatives of this run, should they be asked for, come from machine code as well."""
+    few = flow.program.operations <= LARGEST_DIFFERENTIATED
     return few or all(is_concrete(leaf) for leaf in jax.tree.leaves(values))
 
 

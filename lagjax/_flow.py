@@ -31,7 +31,8 @@ from lagjax._program import Program, Unlowerable, lower
 
 LARGEST_PROGRAM = 6_000  # operations of an acceleration, beyond which LLVM takes too long
 _BUDGET = 100_000  # operations of a program with sensitivities
-MORE_STEPS = 4  # than a motion, for its sensitivities
+# Entries of ∂q̈/∂(q, q̇, parameters) up to which all sensitivities are followed at once.
+LARGEST_JACOBIAN = 150
 # How a motion ends that its program cannot follow.
 GIVEN_UP = (_native.SINGULAR, _native.NOT_FINITE, _native.STEP_TOO_SMALL)
 
@@ -53,6 +54,11 @@ class Tolerances(NamedTuple):
     rtol: float
     atol: float
     max_steps: int
+
+    @property
+    def patient(self) -> "Tolerances":
+        """For a motion with its sensitivities, which takes more steps."""
+        return self._replace(max_steps=4 * self.max_steps)
 
 
 def unfit(program: Program, size: int, dtype) -> str | None:
@@ -191,6 +197,11 @@ class Flow:
 
         return run
 
+    @functools.cached_property
+    def directed(self) -> "Flow":
+        """The flow of this one's derivative along a direction that is among its numbers."""
+        return _Directed(self)
+
     def _varied(self, by_state: bool, params: tuple[int, ...]) -> "Flow":
         return _Varied(self, by_state, params)
 
@@ -215,6 +226,22 @@ class _Varied(Flow):
             return flow.varied(by_state, params) if (flow := base.careful()) else None
 
         super().__init__(None, self.rows * n, None, None, groups, careful)
+
+    # A state is (2, rows, n), end to end; the first row is the motion, and row by row states are (rows, 2, n).
+
+    def start(self, y0):
+        """The state at the beginning, from that of the motion, shape (..., 2n)."""
+        n, states = self.base.size, self.base.states
+        unit = np.eye(self.rows, states, -1)[1:] * (self.free > 0)
+        library = np if isinstance(y0, np.ndarray) else jnp
+        y = library.concatenate([y0[..., None, :], library.broadcast_to(unit, (*y0.shape[:-1], *unit.shape))], axis=-2)
+        return y.reshape(*y0.shape[:-1], self.rows, 2, n).swapaxes(-3, -2).reshape(*y0.shape[:-1], self.states)
+
+    def sensitivities(self, y):
+        """∂y/∂x for every x, in front of all other axes, from states of shape (..., 2 · rows · n)."""
+        n, library = self.base.size, np if isinstance(y, np.ndarray) else jnp
+        by_rows = library.moveaxis(y.reshape(*y.shape[:-1], 2, self.rows, n), -2, 0)
+        return by_rows.reshape(self.rows, *y.shape[:-1], 2 * n)[1:]
 
     @functools.cached_property
     def _programs(self):
@@ -242,6 +269,39 @@ class _Varied(Flow):
             return both[:, :n], both[:, n:]
 
         shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((rows, n), (rows, n), (), (numbers,))]
+        projection = None if base.projection is None else lower(projected, *shapes, budget=_BUDGET)
+        return lower(moving, *shapes, budget=_BUDGET), projection
+
+
+class _Directed(Flow):
+    """The flow of q and of its derivative δq along one direction (δy0, δparams): 2n coordinates, twice the numbers."""
+
+    def __init__(self, base: Flow):
+        self.base = base
+
+        def careful():
+            return flow.directed if (flow := base.careful()) else None
+
+        super().__init__(None, 2 * base.size, None, None, base.groups + (base.size,) * base.size, careful)
+
+    @functools.cached_property
+    def _programs(self):
+        base, n = self.base, self.base.size
+        numbers = base.program.size - base.states - 1
+
+        def derivative(function, q, v, t, p):
+            values, moving = jax.jvp(lambda q, v, p: function(q, v, t, p), (q[0], v[0], p[0]), (q[1], v[1], p[1]))
+            return jnp.stack([values, moving])
+
+        def moving(q, v, t, p):
+            accelerations = derivative(lambda q, v, t, p: jnp.stack(base.program(*q, *v, t, *p)[:n]), q, v, t, p)
+            return accelerations, base.program(*q[0], *v[0], t, *p[0])[n]
+
+        def projected(q, v, t, p):
+            both = derivative(lambda q, v, t, p: jnp.stack(base.projection(*q, *v, t, *p)), q, v, t, p)
+            return both[:, :n], both[:, n:]
+
+        shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((2, n), (2, n), (), (2, numbers))]
         projection = None if base.projection is None else lower(projected, *shapes, budget=_BUDGET)
         return lower(moving, *shapes, budget=_BUDGET), projection
 
@@ -291,15 +351,18 @@ class _Response(NamedTuple):
         """(δpath, δy_end) from the numbers that vary, end to end."""
         count = len(moving)
 
-        def with_response(sign):
-            return lambda x: jnp.concatenate([x[:count], x[count:] + sign * self.push(x[:count])])
+        def without_response(x):  # only its derivatives are ever computed
+            return jnp.concatenate([x[:count], x[count:] - self._by_sensitivities(x[:count])])
+
+        def solved(_, b):
+            return jnp.concatenate([b[:count], b[count:] + self.push(b[:count])])
 
         def transposed(_, b):
             return jnp.concatenate([b[:count] + self.pull(b[count:]), b[count:]])
 
         shape = self.outcome.path.shape
         b = jnp.pad(moving, (0, shape[0] * shape[1] + shape[1]))
-        x = jax.lax.custom_linear_solve(with_response(-1.0), b, lambda _, b: with_response(1.0)(b), transposed)
+        x = jax.lax.custom_linear_solve(without_response, b, solved, transposed)
         return self._apart(x[count:])
 
     def _apart(self, flat):
@@ -313,23 +376,37 @@ class _Response(NamedTuple):
         return jnp.isfinite(self.outcome.path)
 
     def push(self, moving):
-        """By sensitivities."""
+        """Along one direction, or by all sensitivities where those are few; only the latter can be transposed."""
+        return self._by_sensitivities(moving) if self._few else self._along(moving)
+
+    @property
+    def _few(self) -> bool:
+        return self.flow.size * (self.flow.program.size - 1) <= LARGEST_JACOBIAN
+
+    def _along(self, moving):
+        """(δpath, δy_end) of a direction of length one, times its length."""
         ts, y0, *params = self.primals
-        larger, n, states = self.flow.varied(self.by_state, self.active), self.flow.size, self.flow.states
-        rows = larger.rows
+        n, states = self.flow.size, self.flow.states
+        length = jnp.max(jnp.abs(moving))
+        direction = moving / jnp.where(length > 0, length, 1.0)
+        dy0 = direction[:states] if self.by_state else jnp.zeros(states)
+        dparams = jnp.zeros(len(params)).at[np.array(self.active, int)].set(direction[states * self.by_state :])
+        start = jnp.stack([y0.reshape(2, n), dy0.reshape(2, n)], axis=1).ravel()
+        found = self.flow.directed.traceable(self.tolerances.patient)(ts, start, *params, *dparams)
 
-        # (rows, states) to the coordinates of the larger system, (2, rows, n) end to end, and back.
-        start = jnp.asarray(np.eye(rows, states, -1) * self.by_state).at[0].set(y0)
-        steps = self.tolerances.max_steps * MORE_STEPS
-        run = larger.traceable(self.tolerances._replace(max_steps=steps))
-        found = run(ts, start.reshape(rows, 2, n).swapaxes(0, 1).ravel(), *params)
+        def moved(y):
+            return y.reshape(*y.shape[:-1], 2, 2, n)[..., 1, :].reshape(*y.shape[:-1], states)
 
-        def by_rows(y):
-            y = y.reshape(*y.shape[:-1], 2, rows, n)
-            return jnp.moveaxis(y, -2, 0).reshape(rows, *y.shape[:-3], states)[1:]
+        d_path = jnp.where(self.reached, moved(found.path), 0.0)
+        return length * jnp.concatenate([d_path.ravel(), moved(found.y_end)])
 
-        d_path = jnp.tensordot(moving, jnp.where(self.reached, by_rows(found.path), 0.0), 1)
-        return jnp.concatenate([d_path.ravel(), moving @ by_rows(found.y_end)])
+    def _by_sensitivities(self, moving):
+        ts, y0, *params = self.primals
+        larger = self.flow.varied(self.by_state, self.active)
+        found = larger.traceable(self.tolerances.patient)(ts, larger.start(y0), *params)
+
+        d_path = jnp.tensordot(moving, jnp.where(self.reached, larger.sensitivities(found.path), 0.0), 1)
+        return jnp.concatenate([d_path.ravel(), moving @ larger.sensitivities(found.y_end)])
 
     def pull(self, bars):
         """By the transpose of the steps."""
@@ -368,11 +445,16 @@ class _Response(NamedTuple):
         return callback(ts, y0, numbers, self.outcome.accepted, path_bar, end_bar)
 
 
-def _pull_batch(flow: Flow, tolerances: Tolerances, *arrays) -> list[np.ndarray]:
+def _pull_batch(flow: Flow, tolerances: Tolerances, ts, y0, params, steps, path_bar, y_bar) -> list[np.ndarray]:
     """`flow.pull` for arrays with any batch axes in front, of length one where they share."""
-    inner = [1, 1, 1, 0, 2, 1]
-    batch = np.broadcast_shapes(*(x.shape[: x.ndim - k] for x, k in zip(arrays, inner, strict=True)))
+    arrays, inner = (ts, y0, params, steps, path_bar, y_bar), (1, 1, 1, 0, 2, 1)
+    leading = [x.shape[: x.ndim - k] for x, k in zip(arrays, inner, strict=True)]
+    batch, motions = np.broadcast_shapes(*leading), np.broadcast_shapes(*leading[:4])
     members = math.prod(batch)
+    if members > math.prod(motions) * (flow.states + params.shape[-1]):  # a Jacobian, row by row
+        found = _by_all_sensitivities(flow, tolerances, motions, ts, y0, params, path_bar, y_bar)
+        if found is not None:
+            return found
 
     def rows(x, k, shared):
         own = x.shape[x.ndim - k :]
@@ -383,6 +465,22 @@ def _pull_batch(flow: Flow, tolerances: Tolerances, *arrays) -> list[np.ndarray]
     given = [rows(x, k, i in (0, 2)) for i, (x, k) in enumerate(zip(arrays, inner, strict=True))]
     found = flow.pull(*given, tolerances)
     return [x.reshape(*batch, x.shape[-1]) for x in (found.y0, found.params)]
+
+
+def _by_all_sensitivities(flow: Flow, tolerances, motions, ts, y0, params, path_bar, y_bar):
+    """The same for many cotangents of few motions; None where sensitivities are too many, or not to be had."""
+    states, numbers = flow.states, params.shape[-1]
+    if flow.size * (flow.program.size - 1) > LARGEST_JACOBIAN:
+        return None
+    larger = flow.varied(True, tuple(range(numbers)))
+    start = np.broadcast_to(larger.start(y0), (*motions, larger.states))
+    columns = [params[..., i] for i in range(numbers)]
+    found = _over_batch(lambda *rows: larger.run(*rows, tolerances.patient)[0], ts, start, *columns)
+    path_by, end_by = larger.sensitivities(found[0]), larger.sensitivities(found[1])
+    if not (np.isfinite(path_by).all() and np.isfinite(end_by).all()):
+        return None
+    bars = np.einsum("r...ts,...ts->...r", path_by, path_bar) + np.einsum("r...s,...s->...r", end_by, y_bar)
+    return [bars[..., :states], bars[..., states:]]
 
 
 # ---- arrays with any batch axes --------------------------------------------------------------------------------------

@@ -48,7 +48,6 @@ class Adjoint(SeriesCode):
             "y_bar": states * (MAX_ORDER + 1),
             "rows_bar": series.rows,
             "values_bar": values,
-            "sums_bar": products * MAX_ORDER,
             "params_bar": program.size - states - 1,
             "active": 1,
         }
@@ -233,7 +232,7 @@ class Adjoint(SeriesCode):
     def _back_sum(self, code, memory, table, i, first: int, k, terms: int) -> None:
         """s = Σ' aⱼ bₖ₋ⱼ at orders k + 1, …: its cotangent times b is one of a, and times a one of b."""
         products = len(self.series.products)
-        bars = self.place(code, memory, "sums_bar", (k * products) + i + first)
+        bars = self.sum_place(code, memory, i + first, k)  # of higher orders, where the sums themselves were
         offsets = [code.load(code.element(Value(code, table), i * 2 + which, INTEGER), INTEGER) for which in range(2)]
         rows = [code.element(self.place(code, memory, "rows"), offset) for offset in offsets]
         totals: list = [None, None]
@@ -246,7 +245,10 @@ class Adjoint(SeriesCode):
             self._add(code, total, code.element(self.place(code, memory, "rows_bar"), offset / MAX_ORDER))
 
     def _back_sweep(self) -> Code:
-        """`(memory, k)`: from the cotangents of order k + 1, and of the rows, to those of order k and of the sums."""
+        """`(memory, k)`: from the cotangents of order k + 1, and of the rows, to those of order k and of the sums.
+
+        Those of the sums take the place of the sums, which nobody reads again: all of it fits into the first cache.
+        """
         code = Code(self.module, "back_sweep", [POINTER, INTEGER], self.width)
         memory, k = code.arguments
         n, inverse = self.n, 1.0 / code.as_double(k + 1)
@@ -269,7 +271,7 @@ class Adjoint(SeriesCode):
         for i, x in enumerate(values):
             self._add(code, x, self.place(code, memory, "values_bar", i))
         for i, x in enumerate(sums):
-            code.store(x, self.place(code, memory, "sums_bar", k * len(sums) + i))
+            code.store(x, self.sum_place(code, memory, i, k))
         return code.finish()
 
     def _back_start(self) -> Code:
