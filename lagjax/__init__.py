@@ -4,6 +4,7 @@ System(L)  →  simulate(system, q0, qdot0, ts, params)  →  Trajectory
 """
 
 from lagjax import plot, scenes
+from lagjax._check import Finding, Findings, check
 from lagjax._explain import Explanation
 from lagjax._hybrid import Transition, simulate_hybrid
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
@@ -18,6 +19,8 @@ __version__ = "0.1.0"
 __all__ = [
     "RESULTS",
     "Explanation",
+    "Finding",
+    "Findings",
     "FineOutput",
     "SimulationError",
     "State",
@@ -29,6 +32,7 @@ __all__ = [
     "Unrolled",
     "WorkPrecision",
     "WorkPrecisionRow",
+    "check",
     "plot",
     "scenes",
     "simulate",

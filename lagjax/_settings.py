@@ -21,7 +21,7 @@ PyTree = Any
 
 # Defaults by dtype. The absolute tolerance is far below the relative one, so that states in small units keep their
 # digits; it is there for components that pass through zero.
-_RTOL = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
+DEFAULT_RTOL = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 _ATOL_OVER_RTOL = 1e-3
 
 
@@ -52,6 +52,9 @@ class Settings(eqx.Module):
             raise ValueError(f"max_steps must be a positive integer, so that every run ends; got {max_steps!r}.")
         if isinstance(progress, bool):
             progress = diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter()
+        _require_instance(progress, "progress", diffrax.AbstractProgressMeter, "True or False")
+        if adjoint is not None:
+            _require_instance(adjoint, "adjoint", diffrax.AbstractAdjoint, "None")
         if dt is None:
             controller, dt0 = _adaptive(layout.dtype, ts, rtol, atol), None
         else:
@@ -67,6 +70,12 @@ class Settings(eqx.Module):
             progress=progress,
             by_default=by_default,
         )
+
+    @property
+    def tolerances(self) -> tuple[jax.Array, jax.Array] | None:
+        """rtol and atol of a step; None where it has a fixed size."""
+        controller = self.controller
+        return (controller.rtol, controller.atol) if isinstance(controller, diffrax.PIDController) else None
 
 
 def as_arrays(tree: PyTree, dtype) -> PyTree:
@@ -91,15 +100,22 @@ def is_concrete(value) -> bool:
     return not isinstance(value, jax.core.Tracer)
 
 
-def require_finite(tree: PyTree, name: str) -> None:
-    """Raise where a number is NaN or infinite, naming it; values that are being traced have none yet."""
+def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
+    """Every number that is NaN or infinite, with its name; values that are being traced have none yet."""
+    found = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if not eqx.is_array_like(leaf) or not is_concrete(leaf):
-            continue
-        bad = np.argwhere(~np.isfinite(np.asarray(leaf)))
-        if len(bad):
-            where = name + jax.tree_util.keystr(path) + (str(bad[0].tolist()) if np.ndim(leaf) else "")
-            raise ValueError(f"{where} is {np.asarray(leaf)[tuple(bad[0])]}: every number given must be finite.")
+        if eqx.is_array_like(leaf) and is_concrete(leaf):
+            label, values = name + jax.tree_util.keystr(path), np.asarray(leaf)
+            for index in np.argwhere(~np.isfinite(values)):
+                found.append((label + (str(index.tolist()) if values.ndim else ""), values[tuple(index)]))
+    return found
+
+
+def require_finite(tree: PyTree, name: str) -> None:
+    """Raise where a number is NaN or infinite, naming it."""
+    if bad := not_finite(tree, name):
+        where, value = bad[0]
+        raise ValueError(f"{where} is {value}: every number given must be finite.")
 
 
 def _output_times(ts, dtype) -> jax.Array:
@@ -107,8 +123,8 @@ def _output_times(ts, dtype) -> jax.Array:
         kind = jnp.result_type(ts if isinstance(ts, jax.Array) else np.asarray(ts))
     except (TypeError, ValueError):
         raise TypeError(f"ts must be an array of output times; got {type(ts).__name__}.") from None
-    if jnp.ndim(ts) != 1 or np.size(ts) < 2:
-        raise ValueError(f"ts must hold at least two output times, ts[0] the start; got shape {jnp.shape(ts)}.")
+    if np.ndim(ts) != 1 or np.size(ts) < 2:
+        raise ValueError(f"ts must hold at least two output times, ts[0] the start; got shape {np.shape(ts)}.")
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"ts must hold real numbers; got {kind}.")
     given = _as_array(ts, dtype)
@@ -130,7 +146,7 @@ def _first_bad_gap(gaps: np.ndarray) -> int:
 def _adaptive(dtype, ts, rtol, atol) -> diffrax.PIDController:
     """Adaptive steps, with tolerances that the dtype can meet and with an end to shrinking."""
     eps = float(jnp.finfo(dtype).eps)
-    rtol = _RTOL[dtype] if rtol is None else _tolerance(rtol, "rtol")
+    rtol = DEFAULT_RTOL[dtype] if rtol is None else _tolerance(rtol, "rtol")
     atol = rtol * _ATOL_OVER_RTOL if atol is None else _tolerance(atol, "atol")
     if is_concrete(rtol) and float(rtol) < 10 * eps:
         more = "; call jax.config.update('jax_enable_x64', True) and pass float64 states" if dtype == np.float32 else ""
@@ -156,19 +172,32 @@ def _norm_or_inf(error: PyTree) -> jax.Array:
 
 
 def _tolerance(value, name):
-    if jnp.ndim(value) != 0:
-        raise ValueError(f"{name} must be one number; got shape {jnp.shape(value)}.")
+    _require_number(value, name)
     if is_concrete(value) and not (np.isfinite(value) and value > 0):
         raise ValueError(f"{name} must be positive; got {value}.")
+    if name == "rtol" and is_concrete(value) and value >= 1:
+        raise ValueError(f"rtol must be less than 1, which would leave no digit of the motion; got {value}.")
     return value
+
+
+def _require_number(value, name) -> None:
+    real = eqx.is_array_like(value) and jnp.issubdtype(jnp.result_type(value), jnp.number)
+    if not real or jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
+        raise TypeError(f"{name} must be a real number; got {value!r}.")
+    if jnp.ndim(value) != 0:
+        raise ValueError(f"{name} must be one number; got shape {jnp.shape(value)}.")
+
+
+def _require_instance(value, name: str, kind: type, example: str) -> None:
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be an instance of diffrax.{kind.__name__}, or {example}; got {value!r}.")
 
 
 def _fixed_step(dt, ts, rtol, atol, max_steps) -> jax.Array:
     """`dt`, positive as the user gives it, as a signed array in the direction of time."""
     if rtol is not None or atol is not None:
         raise ValueError("dt asks for fixed steps and rtol/atol for adaptive ones: give one or the other.")
-    if jnp.ndim(dt) != 0:
-        raise ValueError(f"dt must be one number; got shape {jnp.shape(dt)}.")
+    _require_number(dt, "dt")
     if is_concrete(dt) and not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"dt must be a positive step size, also backward in time; got {dt}.")
     if is_concrete(dt) and is_concrete(ts):

@@ -21,7 +21,7 @@ from lagjax._integrate import integrate
 from lagjax._layout import Layout
 from lagjax._results import RESULTS, SimulationError, advice
 from lagjax._settings import Settings, as_arrays, is_concrete, require_finite
-from lagjax._system import System
+from lagjax._system import System, require_system
 from lagjax._trajectory import State, Trajectory
 
 PyTree = Any
@@ -95,6 +95,7 @@ def simulate(
     trajectory.q - jnp.cos(trajectory.ts)
     ```
     """
+    require_system(system)
     layout = Layout.of(q0, qdot0)
     settings = Settings.of(layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress)
     params = as_arrays(params, layout.dtype)
@@ -148,6 +149,7 @@ def simulate_batch(
     assert trajectory.q.shape == (1000, 101) and trajectory.ok.all()
     ```
     """
+    require_system(system)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
     axes, size = _axes_per_leaf(values, batch_axes)
     member = {name: _first_member(value, axes[name]) for name, value in values.items()}

@@ -244,7 +244,9 @@ class System(eqx.Module):
     def _at(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
         """Evaluate one of `Motion`'s functions at a state given in the user's pytree."""
         layout = Layout.of(q, qdot)
-        value = _evaluate(self, quantity, *as_arrays((q, qdot, t, params), layout.dtype))
+        if jnp.ndim(t) != 0:
+            raise ValueError(f"t must be one number; got shape {jnp.shape(t)} (jax.vmap is for many).")
+        value = _evaluate(self, quantity, *as_arrays((q, qdot, 1.0 * t, params), layout.dtype))
         return layout.restore(value) if restore else value
 
     def _check_outputs(self, layout: Layout, params: PyTree) -> None:
@@ -262,6 +264,12 @@ class System(eqx.Module):
             _require_structure(returned(self.forces), layout)
         if self.constraints is not None or self.velocity_constraints is not None:
             _require_constraints(self.constraint_structure(layout, params), layout)
+
+
+def require_system(system: Any) -> None:
+    """Raise `TypeError` for anything else in its place, a bare Lagrangian most often."""
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {system!r}.")
 
 
 @eqx.filter_jit

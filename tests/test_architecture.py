@@ -28,6 +28,7 @@ STREET = [
     "_system",
     "_integrate",
     "_consistent",
+    "_check",
     "_trajectory",
     "_engine",
     "_simulate",

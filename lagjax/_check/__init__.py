@@ -1,0 +1,173 @@
+"""`check`: what is wrong with a scene at a state, before anything is integrated.
+
+Everything is computed once, compiled together: values, derivatives, their finite differences, the mass matrix at states
+nearby, the linearised motion. What follows is NumPy and sentences, each file for one question:
+
+    Scene.of ─► _derivatives ─► _constraints ─► _mass ─► _borders ─► _stiffness ─► Findings
+    _measure    _differences
+                _operations: which line of the user's code is to blame
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._check import _borders, _constraints, _derivatives, _mass, _stiffness
+from lagjax._check._findings import Finding, Findings, listed
+from lagjax._check._measure import Scene
+from lagjax._layout import Layout
+from lagjax._settings import DEFAULT_RTOL, is_concrete, not_finite
+from lagjax._system import System, require_system
+
+__all__ = ["Finding", "Findings", "check"]
+
+PyTree = Any
+
+
+def check(system: System, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> Findings:
+    r"""What is wrong with `system` at the state (q, qdot), or worth knowing before it is integrated.
+
+    Derivatives are compared with finite differences, L̇ᵢ = [L(x + hᵢ) − L(x − hᵢ)]/2hᵢ and of higher order, on steps
+    over many scales, from both sides and from each. A mass matrix M = ∂²L/∂q̇² that is singular is looked at in the
+    neighbourhood as well, which tells why. The arguments are those of `System.acceleration`: numbers, not batches.
+
+    **Kinds** of findings, by level (`Finding.level` may be lower for a mild case):
+
+    - error: `not_finite` (a number given), `value_not_finite` (of L, a force, D), `derivative_not_finite`, `kink` (no
+      derivative, although one is computed), `wrong_derivative` (of a custom rule), `constraint_not_finite`,
+      `constraint_zero_gradient`, `inconsistent_start`; for a singular mass matrix `velocity_unused`,
+      `linear_in_velocity`, `velocity_combination`, `gauge`, `coordinate_singularity`, `singular_at_velocity`,
+      `singular_saddle_point`; `acceleration_not_finite`.
+    - warning: `creates_energy` (a dissipation function of the wrong sign), `indefinite_mass_matrix`,
+      `near_coordinate_singularity`, `velocity_constraint_not_affine`, `discontinuity`.
+    - advice: `single_precision`, `integer_parameter`, `small_state`, `ill_conditioned`, `dependent_constraints`,
+      `stiff`, `explicit_time`.
+
+    **Raises** `TypeError`, `ValueError` for a state or for functions that no motion can begin with, in the words of
+    `simulate`; `ValueError` inside `jit`, where there are no numbers.
+
+    Source: Press et al., *Numerical Recipes*, §5.7 (differences); Hairer & Wanner, *Solving Ordinary Differential
+    Equations II*, §IV.1 (stiffness).
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    spring = lagjax.System(lambda q, qdot: 0.5 * jnp.linalg.norm(qdot) ** 2 - 0.5 * jnp.sum(q**2))
+    findings = lagjax.check(spring, jnp.ones(2), jnp.zeros(2))
+    print(findings)  # the norm has no derivative at rest: names the line
+    assert not findings.ok
+    ```
+    """
+    require_system(system)
+    layout = Layout.of(q, qdot)
+    if jnp.ndim(t) != 0:
+        raise ValueError(f"t must be one number; got shape {jnp.shape(t)}.")
+    if not all(is_concrete(leaf) for leaf in jax.tree.leaves((q, qdot, t, params))):
+        raise ValueError("check looks at numbers: call it outside of jit, vmap and grad, on one state.")
+    found = _inputs(layout, q, qdot, t, params)
+    if any(finding.level == "error" for finding in found):
+        return Findings.of(found)
+    scene = Scene.of(system, layout, q, qdot, t, params)
+    found += _derivatives.findings(scene)
+    found += _dissipation(scene)
+    found += _constraints.findings(scene)
+    found += _mass.findings(scene)
+    if not any(finding.level == "error" for finding in found):
+        found += [*_acceleration(scene), *_borders.findings(scene), *_stiffness.findings(scene)]
+    return Findings.of([*found, *_time(scene)])
+
+
+# ---- what was given --------------------------------------------------------------------------------------------------
+
+
+def _inputs(layout: Layout, q, qdot, t, params) -> list[Finding]:
+    found = []
+    for name, tree in (("q", q), ("qdot", qdot), ("t", t), ("params", params)):
+        for where, value in not_finite(tree, name):
+            message = f"{where} is {value}: every number must be finite."
+            found.append(Finding("not_finite", "error", (where,), message))
+    found += _precision(layout, q, qdot, params)
+    state = np.abs([float(x) for leaf in jax.tree.leaves((q, qdot)) for x in np.ravel(leaf)])
+    atol = 1e-3 * DEFAULT_RTOL[layout.dtype]
+    if state.any() and state.max() < 1e3 * atol:
+        message = (
+            f"The largest number of the state is {state.max():.1e}, near the default atol of {atol:.0e}, which is in "
+            "the units of the state: errors of that size are allowed. Use units in which the motion is of order one, "
+            "or pass a smaller atol."
+        )
+        found.append(Finding("small_state", "advice", layout.names, message))
+    return found
+
+
+def _precision(layout: Layout, q, qdot, params) -> list[Finding]:
+    found = []
+    if layout.dtype == np.float32:
+        wide = any(getattr(leaf, "dtype", None) == np.float64 for leaf in jax.tree.leaves((q, qdot, params)))
+        what = "float64 was given, but JAX makes float32 of it" if wide else "The state is in float32"
+        do = "" if jax.config.jax_enable_x64 else "call jax.config.update('jax_enable_x64', True) first and "  # pyright: ignore[reportAttributeAccessIssue]
+        message = (
+            f"{what}: a run keeps about {DEFAULT_RTOL[layout.dtype]:.0e} per step, and machine code is for float64. "
+            f"For more, {do}pass float64."
+        )
+        found.append(Finding("single_precision", "advice", layout.names, message))
+    whole = [
+        "params" + jax.tree_util.keystr(path)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(params)
+        if eqx.is_array_like(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.integer)
+    ]
+    if whole:
+        message = (
+            f"{listed(whole)}: integers. Their products wrap around when they overflow, and nothing can be "
+            "differentiated by them. Write 1.0 for 1 unless it counts something."
+        )
+        found.append(Finding("integer_parameter", "advice", tuple(whole), message))
+    return found
+
+
+# ---- what the forces do ----------------------------------------------------------------------------------------------
+
+
+def _dissipation(scene: Scene) -> list[Finding]:
+    """A dissipation function takes energy out at every velocity."""
+    power, size = scene.measured.power.T
+    usable = np.isfinite(power)
+    gained = power < -np.sqrt(np.finfo(scene.layout.dtype).eps) * size
+    if not (usable & gained).any():
+        return []
+    kept = (usable & (power > 0)).any()
+    when = "at some velocities, and takes it out at others" if kept else "at every velocity that was tried"
+    message = (
+        f"The dissipation function puts energy in {when}: its force is -dD/dqdot, so that friction has D = + c/2 "
+        "qdot**2 with c > 0. Turn its sign; a force that is meant to drive belongs into forces=..."
+    )
+    return [Finding("creates_energy", "warning", (), message)]
+
+
+def _acceleration(scene: Scene) -> list[Finding]:
+    bad = ~np.isfinite(scene.solved()[0])
+    if not bad.any():
+        return []
+    where = tuple(name for name, b in zip(scene.layout.names, bad, strict=True) if b)
+    message = (
+        f"The acceleration of {listed(where)} is not finite, although M and the forces are: numbers overflow, or M is "
+        "singular to working precision. Use units in which the motion is of order one."
+    )
+    return [Finding("acceleration_not_finite", "error", where, message)]
+
+
+def _time(scene: Scene) -> list[Finding]:
+    functions = [getattr(scene.system, role) for role in _ROLES]
+    timed = tuple(role for role, f in zip(_ROLES, functions, strict=True) if f is not None and "t" in f.extras)
+    if not timed:
+        return []
+    message = (
+        f"{listed(timed)}: may depend on the time, so that the energy h need not be conserved and a run must start at "
+        "the right ts[0]."
+    )
+    return [Finding("explicit_time", "advice", timed, message)]
+
+
+_ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")

@@ -1,0 +1,94 @@
+"""Constraints: do they hold, do they hold anything, and does one of them say what others say already."""
+
+import numpy as np
+
+from lagjax._check._derivatives import position_count
+from lagjax._check._findings import Finding, listed
+from lagjax._check._mass import null_directions
+from lagjax._check._measure import Scene
+from lagjax._consistent import require_consistent
+from lagjax._layout import Layout
+from lagjax._linear import dependent_rows
+
+
+def findings(scene: Scene) -> list[Finding]:
+    """All there is to say about constraints on positions and on velocities."""
+    if not scene.motion.constrained:
+        return []
+    residual, rows = scene.residual, scene.measured.rows
+    names = scene.system.constraint_names(scene.layout, scene.given[3])
+    bad = [k for k in range(len(names)) if not (np.isfinite(residual[k]) and np.isfinite(rows[0, k]).all())]
+    if bad:
+        return [_not_finite(names[k], residual[k]) for k in bad]
+    positions = position_count(scene)
+    idle = [k for k in range(len(names)) if not rows[0, k].any()]
+    found = [_idle(names[k], k >= positions, residual[k], rows[:, k]) for k in idle]
+    found += _not_affine(names, rows, positions, scene.layout)
+    if idle:
+        return found
+    q, qdot, t, params = scene.given
+    try:
+        require_consistent(scene.system, scene.layout, np.asarray([t], scene.layout.dtype), q, qdot, params)
+    except ValueError as error:
+        where = tuple(name for name in names if name in str(error))
+        return [*found, Finding("inconsistent_start", "error", where, str(error))]
+    held = scene.held[0]
+    if not np.isfinite(held).all() or len(null_directions(held)):
+        return found
+    return [*found, *_dependent(rows[0] @ np.linalg.solve(held, rows[0].T), names)]
+
+
+def _not_finite(name: str, value) -> Finding:
+    what = f"is {value}" if not np.isfinite(value) else "has a gradient that is not finite"
+    message = f"{name} {what} at this state: look for a root or a norm at zero; constrain the square instead."
+    return Finding("constraint_not_finite", "error", (name,), message)
+
+
+def _idle(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
+    """A constraint whose gradient is zero: of no use here, and often an inequality or a square."""
+    if of_velocities:
+        message = (
+            f"{name} does not depend on qdot here, so that no force can keep it. Give what depends on q alone as "
+            "constraints=..., and multiply out what divides by a speed."
+        )
+    else:
+        nearby = rows[1:][np.isfinite(rows[1:]).all(axis=1)]
+        where = (
+            "but not nearby: it is a square or a product whose gradient vanishes where it holds, or a singular point"
+            if nearby.any()
+            else "and nearby: it is slack, as max(0, x) is where x < 0, or does not contain q"
+        )
+        message = (
+            f"{name} is {value:.3g} and has zero gradient here, {where}. A constraint is an equality with a gradient "
+            "where it holds: write f and not f**2; a motion that may leave it (a string, a contact) is one of two "
+            "modes of simulate_hybrid, with a guard on the multiplier."
+        )
+    return Finding("constraint_zero_gradient", "error", (name,), message)
+
+
+def _not_affine(names, rows, positions: int, layout: Layout) -> list[Finding]:
+    """da/dqdot must not change with q̇; the last half of the states differs from the first in q̇ alone."""
+    found = []
+    for k in range(positions, len(names)):
+        others = rows[(len(rows) + 1) // 2 :, k]
+        others = others[np.isfinite(others).all(axis=1)]
+        size = max(np.abs(rows[0, k]).max(), np.abs(others).max(initial=0))
+        if np.abs(others - rows[0, k]).max(initial=0) > np.sqrt(np.finfo(layout.dtype).eps) * size:
+            message = (
+                f"{names[k]} is not affine in qdot: its derivative by qdot changes with qdot. The principle of "
+                "d'Alembert and Lagrange is for a(q, qdot) = A(q) qdot + b(q); write it so, or take it out."
+            )
+            found.append(Finding("velocity_constraint_not_affine", "warning", (names[k],), message))
+    return found
+
+
+def _dependent(coupling: np.ndarray, names: list[str]) -> list[Finding]:
+    found = []
+    for row, factors in dependent_rows(coupling).items():
+        others = tuple(name for name, factor in zip(names, factors, strict=True) if factor)
+        message = (
+            f"{names[row]} follows from {listed(others)} here. The motion is right, but how their forces are shared "
+            "is not determined; the shortest multipliers are given. Drop it if its force is wanted."
+        )
+        found.append(Finding("dependent_constraints", "advice", (names[row], *others), message))
+    return found

@@ -1,0 +1,171 @@
+"""Values and derivatives: finite, and what finite differences say; where not, which operation is to blame."""
+
+import numpy as np
+
+from lagjax._check._differences import Slopes, differ, slopes
+from lagjax._check._findings import Finding, listed
+from lagjax._check._measure import Scene
+from lagjax._check._operations import Offender, borders, offenders
+
+_SHOWN = 3  # findings of one kind about one function
+
+
+def findings(scene: Scene) -> list[Finding]:
+    """All there is to say about L, the forces and D, one after the other."""
+    found = _values(scene)
+    if found:
+        return found
+    found = _not_finite(scene)
+    if found:
+        return found
+    return [finding for block in _blocks(scene) for finding in _compared(scene, *block)]
+
+
+# ---- finite ----------------------------------------------------------------------------------------------------------
+
+
+def _values(scene: Scene) -> list[Finding]:
+    m, found = scene.measured, []
+    for role, name, value in (("lagrangian", "L", scene.lagrangian), ("forces", "The force", m.extra),
+                              ("dissipation", "D", scene.dissipation)):  # fmt: skip
+        if not np.isfinite(value).all():
+            where = () if value.ndim == 0 else _named(scene.layout.names, ~np.isfinite(value))
+            message = f"{name}{' of ' + listed(where) if where else ''} is {_first_bad(value)} at this state"
+            found.append(Finding("value_not_finite", "error", where, message + _blame(scene, role, "value")))
+    return found
+
+
+def _first_bad(value: np.ndarray) -> str:
+    return str(value[~np.isfinite(value)].ravel()[0])
+
+
+def _not_finite(scene: Scene) -> list[Finding]:
+    m, n, names = scene.measured, scene.layout.size, scene.names
+    first = ~np.isfinite(np.concatenate([m.by_q, m.momentum[0]]))
+    second = ~np.isfinite(m.mass[0]).all(axis=0) | ~np.isfinite(m.drift)
+    dragged = ~np.isfinite(m.by_v_of_dissipation)
+    found = []
+    if first.any():
+        found.append(_no_derivative(scene, "lagrangian", "The derivative of L by", _named(names[:-1], first), "first"))
+    elif second.any():
+        where = _named(names[n:-1], second)
+        found.append(_no_derivative(scene, "lagrangian", "The second derivative of L by", where, "second"))
+    if dragged.any():
+        where = _named(names[n:-1], dragged)
+        found.append(_no_derivative(scene, "dissipation", "The derivative of D by", where, "first"))
+    return found
+
+
+def _no_derivative(scene: Scene, role: str, what: str, where: tuple[str, ...], order: str) -> Finding:
+    message = f"{what} {listed(where)} is not finite at this state, although the function is"
+    return Finding("derivative_not_finite", "error", where, message + _blame(scene, role, order))
+
+
+def _named(names, chosen) -> tuple[str, ...]:
+    return tuple(name for name, yes in zip(names, chosen, strict=True) if yes)
+
+
+# ---- the operation to blame ------------------------------------------------------------------------------------------
+
+_REMEDIES = {
+    "sqrt": "A norm at zero, most often: where its square is wanted write jnp.sum(v**2) and not jnp.linalg.norm(v)**2.",
+    "pow": "Powers that are no whole numbers have no derivative of every order at zero: write a polynomial there.",
+    "atan2": "An angle has no derivative at the origin: take Cartesian coordinates, or start elsewhere.",
+    "div": "Divide by something that is not zero where the motion goes, or cancel the fraction by hand.",
+    "log": "Its argument must stay positive.",
+}
+_REMEDIES |= {"rsqrt": _REMEDIES["sqrt"], "cbrt": _REMEDIES["pow"], "integer_pow": _REMEDIES["div"]}
+_BRANCH = (
+    "L itself does not see it, as it is a branch that `where` does not take; its derivative does, as zero times NaN is "
+    "NaN. Keep the argument good in both: where(ok, f(where(ok, x, 1.0)), other)."
+)
+
+
+def _blame(scene: Scene, role: str, order: str) -> str:
+    """The end of a sentence: which operation, with which operands, in which line, and what to write instead."""
+    wanted = {"value": ("value",), "first": ("value", "first derivative")}.get(order)
+    found = [o for o in offenders(getattr(scene.motion, role), *scene.state) if not wanted or o.fault in wanted]
+    if not found:
+        return ". No single operation is to blame: large numbers may overflow together; look at the units."
+    first = found[0]
+    hidden = first.fault == "value" and order != "value"
+    return f": {first}. {_BRANCH if hidden else _remedy(first)}".rstrip()
+
+
+def _remedy(offender: Offender) -> str:
+    return _REMEDIES.get(offender.name, "Write it so that it is smooth there, or start elsewhere.")
+
+
+def _blame_for_kink(scene: Scene, role: str) -> str:
+    function = getattr(scene.motion, role)
+    places = list(dict.fromkeys(f"{name}{place}" for name, place, _ in borders(function, *scene.state)))
+    return f" (the function is pieced together by {listed(places, 3)})" if places else ""
+
+
+# ---- against finite differences --------------------------------------------------------------------------------------
+
+
+def _blocks(scene: Scene):
+    """What is compared: name, function, derivatives (directions, outputs), and where these lie among all."""
+    m, n = scene.measured, scene.layout.size
+    first, dragged = 1 + n, scene.motion.dissipation is not None
+    held = first + dragged
+    by_y = np.concatenate([m.by_q, m.momentum[0]])[:, None]
+    along = np.concatenate([m.mass[0], m.drift[None]])
+    blocks = [
+        ("L", "lagrangian", by_y, range(2 * n), range(1)),
+        ("p = dL/dqdot", "lagrangian", along, range(n, 2 * n + 1), range(1, first)),
+    ]
+    if dragged:
+        blocks.append(("D", "dissipation", m.by_v_of_dissipation[:, None], range(n, 2 * n), range(first, held)))
+    count = len(scene.residual)
+    if np.isfinite(scene.residual).all() and np.isfinite(m.rows[0]).all():
+        positions = position_count(scene)
+        blocks += [
+            ("a constraint", "constraints", m.rows[0, :positions].T, range(n), range(held, held + positions)),
+            ("a velocity constraint", "velocity_constraints", m.rows[0, positions:].T, range(n, 2 * n),
+             range(held + positions, held + count)),
+        ]  # fmt: skip
+    return [block for block in blocks if len(block[-1])]
+
+
+def position_count(scene: Scene) -> int:
+    """How many of the constraints are on positions; they come first."""
+    q, _, t, params = scene.state
+    return 0 if scene.motion.constraints is None else len(scene.motion.constraints(q, t, params))
+
+
+def _compared(scene: Scene, name, role, derivative, directions, outputs) -> list[Finding]:
+    m, dtype = scene.measured, scene.layout.dtype
+    chosen = np.ix_(directions, range(m.plus.shape[1]), outputs)
+    place = _places(scene)[list(directions)]
+    both, ahead, behind = slopes(
+        m.minus[chosen], m.here[list(outputs)], m.plus[chosen], scene.steps[:, list(directions)], place,
+        float(np.finfo(dtype).eps),
+    )  # fmt: skip
+    kinks = differ(ahead, behind, dtype)
+    wrong = differ(Slopes(derivative, np.zeros_like(derivative)), both, dtype) & ~kinks
+    names, found = [scene.names[i] for i in directions], []
+    for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
+        message = (
+            f"The slope of {name} along {names[i]} is {behind.value[i, k]:.6g} below this state and "
+            f"{ahead.value[i, k]:.6g} above it: a kink, where automatic differentiation says {derivative[i, k]:.6g}"
+            f"{_blame_for_kink(scene, role) if role in ('lagrangian', 'dissipation') else ''}. Smooth it (sqrt(x**2 + "
+            "w**2) for abs(x)), or start beside it; a motion across it is one of two modes of simulate_hybrid."
+        )
+        found.append(Finding("kink", "error", (names[i],), message))
+    for i, k in list(zip(*np.nonzero(wrong), strict=True))[:_SHOWN]:
+        message = (
+            f"The derivative of {name} along {names[i]} is {derivative[i, k]:.6g} by automatic differentiation, and "
+            f"{both.value[i, k]:.6g} ± {both.error[i, k]:.0e} by finite differences: a custom derivative is wrong, or "
+            "stop_gradient, a round or a cast to integers hides a dependence."
+        )
+        found.append(Finding("wrong_derivative", "error", (names[i],), message))
+    return found
+
+
+def _places(scene: Scene) -> np.ndarray:
+    """The coordinates themselves, whose rounding moves what is computed from them, in the units of the directions."""
+    q, v, t = (np.abs(np.asarray(x, float)) for x in scene.state[:3])
+    speed = v.max()
+    return np.concatenate([q, v, [max(t, q.max() / speed if speed > 0 else 0)]])

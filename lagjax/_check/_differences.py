@@ -1,0 +1,70 @@
+"""Slopes by finite differences, with an honest estimate of their error, to compare derivatives with.
+
+f is taken at x ± hₖ e for steps that halve from rung to rung, hₖ = h₀ 2⁻ᵏ. On every rung
+
+    two-sided  (8 (f(h) − f(−h)) − (f(2h) − f(−2h))) / 12h       forward  (4 f(h) − f(2h) − 3 f(0)) / 2h
+
+and backward likewise. Large steps suffer from curvature, small ones from rounding. The error on a rung is the largest
+change between neighbouring rungs, which sees both, and never less than the rounding that f must have; the rung with the
+least error counts. Where forward and backward slopes differ by more than their errors, f has a kink.
+
+Source: Press et al., *Numerical Recipes*, §5.7 (the two errors); Ridders, Adv. Eng. Softw. 4 (1982) 75.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+_SAFETY = 8.0  # an error is trusted within this factor
+
+
+class Slopes(NamedTuple):
+    """Estimates and their errors, each of shape (directions, outputs)."""
+
+    value: np.ndarray
+    error: np.ndarray
+
+
+def ladder(size: np.ndarray, dtype) -> np.ndarray:
+    """Steps for coordinates of these sizes, shape (rungs, coordinates): from a quarter down to eps^(1/2) of a size."""
+    rungs = int(-np.log2(np.finfo(dtype).eps) / 2)
+    return (size * 0.25 * 2.0 ** -np.arange(rungs)[:, None]).astype(dtype)
+
+
+def slopes(minus, here, plus, steps, place, eps: float) -> tuple[Slopes, Slopes, Slopes]:
+    """Two-sided, forward and backward, from f(x − h e), f(x) and f(x + h e).
+
+    `minus` and `plus` have the shape (directions, rungs, outputs), `here` (outputs,), `steps` (rungs, directions),
+    `place` (directions,): the coordinate itself, whose rounding moves f.
+    """
+    h, here = steps.T[:, 1:, None], np.asarray(here, float)
+    minus, plus = np.asarray(minus, float), np.asarray(plus, float)
+    near, far = (plus[:, 1:], minus[:, 1:]), (plus[:, :-1], minus[:, :-1])
+    size = np.maximum(np.maximum(np.abs(near[0]), np.abs(near[1])), np.abs(here))
+    with np.errstate(all="ignore"):
+        both = (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * h)
+        ahead = (4 * near[0] - far[0] - 3 * here) / (2 * h)
+        behind = (4 * near[1] - far[1] - 3 * here) / (-2 * h)
+
+        def best(x):
+            return _best(x, eps * (size + np.abs(place)[:, None, None] * np.abs(x)) / h)
+
+        return best(both), best(ahead), best(behind)
+
+
+def _best(estimates: np.ndarray, rounding: np.ndarray) -> Slopes:
+    changes = np.abs(np.diff(estimates, axis=1))
+    # The largest of the changes to two rungs on either side.
+    padded = np.pad(changes, ((0, 0), (2, 2), (0, 0)), mode="edge")
+    nearby = np.max([padded[:, i : i + estimates.shape[1]] for i in range(4)], axis=0)
+    error = nearby + rounding
+    error = np.where(np.isfinite(error), error, np.inf)
+    rung = np.argmin(error, axis=1)[:, None]
+    return Slopes(*(np.take_along_axis(x, rung, axis=1)[:, 0] for x in (estimates, error)))
+
+
+def differ(one: Slopes, other: Slopes, dtype) -> np.ndarray:
+    """Where two slopes differ by more than their errors and by more than eps^(1/3) of them."""
+    allowed = _SAFETY * (one.error + other.error) + np.finfo(dtype).eps ** (1 / 3) * (abs(one.value) + abs(other.value))
+    with np.errstate(invalid="ignore"):
+        return np.abs(one.value - other.value) > allowed

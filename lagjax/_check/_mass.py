@@ -1,0 +1,220 @@
+"""The mass matrix: velocities that carry no kinetic energy, and why; its signs and its condition.
+
+With constraints it may be singular where they hold what L does not. Then K = M + GᵀW G is looked at, which is regular
+when the saddle point is (`_linear`). A direction u with K u = 0 is told apart by what happens at states nearby:
+
+    the row of M is zero everywhere, and p too             a velocity that L does not contain
+    the row of M is zero everywhere, p is not              L is linear in it
+    K is regular where q is another                        the chart is singular here: r = 0, a pole
+    K is regular where q̇ is another                        kinetic energy of a higher order than the second
+    K is singular everywhere, u the same                   a combination of velocities is missing
+    K is singular everywhere, u another                    a gauge: some motion is left undetermined, as the
+                                                           parametrisation of a path where L is of degree one in q̇
+"""
+
+import numpy as np
+
+from lagjax._check._findings import Finding, listed
+from lagjax._check._measure import Scene
+from lagjax._settings import DEFAULT_RTOL
+
+
+def findings(scene: Scene) -> list[Finding]:
+    """All that there is to say about the mass matrix."""
+    m, names = scene.measured, scene.layout.names
+    held = scene.held
+    usable = [k for k in range(1, len(held)) if np.isfinite(held[k]).all()]
+    if not np.isfinite(held[0]).all():
+        return []  # a derivative is not finite, which was said already
+    if len(null_directions(held[0])):
+        return _singular(scene, held, usable)
+    others = [held[k] for k in usable]
+    condition = _condition(held[0], names, DEFAULT_RTOL[scene.layout.dtype])
+    return [*_nearly_singular(held[0], others, names), *_signs(m.mass[0], m.rows[0], names), *condition]
+
+
+def _scale(matrix: np.ndarray) -> np.ndarray:
+    diagonal = np.abs(np.diagonal(matrix))
+    size = np.where(diagonal > 0, diagonal, np.abs(matrix).max(axis=1))
+    return 1 / np.sqrt(np.where(size > 0, size, 1))
+
+
+def null_directions(matrix: np.ndarray) -> np.ndarray:
+    """Directions in which a symmetric matrix, scaled to a unit diagonal, is zero up to rounding; one a row."""
+    scale = _scale(matrix)
+    values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale)
+    null = np.abs(values) <= _rounding(matrix) * max(np.abs(values).max(), np.finfo(matrix.dtype).tiny)
+    directions = (scale[:, None] * vectors[:, null]).T
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _rounding(matrix: np.ndarray) -> float:
+    return 32 * len(matrix) * float(np.finfo(matrix.dtype).eps)
+
+
+# ---- singular --------------------------------------------------------------------------------------------------------
+
+
+def _singular(scene: Scene, held: np.ndarray, usable: list[int]) -> list[Finding]:
+    names, constrained = scene.layout.names, scene.motion.constrained
+    empty = [i for i in range(len(names)) if all(not held[k][i].any() for k in [0, *usable])]
+    found = [_empty(i, scene.measured.momentum[[0, *usable], i], names[i], constrained) for i in empty]
+    rest = [i for i in range(len(names)) if i not in empty]
+
+    def among_rest(k):
+        return null_directions(held[k][np.ix_(rest, rest)])
+
+    if not rest or not len(here := among_rest(0)):
+        return found
+    where = tuple(names[rest[i]] for i in np.flatnonzero(np.abs(here).max(axis=0) > 1e-6))
+    along = "; ".join(_combination(u, [names[i] for i in rest]) for u in here)
+    what = "The saddle point of M and the constraints" if constrained else "The mass matrix d2L/dqdot2"
+    kind, why = _classified(scene, here, {k: among_rest(k) for k in usable})
+    return [*found, Finding(kind, "error", where, f"{what} is singular along {along}, {why}")]
+
+
+def _empty(i: int, momenta: np.ndarray, name: str, constrained: bool) -> Finding:
+    linear = bool(np.any(momenta != 0))
+    kind = "linear_in_velocity" if linear else "velocity_unused"
+    what = f"L is linear in d{name}" if linear else f"L does not contain the velocity d{name}"
+    nor = ", and no constraint holds it" if constrained else ""
+    message = (
+        f"{what}{nor}: the mass matrix has a zero row, and nothing determines the acceleration of {name}. Add its "
+        f"kinetic energy, or take {name} out of q"
+        + (": an equation of first order is not one of motion." if linear else " and give it as a parameter.")
+    )
+    return Finding(kind, "error", (name,), message)
+
+
+def _classified(scene: Scene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
+    """The kind of a singularity with these null directions, and the rest of the sentence about it."""
+    m = scene.measured
+    if any(not len(found) for k, found in nearby.items() if not (m.velocity[k] != m.velocity[0]).any()):
+        return "coordinate_singularity", (
+            "but regular at positions nearby: these coordinates are singular here (polar ones at r = 0, spherical ones "
+            "and Euler angles at a pole, a slack variable s² at s = 0). Use others that are regular where the motion "
+            "goes, such as Cartesian ones with a constraint, or start elsewhere."
+        )
+    if any(not len(found) for found in nearby.values()):
+        return "singular_at_velocity", (
+            "but regular at other velocities: L has no second order in them here. Start with another velocity, or "
+            "write a kinetic energy that is quadratic in small velocities."
+        )
+    if scene.motion.constrained:
+        return "singular_saddle_point", (
+            "here and nearby: neither L nor a constraint determines the acceleration there. Add the kinetic energy of "
+            "these velocities or a constraint on them, or take a coordinate out."
+        )
+    if _homogeneous(scene, [0, *nearby]):
+        return "gauge", (
+            "the velocity itself: L is of degree one in the velocities, and every parametrisation of the path is as "
+            "good as another. Take one of the coordinates as t, or, where L is a length alone, integrate its square."
+        )
+    if nearby and all(_same_space(here, found) for found in nearby.values()):
+        return "velocity_combination", (
+            "here and nearby: L has no kinetic energy along this combination of velocities. Add it (a missing mass?), "
+            "or use fewer coordinates."
+        )
+    return "gauge", (
+        "and nearby along directions that change with the state: a part of the motion is left free. Fix it by a "
+        "constraint, or use fewer coordinates."
+    )
+
+
+def _homogeneous(scene: Scene, states: list[int]) -> bool:
+    """Whether M q̇ = 0 wherever it was looked at: L is of degree one in the velocities."""
+    m = scene.measured
+
+    def turned(mass, v):
+        return np.abs(mass @ v).max() <= np.sqrt(np.finfo(mass.dtype).eps) * np.abs(mass).max() * np.abs(v).max()
+
+    moving = [k for k in states if m.velocity[k].any()]
+    return bool(moving) and all(turned(m.mass[k], m.velocity[k]) for k in moving)
+
+
+def _same_space(one: np.ndarray, other: np.ndarray) -> bool:
+    if one.shape != other.shape:
+        return False
+    basis = np.linalg.qr(other.T)[0]
+    return bool(np.abs(one - one @ basis @ basis.T).max() < np.sqrt(np.finfo(one.dtype).eps))
+
+
+def _combination(direction: np.ndarray, names: list[str]) -> str:
+    """A direction as +1 dq[0] -0.3 dq[1]."""
+    direction = direction / direction[np.argmax(np.abs(direction))]
+    terms = [f"{c:+.3g} d{name}" for c, name in zip(direction, names, strict=True) if abs(c) > 1e-6]
+    return " ".join(terms[:8]) + (" …" if len(terms) > 8 else "")
+
+
+# ---- regular ---------------------------------------------------------------------------------------------------------
+
+_NEARLY = 1e-6  # of the smallest eigenvalue that is usual nearby
+
+
+def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[Finding]:
+    """Next to a pole K is regular in its own scale, but far from it in that of its neighbourhood."""
+    if not others:
+        return []
+    usual = 1 / np.sqrt(np.maximum(np.median([np.abs(np.diagonal(k)) for k in others], axis=0), 1e-300))
+
+    def smallest(matrix):
+        values, vectors = np.linalg.eigh(usual[:, None] * matrix * usual)
+        place = np.argmin(np.abs(values))
+        return np.abs(values[place]) / np.abs(values).max(), vectors[:, place]
+
+    lowest, direction = smallest(here)
+    if lowest >= _NEARLY * np.median([smallest(k)[0] for k in others]):
+        return []
+    where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 0.1)
+    message = (
+        f"The mass matrix is {lowest:.1g} of its usual size along {listed([f'd{name}' for name in where])}: the state "
+        "is next to a singularity of the coordinates (r = 0, a pole, a gimbal), where accelerations and steps become "
+        "extreme. Use coordinates that are regular there, such as Cartesian ones with a constraint."
+    )
+    return [Finding("near_coordinate_singularity", "warning", where, message)]
+
+
+def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
+    """Negative kinetic energy along velocities that the constraints allow."""
+    scale = _scale(mass)
+    free = kernel(rows * scale)
+    if not free.shape[1]:
+        return []
+    values, vectors = np.linalg.eigh(free.T @ (scale[:, None] * mass * scale) @ free)
+    negative = values < -_rounding(mass) * np.abs(values).max()
+    if not negative.any():
+        return []
+    direction = scale * (free @ vectors[:, 0])
+    along = _combination(direction, list(names))
+    where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 1e-6 * np.abs(direction).max())
+    whole = "negative definite" if negative.all() else "indefinite"
+    return [Finding(
+        "indefinite_mass_matrix", "warning", where,
+        f"The mass matrix is {whole}: d2L is negative along {along}. The motion is that of L all the same, but "
+        "if L is meant to be T - U, a sign is wrong, or a mass is negative.",
+    )]  # fmt: skip
+
+
+def kernel(rows: np.ndarray) -> np.ndarray:
+    """Columns that span what the rows leave free."""
+    if not len(rows):
+        return np.eye(rows.shape[1], dtype=rows.dtype)
+    _, values, vectors = np.linalg.svd(rows)
+    rank = int(np.sum(values > 1e-10 * max(values.max(), 1e-300)))
+    return vectors[rank:].T
+
+
+def _condition(matrix: np.ndarray, names, default_rtol: float) -> list[Finding]:
+    scale = _scale(matrix)
+    condition, raw = np.linalg.cond(scale[:, None] * matrix * scale), np.linalg.cond(matrix)
+    lost = condition * np.finfo(matrix.dtype).eps
+    if lost <= default_rtol:
+        return []
+    _, vectors = np.linalg.eigh(scale[:, None] * matrix * scale)
+    where = tuple(name for name, c in zip(names, vectors[:, 0], strict=True) if abs(c) > 0.1)
+    message = (
+        f"The mass matrix has the condition {condition:.1e} after scaling each coordinate ({raw:.1e} before): "
+        f"accelerations are good to {lost:.0e} only, through {listed(where)}. Use coordinates that are less coupled "
+        "(absolute angles instead of joint angles), masses less far apart, or do not ask for a tighter rtol."
+    )
+    return [Finding("ill_conditioned", "advice", where, message)]

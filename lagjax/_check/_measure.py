@@ -1,0 +1,218 @@
+"""Everything `check` has to compute, compiled together: of a scene, at a state and around it."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._check._differences import ladder
+from lagjax._layout import Layout
+from lagjax._motion import Motion
+from lagjax._settings import as_arrays
+from lagjax._system import System
+
+PyTree = Any
+
+_LARGEST_AT_ONCE = 16  # coordinates up to which all differences are taken side by side
+_NEARBY = 4  # states with other positions, and as many with other velocities
+
+
+class Scene(NamedTuple):
+    """A scene at a state, and what was measured there. Everything is flat; n coordinates, m constraints."""
+
+    system: System
+    layout: Layout
+    motion: Motion
+    given: tuple  # q, qdot, t, params in the user's pytrees
+    state: tuple  # q, q̇, t and the numbers in params
+    sizes: np.ndarray  # of q, then of q̇, and of the time along the motion
+    steps: np.ndarray  # of the differences, (rungs, 2n + 1), along the same directions
+    measured: "Measured"
+
+    @classmethod
+    def of(cls, system: System, layout: Layout, q, qdot, t, params) -> "Scene":
+        """Measure `system` at a state."""
+        q, qdot, t, params = as_arrays((q, qdot, 1.0 * t, params), layout.dtype)
+        state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)
+        sizes = _sizes(layout, q, qdot)
+        steps = ladder(sizes, layout.dtype)
+        measured = jax.tree.map(np.asarray, _measure(system, q, qdot, t, params, steps, _offsets(layout, q, sizes)))
+        motion = system.motion(layout, params)
+        return cls(system, layout, motion, (q, qdot, t, params), state, sizes, steps, measured)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the directions: coordinates, velocities, and along the motion."""
+        names = self.layout.names
+        return (*names, *(f"d{name}" for name in names), "the motion")
+
+    @property
+    def lagrangian(self) -> np.ndarray:
+        """L at the state."""
+        return self.measured.here[0]
+
+    @property
+    def dissipation(self) -> np.ndarray:
+        """D at the state, zero where there is none."""
+        return self.measured.here[1 + self.layout.size] if self.motion.dissipation is not None else np.zeros(())
+
+    @property
+    def residual(self) -> np.ndarray:
+        """The constraints at the state."""
+        count = self.measured.rows.shape[1]
+        return self.measured.here[len(self.measured.here) - count :]
+
+    @property
+    def held(self) -> np.ndarray:
+        """K = M + GᵀW G of every state (see `_mass`), every row of G as heavy as M."""
+        m = self.measured
+        size = np.sum(m.rows**2, axis=2, keepdims=True)
+        heavy = np.abs(np.diagonal(m.mass, axis1=1, axis2=2)).max(axis=1)[:, None, None]
+        weight = np.where(heavy > 0, heavy, 1) / np.where(size > 0, size, 1)
+        return m.mass + np.swapaxes(m.rows, 1, 2) @ (weight * m.rows)
+
+    def solved(self) -> tuple[np.ndarray, np.ndarray]:
+        """q̈ and λ."""
+        m, n = self.measured, self.layout.size
+        x = self._solve(np.concatenate([m.force, m.targets])[:, None])[:, 0]
+        return x[:n], x[n:]
+
+    def jacobian(self) -> np.ndarray:
+        """∂q̈/∂(q, q̇), (n, 2n): by the implicit function."""
+        (q, qdot, t, params), (acceleration, multipliers) = self.given, self.solved()
+        varied = np.asarray(_variation(self.system, q, qdot, t, params, acceleration, multipliers))
+        return self._solve(-varied)[: self.layout.size]
+
+    def _solve(self, b: np.ndarray) -> np.ndarray:
+        """(q̈, λ) of the saddle point M q̈ − Gᵀλ = b₁, G q̈ = b₂, scaled; of the λ some that are right."""
+        mass, rows = self.measured.mass[0], self.measured.rows[0]
+        diagonal = np.sqrt(np.abs(np.diagonal(self.held[0])))
+        units = np.concatenate([1 / np.where(diagonal > 0, diagonal, 1), np.ones(len(rows))])
+        units[len(mass) :] = 1 / np.maximum(np.linalg.norm(rows * units[: len(mass)], axis=1), 1e-300)
+        matrix = np.block([[mass, -rows.T], [rows, np.zeros((len(rows), len(rows)))]])
+        scaled = units[:, None] * matrix * units
+        if not (np.isfinite(scaled).all() and np.isfinite(b).all()):
+            return np.full_like(b, np.nan)
+        if not len(rows):
+            return units[:, None] * np.linalg.solve(scaled, units[:, None] * b)
+        tolerance = float(np.finfo(matrix.dtype).eps) ** (2 / 3)
+        return units[:, None] * np.linalg.lstsq(scaled, units[:, None] * b, rcond=tolerance)[0]
+
+
+class Measured(NamedTuple):
+    """Where there is a first axis of states: at the state itself, at others in q, at others in q̇."""
+
+    by_q: Any  # ∂L/∂q
+    momentum: Any  # (states, n)
+    mass: Any  # (states, n, n)
+    force: Any  # M q̈ − Gᵀλ, (n,)
+    drift: Any  # (∂p/∂q) q̇ + ∂p/∂t
+    extra: Any  # Q as the user gives it
+    by_v_of_dissipation: Any
+    rows: Any  # G, (states, m, n)
+    targets: Any  # G q̈, (m,)
+    velocity: Any  # (states, n)
+    power: Any  # that D takes, Σ q̇ ∂D/∂q̇, and the sum of its parts without their signs, (states, 2)
+    minus: Any  # L, p, D if there is one, and the constraints at steps back, (2n + 1, rungs, outputs)
+    here: Any  # the same at the state, (outputs,)
+    plus: Any  # and ahead
+
+
+def _sizes(layout: Layout, q: PyTree, qdot: PyTree) -> np.ndarray:
+    """Of every coordinate its own size, or that of others in its array, or 1; in time what moves q by its size."""
+
+    def size(leaf):
+        x = np.abs(np.asarray(leaf, np.float64))
+        return np.broadcast_to(np.where(x > 0, x, x.max() or 1.0), x.shape).ravel()
+
+    of_q, of_v = (np.concatenate([size(leaf) for leaf in jax.tree.leaves(tree)]) for tree in (q, qdot))
+    speed = np.abs(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(qdot)]))
+    time = np.min(of_q / np.where(speed > of_q, speed, of_q))
+    return np.concatenate([of_q, of_v, [time]])
+
+
+def _offsets(layout: Layout, q: PyTree, sizes: np.ndarray) -> np.ndarray:
+    """From the state to others: none, then in q alone, then in q̇ alone; a tenth of the sizes.
+
+    A coordinate that is small beside the others moves farther: it may be next to where the chart is singular.
+    """
+    n, whole = layout.size, np.abs(layout.flatten(q)).max()
+    sizes = np.concatenate([np.maximum(sizes[:n], min(1.0, whole)), sizes[n:-1]])
+    moved = 0.1 * np.random.default_rng(0).standard_normal((2 * _NEARBY, 2 * n)) * sizes
+    moved[:_NEARBY, n:] = 0
+    moved[_NEARBY:, :n] = 0
+    return np.concatenate([np.zeros((1, 2 * n)), moved]).astype(layout.dtype)
+
+
+@eqx.filter_jit
+def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
+    layout = Layout.of(q, qdot)
+    motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
+    n, q, v = layout.size, layout.flatten(q), layout.flatten(qdot)
+    state = q, v, t, numbers
+
+    free = Motion(motion.lagrangian, None, None)  # L alone, and D alone beside it
+    damped = Motion(motion.lagrangian, None, motion.dissipation)
+
+    def nearby(offset):
+        at = q + offset[:n], v + offset[n:], t, numbers
+        none = jnp.zeros((0, n), q.dtype), jnp.zeros(0, q.dtype)
+        rows, targets = motion.rows_and_targets(*at) if motion.constrained else none
+        return motion.momentum(*at), *motion.mass_matrix_and_force(*at), rows, targets, at[1]
+
+    def dissipated(offset):
+        at = q, v + offset[n:], t, numbers
+        terms = -damped.nonconservative_force(*at) * at[1]
+        return jnp.stack([terms.sum(), jnp.abs(terms).sum()])
+
+    def everything(y):
+        at = y[:n], y[n:-1], y[-1], numbers
+        parts = [motion.lagrangian(*at)[None], motion.momentum(*at)]
+        parts += [] if motion.dissipation is None else [motion.dissipation(*at)[None]]
+        return jnp.concatenate(parts + ([motion.residual(*at)] if motion.constrained else []))
+
+    def along(direction, h):
+        return jax.vmap(lambda h: everything(y + h * direction))(jnp.concatenate([-h, h])).reshape(2, len(h), -1)
+
+    y = jnp.concatenate([q, v, t[None]])
+    directions = jnp.eye(2 * n + 1, dtype=y.dtype).at[-1, :n].set(v)
+    small = n <= _LARGEST_AT_ONCE
+    sides = jax.vmap(along)(directions, steps.T) if small else jax.lax.map(lambda x: along(*x), (directions, steps.T))
+    momentum, mass, force, rows, targets, velocity = jax.vmap(nearby)(offsets)
+    by_q = free.generalized_force(*state)
+    return Measured(
+        by_q=by_q,
+        momentum=momentum,
+        mass=mass,
+        force=force[0],
+        drift=by_q - free.mass_matrix_and_force(*state)[1],
+        extra=jnp.zeros_like(q) if motion.forces is None else motion.forces(*state),
+        by_v_of_dissipation=-damped.nonconservative_force(*state),
+        rows=rows,
+        targets=targets[0],
+        velocity=velocity,
+        power=jax.vmap(dissipated)(offsets),
+        minus=sides[:, 0],
+        here=everything(y),
+        plus=sides[:, 1],
+    )
+
+
+@eqx.filter_jit
+def _variation(system: System, q, qdot, t, params, acceleration, multipliers):
+    """How M q̈ − Gᵀλ − F and G q̈ − c vary with (q, q̇) while q̈ and λ do not, (n + m, 2n)."""
+    layout = Layout.of(q, qdot)
+    motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
+
+    def balance(y):
+        q, qdot = jnp.split(y, 2)
+        matrix, force = motion.mass_matrix_and_force(q, qdot, t, numbers)
+        if not motion.constrained:
+            return matrix @ acceleration - force
+        rows, targets = motion.rows_and_targets(q, qdot, t, numbers)
+        left = matrix @ acceleration - rows.T @ multipliers - force
+        return jnp.concatenate([left, rows @ acceleration - targets])
+
+    return jax.jacfwd(balance)(jnp.concatenate([layout.flatten(q), layout.flatten(qdot)]))

@@ -1,0 +1,207 @@
+"""Which operation of a user's function is to blame: its jaxpr, followed one equation at a time.
+
+Every equation is evaluated as it stands. One whose result is not finite although its operands are, or whose own first
+or second derivative is not finite, is an `Offender`; comparisons and their like (|x|, max, sign, floor) are `borders`,
+where a function may have a kink or a jump. Both know the line of the user's code that they come from.
+"""
+
+import os
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core, source_info_util
+
+_PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+
+
+class Offender(NamedTuple):
+    """An operation, the operands at which it fails, the line it stands in, and what is not finite there."""
+
+    name: str
+    operands: str
+    place: str
+    fault: str  # "value", "first derivative" or "second derivative"
+
+    def __str__(self) -> str:
+        return f"{self.name}({self.operands}){self.place}, whose {self.fault} is not finite there"
+
+
+def offenders(function: Callable, *arguments) -> list[Offender]:
+    """The operations of `function(q, qdot, t, params)` that are not finite, or whose derivatives are not, by (q, q̇, t).
+
+    In the order in which they are evaluated.
+    """
+    found = []
+
+    def visit(equation, operands, moves, results, place):
+        chosen = [i for i, x in enumerate(operands) if moves[i] and _floating(x)]
+        if not chosen or not all(_finite(x) for x in operands):
+            return
+        name = _name(equation)
+        if not all(_finite(x) for x in results):
+            found.append(Offender(name, _operands(operands, results), place, "value"))
+        elif any(_floating(x) for x in results):
+            first, second = _derivatives(equation, operands, chosen)
+            for fault, values in (("first derivative", first), ("second derivative", second)):
+                if not all(_finite(x) for x in values):
+                    found.append(Offender(name, _operands(operands, values), place, fault))
+                    break
+
+    _follow(function, arguments, visit, into_rules=False)
+    return found
+
+
+def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
+    """The operations of `function` at which it is pieced together: name, place, and on which side of it we are.
+
+    Works on values that are being traced, so that the sides can be had for many states at once.
+    """
+    found = []
+
+    def visit(equation, operands, moves, results, place):
+        side = _SIDES.get(equation.primitive.name)
+        if side is not None and any(m and _floating(x) for m, x in zip(moves, operands, strict=True)):
+            found.append((_name(equation), place, jnp.asarray(side(operands, results), float)))
+
+    _follow(function, arguments, visit, into_rules=True)
+    return found
+
+
+def _of_result(operands, results):
+    return results[0]
+
+
+def _first_larger(operands, results):
+    return operands[0] >= operands[1]
+
+
+_SIDES = {
+    **dict.fromkeys(("gt", "ge", "lt", "le", "eq", "ne", "sign"), _of_result),
+    **dict.fromkeys(("floor", "ceil", "round", "argmax", "argmin"), _of_result),
+    "abs": lambda operands, results: operands[0] >= 0,
+    "max": _first_larger,
+    "min": _first_larger,
+    "clamp": lambda operands, results: 1.0 * (operands[1] > operands[0]) + (operands[1] > operands[2]),
+    "reduce_max": lambda operands, results: jnp.argmax(operands[0]),
+    "reduce_min": lambda operands, results: jnp.argmin(operands[0]),
+    "rem": lambda operands, results: jnp.trunc(operands[0] / operands[1]),
+}  # fmt: skip
+
+
+# ---- following a jaxpr -----------------------------------------------------------------------------------------------
+
+_CALLS = ("jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2")
+_RULES = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
+
+
+def _follow(function: Callable, arguments: tuple, visit: Callable, into_rules: bool) -> None:
+    """Evaluate `function(q, qdot, t, params)`, and show every equation that q, q̇ or t moves to `visit`.
+
+    What has a rule of its own for its derivative is one operation, unless `into_rules`.
+    """
+    closed = jax.make_jaxpr(function)(*arguments)
+    *state, params = arguments
+    moves = [True] * len(jax.tree.leaves(state)) + [False] * len(jax.tree.leaves(params))
+    inside = (*_CALLS, *_RULES) if into_rules else _CALLS
+    with np.errstate(all="ignore"):
+        _run(closed.jaxpr, closed.consts, jax.tree.leaves(arguments), moves, "", visit, inside)
+
+
+def _run(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside: tuple[str, ...]) -> tuple[list, list]:
+    """The results of a jaxpr, and which of them move."""
+    values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
+    moving = {v for v, m in zip(jaxpr.invars, moves, strict=True) if m}
+
+    def read(atom):
+        return atom.val if isinstance(atom, core.Literal) else values[atom]
+
+    def is_moving(atom):
+        return not isinstance(atom, core.Literal) and atom in moving
+
+    for equation in jaxpr.eqns:
+        operands, moved = [read(x) for x in equation.invars], [is_moving(x) for x in equation.invars]
+        # A library function is traced once and remembers who asked first: the line is that of the outermost call.
+        place = outer or _place(equation)
+        body = _body(equation) if equation.primitive.name in inside else None
+        if body is not None:
+            results, out_moved = _run(body[0], body[1], operands, moved, place, visit, inside)
+        else:
+            results = _bind(equation, operands)
+            out_moved = [any(moved)] * len(results)
+            if any(moved):
+                visit(equation, operands, moved, results, place)
+        values |= zip(equation.outvars, results, strict=True)
+        moving |= {v for v, m in zip(equation.outvars, out_moved, strict=True) if m}
+    return [read(x) for x in jaxpr.outvars], [is_moving(x) for x in jaxpr.outvars]
+
+
+def _body(equation) -> tuple | None:
+    """The jaxpr that an equation calls, and its constants."""
+    body = next((equation.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in equation.params), None)
+    if body is None:
+        return None
+    return (body.jaxpr, body.consts) if hasattr(body, "consts") else (body, ())
+
+
+def _bind(equation, operands) -> list:
+    bound = equation.primitive.get_bind_params(equation.params)
+    functions, params = bound if isinstance(bound, tuple) else ((), bound)  # before and since jax 0.10
+    results = equation.primitive.bind(*functions, *operands, **params)
+    return list(results) if equation.primitive.multiple_results else [results]
+
+
+def _derivatives(equation, operands, chosen: list[int]) -> tuple[list, list]:
+    """Sums over its results of the first derivatives of one operation, and of the second: in reverse, then forward."""
+
+    def local(*xs):
+        filled = list(operands)
+        for i, x in zip(chosen, xs, strict=True):
+            filled[i] = x
+        return [x for x in _bind(equation, filled) if _floating(x)]
+
+    def slopes(*xs):
+        results, pull_back = jax.vjp(local, *xs)
+        return pull_back([jnp.ones_like(x) for x in results])
+
+    point = [jnp.asarray(operands[i]) for i in chosen]
+    first, second = jax.jvp(slopes, point, [jnp.ones_like(x) for x in point])
+    return list(first), list(second)
+
+
+def _name(equation) -> str:
+    body = _body(equation) if equation.primitive.name in _RULES else None
+    own = getattr(getattr(body[0], "debug_info", None), "func_name", None) if body else None
+    return own or equation.primitive.name
+
+
+def _place(equation) -> str:
+    """The user's line, as the end of a sentence; empty where it is one of lagjax."""
+    summary = source_info_util.summarize(equation.source_info)  # file:line (function)
+    file = summary.partition(":")[0]
+    own = os.path.relpath(file, _PACKAGE).startswith("_")
+    return "" if own or file == summary else f" at {os.path.basename(summary)}"
+
+
+def _floating(x) -> bool:
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def _finite(x) -> bool:
+    return not _floating(x) or bool(np.isfinite(np.asarray(x)).all())
+
+
+def _operands(operands, failing) -> str:
+    """The operands where the first of `failing` is not finite, number by number if they have its shape."""
+    bad = next(np.asarray(x) for x in failing if not _finite(x))
+    index = tuple(np.argwhere(~np.isfinite(bad))[0])
+
+    def show(x):
+        x = np.asarray(x)
+        if x.shape == bad.shape:
+            x = x[index]
+        return f"{x:.6g}" if x.ndim == 0 and _floating(x) else str(x) if x.ndim == 0 else f"array of shape {x.shape}"
+
+    return ", ".join(map(show, operands))

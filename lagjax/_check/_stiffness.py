@@ -1,0 +1,51 @@
+"""Time scales: the eigenvalues of the motion linearised at the state."""
+
+import numpy as np
+
+from lagjax._check._findings import Finding
+from lagjax._check._mass import kernel
+from lagjax._check._measure import Scene
+
+_RATIO = 1e4  # of time scales, from which on an explicit solver spends nearly all of its steps on the fastest
+
+
+def findings(scene: Scene) -> list[Finding]:
+    """Advice where one part of the motion is much faster than another."""
+    n, m = scene.layout.size, scene.measured
+    # Constraints leave the velocities in the kernel of G free.
+    free = kernel(m.rows[0].astype(float))
+    jacobian = scene.jacobian()
+    by_q, by_v = free.T @ jacobian[:, :n] @ free, free.T @ jacobian[:, n:] @ free
+    if not (np.isfinite(by_q).all() and np.isfinite(by_v).all()) or not free.shape[1]:
+        return []
+    f = len(by_q)
+    linear = np.block([[np.zeros((f, f)), np.eye(f)], [by_q, by_v]])
+    values = _trusted(linear, float(np.finfo(scene.layout.dtype).eps))
+    speeds = np.abs(values)
+    if len(values) < 2 or speeds.max() < _RATIO * speeds.min():
+        return []
+    fastest, ratio = values[np.argmax(speeds)], speeds.max() / speeds.min()
+    start = f"Time scales here lie from {1 / speeds.max():.1e} to {1 / speeds.min():.1e}, a ratio of {ratio:.0e}"
+    if -fastest.real > abs(fastest.imag):
+        message = (
+            f"{start}, and the fastest dies out: the motion is stiff. Explicit solvers, the default among them, take "
+            "steps of the shortest; an implicit one need not: simulate(..., solver=diffrax.Kvaerno5(), rtol=1e-6)."
+        )
+    else:
+        message = (
+            f"{start}: every period of the fastest costs steps. Replace a stiff spring by a constraint, average a "
+            "fast motion out, or count on long runs."
+        )
+    return [Finding("stiff", "advice", (), message)]
+
+
+def _trusted(linear: np.ndarray, eps: float) -> np.ndarray:
+    """The eigenvalues that rounding does not move by a tenth; a defective zero is not one of them."""
+    speed = np.sqrt(np.abs(linear[len(linear) // 2 :]).max()) or 1.0
+    scale = np.repeat([1.0, speed], len(linear) // 2)  # the time in units in which both halves are alike
+    linear = linear * scale / scale[:, None]
+    values = np.linalg.eigvals(linear)
+    noise = 64 * eps * np.abs(linear).max() * np.random.default_rng(0).standard_normal(linear.shape)
+    moved = np.linalg.eigvals(linear + noise)
+    nearest = np.abs(values[:, None] - moved).min(axis=1)
+    return values[(np.abs(values) > 0) & (nearest < 0.1 * np.abs(values))]
