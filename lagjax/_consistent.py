@@ -28,12 +28,8 @@ def require_consistent(system: System, layout: Layout, ts, q0: PyTree, qdot0: Py
     if _free(system) or not _known((ts, q0, qdot0, params, system)):
         return
     names = system.constraint_names(layout, params)
-    if len(names) > layout.size:
-        raise ValueError(
-            f"There are {len(names)} constraints ({', '.join(names)}) for {layout.size} coordinates: no more than "
-            f"{layout.size} can be independent. Drop those that follow from the others."
-        )
-    positions, velocities, demands, lengths, coupling = map(np.asarray, _compiled(system, ts, q0, qdot0, params))
+    numbers = map(np.asarray, _compiled(system, ts, q0, qdot0, params))
+    positions, velocities, demands, lengths, coupling, driven = numbers
     tolerance = TOLERANCE[layout.dtype]
     for name, *found, length in zip(names, positions, velocities, demands, lengths, strict=True):
         if not np.isfinite([*found, length]).all():
@@ -41,6 +37,13 @@ def require_consistent(system: System, layout: Layout, ts, q0: PyTree, qdot0: Py
         if length == 0:
             raise ValueError(f"{name} has zero gradient at the initial state, where it holds nothing.")
     dependent = dependent_rows(coupling)
+    independent = len(names) - len(dependent)
+    crowded = len(names) > layout.size <= independent and np.isfinite(coupling).all()
+    if crowded and not (driven or _timed(system)):
+        raise ValueError(
+            f"There are {len(names)} constraints ({', '.join(names)}) for {layout.size} coordinates, and {independent} "
+            "of them are independent at the initial state: nothing can move. Drop those that are not meant."
+        )
     for values, what, state in ((positions, "q0", "it"), (velocities, "qdot0", "its rate of change")):
         clash = _contradiction(names, values, what, lengths, dependent, tolerance)
         if clash and (what == "qdot0" or _nowhere(system, q0, qdot0, ts[0], params)):
@@ -81,14 +84,16 @@ def inconsistent_members(system: System, layout: Layout, ts, values: dict, axes:
     if _free(system) or not _known((ts, values, system)):
         return None
     each = jax.vmap(lambda *one: _compiled(system, ts, *one), in_axes=tuple(axes.values()))
-    positions, velocities, _, lengths, _ = each(*values.values())
+    positions, velocities, _, lengths, _, _ = each(*values.values())
     off = jnp.maximum(jnp.abs(positions), jnp.abs(velocities)) / lengths
     return ~(off <= TOLERANCE[layout.dtype]).all(axis=1)
 
 
 @eqx.filter_jit
 def _compiled(system: System, ts, q0: PyTree, qdot0: PyTree, params: PyTree):
-    """For every constraint its value and rate over the size of the state, what it asks of q̈, |gradient|; and S."""
+    """For every constraint its value and rate over the size of the state, what it asks of q̈, |gradient|; and of all S
+    and whether they move what is at rest.
+    """
     layout = Layout.of(q0, qdot0)
     numbers = eqx.filter(params, eqx.is_array_like)
     motion = system.motion(layout, params)
@@ -105,11 +110,17 @@ def _off(motion: Motion, q, qdot, t, params):
         held = motion.constraints(q, t, params)
         values = values.at[: len(held)].set(held)
     sizes = 1 + jnp.max(jnp.abs(q)), 1 + jnp.max(jnp.abs(qdot))
-    return values / sizes[0], rates / sizes[1], demands, lengths, motion.coupling(q, qdot, t, params)
+    coupling, driven = motion.coupling(q, qdot, t, params), motion.velocity_saddle(q, jnp.zeros_like(q), t, params)[2]
+    return values / sizes[0], rates / sizes[1], demands, lengths, coupling, jnp.any(driven != 0)
 
 
 def _free(system: System) -> bool:
     return system.constraints is None and system.velocity_constraints is None
+
+
+def _timed(system: System) -> bool:
+    """Whether a constraint asks for the time: it may prescribe a motion."""
+    return any("t" in held.extras for held in (system.constraints, system.velocity_constraints) if held is not None)
 
 
 def _known(tree: PyTree) -> bool:

@@ -6,7 +6,9 @@ forms give the same motion to round-off, and are tested against each other.
 """
 
 import abc
+import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -113,7 +115,7 @@ def equations(motion: Motion, layout: Layout, params: PyTree, path: str = "auto"
     if path == "array":
         return ArrayEquations(motion, "asked for")
     try:
-        program = scalar_program(motion, layout, params)
+        program = scalar_program(motion, layout, params).complete
     except Unlowerable as reason:
         if path == "scalar":
             raise ValueError(f"This scene has no scalar program: {reason}.") from None
@@ -128,6 +130,12 @@ def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
     """q̈ and the singularity of M as one program: first M and the forces, then the elimination their zeros allow.
 
     Its inputs are q, q̇, t and every number in params. Raises `Unlowerable` with the reason.
+
+    With constraints M may be singular (a parameter may make it so) as long as the saddle point is not. To allow for
+    that costs three times the arithmetic. Where M is regular in general the program therefore takes it for regular, and
+    its last output tells where that would cost digits; there `otherwise` is the program for any M. Machine code changes
+    over where that comes about (`_flow`), with the numbers of the run at hand; XLA, which has to write the program down
+    before it knows them, takes the one that always holds (`complete`).
     """
     _require_small(layout)
     if not motion.constrained:
@@ -136,7 +144,11 @@ def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
     def saddle(*state):
         return *motion.mass_matrix_and_force(*state), *motion.rows_and_targets(*state)
 
-    return _eliminated(saddle, motion, layout, params)
+    def for_any_mass_matrix():
+        return _eliminated(saddle, motion, layout, params)
+
+    lean = _eliminated(saddle, motion, layout, params, wary=True)
+    return for_any_mass_matrix() if lean is None else replace(lean, otherwise=functools.cache(for_any_mass_matrix))
 
 
 def projection_program(motion: Motion, layout: Layout, params: PyTree) -> Program | None:
@@ -180,15 +192,23 @@ def _require_small(layout: Layout) -> None:
         raise Unlowerable(f"it has {layout.size} coordinates, more than {LARGEST_SCALAR_SCENE}")
 
 
-def _eliminated(parts_of: Callable, motion: Motion, layout: Layout, params: PyTree, wanted: str = "x") -> Program:
-    """x (or λ) with M x = b, or with M x − Gᵀλ = b and G x = c, from a function that returns (M, b) or (M, b, G, c)."""
+def _eliminated(parts_of: Callable, motion: Motion, layout, params, wanted: str = "x", wary: bool = False):
+    """x (or λ) with M x = b, or with M x − Gᵀλ = b and G x = c, from a function that returns (M, b) or (M, b, G, c).
+
+    With constraints M is helped by GᵀG unless it is constant and regular. A `wary` program does not help it, and says
+    where it should; None where that is everywhere, or nowhere.
+    """
     n = layout.size
     q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
     parts = lower(parts_of, q, q, t, params, budget=OPERATION_BUDGET)
     m = (len(parts.outputs) - n * n - n) // (n + 1)  # rows of G
     regular = _require_definite(parts, n, m)
+    constant = not any(parts.depends(i) for i in range(n * n))
+    if wary and (constant or not regular):
+        return None
     zeros = np.array([parts.constant(i) == 0 for i in range(len(parts.outputs))])
     mass_zeros, row_zeros = zeros[: n * n].reshape(n, n), zeros[n * n + n : n * n + n + m * n].reshape(m, n)
+    helped = not (wary or (constant and regular))
 
     def solved(*scalars):
         values = list(parts(*scalars))
@@ -199,7 +219,7 @@ def _eliminated(parts_of: Callable, motion: Motion, layout: Layout, params: PyTr
         else:
             rows, c = [values[n * i : n * i + n] for i in range(m)], values[m * n :]
             zeros = (mass_zeros, row_zeros)
-            x, multipliers, singular = _linear.eliminate_saddle(matrix, b, rows, c, zeros, regular, layout.dtype)
+            x, multipliers, singular = _linear.eliminate_saddle(matrix, b, rows, c, zeros, layout.dtype, helped, wary)
             if wanted == "multipliers":
                 return tuple(multipliers)
         return *x, singular
@@ -216,12 +236,10 @@ def _scalar_shapes(layout: Layout, params: PyTree) -> list[jax.ShapeDtypeStruct]
 def _require_definite(parts: Program, n: int, m: int) -> bool:
     """Elimination without pivoting is for positive definite M; look at a few states whether this M can be.
 
-    With constraints it may be singular, and is then helped by GᵀG. Returns whether it never needs help, which nobody
-    knows where it depends on parameters: one of them may be zero. The choice is between right answers: a wrong guess
-    here is caught by the test on the pivots.
+    With constraints it may be singular, and is then helped by GᵀG. Returns whether it is regular without, in general:
+    at all of these states. The choice is between right answers: a wrong guess here is caught by the test on the pivots.
     """
-    rng = np.random.default_rng(0)
-    regular = not any(position > 2 * n for i in range(n * n) for position in parts.depends(i))
+    rng, regular = np.random.default_rng(0), True
     for _ in range(3):
         values = np.array(parts.evaluate(*rng.uniform(0.3, 1.2, parts.size)), float)
         matrix = values[: n * n].reshape(n, n)

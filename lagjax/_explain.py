@@ -28,7 +28,8 @@ class Explanation:
       the coordinates, velocities (`d` before the name) and `t` that it reads.
     - `velocity_terms`: whether forces depend on the velocities; `explicit_time`: whether anything depends on `t`.
     - `energy_conserved`: whether h = p·q̇ − L is constant along every motion.
-    - `operations`: scalar operations of one acceleration; `traced_operations`: of its derivatives before reduction.
+    - `operations`: scalar operations of one acceleration (with constraints in machine code, where M is regular);
+      `traced_operations`: of its derivatives before reduction.
     - `constraints`: the name of every number that is to be zero; `dependent_constraints`: those that, at the state
       asked about, are combinations of others before them, and of which (up to the part eps^(2/3) of the square of the
       gradient). They change nothing but the multipliers.
@@ -93,9 +94,9 @@ def explain(motion: Motion, layout: Layout, params, path: str) -> Explanation:
     form = equations(motion, layout, params, path)
     scalar = isinstance(form, ScalarEquations)
     known = {"coordinates": names, "path": "scalar" if scalar else "array", "reason": "" if scalar else form.reason}
-    known["solver"] = _solver(motion, layout, params, path)
+    known["solver"], lean = _solver(motion, layout, params, path)
     if scalar:
-        known["operations"] = form.program.operations
+        known["operations"] = (lean or form.program).operations
         if form.projection is not None:
             known["projection_operations"] = form.projection.operations
 
@@ -141,13 +142,14 @@ def _moving_constraints(motion: Motion, q, t, params) -> tuple[bool, bool]:
     return timed, any(rest.constant(k) != 0 for k in range(len(rest.outputs)))
 
 
-def _solver(motion: Motion, layout: Layout, params, path: str) -> str:
+def _solver(motion: Motion, layout: Layout, params, path: str) -> tuple[str, Program | None]:
+    """What integrates by default, and the program of machine code, where it is that."""
     try:
-        reason = "the array path was asked for" if path == "array" else None
-        reason = reason or unfit(scalar_program(motion, layout, params), layout.size, layout.dtype)
+        program = scalar_program(motion, layout, params)
+        reason = unfit(program, layout.size, layout.dtype) if path != "array" else "the array path was asked for"
     except Unlowerable as why:
         reason = str(why)
-    return "Taylor series in machine code" if reason is None else f"diffrax.Dopri8, because {reason}"
+    return ("Taylor series in machine code", program) if reason is None else (f"diffrax.Dopri8, because {reason}", None)
 
 
 def _pattern(parts: Program, n: int) -> str:

@@ -267,7 +267,7 @@ def _made(name: str, system: System, leaving: tuple[Transition, ...], layout: La
             return jnp.stack([_scalar(one.guard, layout.restore(q), layout.restore(v), given) for one in leaving])
 
         def guards(y, numbers):
-            slope = jnp.stack(program(*y, *_scalars(numbers))[:n])
+            slope = jnp.stack(program.complete(*y, *_scalars(numbers))[:n])
             along = jnp.concatenate([y[n:-1], slope, jnp.ones(1)])
             by_y = jax.jacfwd(surfaces)(y, numbers)
             terms, moving = by_y * y, by_y * along
@@ -434,7 +434,7 @@ class _Rounds(NamedTuple):
         t, y, scalars = jax.lax.stop_gradient((t, y, self.scalars))
         n, out = self.layout.size, self.modes[index].guards(*y, t, *scalars)
         count = len(out) // 4
-        slope = jnp.concatenate([y[n:], jnp.stack(self.modes[index].flow.program(*y, t, *scalars)[:n])])
+        slope = jnp.concatenate([y[n:], jnp.stack(self.modes[index].flow.everywhere(*y, t, *scalars)[:n])])
         return out[:count], out[count : 2 * count], out[2 * count : 3 * count], slope
 
     def astray(self, index: int, t, y):

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from lagjax._equations import Equations
 from lagjax._program import plain_elementary
 from lagjax._settings import Settings
-from lagjax._solvers import FineOutput, Projected
+from lagjax._solvers import Projected
 from lagjax._taylor import Taylor
 
 PyTree = Any
@@ -69,14 +69,14 @@ def _differentiable(moving, settings: Settings, event, primal) -> Solved:
 def _solve(moving, settings: Settings, controller, adjoint, event=None, record: bool = False):
     """Call diffrax; `moving` is all that can be differentiated. With `record`, the accepted times come along."""
     field, project, ts, y0, params = moving
-    solver = _looping(settings.solver, adjoint)
+    solver = settings.solver if project is None else Projected(settings.solver, project)
     fixed_dt = settings.dt0 if controller is settings.controller else None
     saved = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]
     if record:
         saved.append(diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t))
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
-        solver if project is None else Projected(solver, project),
+        _looping(solver, adjoint),
         t0=ts[0],
         t1=ts[-1],
         dt0=fixed_dt,
@@ -98,12 +98,18 @@ def _solve(moving, settings: Settings, controller, adjoint, event=None, record: 
 
 
 def _looping(solver, adjoint):
-    """The solver with a stage loop that the adjoint can differentiate, which diffrax sets for its own solvers only."""
-    if not isinstance(solver, FineOutput) or solver.solver.scan_kind is not None:
+    """The solver with a stage loop that the adjoint can differentiate, which diffrax sees to unless it is wrapped."""
+    if isinstance(solver, diffrax.AbstractRungeKutta):
         return solver
     kinds = {diffrax.ForwardMode: "lax", diffrax.RecursiveCheckpointAdjoint: "checkpointed"}
     kind = kinds.get(type(adjoint), "bounded")
-    return eqx.tree_at(lambda s: s.solver.scan_kind, solver, kind, is_leaf=lambda leaf: leaf is None)
+
+    def within(part):
+        if not isinstance(part, diffrax.AbstractRungeKutta) or part.scan_kind is not None:
+            return part
+        return eqx.tree_at(lambda s: s.scan_kind, part, kind, is_leaf=lambda leaf: leaf is None)
+
+    return jax.tree.map(within, solver, is_leaf=lambda part: isinstance(part, diffrax.AbstractRungeKutta))
 
 
 @eqx.filter_custom_vjp

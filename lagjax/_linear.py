@@ -8,6 +8,8 @@ scaling for positive definite M, van der Sluis 1969), so that masses of very dif
 factorised by LU with pivoting. `eliminate` is for scalar programs: the same solution, written out entry by entry.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -222,38 +224,53 @@ def _inverse_on_range_jvp(primals, tangents):
     return inverse, turned + turned.T - inverse @ moving @ inverse
 
 
-def eliminate_saddle(matrix, b, rows, c, zeros, regular: bool, dtype) -> tuple[list, list, jax.Array]:
+def eliminate_saddle(matrix, b, rows, c, zeros, dtype, helped: bool, wary: bool) -> tuple[list, list, jax.Array]:
     """The same as `saddle` on scalars, without pivoting: M positive (semi)definite, `rows` a list of lists.
 
-    `zeros` marks what is zero in (M, G) whatever the state; `regular` says that M needs no help. Redundant rows are
-    left out of λ: the motion is the same, the multipliers are a solution but not the shortest.
+    `zeros` marks what is zero in (M, G) whatever the state. With `helped` M may be singular; without, it must be
+    regular. Redundant rows are left out of λ: the motion is the same, the multipliers are a solution but not the
+    shortest. A `wary` elimination calls a saddle point singular as soon as it loses digits: where M, or what the
+    constraints make of it, is not far from singular (`WARY`).
     """
-    n, m = len(matrix), len(rows)
     mass_zeros, row_zeros = zeros
-    small = singular_threshold(n, dtype)
-    if not regular:
-        touched = ~row_zeros
-        total = _dot((matrix[i][i], 1.0) for i in range(n))
-        sizes = [_dot((rows[k][i], rows[k][i]) for i in range(n) if touched[k, i]) for k in range(m)]
-        # Weights that make every row of G as heavy as M.
-        heavy = [total / jnp.where(size > 0, size, 1.0) for size in sizes]
-        pulled = [[heavy[k] * rows[k][i] for i in range(n)] for k in range(m)]
-        mass_zeros = mass_zeros & ~((touched.T.astype(int) @ touched.astype(int)) > 0)
-        matrix = [
-            [matrix[i][j] + _dot((pulled[k][i], rows[k][j]) for k in range(m) if touched[k, i] and touched[k, j])
-             for j in range(n)] for i in range(n)
-        ]  # fmt: skip
-        b = [b[i] + _dot((pulled[k][i], c[k]) for k in range(m) if touched[k, i]) for i in range(n)]
-    factors, singular = _ldl_factors(matrix, ~mass_zeros, small)
+    n, m, singular = len(matrix), len(rows), jnp.zeros((), bool)
+    if helped:
+        matrix, b, mass_zeros = _helped(matrix, b, rows, c, zeros)
+    if wary:
+        least, most = (functools.reduce(of, (matrix[i][i] for i in range(n))) for of in (jnp.minimum, jnp.maximum))
+        singular = least <= WARY * most  # the constraints would have to hold a light coordinate against large forces
+    factors, lost = _ldl_factors(matrix, ~mass_zeros, WARY if wary else singular_threshold(n, dtype))
     free = _ldl_solve(factors, b)
     responses = [_ldl_solve(factors, row) for row in rows]
     schur = [[_dot((rows[i][k], responses[j][k]) for k in range(n) if not row_zeros[i, k]) for j in range(m)]
              for i in range(m)]  # fmt: skip
     missing = [c[i] - _dot((rows[i][k], free[k]) for k in range(n) if not row_zeros[i, k]) for i in range(m)]
-    kept, _ = _ldl_factors(schur, np.ones((m, m), bool), rank_tolerance(dtype), drop=True)
+    small = WARY if wary else rank_tolerance(dtype)
+    kept, redundant = _ldl_factors(schur, np.ones((m, m), bool), small, drop=not wary)
     multipliers = _ldl_solve(kept, missing)
     x = [free[k] + _dot((responses[i][k], multipliers[i]) for i in range(m)) for k in range(n)]
-    return x, multipliers, singular
+    return x, multipliers, singular | lost | redundant if wary else lost
+
+
+WARY = 1e-4  # the part of a pivot that has to be left: four digits of an acceleration may be lost, and no more
+
+
+def _helped(matrix, b, rows, c, zeros):
+    """M + GᵀW G, b + GᵀW c, and where the first is zero whatever the state."""
+    n, m = len(matrix), len(rows)
+    mass_zeros, row_zeros = zeros
+    touched = ~row_zeros
+    total = _dot((matrix[i][i], 1.0) for i in range(n))
+    sizes = [_dot((rows[k][i], rows[k][i]) for i in range(n) if touched[k, i]) for k in range(m)]
+    # Weights that make every row of G as heavy as M.
+    heavy = [total / jnp.where(size > 0, size, 1.0) for size in sizes]
+    pulled = [[heavy[k] * rows[k][i] for i in range(n)] for k in range(m)]
+    matrix = [
+        [matrix[i][j] + _dot((pulled[k][i], rows[k][j]) for k in range(m) if touched[k, i] and touched[k, j])
+         for j in range(n)] for i in range(n)
+    ]  # fmt: skip
+    b = [b[i] + _dot((pulled[k][i], c[k]) for k in range(m) if touched[k, i]) for i in range(n)]
+    return matrix, b, mass_zeros & ~((touched.T.astype(int) @ touched.astype(int)) > 0)
 
 
 def _dot(pairs):

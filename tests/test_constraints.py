@@ -14,7 +14,7 @@ import scipy.integrate
 
 import lagjax
 from lagjax import scenes
-from lagjax._equations import equations
+from lagjax._equations import equations, scalar_program
 from lagjax._layout import Layout
 from lagjax._linear import rank_tolerance
 
@@ -55,6 +55,7 @@ def hung(angle, rate=0.0):
 def test_the_force_between_rolling_cylinders_is_the_closed_form():
     scene, rng = scenes.rolling_cylinder(), np.random.default_rng(0)
     alpha, start = rng.uniform(0, 1, 200), rng.uniform(0.05, 0.5, 200)
+    alpha[:4] = 0.0, 1e-15, 1e-8, 1e-3  # without inertia, and with hardly any
     turns = (scene.params["R"] + scene.params["a"]) / scene.params["a"]
     q0 = scenes.Rolling(np.full(200, scene.q0.r), start, turns * start)
     rest = jax.tree.map(np.zeros_like, q0)
@@ -271,11 +272,41 @@ def test_a_coordinate_without_mass_that_a_constraint_holds():
 
 
 def test_a_singular_saddle_point_is_reported():
-    # Neither L nor the constraint holds q[1].
+    # Neither L nor the constraint holds q[1]; in the second only because a parameter is zero.
     system = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1], constraints=lambda q: q[0] - 1.0)
     assert np.isnan(system.acceleration(jnp.array([1.0, 0.0]), jnp.zeros(2))).all()
     with pytest.raises(lagjax.SimulationError):
         lagjax.simulate(system, np.array([1.0, 0.0]), np.zeros(2), np.array([0.0, 1.0]))
+    system = lagjax.System(lambda q, v, params: 0.5 * params @ v**2 - q[1], constraints=lambda q: q[0] - 1.0)
+    q0, masses = np.array([1.0, 0.0]), np.array([[1.0, 2.0], [0.0, 2.0], [1.0, 0.0]])
+    run = lagjax.simulate_batch(system, q0, 0 * q0, np.array([0.0, 1.0]), masses, batch_axes=(None, None, 0))
+    assert (run.result == lagjax.RESULTS.mass_matrix_singular).tolist() == [False, False, True]
+    np.testing.assert_allclose(run.q[:2, -1, 1], -0.25, rtol=1e-13)
+
+
+def test_masses_in_params_are_taken_for_what_they_are():
+    # Where they are regular the program is the lean one; where they are not, or hardly, the one for any mass matrix
+    # takes over, also where JAX does not know them while it traces, and in derivatives.
+    rods = scenes.cartesian_double_pendulum()
+    layout = Layout.of(rods.q0, rods.qdot0)
+    lean = scalar_program(rods.system.motion(layout, rods.params), layout, rods.params)
+    assert 2 * lean.operations < lean.complete.operations
+    scene = scenes.rolling_cylinder()
+    rest = scenes.Rolling(0.0, 0.0, 0.0)
+
+    def end(alpha):
+        params = scene.params | {"alpha": alpha}
+        return lagjax.simulate(scene.system, scene.q0, rest, np.array([0.0, 0.6]), params, rtol=1e-12).q.theta2[-1]
+
+    def exact(alpha):
+        return scene.exact(0.6, scene.q0, rest, scene.params | {"alpha": alpha})[0].theta2
+
+    alpha = jnp.array([0.0, 1e-15, 1e-3, 0.5])
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(end)))(alpha)
+    np.testing.assert_allclose(values, jax.vmap(exact)(alpha), rtol=1e-10)
+    central = (jax.vmap(exact)(alpha + 1e-4) - jax.vmap(exact)(alpha - 1e-4)) / 2e-4
+    np.testing.assert_allclose(slopes, central, rtol=1e-6)  # 1e-8 of third derivatives
+    np.testing.assert_allclose(end(0.0), values[0], rtol=1e-14)
 
 
 def crank_alone(q, qdot, params):
@@ -356,14 +387,65 @@ def test_parallelogram_linkages_pass_the_flat_configuration():
     np.testing.assert_allclose(run.q, np.stack([free.q, GROUND[1] + 0 * free.q, free.q], axis=-1), atol=1e-6)
 
 
+def test_more_constraints_than_coordinates():
+    # A sphere four times over, in three coordinates.
+    scene = scenes.particle_on_sphere()
+    sphere = code(scene.system.constraints)
+    many = rebuilt(scene.system, constraints=lambda q, params: sphere(q, params)["sphere"] * jnp.array([1, -2, 1e3, 1]))
+    ts = np.linspace(0, 0.6, 3)
+    once, often = (
+        lagjax.simulate(system, scene.q0, scene.qdot0, ts, scene.params, rtol=1e-11) for system in (scene.system, many)
+    )
+    np.testing.assert_allclose(np.array(often.q), np.array(once.q), atol=1e-10)
+    np.testing.assert_allclose(often.multipliers @ np.array([1, -2, 1e3, 1]), once.multipliers["sphere"], rtol=1e-9)
+    # A prescribed motion leaves nothing to move, but something to carry it out.
+    led = lagjax.System(weight, constraints=lambda q, t: jnp.stack([q[0] - t**2, q[1], q[0] + q[1] - t**2]))
+    run = lagjax.simulate(led, np.zeros(2), np.zeros(2), ts)
+    np.testing.assert_allclose(run.q[:, 0], ts**2, atol=1e-12)
+    np.testing.assert_allclose(run.constraint_force(), np.tile([2, 9.81], (3, 1)), rtol=1e-9)
+
+
+def ladder(q, qdot):
+    """`linkage`, with two more bars of unit mass in the middle that are pivoted on the ground and on the coupler."""
+    middle = qdot[3] ** 2 / 6 + qdot[4] ** 2 / 6 - 9.81 * 0.5 * (jnp.sin(q[3]) + jnp.sin(q[4]))
+    return linkage(q[:3], qdot[:3]) + middle
+
+
+def closed_ladder(q):
+    length, lean = GROUND
+    closed = {}
+    for name, part, bar in (("end", 1.0, q[2]), ("first", 0.3, q[3]), ("second", 0.6, q[4])):
+        across = part * length * (jnp.stack([jnp.cos(q[1]), jnp.sin(q[1])]) - np.array([np.cos(lean), np.sin(lean)]))
+        closed[name] = jnp.stack([jnp.cos(q[0]), jnp.sin(q[0])]) + across - jnp.stack([jnp.cos(bar), jnp.sin(bar)])
+    return closed
+
+
+def test_a_linkage_held_by_more_bars_than_it_needs():
+    # Six constraints on five coordinates, four of them independent.
+    system = lagjax.System(ladder, constraints=closed_ladder)
+    minimal = lagjax.System(lambda a, v: ladder(jnp.stack([a, GROUND[1], a, a, a]), jnp.stack([v, 0, v, v, v])))
+    ts, start, lean = np.linspace(0, 0.5, 3), 1.4, GROUND[1]
+    free = lagjax.simulate(minimal, start, 0.4, ts, rtol=1e-11)
+    q0, qdot0 = np.array([start, lean, start, start, start]), np.array([0.4, 0, 0.4, 0.4, 0.4])
+    run = lagjax.simulate(system, q0, qdot0, ts, rtol=1e-11)
+    np.testing.assert_allclose(run.q, np.stack([free.q, lean + 0 * free.q, *[free.q] * 3], axis=1), atol=1e-9)
+    assert drift(run) < DRIFT
+    facts = system.explain(run.q[1], run.qdot[1])
+    assert len(facts.constraints) == 6 and len(facts.dependent_constraints) == 2
+    torn = lagjax.System(ladder, constraints=lambda q: closed_ladder(q) | {"wrong": q[2] - q[0] - 0.1})
+    with pytest.raises(ValueError, match=r"constraints\['wrong'\] contradicts"):
+        lagjax.simulate(torn, run.q[0], run.qdot[0], ts)
+
+
 # ---- derivatives and other transformations ---------------------------------------------------------------------------
 
 
-def outcome(system, x, **options):
+def outcome(system, x, beside=0.0, **options):
     """A number that depends on where a pendulum ends and on its tension there, after a start beside its circle."""
     angle, params = x[0], {"m": 1.0, "l": x[1], "g": x[2]}
-    q0 = 1.1 * x[1] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)]) + jnp.array([0.05, 0.0])
-    q0, qdot0 = system.project(q0, jnp.array([0.3, 0.2]), params=params)
+    q0, qdot0 = x[1] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)]), 0.3 * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    if beside:
+        q0, qdot0 = system.project((1 + beside) * q0 + beside, qdot0 + beside, params=params)
     run = lagjax.simulate(system, q0, qdot0, np.array([0.0, 1.0]), params, **options)
     return run.q[-1, 0] + 0.3 * run.qdot[-1, 1] + 0.1 * run.multipliers["rod"][-1]
 
@@ -373,21 +455,26 @@ POINTS = jnp.array([[0.8, 1.3, 9.0], [0.9, 1.4, 9.1]])  # angle, length, g
 
 def test_gradients_through_projection_motion_and_multipliers():
     def of(x):
-        return outcome(scenes.cartesian_pendulum().system, x, rtol=1e-11)
+        return outcome(scenes.cartesian_pendulum().system, x, beside=0.1, rtol=1e-11)
 
     value = jax.jit(jax.vmap(of))
     # The error of a central difference: 1e-8 of third derivatives of size one, and 1e-11/1e-4.
     central = np.stack([(value(POINTS + e) - value(POINTS - e)) / 2e-4 for e in 1e-4 * np.eye(3)], axis=1)
     reverse = jax.jit(jax.vmap(jax.grad(of)))(POINTS)
     np.testing.assert_allclose(reverse, central, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(of))(POINTS[0]), reverse[0], rtol=1e-12)
-    # The same along the steps of diffrax, where forward mode must be asked for.
-    options = {"solver": lagjax.FineOutput(diffrax.Tsit5()), "rtol": 1e-9}
-    by_steps = jax.jit(jax.grad(lambda x: outcome(scenes.cartesian_pendulum().system, x, **options)))
-    np.testing.assert_allclose(by_steps(POINTS[0]), reverse[0], rtol=1e-6)
-    options["adjoint"] = diffrax.ForwardMode()
-    forward = jax.jit(jax.jacfwd(lambda x: outcome(scenes.cartesian_pendulum().system, x, **options)))
-    np.testing.assert_allclose(forward(POINTS[0]), reverse[0], rtol=1e-6)
+
+
+def test_gradients_by_machine_code_are_those_along_the_steps_of_diffrax():
+    def of(x, **options):
+        return outcome(scenes.cartesian_pendulum().system, x, **options)
+
+    forward = jax.jit(jax.jacfwd(lambda x: of(x, rtol=1e-11)))(POINTS[0])
+    for derivative, solver, adjoint in (
+        (jax.grad, lagjax.FineOutput(diffrax.Tsit5()), None),
+        (jax.jacfwd, diffrax.Tsit5(), diffrax.ForwardMode()),  # where forward mode must be asked for
+    ):
+        by_steps = derivative(lambda x, s=solver, a=adjoint: of(x, solver=s, adjoint=a, rtol=1e-9))
+        np.testing.assert_allclose(jax.jit(by_steps)(POINTS[0]), forward, rtol=1e-6)
 
 
 def test_jit_and_vmap_change_nothing():
@@ -488,7 +575,8 @@ ORIGIN, REST = np.zeros(2), np.zeros(2)
     [
         (lambda q: {"rod": q @ q - 1}, [0.0, -1.1], REST, r"q0 does not satisfy constraints\['rod'\]: .*project"),
         (lambda q: {"rod": q @ q - 1}, [0.0, -1.0], [0.1, 0.2], r"qdot0 does not satisfy constraints\['rod'\]"),
-        (lambda q: jnp.stack([q[0], q[1], q[0] + q[1]]), ORIGIN, REST, r"3 constraints .* for 2 coordinates"),
+        (lambda q: jnp.stack([q[0], q[1], q[0] + q[1]]), ORIGIN, REST, r"3 constraints .* for 2 coordinates, and 2"),
+        (lambda q: jnp.stack([q[0], 2 * q[0], q[0] + 1.0]), ORIGIN, REST, r"\[2\] contradicts .*\[0\]"),
         (lambda q: {"root": jnp.sqrt(q[0] - 1)}, ORIGIN, REST, r"constraints\['root'\] is not finite"),
         (lambda q: {"flat": q[0] ** 2}, ORIGIN, REST, r"constraints\['flat'\] has zero gradient"),
         (lambda q: {"a": q[0], "b": q[0] - 1.0}, ORIGIN, REST, r"\['b'\] contradicts constraints\['a'\]: .*of q0"),
