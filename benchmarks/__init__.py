@@ -12,7 +12,8 @@ error of each run against an independent reference, and compares times *at equal
   of them;
 - `_measure`: warm-up, interleaved repeats, medians, errors;
 - `_comparisons`: right-hand sides, sizes of scenes and of batches, cores; `_derivation`: the time to the first result;
-  `_gradient`: derivatives; `_mixed`: batches whose members need different numbers of steps;
+  `_gradient`: derivatives; `_mixed`: batches whose members need different numbers of steps; `_constraints`: what they
+  cost;
 - `_goals`: what is to be reached, from the stored numbers;
 - `_report`: tables, and a JSON file that says on what machine and with which versions; `_figures`: a figure of each.
 """

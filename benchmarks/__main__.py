@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from benchmarks import _comparisons, _derivation, _figures, _goals, _gradient, _mixed, _report
+from benchmarks import _comparisons, _constraints, _derivation, _figures, _goals, _gradient, _mixed, _report
 from benchmarks._cases import CASES
 from benchmarks._contenders import BATCHED, SINGLE
 from benchmarks._measure import Comparison, compare
@@ -67,7 +67,10 @@ def _rows_of(part: str, options: argparse.Namespace, record: dict[str, Any]) -> 
         for comparison in COMPARISONS[part](options):
             _report.print_comparison(comparison)
             sys.stdout.flush()
-            yield comparison.as_dict() | {"equal_error": _report.equal_error(comparison)} | _origin(options)
+            row = comparison.as_dict() | {"equal_error": _report.equal_error(comparison)} | _origin(options)
+            if part == "constraints":
+                print(_constraints.price_line(row), flush=True)
+            yield row
 
 
 # ---- parts that are errors against times -----------------------------------------------------------------------------
@@ -125,7 +128,9 @@ def _gpu(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 # ---- all parts -------------------------------------------------------------------------------------------------------
 
-COMPARISONS: dict[str, Callable] = {"errors": _errors, "single": _single, "mixed": _mixed_batch}
+COMPARISONS: dict[str, Callable] = {
+    "errors": _errors, "single": _single, "mixed": _mixed_batch, "constraints": _constraints.constraints,
+}  # fmt: skip
 TABLES: dict[str, Callable] = {
     "right_hand_sides": _comparisons.right_hand_sides,
     "derivation": _derivation.derivation,

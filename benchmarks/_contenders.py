@@ -60,7 +60,7 @@ def installed(package: str) -> bool:
 # ---- lagjax ----------------------------------------------------------------------------------------------------------
 
 
-def _lagjax(**options) -> Callable[[Case], Solve]:
+def lagjax_batch(**options) -> Callable[[Case], Solve]:
     """`lagjax.simulate_batch`, called as a user does."""
 
     def prepare(case):
@@ -278,7 +278,7 @@ def reference(case: Case) -> tuple[np.ndarray, np.ndarray]:
         solve = _heyoka_batch(case)
         return solve(1e-18)[0], solve(1e-16)[0]
     few = case.first(8)
-    return _dop853_of_all(few, 1e-13), _dop853_of_all(few, 1e-12)
+    return tuple(dop853_of_all(few, autodiff_acceleration(few), tol) for tol in (1e-13, 1e-12))
 
 
 def _heyoka_compiles(case: Case) -> str | None:
@@ -322,10 +322,11 @@ def _scipy(case: Case) -> Solve:
     return solve
 
 
-def _dop853_of_all(case: Case, tol: float) -> np.ndarray:
+def dop853_of_all(case: Case, acceleration: Callable, tol: float) -> np.ndarray:
+    """Final states by SciPy's DOP853, all members as one system, from q̈ of one state."""
     from scipy.integrate import solve_ivp
 
-    n, derived = case.coordinates, jax.jit(jax.vmap(autodiff_acceleration(case)))
+    n, derived = case.coordinates, jax.jit(jax.vmap(acceleration))
 
     def field(t, y):
         y = y.reshape(-1, 2 * n)
@@ -344,8 +345,8 @@ def _sympy_copes(case: Case) -> str | None:
 HEYOKA = {"packages": ("heyoka",), "suits": _heyoka_compiles}
 
 BATCHED = (
-    Contender("lagjax", _lagjax()),
-    Contender("lagjax, diffrax", _lagjax(solver=diffrax.Dopri8())),
+    Contender("lagjax", lagjax_batch()),
+    Contender("lagjax, diffrax", lagjax_batch(solver=diffrax.Dopri8())),
     Contender("diffrax, by hand", _diffrax(by_hand), suits=_has_formulas),
     Contender("diffrax, autodiff", _diffrax(autodiff_acceleration)),
     Contender("heyoka, SIMD", _heyoka_batch, **HEYOKA),

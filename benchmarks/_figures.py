@@ -10,6 +10,7 @@ Record = dict[str, Any]
 
 COLOURS = {
     "lagjax": "#c1121f",
+    "lagjax, minimal": "#1d4e89",
     "lagjax, diffrax": "#ef8d7a",
     "lagjax, plain vmap": "#b07aa1",
     "diffrax, by hand": "#1d4e89",
@@ -61,12 +62,12 @@ def draw(part: str, record: Record, folder: Path) -> list[Path]:
 def _figures_of(part: str, rows: list[dict]) -> Iterable[tuple[str, tuple[float, float], Callable]]:
     if not rows:
         return
-    if part in ("errors", "single", "mixed"):
+    if part in ("errors", "single", "mixed", "constraints"):
         for row in rows:
             name = row["case"] if part in ("errors", row["case"]) else f"{part}_{row['case']}"
             yield name, (8, 5), lambda figure, row=row: _error_against_time(figure.add_subplot(), row, part)
-    if part == "errors" and len(rows) > 1:
-        yield "errors", (12, 3.4 * -(-len(rows) // 3)), lambda figure: _overview(figure, rows)
+    if part in ("errors", "constraints") and len(rows) > 1:
+        yield part, (12, 3.4 * -(-len(rows) // 3)), lambda figure: _overview(figure, rows)
     elif part in PLOTS:
         fill, size = PLOTS[part]
         yield part, size(rows) if callable(size) else size, lambda figure: fill(figure, rows)

@@ -7,6 +7,8 @@ its loosest tolerance, its time is an upper bound and so is the ratio: such poin
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from benchmarks._constraints import price
+
 Record = dict[str, Any]
 HEYOKA = ("heyoka, SIMD", "heyoka, threads", "heyoka, single")
 DIFFRAX = ("diffrax, by hand", "diffrax, autodiff")
@@ -55,6 +57,17 @@ def _over_plain_vmap(record: Record) -> Iterable[float | None]:
         yield mixed / uniform if mixed and uniform else None
 
 
+def _price(case: str, *errors: float) -> Callable:
+    """Of constraints, in times the minimal form."""
+
+    def prices(record):
+        for comparison in _rows(record, "constraints", case=case):
+            known = price(comparison)
+            yield from (known.get(error) for error in errors)
+
+    return prices
+
+
 def _column(part: str, column: str, **wanted) -> Callable:
     return lambda record: [row[column] for row in _rows(record, part, **wanted)]
 
@@ -91,6 +104,7 @@ GOALS = (
     ("first result, 2 links, s", "≤ 3", _compile(2)),
     ("first result, 4 links, s", "≤ 6", _compile(4)),
     ("first result, 8 links, s", "≤ 12", _compile(8)),
+    ("constraints / minimal coordinates, 2 links, 1e-6…1e-12", "≤ 3", _price("double_pendulum", *ALL)),
     ("reverse gradient / solve, 8 parameters", "≤ 5", _column("gradient", "reverse/solve", contender="lagjax")),
     ("reverse against forward mode", "≤ 1e-8", _column("gradient", "largest", contender="lagjax")),
 )

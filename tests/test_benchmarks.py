@@ -145,6 +145,30 @@ def test_mixed():
     assert all(row.median_error < 1e-4 for row in comparison.rows if row.tol == 1e-10)
 
 
+@pytest.mark.parametrize(("name", "alone"), [("pendulum", False), ("rolling_cylinder", False), ("pendulum", True)])
+def test_the_price_of_constraints(name, alone):
+    pytest.importorskip("scipy", reason="the reference needs SciPy or heyoka")
+    constraints = of_benchmarks("_constraints")
+    pair = constraints.PAIRS[name](8).of_duration(0.2)
+    pair = replace(pair, minimal=None) if alone else pair  # as the squeezer, for which there is no minimal form
+    comparison = constraints.compared(pair, OPTIONS)
+    names = [constraints.HELD] if alone else [constraints.HELD, constraints.MINIMAL]
+    assert list(dict.fromkeys(row.contender for row in comparison.rows)) == names
+    assert all(row.worst_error < 1e-8 for row in comparison.rows if row.tol == 1e-10)
+    row = comparison.as_dict() | {"equal_error": of_benchmarks("_report").equal_error(comparison)}
+    assert all(times > 0 for times in constraints.price(row).values())
+
+
+def test_chains_of_rods_start_where_the_angles_say():
+    pair = of_benchmarks("_constraints").PAIRS["chain_4"](3)
+    rates = np.random.default_rng(0).normal(size=(3, 4))
+    q, v = (x.reshape(3, 4, 2) for x in pair.carried(pair.minimal.q0, rates))
+    along, moving = (np.diff(x, axis=1, prepend=0.0) for x in (q, v))
+    np.testing.assert_allclose(np.linalg.norm(along, axis=-1), 1.0, rtol=1e-14)
+    np.testing.assert_allclose(np.arctan2(along[..., 0], -along[..., 1]), pair.minimal.q0, rtol=1e-12)
+    np.testing.assert_allclose(along[..., 1] * moving[..., 0] - along[..., 0] * moving[..., 1], -rates, rtol=1e-12)
+
+
 def comparison_of(times):
     """Programs with straight lines in the figure of errors against times; the record as it is stored."""
     measure, report = of_benchmarks("_measure"), of_benchmarks("_report")
@@ -160,7 +184,9 @@ def comparison_of(times):
 def test_goals():
     record = {"errors": comparison_of({"lagjax": 1.0, "heyoka, SIMD": 1.2, "heyoka, single": 9.0})}
     record["gradient"] = {"rows": [{"contender": "lagjax", "reverse/solve": 7.0, "largest": 0.0}]}
+    record["constraints"] = comparison_of({"lagjax": 2.5, "lagjax, minimal": 1.0})
     found = {row["work"]: (row["reached"], row["met"]) for row in of_benchmarks("_goals").goals(record)}
+    assert found["constraints / minimal coordinates, 2 links, 1e-6…1e-12"] == (pytest.approx(2.5), "yes")
     assert found["heyoka's best / lagjax, 2 links, 1e-6…1e-12"] == (pytest.approx(1.2), "yes")
     assert found["heyoka's best / lagjax, 2 links, 1e-6…1e-8"] == (pytest.approx(1.2), "no")
     assert found["heyoka's best / lagjax, 4 links, 1e-6…1e-10"] == (None, "–")
@@ -191,7 +217,7 @@ RECORD = {
 }
 
 
-@pytest.mark.parametrize("part", ["errors", "mixed", *RECORD])
+@pytest.mark.parametrize("part", ["errors", "mixed", "constraints", *RECORD])
 def test_figure(tmp_path, part):
     pytest.importorskip("matplotlib", reason="figures need matplotlib")
     record = {part: {"rows": RECORD[part]} if part in RECORD else comparison_of({"lagjax": 1.0, "numba": 1.01})}
