@@ -6,6 +6,7 @@ System(L)  →  simulate(system, q0, qdot0, ts, params)  →  Trajectory
 from lagjax import plot, scenes
 from lagjax._check import Finding, Findings, check
 from lagjax._explain import Explanation
+from lagjax._health import Health
 from lagjax._hybrid import Transition, simulate_hybrid
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
@@ -22,6 +23,7 @@ __all__ = [
     "Finding",
     "Findings",
     "FineOutput",
+    "Health",
     "SimulationError",
     "State",
     "System",

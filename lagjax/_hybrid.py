@@ -96,8 +96,9 @@ def simulate_hybrid(
     - `modes`: a `System` for each name; all share the structure of `q0` and `params`.
     - `transitions`: which mode gives way to which, and where; the earliest one wins, the first listed of several at one
       instant. The others then follow at once if the mode is the same and the reset has not changed their guards.
-    - `max_transitions`: the budget of transitions. A motion that needs more (infinitely many, where they pile up as the
-      bounces of a ball do) ends there and says so.
+    - `max_transitions`: the budget of transitions. A motion that needs more ends there and says so, with the result
+      `max_transitions_reached`; or `zeno` where no budget is enough: where their times pile up as the bounces of a ball
+      do, seen by intervals that shrink steadily to a sum before `ts[-1]`, or to less than rounding leaves of the time.
 
     The other arguments are those of `simulate`, `max_steps` counting for each stretch between transitions. The result
     is a `Trajectory` with two more fields: `mode`, for every output time the place of its mode in `modes` (−1 where it
@@ -140,7 +141,7 @@ def simulate_hybrid(
     tolerances = Tolerances(float(controller.rtol), float(controller.atol), max_steps)
     plan = _Plan(tuple(modes), tuple(modes.values()), tuple(transitions), start, max_transitions, tolerances)
     *fields, last = _run(plan, settings.ts, q0, qdot0, params)
-    trajectory = Trajectory(*fields[:6], dict(modes), params, None, *fields[6:], tuple(modes))
+    trajectory = Trajectory(*fields[:6], dict(modes), params, None, *fields[6:], tuple(modes), settings.tolerances)
     return _raise_unless_ok(trajectory, layout, last) if throw else trajectory
 
 
@@ -373,7 +374,7 @@ class _Rounds(NamedTuple):
 
         exit = self._through(index, changes, carry.latest, t_end, y_end)
         event = (changes > 0) & ~exit.piled
-        failed = jnp.where(exit.piled, TOO_MANY_TRANSITIONS, jnp.where(runs & ~event, found.code, carry.code))
+        failed = jnp.where(exit.piled, ZENO, jnp.where(runs & ~event, found.code, carry.code))
         state = carry._replace(
             t=jnp.where(event, exit.t, t_end),
             y=jnp.where(event, exit.y_next, y_end),
@@ -499,15 +500,31 @@ def _distance(motion: Motion, q, v, t, numbers):
 
 SAME = 64 * np.finfo(np.float64).eps  # of a guard's size
 # Codes beyond those of the kernel.
-TOO_MANY_TRANSITIONS, INCONSISTENT = len(RESULT_OF_CODE), len(RESULT_OF_CODE) + 1
-_RESULT_OF_CODE = np.array(
-    [*RESULT_OF_CODE, RESULTS.max_transitions_reached._value, RESULTS.inconsistent_start._value], np.int32
-)
+TOO_MANY_TRANSITIONS, INCONSISTENT, ZENO = range(len(RESULT_OF_CODE), len(RESULT_OF_CODE) + 3)
+_BEYOND = RESULTS.max_transitions_reached, RESULTS.inconsistent_start, RESULTS.zeno
+_RESULT_OF_CODE = np.array([*RESULT_OF_CODE, *(result._value for result in _BEYOND)], np.int32)
+_STEADY = 0.05  # how far the logarithms of two ratios of a geometric sequence may differ, as a part of them
+
+
+def _pile_up(times, end) -> jax.Array:
+    """Whether the times of a spent budget of transitions run geometrically to a limit before `end`.
+
+    Aitken's extrapolation of the last times, taken far enough apart that a pattern of two, three or six transitions (a
+    flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one.
+    """
+    apart = next((k for k in (6, 2, 1) if 3 * k < times.size), None)
+    if apart is None:
+        return jnp.asarray(False)  # too few to tell
+    first, second, third = jnp.diff(times[-1 - 3 * apart :: apart])
+    before, ratio = second / first, third / second
+    steady = jnp.abs(jnp.log(ratio) - jnp.log(before)) <= _STEADY * jnp.abs(jnp.log(before))
+    return (ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end)
 
 
 def _fields(layout: Layout, ts, last: _Carry, seen: _Seen):
     n = layout.size
-    result = result_from(jnp.asarray(_RESULT_OF_CODE)[last.code])
+    piled = (last.code == TOO_MANY_TRANSITIONS) & _pile_up(seen.t, ts[-1])
+    result = result_from(jnp.asarray(_RESULT_OF_CODE)[jnp.where(piled, ZENO, last.code)])
     accepted, rejected = last.steps
     stats = {
         "num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected,

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import _engine, _linear
-from lagjax._consistent import inconsistent_members, require_consistent
+from lagjax._consistent import inconsistent_members, rank_lost, require_consistent
 from lagjax._equations import equations
 from lagjax._integrate import integrate
 from lagjax._layout import Layout
 from lagjax._results import RESULTS, SimulationError, advice
 from lagjax._settings import Settings, as_arrays, is_concrete, require_finite
+from lagjax._solvers import Projected
 from lagjax._system import System, require_system
 from lagjax._trajectory import State, Trajectory
 
@@ -111,7 +112,7 @@ def simulate(
         fields = _integrate(system, settings, q0, qdot0, params, _engine.primal(flow, settings))
     else:
         fields = _engine.run(flow, settings, layout, q0, qdot0, params)
-    trajectory = Trajectory(*fields, system, params)
+    trajectory = Trajectory(*fields, system, params, tolerances=settings.tolerances)
     return raise_unless_ok(trajectory, layout) if throw else trajectory
 
 
@@ -173,7 +174,8 @@ def simulate_batch(
     else:
         primal = _engine.primal(flow, settings)
         fields = _integrate_batch(system, settings, *values.values(), _Static(tuple(batch_axes)), primal)
-    trajectory = Trajectory(jnp.asarray(settings.ts), *fields[1:], system, values["params"], batch_axes[2])
+    shared = {"params_axes": batch_axes[2], "tolerances": settings.tolerances}
+    trajectory = Trajectory(jnp.asarray(settings.ts), *fields[1:], system, values["params"], **shared)
     return trajectory if astray is None else _refused(trajectory, astray)
 
 
@@ -195,8 +197,8 @@ def _integrate_batch(system, settings, q0, qdot0, params, batch_axes: _Static, p
 def _integrate(system: System, settings: Settings, q0, qdot0, params, primal=None):
     """One trajectory by diffrax, the first six fields of `Trajectory`; with `primal` diffrax only differentiates."""
     layout = Layout.of(q0, qdot0)
-    numbers = eqx.filter(params, eqx.is_array)
-    form = equations(system.motion(layout, params), layout, numbers, system.path)
+    numbers, motion = eqx.filter(params, eqx.is_array), system.motion(layout, params)
+    form = equations(motion, layout, numbers, system.path)
     y0 = layout.flatten(q0), layout.flatten(qdot0)
 
     # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
@@ -207,6 +209,9 @@ def _integrate(system: System, settings: Settings, q0, qdot0, params, primal=Non
     path, end, t_end = solved.path, solved.end, solved.t_end
 
     result = _explained(RESULTS.promote(solved.result), start, _health(end, *form.acceleration(t_end, end, numbers)))
+    if motion.constrained:
+        lost = rank_lost(motion, (*y0, settings.ts[0], numbers), (*end, t_end, numbers))
+        result = _of_constraints(result, RESULTS.promote(solved.result), lost)
     # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start.
     reached = jnp.isfinite(path[0]).all(axis=1) & jnp.isfinite(path[1]).all(axis=1) & (ts == settings.ts)
     q, qdot = (jax.vmap(layout.restore)(jnp.where(reached[:, None], leaf, jnp.nan)) for leaf in path)
@@ -233,6 +238,13 @@ def _explained(result: RESULTS, start: RESULTS, end: RESULTS) -> RESULTS:
     unhealthy = (end != RESULTS.successful) & (stopped | (end == RESULTS.nonfinite_state))
     result = RESULTS.where(unhealthy, end, result)
     return RESULTS.where(start == RESULTS.successful, result, start)
+
+
+def _of_constraints(result: RESULTS, reported: RESULTS, lost) -> RESULTS:
+    """What failed, where the constraints are the reason: Newton's method, or fewer of them independent than before."""
+    failed = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
+    result = RESULTS.where(failed & lost, RESULTS.constraint_rank_lost, result)
+    return RESULTS.where(reported == RESULTS.promote(Projected.FAILED), RESULTS.projection_failed, result)
 
 
 def _in_coordinates(event: diffrax.Event, layout: Layout, params: PyTree) -> diffrax.Event:

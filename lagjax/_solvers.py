@@ -154,13 +154,19 @@ def _pick(stacked: PyTree, index: int) -> PyTree:
 
 
 class Projected(diffrax.AbstractAdaptiveSolver):
-    """The steps of a solver, each followed by a projection of the state: `project(t, y, args)` → y.
+    """The steps of a solver, each followed by a projection of the state: `project(t, y, args)` → y, one Newton step.
 
-    The error estimate and the states inside a step are those of the solver.
+    It is taken twice: the second says whether Newton's method arrives. Where it does not the state is NaN, which makes
+    the step one to reject; if that cannot be (fixed steps), the run ends with `Projected.FAILED`. How far the state was
+    moved is a part of the error of the step, so that a constraint that jumps is not followed by a jump. The states
+    inside a step are those of the solver.
     """
 
     solver: diffrax.AbstractSolver
     project: Callable
+
+    # The one of diffrax's codes that none of its solvers gives.
+    FAILED: ClassVar[Any] = diffrax.RESULTS.breakdown
 
     @property
     def term_structure(self):
@@ -187,7 +193,32 @@ class Projected(diffrax.AbstractAdaptiveSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """The solver's step, then the projection. A slope kept from the step before belongs to another state."""
         y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, True)
-        return self.project(t1, y1, args), error, dense, state, result
+        near = self.project(t1, y1, args)
+        nearer = self.project(t1, near, args)
+        failed = ~_contracts(y1, near, nearer)
+        if error is not None:
+            error = jax.tree.map(lambda e, a, b: jnp.abs(e) + jnp.abs(b - a), error, y1, near)
+        y1, error, dense = _nan_where(failed, (nearer, error, dense))
+        lost = diffrax.RESULTS.where(failed, self.FAILED, diffrax.RESULTS.successful)
+        return y1, error, dense, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, lost, result)
+
+
+def _contracts(start: PyTree, near: PyTree, nearer: PyTree) -> jax.Array:
+    """Whether the second of two steps is far shorter than the first, or round-off: a third would be nothing.
+
+    Newton's method squares a distance that is small enough; from too far away it goes half the way at best.
+    """
+    first, second = (
+        jnp.max(jnp.stack([jnp.max(jnp.abs(b - a)) for a, b in zip(*map(jax.tree.leaves, pair), strict=True)]))
+        for pair in ((start, near), (near, nearer))
+    )
+    leaves = jax.tree.leaves(nearer)
+    size = 1 + jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in leaves]))
+    return second <= jnp.maximum(0.01 * first, 1e3 * float(jnp.finfo(leaves[0].dtype).eps) * size)
+
+
+def _nan_where(failed, tree: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
 class Unrolled(diffrax.AbstractAdaptiveSolver):

@@ -4,6 +4,7 @@ Time is the first axis of `q` and `qdot`; the members of a batch are an axis bef
 states are methods: they cost nothing until they are asked for, and they are differentiable.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._health import Health, examine
 from lagjax._layout import Layout
 from lagjax._results import RESULTS
 from lagjax._system import System
@@ -51,6 +53,7 @@ class Trajectory(eqx.Module):
     - `end`: where each member ended, a `State` of `t`, `q`, `qdot`: at `ts[-1]`, at the event, or at the last accepted
       step before it failed.
     - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+    - `tolerances`: rtol and atol of a step; None where it had a fixed size.
     - `mode`, `transitions`: of a hybrid motion (`simulate_hybrid`), else None. `system` is then the dict of its modes,
       and quantities are those of the mode at every time, NaN where it is −1. A mode is a place in `mode_names`: the
       dict itself loses its order in `jax.jit`.
@@ -68,6 +71,7 @@ class Trajectory(eqx.Module):
     mode: jax.Array | None = None
     transitions: "Transitions | None" = None
     mode_names: tuple[str, ...] = eqx.field(static=True, default=())
+    tolerances: tuple[jax.Array, jax.Array] | None = None
 
     @property
     def ok(self) -> jax.Array:
@@ -96,6 +100,26 @@ class Trajectory(eqx.Module):
         """f and a at every output time, in the structure of `multipliers`: how far the motion has drifted."""
         return self._at_every_time("constraint_residual")
 
+    def health(self, reference: "Trajectory | None" = None) -> Health:
+        """How far this motion can be trusted: what must be conserved and is not, constraints, the mass matrix, ...
+
+        Print the result for a report with a verdict, or read its fields, which have the batch axes of the trajectory
+        (`lagjax.Health`). `reference` is a trajectory of the same system from the same start at the same times, with a
+        tolerance tighter by ten or more: with it the error of the whole motion is estimated. What a law of conservation
+        shows is no bound for that error, which may grow with the motion.
+
+        Raises `ValueError` for a reference that cannot be compared or is not tighter.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q))
+        run = lagjax.simulate(pendulum, 1.0, 0.0, jnp.linspace(0.0, 10.0, 101), rtol=1e-4)
+        print(run.health(reference=lagjax.simulate(pendulum, 1.0, 0.0, run.ts, rtol=1e-6)))
+        ```
+        """
+        return examine(self, reference)
+
     def to_xarray(self):
         """An `xarray.Dataset` with a variable per leaf of `q` and `qdot` and the dimensions (member,) time, ...
 
@@ -117,15 +141,25 @@ class Trajectory(eqx.Module):
         time = self.ts if self.ts.ndim == 1 else self.ts[(0,) * (self.ts.ndim - 1)]
         return xarray.Dataset(variables, coords={"time": np.asarray(time)})
 
-    def _at_every_time(self, name: str) -> PyTree:
-        """Map a method (q, qdot, t, params) of the system over the time axis, and over the batch axes before it."""
-        mapped = jax.vmap(lambda *at: self._at_one_time(name, *at), in_axes=(0, 0, 0, None, 0))
-        for outer in range(jnp.ndim(self.result._value)):
+    def over_members(self, function, *more) -> PyTree:
+        """Map `function(q, qdot, (ts, tolerances), params, mode, *more)` over the batch axes, those of `more` too."""
+        mapped, rank = function, jnp.ndim(self.result._value)
+        for outer in range(rank):
             # The innermost batch axis of `simulate_batch` shares its times and some parameters; axes that the user's
             # own `jax.vmap(simulate)` added are on everything.
-            shared = outer == 0 and self.ts.ndim < 1 + jnp.ndim(self.result._value)
-            mapped = jax.vmap(mapped, in_axes=(0, 0, None, self.params_axes, 0) if shared else 0)
-        return mapped(self.q, self.qdot, self.ts, self.params, self.mode)
+            shared = outer == 0 and self.ts.ndim < 1 + rank
+            axes = (None, self.params_axes) if shared else (0, 0)
+            mapped = jax.vmap(mapped, in_axes=(0, 0, *axes, 0, *[0] * len(more)))
+        return mapped(self.q, self.qdot, (self.ts, self.tolerances), self.params, self.mode, *more)
+
+    def _at_every_time(self, name: str) -> PyTree:
+        """Map a method (q, qdot, t, params) of the system over the time axis, and over the batch axes before it."""
+
+        def of_member(q, qdot, given, params, mode):
+            at_one_time = partial(self._at_one_time, name)
+            return jax.vmap(at_one_time, in_axes=(0, 0, 0, None, 0))(q, qdot, given[0], params, mode)
+
+        return self.over_members(of_member)
 
     def _at_one_time(self, name: str, q, qdot, t, params, mode) -> PyTree:
         if isinstance(self.system, System):

@@ -29,6 +29,7 @@ STREET = [
     "_integrate",
     "_consistent",
     "_check",
+    "_health",
     "_trajectory",
     "_engine",
     "_simulate",

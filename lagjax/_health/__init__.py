@@ -1,0 +1,250 @@
+"""`Health`: how far a trajectory can be trusted, measured on the trajectory itself.
+
+A motion has laws that the numbers must obey whatever integrated them. At every output are evaluated
+
+    h − h₀ − ∫ P dt      with the power P = −∂L/∂t + Q·q̇ + λ·(G q̇), zero where nothing drives or slows the motion
+    pᵢ − pᵢ₀             where neither L nor any force knows qᵢ
+    f, G q̇ + ∂f/∂t       of the constraints
+    M                    its eigenvalues
+    ∂(M, F, G)           by the state, the time and every parameter: whether it is finite
+
+The first two are compared with what the tolerances allow. A step may put the error rtol|yᵢ| + atol into each component
+of the state y = (q, q̇), and what is conserved keeps what it is given: after N steps c may be off by
+
+    N maxₜ Σᵢ |∂c/∂yᵢ| (rtol|yᵢ| + atol),
+
+times √(2n) `SLACK` for solvers that measure errors in root mean square, and round-off. Other errors, those of q above
+all, may grow with the motion: there is no bound for them, only a second trajectory to compare with.
+
+Between outputs the power is integrated by Hermite's rule from P, Ṗ and P̈ at both ends, derivatives along the motion. It
+is of order six; how far it may be off is told by the rules of order four and two. Source: Hairer, Nørsett & Wanner,
+*Solving Ordinary Differential Equations I*, §II.4 (error per step); Davis & Rabinowitz, *Methods of Numerical
+Integration*, §2.9 (the trapezoidal rule with end corrections).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._health._compare import global_error
+from lagjax._health._measure import SLACK, VISIBLE, Extreme, measured
+from lagjax._results import RESULTS, advice
+
+__all__ = ["Extreme", "Health", "examine"]
+
+UNSTEADY = 0.5  # the part of steps rejected beyond which they are fighting something
+
+
+def examine(trajectory, reference=None) -> "Health":
+    """`Trajectory.health`."""
+    fields, names = measured(trajectory)
+    return Health(
+        result=trajectory.result,
+        ok=jnp.asarray(trajectory.ok),
+        t_end=jnp.asarray(trajectory.end.t),
+        accepted_steps=jnp.asarray(trajectory.stats["num_accepted_steps"]),
+        rejected_steps=jnp.asarray(trajectory.stats["num_rejected_steps"]),
+        global_error=None if reference is None else global_error(trajectory, reference),
+        works=names.works,
+        momentum_names=names.momenta,
+        constraint_names=names.constraints,
+        **fields,
+    )
+
+
+class Health(eqx.Module):
+    """How far a trajectory can be trusted; made by `Trajectory.health`. Print it, or read its fields.
+
+    Every field has the batch axes of the trajectory, and is measured over the outputs that were reached. An `Extreme`
+    is a pair of a `value` and the time `t` where it is found, NaN where nothing was reached.
+
+    - `result`, `ok`, `accepted_steps`, `rejected_steps`: as in the trajectory.
+    - `energy`: the largest |h − h₀ − W|, in units of energy, W the work done by forces, by an explicit time and by
+      moving constraints. `energy_allowed`: what the tolerances and round-off may add up to. `work_error`: how well W is
+      known from the outputs alone, zero where nothing does work; an imbalance below it means nothing, and outputs
+      closer to each other would tell more. Where a transition lies between two outputs, what it takes is left out, and
+      so is the time from it to the next output.
+    - `momentum`: the same for each momentum that is conserved, pᵢ with ∂L/∂qᵢ = 0 and no force of any kind on it; a
+      last axis for those in `momentum_names`, which is None where the scene is too large to see which; and
+      `momentum_allowed`.
+    - `constraint_distance`: for each of `constraint_names` (a last axis) the largest distance |f| / |∂f/∂q| of q from
+      f = 0, zero for a velocity constraint; `constraint_rate`: the same for velocities, |Gq̇ + ∂f/∂t| / |G|.
+      `constraint_allowed`: for these two (a last axis).
+    - `smallest_eigenvalue` of M = ∂²L/∂q̇² (negative where M is indefinite); `condition`: the largest max|λ| / min|λ|;
+      `scaled_condition`: the same after scaling M to a unit diagonal, which is what accelerations suffer from.
+      `scaled_condition_allowed`: where round-off in q̈ reaches `SLACK` rtol; infinite with constraints, which hold what
+      M does not.
+    - `gradients_finite`: whether all that the acceleration is solved from has finite derivatives by the state, the time
+      and every parameter, at every output; `gradients_time`: the first where not.
+    - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
+      largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
+    """
+
+    result: RESULTS
+    ok: jax.Array
+    t_end: jax.Array
+    accepted_steps: jax.Array
+    rejected_steps: jax.Array
+    energy: Extreme
+    energy_allowed: jax.Array
+    work_error: jax.Array
+    momentum: Extreme
+    momentum_allowed: jax.Array
+    constraint_distance: Extreme
+    constraint_rate: Extreme
+    constraint_allowed: jax.Array
+    smallest_eigenvalue: Extreme
+    condition: Extreme
+    scaled_condition: Extreme
+    scaled_condition_allowed: jax.Array
+    gradients_finite: jax.Array
+    gradients_time: jax.Array
+    global_error: Extreme | None
+    works: bool = eqx.field(static=True)
+    momentum_names: tuple[str, ...] | None = eqx.field(static=True)
+    constraint_names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def suspicious(self) -> jax.Array:
+        """Whether anything is, for each member."""
+        return jnp.any(jnp.stack(list(self.checks().values())), axis=0)
+
+    def checks(self) -> dict[str, jax.Array]:
+        """What is suspicious, by name: a Boolean for each member. A NaN at a state that was reached is."""
+        energy = self.energy_allowed + SLACK * self.work_error
+        tries = self.accepted_steps + self.rejected_steps
+        found = {
+            "result": ~self.ok,
+            "energy": _exceeds(self.energy, energy),
+            "momentum": _exceeds(self.momentum, self.momentum_allowed).any(axis=-1),
+            "constraints": _exceeds(self.constraint_distance, self.constraint_allowed[..., :1]).any(axis=-1)
+            | _exceeds(self.constraint_rate, self.constraint_allowed[..., 1:]).any(axis=-1),
+            "mass_matrix": _exceeds(self.scaled_condition, self.scaled_condition_allowed),
+            "gradients": ~self.gradients_finite,
+            "steps": self.rejected_steps > jnp.maximum(UNSTEADY * tries, 20),
+        }
+        if self.global_error is not None:
+            found["global_error"] = _exceeds(self.global_error, VISIBLE)
+        return found
+
+    def findings(self) -> tuple[str, ...]:
+        """What is suspicious, as sentences that say what to do; none where nothing is."""
+        found = {name: np.asarray(flags) for name, flags in self.checks().items() if np.any(flags)}
+        sentences = [_SENTENCES[name].format(_who(flags)) for name, flags in found.items()]
+        if "result" in found:
+            sentences[0] += " " + self._advice()
+        return tuple(sentences)
+
+    def __str__(self) -> str:
+        rows = [("result", self._results()), ("steps", self._steps())]
+        known = f"; the work between outputs is known to {_greatest(self.work_error):.1e}" if self.works else ""
+        law = "power balance" if self.works else "energy"
+        rows.append((law, f"off by {_worst(self.energy, self.energy_allowed)}{known}"))
+        if self.momentum_names is None:
+            rows.append(("momenta", "too many coordinates to see which are conserved"))
+        rows += _by_name("momenta", self.momentum_names or (), self.momentum, self.momentum_allowed)
+        for k, (what, off) in enumerate((("q", self.constraint_distance), ("qdot", self.constraint_rate))):
+            allowed = jnp.broadcast_to(self.constraint_allowed[..., k, None], off.value.shape)
+            rows += _by_name(f"constraints, {what}", self.constraint_names, off, allowed)
+        smallest = Extreme(-self.smallest_eigenvalue.value, self.smallest_eigenvalue.t)
+        rows += [
+            ("mass matrix", f"smallest eigenvalue {_worst(smallest, sign=-1)}"),
+            ("", f"condition {_worst(self.condition)}"),
+            ("", f"scaled to a unit diagonal {_worst(self.scaled_condition, self.scaled_condition_allowed)}"),
+            ("gradients", "finite" if bool(jnp.all(self.gradients_finite)) else "not finite"),
+        ]
+        if self.global_error is not None:
+            rows.append(("global error", f"{_worst(self.global_error, VISIBLE)}, in units of the largest |y|"))
+        verdict = self.findings() or ("nothing suspicious",)
+        rows += [("" if k else "verdict", text) for k, text in enumerate(verdict)]
+        return "\n".join(f"{name:17s} {text}" for name, text in rows)
+
+    def _results(self) -> str:
+        codes, counts = np.unique(np.asarray(self.result._value), return_counts=True)
+        if self.ok.ndim == 0:
+            return _RESULT_NAMES[int(codes[0])]
+        listed = [f"{counts[k]} {_RESULT_NAMES[int(codes[k])]}" for k in np.argsort(-counts)]
+        return f"of {self.ok.size} members " + ", ".join(listed)
+
+    def _advice(self) -> str:
+        """For what befell most members."""
+        codes, counts = np.unique(np.asarray(self.result._value)[~np.asarray(self.ok)], return_counts=True)
+        name = _RESULT_NAMES[int(codes[np.argmax(counts)])]
+        return f"{name}: {advice(getattr(RESULTS, name))}"
+
+    def _steps(self) -> str:
+        accepted, rejected = (np.asarray(x).ravel() for x in (self.accepted_steps, self.rejected_steps))
+        if self.ok.ndim == 0:
+            return f"{accepted[0]} accepted, {rejected[0]} rejected"
+        return f"{np.median(accepted):.0f} accepted, at most {accepted.max()}; at most {rejected.max()} rejected"
+
+
+def _greatest(values) -> float:
+    return float(np.max(np.nan_to_num(np.asarray(values, float), nan=-np.inf)))
+
+
+def _exceeds(extreme: Extreme, allowed) -> jax.Array:
+    return ~jnp.isnan(extreme.t) & ~(extreme.value <= allowed)
+
+
+def _worst(extreme: Extreme, allowed=None, sign: int = 1) -> str:
+    """The largest of all members, where and when; `sign` gives a value back its own."""
+    values, times = np.asarray(extreme.value, float), np.asarray(extreme.t, float)
+    if np.isnan(times).all():
+        return "nan: no output was reached"
+    index = np.unravel_index(np.argmax(np.where(np.isnan(times), -np.inf, values)), values.shape)  # NaN before all
+    text = f"{sign * values[index]:.1e} at t = {times[index]:.6g}" + (f" in member {_member(index)}" if index else "")
+    if allowed is None or not np.isfinite(limit := np.broadcast_to(allowed, values.shape)[index]):
+        return text
+    return f"{text} ({limit:.1e} allowed)"
+
+
+def _by_name(label: str, names: tuple[str, ...], extreme: Extreme, allowed) -> list[tuple[str, str]]:
+    """A row for the one that comes nearest to what is allowed, or exceeds it most."""
+    if not names:
+        return []
+    part = np.asarray(extreme.value / allowed).reshape(-1, len(names))
+    part = np.where(np.isnan(np.asarray(extreme.t)).reshape(part.shape), -np.inf, part)
+    which = int(np.argmax(np.max(part, axis=0)))
+    picked = Extreme(extreme.value[..., which], extreme.t[..., which])
+    of = names[which] if len(names) == 1 else f"worst of {len(names)}: {names[which]}"
+    return [(label, f"{of} off by {_worst(picked, allowed[..., which])}")]
+
+
+def _who(flags: np.ndarray) -> str:
+    if flags.ndim == 0:
+        return ""
+    return f" in {np.sum(flags)} of {flags.size} members, the first {_member(np.argwhere(flags)[0])}"
+
+
+def _member(index) -> str:
+    return str(int(index[0])) if len(index) == 1 else str(tuple(int(i) for i in index))
+
+
+_RESULT_NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
+_SENTENCES = {
+    "result": "The motion did not reach its end{0}.",
+    "energy": (
+        "Energy: off by more than the tolerances allow{0}. Something is not smooth within a step (a force that jumps, "
+        "a contact), or the steps are too long: tighten rtol or shorten dt."
+    ),
+    "momentum": "Momentum: what is conserved is off by more than the tolerances allow{0}: tighten rtol or shorten dt.",
+    "constraints": "Constraints: the motion has left them{0}: tighten rtol or shorten dt.",
+    "mass_matrix": (
+        "Mass matrix: so near to singular{0} that round-off in the acceleration exceeds the tolerance. Use other "
+        "coordinates or float64, or loosen rtol."
+    ),
+    "gradients": (
+        "Gradients: derivatives of the acceleration are not finite{0}, and jax.grad of this motion would be NaN. Look "
+        "for a norm or a square root at zero, or a branch of `where` that is not taken."
+    ),
+    "steps": (
+        "Steps: most were rejected{0}. The motion meets something that is not smooth, or is stiff: make it an event or "
+        "a mode, or use an implicit solver."
+    ),
+    "global_error": (
+        "Global error: the motion parts from its reference by a hundredth of its size or more{0}. If its steps are "
+        "accurate it is chaotic or unstable: tighten rtol, trust a shorter time, or speak of averages."
+    ),
+}

@@ -1,0 +1,329 @@
+"""What `Trajectory.health` measures, against closed forms, NumPy and trajectories that were spoilt on purpose."""
+
+import dataclasses
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import scenes
+
+OSCILLATOR = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
+TS = jnp.linspace(0.0, 10.0, 41)
+
+
+def run(scene, ts=21, **options):
+    ts = jnp.linspace(0.0, scene.duration, ts) if isinstance(ts, int) else ts
+    return lagjax.simulate(scene.system, scene.q0, scene.qdot0, ts, scene.params, **options)
+
+
+def moved(trajectory, q=None, qdot=None):
+    """The trajectory with other states."""
+    q, qdot = (old if new is None else new for new, old in ((q, trajectory.q), (qdot, trajectory.qdot)))
+    return dataclasses.replace(trajectory, q=q, qdot=qdot)
+
+
+def flagged(health):
+    return {name for name, flags in health.checks().items() if np.any(flags)}
+
+
+def swinging(**options):
+    return lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS, {"k": 1.3}, **options)
+
+
+# ---- no false alarm --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", scenes.ALL, ids=lambda make: make.__name__)
+def test_nothing_is_suspicious_about_the_scenes(make):
+    health = run(make()).health()
+    assert not health.suspicious, str(health)
+    assert health.findings() == () and str(health).endswith("nothing suspicious")
+    # Limits that nothing comes near would find nothing either.
+    assert health.energy_allowed < 1e-3 * np.abs(run(make()).energy()).max() + 1e-3
+
+
+# ---- conserved quantities --------------------------------------------------------------------------------------------
+
+
+def test_energy_of_an_oscillator():
+    trajectory = swinging(rtol=1e-5, solver=diffrax.Tsit5())
+    health, q, v = trajectory.health(), np.asarray(trajectory.q), np.asarray(trajectory.qdot)
+    drift = np.abs(0.5 * v**2 + 0.65 * q**2 - (0.5 * v[0] ** 2 + 0.65 * q[0] ** 2))
+    np.testing.assert_allclose(health.energy.value, drift.max(), rtol=1e-9)
+    assert health.energy.t == TS[drift.argmax()] and drift.max() > 1e-7
+    assert not health.works and health.work_error == 0 and health.momentum_names == ()
+    assert flagged(health) == set()
+    # The limit: N steps, each with |k q| (rtol |q| + atol) + |v| (rtol |v| + atol) at the worst place of the path.
+    slope = 1.3 * np.abs(q) * (1e-5 * np.abs(q) + 1e-8) + np.abs(v) * (1e-5 * np.abs(v) + 1e-8)
+    expected = 10 * np.sqrt(2) * (trajectory.stats["num_accepted_steps"] + 1) * slope.max()
+    np.testing.assert_allclose(health.energy_allowed, expected, rtol=1e-6)
+
+
+def test_a_drift_beyond_the_tolerances_is_found():
+    trajectory = swinging()
+    late = TS > 6.0
+    health = moved(trajectory, qdot=jnp.where(late, 1.001, 1.0) * trajectory.qdot).health()
+    assert flagged(health) == {"energy"} and health.energy.t > 6.0
+    assert "tighten rtol" in health.findings()[0] and "Energy" in str(health)
+
+
+def test_power_balance_with_friction_and_a_driving_force():
+    # x″ = −2γ x′ − ω² x + cos t/2 by forces, dissipation and an explicit time at once.
+    driven = lagjax.System(
+        lambda q, v, t: 0.5 * v**2 - 0.5 * 4.0 * q**2 + 0.3 * q * jnp.cos(0.5 * t),
+        forces=lambda q, v, t: 0.2 * jnp.cos(0.5 * t),
+        dissipation=lambda q, v: 0.5 * 0.3 * v**2,
+    )
+    trajectory = lagjax.simulate(driven, 1.0, 0.0, TS)
+    health = trajectory.health()
+    lost = np.ptp(np.asarray(trajectory.energy()))
+    assert health.works and lost > 0.5
+    # Hermite's rule of order six at steps of 1/4 and frequencies up to 4 (of the power): 10 · 4 · (1/4 · 4)^6/100800.
+    assert health.energy.value < health.work_error < 4e-4 * lost
+    assert flagged(health) == set()
+    finer = lagjax.simulate(driven, 1.0, 0.0, jnp.linspace(0.0, 10.0, 401)).health()
+    assert finer.energy.value < finer.work_error < 1e-5 * health.work_error and flagged(finer) == set()
+    forgotten = dataclasses.replace(trajectory, system=lagjax.System(driven.lagrangian.code, forces=driven.forces.code))
+    assert flagged(forgotten.health()) == {"energy"}
+
+
+def test_work_of_constraints_that_move():
+    # A bead on a rod that turns at a given rate: the rod does work; r = cosh(ω t) from rest at 1.
+    omega = 0.7
+    bead = lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v**2), constraints=lambda q, t: q[0] * jnp.sin(omega * t) - q[1] * jnp.cos(omega * t)
+    )
+    ts = jnp.linspace(0.0, 2.0, 41)
+    trajectory = lagjax.simulate(bead, jnp.array([1.0, 0.0]), jnp.array([0.0, omega]), ts)
+    health = trajectory.health()
+    gained = 0.5 * omega**2 * (np.cosh(2 * omega * 2.0) - 1)
+    np.testing.assert_allclose(np.ptp(np.asarray(trajectory.energy())), gained, rtol=1e-7)
+    assert health.works and health.energy.value < 1e-9 * gained
+    # A platform that carries a skater along: its constraint asks for a velocity, and pays for the friction.
+    carried = lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v**2), dissipation=lambda q, v: 0.1 * jnp.sum(v**2),
+        velocity_constraints=lambda q, v, t: v[0] - jnp.sin(t),
+    )  # fmt: skip
+    skating = lagjax.simulate(carried, jnp.zeros(2), jnp.array([0.0, 1.0]), ts).health()
+    assert skating.works and skating.energy.value < 1e-8 and flagged(skating) == set()
+
+
+def test_momenta_known_to_be_conserved():
+    scene = scenes.spherical_pendulum()
+    trajectory = run(scene)
+    health = trajectory.health()
+    assert len(health.momentum_names) == 1 and "phi" in health.momentum_names[0]
+    p = np.asarray(trajectory.momentum().phi)
+    np.testing.assert_allclose(health.momentum.value, [np.abs(p - p[0]).max()], rtol=1e-6)
+    faster = trajectory.qdot._replace(phi=trajectory.qdot.phi.at[7].multiply(1.01))
+    spoilt = moved(trajectory, qdot=faster).health()
+    assert "momentum" in flagged(spoilt) and spoilt.momentum.t == trajectory.ts[7]
+    # A force on the coordinate, be it that of a constraint, and its momentum is no constant any more.
+    free = lambda q, v: 0.5 * jnp.sum(v**2)
+    start = jnp.array([1.0, 0.5, 0.0]), jnp.array([0.0, 0.0, 1.0])
+    pushed = lagjax.System(free, forces=lambda q, v: jnp.array([1.0, 0.0, 0.0]) * q[1])
+    assert lagjax.simulate(pushed, *start, TS).health().momentum_names == ("q[1]", "q[2]")
+    wire = lagjax.System(free, constraints=lambda q: q[0] * q[2] - 0.0)
+    assert lagjax.simulate(wire, *start[:1], jnp.array([0.0, 1.0, 0.0]), TS).health().momentum_names == ("q[1]",)
+
+
+# ---- constraints, mass matrix, gradients -----------------------------------------------------------------------------
+
+
+def test_distances_from_the_constraints():
+    trajectory = run(scenes.cartesian_pendulum())
+    health = trajectory.health()
+    size = 1 + np.abs(trajectory.q).max()
+    assert health.constraint_names == ("constraints['rod']",) or len(health.constraint_names) == 1
+    assert health.constraint_distance.value[0] < 1e-14 * size and health.constraint_rate.value[0] < 1e-13 * size
+    late = jnp.arange(21)[:, None] == 13
+    off = moved(trajectory, q=jnp.where(late, 1 + 1e-6, 1.0) * trajectory.q).health()
+    length = np.linalg.norm(trajectory.q[13])
+    np.testing.assert_allclose(off.constraint_distance.value, [1e-6 * length], rtol=1e-5)
+    assert off.constraint_distance.t == trajectory.ts[13] and "constraints" in flagged(off)
+    outward = jnp.where(late, 1e-5, 0.0) * trajectory.q  # along the rod
+    off = moved(trajectory, qdot=trajectory.qdot + outward).health()
+    np.testing.assert_allclose(off.constraint_rate.value, [1e-5 * length], rtol=1e-5)
+    assert "constraints" in flagged(off)
+
+
+@pytest.mark.parametrize("make", [scenes.double_pendulum, scenes.chain], ids=["two", "three"])
+def test_eigenvalues_of_the_mass_matrix(make):
+    trajectory = run(make())
+    health = trajectory.health()
+    M = np.asarray(jax.vmap(trajectory.system.mass_matrix, (0, 0, 0, None))(
+        trajectory.q, trajectory.qdot, trajectory.ts, trajectory.params
+    ))  # fmt: skip
+    scale = 1 / np.sqrt(np.diagonal(M, axis1=1, axis2=2))
+    for found, values, pick in (
+        (health.smallest_eigenvalue, np.linalg.eigvalsh(M)[:, 0], np.argmin),
+        (health.condition, np.linalg.cond(M), np.argmax),
+        (health.scaled_condition, np.linalg.cond(scale[:, :, None] * M * scale[:, None, :]), np.argmax),
+    ):
+        np.testing.assert_allclose(found.value, values[pick(values)], rtol=1e-12)
+        assert found.t == trajectory.ts[pick(values)]
+
+
+def test_a_nearly_singular_mass_matrix_and_scaling():
+    def two(q, v, params):
+        m = params["m"]
+        return 0.5 * (v[0] ** 2 + m**2 * v[1] ** 2 + 2 * params["c"] * m * v[0] * v[1]) - 0.5 * jnp.sum(q**2)
+
+    def health(m, c):
+        given = {"m": m, "c": c}
+        start = jnp.array([1.0, m**2])
+        return lagjax.simulate(lagjax.System(two), start, jnp.zeros(2), TS[:3] / 10, given, throw=False).health()
+
+    light = health(1e-5, 0.5)  # a light mass alone is no danger: eigenvalues of ((1, ½), (½, 1)) after scaling
+    np.testing.assert_allclose(light.scaled_condition.value, 3.0, rtol=1e-9)
+    assert light.condition.value > 1e9 and flagged(light) == set()
+    assert "mass_matrix" in flagged(health(1.0, 1 - 1e-9))
+
+
+def test_gradients_that_are_not_finite():
+    # Where q < 0 the force is zero, but the derivative of the branch that is not taken is NaN.
+    def force(q, v):
+        return -jnp.where(q > 0, jnp.sqrt(q) ** 9, 0.0)
+
+    trap = lagjax.System(lambda q, v: 0.5 * v**2, forces=force)
+    trajectory = lagjax.simulate(trap, 1.0, -1.0, TS[:9], solver=diffrax.Tsit5(), rtol=1e-6)
+    health = trajectory.health()
+    assert trajectory.ok and flagged(health) == {"gradients"}
+    assert health.gradients_time == TS[int(np.argmax(trajectory.q <= 0))]
+    assert "where" in health.findings()[0]
+
+
+# ---- the error of the whole motion -----------------------------------------------------------------------------------
+
+
+def test_global_error_from_a_reference():
+    loose, tight = swinging(rtol=1e-5, solver=diffrax.Tsit5()), swinging(rtol=1e-9)
+    health, w = loose.health(tight), np.sqrt(1.3)
+    q = np.cos(w * TS) + 0.5 / w * np.sin(w * TS)
+    v = -w * np.sin(w * TS) + 0.5 * np.cos(w * TS)
+    errors = [np.abs(x - exact) / (np.abs(exact).max() + 1e-3) for x, exact in ((loose.q, q), (loose.qdot, v))]
+    np.testing.assert_allclose(health.global_error.value, np.max(errors), rtol=1e-3)
+    assert health.global_error.t == TS[np.max(errors, axis=0).argmax()] and "global error" in str(health)
+    assert loose.health().global_error is None
+
+
+def test_a_chaotic_motion_is_called_one():
+    scene = dataclasses.replace(scenes.double_pendulum(), q0=jnp.array([2.0, 2.5]))
+    loose, tight = (run(scene, jnp.linspace(0.0, 60.0, 61), rtol=rtol) for rtol in (1e-6, 1e-9))
+    health = loose.health(tight)
+    assert flagged(health) == {"global_error"} and "chaotic" in str(health)
+
+
+def test_references_that_cannot_be_compared():
+    given, params = swinging(rtol=1e-6), {"k": 1.3}
+    tight = {"rtol": 1e-10}
+    for reference, sentence in (
+        (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS[:-1], params, **tight), "shapes"),
+        (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS + 1e-3, params, **tight), "times"),
+        (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS, {"k": 1.4}, **tight), "params"),
+        (dataclasses.replace(given, system=lagjax.System(lambda q, v: 0.5 * v**2)), "same system"),
+        (swinging(rtol=2e-7), "at most 1e-07"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            given.health(reference)
+    with pytest.raises(TypeError, match="must be a Trajectory"):
+        given.health(tight)
+
+
+# ---- batches and transformations -------------------------------------------------------------------------------------
+
+
+def test_members_that_failed_do_not_spoil_the_others():
+    # q″ = −k q + c/(2 − q): the member that starts beside q = 2 falls into it, one has no parameter.
+    fall = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2 - jnp.log(2.0 - q) * params["c"])
+    q0, k = jnp.array([0.1, 1.9, 0.2, 0.3]), jnp.array([1.0, 1.0, jnp.nan, 2.0])
+    batch = lagjax.simulate_batch(
+        fall, q0, jnp.zeros(4), TS, {"k": k, "c": jnp.full(4, 0.5)}, batch_axes=(0, 0, {"k": 0, "c": 0})
+    )
+    assert batch.ok.tolist() == [True, False, False, True]
+    health = batch.health()
+    assert health.suspicious.tolist() == [False, True, True, False]
+    for i in (0, 3):
+        alone = lagjax.simulate(fall, q0[i], 0.0, TS, {"k": k[i], "c": 0.5}).health()
+        np.testing.assert_allclose(health.energy.value[i], alone.energy.value, rtol=1e-6, atol=1e-15)
+        np.testing.assert_allclose(health.energy_allowed[i], alone.energy_allowed, rtol=1e-9)
+        np.testing.assert_allclose(health.condition.value[i], alone.condition.value, rtol=1e-12)
+    # One was followed for a while, of the other there is no more than its start.
+    assert np.isfinite(health.energy.value[1]) and health.energy.t[1] < batch.end.t[1]
+    assert np.isnan(health.energy.value[2]) and health.energy.t[2] == 0
+    report = str(health)
+    assert "of 4 members 2 successful" in report and "in 2 of 4 members, the first 1" in report
+    assert len(report.splitlines()) < 24 and max(map(len, report.splitlines())) < 500
+
+
+def test_batch_vmap_and_jit_agree():
+    k = jnp.array([0.7, 1.3, 2.0])
+
+    def one(k):
+        return lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS, {"k": k}, throw=False)
+
+    batch = lagjax.simulate_batch(OSCILLATOR, 1.0, 0.5, TS, {"k": k}, batch_axes=(None, None, 0)).health()
+    mapped = jax.vmap(one)(k).health()
+    inside = jax.jit(jax.vmap(lambda k: one(k).health()))(k)
+    twice = jax.vmap(lambda c: lagjax.simulate_batch(
+        OSCILLATOR, c, 0.5, TS, {"k": k}, batch_axes=(None, None, 0)
+    ))(jnp.array([1.0, 2.0])).health()  # fmt: skip
+    for other in (mapped, inside, jax.tree.map(lambda leaf: leaf[0], twice)):
+        for a, b in zip(jax.tree.leaves(batch), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(np.asarray(a, float), np.asarray(b, float), rtol=1e-6, atol=1e-14)
+    assert twice.energy.value.shape == (2, 3) and "in member (" in str(twice)
+
+
+def test_a_new_value_never_recompiles():
+    traces = []
+
+    def counted(q, v, params):
+        traces.append(None)
+        return 0.5 * v**2 - params["k"] * q**2
+
+    system = lagjax.System(counted)
+    first = lagjax.simulate(system, 1.0, 0.0, TS, {"k": 0.5}, rtol=1e-8)
+    second = lagjax.simulate(system, 1.1, 0.0, 2 * TS, {"k": 2.0}, rtol=1e-6)
+    first.health()
+    count = len(traces)
+    second.health()
+    assert len(traces) == count
+
+
+# ---- modes -----------------------------------------------------------------------------------------------------------
+
+
+def test_energy_between_bounces():
+    # Every bounce takes 0.36 of the energy; between them none is lost.
+    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+    bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.8 * v))
+    bouncing = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, jnp.linspace(0.0, 1.5, 31))
+    health = bouncing.health()
+    energy = np.asarray(bouncing.energy())
+    assert bouncing.transitions.count == 2 and np.ptp(energy) > 5
+    assert health.energy.value < 1e-12 * energy[0] and flagged(health) == set()
+    spoilt = moved(bouncing, q=bouncing.q.at[20].add(1e-3)).health()
+    np.testing.assert_allclose(spoilt.energy.value, 9.81e-3, rtol=1e-6)
+    assert flagged(spoilt) == {"energy"}
+
+
+def test_constraints_of_one_mode_and_not_of_another():
+    # Down the inside of a circle to its lowest place, then straight on.
+    held = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * q[1], constraints=lambda q: {"rail": q @ q - 1.0})
+    free = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * q[1])
+    off = lagjax.Transition("rail", "air", lambda q, v: q[0])
+    modes, start = {"rail": held, "air": free}, (jnp.array([-1.0, 0.0]), jnp.zeros(2))
+    fallen = lagjax.simulate_hybrid(modes, [off], "rail", *start, jnp.linspace(0.0, 1.0, 21))
+    health = fallen.health()
+    assert np.unique(fallen.mode).tolist() == [0, 1] and flagged(health) == set()
+    assert health.constraint_names == ("rail: constraints['rail']",)
+    assert health.constraint_distance.value[0] < 1e-13 < np.abs(np.sum(fallen.q[-1] ** 2) - 1)
+    assert health.momentum_names == ("q[0]",)  # of the flight
+    assert health.momentum.value[0] < 1e-12
+
+
+# ---- float32 ---------------------------------------------------------------------------------------------------------
