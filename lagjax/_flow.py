@@ -34,7 +34,7 @@ _BUDGET = 100_000  # operations of a program with sensitivities
 # Entries of ∂q̈/∂(q, q̇, parameters) up to which all sensitivities are followed at once.
 LARGEST_JACOBIAN = 150
 # How a motion ends that its program cannot follow.
-GIVEN_UP = (_native.SINGULAR, _native.NOT_FINITE, _native.STEP_TOO_SMALL)
+GIVEN_UP = (_native.SINGULAR, _native.NOT_FINITE, _native.STEP_TOO_SMALL, _native.NOT_LANDED)
 
 
 class Outcome(NamedTuple):

@@ -46,10 +46,11 @@ GUARD_NOISE, LITTLE = 64 * 2.0**-52, 1e-4  # rounding; of the step
 # A series that ends (free flight) allows any step, and a step that is too long sees nothing of what lies inside it.
 FIRST_STEP, GROWTH, GROWTH_AFTER_REJECTION = 1 / 16, 5.0, 2.0  # of the whole time; of the step before
 SMALLEST_STEP = 4 * 2.0**-52  # of the largest time: below this a step no longer moves the time reliably
+LANDING = 16.0  # tolerances from the end of a series to the constraints, at most
 CHECKS = (0.5, 1.0)  # where in the step its series is held against the equations
 
 # How a member ended.
-DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, EVENT = range(6)
+DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, NOT_LANDED, EVENT = range(7)
 # EVENT + Σ 4ᵏ (1 where guard k falls, 2 where it rises), over those that do so at that instant.
 _RUNNING = -1
 
@@ -72,7 +73,7 @@ class Job(ctypes.Structure):
 # Doubles of a lane. `due` and `reached` are times in the direction of time; `active`, `last`, `singular` are 1 or 0.
 _OF_A_LANE = (
     "t_low", "t_end", "forward", "smallest", "due", "reached", "worst", "active", "last", "code", "steps", "rejected",
-    "longest", "growth", "planned", "event",
+    "longest", "growth", "planned", "event", "by_series",
 )  # fmt: skip
 
 
@@ -88,6 +89,7 @@ class Integrator(SeriesCode):
             "low": 2 * series.size,  # what rounding took from the state
             "scale": 2 * series.size,
             "increment": 2 * series.size,
+            **dict.fromkeys(("landed", "landed_low"), 0 if projection is None else 2 * series.size),
             **dict.fromkeys(("guard", "side", "noise", "root", "change"), len(self.directions)),
             "samples": _SAMPLES * len(self.directions),
             **dict.fromkeys(_OF_A_LANE, 1),
@@ -95,7 +97,9 @@ class Integrator(SeriesCode):
         super().__init__("motion", program, series, Job, sizes)
         self.defect = self._defect()
         self.start_next = self._start_next()
-        self.project = None if projection is None else self._project()
+        self.project = self.land = None
+        if projection is not None:
+            self.project, self.land = self._project(), self._land()
         if guards is not None:
             self.guard = self._guard()
             self.begin_sides = self._begin_sides()
@@ -197,8 +201,6 @@ class Integrator(SeriesCode):
                 self._record(code, memory, lane_data, job, lane)
             self._move_time(code, memory, lane_data, job, order)
             self._advance(code, memory)
-            if self.project is not None:
-                code.call(self.project, memory)
             self._end_or_go_on(code, memory, lane_data, job, idle)
         code.finish()
 
@@ -265,6 +267,9 @@ class Integrator(SeriesCode):
             self._keep(code, memory, "worst", code.lanes_of(0.0))
             for place in CHECKS:
                 code.call(self.defect, memory, order, double(code, place))
+            if self.land is not None:
+                self._keep(code, memory, "by_series", self._vector(code, memory, "worst"))
+                code.call(self.land, memory)
             h = self._vector(code, memory, "h")
             bad = ~(self._vector(code, memory, "worst") <= 1.0) & code.compare("!=", h, 0.0)
             with code.only_if(code.any_lane(bad)):
@@ -274,12 +279,19 @@ class Integrator(SeriesCode):
                 rejected = self._vector(code, memory, "rejected")
                 ending = self._vector(code, memory, "code")
                 self._keep(code, memory, "h", code.select(small, 0.0, code.select(bad, half, h)))
-                self._keep(code, memory, "code", code.select(small, code.lanes_of(STEP_TOO_SMALL), ending))
+                self._keep(code, memory, "code", code.select(small, self._reason(code, memory), ending))
                 self._keep(code, memory, "rejected", rejected + code.select(bad, code.lanes_of(1), 0.0))
                 last = self._vector(code, memory, "last")
                 self._keep(code, memory, "last", code.select(bad, 0.0, last))
                 growth = self._vector(code, memory, "growth")
                 self._keep(code, memory, "growth", code.select(bad, GROWTH_AFTER_REJECTION, growth))
+
+    def _reason(self, code, memory) -> Value:
+        """Why no step is small enough: the series, or only the way from its end to the constraints."""
+        reason = code.lanes_of(STEP_TOO_SMALL)
+        if self.land is None:
+            return reason
+        return code.select(self._vector(code, memory, "by_series") <= 1.0, code.lanes_of(NOT_LANDED), reason)
 
     def _record(self, code, memory, lane_data, job, lane) -> None:
         """Time, size and first state of the step, where a member has room for it."""
@@ -343,16 +355,23 @@ class Integrator(SeriesCode):
         moving = code.compare("!=", h, 0.0)
         self._keep(code, memory, "longest", code.intrinsic("fabs", h) * self._vector(code, memory, "growth"))
         for i in range(self.states):
-            y = code.load(self.state(code, memory, i), self.vector)
-            low = self._vector(code, memory, "low", i)
-            increment = self._vector(code, memory, "increment", i) + low
-            total = y + increment
-            part = total - y
-            rest = (y - (total - part)) + (increment - part)
+            y, low = code.load(self.state(code, memory, i), self.vector), self._vector(code, memory, "low", i)
+            if self.land is None:
+                total, rest = self._sum(code, memory, i)
+            else:
+                total, rest = (self._vector(code, memory, name, i) for name in ("landed", "landed_low"))
             code.store(code.select(moving, total, y), self.state(code, memory, i))
             self._keep(code, memory, "low", code.select(moving, rest, low), i)
         steps = self._vector(code, memory, "steps")
         self._keep(code, memory, "steps", steps + code.select(moving, code.lanes_of(1), 0.0))
+
+    def _sum(self, code, memory, i: int) -> tuple[Value, Value]:
+        """A component at the end of the step, and what rounding takes from it."""
+        y = code.load(self.state(code, memory, i), self.vector)
+        increment = self._vector(code, memory, "increment", i) + self._vector(code, memory, "low", i)
+        total = y + increment
+        part = total - y
+        return total, (y - (total - part)) + (increment - part)
 
     def _end_or_go_on(self, code, memory, lane_data, job, idle) -> None:
         """Write down the members that have ended, and take the next ones."""
@@ -453,6 +472,8 @@ class Integrator(SeriesCode):
         self._keep(code, memory, "h", nearest)
         with code.only_if(code.any_lane(code.compare("!=", nearest, self._vector(code, memory, "planned")))):
             code.call(self.defect, memory, order, double(code, 1.0))  # leaves the increment of the new step
+            if self.land is not None:
+                code.call(self.land, memory)
 
     def _sample(self, code, memory, order) -> None:
         """The guards at equal distances along the step and one beyond either end, into `samples`.
@@ -598,6 +619,32 @@ class Integrator(SeriesCode):
         line = StraightLine(self.projection.nodes, self.projection.kinds, self.projection.outputs)
         for i, y in enumerate(emit(code, line, self.now(code, memory), self.sincos)):
             code.store(y, self.state(code, memory, i))
+        return code.finish()
+
+    def _land(self) -> Code:
+        """`(memory)`: the end of the step back on the constraints, into `landed`; how far it was, into `worst`.
+
+        The series ends within the tolerance of the constraints. If it is much farther to the state that the projection
+        finds, that is not the end of this motion: near a configuration where constraints become dependent there are
+        several branches close together.
+        """
+        code = Code(self.module, "land", [POINTER], self.width)
+        (memory,) = code.arguments
+        sums, now = [self._sum(code, memory, i) for i in range(self.states)], self.now(code, memory)
+        h, worst = self._vector(code, memory, "h"), self._vector(code, memory, "worst")
+
+        def then(i):
+            return sums[i][0] if i < self.states else now(i) + h if i == self.states else now(i)
+
+        line = StraightLine(self.projection.nodes, self.projection.kinds, self.projection.outputs)
+        for i, landed in enumerate(emit(code, line, then, self.sincos)):
+            far = code.intrinsic("fabs", landed - sums[i][0])
+            size = code.intrinsic("fabs", landed) + code.intrinsic("fabs", self._vector(code, memory, "increment", i))
+            error = (far - ROUND_OFF * size) * self._vector(code, memory, "scale", i) * (1 / LANDING)
+            worst = code.select(error <= worst, worst, error)  # NaN goes through
+            self._keep(code, memory, "landed", landed, i)
+            self._keep(code, memory, "landed_low", sums[i][1], i)
+        self._keep(code, memory, "worst", worst)
         return code.finish()
 
     def _project_rows(self) -> None:
