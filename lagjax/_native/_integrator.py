@@ -47,6 +47,7 @@ GUARD_NOISE, LITTLE = 64 * 2.0**-52, 1e-4  # rounding; of the step
 FIRST_STEP, GROWTH, GROWTH_AFTER_REJECTION = 1 / 16, 5.0, 2.0  # of the whole time; of the step before
 SMALLEST_STEP = 4 * 2.0**-52  # of the largest time: below this a step no longer moves the time reliably
 LANDING = 16.0  # tolerances from the end of a series to the constraints, at most
+START = 1e-5  # of the size of the state, the same for the first step
 CHECKS = (0.5, 1.0)  # where in the step its series is held against the equations
 
 # How a member ended.
@@ -632,6 +633,7 @@ class Integrator(SeriesCode):
         (memory,) = code.arguments
         sums, now = [self._sum(code, memory, i) for i in range(self.states)], self.now(code, memory)
         h, worst = self._vector(code, memory, "h"), self._vector(code, memory, "worst")
+        first = code.compare("==", self._vector(code, memory, "steps"), 0.0)
 
         def then(i):
             return sums[i][0] if i < self.states else now(i) + h if i == self.states else now(i)
@@ -641,6 +643,8 @@ class Integrator(SeriesCode):
             far = code.intrinsic("fabs", landed - sums[i][0])
             size = code.intrinsic("fabs", landed) + code.intrinsic("fabs", self._vector(code, memory, "increment", i))
             error = (far - ROUND_OFF * size) * self._vector(code, memory, "scale", i) * (1 / LANDING)
+            # A start may be off by more, as much as is taken for consistent.
+            error = code.select(first, far / (START * (1.0 + size)), error)
             worst = code.select(error <= worst, worst, error)  # NaN goes through
             self._keep(code, memory, "landed", landed, i)
             self._keep(code, memory, "landed_low", sums[i][1], i)
