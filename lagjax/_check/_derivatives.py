@@ -42,8 +42,8 @@ def _first_bad(value: np.ndarray) -> str:
 def _not_finite(scene: Scene) -> list[Finding]:
     m, n, names = scene.measured, scene.layout.size, scene.names
     first = ~np.isfinite(np.concatenate([m.by_q, m.momentum[0]]))
-    second = ~np.isfinite(m.mass[0]).all(axis=0) | ~np.isfinite(m.drift)
     dragged = ~np.isfinite(m.by_v_of_dissipation)
+    second = ~np.isfinite(m.mass[0]).all(axis=0) | ~np.isfinite(scene.drift) & ~dragged
     found = []
     if first.any():
         found.append(_no_derivative(scene, "lagrangian", "The derivative of L by", _named(names[:-1], first), "first"))
@@ -111,7 +111,7 @@ def _blocks(scene: Scene):
     first, dragged = 1 + n, scene.motion.dissipation is not None
     held = first + dragged
     by_y = np.concatenate([m.by_q, m.momentum[0]])[:, None]
-    along = np.concatenate([m.mass[0], m.drift[None]])
+    along = np.concatenate([m.mass[0], scene.drift[None]])
     blocks = [
         ("L", "lagrangian", by_y, range(2 * n), range(1)),
         ("p = dL/dqdot", "lagrangian", along, range(n, 2 * n + 1), range(1, first)),

@@ -47,7 +47,9 @@ def slopes(minus, here, plus, steps, place, eps: float) -> tuple[Slopes, Slopes,
         behind = (4 * near[1] - far[1] - 3 * here) / (-2 * h)
 
         def best(x):
-            return _best(x, eps * (size + np.abs(place)[:, None, None] * np.abs(x)) / h)
+            # f has the rounding of its value, and of every coordinate in it.
+            terms = np.abs(place)[:, None, None] * np.abs(x)
+            return _best(x, eps * (size + np.sum(np.where(np.isfinite(terms), terms, 0), axis=0)) / h)
 
         return best(both), best(ahead), best(behind)
 

@@ -65,6 +65,12 @@ class Scene(NamedTuple):
         return self.measured.here[len(self.measured.here) - count :]
 
     @property
+    def drift(self) -> np.ndarray:
+        """(∂p/∂q) q̇ + ∂p/∂t at the state."""
+        m = self.measured
+        return m.by_q + m.extra - m.by_v_of_dissipation - m.force
+
+    @property
     def held(self) -> np.ndarray:
         """K = M + GᵀW G of every state (see `_mass`), every row of G as heavy as M."""
         m = self.measured
@@ -108,7 +114,6 @@ class Measured(NamedTuple):
     momentum: Any  # (states, n)
     mass: Any  # (states, n, n)
     force: Any  # M q̈ − Gᵀλ, (n,)
-    drift: Any  # (∂p/∂q) q̇ + ∂p/∂t
     extra: Any  # Q as the user gives it
     by_v_of_dissipation: Any
     rows: Any  # G, (states, m, n)
@@ -121,13 +126,19 @@ class Measured(NamedTuple):
 
 
 def _sizes(layout: Layout, q: PyTree, qdot: PyTree) -> np.ndarray:
-    """Of every coordinate its own size, or that of others in its array, or 1; in time what moves q by its size."""
+    """Of every coordinate its own size, or that of others in its array, or 1; in time what moves q by its size.
 
-    def size(leaf):
-        x = np.abs(np.asarray(leaf, np.float64))
-        return np.broadcast_to(np.where(x > 0, x, x.max() or 1.0), x.shape).ravel()
+    One that is next to nothing beside the others (an angle that was projected to 1e-20) has a thousandth of theirs.
+    """
 
-    of_q, of_v = (np.concatenate([size(leaf) for leaf in jax.tree.leaves(tree)]) for tree in (q, qdot))
+    def of(tree):
+        leaves = [np.abs(np.asarray(leaf, np.float64)) for leaf in jax.tree.leaves(tree)]
+        least = 1e-3 * min(1.0, max(x.max(initial=0) for x in leaves))
+        return np.concatenate(
+            [np.ravel(np.maximum(np.where(x > 0, x, x.max(initial=0) or 1.0), least)) for x in leaves]
+        )
+
+    of_q, of_v = of(q), of(qdot)
     speed = np.abs(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(qdot)]))
     time = np.min(of_q / np.where(speed > of_q, speed, of_q))
     return np.concatenate([of_q, of_v, [time]])
@@ -153,7 +164,6 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
     n, q, v = layout.size, layout.flatten(q), layout.flatten(qdot)
     state = q, v, t, numbers
 
-    free = Motion(motion.lagrangian, None, None)  # L alone, and D alone beside it
     damped = Motion(motion.lagrangian, None, motion.dissipation)
 
     def nearby(offset):
@@ -181,13 +191,11 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
     small = n <= _LARGEST_AT_ONCE
     sides = jax.vmap(along)(directions, steps.T) if small else jax.lax.map(lambda x: along(*x), (directions, steps.T))
     momentum, mass, force, rows, targets, velocity = jax.vmap(nearby)(offsets)
-    by_q = free.generalized_force(*state)
     return Measured(
-        by_q=by_q,
+        by_q=Motion(motion.lagrangian, None, None).generalized_force(*state),
         momentum=momentum,
         mass=mass,
         force=force[0],
-        drift=by_q - free.mass_matrix_and_force(*state)[1],
         extra=jnp.zeros_like(q) if motion.forces is None else motion.forces(*state),
         by_v_of_dissipation=-damped.nonconservative_force(*state),
         rows=rows,
