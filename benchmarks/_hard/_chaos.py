@@ -46,10 +46,10 @@ _HENON_HEILES = lagjax.System(_henon_heiles_lagrangian)
 
 def henon_heiles() -> scenes.Scene:
     """The star of Hénon and Heiles at E = 1/6 − 1e-4, where almost all is chaos. Astronomical Journal 69 (1964) 73."""
-    y, energy = 0.1, 1 / 6 - 1e-4
-    push = np.sqrt(2 * (energy - 0.5 * y**2 + y**3 / 3))
+    y, up, energy = -0.1, 0.1, 1 / 6 - 1e-4
+    push = np.sqrt(2 * (energy - 0.5 * y**2 + y**3 / 3) - up**2)
     return scenes.Scene(
-        _HENON_HEILES, {}, np.array([0.0, y]), np.array([push, 0.0]), 1e4, {"energy": _HENON_HEILES.energy}
+        _HENON_HEILES, {}, np.array([0.0, y]), np.array([push, up]), 1e4, {"energy": _HENON_HEILES.energy}
     )
 
 
