@@ -326,4 +326,57 @@ def test_constraints_of_one_mode_and_not_of_another():
     assert health.momentum.value[0] < 1e-12
 
 
+# ---- how a motion may end, with diffrax ------------------------------------------------------------------------------
+
+BY_DIFFRAX = {"solver": lagjax.FineOutput(diffrax.Dopri8()), "throw": False}
+
+
+def held(constraint, q0, v0, end, **options):
+    system = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2), constraints=constraint)
+    ts = jnp.linspace(0.0, end, 5)
+    return lagjax.simulate(system, jnp.array(q0), jnp.array(v0), ts, **(BY_DIFFRAX | options))
+
+
+def test_a_constraint_that_loses_its_gradient():
+    # Along y² = x³ into its cusp, at constant speed, where ∂f/∂q vanishes: the length of the curve is known.
+    run = held(lambda q: q[1] ** 2 - q[0] ** 3, [1.0, 1.0], [-1.0, -1.5], 2.0)
+    length, speed = (13**1.5 - 8) / 27, np.sqrt(3.25)
+    assert run.result == lagjax.RESULTS.constraint_rank_lost and not run.ok
+    np.testing.assert_allclose(run.end.t, length / speed, rtol=1e-6)
+    np.testing.assert_array_equal(np.isnan(run.q).all(axis=1), run.ts > run.end.t)
+    with pytest.raises(lagjax.SimulationError, match="no longer determine") as caught:
+        held(lambda q: q[1] ** 2 - q[0] ** 3, [1.0, 1.0], [-1.0, -1.5], 2.0, throw=True)
+    assert "t = 0.7986" in str(caught.value) and "last state was q[0]" in str(caught.value)
+
+
+def test_steps_too_long_for_the_projection():
+    scene = scenes.cartesian_pendulum()
+    for dt in (1.0, 2.0):  # so far from the circle that Newton's method comes back half the way at best
+        failed = run(scene, jnp.linspace(0.0, 10.0, 5), dt=dt, throw=False)
+        assert failed.result == lagjax.RESULTS.projection_failed and np.isnan(failed.q[1:]).all()
+        assert "projection_failed" in str(failed.health())
+    fine = run(scene, jnp.linspace(0.0, 10.0, 5), dt=0.1)
+    assert fine.ok and flagged(fine.health()) == set()
+
+
+def test_a_constraint_that_jumps_is_not_followed_by_a_jump():
+    run = held(lambda q, t: q[1] - jnp.where(t > 0.7, 0.1, 0.0), [0.0, 0.0], [1.0, 0.0], 2.0)
+    assert not run.ok and abs(run.end.t - 0.7) < 1e-9 and np.isnan(run.q[2:]).all()
+
+
 # ---- float32 ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [scenes.pendulum, scenes.kepler, scenes.wedge], ids=lambda make: make.__name__)
+def test_float32_end_to_end_is_as_accurate_as_stated(make):
+    scene = make()
+    q0, qdot0, params = jax.tree.map(jnp.float32, (scene.q0, scene.qdot0, scene.params))
+    trajectory = lagjax.simulate(scene.system, q0, qdot0, jnp.linspace(0.0, scene.duration, 21), params)
+    health = trajectory.health()
+    kinds = {leaf.dtype for leaf in jax.tree.leaves((trajectory.q, trajectory.ts, trajectory.energy(), health.energy))}
+    assert kinds == {np.dtype("float32")} and flagged(health) == set()
+    # From the same numbers, in float64.
+    ts, start = np.asarray(trajectory.ts, float), jax.tree.map(lambda x: jnp.asarray(x, float), (q0, qdot0, params))
+    exact = jax.jit(jax.vmap(lambda t: scene.exact(t, *start)))(ts)
+    for x, truth in zip(jax.tree.leaves((trajectory.q, trajectory.qdot)), jax.tree.leaves(exact), strict=True):
+        assert np.abs(x - truth).max() <= 3e-4 * (np.abs(truth).max() + 1e-3)

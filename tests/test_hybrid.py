@@ -176,7 +176,7 @@ def test_bounces_that_pile_up_are_reported_and_never_fall_through(direction):
         max_transitions=200, throw=False,
     )  # fmt: skip
     runs = jax.vmap(run)(floor, e)
-    assert (runs.result._value == lagjax.RESULTS.max_transitions_reached._value).all() and not runs.ok.any()
+    assert (runs.result._value == lagjax.RESULTS.zeno._value).all() and not runs.ok.any()
     still = np.sqrt(2 / G) * (1 + 2 * e / (1 - e))
     np.testing.assert_allclose(runs.end.t, still, atol=1e-6)
     for i in range(4):
@@ -199,6 +199,26 @@ def test_the_budget_of_transitions():
     assert bouncing(1.0, 0.9, max_transitions=3).ok
     with pytest.raises(Exception, match="max_transitions"):
         jax.block_until_ready(jax.jit(lambda h: bouncing(h, 0.9, max_transitions=2).q)(1.0))
+
+
+def test_a_spent_budget_is_told_from_bounces_that_pile_up():
+    # They add up to sqrt(2 h/g) (1 + e)/(1 − e): 4.06 for e = 0.8 and h = 1. Those of e = 1 never end.
+    run = lambda e, end, **options: bouncing(1.0, e, ts=jnp.linspace(0.0, 1.0, 5) * end, throw=False, **options)
+    zeno, spent = lagjax.RESULTS.zeno, lagjax.RESULTS.max_transitions_reached
+    assert run(0.8, 4.2, max_transitions=8).result == zeno
+    assert run(0.8, 4.0, max_transitions=8).result == spent, "a larger budget reaches the end"
+    assert run(0.8, 4.0).ok
+    found = jax.vmap(lambda e: run(e, 200.0).result._value)(jnp.array([0.5, 0.9, 0.95, 1.0]))
+    assert found.tolist() == [zeno._value] * 3 + [spent._value]
+    with pytest.raises(lagjax.SimulationError, match="mode at rest") as caught:
+        bouncing(1.0, 0.8, ts=jnp.array([0.0, 5.0]))
+    assert caught.value.trajectory.result == zeno
+    # Two modes that take turns, one above and one below the floor, which is soft: flight and contact alternate.
+    soft = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q - 0.5 * 1e3 * q**2)
+    land = lagjax.Transition("flight", "floor", lambda q, v: q, direction=-1)
+    leave = lagjax.Transition("floor", "flight", lambda q, v: q, direction=1, reset=lambda q, v: (q, 0.7 * v))
+    run = hybrid({"flight": BALL, "floor": soft}, [land, leave], 1.0, 0.0, (0.0, 20.0), {"g": G}, throw=False)
+    assert run.result == spent, "a contact lasts as long for a small bounce as for a large one: no sum is finite"
 
 
 def test_derivatives_of_the_bouncing_ball():

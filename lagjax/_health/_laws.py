@@ -134,7 +134,8 @@ def _off(motion: Motion, q, qdot, t, params) -> tuple[jax.Array, jax.Array]:
     if motion.constraints is not None:
         held = motion.constraints(q, t, params)
         values = values.at[: len(held)].set(held)
-    return tuple(jnp.where(off == 0, 0.0, jnp.abs(off) / lengths) for off in (values, rates))
+    distances, speeds = (jnp.where(off == 0, 0.0, jnp.abs(off) / lengths) for off in (values, rates))
+    return distances, speeds
 
 
 def _conditions(matrix: jax.Array) -> jax.Array:

@@ -66,6 +66,7 @@ def _measured(trajectory, axes, tree, steps):
     names, members = {}, max(1, jnp.size(trajectory.result._value))
 
     def one(q, qdot, given, params, mode, steps, transitions):
+        ts, tolerances = given
         layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
         laws = [Law.of(system, layout, params, name if len(modes) > 1 else "") for name, system in modes.items()]
         momenta = _conserved(laws)
@@ -74,7 +75,7 @@ def _measured(trajectory, axes, tree, steps):
             None if momenta is None else tuple(layout.names[i] for i in momenta),
             tuple(name for law in laws for name in law.names),
         )
-        member = _Member(q, qdot, *given, eqx.filter(params, eqx.is_array), mode, steps, transitions)
+        member = _Member(q, qdot, ts, tolerances, eqx.filter(params, eqx.is_array), mode, steps, transitions)
         return _one_member(laws, momenta or (), layout, member, members)
 
     found = trajectory.over_members(one, steps, trajectory.transitions)
@@ -163,15 +164,17 @@ def _ends(given: _Member) -> jax.Array:
 def _in_its_mode(laws: list[Law], momenta, tolerances, params, q, qdot, t, mode) -> Found:
     """By the law of its mode; constraints of the others are zero."""
     starts = np.cumsum([0, *(len(law.names) for law in laws)])
-    total = None
+    each = []
     for index, law in enumerate(laws):
         found = found_at(law, momenta, tolerances, q, qdot, t, params)
         held = [
             jnp.zeros(starts[-1], q.dtype).at[starts[index] : starts[index + 1]].set(off)
             for off in (found.distances, found.rates)
         ]
-        found = found._replace(distances=held[0], rates=held[1])
-        total = found if total is None else _where(mode == index, found, total)
+        each.append(found._replace(distances=held[0], rates=held[1]))
+    total = each[0]
+    for index, found in enumerate(each[1:], 1):
+        total = _where(mode == index, found, total)
     return total
 
 
