@@ -375,12 +375,15 @@ class _Rounds(NamedTuple):
         exit = self._through(index, changes, carry.latest, t_end, y_end)
         event = (changes > 0) & ~exit.piled
         failed = jnp.where(exit.piled, ZENO, jnp.where(runs & ~event, found.code, carry.code))
+        # A reset may give NaN, and a guard that is NaN never fires.
+        sound = jnp.isfinite(jnp.where(event, exit.y_next, y_end)).all() & exit.seen
+        broken = here & ~sound & (event | (failed == _native.DONE))
         state = carry._replace(
             t=jnp.where(event, exit.t, t_end),
             y=jnp.where(event, exit.y_next, y_end),
             mode=jnp.where(event, exit.target, index),
-            going=event & ~exit.astray,
-            code=jnp.where(event & exit.astray, INCONSISTENT, failed),
+            going=event & ~exit.astray & ~broken,
+            code=jnp.where(broken, _native.NOT_FINITE, jnp.where(event & exit.astray, INCONSISTENT, failed)),
             path=jnp.where(covered[:, None], run.path[1:-1], carry.path),
             modes=jnp.where(covered, index, carry.modes),
             steps=carry.steps + jnp.stack([found.accepted, found.rejected]),
@@ -392,12 +395,14 @@ class _Rounds(NamedTuple):
     def _through(self, index: int, changes, latest, t, y) -> "_Exit":
         """Through the first transition whose bits in `changes` say that its guard falls (1) or rises (2)."""
         leaving = self.plan.leaving(index)
-        exit = _Exit(t, y, y, jnp.asarray(index), *[jnp.asarray(-1), jnp.asarray(0)], *[jnp.asarray(False)] * 2)
+        exit = _Exit(t, y, y, jnp.asarray(index), *[jnp.asarray(-1), jnp.asarray(0)], *[jnp.asarray(False)] * 2,
+                     jnp.asarray(True))  # fmt: skip
         if not leaving:
             return exit
         kinds = [(changes >> (2 * k)) & 3 for k in range(len(leaving))]
         y_here, scalars = _held(changes > 0, (y, self.scalars))
         values = self.modes[index].surfaces(*y_here, t, *scalars)
+        seen = ~jnp.isnan(jnp.stack(values)).any()
         _, rates, sizes, slope = self._at_guards(index, t, y)
         before = jnp.asarray(False)
         for k, (number, transition) in enumerate(leaving):
@@ -413,10 +418,10 @@ class _Rounds(NamedTuple):
             here = _Exit(
                 moved_t, moved_y, y_next, jnp.asarray(target), jnp.asarray(number),
                 self._waiting(index, kinds, k, t, y_next, values, sizes) if target == index else jnp.asarray(0),
-                against, self.astray(target, moved_t, y_next),
+                against, self.astray(target, moved_t, y_next), seen,
             )  # fmt: skip
             exit = jax.tree.map(lambda new, old, taken=taken: jnp.where(taken, new, old), here, exit)
-        return exit
+        return exit._replace(seen=seen)
 
     def _waiting(self, index: int, kinds, taken: int, t, y_next, values, sizes):
         """Which other guards changed sign at that instant and go on to, unmoved by the reset."""
@@ -475,6 +480,7 @@ class _Exit(NamedTuple):
     waiting: jax.Array
     piled: jax.Array
     astray: jax.Array
+    seen: jax.Array  # whether all guards were numbers
 
 
 def _held(varies, tree: PyTree) -> PyTree:
@@ -510,8 +516,7 @@ def _pile_up(times, end) -> jax.Array:
     """Whether the times of a spent budget of transitions run geometrically to a limit before `end`.
 
     Aitken's extrapolation of the last times, taken far enough apart that a pattern of two, three or six transitions (a
-    flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one. Or the
-    time does not move any more.
+    flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one.
     """
     apart = next((k for k in (6, 2, 1) if 3 * k < times.size), None)
     if apart is None:
@@ -519,9 +524,7 @@ def _pile_up(times, end) -> jax.Array:
     first, second, third = jnp.diff(times[-1 - 3 * apart :: apart])
     before, ratio = second / first, third / second
     steady = jnp.abs(jnp.log(ratio) - jnp.log(before)) <= _STEADY * jnp.abs(jnp.log(before))
-    rounding = 4 * float(jnp.finfo(times.dtype).eps) * jnp.abs(times[-1])
-    lost = (third <= rounding) & (apart > 1)  # one alone may be two transitions at the same instant
-    return lost | ((ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end))
+    return (ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end)
 
 
 def _fields(layout: Layout, ts, last: _Carry, seen: _Seen):

@@ -670,6 +670,14 @@ def test_a_failure_names_the_mode():
         hybrid({"a": PLANE, "b": massless}, [pass_on], jnp.zeros(2), jnp.array([1.0, 0.0]))
 
 
+def test_guards_and_resets_that_are_nan():
+    blind = lagjax.Transition("a", "a", lambda q, v: jnp.sqrt(-1.0 - q) + q - 0.5)
+    broken = lagjax.Transition("a", "a", lambda q, v: q - 0.5, reset=lambda q, v: (q, jnp.sqrt(-q)))
+    for transition in (blind, broken):
+        with pytest.raises(lagjax.SimulationError, match=r"NaN or infinite[^$]*mode 'a'"):
+            hybrid({"a": FREE}, [transition], 0.0, 1.0, (0.0, 1.0, 2.0), max_transitions=2)
+
+
 # ---- compile counts -------------------------------------------------------------------------------------------------
 
 
