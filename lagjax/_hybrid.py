@@ -516,7 +516,8 @@ def _pile_up(times, end) -> jax.Array:
     """Whether the times of a spent budget of transitions run geometrically to a limit before `end`.
 
     Aitken's extrapolation of the last times, taken far enough apart that a pattern of two, three or six transitions (a
-    flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one.
+    flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one. Or the
+    time does not move any more.
     """
     apart = next((k for k in (6, 2, 1) if 3 * k < times.size), None)
     if apart is None:
@@ -524,7 +525,9 @@ def _pile_up(times, end) -> jax.Array:
     first, second, third = jnp.diff(times[-1 - 3 * apart :: apart])
     before, ratio = second / first, third / second
     steady = jnp.abs(jnp.log(ratio) - jnp.log(before)) <= _STEADY * jnp.abs(jnp.log(before))
-    return (ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end)
+    rounding = 4 * float(jnp.finfo(times.dtype).eps) * jnp.abs(times[-1])
+    lost = (third <= rounding) & (apart > 1)  # one alone may be two transitions at the same instant
+    return lost | ((ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end))
 
 
 def _fields(layout: Layout, ts, last: _Carry, seen: _Seen):
