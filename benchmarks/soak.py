@@ -125,7 +125,8 @@ def _faults(system, run: lagjax.Trajectory, rtol: float, with_energy: bool, memb
     found, ok = [], np.asarray(run.ok)
     if not ok.all():
         bad = int(np.argmin(ok))
-        found.append(f"member {bad} of {len(ok)} ended with {run.result[bad]}")
+        result = jax.tree.map(lambda codes: codes[bad], run.result)
+        found.append(f"member {bad} of {len(ok)} did not arrive: {lagjax.RESULTS[result]}")
     q, qdot = np.asarray(run.q), np.asarray(run.qdot)
     if with_energy and ok.all():
         energy = np.asarray(run.energy())
