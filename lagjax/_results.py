@@ -29,8 +29,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "the constraint a form whose gradient stays away from zero, or drop one that follows from the others."
     )
     projection_failed = (
-        "The state could not be brought back to its constraints. Take shorter steps (a tighter rtol, a smaller dt), "
-        "and look whether the constraints can still be met there: a rod that is too short, a wire that ends."
+        "The state could not be brought back to its constraints. Look whether they can still be met there: a rod that "
+        "is too short, a wire that ends. With fixed steps take a smaller dt. At a dead point of a mechanism, near which "
+        "constraints are almost dependent, a looser rtol steps across it."
     )
     mass_matrix_singular = (
         "The mass matrix d2L/dqdot2 became singular. Some velocity, or combination of velocities, has no kinetic "

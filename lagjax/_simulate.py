@@ -66,16 +66,17 @@ def simulate(
       `lagjax.FineOutput(diffrax.Dopri8())`, order 8, with states between its steps about as good as those at their ends
       (which diffrax's own interpolation for it is not).
     - `dt`: take fixed steps of this size instead of adaptive ones; `rtol` and `atol` then do not apply.
-    - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient records that many times for
-      every member: lower it for the gradient of a large batch.
+    - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient by diffrax records that many
+      times for every member: lower it for the gradient of a large batch.
     - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued one stops the motion where it
       changes sign, a Boolean one after the step on which it becomes true. `diffrax.Event` around such functions sets
       the direction and the root finder. Where the motion starts on the zero itself, give a direction.
-    - `adjoint`: how derivatives are taken. By default machine code integrates the sensitivities along with the motion,
-      for both modes and every order of derivatives; a scene with many parameters, and all that diffrax integrates, goes
-      back over the steps that were taken, in reverse mode only (`jax.grad`, `jax.vjp`, `jax.jacrev`). Pass
-      `diffrax.ForwardMode()` for forward mode (`jax.jvp`, `jax.jacfwd`) there, or any other diffrax adjoint. With an
-      event the default is `diffrax.RecursiveCheckpointAdjoint()`.
+    - `adjoint`: how derivatives are taken. By default machine code goes back over its own steps in reverse mode
+      (`jax.grad`, `jax.vjp`), at the cost of four or five motions however many parameters there are, and integrates
+      sensitivities along with the motion in forward mode (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist.
+      All that diffrax integrates, and the derivatives of scenes of more than 2000 operations, go back over the recorded
+      steps, in reverse mode only. Pass `diffrax.ForwardMode()` for forward mode there, or any other diffrax adjoint.
+      With an event the default is `diffrax.RecursiveCheckpointAdjoint()`.
     - `throw`: raise when the motion does not reach its end. With `throw=False` look at `trajectory.ok`.
     - `progress`: print how far the integration has come; or any diffrax progress meter.
 
@@ -109,7 +110,7 @@ def simulate(
     flow = _engine.flow_for(system, settings, layout, q0, qdot0, params)
     if isinstance(flow, str):
         fields = _integrate(system, settings, q0, qdot0, params)
-    elif not _engine.has_sensitivities(flow, settings.ts, q0, qdot0, params):
+    elif not _engine.has_derivatives(flow, settings.ts, q0, qdot0, params):
         fields = _integrate(system, settings, q0, qdot0, params, _engine.primal(flow, settings))
     else:
         fields = _engine.run(flow, settings, layout, q0, qdot0, params)
@@ -169,7 +170,7 @@ def simulate_batch(
         fields[5]["num_wasted_lane_steps"] = steps.size * jnp.max(steps) - jnp.sum(steps)
     elif all(is_concrete(leaf) for leaf in jax.tree.leaves((settings.ts, values))):
         fields = _engine.run_batch(flow, settings, layout, values, axes, size)
-    elif _engine.has_sensitivities(flow, settings.ts, *values.values()):
+    elif _engine.has_derivatives(flow, settings.ts, *values.values()):
         run = jax.vmap(lambda *one: _engine.run(flow, settings, layout, *one), in_axes=tuple(batch_axes))
         fields = run(*values.values())
     else:
