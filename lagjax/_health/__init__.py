@@ -22,6 +22,8 @@ is of order six; how far it may be off is told by the rules of order four and tw
 Integration*, §2.9 (the trapezoidal rule with end corrections).
 """
 
+import textwrap
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -110,6 +112,7 @@ class Health(eqx.Module):
         """Whether anything is, for each member."""
         return jnp.any(jnp.stack(list(self.checks().values())), axis=0)
 
+    @eqx.filter_jit
     def checks(self) -> dict[str, jax.Array]:
         """What is suspicious, by name: a Boolean for each member. A NaN at a state that was reached is."""
         energy = self.energy_allowed + SLACK * self.work_error
@@ -130,7 +133,8 @@ class Health(eqx.Module):
 
     def findings(self) -> tuple[str, ...]:
         """What is suspicious, as sentences that say what to do; none where nothing is."""
-        found = {name: np.asarray(flags) for name, flags in self.checks().items() if np.any(flags)}
+        flags = self.checks()  # which `jit` has put in another order
+        found = {name: np.asarray(flags[name]) for name in _SENTENCES if name in flags and np.any(flags[name])}
         sentences = [_SENTENCES[name].format(_who(flags)) for name, flags in found.items()]
         if "result" in found:
             sentences[0] += " " + self._advice()
@@ -157,7 +161,8 @@ class Health(eqx.Module):
         if self.global_error is not None:
             rows.append(("global error", f"{_worst(self.global_error, VISIBLE)}, in units of the largest |y|"))
         verdict = self.findings() or ("nothing suspicious",)
-        rows += [("" if k else "verdict", text) for k, text in enumerate(verdict)]
+        lines = [line for text in verdict for line in textwrap.wrap(text, 100)]
+        rows += [("" if k else "verdict", line) for k, line in enumerate(lines)]
         return "\n".join(f"{name:17s} {text}" for name, text in rows)
 
     def _results(self) -> str:
