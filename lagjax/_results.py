@@ -30,7 +30,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     projection_failed = (
         "The state could not be brought back to its constraints. Look whether they can still be met there: a rod that "
-        "is too short, a wire that ends. With fixed steps take a smaller dt. At a dead point of a mechanism, near which "
+        "is too short, a wire that ends. With fixed steps take a smaller dt. At a dead point of a mechanism, where "
         "constraints are almost dependent, a looser rtol steps across it."
     )
     mass_matrix_singular = (
