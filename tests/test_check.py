@@ -55,6 +55,13 @@ def test_no_false_alarm_in_single_precision_or_in_other_units():
     assert kinds(planet, jnp.array([1.496e11, 0.0]), jnp.array([0.0, 2.98e4]), 1.327e20) == set()
     assert kinds(lambda q, v: 0.5 * jnp.sum(v**2) - jnp.sum(jnp.cos(q)), q, qdot) == {"single_precision"}
 
+    def orbit(q, v):  # dp/dt is a small difference of large terms
+        return 5e24 * (0.5 * (v["r"] ** 2 + q["r"] ** 2 * v["phi"] ** 2) + 1.327e20 / q["r"])
+
+    assert kinds(orbit, {"r": 1.5e11, "phi": 0.0}, {"r": 0.0, "phi": 2e-7}) == set()
+    # After very many turns every large step sees a slope of zero.
+    assert kinds(lambda q, v: 0.5 * v**2 + jnp.cos(q), 1e6, 3.0) == set()
+
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_differences_know_their_error(dtype):

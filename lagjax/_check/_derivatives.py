@@ -111,7 +111,11 @@ def _blocks(scene: Scene):
     first, dragged = 1 + n, scene.motion.dissipation is not None
     held = first + dragged
     by_y = np.concatenate([m.by_q, m.momentum[0]])[:, None]
-    along = np.concatenate([m.mass[0], scene.drift[None]])
+    # The drift is a difference, and has the rounding of its terms.
+    lost = (
+        4 * np.finfo(scene.layout.dtype).eps * (abs(m.by_q) + abs(m.extra) + abs(m.by_v_of_dissipation) + abs(m.force))
+    )
+    along = Slopes(np.concatenate([m.mass[0], scene.drift[None]]), np.concatenate([0 * m.mass[0], lost[None]]))
     blocks = [
         ("L", "lagrangian", by_y, range(2 * n), range(1)),
         ("p = dL/dqdot", "lagrangian", along, range(n, 2 * n + 1), range(1, first)),
@@ -144,7 +148,8 @@ def _compared(scene: Scene, name, role, derivative, directions, outputs) -> list
         float(np.finfo(dtype).eps),
     )  # fmt: skip
     kinks = differ(ahead, behind, dtype)
-    wrong = differ(Slopes(derivative, np.zeros_like(derivative)), both, dtype) & ~kinks
+    given = derivative if isinstance(derivative, Slopes) else Slopes(derivative, np.zeros_like(derivative))
+    derivative, wrong = given.value, differ(given, both, dtype) & ~kinks
     names, found = [scene.names[i] for i in directions], []
     for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
         message = (

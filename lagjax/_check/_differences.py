@@ -26,8 +26,8 @@ class Slopes(NamedTuple):
 
 
 def ladder(size: np.ndarray, dtype) -> np.ndarray:
-    """Steps for coordinates of these sizes, shape (rungs, coordinates): from a quarter down to eps^(1/2) of a size."""
-    rungs = int(-np.log2(np.finfo(dtype).eps) / 2)
+    """Steps for coordinates of these sizes, shape (rungs, coordinates): from a quarter down to eps^(2/3) of a size."""
+    rungs = int(-np.log2(np.finfo(dtype).eps) * 2 / 3)
     return (size * 0.25 * 2.0 ** -np.arange(rungs)[:, None]).astype(dtype)
 
 
@@ -61,8 +61,17 @@ def _best(estimates: np.ndarray, rounding: np.ndarray) -> Slopes:
     nearby = np.max([padded[:, i : i + estimates.shape[1]] for i in range(4)], axis=0)
     error = nearby + rounding
     error = np.where(np.isfinite(error), error, np.inf)
-    rung = np.argmin(error, axis=1)[:, None]
-    return Slopes(*(np.take_along_axis(x, rung, axis=1)[:, 0] for x in (estimates, error)))
+    trusted = np.where(_agrees_below(estimates, error), error, np.inf)
+    rung = np.argmin(trusted, axis=1)[:, None]
+    return Slopes(*(np.take_along_axis(x, rung, axis=1)[:, 0] for x in (estimates, trusted)))
+
+
+def _agrees_below(estimates: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Whether a rung agrees with all smaller steps, within errors: over many periods all slopes look like zero."""
+    value, reach = np.where(np.isfinite(error), estimates, 0.0), _SAFETY * error
+    lowest = np.maximum.accumulate((value - reach)[:, ::-1], axis=1)[:, ::-1]
+    highest = np.minimum.accumulate((value + reach)[:, ::-1], axis=1)[:, ::-1]
+    return (value + reach >= lowest) & (value - reach <= highest)
 
 
 def differ(one: Slopes, other: Slopes, dtype) -> np.ndarray:

@@ -169,7 +169,8 @@ def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[
     message = (
         f"The mass matrix is {lowest:.1g} of its usual size along {listed([f'd{name}' for name in where])}: the state "
         "is next to a singularity of the coordinates (r = 0, a pole, a gimbal), where accelerations and steps become "
-        "extreme. Use coordinates that are regular there, such as Cartesian ones with a constraint."
+        "extreme (or a length is in units far too large for it). Use coordinates that are regular there, such as "
+        "Cartesian ones with a constraint."
     )
     return [Finding("near_coordinate_singularity", "warning", where, message)]
 
