@@ -131,7 +131,10 @@ class Flow:
         The second result counts the steps for which lanes stood empty.
         """
         *outcome, idle = self.kernel(ts, y0, params, *tolerances)
-        outcome, again = Outcome(*outcome), np.isin(outcome[3], GIVEN_UP)
+        outcome = Outcome(*outcome)
+        if (outcome.code == _native.DONE).all():
+            return outcome, idle
+        again = np.isin(outcome.code, GIVEN_UP)
         if not again.any() or (careful := self.careful()) is None:
             return outcome, idle
         better, more = careful.run(*(x[again] if len(x) > 1 else x for x in (ts, y0, params)), tolerances)

@@ -40,6 +40,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
+ENDED_WELL = tuple(int(result._value) for result in (RESULTS.successful, RESULTS.event_occurred))
+
+
 def advice(result: RESULTS) -> str:
     """What happened and what to try, for one concrete result."""
     if result == RESULTS.dt_min_reached:

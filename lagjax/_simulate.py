@@ -19,7 +19,7 @@ from lagjax._consistent import inconsistent_members, rank_lost, require_consiste
 from lagjax._equations import equations
 from lagjax._integrate import integrate
 from lagjax._layout import Layout
-from lagjax._results import RESULTS, SimulationError, advice
+from lagjax._results import ENDED_WELL, RESULTS, SimulationError, advice
 from lagjax._settings import Settings, as_arrays, is_concrete, require_finite
 from lagjax._solvers import Projected
 from lagjax._system import System, require_system
@@ -306,10 +306,10 @@ def _first_member(tree: PyTree, axes: PyTree) -> PyTree:
 
 def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced."""
-    ok = trajectory.ok
-    if not is_concrete(ok):
-        return trajectory.result.error_if(trajectory, ~ok)
-    if bool(ok):
+    code = trajectory.result._value
+    if not is_concrete(code):
+        return trajectory.result.error_if(trajectory, ~trajectory.ok)
+    if int(code) in ENDED_WELL:
         return trajectory
     end = trajectory.end
     q, qdot = np.asarray(layout.flatten(end.q)), np.asarray(layout.flatten(end.qdot))
