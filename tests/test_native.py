@@ -43,8 +43,8 @@ def lanewise(body, *columns):
         is_bit = value.it.type.element == _ir.BIT
         code.store(code.as_double(value) if is_bit else value, code.element(results, i * WIDTH))
     code.finish()
-    engine = _ir.compiled(module)
-    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(engine.get_function_address("test"))
+    _engine, at = _ir.compiled(module, ("test",))
+    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(at["test"])
     count = len(columns[0])
     padded = np.zeros((len(columns), -(-count // WIDTH) * WIDTH))
     padded[:, :count] = columns

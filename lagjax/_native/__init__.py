@@ -83,11 +83,11 @@ class Kernel:
         integrator = _integrator.Integrator(*self._parts, guards, groups)
         self.states, self.numbers, self.width = 2 * size, integrator.numbers, integrator.width
         self._memory = integrator.memory
-        self._engine = compiled(integrator.module)  # holds the code that the next lines point to
-        self._run = _function(self._engine, "run", *[ctypes.c_void_p] * 4)
-        self._project = None
+        # The engine holds the code that the other two point to.
+        self._engine, at = compiled(integrator.module, ("run",) if projection is None else ("run", "project_rows"))
+        self._run, self._project = _function(at["run"], *[ctypes.c_void_p] * 4), None
         if projection is not None:
-            self._project = _function(self._engine, "project_rows", *[ctypes.c_void_p] * 3, ctypes.c_int64)
+            self._project = _function(at["project_rows"], *[ctypes.c_void_p] * 3, ctypes.c_int64)
 
     def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int) -> Outcome:
         """`y0` (N, 2n); `ts` (N, T) and `params` (N, P), or one row for all; all float64."""
@@ -153,8 +153,7 @@ class Kernel:
             *_addresses(counter, ts, params, record, first_step, steps, path_bar, y_bar, params_bar),
             times if len(ts) > 1 else 0, self.numbers if len(params) > 1 else 0, members, times, order_for(rtol),
         )  # fmt: skip
-        engine, size = self._adjoint
-        run = _function(engine, "pull", *[ctypes.c_void_p] * 3)
+        _, run, size = self._adjoint
 
         def pull(_) -> None:
             memory, lanes = _aligned(size), np.zeros(len(LANE) * self.width, np.int64)
@@ -165,17 +164,18 @@ class Kernel:
 
     @functools.cached_property
     def _adjoint(self):
-        """The engine that holds the code of `pull`, and what a thread needs; compiled when it is first asked for."""
+        """The engine that holds `pull`, `pull`, and what a thread needs for it; compiled when it is first asked for."""
         adjoint = _adjoint.Adjoint(*self._parts)
-        return compiled(adjoint.module), adjoint.memory
+        engine, at = compiled(adjoint.module, ("pull",))
+        return engine, _function(at["pull"], *[ctypes.c_void_p] * 3), adjoint.memory
 
     def _on_all_cores(self, work, members: int) -> list:
         threads = min(cores(), max(1, members // (4 * self.width)))
         return list(_pool().map(work, range(threads))) if threads > 1 else [work(0)]
 
 
-def _function(engine, name: str, *types):
-    return ctypes.CFUNCTYPE(None, *types)(engine.get_function_address(name))
+def _function(address: int, *types):
+    return ctypes.CFUNCTYPE(None, *types)(address)
 
 
 def _contiguous(*arrays) -> list[np.ndarray]:

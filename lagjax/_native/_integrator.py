@@ -33,6 +33,7 @@ from lagjax._program import Program, Series, StraightLine
 
 SAFETY = 0.9
 ROUND_OFF = 256 * 2.0**-52  # of an acceleration
+PLACES, LARGEST_UNIT = 16, 1e-6  # units in the last place of a coordinate; of what an acceleration varies
 
 # Guards, and where they change sign.
 INTERVALS = 8  # of a step, at whose ends they are looked at
@@ -134,9 +135,17 @@ class Integrator(SeriesCode):
         worst = self._vector(code, memory, "worst")
         weight = code.intrinsic("fabs", h) / code.as_double(order + 1)
         size = self._by_group(code, [code.intrinsic("fabs", a) for a in acceleration])
+        # Half a unit in the last place of q moves an acceleration by what it varies along the step, in proportion.
+        place = functools.reduce(code.maximum, (code.intrinsic("fabs", q) for q in moved[:n]))
+        moves = functools.reduce(code.maximum, (code.intrinsic("fabs", dq) for dq in increments[:n]))
+        unit = (PLACES * 2.0**-52) * place / moves
+        unit = code.select(unit < LARGEST_UNIT, unit, 0.0)  # what hardly moves is not what makes it vary
         for i in range(n):
             # What rounding leaves of an acceleration is not a defect of the series.
-            excess = code.intrinsic("fabs", acceleration[i] - slopes[i]) - ROUND_OFF * size[i]
+            before = code.load(self.state(code, memory, n + i, 1), self.vector)
+            change = code.intrinsic("fabs", acceleration[i] - before)
+            noise = ROUND_OFF * size[i] + unit * change
+            excess = code.intrinsic("fabs", acceleration[i] - slopes[i]) - noise
             error = weight * excess * self._vector(code, memory, "scale", n + i)
             worst = code.select(error <= worst, worst, error)  # NaN goes through
         self._keep(code, memory, "worst", worst)

@@ -57,19 +57,31 @@ def lanes() -> int:
     return 8 if llvm.get_host_cpu_features().get("avx512f", False) else 4
 
 
-def compiled(module: ir.Module) -> llvm.ExecutionEngine:
-    """Machine code for a module. It lives as long as the engine."""
+# Loops over lanes and orders are written out by hand, so that little is left to do. Not LLVM's default pipeline for a
+# level, which in llvmlite loses some memory for every module.
+_PASSES = (
+    "sroa", "instruction_combine", "simplify_cfg", "new_gvn", "dead_code_elimination", "simplify_cfg",
+    "instruction_combine",
+)  # fmt: skip
+
+
+def compiled(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
+    """Machine code for a module, and where its functions are. It lives as long as the engine."""
     parsed = llvm.parse_assembly(str(module))
     parsed.verify()
-    # The loops are vectorised by hand, over lanes.
-    tuning = llvm.create_pipeline_tuning_options(speed_level=2)
-    tuning.loop_vectorization = tuning.slp_vectorization = tuning.loop_unrolling = False
     machine = _machine()
-    passes = llvm.create_pass_builder(machine, tuning)
-    passes.getModulePassManager().run(parsed, passes)
+    builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
+    manager = llvm.create_new_module_pass_manager()
+    for name in _PASSES:
+        getattr(manager, f"add_{name}_pass")()
+    manager.run(parsed, builder)
     engine = llvm.create_mcjit_compiler(parsed, machine)
     engine.finalize_object()
-    return engine
+    places = {name: engine.get_function_address(name) for name in functions}
+    # The code is made: what it was made from takes ten times its memory.
+    engine.remove_module(parsed)
+    parsed.close()
+    return engine, places
 
 
 @dataclass(frozen=True, eq=False)
