@@ -32,7 +32,7 @@ from lagjax._layout import Layout
 from lagjax._motion import Motion
 from lagjax._program import Program, Unlowerable, lower
 from lagjax._results import RESULTS, SimulationError
-from lagjax._settings import Settings, as_arrays, is_concrete, require_finite
+from lagjax._settings import Settings, as_arrays, is_concrete, require_budget, require_finite, require_flag
 from lagjax._simulate import raise_unless_ok
 from lagjax._system import System
 from lagjax._trajectory import State, Trajectory, Transitions
@@ -67,11 +67,14 @@ class Transition(eqx.Module):
     def __init__(
         self, source: str, target: str, guard: Callable, direction: int = 0, reset: Callable | None = None
     ):
-        if direction not in (-1, 0, 1):
+        for role, name in (("source", source), ("target", target)):
+            if not isinstance(name, str):
+                raise TypeError(f"{role} must be the name of a mode; got {name!r}.")
+        if isinstance(direction, bool) or not isinstance(direction, int | np.integer) or abs(direction) > 1:
             raise ValueError(f"direction must be -1 (falling), +1 (rising) or 0 (both); got {direction!r}.")
         if guard is None:
             raise TypeError(f"The transition from {source!r} to {target!r} has no guard: say where it happens.")
-        self.source, self.target, self.direction = source, target, direction
+        self.source, self.target, self.direction = source, target, int(direction)
         self.guard = accept(guard, "guard", extras=("t", "params", "multipliers"))
         self.reset = None if reset is None else accept(reset, "reset")
 
@@ -125,6 +128,7 @@ def simulate_hybrid(
     run.transitions.t[: int(run.transitions.count)]
     ```
     """
+    require_flag(throw, "throw")
     layout = Layout.of(q0, qdot0)
     settings = Settings.of(layout, ts, None, rtol, atol, None, max_steps, None, None, False)
     _require_modes(modes, transitions, start, max_transitions)
@@ -162,7 +166,7 @@ def _require_modes(modes, transitions, start, max_transitions) -> None:
     if not isinstance(transitions, list | tuple):
         raise TypeError(f"transitions must be a list of lagjax.Transition; got {type(transitions).__name__}.")
     known = ", ".join(map(repr, modes))
-    if start not in modes:
+    if not isinstance(start, str) or start not in modes:
         raise ValueError(f"The motion is to start in the mode {start!r}, which does not exist; there are {known}.")
     for transition in transitions:
         if not isinstance(transition, Transition):
@@ -179,8 +183,7 @@ def _require_modes(modes, transitions, start, max_transitions) -> None:
         reached, growing = reached | more, bool(more)
     if lost := [name for name in modes if name not in reached]:
         raise ValueError(f"No transition leads from {start!r} to {', '.join(map(repr, lost))}: unreachable.")
-    if isinstance(max_transitions, bool) or not isinstance(max_transitions, int) or max_transitions < 1:
-        raise ValueError(f"max_transitions must be a positive integer; got {max_transitions!r}.")
+    require_budget(max_transitions, "max_transitions")
 
 
 class _Plan(eqx.Module):

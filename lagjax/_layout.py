@@ -73,13 +73,21 @@ class Layout:
 
 def _structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tuple[int, ...], ...]]:
     """Paths, tree and shapes of `tree`, after checking that every leaf is an array of real floats."""
-    leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
-    paths = tuple(name + jax.tree_util.keystr(path) for path, _ in leaves)
-    for path, (_, leaf) in zip(paths, leaves, strict=True):
+    paths, leaves, structure = taken_apart(tree, name)
+    for path, leaf in zip(paths, leaves, strict=True):
         try:
             dtype = jnp.result_type(leaf)
         except (TypeError, ValueError):
             raise TypeError(f"{path} must be a real number or array; got {leaf!r}.") from None
         if not jnp.issubdtype(dtype, jnp.floating):
             raise TypeError(f"{path} must hold real floating-point numbers; got {dtype} (write 1.0 instead of 1).")
-    return paths, structure, tuple(jnp.shape(leaf) for _, leaf in leaves)
+    return paths, structure, tuple(jnp.shape(leaf) for leaf in leaves)
+
+
+def taken_apart(tree: PyTree, name: str, is_leaf=None) -> tuple[tuple[str, ...], list, Any]:
+    """The leaves of a pytree with their names, such as `params['m']`, and its structure."""
+    try:
+        leaves, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf)
+    except ValueError as why:  # a dict whose keys have no order
+        raise ValueError(f"{name} cannot be taken apart: {why}") from None
+    return tuple(name + jax.tree_util.keystr(path) for path, _ in leaves), [leaf for _, leaf in leaves], structure

@@ -15,6 +15,7 @@ import numpy as np
 import optimistix as optx
 
 from lagjax._arguments import accept
+from lagjax._layout import taken_apart
 from lagjax._solvers import FineOutput
 
 PyTree = Any
@@ -48,8 +49,7 @@ class Settings(eqx.Module):
             between = ts.size > 2 or event is not None
             solver = FineOutput(diffrax.Dopri8()) if between else diffrax.Dopri8()
         _require_solver(solver, adaptive=dt is None)
-        if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-            raise ValueError(f"max_steps must be a positive integer, so that every run ends; got {max_steps!r}.")
+        require_budget(max_steps, "max_steps")
         if isinstance(progress, bool):
             progress = diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter()
         _require_instance(progress, "progress", diffrax.AbstractProgressMeter, "True or False")
@@ -78,15 +78,53 @@ class Settings(eqx.Module):
         return (controller.rtol, controller.atol) if isinstance(controller, diffrax.PIDController) else None
 
 
-def as_arrays(tree: PyTree, dtype) -> PyTree:
-    """Every number as an array, so that a new value is no new program; floats in the dtype of the state."""
+def as_arrays(tree: PyTree, dtype, name: str = "params") -> PyTree:
+    """Every number as an array, so that a new value is no new program; floats in the dtype of the state.
 
-    def convert(leaf):
-        if not eqx.is_array_like(leaf):
-            return leaf  # a function, a string: part of the program
+    Raises `TypeError` or `ValueError`, with the name of the leaf, for what is neither a number nor can be a part of the
+    program.
+    """
+    labels, leaves, structure = taken_apart(tree, name)
+    return structure.unflatten(_leaf_as_array(*of, dtype) for of in zip(leaves, labels, strict=True))
+
+
+def _leaf_as_array(leaf, label: str, dtype):
+    if not eqx.is_array_like(leaf):  # a function, a string: part of the program
+        _require_hashable(leaf, label)
+        return leaf
+    require_numbers(leaf, label)
+    if np.ma.is_masked(leaf):
+        raise ValueError(f"{label} is masked in places, where it has no number: fill them first.")
+    try:
         return _as_array(leaf, dtype if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else None)
+    except OverflowError:
+        raise ValueError(f"{label} is too large for an integer of 64 bits: write it as a float.") from None
 
-    return jax.tree.map(convert, tree)
+
+def _dtype_of(value):
+    """The dtype of a number or an array of numbers; None for all else, of which NumPy has many kinds."""
+    try:
+        kind = jnp.result_type(value)
+    except (TypeError, ValueError):
+        return None
+    return kind if jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.bool_) else None
+
+
+def require_numbers(leaf, label: str) -> None:
+    """Raise `TypeError` for a leaf that is not a number or an array of numbers, of a kind that JAX knows."""
+    if _dtype_of(leaf) is None:
+        kind = getattr(leaf, "dtype", None)
+        got = type(leaf).__name__ if kind is None else f"an array of {kind}"
+        raise TypeError(f"{label} must hold numbers that JAX knows; got {got}.")
+
+
+def _require_hashable(leaf, label: str) -> None:
+    try:
+        hash(leaf)
+    except TypeError:
+        raise TypeError(
+            f"{label} is a {type(leaf).__name__}, neither a number nor hashable: it can be no part of a program."
+        ) from None
 
 
 def _as_array(x, dtype=None):
@@ -104,11 +142,25 @@ def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
     """Every number that is NaN or infinite, with its name; values that are being traced have none yet."""
     found = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if eqx.is_array_like(leaf) and is_concrete(leaf):
+        if eqx.is_array_like(leaf) and is_concrete(leaf) and _dtype_of(leaf) is not None:
             label, values = name + jax.tree_util.keystr(path), np.asarray(leaf)
             for index in np.argwhere(~np.isfinite(values)):
                 found.append((label + (str(index.tolist()) if values.ndim else ""), values[tuple(index)]))
     return found
+
+
+def require_budget(value, name: str) -> None:
+    """Raise for what is no positive integer of 32 bits, in which steps and transitions are counted."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name} must be a positive integer, so that every run ends; got {value!r}.")
+    if value >= 2**31:
+        raise ValueError(f"{name} must be less than 2**31, more than any run could use up.")
+
+
+def require_flag(value, name: str) -> None:
+    """Raise `TypeError` for what is neither true nor false."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be True or False; got {value!r}.")
 
 
 def require_finite(tree: PyTree, name: str) -> None:
@@ -127,7 +179,8 @@ def _output_times(ts, dtype) -> jax.Array:
         raise ValueError(f"ts must hold at least two output times, ts[0] the start; got shape {np.shape(ts)}.")
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"ts must hold real numbers; got {kind}.")
-    given = _as_array(ts, dtype)
+    whole = ts if isinstance(ts, jax.Array) else np.asanyarray(ts)
+    given = _as_array(_leaf_as_array(whole, "ts", dtype), dtype)
     require_finite(given, "ts")
     if is_concrete(given):
         gaps = np.diff(np.asarray(given))
@@ -172,7 +225,7 @@ def _norm_or_inf(error: PyTree) -> jax.Array:
 
 
 def _tolerance(value, name):
-    _require_number(value, name)
+    require_number(value, name)
     if is_concrete(value) and not (np.isfinite(value) and value > 0):
         raise ValueError(f"{name} must be positive; got {value}.")
     if name == "rtol" and is_concrete(value) and value >= 1:
@@ -180,10 +233,13 @@ def _tolerance(value, name):
     return value
 
 
-def _require_number(value, name) -> None:
-    real = eqx.is_array_like(value) and jnp.issubdtype(jnp.result_type(value), jnp.number)
-    if not real or jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
+def require_number(value, name: str) -> None:
+    """Raise for anything but one real number."""
+    kind = _dtype_of(value) if eqx.is_array_like(value) else None
+    if kind is None or kind == jnp.bool_ or jnp.issubdtype(kind, jnp.complexfloating):
         raise TypeError(f"{name} must be a real number; got {value!r}.")
+    if isinstance(value, int) and abs(value) >= 2**63:
+        raise ValueError(f"{name} is too large for an integer of 64 bits: write it as a float.")
     if jnp.ndim(value) != 0:
         raise ValueError(f"{name} must be one number; got shape {jnp.shape(value)}.")
 
@@ -197,7 +253,7 @@ def _fixed_step(dt, ts, rtol, atol, max_steps) -> jax.Array:
     """`dt`, positive as the user gives it, as a signed array in the direction of time."""
     if rtol is not None or atol is not None:
         raise ValueError("dt asks for fixed steps and rtol/atol for adaptive ones: give one or the other.")
-    _require_number(dt, "dt")
+    require_number(dt, "dt")
     if is_concrete(dt) and not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"dt must be a positive step size, also backward in time; got {dt}.")
     if is_concrete(dt) and is_concrete(ts):
@@ -230,6 +286,10 @@ def _event(event, dtype) -> diffrax.Event | None:
     """The event with its functions' signatures checked, and with a root finder that uses the dtype's digits."""
     if event is None:
         return None
+    given = event.cond_fn if isinstance(event, diffrax.Event) else event
+    _, functions, _ = taken_apart(given, "event", is_leaf=lambda leaf: leaf is None or callable(leaf))
+    if not functions or not all(map(callable, functions)):
+        raise TypeError(f"event must be a function event(q, qdot), or a pytree of such; got {given!r}.")
     if not isinstance(event, diffrax.Event):
         event = diffrax.Event(event)
     conditions = jax.tree.map(lambda function: accept(function, "event"), event.cond_fn, is_leaf=callable)

@@ -20,7 +20,7 @@ from lagjax._equations import equations
 from lagjax._integrate import integrate
 from lagjax._layout import Layout
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, advice
-from lagjax._settings import Settings, as_arrays, is_concrete, require_finite
+from lagjax._settings import Settings, as_arrays, is_concrete, require_finite, require_flag, require_numbers
 from lagjax._solvers import Projected
 from lagjax._system import System, require_system
 from lagjax._trajectory import State, Trajectory
@@ -99,6 +99,7 @@ def simulate(
     ```
     """
     require_system(system)
+    require_flag(throw, "throw")
     layout = Layout.of(q0, qdot0)
     settings = Settings.of(layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress)
     params = as_arrays(params, layout.dtype)
@@ -276,6 +277,7 @@ def _axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyT
         for (path, leaf), axis in zip(leaves, tree.flatten_up_to(axes[name]), strict=True):
             label = name + jax.tree_util.keystr(path)
             if axis is not None:
+                require_numbers(leaf, label)
                 if not -jnp.ndim(leaf) <= axis < jnp.ndim(leaf):
                     raise ValueError(f"{label} has shape {jnp.shape(leaf)}: it has no axis {axis} for the batch.")
                 sizes[label] = jnp.shape(leaf)[axis]
@@ -319,7 +321,7 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     )
     if trajectory.result == RESULTS.mass_matrix_singular:
         mass = np.asarray(trajectory.system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
-        message += f"\nSingular there: {_describe_null(mass, layout.names)}."
+        message += f"\n{_describe_null(mass, layout.names)}"
     state = ", ".join(f"{name} = {value:.6g}" for name, value in zip(layout.names[:8], q[:8], strict=True))
     velocity = ", ".join(f"{value:.6g}" for value in qdot[:8])
     raise SimulationError(f"{message}\nThe last state was {state}; velocities {velocity}.", trajectory)
@@ -329,10 +331,18 @@ def _describe_null(mass: np.ndarray, names: tuple[str, ...]) -> str:
     """The coordinates, or their combinations, that carry no kinetic energy."""
     unused = [name for name, row in zip(names, mass, strict=True) if not row.any()]
     if unused:
-        return f"L has no kinetic energy in the velocity of {', '.join(unused)} (absent from L, or linear in it)"
+        return (
+            f"Singular there: L has no kinetic energy in the velocity of {', '.join(unused)} (absent from L, or linear "
+            "in it)."
+        )
     combinations = []
     for direction in _linear.null_directions(mass):
         direction = direction / direction[np.argmax(np.abs(direction))]
         terms = [f"{c:+.3g} d{name}" for c, name in zip(direction, names, strict=True) if abs(c) > 1e-6]
         combinations.append(" ".join(terms))
-    return "no kinetic energy along " + "; ".join(combinations)
+    if not combinations:
+        return (
+            "It is regular there, but not positive definite, and more than two coordinates are solved for without "
+            "pivoting: turn the sign of L, or give path='array' to System."
+        )
+    return f"Singular there: no kinetic energy along {'; '.join(combinations)}."

@@ -17,7 +17,7 @@ from lagjax._arguments import Function, accept
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
 from lagjax._motion import Motion, nearest_consistent
-from lagjax._settings import as_arrays
+from lagjax._settings import as_arrays, require_number
 
 PyTree = Any
 
@@ -244,9 +244,9 @@ class System(eqx.Module):
     def _at(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
         """Evaluate one of `Motion`'s functions at a state given in the user's pytree."""
         layout = Layout.of(q, qdot)
-        if jnp.ndim(t) != 0:
-            raise ValueError(f"t must be one number; got shape {jnp.shape(t)} (jax.vmap is for many).")
-        value = _evaluate(self, quantity, *as_arrays((q, qdot, 1.0 * t, params), layout.dtype))
+        require_number(t, "t")
+        state, params = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state"), as_arrays(params, layout.dtype)
+        value = _evaluate(self, quantity, *state, params)
         return layout.restore(value) if restore else value
 
     def _check_outputs(self, layout: Layout, params: PyTree) -> None:
