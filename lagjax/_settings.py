@@ -24,6 +24,9 @@ PyTree = Any
 # digits; it is there for components that pass through zero.
 DEFAULT_RTOL = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 _ATOL_OVER_RTOL = 1e-3
+# Units of round-off. Machine code sums with the rounding errors carried along: below one unit its truncation, which
+# has a sign, does not add up to more than the round-off of a long run, which has none.
+_LEAST, _LEAST_OF_SOLVERS = 0.25, 10
 
 
 class Settings(eqx.Module):
@@ -56,7 +59,9 @@ class Settings(eqx.Module):
         if adjoint is not None:
             _require_instance(adjoint, "adjoint", diffrax.AbstractAdjoint, "None")
         if dt is None:
-            controller, dt0 = _adaptive(layout.dtype, ts, rtol, atol), None
+            # Whether it comes to machine code is not known yet: `require_solver_reaches`.
+            least = _LEAST if by_default and layout.dtype == np.float64 else _LEAST_OF_SOLVERS
+            controller, dt0 = _adaptive(layout.dtype, ts, rtol, atol, least), None
         else:
             controller, dt0 = diffrax.ConstantStepSize(), _fixed_step(dt, ts, rtol, atol, max_steps)
         return cls(
@@ -196,17 +201,29 @@ def _first_bad_gap(gaps: np.ndarray) -> int:
     return int(np.argmax(np.sign(gaps) != np.sign(gaps[0]))) if gaps[0] != 0 else 0
 
 
-def _adaptive(dtype, ts, rtol, atol) -> diffrax.PIDController:
+def require_solver_reaches(settings: Settings, dtype) -> None:
+    """Raise where machine code would reach a tolerance that the solvers of diffrax do not."""
+    if settings.tolerances is not None:
+        _require_within(settings.tolerances[0], dtype, _LEAST_OF_SOLVERS)
+
+
+def _require_within(rtol, dtype, least: float) -> None:
+    """Raise where rtol is below `least` units of round-off."""
+    eps = float(jnp.finfo(dtype).eps)
+    if is_concrete(rtol) and float(rtol) < least * eps:
+        more = "; call jax.config.update('jax_enable_x64', True) and pass float64 states" if dtype == np.float32 else ""
+        raise ValueError(
+            f"{dtype.name} cannot meet rtol={float(rtol):.3g}: its round-off is {eps:.1e}, "
+            f"so rtol must be at least {least * eps:.1e}{more}."
+        )
+
+
+def _adaptive(dtype, ts, rtol, atol, least: float) -> diffrax.PIDController:
     """Adaptive steps, with tolerances that the dtype can meet and with an end to shrinking."""
     eps = float(jnp.finfo(dtype).eps)
     rtol = DEFAULT_RTOL[dtype] if rtol is None else _tolerance(rtol, "rtol")
     atol = rtol * _ATOL_OVER_RTOL if atol is None else _tolerance(atol, "atol")
-    if is_concrete(rtol) and float(rtol) < 10 * eps:
-        more = "; call jax.config.update('jax_enable_x64', True) and pass float64 states" if dtype == np.float32 else ""
-        raise ValueError(
-            f"{dtype.name} cannot meet rtol={float(rtol):.3g}: its round-off is {eps:.1e}, "
-            f"so rtol must be at least {10 * eps:.1e}{more}."
-        )
+    _require_within(rtol, dtype, least)
     ts, library = (np.asarray(ts), np) if is_concrete(ts) else (ts, jnp)
     return diffrax.PIDController(
         rtol=_as_array(rtol, dtype),

@@ -20,12 +20,21 @@ from lagjax._equations import equations
 from lagjax._integrate import integrate
 from lagjax._layout import Layout
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, advice
-from lagjax._settings import Settings, as_arrays, is_concrete, require_finite, require_flag, require_numbers
+from lagjax._settings import (
+    Settings,
+    as_arrays,
+    is_concrete,
+    require_finite,
+    require_flag,
+    require_numbers,
+    require_solver_reaches,
+)
 from lagjax._solvers import Projected
 from lagjax._system import System, require_system
 from lagjax._trajectory import State, Trajectory
 
 PyTree = Any
+
 
 def simulate(
     system: System,
@@ -110,6 +119,7 @@ def simulate(
     require_consistent(system, layout, settings.ts, q0, qdot0, params)
     flow = _engine.flow_for(system, settings, layout, q0, qdot0, params)
     if isinstance(flow, str):
+        require_solver_reaches(settings, layout.dtype)
         fields = _integrate(system, settings, q0, qdot0, params)
     elif not _engine.has_derivatives(flow, settings.ts, q0, qdot0, params):
         fields = _integrate(system, settings, q0, qdot0, params, _engine.primal(flow, settings))
@@ -166,6 +176,7 @@ def simulate_batch(
     astray = inconsistent_members(system, layout, settings.ts, values, axes)
     flow = _engine.flow_for(system, settings, layout, *member.values())
     if isinstance(flow, str):
+        require_solver_reaches(settings, layout.dtype)
         fields = _integrate_batch(system, settings, *values.values(), _Static(tuple(batch_axes)))
         steps = fields[5]["num_steps"]  # every lane waits for the slowest
         fields[5]["num_wasted_lane_steps"] = steps.size * jnp.max(steps) - jnp.sum(steps)
