@@ -7,9 +7,9 @@ end, forgotten; its batches differ in size, tolerance and horizon. Their potenti
 positive definite: every member must arrive, must keep its energy within what its tolerance allows, and must be, bit for
 bit, what `simulate` makes of it alone. Anything else is a failure, and is listed with the seed of its scene.
 
-After a warm-up, in which caches fill, the resident memory must stay flat within 5 %. JAX keeps all that XLA compiles, for
-the energy of each scene here, until `jax.clear_caches()`, which is called now and then: what is watched is the memory of
-lagjax. The record goes to
+After a warm-up, in which caches fill, the resident memory must stay flat within 5 %. JAX keeps all that XLA compiles,
+for the energy of each scene here, until `jax.clear_caches()`, which is called now and then: what is watched is the
+memory of lagjax. The record goes to
 `benchmarks/results/soak.json`, with commit, versions and machine.
 """
 
