@@ -86,7 +86,7 @@ class System(eqx.Module):
         velocity_constraints: Callable | None = None,
         path: Literal["auto", "scalar", "array"] = "auto",
     ):
-        if path not in ("auto", "scalar", "array"):
+        if not isinstance(path, str) or path not in ("auto", "scalar", "array"):
             raise ValueError(f"path must be 'auto', 'scalar' or 'array'; got {path!r}.")
         self.path = path
         self.lagrangian = accept(lagrangian, "lagrangian")
