@@ -5,6 +5,7 @@
 - `cores`: what a second core is worth.
 """
 
+import ctypes
 import os
 import statistics
 from collections.abc import Callable
@@ -12,15 +13,22 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from llvmlite import ir
 
 from benchmarks import _contenders
 from benchmarks._cases import CASES, Case, chain, double_pendulum
 from benchmarks._contenders import Contender, autodiff_acceleration, named
 from benchmarks._measure import Comparison, compare, seconds
+from lagjax._engine import scene_flow
 from lagjax._equations import Equations, equations
 from lagjax._layout import Layout
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, compiled, lanes
+from lagjax._native._lanes import emit, sincos_function
+from lagjax._program import StraightLine, lower
 
 TOLERANCE = 1e-9
 Rows = list[dict[str, Any]]
@@ -32,24 +40,29 @@ EVALUATIONS = 100
 
 
 def right_hand_sides(options) -> Rows:
-    """Nanoseconds per lane and evaluation, all compiled by XLA: derived by lagjax, best by hand, plain autodiff."""
+    """Nanoseconds per lane and evaluation on one core: derived by lagjax, best by hand, plain autodiff.
+
+    "lagjax" is what `simulate` runs by default, in machine code, where a scene has it; "in XLA" is what diffrax gets.
+    """
     rows = []
     for name in options.cases:
         case = CASES[name](options.batch)
-        forms = {"lagjax": _derived(case), "autodiff": _autodiff(case)}
+        forms = {"in XLA": _derived(case), "autodiff": _autodiff(case)}
         if case.acceleration is not None:
             forms |= {"rows": _hand_on_rows(case), "array": _hand_on_arrays(case)}
-        times = _nanoseconds(forms, case.batch, options.repeats)
+        times = _nanoseconds(forms, case, options.repeats)
         cost = {form: statistics.median(values) for form, values in times.items()}
         hand = min((form for form in ("rows", "array") if form in cost), key=cost.get, default=None)
         rows.append(
             {
                 "case": name,
                 "lagjax ns": cost["lagjax"],
+                "in XLA ns": cost["in XLA"],
                 "by hand ns": hand and cost[hand],
                 "autodiff ns": cost["autodiff"],
                 "lagjax/by hand": hand and _median_ratio(times["lagjax"], times[hand]),
                 "autodiff/lagjax": _median_ratio(times["autodiff"], times["lagjax"]),
+                "in XLA/by hand": hand and _median_ratio(times["in XLA"], times[hand]),
             }
         )
     return rows
@@ -59,7 +72,7 @@ def _median_ratio(over: list[float], under: list[float]) -> float:
     return statistics.median(a / b for a, b in zip(over, under, strict=True))
 
 
-def _nanoseconds(forms: dict[str, tuple[Callable, Any]], lanes: int, repeats: int) -> dict[str, list[float]]:
+def _nanoseconds(forms: dict[str, tuple[Callable, Any]], case: Case, repeats: int) -> dict[str, list[float]]:
     """A chain of evaluations, each at a state that depends (by nothing that matters) on the value before; in rounds."""
 
     def chained(field):
@@ -72,12 +85,47 @@ def _nanoseconds(forms: dict[str, tuple[Callable, Any]], lanes: int, repeats: in
     for name, (field, y) in forms.items():
         run = chained(jax.vmap(field))
         runs[name] = lambda run=run, y=y: jax.block_until_ready(run(y))
-        runs[name]()
+    runs["lagjax"] = _in_machine_code(case) or runs["in XLA"]
+    for run in runs.values():
+        run()
     times = {name: [] for name in runs}
     for _ in range(max(5, repeats)):
         for name, run in runs.items():
-            times[name].append(1e9 * seconds(run)[0] / (EVALUATIONS * lanes))
+            times[name].append(1e9 * seconds(run)[0] / (EVALUATIONS * case.batch))
     return times
+
+
+def _in_machine_code(case: Case) -> Callable[[], None] | None:
+    """The same chain in the lanes of vectors, as the integrator evaluates them; None without machine code."""
+    layout = Layout.of(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
+    flow = scene_flow(case.scene.system, layout, case.scene.params)
+    if isinstance(flow, str):
+        return None
+    n, width = layout.size, lanes()
+    numbers = [np.ravel(leaf) for leaf in jax.tree.leaves(eqx.filter(case.scene.params, eqx.is_array_like))]
+    constants = [float(x) for leaf in numbers for x in leaf]  # as for the others: XLA knows them
+    shape = jax.ShapeDtypeStruct((n,), np.float64)
+    program = lower(lambda q, v: jnp.stack(flow.program(*q, *v, 0.0, *constants)[:n]), shape, shape)
+    vector, module = ir.VectorType(DOUBLE, width), ir.Module("right_hand_side")
+    module.triple = ""
+    sincos = sincos_function(module, width)
+    code = Code(module, "evaluate", [POINTER, INTEGER], width, public=True)
+    states, groups = code.arguments
+    line = StraightLine(program.nodes, program.kinds, program.outputs)
+    with code.loop(EVALUATIONS), code.loop(groups) as group:
+        places = [code.element(states, (group * (2 * n) + i) * width) for i in range(2 * n)]
+        y = [code.load(place, vector) for place in places]
+        for place, x, slope in zip(places, y, [*y[n:], *emit(code, line, y.__getitem__, sincos)], strict=True):
+            code.store(slope * 1e-30 + x, place)
+    code.finish()
+    engine, at = compiled(module, ("evaluate",))
+    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(at["evaluate"])
+    rows = -(-case.batch // width)
+    padded = np.resize(np.asarray(case.states, float), (rows * width, 2 * n)).reshape(rows, width, 2 * n)
+    memory = np.zeros(padded.size + 8)
+    memory = memory[(-memory.ctypes.data // 8) % 8 :][: padded.size]
+    memory[:] = padded.swapaxes(1, 2).ravel()
+    return lambda held=engine: function(memory.ctypes.data, rows)
 
 
 def derived_equations(case: Case) -> tuple[Equations, Any]:

@@ -56,7 +56,8 @@ class Adjoint(SeriesCode):
         self.start_line = pullback(series.start, dtypes, self.moved, outputs)
         given = states + 3
         by, inputs = [*range(states), *range(given, given + values + products)], given + values + products
-        self.sweep_line = pullback(series.sweep, [dtypes[0]] * inputs, by, range(n + series.rows))
+        rows = range(n, n + series.rows)  # whose coefficients are kept
+        self.sweep_line = pullback(series.sweep, [dtypes[0]] * inputs, by, range(n + series.rows), rows)
         self.projection = projection
         self.start_next = self._start_next()
         steps = [self._seed(), self._back_orders(self._back_sums(), self._back_sweep()), self._back_start()]
@@ -262,7 +263,10 @@ class Adjoint(SeriesCode):
                 return read(i)
             if i < known + n:
                 return code.load(self._bar(code, memory, n + (i - known), k + 1), self.vector) * inverse
-            return self._vector(code, memory, "rows_bar", i - known - n)
+            i -= known + n
+            if i < self.series.rows:
+                return self._vector(code, memory, "rows_bar", i)
+            return self._vector(code, memory, "rows", k + (i - self.series.rows) * MAX_ORDER)
 
         out = emit(code, self.sweep_line, inputs, None)
         for i, x in enumerate(out[: self.states]):

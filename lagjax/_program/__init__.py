@@ -36,7 +36,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from lagjax._program._emit import emit, plain_elementary
 from lagjax._program._graph import FOLD, Node, Unlowerable
-from lagjax._program._passes import finish
+from lagjax._program._passes import finish, with_given
 from lagjax._program._rules import Expansion, kind_of
 from lagjax._program._series import Series, StraightLine, series
 
@@ -82,8 +82,11 @@ def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], 
     return Program(nodes, kinds, outputs, expansion.traced_operations, function, shapes, budget)
 
 
-def pullback(line: StraightLine, dtypes, by, of) -> StraightLine:
-    """The transposed derivative: from the inputs and the cotangents of the outputs `of` to those of the inputs `by`."""
+def pullback(line: StraightLine, dtypes, by, of, known=()) -> StraightLine:
+    """The transposed derivative: from the inputs and the cotangents of the outputs `of` to those of the inputs `by`.
+
+    The outputs `known` are inputs too, after all others: what they are is not computed once more.
+    """
 
     def pulled(*scalars):
         inputs, bars = scalars[: len(dtypes)], scalars[len(dtypes) :]
@@ -91,13 +94,16 @@ def pullback(line: StraightLine, dtypes, by, of) -> StraightLine:
         def moving(*some):
             given = dict(zip(by, some, strict=True))
             results = emit(*line, tuple(given.get(i, x) for i, x in enumerate(inputs)))
-            return tuple(results[i] for i in of)
+            return tuple(results[i] for i in of), tuple(results[i] for i in known)
 
-        return jax.vjp(moving, *(inputs[i] for i in by))[1](bars)
+        _, pull, values = jax.vjp(moving, *(inputs[i] for i in by), has_aux=True)
+        return pull(bars), values
 
     shapes = [jax.ShapeDtypeStruct((), dtype) for dtype in (*dtypes, *[jnp.result_type(float)] * len(of))]
     program = lower(pulled, *shapes, budget=_TRANSPOSED * len(line.nodes) + 1000)
-    return StraightLine(program.nodes, program.kinds, program.outputs)
+    results, values = program.outputs[: len(by)], program.outputs[len(by) :]
+    given = {node: len(shapes) + k for k, node in enumerate(values) if program.nodes[node][1]}
+    return StraightLine(*with_given(program.nodes, program.kinds, results, given))
 
 
 @dataclass(frozen=True, eq=False)

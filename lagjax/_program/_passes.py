@@ -48,6 +48,14 @@ def _compact(graph, outputs):
     return renumbered, tuple(graph.kinds[i] for i in position), tuple(position[i] for i in outputs)
 
 
+def with_given(nodes, kinds, outputs, given: dict[int, int]):
+    """The same where some nodes, whose values are known, are inputs at the positions given."""
+    graph = Graph(len(nodes) + 1)
+    graph.nodes = [("input", (), given[i]) if i in given else node for i, node in enumerate(nodes)]
+    graph.kinds = list(kinds)
+    return _compact(graph, list(outputs))
+
+
 def _uses(graph, outputs) -> Counter:
     """How often each live node is used, by a live node or as an output."""
     uses = Counter(outputs)
