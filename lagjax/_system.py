@@ -245,8 +245,8 @@ class System(eqx.Module):
         """Evaluate one of `Motion`'s functions at a state given in the user's pytree."""
         layout = Layout.of(q, qdot)
         require_number(t, "t")
-        state, params = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state"), as_arrays(params, layout.dtype)
-        value = _evaluate(self, quantity, *state, params)
+        q, qdot, t = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state")
+        value = _evaluate(self, quantity, q, qdot, t, as_arrays(params, layout.dtype))
         return layout.restore(value) if restore else value
 
     def _check_outputs(self, layout: Layout, params: PyTree) -> None:

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import lagjax
 
 few = settings(derandomize=True, deadline=None, max_examples=12, database=None, phases=(Phase.generate, Phase.shrink))
-RTOL, GROWTH = 1e-10, 10.0
+RTOL, GROWTH = 1e-10, 2.0
 TS = np.linspace(0.0, 2.0, 9)
 NEXT = np.array([1, 2, 0])
 
@@ -119,7 +119,7 @@ def test_energy_is_conserved(params, q0, v0):
     motion = run(params, q0, v0)
     per_step = RTOL * (float(energy_sizes()(motion.q, motion.qdot, params).max()) + 1e-3)
     drift = np.abs(motion.energy() - motion.energy()[0]).max()
-    assert drift <= 3 * per_step * (10 + int(motion.stats["num_steps"]))  # h is conserved: its errors do not grow
+    assert drift <= per_step * (10 + int(motion.stats["num_steps"]))  # h is conserved: its errors do not grow
 
 
 @few
@@ -257,7 +257,7 @@ def test_reverse_mode_is_forward_mode_is_the_difference(params, along, q0):
     ahead = float(forward(params, q0, along))
     terms = np.concatenate([np.ravel(slopes[name] * along[name]) for name in params])
     size = np.abs(terms).sum() + 1e-2
-    assert abs(terms.sum() - ahead) <= 1e3 * GROWTH * RTOL * size  # some tens of steps, two integrations
+    assert abs(terms.sum() - ahead) <= 100 * GROWTH * RTOL * size  # some tens of steps, two integrations
     step = 1e-4  # h² of truncation, with third derivatives of up to a hundred or so, and the solver's error over h
     up, down = (end({name: x + sign * step * along[name] for name, x in params.items()}, q0) for sign in (1, -1))
     assert abs((up - down) / (2 * step) - ahead) <= 1e-5 * (1 + size)
