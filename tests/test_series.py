@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from lagjax._program import Program, Unlowerable, _series, lower, series
+from lagjax._program import Program, StraightLine, Unlowerable, _series, emit, lower, pullback, series
 from lagjax._program._graph import COMPARISONS, FOLD
 
 ORDER = 10
@@ -360,3 +360,20 @@ def test_all_moving_inputs_may_be_any_mixture():
         exact = total_derivatives(function, [0.4], [0.9], 0.2, count=4)
         found = coefficients(function, 5, [0.4], [0.9], 0.2)
         close(found[:, 2:], np.asarray(exact) / [2, 6, 24, 120])
+
+
+def test_pullback_is_the_transposed_derivative():
+    function = lambda x, y, z: (jnp.exp(x), jnp.where(z > 0, x * x / y, 0.0), jnp.exp(x) * jnp.sin(y) + z)
+    scalar = jax.ShapeDtypeStruct((), np.float64)
+    program = lower(function, scalar, scalar, scalar)
+    line = StraightLine(program.nodes, program.kinds, program.outputs)
+    inputs, bars, by, of = (0.7, -1.3, 0.4), (0.9, -0.2), [0, 1], [0, 1]
+    exact = jax.vjp(lambda x, y: function(x, y, inputs[2])[:2], *inputs[:2])[1](bars)
+    plain = pullback(line, [np.dtype(float)] * 3, by, of)
+    np.testing.assert_allclose(emit(*plain, (*inputs, *bars)), exact, rtol=1e-14)
+    # With eˣ from outside it is not computed again.
+    known = pullback(line, [np.dtype(float)] * 3, by, [0, 2], known=[0])
+    assert "exp" not in {op for op, _, _ in known.nodes}
+    value = function(*inputs)
+    again = jax.vjp(lambda x, y: function(x, y, inputs[2])[::2], *inputs[:2])[1](bars)
+    np.testing.assert_allclose(emit(*known, (*inputs, *bars, value[0])), again, rtol=1e-14)
