@@ -99,7 +99,8 @@ class ScalarEquations(Equations):
     def projected(self, t, y, params):
         """By the second program."""
         state = _compiled_once(self.projected_by, *y[0], *y[1], t, *_scalars(params))
-        return jnp.stack(state[: len(state) // 2]), jnp.stack(state[len(state) // 2 :])
+        n = len(y[0])
+        return jnp.stack(state[:n]), jnp.stack(state[n : 2 * n])
 
     def acceleration(self, t, y, params):
         """By the program."""
@@ -152,7 +153,10 @@ def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
 
 
 def projection_program(motion: Motion, layout: Layout, params: PyTree) -> Program | None:
-    """`Motion.projected` as a program, from q, q̇, t and the numbers in params to q and q̇; None without constraints."""
+    """`Motion.projected` as a program, from q, q̇, t and the numbers in params; None without constraints.
+
+    To q and q̇ it adds `Motion.speeds` there.
+    """
     if not motion.constrained:
         return None
     n = layout.size
@@ -171,9 +175,11 @@ def projection_program(motion: Motion, layout: Layout, params: PyTree) -> Progra
         q, rest = list(scalars[:n]), scalars[n:]
         if position is not None:
             q = [x + dx for x, dx in zip(q, position(*scalars), strict=False)]
-        v = [x + dx for x, dx in zip(rest, velocity(*q, *rest), strict=False)]
-        return *q, *v[:n]
+        v = [x + dx for x, dx in zip(rest[:n], velocity(*q, *rest), strict=False)]
+        return *q, *v, *speeds(*q, *v, *rest[n:])
 
+    q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
+    speeds = lower(motion.speeds, q, q, t, params, budget=OPERATION_BUDGET)
     return lower(projected, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
 
 

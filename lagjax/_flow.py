@@ -54,6 +54,12 @@ class Tolerances(NamedTuple):
     rtol: float
     atol: float
     max_steps: int
+    tries: int = 4
+
+    @property
+    def elsewhere(self) -> "Tolerances":
+        """For another try, whose steps end at other places."""
+        return self._replace(rtol=0.7 * self.rtol, atol=0.7 * self.atol, tries=self.tries - 1)
 
     @property
     def patient(self) -> "Tolerances":
@@ -80,7 +86,8 @@ class Flow:
     """The map of one program for q̈ with n coordinates.
 
     `program` takes q, q̇, t and then the parameters, number by number; it gives q̈ and whether the mass matrix is
-    singular. `projection`, from the same to (q, q̇), keeps the motion on its constraints. `guards` end the motion early:
+    singular. `projection`, from the same to (q, q̇), keeps the motion on its constraints, and tells by which speeds to measure
+    the errors of q̇ there. `guards` end the motion early:
     then the outcome is a plain number, without derivatives. `careful()` is the flow for members that a program which
     does not hold everywhere cannot follow: they start again, from the beginning.
     """
@@ -112,13 +119,23 @@ class Flow:
 
     @property
     def projection(self) -> Program | None:
-        """(q, q̇) on the constraints, where there are some."""
+        """(q, q̇) on the constraints, where there are some, and `Motion.speeds`."""
         return self._programs[1]
+
+    def projected(self, *scalars) -> tuple[jax.Array, jax.Array]:
+        """The state on the constraints, and the speeds there by which errors are measured."""
+        y = jnp.stack(self.projection(*scalars))
+        return y[: self.states], y[self.states :]
 
     @functools.cached_property
     def kernel(self) -> _native.Kernel:
         """The machine code."""
-        return _native.Kernel(self.program, self.size, self.projection, self.guards, self.groups)
+        return _native.Kernel(self.program, self.size, self.projection, self.guards, self.groups, self.own)
+
+    @property
+    def own(self) -> int:
+        """Coordinates that are the motion itself, not derivatives of it."""
+        return self.size
 
     @property
     def states(self) -> int:
@@ -130,28 +147,37 @@ class Flow:
 
         The second result counts the steps for which lanes stood empty.
         """
-        *outcome, idle = self.kernel(ts, y0, params, *tolerances)
+        *outcome, idle = self.kernel(ts, y0, params, *tolerances[:3])
         outcome = Outcome(*outcome)
-        if (outcome.code == _native.DONE).all():
+        again, flow, tolerances = self._second_chance(outcome.code, tolerances)
+        if not again.any():
             return outcome, idle
-        again = np.isin(outcome.code, GIVEN_UP)
-        if not again.any() or (careful := self.careful()) is None:
-            return outcome, idle
-        better, more = careful.run(*(x[again] if len(x) > 1 else x for x in (ts, y0, params)), tolerances)
+        better, more = flow.run(*(x[again] if len(x) > 1 else x for x in (ts, y0, params)), tolerances)
         for values, new in zip(outcome, better, strict=True):
             values[again] = new
         return outcome, idle + more
 
     def pull(self, ts, y0, params, steps, path_bar, y_bar, tolerances: Tolerances) -> _native.Cotangents:
         """The transpose of the derivative of `run`, which took so many `steps`; see `Kernel.pull`."""
-        cotangents = self.kernel.pull(ts, y0, params, steps, path_bar, y_bar, *tolerances)
-        again = np.isin(cotangents.code, GIVEN_UP)
-        if again.any() and (careful := self.careful()) is not None:
+        cotangents = self.kernel.pull(ts, y0, params, steps, path_bar, y_bar, *tolerances[:3])
+        again, flow, tolerances = self._second_chance(cotangents.code, tolerances)
+        if again.any():
             shared = (x[again] if len(x) > 1 else x for x in (ts, y0, params))
-            better = careful.pull(*shared, steps[again], path_bar[again], y_bar[again], tolerances)
+            better = flow.pull(*shared, steps[again], path_bar[again], y_bar[again], tolerances)
             for values, new in zip(cotangents, better, strict=True):
                 values[again] = new
         return cotangents
+
+    def _second_chance(self, code, tolerances: Tolerances) -> tuple[np.ndarray, "Flow", Tolerances]:
+        """The members to run once more, and how.
+
+        A program that does not hold everywhere gives way to one that does. And where constraints become dependent, as
+        at a dead centre, a step must not end: rounding of q would decide on q̇. It is by accident that one does.
+        """
+        given_up = np.isin(code, GIVEN_UP)
+        if given_up.any() and (careful := self.careful()) is not None:
+            return given_up, careful, tolerances
+        return (code == _native.NOT_LANDED) & (tolerances.tries > 1), self, tolerances.elsewhere
 
     def _careful(self) -> "Flow | None":
         """With the program that holds everywhere; None where this is it, or where that is too large."""
@@ -230,6 +256,10 @@ class _Varied(Flow):
 
         super().__init__(None, self.rows * n, None, None, groups, careful)
 
+    @property
+    def own(self) -> int:
+        return self.base.size
+
     # A state is (2, rows, n), end to end; the first row is the motion, and row by row states are (rows, 2, n).
 
     def start(self, y0):
@@ -268,8 +298,8 @@ class _Varied(Flow):
             return derivative(accelerations, q, v, t, p), base.program(*q[0], *v[0], t, *p)[n]
 
         def projected(q, v, t, p):
-            both = derivative(lambda *state: jnp.stack(base.projection(*state[0], *state[1], t, *state[3])), q, v, t, p)
-            return both[:, :n], both[:, n:]
+            both = derivative(lambda *state: base.projected(*state[0], *state[1], t, *state[3])[0], q, v, t, p)
+            return both[:, :n], both[:, n:], base.projected(*q[0], *v[0], t, *p)[1]
 
         shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((rows, n), (rows, n), (), (numbers,))]
         projection = None if base.projection is None else lower(projected, *shapes, budget=_BUDGET)
@@ -287,6 +317,10 @@ class _Directed(Flow):
 
         super().__init__(None, 2 * base.size, None, None, base.groups + (base.size,) * base.size, careful)
 
+    @property
+    def own(self) -> int:
+        return self.base.size
+
     @functools.cached_property
     def _programs(self):
         base, n = self.base, self.base.size
@@ -301,8 +335,8 @@ class _Directed(Flow):
             return accelerations, base.program(*q[0], *v[0], t, *p[0])[n]
 
         def projected(q, v, t, p):
-            both = derivative(lambda q, v, t, p: jnp.stack(base.projection(*q, *v, t, *p)), q, v, t, p)
-            return both[:, :n], both[:, n:]
+            both = derivative(lambda q, v, t, p: base.projected(*q, *v, t, *p)[0], q, v, t, p)
+            return both[:, :n], both[:, n:], base.projected(*q[0], *v[0], t, *p[0])[1]
 
         shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((2, n), (2, n), (), (2, numbers))]
         projection = None if base.projection is None else lower(projected, *shapes, budget=_BUDGET)
@@ -418,8 +452,8 @@ class _Response(NamedTuple):
         path_bar = jnp.where(self.reached, path_bar, 0.0)
         params_bar = jnp.zeros(len(params))
         if self.flow.projection is not None and len(ts) > 2:  # outputs were put on the constraints
-            path_bar, more = jax.vmap(self._back_on_constraints)(ts, self.outcome.path, path_bar)
-            params_bar = params_bar + more.sum(axis=0)
+            inner, more = jax.vmap(self._back_on_constraints)(ts[1:-1], self.outcome.path[1:-1], path_bar[1:-1])
+            path_bar, params_bar = path_bar.at[1:-1].set(inner), params_bar + more.sum(axis=0)
         done = self.outcome.code == _native.DONE
         end_bar = end_bar + jnp.where(done, path_bar[-1], 0.0)
         y0_bar, more = self._on_host(path_bar.at[-1].set(0.0), end_bar)
@@ -429,8 +463,7 @@ class _Response(NamedTuple):
 
     def _back_on_constraints(self, t, y, bar):
         y = jnp.where(jnp.isfinite(y), y, self.primals[1])
-        projection = self.flow.projection
-        y_bar, *params_bar = jax.vjp(lambda y, *p: jnp.stack(projection(*y, t, *p)), y, *self.primals[2:])[1](bar)
+        y_bar, *params_bar = jax.vjp(lambda y, *p: self.flow.projected(*y, t, *p)[0], y, *self.primals[2:])[1](bar)
         return y_bar, jnp.stack(params_bar) if params_bar else jnp.zeros(0)
 
     def _on_host(self, path_bar, end_bar):

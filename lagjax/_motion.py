@@ -131,6 +131,20 @@ class Motion(eqx.Module):
         matrix, rows, target = self.velocity_saddle(q, qdot, t, params)
         return q, qdot + _linear.saddle(matrix, jnp.zeros_like(q), rows, target)[0]
 
+    def speeds(self, q, qdot, t, params) -> jax.Array:
+        """By which to measure an error of q̇ᵢ that the others cause through the constraints: zero if they cannot.
+
+        A term of a constraint, Gⱼ q̇ⱼ, is as large as the speed |Gⱼ q̇ⱼ / Gᵢ| of coordinate i, and a kinetic energy as
+        large as the speed √(Mⱼⱼ/Mᵢᵢ) |q̇ⱼ|. The smallest of the constraints' speeds counts, if it is not above the
+        energy's, where Gᵢ happens to pass through zero. A coupler that does not turn, for instance, is as exact as the
+        cranks that carry it, and not relative to its own speed, which is rounding.
+        """
+        matrix, rows, _ = self.velocity_saddle(q, qdot, t, params)
+        by_constraints = jnp.min(_largest_term(rows * qdot, rows), axis=0)
+        root = jnp.sqrt(jnp.abs(jnp.diagonal(matrix)))[None]
+        by_energy = _largest_term(root * qdot, root)[0]
+        return jnp.where(by_constraints < jnp.inf, jnp.minimum(by_constraints, by_energy), 0.0)
+
     def acceleration(self, q, qdot, t, params) -> jax.Array:
         """q̈ from M q̈ = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q."""
         return self.solved_acceleration(q, qdot, t, params)[0]
@@ -138,6 +152,13 @@ class Motion(eqx.Module):
     def energy(self, q, qdot, t, params) -> jax.Array:
         """h = p·q̇ − L, with dh/dt = −∂L/∂t + Q·q̇ along the motion."""
         return self.momentum(q, qdot, t, params) @ qdot - self.lagrangian(q, qdot, t, params)
+
+
+def _largest_term(terms, weights):
+    """The largest term of every row, divided by the weights in it; infinite where a weight is zero."""
+    there = weights != 0
+    largest = jnp.max(jnp.abs(terms), axis=1, keepdims=True)
+    return jnp.where(there, largest / jnp.abs(jnp.where(there, weights, 1.0)), jnp.inf)
 
 
 _NEWTON_STEPS = 50

@@ -340,7 +340,7 @@ def test_a_dead_centre_is_passed_rightly_or_not_at_all():
     qdot0 = scenes.SliderCrank(rate, -rate, -2 * rate * np.sin(start))
     for rtol in (1e-10, 1e-12):
         run = lagjax.simulate_batch(scene.system, q0, qdot0, np.linspace(0, 2, 5), scene.params, rtol=rtol)
-        assert np.mean(run.ok) > 0.8
+        assert np.mean(run.ok) > 0.97
         assert np.max(np.abs(run.q.crank + run.q.rod)[run.ok]) < 1e-12
         assert set(run.result._value[~run.ok].tolist()) <= {int(lagjax.RESULTS.projection_failed._value)}
 
@@ -397,7 +397,21 @@ def test_parallelogram_linkages_pass_the_flat_configuration():
     q0, qdot0 = np.stack([start, GROUND[1] + still, start], 1), np.stack([turning, still, turning], 1)
     run = lagjax.simulate_batch(system, q0, qdot0, ts, rtol=1e-8)
     assert np.all(free.q[:, -1] < GROUND[1] - 0.5) and run.ok.all() and drift(run) < DRIFT
+    # The coupler hardly turns: it is measured by what carries it, and costs no steps of its own.
+    assert np.mean(run.stats["num_accepted_steps"]) < 2 * np.mean(free.stats["num_accepted_steps"])
     np.testing.assert_allclose(run.q, np.stack([free.q, GROUND[1] + 0 * free.q, free.q], axis=-1), atol=1e-6)
+
+
+def test_units_of_constrained_coordinates_do_not_matter():
+    def in_units(q, qdot):  # the first coordinate in millimetres
+        return weight(jnp.stack([q[0] / 1e3, q[1]]), jnp.stack([qdot[0] / 1e3, qdot[1]]))
+
+    (q0, qdot0), ts, unit = hung(1.0, 0.5), np.linspace(0, 5, 3), np.array([1e3, 1])
+    plain = lagjax.simulate(lagjax.System(weight, constraints=rod), q0, qdot0, ts)
+    scaled_rod = lagjax.System(in_units, constraints=lambda q: rod(jnp.stack([q[0] / 1e3, q[1]])))
+    scaled = lagjax.simulate(scaled_rod, q0 * unit, qdot0 * unit, ts)
+    np.testing.assert_allclose(scaled.q / unit, plain.q, rtol=1e-10, atol=1e-10)
+    assert abs(int(scaled.stats["num_accepted_steps"]) - int(plain.stats["num_accepted_steps"])) <= 2
 
 
 def test_more_constraints_than_coordinates():

@@ -91,6 +91,7 @@ FAMILIES = {
     "iota": (lambda a: a * jnp.arange(3) + jnp.eye(3)[1] + lax.broadcasted_iota(float, (2, 3), 0), A),
     "products": (lambda m, a: (a @ m, m.T @ m, jnp.outer(a, a), jnp.cross(a, a[::-1]), m.T @ a), M, A),
     "einsum": (lambda m: (jnp.einsum("ij,ik->ijk", m, m), jnp.einsum("ij,ij->j", m, m), jnp.trace(m @ m.T)), M),
+    "diagonals": (lambda m: (jnp.diagonal(m[:, :3]), jnp.diag(m[0]), jnp.fill_diagonal(m, 2.0, inplace=False)), M),
     "reductions": (lambda m: (m.sum(), m.sum(0), m.prod(1), m.max(1), m.min(), (m > 0).any(0), (m > 0).all()), M),
     "cumulations": (lambda m: (m.cumsum(0), jnp.cumprod(m, 1), lax.cummax(m, 1), lax.cummin(m, 0, reverse=True)), M),
     "norms": (lambda a: (jnp.linalg.norm(a), jnp.hypot(a[0], a[1]), jnp.logaddexp(a[0], a[1]), jnp.sinc(a)), A),

@@ -65,9 +65,10 @@ class Kernel:
     """The integration of (q, q̇) with q̈ from a program, whose inputs are q, q̇, t and numbers that stay constant.
 
     The outputs of the program are q̈, then whether the mass matrix is singular. `projection`, from the same inputs to
-    (q, q̇), is applied to the state after every step, and to the outputs. `guards`, again from the same inputs, end the
-    motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are relative to
-    each coordinate, or to the largest one of its group. Raises `Unlowerable` where an operation has no Taylor series or
+    (q, q̇), is applied to the state after every step, and to the outputs after the first. `guards`, again from the same
+    inputs, end the motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are
+    relative to each coordinate, or to the largest one of its group. Of the coordinates the first `own` are the motion,
+    the others its derivatives. Raises `Unlowerable` where an operation has no Taylor series or
     is not one of doubles.
     """
 
@@ -78,16 +79,15 @@ class Kernel:
         projection: Program | None = None,
         guards: Guards | None = None,
         groups: tuple[int, ...] | None = None,
+        own: int | None = None,
     ):
         self._parts = program, recurrences(program, size), projection
-        integrator = _integrator.Integrator(*self._parts, guards, groups)
+        integrator = _integrator.Integrator(*self._parts, guards, groups, own)
         self.states, self.numbers, self.width = 2 * size, integrator.numbers, integrator.width
         self._memory = integrator.memory
-        # The engine holds the code that the other two point to.
-        self._engine, at = compiled(integrator.module, ("run",) if projection is None else ("run", "project_rows"))
-        self._run, self._project = _function(at["run"], *[ctypes.c_void_p] * 4), None
-        if projection is not None:
-            self._project = _function(at["project_rows"], *[ctypes.c_void_p] * 3, ctypes.c_int64)
+        # The engine holds the code that the other points to.
+        self._engine, at = compiled(integrator.module, ("run",))
+        self._run = _function(at["run"], *[ctypes.c_void_p] * 4)
 
     def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int) -> Outcome:
         """`y0` (N, 2n); `ts` (N, T) and `params` (N, P), or one row for all; all float64."""
@@ -111,14 +111,7 @@ class Kernel:
             self._run(ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data, idle.ctypes.data)
             return int(idle[0])
 
-        def project(_) -> None:
-            memory = _aligned(self._memory)  # a name keeps it alive
-            self._project(ctypes.addressof(job), memory.ctypes.data, path.ctypes.data, times)
-
         idle = sum(self._on_all_cores(integrate, members))
-        if self._project is not None and times > 2:
-            counter[0] = 0
-            self._on_all_cores(project, members)
         ended_badly = code != DONE
         if ended_badly.any():  # a start that is infinite was not reached either
             reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)

@@ -62,7 +62,7 @@ class Adjoint(SeriesCode):
         self.start_next = self._start_next()
         steps = [self._seed(), self._back_orders(self._back_sums(), self._back_sweep()), self._back_start()]
         if projection is not None:
-            line = StraightLine(projection.nodes, projection.kinds, projection.outputs)
+            line = StraightLine(projection.nodes, projection.kinds, projection.outputs[:states])
             self.projection_line = pullback(line, dtypes, self.moved, range(states))
             steps.insert(0, self._back_projection())
         self._run(steps)

@@ -75,23 +75,28 @@ class Job(ctypes.Structure):
 # Doubles of a lane. `due` and `reached` are times in the direction of time; `active`, `last`, `singular` are 1 or 0.
 _OF_A_LANE = (
     "t_low", "t_end", "forward", "smallest", "due", "reached", "worst", "active", "last", "code", "steps", "rejected",
-    "longest", "growth", "planned", "event", "by_series",
+    "longest", "growth", "planned", "event", "by_series", "is_due",
 )  # fmt: skip
 
 
 class Integrator(SeriesCode):
-    """Builds the module. `memory` is what a thread needs, in doubles; `width` the lanes."""
+    """Builds the module. `memory` is what a thread needs, in doubles; `width` the lanes.
 
-    def __init__(self, program: Program, series: Series, projection: Program | None = None, guards=None, groups=None):
-        # Coordinates of one group are measured by the largest of them.
+    Coordinates of one of the `groups` are measured by the largest of them. The first `own` coordinates are the motion,
+    the others derivatives of it, which follow where it lands.
+    """
+
+    def __init__(self, program: Program, series: Series, projection=None, guards=None, groups=None, own=None):
         self.groups = tuple(range(series.size)) if groups is None else groups
+        self.own = series.size if own is None else own
         self.projection, self.guards = projection, guards
         self.directions = () if guards is None else guards.directions
         sizes = {
             "low": 2 * series.size,  # what rounding took from the state
             "scale": 2 * series.size,
             "increment": 2 * series.size,
-            **dict.fromkeys(("landed", "landed_low"), 0 if projection is None else 2 * series.size),
+            "between": 2 * series.size,  # the state at an output time
+            **({} if projection is None else {"landed": 2 * series.size, "speeds": self.own}),
             **dict.fromkeys(("guard", "side", "noise", "root", "change"), len(self.directions)),
             "samples": _SAMPLES * len(self.directions),
             **dict.fromkeys(_OF_A_LANE, 1),
@@ -99,15 +104,11 @@ class Integrator(SeriesCode):
         super().__init__("motion", program, series, Job, sizes)
         self.defect = self._defect()
         self.start_next = self._start_next()
-        self.project = self.land = None
-        if projection is not None:
-            self.project, self.land = self._project(), self._land()
+        self.land = None if projection is None else self._land()
         if guards is not None:
             self.guard = self._guard()
             self.begin_sides = self._begin_sides()
         self._run()
-        if projection is not None:
-            self._project_rows()
 
     # ---- along the step ----
 
@@ -176,6 +177,8 @@ class Integrator(SeriesCode):
             self._set(code, memory, "smallest", lane, SMALLEST_STEP * largest)
             self._set(code, memory, "longest", lane, code.intrinsic("fabs", end - begin) * FIRST_STEP)
             self._await_output(code, memory, lane_data, job, lane, integer(code, 1))
+            for i in range(0 if self.projection is None else self.own):
+                code.store(double(code, 0.0), self.place(code, memory, "speeds", i, lane))
             for i in range(self.states):
                 x = self._read(code, job, "y0", member * self.states + i)
                 code.store(x, self.state(code, memory, i, 0, lane))
@@ -243,12 +246,16 @@ class Integrator(SeriesCode):
         before = code.intrinsic("fabs", self._vector(code, memory, "h"))
         errors = [code.lanes_of(0.0), code.lanes_of(0.0)]
 
+        n = self.n
+
         def largest(i):
             # A component that passes through zero is as large as it will be a step away.
             y, rate = (code.intrinsic("fabs", code.load(self.state(code, memory, i, k), self.vector)) for k in range(2))
+            if self.projection is not None and i % n < self.own:
+                speed = self._vector(code, memory, "speeds", i % n)
+                y, rate = (y, code.maximum(rate, speed)) if i < n else (code.maximum(y, speed), rate)
             return code.maximum(y, rate * before)
 
-        n = self.n
         sizes = [x for half in (range(n), range(n, 2 * n)) for x in self._by_group(code, [largest(i) for i in half])]
         for i, size in enumerate(sizes):
             rate = code.intrinsic("fabs", code.load(self.state(code, memory, i, 1), self.vector))
@@ -332,32 +339,40 @@ class Integrator(SeriesCode):
         after, rest = code.select(is_last, end, after), code.select(is_last, 0.0, rest)
         moving = code.compare("!=", h, 0.0)
         self._keep(code, memory, "reached", after * forward)
-        with code.only_if(code.any_lane(moving & (self._vector(code, memory, "due") <= after * forward))):
-            with code.loop(self.width) as lane:
-                moves = code.compare("!=", self._get(code, memory, "h", lane), 0.0)
-                self._outputs(code, memory, lane_data, job, order, lane, moves)
+        self._outputs(code, memory, lane_data, job, order, moving)
         self._keep(code, memory, "t", code.select(moving, after, t))
         self._keep(code, memory, "t_low", code.select(moving, rest, low))
 
-    def _outputs(self, code, memory, lane_data, job, order, lane, moves) -> None:
-        t, low = (self._get(code, memory, name, lane) for name in ("t", "t_low"))
-        member = code.load(self._lane(code, lane_data, "member", lane), INTEGER)
+    def _outputs(self, code, memory, lane_data, job, order, moving) -> None:
+        """The states at the output times before the end of the step, one of every lane at a time."""
+        t, low = self._vector(code, memory, "t"), self._vector(code, memory, "t_low")
+        forward, reached = self._vector(code, memory, "forward"), self._vector(code, memory, "reached")
 
         def due():
-            return moves & (self._get(code, memory, "due", lane) <= self._get(code, memory, "reached", lane))
+            return moving & (self._vector(code, memory, "due") <= reached)
 
-        with code.repeat_while(due):
-            index = code.load(self._lane(code, lane_data, "output", lane), INTEGER)
-            s = (self._time(code, job, member, index) - t) - low
-            values = [code.variable(code.load(self.state(code, memory, i, order, lane), DOUBLE)) for i in
-                      range(self.states)]  # fmt: skip
-            with code.loop(order + 1, start=1) as j:
-                for i, value in enumerate(values):
-                    c = code.load(self.state(code, memory, i, order - j, lane), DOUBLE)
-                    code.store(code.load(value, DOUBLE) * s + c, value)
+        with code.repeat_while(lambda: code.any_lane(due())):
+            there = due()
+            s = code.select(there, (self._vector(code, memory, "due") * forward - t) - low, 0.0)
+            increments, _ = self.increments(code, memory, order, s)
+            values = [
+                code.load(self.state(code, memory, i), self.vector) + (dy + self._vector(code, memory, "low", i))
+                for i, dy in enumerate(increments)
+            ]
+            if self.land is not None:
+                landed, off = self._landed(code, memory, values, increments, s)
+                values = [code.select(off <= 1.0, on, value) for on, value in zip(landed, values, strict=False)]
             for i, value in enumerate(values):
-                code.store(code.load(value, DOUBLE), self._output(code, job, member, index, i))
-            self._await_output(code, memory, lane_data, job, lane, index + 1)
+                self._keep(code, memory, "between", value, i)
+            self._keep(code, memory, "is_due", code.select(there, code.lanes_of(1.0), 0.0))
+            with code.loop(self.width) as lane, code.only_if(self._get(code, memory, "is_due", lane) > 0.0):
+                member, index = (
+                    code.load(self._lane(code, lane_data, name, lane), INTEGER) for name in ("member", "output")
+                )
+                for i in range(self.states):
+                    value = code.load(self.place(code, memory, "between", i, lane), DOUBLE)
+                    code.store(value, self._output(code, job, member, index, i))
+                self._await_output(code, memory, lane_data, job, lane, index + 1)
 
     def _advance(self, code, memory) -> None:
         """y + h y₁ + …, with what rounding takes carried to the next step; and one step more on the count."""
@@ -366,10 +381,9 @@ class Integrator(SeriesCode):
         self._keep(code, memory, "longest", code.intrinsic("fabs", h) * self._vector(code, memory, "growth"))
         for i in range(self.states):
             y, low = code.load(self.state(code, memory, i), self.vector), self._vector(code, memory, "low", i)
-            if self.land is None:
-                total, rest = self._sum(code, memory, i)
-            else:
-                total, rest = (self._vector(code, memory, name, i) for name in ("landed", "landed_low"))
+            total, rest = self._sum(code, memory, i)
+            if self.land is not None:
+                total = self._vector(code, memory, "landed", i)
             code.store(code.select(moving, total, y), self.state(code, memory, i))
             self._keep(code, memory, "low", code.select(moving, rest, low), i)
         steps = self._vector(code, memory, "steps")
@@ -622,76 +636,43 @@ class Integrator(SeriesCode):
 
     # ---- constraints ----
 
-    def _project(self) -> Code:
-        """`(memory)`: the state of every lane back to the constraints."""
-        code = Code(self.module, "project", [POINTER], self.width)
-        (memory,) = code.arguments
-        line = StraightLine(self.projection.nodes, self.projection.kinds, self.projection.outputs)
-        for i, y in enumerate(emit(code, line, self.now(code, memory), self.sincos)):
-            code.store(y, self.state(code, memory, i))
-        return code.finish()
-
-    def _land(self) -> Code:
-        """`(memory)`: the end of the step back on the constraints, into `landed`; how far it was, into `worst`.
+    def _landed(self, code, memory, values, increments, s) -> tuple[list[Value], Value]:
+        """What the projection gives for a state of the series, at t + s; and how far that is, in `LANDING` tolerances.
 
         The series ends within the tolerance of the constraints. If it is much farther to the state that the projection
-        finds, that is not the end of this motion: near a configuration where constraints become dependent there are
-        several branches close together.
+        finds, that is not the state of this motion: near a configuration where constraints become dependent there are
+        several branches close together, and rounding of q decides on q̇.
         """
-        code = Code(self.module, "land", [POINTER], self.width)
-        (memory,) = code.arguments
-        sums, now = [self._sum(code, memory, i) for i in range(self.states)], self.now(code, memory)
-        h, worst = self._vector(code, memory, "h"), self._vector(code, memory, "worst")
-        first = code.compare("==", self._vector(code, memory, "steps"), 0.0)
+        now = self.now(code, memory)
 
         def then(i):
-            return sums[i][0] if i < self.states else now(i) + h if i == self.states else now(i)
+            return values[i] if i < self.states else now(i) + s if i == self.states else now(i)
 
         line = StraightLine(self.projection.nodes, self.projection.kinds, self.projection.outputs)
-        for i, landed in enumerate(emit(code, line, then, self.sincos)):
-            far = code.intrinsic("fabs", landed - sums[i][0])
-            size = code.intrinsic("fabs", landed) + code.intrinsic("fabs", self._vector(code, memory, "increment", i))
+        landed, off = emit(code, line, then, self.sincos), code.lanes_of(0.0)
+        first = code.compare("==", self._vector(code, memory, "steps"), 0.0)
+        for i in (*range(self.own), *range(self.n, self.n + self.own)):
+            far = code.intrinsic("fabs", landed[i] - values[i])
+            size = code.intrinsic("fabs", landed[i]) + code.intrinsic("fabs", increments[i])
             error = (far - ROUND_OFF * size) * self._vector(code, memory, "scale", i) * (1 / LANDING)
             # A start may be off by more, as much as is taken for consistent.
             error = code.select(first, far / (START * (1.0 + size)), error)
-            worst = code.select(error <= worst, worst, error)  # NaN goes through
-            self._keep(code, memory, "landed", landed, i)
-            self._keep(code, memory, "landed_low", sums[i][1], i)
-        self._keep(code, memory, "worst", worst)
+            off = code.select(error <= off, off, error)  # NaN goes through
+        return landed, off
+
+    def _land(self) -> Code:
+        """`(memory)`: the end of the step back on the constraints, into `landed`; how far it was, into `worst`."""
+        code = Code(self.module, "land", [POINTER], self.width)
+        (memory,) = code.arguments
+        sums = [self._sum(code, memory, i)[0] for i in range(self.states)]
+        increments = [self._vector(code, memory, "increment", i) for i in range(self.states)]
+        landed, off = self._landed(code, memory, sums, increments, self._vector(code, memory, "h"))
+        for i, value in enumerate(landed):
+            name, i = ("landed", i) if i < self.states else ("speeds", i - self.states)
+            self._keep(code, memory, name, value, i)
+        worst = self._vector(code, memory, "worst")
+        self._keep(code, memory, "worst", code.select(off <= worst, worst, off))
         return code.finish()
-
-    def _project_rows(self) -> None:
-        """`(job, memory, rows, times)`: states, `times` of them for each member, back to the constraints."""
-        code = Code(self.module, "project_rows", [POINTER, POINTER, POINTER, INTEGER], self.width, public=True)
-        job, memory, rows, times = code.arguments
-        total = self._job(code, job, "members") * times
-        counter = self._job(code, job, "next_member")
-
-        def take() -> Value:
-            width = ir.Constant(INTEGER, self.width)
-            return Value(code, code.builder.atomic_rmw("add", counter.it, width, "monotonic"))
-
-        first = code.variable(take())
-        with code.repeat_while(lambda: code.load(first, INTEGER) < total):
-            for load in (True, False):
-                with code.loop(self.width) as lane:
-                    row = code.load(first, INTEGER) + lane
-                    row = code.select(row < total, row, total - 1)
-                    member = row / times
-                    for i in range(self.states):
-                        inside = self.state(code, memory, i, 0, lane)
-                        outside = code.element(rows, row * self.states + i)
-                        source, target = (outside, inside) if load else (inside, outside)
-                        code.store(code.load(source, DOUBLE), target)
-                    if load:
-                        self._set(code, memory, "t", lane, self._time(code, job, member, row - member * times))
-                        with code.loop(self.numbers) as i:
-                            x = self._read(code, job, "params", member * self._job(code, job, "params_stride") + i)
-                            code.store(x, self.place(code, memory, "params", i, lane))
-                if load:
-                    code.call(self.project, memory)
-            code.store(take(), first)
-        code.finish()
 
 
 def _power(code, x: Value, exponent: Value) -> Value:

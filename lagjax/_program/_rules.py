@@ -255,6 +255,14 @@ def _iota(expansion, params):
     return np.broadcast_to(expansion.constants(numbers).reshape(shape), params["shape"])
 
 
+@_lowers("platform_index")
+def _platform_index(expansion, params):
+    # Which of the equivalent branches: that for CPUs, or the default. A program has no platform of its own.
+    cases = params["platforms"]
+    fits = [i for i, platforms in enumerate(cases) if platforms is not None and "cpu" in platforms]
+    return expansion.constants(np.int32((fits + [i for i, platforms in enumerate(cases) if platforms is None])[0]))
+
+
 @_lowers("dot_general")
 def _dot_general(expansion, params, x, y):
     (contract_x, contract_y), (batch_x, batch_y) = params["dimension_numbers"]
