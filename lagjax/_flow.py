@@ -86,10 +86,10 @@ class Flow:
     """The map of one program for q̈ with n coordinates.
 
     `program` takes q, q̇, t and then the parameters, number by number; it gives q̈ and whether the mass matrix is
-    singular. `projection`, from the same to (q, q̇), keeps the motion on its constraints, and tells by which speeds to measure
-    the errors of q̇ there. `guards` end the motion early:
-    then the outcome is a plain number, without derivatives. `careful()` is the flow for members that a program which
-    does not hold everywhere cannot follow: they start again, from the beginning.
+    singular. `projection`, from the same to (q, q̇), keeps the motion on its constraints, and tells by which speeds to
+    measure the errors of q̇ there. `guards` end the motion early: then the outcome is a plain number, without
+    derivatives. `careful()` is the flow for members that a program which does not hold everywhere cannot follow: they
+    start again, from the beginning.
     """
 
     def __init__(

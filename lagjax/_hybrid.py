@@ -64,9 +64,7 @@ class Transition(eqx.Module):
     direction: int = eqx.field(static=True)
     reset: Function | None
 
-    def __init__(
-        self, source: str, target: str, guard: Callable, direction: int = 0, reset: Callable | None = None
-    ):
+    def __init__(self, source: str, target: str, guard: Callable, direction: int = 0, reset: Callable | None = None):
         for role, name in (("source", source), ("target", target)):
             if not isinstance(name, str):
                 raise TypeError(f"{role} must be the name of a mode; got {name!r}.")
@@ -352,9 +350,7 @@ class _Rounds(NamedTuple):
             seen = jax.tree.map(lambda new, old, hit=here & event: jnp.where(hit, new, old), event_seen, seen)
             fired = fired | (here & event)
         spent = fired & (count == self.plan.max_transitions)
-        after = after._replace(
-            going=after.going & ~spent, code=jnp.where(spent, TOO_MANY_TRANSITIONS, after.code)
-        )
+        after = after._replace(going=after.going & ~spent, code=jnp.where(spent, TOO_MANY_TRANSITIONS, after.code))
         return after, seen
 
     def _in_mode(self, index: int, carry: _Carry, here) -> tuple[_Carry, jax.Array, _Seen]:

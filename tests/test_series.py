@@ -354,9 +354,10 @@ def test_an_operation_without_a_series_is_named(monkeypatch):
 def test_all_moving_inputs_may_be_any_mixture():
     # Each of q, v, t alone, in pairs, and all: what does not move has no coefficients, and the rest stays right.
     for which in itertools.chain.from_iterable(itertools.combinations("qvt", r) for r in range(4)):
-        function = lambda q, v, t, which=which: jnp.sin(
-            sum(c * x for c, x, name in ((0.7, q, "q"), (1.1, v, "v"), (0.4, t, "t")) if name in which) + 0.3
-        ) + jnp.zeros(1)
+        function = lambda q, v, t, which=which: (
+            jnp.sin(sum(c * x for c, x, name in ((0.7, q, "q"), (1.1, v, "v"), (0.4, t, "t")) if name in which) + 0.3)
+            + jnp.zeros(1)
+        )
         exact = total_derivatives(function, [0.4], [0.9], 0.2, count=4)
         found = coefficients(function, 5, [0.4], [0.9], 0.2)
         close(found[:, 2:], np.asarray(exact) / [2, 6, 24, 120])

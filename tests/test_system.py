@@ -120,7 +120,7 @@ def test_transformations_of_the_derivation():
     for derivative in (jax.grad(of_k), jax.jacfwd(of_k)):
         np.testing.assert_allclose(derivative(3.0, 1.5), -1 / (2.0 * 1.5**2), rtol=1e-14)
         np.testing.assert_allclose(
-            jax.vmap(derivative, (None, 0))(3.0, states[0].rho), -1 / (2.0 * states[0].rho**2), rtol=1e-14
+            jax.vmap(derivative, (None, 0))(3.0, states[0].rho), -1 / (2.0 * states[0].rho ** 2), rtol=1e-14
         )
 
 

@@ -65,11 +65,11 @@ class Kernel:
     """The integration of (q, q̇) with q̈ from a program, whose inputs are q, q̇, t and numbers that stay constant.
 
     The outputs of the program are q̈, then whether the mass matrix is singular. `projection`, from the same inputs to
-    (q, q̇), is applied to the state after every step, and to the outputs after the first. `guards`, again from the same
-    inputs, end the motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are
-    relative to each coordinate, or to the largest one of its group. Of the coordinates the first `own` are the motion,
-    the others its derivatives. Raises `Unlowerable` where an operation has no Taylor series or
-    is not one of doubles.
+    (q, q̇) and to the speeds that errors of q̇ are measured by, is applied to the state after every step, and to the
+    outputs after the first. `guards`, again from the same inputs, end the motion of a member with the code `EVENT` +
+    Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are relative to each coordinate, or to the largest one of its
+    group. Of the coordinates the first `own` are the motion, the others its derivatives. Raises `Unlowerable` where an
+    operation has no Taylor series or is not one of doubles.
     """
 
     def __init__(
