@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import _native
-from lagjax._equations import projection_program, scalar_program
+from lagjax._equations import projection, scalar_program
 from lagjax._flow import Flow, Outcome, Tolerances, unfit
 from lagjax._integrate import Solved
 from lagjax._layout import Layout
@@ -119,10 +119,10 @@ def _made(scene: _Scene) -> "Flow | str":
     try:
         motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
         program = scalar_program(motion, layout, numbers)
-        projection = projection_program(motion, layout, numbers)
+        back = projection(motion, layout, numbers)
     except Unlowerable as reason:
         return str(reason)
-    return unfit(program, layout.size, layout.dtype) or Flow(program, layout.size, projection)
+    return unfit(program, layout.size, layout.dtype) or Flow(program, layout.size, back)
 
 
 # ---- one trajectory --------------------------------------------------------------------------------------------------

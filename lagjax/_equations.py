@@ -20,6 +20,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from lagjax import _linear
 from lagjax._layout import Layout
 from lagjax._motion import Motion
+from lagjax._native import Projection
 from lagjax._program import Program, Unlowerable, lower
 
 PyTree = Any
@@ -99,8 +100,7 @@ class ScalarEquations(Equations):
     def projected(self, t, y, params):
         """By the second program."""
         state = _compiled_once(self.projected_by, *y[0], *y[1], t, *_scalars(params))
-        n = len(y[0])
-        return jnp.stack(state[:n]), jnp.stack(state[n : 2 * n])
+        return jnp.stack(state[: len(state) // 2]), jnp.stack(state[len(state) // 2 :])
 
     def acceleration(self, t, y, params):
         """By the program."""
@@ -153,10 +153,7 @@ def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
 
 
 def projection_program(motion: Motion, layout: Layout, params: PyTree) -> Program | None:
-    """`Motion.projected` as a program, from q, q̇, t and the numbers in params; None without constraints.
-
-    To q and q̇ it adds `Motion.speeds` there.
-    """
+    """`Motion.projected` as a program, from q, q̇, t and the numbers in params to q and q̇; None without constraints."""
     if not motion.constrained:
         return None
     n = layout.size
@@ -176,11 +173,18 @@ def projection_program(motion: Motion, layout: Layout, params: PyTree) -> Progra
         if position is not None:
             q = [x + dx for x, dx in zip(q, position(*scalars), strict=False)]
         v = [x + dx for x, dx in zip(rest[:n], velocity(*q, *rest), strict=False)]
-        return *q, *v, *speeds(*q, *v, *rest[n:])
+        return *q, *v
 
-    q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
-    speeds = lower(motion.speeds, q, q, t, params, budget=OPERATION_BUDGET)
     return lower(projected, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
+
+
+def projection(motion: Motion, layout: Layout, params: PyTree) -> Projection | None:
+    """What machine code needs to keep a motion on its constraints; None without any."""
+    if not motion.constrained:
+        return None
+    q, t = jax.ShapeDtypeStruct((layout.size,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
+    speeds = lower(motion.speeds, q, q, t, params, budget=OPERATION_BUDGET)
+    return Projection(projection_program(motion, layout, params), speeds)
 
 
 def multiplier_program(motion: Motion, layout: Layout, params: PyTree) -> Program:

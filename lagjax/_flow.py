@@ -86,17 +86,16 @@ class Flow:
     """The map of one program for q̈ with n coordinates.
 
     `program` takes q, q̇, t and then the parameters, number by number; it gives q̈ and whether the mass matrix is
-    singular. `projection`, from the same to (q, q̇), keeps the motion on its constraints, and tells by which speeds to
-    measure the errors of q̇ there. `guards` end the motion early: then the outcome is a plain number, without
-    derivatives. `careful()` is the flow for members that a program which does not hold everywhere cannot follow: they
-    start again, from the beginning.
+    singular. `projection` keeps the motion on its constraints. `guards` end the motion early: then the outcome is a
+    plain number, without derivatives. `careful()` is the flow for members that a program which does not hold everywhere
+    cannot follow: they start again, from the beginning.
     """
 
     def __init__(
         self,
         program: Program,
         size: int,
-        projection: Program | None = None,
+        projection: _native.Projection | None = None,
         guards: _native.Guards | None = None,
         groups: tuple[int, ...] | None = None,
         careful: Callable[[], "Flow | None"] | None = None,
@@ -118,14 +117,9 @@ class Flow:
         return self._programs[0]
 
     @property
-    def projection(self) -> Program | None:
-        """(q, q̇) on the constraints, where there are some, and `Motion.speeds`."""
+    def projection(self) -> _native.Projection | None:
+        """The way back to the constraints, where there are some."""
         return self._programs[1]
-
-    def projected(self, *scalars) -> tuple[jax.Array, jax.Array]:
-        """The state on the constraints, and the speeds there by which errors are measured."""
-        y = jnp.stack(self.projection(*scalars))
-        return y[: self.states], y[self.states :]
 
     @functools.cached_property
     def kernel(self) -> _native.Kernel:
@@ -298,12 +292,15 @@ class _Varied(Flow):
             return derivative(accelerations, q, v, t, p), base.program(*q[0], *v[0], t, *p)[n]
 
         def projected(q, v, t, p):
-            both = derivative(lambda *state: base.projected(*state[0], *state[1], t, *state[3])[0], q, v, t, p)
-            return both[:, :n], both[:, n:], base.projected(*q[0], *v[0], t, *p)[1]
+            state = base.projection.state
+            both = derivative(lambda q, v, t, p: jnp.stack(state(*q, *v, t, *p)), q, v, t, p)
+            return both[:, :n], both[:, n:]
 
-        shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((rows, n), (rows, n), (), (numbers,))]
-        projection = None if base.projection is None else lower(projected, *shapes, budget=_BUDGET)
-        return lower(moving, *shapes, budget=_BUDGET), projection
+        def speeds(q, v, t, p):
+            return base.projection.speeds(*q[0], *v[0], t, *p)
+
+        back = None if base.projection is None else (projected, speeds)
+        return _lowered(moving, back, (rows, n), (rows, n), (), (numbers,))
 
 
 class _Directed(Flow):
@@ -335,12 +332,22 @@ class _Directed(Flow):
             return accelerations, base.program(*q[0], *v[0], t, *p[0])[n]
 
         def projected(q, v, t, p):
-            both = derivative(lambda q, v, t, p: base.projected(*q, *v, t, *p)[0], q, v, t, p)
-            return both[:, :n], both[:, n:], base.projected(*q[0], *v[0], t, *p[0])[1]
+            state = base.projection.state
+            both = derivative(lambda q, v, t, p: jnp.stack(state(*q, *v, t, *p)), q, v, t, p)
+            return both[:, :n], both[:, n:]
 
-        shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((2, n), (2, n), (), (2, numbers))]
-        projection = None if base.projection is None else lower(projected, *shapes, budget=_BUDGET)
-        return lower(moving, *shapes, budget=_BUDGET), projection
+        def speeds(q, v, t, p):
+            return base.projection.speeds(*q[0], *v[0], t, *p[0])
+
+        back = None if base.projection is None else (projected, speeds)
+        return _lowered(moving, back, (2, n), (2, n), (), (2, numbers))
+
+
+def _lowered(moving: Callable, back: tuple[Callable, Callable] | None, *shapes):
+    """The two programs of a flow, from functions of arrays of these shapes."""
+    arrays = [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes]
+    program, *parts = (lower(function, *arrays, budget=_BUDGET) for function in (moving, *(back or ())))
+    return program, _native.Projection(*parts) if parts else None
 
 
 def _push(flow: Flow, tolerances: Tolerances, primals, tangents) -> tuple[Outcome, Outcome]:
@@ -463,7 +470,8 @@ class _Response(NamedTuple):
 
     def _back_on_constraints(self, t, y, bar):
         y = jnp.where(jnp.isfinite(y), y, self.primals[1])
-        y_bar, *params_bar = jax.vjp(lambda y, *p: self.flow.projected(*y, t, *p)[0], y, *self.primals[2:])[1](bar)
+        projection = self.flow.projection.state
+        y_bar, *params_bar = jax.vjp(lambda y, *p: jnp.stack(projection(*y, t, *p)), y, *self.primals[2:])[1](bar)
         return y_bar, jnp.stack(params_bar) if params_bar else jnp.zeros(0)
 
     def _on_host(self, path_bar, end_bar):

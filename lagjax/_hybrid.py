@@ -26,7 +26,7 @@ from lagjax import _native
 from lagjax._arguments import Function, accept
 from lagjax._consistent import TOLERANCE, require_consistent
 from lagjax._engine import RESULT_OF_CODE, result_from
-from lagjax._equations import multiplier_program, projection_program, scalar_program
+from lagjax._equations import multiplier_program, projection, scalar_program
 from lagjax._flow import Flow, Tolerances, unfit
 from lagjax._layout import Layout
 from lagjax._motion import Motion
@@ -257,7 +257,7 @@ def _made(name: str, system: System, leaving: tuple[Transition, ...], layout: La
     motion = system.motion(layout, params)
     try:
         program = scalar_program(motion, layout, numbers)
-        projection = projection_program(motion, layout, numbers)
+        back = projection(motion, layout, numbers)
         multipliers = multiplier_program(motion, layout, numbers) if motion.constrained else None
 
         def surfaces(y, numbers):
@@ -281,13 +281,13 @@ def _made(name: str, system: System, leaving: tuple[Transition, ...], layout: La
         raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
     if reason := unfit(program, n, layout.dtype):
         raise ValueError(f"The mode {name!r} has no machine code: {reason}.")
-    flow = Flow(program, n, projection)
+    flow = Flow(program, n, back)
     if not leaving:
         return _Mode(flow, flow, *programs)
     if len(leaving) > MOST_GUARDS:
         raise ValueError(f"{len(leaving)} transitions leave the mode {name!r}, more than {MOST_GUARDS}.")
     directions = tuple(transition.direction for transition in leaving)
-    return _Mode(flow, Flow(program, n, projection, _native.Guards(programs[1], directions)), *programs)
+    return _Mode(flow, Flow(program, n, back, _native.Guards(programs[1], directions)), *programs)
 
 
 MOST_GUARDS = 24  # two bits each in the code of an event, which is a double

@@ -24,7 +24,7 @@ from lagjax._program import Program, Series, Unlowerable, series
 
 __all__ = [
     "DONE", "EVENT", "NOT_FINITE", "NOT_LANDED", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Cotangents", "Guards",
-    "Kernel", "cores", "recurrences",
+    "Kernel", "Projection", "cores", "recurrences",
 ]  # fmt: skip
 
 LARGEST_RECORD = 2**23  # numbers of the steps that are kept at once: 64 MiB
@@ -61,22 +61,31 @@ class Guards(NamedTuple):
     directions: tuple[int, ...]
 
 
+class Projection(NamedTuple):
+    """What keeps a motion on its constraints, from the inputs of its program: (q, q̇) there, nearby, and speeds.
+
+    An error of q̇ counts relative to its speed where that is larger than q̇ itself.
+    """
+
+    state: Program
+    speeds: Program
+
+
 class Kernel:
     """The integration of (q, q̇) with q̈ from a program, whose inputs are q, q̇, t and numbers that stay constant.
 
-    The outputs of the program are q̈, then whether the mass matrix is singular. `projection`, from the same inputs to
-    (q, q̇) and to the speeds that errors of q̇ are measured by, is applied to the state after every step, and to the
-    outputs after the first. `guards`, again from the same inputs, end the motion of a member with the code `EVENT` +
-    Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are relative to each coordinate, or to the largest one of its
-    group. Of the coordinates the first `own` are the motion, the others its derivatives. Raises `Unlowerable` where an
-    operation has no Taylor series or is not one of doubles.
+    The outputs of the program are q̈, then whether the mass matrix is singular. `projection` is applied to the state
+    after every step, and to the outputs after the first. `guards`, again from the same inputs, end the motion of a
+    member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are relative to each
+    coordinate, or to the largest one of its group. Of the coordinates the first `own` are the motion, the others its
+    derivatives. Raises `Unlowerable` where an operation has no Taylor series or is not one of doubles.
     """
 
     def __init__(
         self,
         program: Program,
         size: int,
-        projection: Program | None = None,
+        projection: Projection | None = None,
         guards: Guards | None = None,
         groups: tuple[int, ...] | None = None,
         own: int | None = None,

@@ -38,7 +38,7 @@ class Job(ctypes.Structure):
 class Adjoint(SeriesCode):
     """Builds the module; its public function is `pull(job, memory, lanes)`."""
 
-    def __init__(self, program: Program, series: Series, projection: Program | None = None):
+    def __init__(self, program: Program, series: Series, projection=None):
         n, states = series.size, 2 * series.size
         dtypes = [shape.dtype for shape in program.shapes for _ in range(shape.size)]
         self.moved = [i for i, dtype in enumerate(dtypes) if dtype.kind == "f" and i != states]  # all but the time
@@ -58,11 +58,11 @@ class Adjoint(SeriesCode):
         by, inputs = [*range(states), *range(given, given + values + products)], given + values + products
         rows = range(n, n + series.rows)  # whose coefficients are kept
         self.sweep_line = pullback(series.sweep, [dtypes[0]] * inputs, by, range(n + series.rows), rows)
-        self.projection = projection
         self.start_next = self._start_next()
         steps = [self._seed(), self._back_orders(self._back_sums(), self._back_sweep()), self._back_start()]
         if projection is not None:
-            line = StraightLine(projection.nodes, projection.kinds, projection.outputs[:states])
+            line = projection.state
+            line = StraightLine(line.nodes, line.kinds, line.outputs)
             self.projection_line = pullback(line, dtypes, self.moved, range(states))
             steps.insert(0, self._back_projection())
         self._run(steps)

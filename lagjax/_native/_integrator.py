@@ -361,7 +361,7 @@ class Integrator(SeriesCode):
             ]
             if self.land is not None:
                 landed, off = self._landed(code, memory, values, increments, s)
-                values = [code.select(off <= 1.0, on, value) for on, value in zip(landed, values, strict=False)]
+                values = [code.select(off <= 1.0, on, value) for on, value in zip(landed, values, strict=True)]
             for i, value in enumerate(values):
                 self._keep(code, memory, "between", value, i)
             self._keep(code, memory, "is_due", code.select(there, code.lanes_of(1.0), 0.0))
@@ -636,6 +636,15 @@ class Integrator(SeriesCode):
 
     # ---- constraints ----
 
+    def _of_state(self, code, memory, program: Program, values, s) -> list[Value]:
+        """A program at such a state, at t + s."""
+        now = self.now(code, memory)
+
+        def then(i):
+            return values[i] if i < self.states else now(i) + s if i == self.states else now(i)
+
+        return emit(code, StraightLine(program.nodes, program.kinds, program.outputs), then, self.sincos)
+
     def _landed(self, code, memory, values, increments, s) -> tuple[list[Value], Value]:
         """What the projection gives for a state of the series, at t + s; and how far that is, in `LANDING` tolerances.
 
@@ -643,13 +652,7 @@ class Integrator(SeriesCode):
         finds, that is not the state of this motion: near a configuration where constraints become dependent there are
         several branches close together, and rounding of q decides on q̇.
         """
-        now = self.now(code, memory)
-
-        def then(i):
-            return values[i] if i < self.states else now(i) + s if i == self.states else now(i)
-
-        line = StraightLine(self.projection.nodes, self.projection.kinds, self.projection.outputs)
-        landed, off = emit(code, line, then, self.sincos), code.lanes_of(0.0)
+        landed, off = self._of_state(code, memory, self.projection.state, values, s), code.lanes_of(0.0)
         first = code.compare("==", self._vector(code, memory, "steps"), 0.0)
         for i in (*range(self.own), *range(self.n, self.n + self.own)):
             far = code.intrinsic("fabs", landed[i] - values[i])
@@ -666,10 +669,12 @@ class Integrator(SeriesCode):
         (memory,) = code.arguments
         sums = [self._sum(code, memory, i)[0] for i in range(self.states)]
         increments = [self._vector(code, memory, "increment", i) for i in range(self.states)]
-        landed, off = self._landed(code, memory, sums, increments, self._vector(code, memory, "h"))
+        h = self._vector(code, memory, "h")
+        landed, off = self._landed(code, memory, sums, increments, h)
         for i, value in enumerate(landed):
-            name, i = ("landed", i) if i < self.states else ("speeds", i - self.states)
-            self._keep(code, memory, name, value, i)
+            self._keep(code, memory, "landed", value, i)
+        for i, value in enumerate(self._of_state(code, memory, self.projection.speeds, landed, h)):
+            self._keep(code, memory, "speeds", value, i)
         worst = self._vector(code, memory, "worst")
         self._keep(code, memory, "worst", code.select(off <= worst, worst, off))
         return code.finish()
