@@ -8,12 +8,13 @@ positive definite: every member must arrive, must keep its energy within what it
 bit, what `simulate` makes of it alone. Anything else is a failure, and is listed with the seed of its scene.
 
 After a warm-up, in which caches fill, the resident memory must stay flat within 5 %. JAX keeps all that XLA compiles,
-for the energy of each scene here, until `jax.clear_caches()`, which is called now and then: what is watched is the
-memory of lagjax. The record goes to
+for the energy of each scene here, until `jax.clear_caches()`, which is called now and then, and the C library keeps
+what was freed, until it is told to give it back: what is watched is the memory of lagjax. The record goes to
 `benchmarks/results/soak.json`, with commit, versions and machine.
 """
 
 import argparse
+import ctypes
 import gc
 import os
 import sys
@@ -63,6 +64,7 @@ def soak(seconds: float, seed: int, say: Callable[[str], None] = lambda line: No
         if scene % FORGET == 0:
             jax.clear_caches()
             gc.collect()
+            _give_back_what_is_free()
         memory.append((time.monotonic() - began, resident()))
         if scene % 20 == 0:
             say(f"{memory[-1][0]:.0f} s: scene {scene}, {memory[-1][1]:.0f} MiB, {len(failures)} failures")
@@ -97,6 +99,12 @@ def resident() -> float:
         size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return size / 2**20 if sys.platform == "darwin" else size / 2**10
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def _give_back_what_is_free() -> None:
+    """Pages that the C library holds in its free lists are no leak, but would be counted as one."""
+    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:  # glibc only
+        trim(0)
 
 
 # ---- one scene -------------------------------------------------------------------------------------------------------
