@@ -103,7 +103,7 @@ def resident() -> float:
 
 def _give_back_what_is_free() -> None:
     """Pages that the C library holds in its free lists are no leak, but would be counted as one."""
-    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:  # glibc only
+    if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):  # glibc only
         trim(0)
 
 

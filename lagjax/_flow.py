@@ -136,12 +136,12 @@ class Flow:
         """Numbers in a state: q, then q̇."""
         return 2 * self.size
 
-    def run(self, ts, y0, params, tolerances: Tolerances) -> tuple[Outcome, int]:
+    def run(self, ts, y0, params, tolerances: Tolerances, keep: bool = False) -> tuple[Outcome, int]:
         """For arrays of numbers: `ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P).
 
-        The second result counts the steps for which lanes stood empty.
+        The second result counts the steps for which lanes stood empty. With `keep`, `pull` may come next.
         """
-        *outcome, idle = self.kernel(ts, y0, params, *tolerances[:3])
+        *outcome, idle = self.kernel(ts, y0, params, *tolerances[:3], keep)
         outcome = Outcome(*outcome)
         again, flow, tolerances = self._second_chance(outcome.code, tolerances)
         if not again.any():
@@ -188,13 +188,13 @@ class Flow:
         except Unlowerable:
             return self.program
 
-    def _traceable(self, tolerances: Tolerances) -> Callable:
+    def _traceable(self, tolerances: Tolerances, keep: bool = False) -> Callable:
         """`(ts, y0, *params)` → `Outcome` of one member, under every transformation of JAX."""
 
         if self.guards is not None:
             run = self.undifferentiated(tolerances)
             return lambda *arrays: run(*map(jax.lax.stop_gradient, arrays))
-        run = jax.custom_jvp(self.undifferentiated(tolerances))
+        run = jax.custom_jvp(self.undifferentiated(tolerances, keep))
 
         @functools.partial(run.defjvp, symbolic_zeros=True)
         def rule(primals, tangents):
@@ -202,13 +202,13 @@ class Flow:
 
         return jax.jit(run)  # a derivative outside of `jit` compiles as one, not operation by operation
 
-    def undifferentiated(self, tolerances: Tolerances) -> Callable:
+    def undifferentiated(self, tolerances: Tolerances, keep: bool = False) -> Callable:
         """The same without derivatives."""
 
         # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
         # the callbacks themselves may occupy.
         def on_host(_, places, *arrays):
-            outcome = _over_batch(lambda *rows: self.run(*rows, tolerances)[0], *map(np.asarray, arrays))
+            outcome = _over_batch(lambda *rows: self.run(*rows, tolerances, keep)[0], *map(np.asarray, arrays))
             for place, values in zip(places, outcome, strict=True):
                 np.asarray(place)[...] = values
 
@@ -356,7 +356,7 @@ def _push(flow: Flow, tolerances: Tolerances, primals, tangents) -> tuple[Outcom
     by_time, moved = not isinstance(dts, SymbolicZero), not isinstance(dy0, SymbolicZero)
     by_state = moved or by_time  # to start later from the same state is to start from another state
     active = tuple(i for i, dx in enumerate(dparams) if not isinstance(dx, SymbolicZero))
-    outcome, n = flow.traceable(tolerances)(*primals), flow.size
+    outcome, n = flow.traceable(tolerances, keep=True)(*primals), flow.size
 
     def slope(t, y):
         rate = jnp.concatenate([y[n:], jnp.stack(flow.everywhere(*y, t, *params)[:-1])])

@@ -79,6 +79,31 @@ def test_portions_do_not_change_a_cotangent(double, monkeypatch):
         np.testing.assert_array_equal(part, all_)
 
 
+def test_kept_steps_do_not_change_a_cotangent(double, monkeypatch):
+    y0, numbers, rng = batch(23)
+    ts, path_bar, y_bar = np.array([[0.0, 0.7, 1.5]]), rng.normal(size=(23, 3, 4)), rng.normal(size=(23, 4))
+
+    def pull(numbers):
+        return double.pull(ts, y0, numbers, outcome.accepted, path_bar, y_bar, TOLERANCES)
+
+    outcome, _ = double.run(ts, y0, numbers, TOLERANCES)
+    plain, other = pull(numbers), pull(1.01 * numbers)
+    followed = []
+    integrate = type(double.kernel)._integrate
+    monkeypatch.setattr(
+        type(double.kernel), "_integrate", lambda self, *given: followed.append(self) or integrate(self, *given)
+    )
+    for asked, expected, runs in ((numbers, plain, 1), (1.01 * numbers, other, 2)):  # those of this run, or of another
+        followed.clear()
+        double.run(ts, y0, numbers, TOLERANCES, keep=True)
+        for kept, again in zip(pull(asked), expected, strict=True):
+            np.testing.assert_array_equal(kept, again)
+        assert len(followed) == runs and not lagjax._native._last_run
+    monkeypatch.setattr(lagjax._native, "LARGEST_KEPT", 23 * 6 * 3)  # room for three steps of each
+    double.run(ts, y0, numbers, TOLERANCES, keep=True)
+    np.testing.assert_array_equal(pull(numbers).y0, plain.y0)
+
+
 def loss(system, ts, rtol=1e-11):
     def of(q0, qdot0, params):
         trajectory = lagjax.simulate(system, q0, qdot0, ts, params, rtol=rtol, atol=rtol, throw=False)

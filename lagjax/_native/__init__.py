@@ -27,7 +27,8 @@ __all__ = [
     "Kernel", "Projection", "cores", "recurrences",
 ]  # fmt: skip
 
-LARGEST_RECORD = 2**23  # numbers of the steps that are kept at once: 64 MiB
+LARGEST_RECORD = 2**23  # numbers of the steps that are written down at once: 64 MiB
+LARGEST_KEPT = 2**26  # and of those that are kept for a derivative that is asked for next: room for half a GiB
 
 
 class Outcome(NamedTuple):
@@ -98,9 +99,21 @@ class Kernel:
         self._engine, at = compiled(integrator.module, ("run",))
         self._run = _function(at["run"], *[ctypes.c_void_p] * 4)
 
-    def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int) -> Outcome:
-        """`y0` (N, 2n); `ts` (N, T) and `params` (N, P), or one row for all; all float64."""
-        return self._integrate(*_contiguous(ts, y0, params), rtol, atol, max_steps)
+    def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int, keep: bool = False) -> Outcome:
+        """`y0` (N, 2n); `ts` (N, T) and `params` (N, P), or one row for all; all float64.
+
+        The steps of a run with `keep` stay in memory until the next run, for `pull` to find them there.
+        """
+        given = (*_contiguous(ts, y0, params), rtol, atol, max_steps)
+        room = min(max_steps, LARGEST_KEPT // ((self.states + 2) * max(1, len(y0)))) if keep else 0
+        _last_run.clear()
+        if room == 0:
+            return self._integrate(*given)
+        first_step = np.arange(len(y0) + 1) * room
+        record = np.empty((first_step[-1], self.states + 2))  # memory that nobody writes to costs nothing
+        outcome = self._integrate(*given, record, first_step)
+        _last_run.append(_Steps(self, given, record, first_step, outcome.code, room))
+        return outcome
 
     def _integrate(self, ts, y0, params, rtol, atol, max_steps, record=None, first_step=None) -> Outcome:
         members, times = len(y0), ts.shape[1]
@@ -131,10 +144,17 @@ class Kernel:
         """The transposed derivative of a run that took so many `steps`, integers (N,).
 
         From the cotangents of the outputs, `path_bar` (N, T, 2n), and of the states at the end, `y_bar` (N, 2n), to
-        those of the initial states and of the parameters. The motion is followed once more to find its steps.
+        those of the initial states and of the parameters. The motion is followed once more to find its steps, unless
+        the last run has kept them.
         """
         ts, y0, params = _contiguous(ts, y0, params)
         steps = np.ascontiguousarray(steps, np.int64)
+        last = _last_run.pop() if _last_run else None
+        if last is not None and last.belong_to(self, (ts, y0, params, rtol, atol, max_steps), steps):
+            y_bar, params_bar = np.array(y_bar, np.float64), np.zeros((len(y0), self.numbers))
+            path_bar = np.ascontiguousarray(path_bar)
+            self._back(ts, params, steps, path_bar, y_bar, params_bar, order_for(rtol), last.record, last.first_step)
+            return Cotangents(y_bar + path_bar[:, 0], params_bar, last.code.astype(int))
         shared = len(ts) == 1, len(params) == 1
         y_bar, params_bar = np.array(y_bar, np.float64), np.zeros((len(y0), self.numbers))
         code = np.empty(len(y0), int)
@@ -150,10 +170,15 @@ class Kernel:
         first_step = np.concatenate([[0], np.cumsum(steps)])
         record = np.empty((first_step[-1], self.states + 2))
         code = self._integrate(ts, y0, params, rtol, atol, max_steps, record, first_step).code
+        self._back(ts, params, steps, path_bar, y_bar, params_bar, order_for(rtol), record, first_step)
+        return code
+
+    def _back(self, ts, params, steps, path_bar, y_bar, params_bar, order, record, first_step) -> None:
+        """Over the recorded steps, from the last to the first."""
         counter, (members, times) = np.zeros(1, np.int64), path_bar.shape[:2]
         job = _adjoint.Job(
             *_addresses(counter, ts, params, record, first_step, steps, path_bar, y_bar, params_bar),
-            times if len(ts) > 1 else 0, self.numbers if len(params) > 1 else 0, members, times, order_for(rtol),
+            times if len(ts) > 1 else 0, self.numbers if len(params) > 1 else 0, members, times, order,
         )  # fmt: skip
         _, run, size = self._adjoint
 
@@ -162,7 +187,6 @@ class Kernel:
             run(ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data)
 
         self._on_all_cores(pull, members)
-        return code
 
     @functools.cached_property
     def _adjoint(self):
@@ -174,6 +198,25 @@ class Kernel:
     def _on_all_cores(self, work, members: int) -> list:
         threads = min(cores(), max(1, members // (4 * self.width)))
         return list(_pool().map(work, range(threads))) if threads > 1 else [work(0)]
+
+
+class _Steps(NamedTuple):
+    """The steps of a run: from where on those of each member stand in the record, with room for so many."""
+
+    kernel: Kernel
+    given: tuple
+    record: np.ndarray
+    first_step: np.ndarray
+    code: np.ndarray
+    room: int
+
+    def belong_to(self, kernel: Kernel, given: tuple, steps: np.ndarray) -> bool:
+        """Whether this is that run, and complete: the same numbers went in, whoever asks."""
+        same = self.kernel is kernel and all(map(np.array_equal, self.given, given))
+        return same and bool((steps <= self.room).all())
+
+
+_last_run: list[_Steps] = []  # of all kernels: one at most
 
 
 def _function(address: int, *types):
