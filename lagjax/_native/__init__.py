@@ -149,24 +149,26 @@ class Kernel:
         """
         ts, y0, params = _contiguous(ts, y0, params)
         steps = np.ascontiguousarray(steps, np.int64)
-        last = _last_run.pop() if _last_run else None
-        if last is not None and last.belong_to(self, (ts, y0, params, rtol, atol, max_steps), steps):
-            y_bar, params_bar = np.array(y_bar, np.float64), np.zeros((len(y0), self.numbers))
-            path_bar = np.ascontiguousarray(path_bar)
-            self._back(ts, params, steps, path_bar, y_bar, params_bar, order_for(rtol), last.record, last.first_step)
-            return Cotangents(y_bar + path_bar[:, 0], params_bar, last.code.astype(int))
-        shared = len(ts) == 1, len(params) == 1
         y_bar, params_bar = np.array(y_bar, np.float64), np.zeros((len(y0), self.numbers))
-        code = np.empty(len(y0), int)
-        for some in _portions(steps * (self.states + 2)):
-            rows = [x if one else x[some] for x, one in zip((ts, params), shared, strict=True)]
-            given = rows[0], y0[some], rows[1], steps[some], *_contiguous(path_bar[some])
-            code[some] = self._pull(*given, y_bar[some], params_bar[some], rtol, atol, max_steps)
+        limits, last = (rtol, atol, max_steps), _taken()
+        if last is not None and last.belong_to(self, (ts, y0, params, *limits), steps):
+            given = ts, params, steps, *_contiguous(path_bar), y_bar, params_bar
+            self._back(*given, order_for(rtol), last.record, last.first_step)
+            code = last.code
+        else:
+            code = np.empty(len(y0), int)
+            shared = len(ts) == 1, len(params) == 1
+            for some in _portions(steps * (self.states + 2)):
+                rows = [x if one else x[some] for x, one in zip((ts, params), shared, strict=True)]
+                given = rows[0], y0[some], rows[1], steps[some], *_contiguous(path_bar[some])
+                code[some] = self._follow_and_go_back(*given, y_bar[some], params_bar[some], *limits)
         y_bar += path_bar[:, 0]  # the first output is the initial state
         return Cotangents(y_bar, params_bar, code)
 
-    def _pull(self, ts, y0, params, steps, path_bar, y_bar, params_bar, rtol, atol, max_steps) -> np.ndarray:
-        """Of one portion; the last two arrays are changed in place."""
+    def _follow_and_go_back(
+        self, ts, y0, params, steps, path_bar, y_bar, params_bar, rtol, atol, max_steps
+    ) -> np.ndarray:
+        """The same for one portion; `y_bar` and `params_bar` are changed in place."""
         first_step = np.concatenate([[0], np.cumsum(steps)])
         record = np.empty((first_step[-1], self.states + 2))
         code = self._integrate(ts, y0, params, rtol, atol, max_steps, record, first_step).code
@@ -217,6 +219,13 @@ class _Steps(NamedTuple):
 
 
 _last_run: list[_Steps] = []  # of all kernels: one at most
+
+
+def _taken() -> _Steps | None:
+    try:
+        return _last_run.pop()
+    except IndexError:  # there was none, or another thread was faster
+        return None
 
 
 def _function(address: int, *types):
