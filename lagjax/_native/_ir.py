@@ -57,12 +57,9 @@ def lanes() -> int:
     return 8 if llvm.get_host_cpu_features().get("avx512f", False) else 4
 
 
-# Loops over lanes and orders are written out by hand, so that little is left to do. Not LLVM's default pipeline for a
-# level, which in llvmlite loses some memory for every module.
-_PASSES = (
-    "sroa", "instruction_combine", "simplify_cfg", "new_gvn", "dead_code_elimination", "simplify_cfg",
-    "instruction_combine",
-)  # fmt: skip
+# Loops over lanes and orders are written out by hand, so that little is left to do. Neither LLVM's default pipeline nor
+# `instruction_combine`, which gains nothing here: in llvmlite both lose some memory for every module.
+_PASSES = ("sroa", "simplify_cfg", "new_gvn", "dead_code_elimination", "simplify_cfg")
 
 
 def compiled(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
