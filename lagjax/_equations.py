@@ -21,7 +21,7 @@ from lagjax import _linear
 from lagjax._layout import Layout
 from lagjax._motion import Motion
 from lagjax._native import Projection
-from lagjax._program import Program, Unlowerable, lower
+from lagjax._program import Program, Unlowerable, lower, lower_solution
 
 PyTree = Any
 State = tuple[jax.Array, jax.Array]
@@ -194,7 +194,13 @@ def multiplier_program(motion: Motion, layout: Layout, params: PyTree) -> Progra
     def saddle(*state):
         return *motion.mass_matrix_and_force(*state), *motion.rows_and_targets(*state)
 
-    return _eliminated(saddle, motion, layout, params, wanted="multipliers")
+    system, solve = _system(saddle, motion, layout, params)
+
+    def multipliers(*scalars):
+        _, right, factors, _ = system(*scalars)
+        return [-pull for pull in solve(factors, right)[layout.size :]]
+
+    return lower(multipliers, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
 
 
 def _require_small(layout: Layout) -> None:
@@ -202,11 +208,20 @@ def _require_small(layout: Layout) -> None:
         raise Unlowerable(f"it has {layout.size} coordinates, more than {LARGEST_SCALAR_SCENE}")
 
 
-def _eliminated(parts_of: Callable, motion: Motion, layout, params, wanted: str = "x", wary: bool = False):
-    """x (or λ) with M x = b, or with M x − Gᵀλ = b and G x = c, from a function that returns (M, b) or (M, b, G, c).
+def _eliminated(parts_of: Callable, motion: Motion, layout: Layout, params, wary: bool = False) -> Program | None:
+    """x as a program, and whether there is none, from the parts of a linear system: see `_system`."""
+    found = _system(parts_of, motion, layout, params, wary)
+    if found is None:
+        return None
+    return lower_solution(*found, layout.size, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
 
-    With constraints M is helped by GᵀG unless it is constant and regular. A `wary` program does not help it, and says
-    where it should; None where that is everywhere, or nowhere.
+
+def _system(parts_of: Callable, motion: Motion, layout: Layout, params, wary: bool = False):
+    """A z = r with z = (x, −λ) for M x = b, or M x − Gᵀλ = b and G x = c; `parts_of` gives (M, b) or (M, b, G, c).
+
+    Two functions: the entries of A, r, factors of A and whether it is singular, from the scalars; and z, from the
+    factors and r. With constraints M is helped by GᵀG unless it is constant and regular. A `wary` elimination does not
+    help it, and says where it should; None where that is everywhere, or nowhere.
     """
     n = layout.size
     q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
@@ -219,22 +234,20 @@ def _eliminated(parts_of: Callable, motion: Motion, layout, params, wanted: str 
     zeros = np.array([parts.constant(i) == 0 for i in range(len(parts.outputs))])
     mass_zeros, row_zeros = zeros[: n * n].reshape(n, n), zeros[n * n + n : n * n + n + m * n].reshape(m, n)
     helped = not (wary or (constant and regular))
+    if motion.constrained:
+        elimination = _linear.SaddleElimination((mass_zeros, row_zeros), layout.dtype, helped, wary)
+    else:
+        elimination = _linear.Elimination(mass_zeros, layout.dtype)
 
-    def solved(*scalars):
+    def system(*scalars):
         values = list(parts(*scalars))
-        matrix = [values[n * i : n * i + n] for i in range(n)]
-        b, values = values[n * n : n * n + n], values[n * n + n :]
-        if not motion.constrained:
-            x, singular = _linear.eliminate(matrix, b, mass_zeros, layout.dtype)
-        else:
-            rows, c = [values[n * i : n * i + n] for i in range(m)], values[m * n :]
-            zeros = (mass_zeros, row_zeros)
-            x, multipliers, singular = _linear.eliminate_saddle(matrix, b, rows, c, zeros, layout.dtype, helped, wary)
-            if wanted == "multipliers":
-                return tuple(multipliers)
-        return *x, singular
+        table = [values[n * i : n * i + n] for i in range(n + 1 + m)]  # the rows of M, b, the rows of G
+        matrix, b, rows, c = table[:n], table[n], table[n + 1 :], values[n * len(table) :]
+        factors, singular = elimination.factors(matrix, rows)
+        entries = {(i, j): x for i, row in enumerate(matrix + rows) for j, x in enumerate(row[: i + 1])}
+        return entries, b + c, factors, singular
 
-    return lower(solved, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
+    return system, elimination.solve
 
 
 def _scalar_shapes(layout: Layout, params: PyTree) -> list[jax.ShapeDtypeStruct]:

@@ -5,10 +5,11 @@ precision gives NaN, never a number: no pseudo-inverse, no regularisation. The c
 
 `factorize` is for arrays: M is scaled to a unit diagonal (Jacobi scaling: within a factor n of the best diagonal
 scaling for positive definite M, van der Sluis 1969), so that masses of very different size cost no accuracy, and then
-factorised by LU with pivoting. `eliminate` is for scalar programs: the same solution, written out entry by entry.
+factorised by LU with pivoting. `Elimination` is for scalar programs: the same solution, written out entry by entry.
 """
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -61,36 +62,48 @@ def null_directions(matrix: np.ndarray) -> np.ndarray:
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def eliminate(matrix: list[list], b: list, zeros: np.ndarray, dtype) -> tuple[list, jax.Array]:
-    """x with M x = b, and whether M is singular, as straight-line arithmetic on scalars.
+class Elimination:
+    """M x = b as straight-line arithmetic on scalars, for one pattern of zeros.
 
     `zeros` marks the entries of M that are zero whatever the state; whatever they would contribute is left out. Two
     coordinates are solved by Cramer's rule, which needs no pivoting. More are solved by M = L D Lᵀ without pivoting,
     which is stable for positive definite M, and no diagonal scaling would change it. A pivot that cancels to round-off
     is singularity; it is replaced by NaN.
     """
-    small = singular_threshold(len(b), dtype)
-    return _cramer(matrix, b, zeros, small) if len(b) == 2 else _ldl(matrix, b, zeros, small)
+
+    def __init__(self, zeros: np.ndarray, dtype):
+        self.zeros, self.small = zeros, singular_threshold(len(zeros), dtype)
+
+    def factors(self, matrix: list[list], rows: list[list] = ()) -> tuple[Any, jax.Array]:
+        """What `solve` needs of M, a tree of scalars, and whether M is singular. There are no rows of constraints."""
+        if len(matrix) == 2:
+            return _cramer_factors(matrix, self.zeros, self.small)
+        return _ldl_factors(matrix, ~self.zeros, self.small)
+
+    def solve(self, factors, b: list) -> list:
+        """x, linear in b."""
+        return _cramer_solve(factors, b) if len(b) == 2 else _ldl_solve(factors, b)
 
 
-def _cramer(matrix, b, zeros, small):
+def _cramer_factors(matrix, zeros, small):
     (a, c), (_, d) = matrix
     if zeros[0, 1]:
-        return [b[0] / a, b[1] / d], (a == 0) | (d == 0)
+        return (a, d), (a == 0) | (d == 0)
     product, square = a * d, c * c
     determinant = product - square
     singular = jnp.abs(determinant) <= small * jnp.maximum(jnp.abs(product), square)
-    inverse = 1 / jnp.where(singular, jnp.nan, determinant)
-    return [(d * b[0] - c * b[1]) * inverse, (a * b[1] - c * b[0]) * inverse], singular
+    return (a, c, d, 1 / jnp.where(singular, jnp.nan, determinant)), singular
 
 
-def _ldl(matrix, b, zeros, small):
-    factors, singular = _ldl_factors(matrix, ~zeros, small)
-    return _ldl_solve(factors, b), singular
+def _cramer_solve(factors, b):
+    if len(factors) == 2:
+        return [b[0] / factors[0], b[1] / factors[1]]
+    a, c, d, inverse = factors
+    return [(d * b[0] - c * b[1]) * inverse, (a * b[1] - c * b[0]) * inverse]
 
 
 def _ldl_factors(matrix, filled, small, drop: bool = False):
-    """L, D⁻¹ and where L has entries, and whether a pivot was lost to round-off.
+    """L, where it has entries, and D⁻¹, and whether a pivot was lost to round-off.
 
     A lost pivot becomes NaN; with `drop` its row is left out instead, which for a consistent system changes nothing.
     """
@@ -117,20 +130,20 @@ def _ldl_factors(matrix, filled, small, drop: bool = False):
                     entry = entry - lower[i, k] * scaled[j, k]
                 scaled[i, j] = entry
                 lower[i, j] = entry * inverse[j]
-    return (lower, inverse, filled), singular
+    return (lower, inverse), singular
 
 
 def _ldl_solve(factors, b) -> list:
-    lower, inverse, filled = factors
+    lower, inverse = factors
     x, n = list(b), len(b)
     for i in range(n):
         for k in range(i):
-            if filled[i, k]:
+            if (i, k) in lower:
                 x[i] = x[i] - lower[i, k] * x[k]
     x = [x[i] * inverse[i] for i in range(n)]
     for i in reversed(range(n)):
         for k in range(i + 1, n):
-            if filled[k, i]:
+            if (k, i) in lower:
                 x[i] = x[i] - lower[k, i] * x[k]
     return x
 
@@ -224,41 +237,58 @@ def _inverse_on_range_jvp(primals, tangents):
     return inverse, turned + turned.T - inverse @ moving @ inverse
 
 
-def eliminate_saddle(matrix, b, rows, c, zeros, dtype, helped: bool, wary: bool) -> tuple[list, list, jax.Array]:
-    """The same as `saddle` on scalars, without pivoting: M positive (semi)definite, `rows` a list of lists.
+class SaddleElimination:
+    """The same as `saddle` on scalars, without pivoting: M positive (semi)definite, G a list of rows.
 
     `zeros` marks what is zero in (M, G) whatever the state. With `helped` M may be singular; without, it must be
     regular. Redundant rows are left out of λ: the motion is the same, the multipliers are a solution but not the
     shortest. A `wary` elimination calls a saddle point singular as soon as it loses digits: where M, or what the
     constraints make of it, is not far from singular (`WARY`).
     """
-    mass_zeros, row_zeros = zeros
-    n, m, singular = len(matrix), len(rows), jnp.zeros((), bool)
-    if helped:
-        matrix, b, mass_zeros = _helped(matrix, b, rows, c, zeros)
-    if wary:
-        least, most = (functools.reduce(of, (matrix[i][i] for i in range(n))) for of in (jnp.minimum, jnp.maximum))
-        singular = least <= WARY * most  # the constraints would have to hold a light coordinate against large forces
-    factors, lost = _ldl_factors(matrix, ~mass_zeros, WARY if wary else singular_threshold(n, dtype))
-    free = _ldl_solve(factors, b)
-    responses = [_ldl_solve(factors, row) for row in rows]
-    schur = [[_dot((rows[i][k], responses[j][k]) for k in range(n) if not row_zeros[i, k]) for j in range(m)]
-             for i in range(m)]  # fmt: skip
-    missing = [c[i] - _dot((rows[i][k], free[k]) for k in range(n) if not row_zeros[i, k]) for i in range(m)]
-    small = WARY if wary else rank_tolerance(dtype)
-    kept, redundant = _ldl_factors(schur, np.ones((m, m), bool), small, drop=not wary)
-    multipliers = _ldl_solve(kept, missing)
-    x = [free[k] + _dot((responses[i][k], multipliers[i]) for i in range(m)) for k in range(n)]
-    return x, multipliers, singular | lost | redundant if wary else lost
+
+    def __init__(self, zeros: tuple[np.ndarray, np.ndarray], dtype, helped: bool, wary: bool):
+        self.mass_zeros, self.row_zeros = zeros
+        self.dtype, self.helped, self.wary = dtype, helped, wary
+
+    def factors(self, matrix: list[list], rows: list[list]) -> tuple[Any, jax.Array]:
+        """What `solve` needs of M and G, a tree of scalars, and whether the saddle point is singular."""
+        n, m, wary = len(matrix), len(rows), self.wary
+        zeros, pulled, singular = self.mass_zeros, None, jnp.zeros((), bool)
+        if self.helped:
+            matrix, pulled, zeros = _helped(matrix, rows, zeros, self.row_zeros)
+        if wary:
+            least, most = (functools.reduce(of, (matrix[i][i] for i in range(n))) for of in (jnp.minimum, jnp.maximum))
+            singular = (
+                least <= WARY * most
+            )  # the constraints would have to hold a light coordinate against large forces
+        free, lost = _ldl_factors(matrix, ~zeros, WARY if wary else singular_threshold(n, self.dtype))
+        responses = [_ldl_solve(free, row) for row in rows]
+        schur = [[self._along(i, rows, responses[j]) for j in range(m)] for i in range(m)]
+        small = WARY if wary else rank_tolerance(self.dtype)
+        held, redundant = _ldl_factors(schur, np.ones((m, m), bool), small, drop=not wary)
+        return (rows, pulled, free, responses, held), singular | lost | redundant if wary else lost
+
+    def solve(self, factors, right: list) -> list:
+        """x and then −λ, linear in b and then c."""
+        rows, pulled, free, responses, held = factors
+        m, n = self.row_zeros.shape
+        b, c = right[:n], right[n:]
+        if pulled is not None:
+            b = [b[i] + _dot((pulled[k][i], c[k]) for k in range(m) if not self.row_zeros[k, i]) for i in range(n)]
+        x = _ldl_solve(free, b)
+        pulls = _ldl_solve(held, [self._along(i, rows, x) - c[i] for i in range(m)])
+        return [x[k] - _dot((responses[i][k], pulls[i]) for i in range(m)) for k in range(n)] + pulls
+
+    def _along(self, i: int, rows, x):
+        return _dot((rows[i][k], x[k]) for k in range(len(x)) if not self.row_zeros[i, k])
 
 
 WARY = 1e-4  # the part of a pivot that has to be left: four digits of an acceleration may be lost, and no more
 
 
-def _helped(matrix, b, rows, c, zeros):
-    """M + GᵀW G, b + GᵀW c, and where the first is zero whatever the state."""
+def _helped(matrix, rows, mass_zeros, row_zeros):
+    """M + GᵀW G, W G, and where the first is zero whatever the state."""
     n, m = len(matrix), len(rows)
-    mass_zeros, row_zeros = zeros
     touched = ~row_zeros
     total = _dot((matrix[i][i], 1.0) for i in range(n))
     sizes = [_dot((rows[k][i], rows[k][i]) for i in range(n) if touched[k, i]) for k in range(m)]
@@ -269,8 +299,7 @@ def _helped(matrix, b, rows, c, zeros):
         [matrix[i][j] + _dot((pulled[k][i], rows[k][j]) for k in range(m) if touched[k, i] and touched[k, j])
          for j in range(n)] for i in range(n)
     ]  # fmt: skip
-    b = [b[i] + _dot((pulled[k][i], c[k]) for k in range(m) if touched[k, i]) for i in range(n)]
-    return matrix, b, mass_zeros & ~((touched.T.astype(int) @ touched.astype(int)) > 0)
+    return matrix, pulled, mass_zeros & ~((touched.T.astype(int) @ touched.astype(int)) > 0)
 
 
 def _dot(pairs):

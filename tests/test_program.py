@@ -247,6 +247,28 @@ def test_chain_of_8_is_lean():
     assert program.operations <= 770 < 2000 < program.traced_operations
 
 
+def test_squares_and_common_factors():
+    def operations(function):
+        assert_same(function, 0.3, 0.4, 0.5, 0.6)
+        return lower(function, *[0.1] * 4).operations
+
+    assert operations(lambda x, y, a, b: (x * (x * (x * y)), x * (x * a))) == 4  # x², x y, x² x y, x² a
+    assert operations(lambda x, y, a, b: a * x + b * x) == 2
+    assert operations(lambda x, y, a, b: a * x - x * b + y * x) == 3
+    assert operations(lambda x, y, a, b: (a * x + b * x, a * x, b * x)) == 3  # nothing is added
+    assert operations(lambda x, y, a, b: a * jnp.cos(x) ** 2 + b * jnp.cos(x) ** 2 + (a + b) * jnp.sin(x) ** 2) == 1
+    assert operations(lambda x, y, a, b: (a * x + b * x) / (y * x)) == 4  # not cancelled: x may be zero
+
+
+def test_masses_as_parameters_do_not_move_the_diagonal_of_a_chain():
+    def lagrangian(q, v, m):
+        vx, vy = jnp.cumsum(jnp.cos(q) * v), jnp.cumsum(jnp.sin(q) * v)
+        return 0.5 * jnp.sum(m * (vx**2 + vy**2)) + jnp.sum(m * jnp.cumsum(jnp.cos(q)))
+
+    mass = lower(jax.hessian(lagrangian, 1), *state(3), jnp.ones(3))
+    assert all(mass.depends(4 * i) <= {6, 7, 8} for i in range(3)) and mass.depends(1) >= {0, 1}
+
+
 def test_writing_it_differently_makes_the_same_program():
     masses = [lower(jax.hessian(L, 1), *state(4)).operations for L in (chain, chain_in_loop)]
     assert masses[0] == masses[1]

@@ -1,6 +1,8 @@
 """Taylor recurrences: every operation, moved in every way, against derivatives that know nothing of them."""
 
+import functools
 import itertools
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,10 @@ import numpy as np
 import pytest
 from jax import lax
 
-from lagjax._program import Program, StraightLine, Unlowerable, _series, emit, lower, pullback, series
+from lagjax import scenes
+from lagjax._equations import scalar_program
+from lagjax._layout import Layout
+from lagjax._program import Program, StraightLine, Unlowerable, _series, emit, lower, lower_solution, pullback, series
 from lagjax._program._graph import COMPARISONS, FOLD
 
 ORDER = 10
@@ -29,10 +34,15 @@ def recurrences(function, q, *rest):
 
 
 def coefficients(function, order, q, v, t, *params):
-    """The series of q, shape (n, order + 1), by one run of `start` and one of `sweep` for each order."""
-    n = len(q)
+    """The series of q, shape (n, order + 1)."""
     program, found = recurrences(function, q, v, t, *params)
     numbers = [*q, *v, t, *np.concatenate([np.ravel(p) for p in params] or [[]])]
+    return coefficients_of(program, found, order, numbers)
+
+
+def coefficients_of(program, found, order, numbers):
+    """The same by one run of `start` and one of `sweep` for each order; the numbers are q, q̇, t and the parameters."""
+    n, (q, v) = found.size, np.split(np.array(numbers[: 2 * found.size]), 2)
     out = Program.evaluate(found.start, *numbers)
     values = out[len(program.outputs) :]
     np.testing.assert_array_equal(out[:n], program.evaluate(*numbers)[:n])
@@ -283,6 +293,56 @@ def test_high_orders_of_a_closed_form():
     np.testing.assert_allclose(found, 0.5 ** np.arange(1, 32), rtol=1e-14)
     (found,) = coefficients(lambda q, v, t: -q, 20, [1.0], [0.0], 0.0)
     np.testing.assert_allclose(found[::2], [(-1) ** k / float(mpmath.factorial(2 * k)) for k in range(11)], rtol=1e-15)
+
+
+# ---- linear systems -------------------------------------------------------------------------------------------------
+
+SYSTEMS = {  # a scene, and the products that its series takes, with the recurrences of its elimination and without
+    "double_pendulum": (scenes.double_pendulum, 17, 13),  # Cramer's rule
+    "chain": (functools.partial(scenes.chain, 4), 71, 52),
+    "spherical_pendulum": (scenes.spherical_pendulum, 10, 10),  # a quotient
+    "cartesian_double_pendulum": (scenes.cartesian_double_pendulum, 26, 16),  # a saddle point
+    "rolling_cylinder": (scenes.rolling_cylinder, 13, 9),
+}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_solution_of_a_linear_system_without_its_elimination(name):
+    make, by_elimination, by_system = SYSTEMS[name]
+    scene = make()
+    layout = Layout.of(scene.q0, scene.qdot0)
+    program = scalar_program(scene.system.motion(layout, scene.params), layout, scene.params)
+    rng, n = np.random.default_rng(3), layout.size
+    states = np.concatenate([layout.flatten(scene.q0), layout.flatten(scene.qdot0)]) + rng.uniform(-0.1, 0.1, 2 * n)
+    numbers = [*states, 0.2, *np.concatenate([np.ravel(p) for p in jax.tree.leaves(scene.params)])]
+    given, without = program, replace(program, linear=None)
+    found, exact = (series(p, n, 2 * n + 1) for p in (given, without))
+    close(coefficients_of(given, found, 12, numbers), coefficients_of(without, exact, 12, numbers))
+    assert (len(exact.products), len(found.products)) == (by_elimination, by_system)
+
+
+def test_a_linear_system_of_any_entries():
+    # Entries that move, that stay and that are zero; a right-hand side with time; divisions in the solution.
+    def system(q, v, t, k):
+        a, b, c, d, e = 2 + jnp.sin(q[0]), k * v[1], 3.0 + k, q[2] * t, 4 + q[1] ** 2
+        entries = {(0, 0): a, (1, 0): b, (1, 1): c, (2, 1): d, (2, 2): e}
+        determinant = a * c * e - a * d * d - b * b * e
+        return entries, [-k * q[0], v[0] * v[1], jnp.sin(t)], ([a, b, c, d, e], determinant), a > 0
+
+    def solve(factors, r):  # Cramer's rule
+        (a, b, c, d, e), determinant = factors
+        return [
+            (r[0] * (c * e - d * d) - b * (r[1] * e - d * r[2])) / determinant,
+            (a * (r[1] * e - d * r[2]) - b * e * r[0]) / determinant,
+            (a * (c * r[2] - d * r[1]) - b * (b * r[2] - d * r[0])) / determinant,
+        ]
+
+    q, v, t, k = [0.3, -0.2, 0.5], [0.4, 0.1, -0.3], 0.2, 1.5
+    program = lower_solution(system, solve, 3, *map(jnp.asarray, (q, v, t, k)))
+    found, exact = (series(p, 3, 7) for p in (program, replace(program, linear=None)))
+    numbers = [*q, *v, t, k]
+    close(coefficients_of(program, found, 10, numbers), coefficients_of(program, exact, 10, numbers))
+    assert len(found.products) < len(exact.products)
 
 
 # ---- what is kept ---------------------------------------------------------------------------------------------------

@@ -27,7 +27,8 @@ function and lowered in turn, when they are first asked for.
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +37,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from lagjax._program._emit import emit, plain_elementary
 from lagjax._program._graph import FOLD, Node, Unlowerable
-from lagjax._program._passes import finish, with_given
+from lagjax._program._passes import finish, regroup, with_given
 from lagjax._program._rules import Expansion, kind_of
 from lagjax._program._series import Series, StraightLine, series
 
@@ -47,6 +48,7 @@ __all__ = [
     "Unlowerable",
     "emit",
     "lower",
+    "lower_solution",
     "plain_elementary",
     "pullback",
     "series",
@@ -78,8 +80,41 @@ def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], 
     with np.errstate(all="ignore"):
         results = expansion.run_closed(traced, arguments)
     outputs = [i for result in results for i in result.ravel().tolist()]
-    nodes, kinds, outputs = finish(expansion.graph, outputs)
+    nodes, kinds, outputs = finish(*regroup(expansion.graph, outputs))
     return Program(nodes, kinds, outputs, expansion.traced_operations, function, shapes, budget)
+
+
+def lower_solution(system: Callable, solve: Callable, size: int, *examples, budget: int = 20_000) -> "Program":
+    """The program of the first `size` components of z with A z = r, A symmetric, and of one more number.
+
+    `system(*examples)` gives the entries of A on and below its diagonal as {(row, column): scalar}, zeros left out or
+    not, r as a list, what `solve` needs of A, and that number; `solve(factors, r)` gives z, and is linear in r.
+    """
+    trees = []
+
+    def whole(*arguments):
+        entries, right, factors, number = system(*arguments)
+        z = solve(factors, right)
+        leaves, tree = jax.tree.flatten((z[:size], number, z[size:], entries, right, factors))
+        trees.append(tree)
+        return leaves
+
+    program = lower(whole, *examples, budget=budget)
+    z, _, others, entries, right, factors = jax.tree.unflatten(trees[0], program.outputs)
+    scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    shapes = jax.tree.map(lambda _: scalar, (factors, right))
+    return replace(
+        program,
+        outputs=program.outputs[: size + 1],
+        function=lambda *arguments: whole(*arguments)[: size + 1],
+        linear=LinearSystem(
+            z=(*z, *others),
+            entries=entries,
+            right=tuple(right),
+            factors=tuple(jax.tree.leaves(factors)),
+            solve=functools.cache(lambda: lower(solve, *shapes, budget=budget)),
+        ),
+    )
 
 
 def pullback(line: StraightLine, dtypes, by, of, known=()) -> StraightLine:
@@ -106,13 +141,28 @@ def pullback(line: StraightLine, dtypes, by, of, known=()) -> StraightLine:
     return StraightLine(*with_given(program.nodes, program.kinds, results, given))
 
 
+class LinearSystem(NamedTuple):
+    """A z = r, of which the outputs of a program are the solution: nodes of that program, made by `lower_solution`.
+
+    `entries` holds those of the symmetric A on and below its diagonal, by row and column. `solve()` is the program that
+    takes the factors and then r, and gives z.
+    """
+
+    z: tuple[int, ...]
+    entries: dict[tuple[int, int], int]
+    right: tuple[int, ...]
+    factors: tuple[int, ...]
+    solve: "Callable[[], Program]"
+
+
 @dataclass(frozen=True, eq=False)
 class Program:
     """A straight line of scalar operations; made by `lower`, compared and hashed by identity.
 
     `nodes` holds the operations in order, as triples `(op, operands, attribute)`, and `outputs` the positions in it
     of the results. `traced_operations` counts the scalar operations of the function as written. A program that does not
-    hold for all inputs says so in its last output, and `otherwise()` is the one for those.
+    hold for all inputs says so in its last output, and `otherwise()` is the one for those. Where the outputs are the
+    solution of a linear system, `linear` is that.
     """
 
     nodes: tuple[Node, ...]
@@ -123,6 +173,7 @@ class Program:
     shapes: tuple[jax.ShapeDtypeStruct, ...]
     budget: int
     otherwise: "Callable[[], Program] | None" = None
+    linear: LinearSystem | None = None
 
     @property
     def complete(self) -> "Program":

@@ -1,6 +1,8 @@
 """Last passes over a finished graph, when it is known how often every node is used."""
 
+import functools
 from collections import Counter
+from collections.abc import Callable
 
 from lagjax._program._graph import Graph, Node
 
@@ -10,21 +12,84 @@ def finish(graph: Graph, outputs: list[int]) -> tuple[tuple[Node, ...], tuple[st
     return _compact(*_turn_signs(graph, outputs))
 
 
+def regroup(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
+    """The same with squares formed first, and with the common factor of a sum drawn out of it.
+
+    Both only where the products that they replace have no other use, so that no operation is added: x(x y) becomes
+    x² y, and x y + x z becomes x (y + z). What has become equal by that is shared, sin² + cos² too.
+    """
+    uses = _uses(graph, outputs)
+
+    def node_of(new, i, moved):
+        op, operands, attribute = graph.nodes[i]
+        given, found = [moved[x] for x in operands], None
+        if graph.kinds[i] == "float" and op == "mul":
+            found = _square_first(new, [moved[x] for x in _factors(graph, uses, i)])
+        elif graph.kinds[i] == "float" and op in ("add", "sub") and 1 in (uses[x] for x in operands):
+            found = _common_factor(new, op, *given)
+        return new.apply(op, *given, attribute=attribute) if found is None else found
+
+    return _rebuilt(graph, outputs, uses, node_of)
+
+
+def _rebuilt(graph, outputs, used, node_of: Callable) -> tuple[Graph, list[int]]:
+    """A new graph, node by node; `node_of(new, i, moved)` makes node i, with `moved` to say where the old ones are."""
+    new, moved = Graph(2 * graph.budget), {}
+    for i in sorted(used):
+        op, _, attribute = graph.nodes[i]
+        if op in ("input", "constant"):
+            moved[i] = getattr(new, op)(attribute, graph.kinds[i])
+        else:
+            moved[i] = node_of(new, i, moved)
+    return new, [moved[i] for i in outputs]
+
+
+def _factors(graph, uses, i):
+    """What a product consists of, looking into products that have no other use."""
+    for x in graph.nodes[i][1]:
+        if graph.nodes[x][0] == "mul" and uses[x] == 1:
+            yield from _factors(graph, uses, x)
+        else:
+            yield x
+
+
+def _square_first(graph, factors) -> int | None:
+    """Their product, if one of them comes twice."""
+    counts = Counter(factors)
+    if len(factors) < 3 or max(counts.values()) < 2:
+        return None
+
+    def product(nodes):
+        return functools.reduce(lambda a, b: graph.apply("mul", a, b), nodes)
+
+    squares = [graph.apply("mul", x, x) for x, n in counts.items() for _ in range(n // 2)]
+    single = [x for x, n in counts.items() if n % 2]
+    return product([product(nodes) for nodes in (squares, single) if nodes])
+
+
+def _common_factor(graph, op, a, b) -> int | None:
+    """x (y ± z) for x y ± x z."""
+    (m, first), (n, second) = graph.term(a), graph.term(b)
+    if graph.nodes[first][0] != "mul" or graph.nodes[second][0] != "mul" or first == second:
+        return None
+    left, right = graph.nodes[first][1], graph.nodes[second][1]
+    common = next((x for x in left if x in right and graph.value(x) is None), None)
+    if common is None:
+        return None
+    y, z = (xs[1] if xs[0] == common else xs[0] for xs in (left, right))
+    return graph.apply("mul", common, graph.apply(op, graph.scale(m, y), graph.scale(n, z)))
+
+
 def _turn_signs(graph, outputs):
     """A sign that nothing absorbed moves into the difference or the constant below it, if nothing else uses that."""
-    uses, moved = _uses(graph, outputs), {}
-    new = Graph(2 * graph.budget)
-    for i in sorted(uses):
+    uses = _uses(graph, outputs)
+
+    def node_of(new, i, moved):
         op, operands, attribute = graph.nodes[i]
-        if op == "input":
-            moved[i] = new.input(attribute, graph.kinds[i])
-        elif op == "constant":
-            moved[i] = new.constant(attribute, graph.kinds[i])
-        else:
-            turned = _negative(new, moved[operands[0]]) if op == "neg" and uses[operands[0]] == 1 else None
-            given = (moved[operand] for operand in operands)
-            moved[i] = new.node(op, *given, attribute=attribute) if turned is None else turned
-    return new, [moved[i] for i in outputs]
+        turned = _negative(new, moved[operands[0]]) if op == "neg" and uses[operands[0]] == 1 else None
+        return new.node(op, *(moved[x] for x in operands), attribute=attribute) if turned is None else turned
+
+    return _rebuilt(graph, outputs, uses, node_of)
 
 
 def _negative(graph, i) -> int | None:

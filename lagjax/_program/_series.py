@@ -8,6 +8,7 @@ result follows from the coefficients of its operands by a recurrence, one for ea
     w = u / v    wₖ = (uₖ − w₀ vₖ − Σ' wⱼ vₖ₋ⱼ) / v₀
     w = √u       wₖ = (uₖ − Σ' wⱼ wₖ₋ⱼ) / 2 w₀
     w = f(u)     wₖ = uₖ g₀ + 1/k Σ' j uⱼ gₖ₋ⱼ       with g = f′(u), itself a program: cos u for sin u
+    A z = r      A₀ zₖ = rₖ − Aₖ z₀ − Σ' Aⱼ zₖ₋ⱼ     with the factors of A₀: no series of an elimination
 
 where Σ' runs over 0 < j < k. Two kinds of work come out of this. The sums Σ' need lower orders only, so all of them can
 be taken at once, product after product; nearly all the arithmetic is there, and it is the same for every scene. What is
@@ -92,6 +93,7 @@ class _Recurrences:
         self.coefficients: list[int | _Unknown | None] = []  # None: constant along the motion
         while len(self.coefficients) < len(self.start.nodes):  # the rules add derivatives at the end
             self.coefficients.append(self._coefficient(len(self.coefficients)))
+        self.solution = [] if program.linear is None else self._solution(program.linear)
 
     # ---- what the sweep reads ----
 
@@ -100,12 +102,12 @@ class _Recurrences:
         number = self.start.value(node)
         return self._input("value", node) if number is None else self.sweep.constant(number, "float")
 
-    def product(self, a: int, b: int, by_order: bool = False) -> int:
+    def product(self, a: int, b: "int | _Component", by_order: bool = False) -> int:
         """Σ' aⱼ bₖ₋ⱼ, or Σ' j aⱼ bₖ₋ⱼ."""
         first, second = self._row(a, by_order), self._row(b, False)
         return self._input("product", min(first, second), max(first, second))
 
-    def _row(self, node: int, by_order: bool) -> int:
+    def _row(self, node: "int | _Component", by_order: bool) -> int:
         return self._rows.setdefault((node, by_order), len(self._rows))
 
     def _input(self, *key) -> int:
@@ -154,11 +156,49 @@ class _Recurrences:
     def number(self, x: float) -> int:
         return self.start.constant(x, "float")
 
+    # ---- a linear system: the coefficients of its solution, without those of its elimination ----
+
+    def _solution(self, system) -> list[int]:
+        """Of z in A z = r: A₀ zₖ = rₖ − Aₖ z₀ − Σ' Aⱼ zₖ₋ⱼ, solved with the factors of A₀."""
+        apply = self.sweep.apply
+        residual = [self._of_output(node) for node in system.right]
+        for (i, j), node in system.entries.items():
+            if self.coefficients[node] is not None:
+                c = self._of_output(node)
+                for row, column in dict.fromkeys([(i, j), (j, i)]):
+                    taken = apply("mul", c, self.value(system.z[column]))
+                    taken = apply("add", taken, self.product(node, _Component(column)))
+                    residual[row] = apply("sub", residual[row], taken)
+        return self._inlined(system.solve(), system.factors, residual)
+
+    def _inlined(self, program, known, given: list[int]) -> list[int]:
+        """Its outputs in the sweep, from nodes of `start`, which are taken at order zero, and nodes of the sweep."""
+        places: list[tuple[bool, int]] = []  # whether in `start`, and which node
+
+        def in_sweep(place):
+            return self.value(place[1]) if place[0] else place[1]
+
+        for (op, operands, attribute), kind in zip(program.nodes, program.kinds, strict=True):
+            of = [places[i] for i in operands]
+            if op == "input":
+                i = attribute - len(known)
+                places.append((True, known[attribute]) if i < 0 else (False, given[i]))
+            elif op == "constant":
+                places.append((True, self.start.constant(attribute, kind)))
+            elif all(at_start for at_start, _ in of):
+                places.append((True, self.start.apply(op, *(node for _, node in of), attribute=attribute)))
+            elif op == "div":
+                inverse = self.start.apply("div", self.number(1.0), of[1][1])
+                places.append((False, self.sweep.apply("mul", in_sweep(of[0]), self.value(inverse))))
+            else:
+                places.append((False, self.sweep.apply(op, *map(in_sweep, of), attribute=attribute)))
+        return [in_sweep(places[i]) for i in program.outputs]
+
     # ---- the end: only what the outputs need ----
 
     def finished(self) -> Series:
         """Both graphs, without the products and values that nothing needs."""
-        rates = [self._of_output(i) for i in self.outputs[: self.size]]
+        rates = self.solution[: self.size] or [self._of_output(i) for i in self.outputs[: self.size]]
         rows = list(self._rows)
         needed: set[int] = set()
         while True:
@@ -189,8 +229,8 @@ class _Recurrences:
             raise Unlowerable(f"`{c.op}` has no Taylor series here")
         return self.sweep.constant(0.0, "float") if c is None else c
 
-    def _of_row(self, node: int, by_order: bool) -> int:
-        c = self._of_output(node)
+    def _of_row(self, node: "int | _Component", by_order: bool) -> int:
+        c = self.solution[node.i] if isinstance(node, _Component) else self._of_output(node)
         return self.sweep.apply("mul", self.k, c) if by_order else c
 
     def _reached(self, roots: list[int]) -> list[tuple]:
@@ -206,6 +246,12 @@ class _Recurrences:
     def _renumber(self, positions: dict[int, int]) -> None:
         for node, position in positions.items():
             self.sweep.nodes[node] = ("input", (), position)
+
+
+class _Component(NamedTuple):
+    """Of the solution of the linear system."""
+
+    i: int
 
 
 class _Unknown(NamedTuple):
