@@ -20,7 +20,7 @@ from benchmarks._measure import REFERENCE_MEMBERS, Comparison, compare
 from benchmarks._report import EQUAL_ERRORS
 from lagjax import scenes
 
-HELD, MINIMAL = "lagjax", "lagjax, minimal"
+HELD, MINIMAL = "lagjax", "minimal coordinates"
 
 
 @dataclass(frozen=True)

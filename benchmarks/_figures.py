@@ -10,7 +10,7 @@ Record = dict[str, Any]
 
 COLOURS = {
     "lagjax": "#c1121f",
-    "lagjax, minimal": "#1d4e89",
+    "minimal coordinates": "#1d4e89",
     "lagjax, diffrax": "#ef8d7a",
     "lagjax, plain vmap": "#b07aa1",
     "diffrax, by hand": "#1d4e89",
@@ -81,7 +81,8 @@ def _error_against_time(axes, row: dict, part: str) -> None:
     axes.set_xlabel(f"median error at T = {row['duration']:.4g}")
     axes.set_ylabel("µs per trajectory")
     which = "one trajectory after the other" if part == "single" else f"{row['batch']} members"
-    axes.set_title(f"{_title(row['case'])}, {which}")
+    held = " with constraints" if part == "constraints" else ""
+    axes.set_title(f"{_title(row['case'])}{held}, {which}")
     _name_the_lines(axes)
 
 
@@ -191,13 +192,13 @@ def _log(axis) -> None:
 def _right_hand_sides(figure, rows: list[dict]) -> None:
     axes = figure.add_subplot()
     columns = {"lagjax ns": "lagjax", "by hand ns": "diffrax, by hand", "autodiff ns": "diffrax, autodiff"}
-    labels = {"lagjax ns": "derived by lagjax", "by hand ns": "best by hand", "autodiff ns": "autodiff and LAPACK"}
+    labels = {"lagjax ns": "lagjax", "by hand ns": "by hand, XLA", "autodiff ns": "autodiff, XLA and LAPACK"}
     for column, name in columns.items():
         _dots(axes, [row[column] for row in rows], COLOURS[name], labels[column])
     _rungs(axes, [_title(row["case"]) for row in rows])
     axes.set_xlabel("ns per evaluation and member")
     _log(axes.xaxis)
-    _legend_above(axes, "Right-hand sides, all compiled by XLA")
+    _legend_above(axes, "One evaluation of the accelerations")
 
 
 def _gradient(figure, rows: list[dict]) -> None:
@@ -208,7 +209,7 @@ def _gradient(figure, rows: list[dict]) -> None:
     axes.axvline(5, color=GREY, linestyle=":", linewidth=1)
     axes.annotate(" goal", (5, 0), (2, 0), xycoords=("data", "axes fraction"), textcoords="offset points",
                   va="bottom", color=GREY, fontsize=9)  # fmt: skip
-    _rungs(axes, [row["contender"] for row in rows])
+    _rungs(axes, [f"{row['contender']}, {row['tol']:.0e}" for row in rows])
     axes.set_xlabel("times a solve")
     _log(axes.xaxis)
     _legend_above(axes, f"Gradient by 8 parameters, {rows[0]['steps']:.0f} steps")
@@ -310,6 +311,6 @@ PLOTS: dict[str, tuple[Callable, Any]] = {
     "derivation": (_derivation, (8, 5)),
     "cores": (_cores, (11, 4.5)),
     "right_hand_sides": (_right_hand_sides, (8, 4.5)),
-    "gradient": (_gradient, (7, 2.6)),
+    "gradient": (_gradient, (7, 3.2)),
     "goals": (_goals, lambda rows: (11, 1 + 0.36 * len(rows))),
 }
