@@ -15,6 +15,7 @@ them, while lagjax gets them as inputs, as in any call of `simulate`.
 """
 
 import copy
+import functools
 import importlib.util
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -78,18 +79,26 @@ def lagjax_batch(**options) -> Callable[[Case], Solve]:
     return prepare
 
 
-def _lagjax_single(**options) -> Callable[[Case], Solve]:
-    """`lagjax.simulate`, for one member after the other."""
+def _lagjax_single(jit: bool = True, **options) -> Callable[[Case], Solve]:
+    """`lagjax.simulate`, for one member after the other, in a function that is compiled, as are those of diffrax."""
 
     def prepare(case):
         scene, ts = case.scene, np.array([0.0, case.duration])
         starts = [(case.tree(q), case.tree(v)) for q, v in zip(case.q0, case.qdot0, strict=True)]
 
+        @functools.cache
+        def simulation(tol):
+            def run(q0, qdot0):
+                run = lagjax.simulate(
+                    scene.system, q0, qdot0, ts, scene.params, rtol=tol, atol=tol, max_steps=MAX_STEPS, **options
+                )
+                return run.end, run.stats["num_steps"]
+
+            return jax.jit(run) if jit else run
+
         def one(start, tol):
-            run = lagjax.simulate(
-                scene.system, *start, ts, scene.params, rtol=tol, atol=tol, max_steps=MAX_STEPS, **options
-            )
-            return rows_of(run.end, 1)[0], run.stats["num_steps"]
+            end, steps = simulation(tol)(*start)
+            return rows_of(end, 1)[0], steps
 
         return lambda tol: _one_by_one(one, starts, tol)
 
@@ -359,6 +368,7 @@ BATCHED = (
 
 SINGLE = (  # one trajectory after the other
     Contender("lagjax", _lagjax_single()),
+    Contender("lagjax, no jit", _lagjax_single(jit=False)),
     Contender("lagjax, diffrax", _lagjax_single(solver=diffrax.Dopri8())),
     Contender("diffrax, by hand", _diffrax(by_hand, batched=False), suits=_has_formulas),
     Contender("diffrax, autodiff", _diffrax(autodiff_acceleration, batched=False)),

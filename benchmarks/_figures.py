@@ -13,6 +13,7 @@ COLOURS = {
     "minimal coordinates": "#1d4e89",
     "lagjax, diffrax": "#ef8d7a",
     "lagjax, plain vmap": "#b07aa1",
+    "lagjax, no jit": "#b07aa1",
     "diffrax, by hand": "#1d4e89",
     "diffrax, autodiff": "#6fa8dc",
     "heyoka, SIMD": "#3a9d5d",

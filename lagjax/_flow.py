@@ -168,6 +168,8 @@ class Flow:
         A program that does not hold everywhere gives way to one that does. And where constraints become dependent, as
         at a dead centre, a step must not end: rounding of q would decide on q̇. It is by accident that one does.
         """
+        if (code == _native.DONE).all():
+            return np.zeros(len(code), bool), self, tolerances
         given_up = np.isin(code, GIVEN_UP)
         if given_up.any() and (careful := self.careful()) is not None:
             return given_up, careful, tolerances

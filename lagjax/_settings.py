@@ -148,8 +148,12 @@ def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
     found = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if eqx.is_array_like(leaf) and is_concrete(leaf) and _dtype_of(leaf) is not None:
-            label, values = name + jax.tree_util.keystr(path), np.asarray(leaf)
-            for index in np.argwhere(~np.isfinite(values)):
+            values = np.asarray(leaf)
+            finite = np.isfinite(values)
+            if finite.all():
+                continue
+            label = name + jax.tree_util.keystr(path)
+            for index in np.argwhere(~finite):
                 found.append((label + (str(index.tolist()) if values.ndim else ""), values[tuple(index)]))
     return found
 
