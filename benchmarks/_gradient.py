@@ -98,7 +98,7 @@ def _with_lagjax(case: Case, tol: float) -> Callable:
     def run(x, adjoint):
         trajectory = lagjax.simulate(
             case.scene.system, x[4:6], x[6:8], ts, _params(case, x),
-            rtol=tol, atol=tol, max_steps=MAX_STEPS, adjoint=adjoint, throw=False,
+            rtol=tol, max_steps=MAX_STEPS, adjoint=adjoint, throw=False,
         )  # fmt: skip
         return jnp.sum(trajectory.q[-1] ** 2), trajectory.stats["num_steps"]
 

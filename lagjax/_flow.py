@@ -538,14 +538,14 @@ def _over_batch(run: Callable, ts, y0, *params) -> tuple[np.ndarray, ...]:
     batch = np.broadcast_shapes(ts.shape[:-1], y0.shape[:-1], *(p.shape for p in params))
     members = math.prod(batch)
 
-    def rows(x, inner: tuple[int, ...]):
+    def rows(x, inner: tuple[int, ...], count: int):
         if x.size == math.prod(inner):
-            return x.reshape(1, *inner)
+            x = x.reshape(1, *inner)
+            return x if count == 1 else np.broadcast_to(x, (count, *inner))
         return np.broadcast_to(x, batch + inner).reshape(members, *inner)
 
-    columns = [rows(p, ()) for p in params]
-    count = max((len(column) for column in columns), default=1)
-    numbers = np.stack([np.broadcast_to(column, count) for column in columns] or [np.zeros(count)], axis=1)
-    states = np.broadcast_to(rows(y0, y0.shape[-1:]), (members, y0.shape[-1]))
-    outcome = run(rows(ts, ts.shape[-1:]), states, numbers)
+    count = members if any(p.size != 1 for p in params) else 1
+    numbers = np.stack([rows(p, (), count) for p in params] or [np.zeros(count)], axis=1)
+    states = rows(y0, y0.shape[-1:], members)
+    outcome = run(rows(ts, ts.shape[-1:], 1), states, numbers)
     return tuple(np.asarray(x).reshape(batch + np.shape(x)[1:]) for x in outcome)
