@@ -260,6 +260,15 @@ def test_squares_and_common_factors():
     assert operations(lambda x, y, a, b: (a * x + b * x) / (y * x)) == 4  # not cancelled: x may be zero
 
 
+def test_long_products_and_sums():
+    def long(x, a):
+        return jnp.prod(a) * x, x * jnp.sum(a * x), jnp.prod(a * a * x)
+
+    many = np.linspace(0.9, 1.1, 3000)
+    found = lower(long, 0.999, many).evaluate(0.999, *many)
+    np.testing.assert_allclose(found, long(0.999, many), rtol=1e-11)
+
+
 def test_masses_as_parameters_do_not_move_the_diagonal_of_a_chain():
     def lagrangian(q, v, m):
         vx, vy = jnp.cumsum(jnp.cos(q) * v), jnp.cumsum(jnp.sin(q) * v)

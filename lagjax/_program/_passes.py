@@ -4,7 +4,7 @@ import functools
 from collections import Counter
 from collections.abc import Callable
 
-from lagjax._program._graph import Graph, Node
+from lagjax._program._graph import LONGEST, Graph, Node
 
 
 def finish(graph: Graph, outputs: list[int]) -> tuple[tuple[Node, ...], tuple[str, ...], tuple[int, ...]]:
@@ -44,13 +44,16 @@ def _rebuilt(graph, outputs, used, node_of: Callable) -> tuple[Graph, list[int]]
     return new, [moved[i] for i in outputs]
 
 
-def _factors(graph, uses, i):
-    """What a product consists of, looking into products that have no other use."""
-    for x in graph.nodes[i][1]:
-        if graph.nodes[x][0] == "mul" and uses[x] == 1:
-            yield from _factors(graph, uses, x)
+def _factors(graph, uses, i) -> list[int]:
+    """What a product consists of, looking into products that have no other use, a few at most."""
+    factors, k = list(graph.nodes[i][1]), 0
+    while k < len(factors):
+        op, operands, _ = graph.nodes[factors[k]]
+        if op == "mul" and uses[factors[k]] == 1 and len(factors) < LONGEST:
+            factors[k : k + 1] = operands
         else:
-            yield x
+            k += 1
+    return factors
 
 
 def _square_first(graph, factors) -> int | None:
