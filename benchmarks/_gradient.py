@@ -22,7 +22,7 @@ from benchmarks._contenders import autodiff_acceleration, diffeqsolve
 from benchmarks._measure import seconds
 
 TOLERANCES, DURATION, MAX_STEPS = (1e-9, 1e-11), 50.0, 4096
-PEER_MEMBERS = 1024  # plain diffrax: its cost is proportional
+PEER_MEMBERS = 256  # plain diffrax: its cost is proportional
 
 
 def gradient(options) -> Iterator[dict[str, Any]]:
