@@ -99,6 +99,11 @@ def test_kept_steps_do_not_change_a_cotangent(double, monkeypatch):
         for kept, again in zip(pull(asked), expected, strict=True):
             np.testing.assert_array_equal(kept, again)
         assert len(followed) == runs and not lagjax._native._last_run
+    reused = np.array(y0 + 0.1, order="C")  # memory of the caller, who puts other numbers there
+    double.run(ts, reused, numbers, TOLERANCES, keep=True)
+    reused[:] = y0
+    asked = double.pull(ts, reused, numbers, outcome.accepted, path_bar, y_bar, TOLERANCES)
+    np.testing.assert_array_equal(asked.y0, plain.y0)
     monkeypatch.setattr(lagjax._native, "LARGEST_KEPT", 23 * 6 * 3)  # room for three steps of each
     double.run(ts, y0, numbers, TOLERANCES, keep=True)
     np.testing.assert_array_equal(pull(numbers).y0, plain.y0)

@@ -104,7 +104,9 @@ class Kernel:
 
         The steps of a run with `keep` stay in memory until the next run, for `pull` to find them there.
         """
-        given = (*_contiguous(ts, y0, params), rtol, atol, max_steps)
+        # What is kept is compared later, when the memory of whoever called may hold other numbers.
+        arrays = [np.array(x, np.float64, order="C") for x in (ts, y0, params)] if keep else _contiguous(ts, y0, params)
+        given = (*arrays, rtol, atol, max_steps)
         room = min(max_steps, LARGEST_KEPT // ((self.states + 2) * max(1, len(y0)))) if keep else 0
         _last_run.clear()
         if room == 0:
