@@ -80,7 +80,7 @@ def lagjax_batch(**options) -> Callable[[Case], Solve]:
 
 
 def _lagjax_single(jit: bool = True, **options) -> Callable[[Case], Solve]:
-    """`lagjax.simulate`, for one member after the other, in a function that is compiled, as are those of diffrax."""
+    """`lagjax.simulate`, for one member after the other; with `jit` in a compiled function, as those of diffrax are."""
 
     def prepare(case):
         scene, ts = case.scene, np.array([0.0, case.duration])
@@ -89,10 +89,10 @@ def _lagjax_single(jit: bool = True, **options) -> Callable[[Case], Solve]:
         @functools.cache
         def simulation(tol):
             def run(q0, qdot0):
-                run = lagjax.simulate(
+                trajectory = lagjax.simulate(
                     scene.system, q0, qdot0, ts, scene.params, rtol=tol, atol=tol, max_steps=MAX_STEPS, **options
                 )
-                return run.end, run.stats["num_steps"]
+                return trajectory.end, trajectory.stats["num_steps"]
 
             return jax.jit(run) if jit else run
 

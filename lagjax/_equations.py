@@ -142,8 +142,7 @@ def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
     if not motion.constrained:
         return _eliminated(motion.mass_matrix_and_force, motion, layout, params)
 
-    def saddle(*state):
-        return *motion.mass_matrix_and_force(*state), *motion.rows_and_targets(*state)
+    saddle = _saddle(motion)
 
     def for_any_mass_matrix():
         return _eliminated(saddle, motion, layout, params)
@@ -191,16 +190,22 @@ def multiplier_program(motion: Motion, layout: Layout, params: PyTree) -> Progra
     """λ as a program, those of `constraints` first; redundant ones are zero."""
     _require_small(layout)
 
-    def saddle(*state):
-        return *motion.mass_matrix_and_force(*state), *motion.rows_and_targets(*state)
-
-    system, solve = _system(saddle, motion, layout, params)
+    system, solve = _system(_saddle(motion), motion, layout, params)
 
     def multipliers(*scalars):
         _, right, factors, _ = system(*scalars)
         return [-pull for pull in solve(factors, right)[layout.size :]]
 
     return lower(multipliers, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
+
+
+def _saddle(motion: Motion) -> Callable:
+    """(M, b, G, c) of a state."""
+
+    def parts(*state):
+        return *motion.mass_matrix_and_force(*state), *motion.rows_and_targets(*state)
+
+    return parts
 
 
 def _require_small(layout: Layout) -> None:
