@@ -15,13 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import _native
+from lagjax import _native, _transforms
 from lagjax._equations import projection, scalar_program
 from lagjax._flow import Flow, Outcome, Tolerances, unfit
 from lagjax._integrate import Solved
-from lagjax._layout import Layout
+from lagjax._layout import Layout, as_vector
 from lagjax._program import Unlowerable
-from lagjax._results import RESULTS
+from lagjax._results import RESULTS, result_from
 from lagjax._settings import Settings, is_concrete
 from lagjax._system import System
 from lagjax._trajectory import State
@@ -55,11 +55,10 @@ def primal(flow: Flow, settings: Settings) -> Callable:
 
 @functools.lru_cache(maxsize=64)  # one function object for one program: it becomes part of what XLA compiles
 def _primal(flow: Flow, tolerances: Tolerances) -> Callable:
-    run, n = flow.undifferentiated(tolerances), flow.size
+    n = flow.size
 
     def solved(ts, y0, params):
-        scalars = [x.astype(y0[0].dtype) for leaf in jax.tree.leaves(params) for x in jnp.ravel(leaf)]
-        outcome = run(ts, jnp.concatenate(y0), *scalars)
+        outcome = _transforms.run(flow, tolerances, ts, jnp.concatenate(y0), as_vector(params, y0[0].dtype))
         stats = {
             "num_steps": outcome.accepted + outcome.rejected,
             "num_accepted_steps": outcome.accepted,
@@ -122,7 +121,7 @@ def _made(scene: _Scene) -> "Flow | str":
         back = projection(motion, layout, numbers)
     except Unlowerable as reason:
         return str(reason)
-    return unfit(program, layout.size, layout.dtype) or Flow(program, layout.size, back)
+    return unfit(program, layout.size, layout.dtype) or Flow.of(program, layout.size, back)
 
 
 # ---- one trajectory --------------------------------------------------------------------------------------------------
@@ -136,8 +135,8 @@ def run(flow: Flow, settings: Settings, layout: Layout, q0: PyTree, qdot0: PyTre
         outcome = Outcome(*(x[0] for x in flow.run(ts, state, given, _tolerances(settings))[0]))
     else:
         state = jnp.concatenate([layout.flatten(q0), layout.flatten(qdot0)])
-        scalars = [x.astype(state.dtype) for leaf in numbers for x in jnp.ravel(jnp.asarray(leaf))]
-        outcome = flow.traceable(_tolerances(settings))(settings.ts, state, *scalars)
+        given = as_vector(numbers, state.dtype)
+        outcome = _transforms.run(flow, _tolerances(settings), jnp.asarray(settings.ts), state, given)
     return _fields(settings, layout, outcome)
 
 
@@ -192,12 +191,6 @@ def _fields(settings: Settings, layout: Layout, outcome: Outcome, idle: int | No
     return ts, q, qdot, result_from(result), end, stats
 
 
-def result_from(values) -> RESULTS:
-    """The result codes with these values, integers of any shape."""
-    return jax.tree.unflatten(_RESULT_STRUCTURE, [jnp.asarray(values)])
-
-
-_RESULT_STRUCTURE = jax.tree.structure(RESULTS.successful)
 # What diffrax calls them; the state at the end tells the rest.
 _AS_DIFFRAX = np.array([
     int(result._value)

@@ -1,55 +1,64 @@
-"""The motion of a scalar program as a function that JAX can transform, computed by machine code on the CPU.
+"""The motion of a scalar program in machine code, for rows of members: it runs, and goes back over its own steps.
 
-A `Flow` is the map from (output times, initial state, parameters) to the states at those times. While JAX traces it, it
-is one callback, and under `vmap` one callback for the whole batch. It has derivatives of every order, in two ways.
+A `Flow` maps (output times, initial state, parameters) to the states at those times. Everything here works on NumPy
+arrays with one row a member; `_transforms` makes functions of it that JAX can transform. Derivatives are of two kinds.
 
-Forward mode is the flow of a larger system: to q belong the sensitivities ∂q/∂x by every number x that is being varied,
-and they move by
+`push` follows tangents along with the motion: to q belong δq₁ … δq_D, derivatives along D directions (δy0, δparams),
+which move by the variational equations
 
-    d²/dt² ∂q/∂x = ∂q̈/∂q ∂q/∂x + ∂q̈/∂q̇ ∂q̇/∂x + ∂q̈/∂x
+    d²/dt² δq = ∂q̈/∂q δq + ∂q̈/∂q̇ δq̇ + ∂q̈/∂p δp.
 
-which is a program like any other: a sensitivity is as accurate as the motion. Source: Hairer, Nørsett & Wanner,
-*Solving Ordinary Differential Equations I*, §I.14.
+They are a program like any other, the *tangent flow*: a derivative is as accurate as the motion. Source: Hairer,
+Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §I.14.
 
-Reverse mode goes back over the steps of the motion itself, each transposed (`_native._adjoint`): its cost does not grow
-with the number of parameters. The two agree within the tolerance.
+`pull` goes back over the steps of the motion itself, each transposed (`_native._adjoint`): its cost does not grow with
+the number of parameters. The two agree within the tolerance.
 """
 
 import functools
-import math
-from collections.abc import Callable
+import itertools
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
-from jax.experimental.buffer_callback import buffer_callback
 
 from lagjax import _native
-from lagjax._program import Program, Unlowerable, lower
+from lagjax._program import Program, Unlowerable, evaluate, lower, pullback
 
 LARGEST_PROGRAM = 6_000  # operations of an acceleration, beyond which LLVM takes too long
-_BUDGET = 100_000  # operations of a program with sensitivities
-# Entries of ∂q̈/∂(q, q̇, parameters) up to which all sensitivities are followed at once.
-LARGEST_JACOBIAN = 150
+_BUDGET = 100_000  # operations of a program with tangents
+# Directions that are followed side by side, and coordinates (those of the motion included) that may come of it: more
+# share the work on the motion among more tangents, and take LLVM longer.
+MOST_DIRECTIONS, MOST_TANGENT_COORDINATES = 8, 40
+LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
+LARGEST_KEPT = 2**26  # and of those that are kept for a derivative that is asked for next: half a GiB
 # How a motion ends that its program cannot follow.
 GIVEN_UP = (_native.SINGULAR, _native.NOT_FINITE, _native.STEP_TOO_SMALL, _native.NOT_LANDED)
 
 
 class Outcome(NamedTuple):
-    """The states (q, q̇) at the output times and at the end, how it ended, and counts."""
+    """What a run of N members gives: states, how each member ended, and counts.
 
-    path: jax.Array
-    y_end: jax.Array
-    t_end: jax.Array
-    code: jax.Array
-    accepted: jax.Array
-    rejected: jax.Array
+    `path` (N, T, 2n) holds the states (q, q̇) at the output times, NaN where a member did not come; `y_end` (N, 2n) and
+    `t_end` (N,) where it ended, `code` (N,) how. `ticket` (N,) names the member's steps in `KEPT`, −1 where they are
+    not kept.
+    """
+
+    path: np.ndarray
+    y_end: np.ndarray
+    t_end: np.ndarray
+    code: np.ndarray
+    accepted: np.ndarray
+    rejected: np.ndarray
+    ticket: np.ndarray
 
 
 class Tolerances(NamedTuple):
-    """How far a run may be off, and what it may cost."""
+    """The local error of a step, and what a run may cost."""
 
     rtol: float
     atol: float
@@ -57,13 +66,13 @@ class Tolerances(NamedTuple):
     tries: int = 4
 
     @property
-    def elsewhere(self) -> "Tolerances":
+    def perturbed(self) -> "Tolerances":
         """For another try, whose steps end at other places."""
         return self._replace(rtol=0.7 * self.rtol, atol=0.7 * self.atol, tries=self.tries - 1)
 
     @property
-    def patient(self) -> "Tolerances":
-        """For a motion with its sensitivities, which takes more steps."""
+    def with_larger_budget(self) -> "Tolerances":
+        """For a motion with its tangents, which takes more steps."""
         return self._replace(max_steps=4 * self.max_steps)
 
 
@@ -82,470 +91,380 @@ def unfit(program: Program, size: int, dtype) -> str | None:
     return None
 
 
-class Flow:
-    """The map of one program for q̈ with n coordinates.
+# ---- the steps of runs, kept for their transposes --------------------------------------------------------------------
 
-    `program` takes q, q̇, t and then the parameters, number by number; it gives q̈ and whether the mass matrix is
-    singular. `projection` keeps the motion on its constraints. `guards` end the motion early: then the outcome is a
-    plain number, without derivatives. `careful()` is the flow for members that a program which does not hold everywhere
-    cannot follow: they start again, from the beginning.
+
+class Steps(NamedTuple):
+    """The steps of a run of N members by one flow.
+
+    A row of `table` holds the time, the size and the first state of a step; those of a member are `counts` (N,) rows
+    from `first` (N,) on. `complete` (N,) is false for a member that took more steps than there was room for.
+    """
+
+    flow: "Flow"
+    order: int
+    table: np.ndarray
+    first: np.ndarray
+    counts: np.ndarray
+    complete: np.ndarray
+
+
+class StepStore:
+    """Steps by the number of their run; the oldest are dropped when all together exceed `limit` numbers.
+
+    A ticket is run · 2³² + member: an integer that travels through the residuals of a derivative, so that the transpose
+    finds the steps that belong to it, or knows that they are gone and follows the motion once more.
+    """
+
+    _runs = itertools.count()  # of all stores: a ticket of one means nothing to another
+
+    def __init__(self, limit: float = float("inf")):
+        self.limit = limit
+        self._steps: OrderedDict[int, Steps] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def keep(self, steps: Steps) -> np.ndarray:
+        """The tickets of the members, −1 for those that are not complete."""
+        with self._lock:
+            run = next(self._runs)
+            self._steps[run] = steps
+            while len(self._steps) > 1 and sum(kept.table.size for kept in self._steps.values()) > self.limit:
+                self._steps.popitem(last=False)
+        return np.where(steps.complete, run * 2**32 + np.arange(len(steps.first)), -1)
+
+    def runs(self, tickets: np.ndarray) -> Iterator[tuple[Steps, np.ndarray, np.ndarray]]:
+        """For every run that is here: its steps, which of the tickets are its members, and which members."""
+        for run in np.unique(tickets[tickets >= 0] >> 32).tolist():
+            with self._lock:
+                steps = self._steps.get(run)
+            if steps is not None:
+                places = np.flatnonzero(tickets >> 32 == run)
+                yield steps, places, tickets[places] & (2**32 - 1)
+
+
+KEPT = StepStore(LARGEST_KEPT)
+
+
+# ---- flows -----------------------------------------------------------------------------------------------------------
+
+
+class Flow:
+    """The flow of a program for q̈ with n coordinates.
+
+    `parts` gives the program, which takes q, q̇, t and then the P parameters and gives q̈ and whether the mass matrix is
+    singular, and the projection that keeps the motion on its constraints, or None. It is called when machine code is
+    first needed. `guards` end a motion early. `groups` (n,) numbers the coordinates whose errors are measured together,
+    and the first `base_size` coordinates are the motion, the others tangents of it. `general` gives the flow of the
+    variant for any mass matrix: members that the regular variant cannot follow start again with it.
     """
 
     def __init__(
         self,
-        program: Program,
+        parts: Callable[[], tuple[Program, _native.Projection | None]],
         size: int,
-        projection: _native.Projection | None = None,
+        numbers: int,
         guards: _native.Guards | None = None,
         groups: tuple[int, ...] | None = None,
-        careful: Callable[[], "Flow | None"] | None = None,
+        base_size: int | None = None,
+        general: "Callable[[], Flow | None]" = lambda: None,
     ):
-        self.size, self.guards = size, guards
+        self._parts, self.size, self.numbers, self.guards = functools.cache(parts), size, numbers, guards
         self.groups = tuple(range(size)) if groups is None else groups
-        self._given = program, projection
-        self.careful = functools.cache(self._careful if careful is None else careful)
-        self.traceable = functools.lru_cache(maxsize=16)(self._traceable)
-        self.varied = functools.lru_cache(maxsize=16)(self._varied)
+        self.base_size = size if base_size is None else base_size
+        self.general = functools.cache(general)
+        self.tangent = functools.lru_cache(maxsize=4)(self._tangent)
 
-    @functools.cached_property
-    def _programs(self):
-        return self._given
+    @classmethod
+    def of(cls, program: Program, size: int, projection=None, guards=None) -> "Flow":
+        """The flow of a scene's program, with that of its general variant behind it."""
+
+        def general():
+            try:
+                other = program.complete
+            except Unlowerable:
+                return None
+            fits = other is not program and other.operations <= LARGEST_PROGRAM
+            return cls.of(other, size, projection, guards) if fits else None
+
+        return cls(lambda: (program, projection), size, program.size - 2 * size - 1, guards, general=general)
 
     @property
     def program(self) -> Program:
         """q̈ and whether the mass matrix is singular."""
-        return self._programs[0]
+        return self._parts()[0]
 
     @property
     def projection(self) -> _native.Projection | None:
         """The way back to the constraints, where there are some."""
-        return self._programs[1]
+        return self._parts()[1]
 
     @functools.cached_property
-    def kernel(self) -> _native.Kernel:
-        """The machine code."""
-        return _native.Kernel(self.program, self.size, self.projection, self.guards, self.groups, self.own)
-
-    @property
-    def own(self) -> int:
-        """Coordinates that are the motion itself, not derivatives of it."""
-        return self.size
+    def anywhere(self) -> Program:
+        """The program that holds for any mass matrix, if there is one, else the flow's own."""
+        try:
+            return self.program.complete
+        except Unlowerable:
+            return self.program
 
     @property
     def states(self) -> int:
         """Numbers in a state: q, then q̇."""
         return 2 * self.size
 
-    def run(self, ts, y0, params, tolerances: Tolerances, keep: bool = False) -> tuple[Outcome, int]:
-        """For arrays of numbers: `ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P).
+    @functools.cached_property
+    def kernel(self) -> _native.Kernel:
+        """The machine code."""
+        return _native.Kernel(self.program, self.size, self.projection, self.guards, self.groups, self.base_size)
 
-        The second result counts the steps for which lanes stood empty. With `keep`, `pull` may come next.
+    # ---- forward ----
+
+    def run(
+        self, ts, y0, params, tolerances: Tolerances, store: StepStore | None = None, room: np.ndarray | None = None
+    ) -> tuple[Outcome, int]:
+        """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the outcome, and how many lane steps idled.
+
+        With a `store` the steps are kept there, up to `room` (N,) of each member: by default to equal parts of what may
+        be kept.
         """
-        *outcome, idle = self.kernel(ts, y0, params, *tolerances[:3], keep)
-        outcome = Outcome(*outcome)
+        rtol, atol, max_steps, _ = tolerances
+        if store is not None and room is None:
+            room = np.full(len(y0), min(max_steps, LARGEST_KEPT // ((self.states + 2) * max(1, len(y0)))))
+        *fields, idle, table = self.kernel(ts, y0, params, rtol, atol, max_steps, room)
+        outcome = Outcome(*fields, np.full(len(y0), -1))
+        if store is not None:
+            outcome = outcome._replace(ticket=store.keep(self._compact(table, room, outcome.accepted, rtol)))
         again, flow, tolerances = self._second_chance(outcome.code, tolerances)
         if not again.any():
             return outcome, idle
-        better, more = flow.run(*(x[again] if len(x) > 1 else x for x in (ts, y0, params)), tolerances)
+        some = _members(again, ts, y0, params)
+        better, more = flow.run(*some, tolerances, store, None if room is None else room[again])
         for values, new in zip(outcome, better, strict=True):
             values[again] = new
         return outcome, idle + more
 
-    def pull(self, ts, y0, params, steps, path_bar, y_bar, tolerances: Tolerances) -> _native.Cotangents:
-        """The transpose of the derivative of `run`, which took so many `steps`; see `Kernel.pull`."""
-        cotangents = self.kernel.pull(ts, y0, params, steps, path_bar, y_bar, *tolerances[:3])
-        again, flow, tolerances = self._second_chance(cotangents.code, tolerances)
-        if again.any():
-            shared = (x[again] if len(x) > 1 else x for x in (ts, y0, params))
-            better = flow.pull(*shared, steps[again], path_bar[again], y_bar[again], tolerances)
-            for values, new in zip(cotangents, better, strict=True):
-                values[again] = new
-        return cotangents
+    def _compact(self, table, room, counts, rtol: float) -> Steps:
+        """The steps of a run, without the room that was not used."""
+        taken, starts = np.minimum(counts, room), np.cumsum(room) - room
+        if not np.array_equal(taken, room):
+            table = np.concatenate([table[:0], *(table[s : s + k] for s, k in zip(starts, taken, strict=True))])
+        return Steps(self, _native.order_for(rtol), table, np.cumsum(taken) - taken, counts, counts <= room)
 
-    def _second_chance(self, code, tolerances: Tolerances) -> tuple[np.ndarray, "Flow", Tolerances]:
-        """The members to run once more, and how.
+    def _second_chance(self, code, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
+        """The members to run once more, by which flow and with which tolerances.
 
-        A program that does not hold everywhere gives way to one that does. And where constraints become dependent, as
-        at a dead centre, a step must not end: rounding of q would decide on q̇. It is by accident that one does.
+        A program that assumes a regular mass matrix gives way to one that does not. And where constraints become
+        dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇. It is by accident that
+        one does, so that steps of other sizes pass.
         """
         if (code == _native.DONE).all():
             return np.zeros(len(code), bool), self, tolerances
         given_up = np.isin(code, GIVEN_UP)
-        if given_up.any() and (careful := self.careful()) is not None:
-            return given_up, careful, tolerances
-        return (code == _native.NOT_LANDED) & (tolerances.tries > 1), self, tolerances.elsewhere
+        if given_up.any() and (general := self.general()) is not None:
+            return given_up, general, tolerances
+        return (code == _native.NOT_LANDED) & (tolerances.tries > 1), self, tolerances.perturbed
 
-    def _careful(self) -> "Flow | None":
-        """With the program that holds everywhere; None where this is it, or where that is too large."""
-        program = self.everywhere
-        if program is self.program or program.operations > LARGEST_PROGRAM:
-            return None
-        return Flow(program, self.size, self.projection, self.guards, self.groups)
+    def push(self, ts, y0, params, dy0, dparams, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
+        """The derivative of `run` along m directions for each of N members, between fixed times.
 
-    @property
-    def everywhere(self) -> Program:
-        """The program that holds everywhere, if there is one."""
-        try:
-            return self.program.complete
-        except Unlowerable:
-            return self.program
+        `dy0` (N, m, 2n), `dparams` (N, m, P) → δpath (N, m, T, 2n), NaN where the motion did not come, and δy_end
+        (N, m, 2n), NaN where it failed.
+        """
+        members, m = dy0.shape[:2]
+        widest = max(1, min(MOST_DIRECTIONS, MOST_TANGENT_COORDINATES // self.size - 1))
+        directions = 1 << min(m - 1, widest - 1).bit_length()
+        directions = directions if directions <= widest else directions // 2
+        groups = -(-m // directions)
+        padding = ((0, 0), (0, groups * directions - m), (0, 0))
+        dy0, dparams = (np.pad(x, padding).reshape(members * groups, directions, -1) for x in (dy0, dparams))
+        length = np.abs(np.concatenate([dy0, dparams], axis=2)).max(axis=2, initial=0.0, keepdims=True)
+        unit = np.where(length > 0, length, 1.0)
+        y0, params = np.repeat(y0, groups, axis=0), _for_all(np.repeat(params, groups, axis=0), members * groups)
+        ts = ts if len(ts) == 1 else np.repeat(ts, groups, axis=0)
+        start = np.concatenate([y0[:, None], dy0 / unit], axis=1)  # (rows, 1 + D, 2n)
+        numbers = np.concatenate([params[:, None], dparams / unit], axis=1).reshape(len(start), -1)
+        flow = self.tangent(directions)
+        outcome, _ = flow.run(ts, from_rows(start), numbers, tolerances.with_larger_budget)
+        failed = outcome.code != _native.DONE
+        lengths = unit.reshape(len(start), directions, 1)
+        path, end = (to_rows(x, self.size)[..., 1:, :] for x in (outcome.path, outcome.y_end))
+        path, end = path * lengths[:, None], end * lengths
+        end[failed] = np.nan
+        path = np.moveaxis(path, -2, 1).reshape(members, groups * directions, *path.shape[1:-2], self.states)
+        return path[:, :m], end.reshape(members, groups * directions, self.states)[:, :m]
 
-    def _traceable(self, tolerances: Tolerances, keep: bool = False) -> Callable:
-        """`(ts, y0, *params)` → `Outcome` of one member, under every transformation of JAX."""
+    # ---- back ----
 
-        if self.guards is not None:
-            run = self.undifferentiated(tolerances)
-            return lambda *arrays: run(*map(jax.lax.stop_gradient, arrays))
-        run = jax.custom_jvp(self.undifferentiated(tolerances, keep))
+    def pull(self, ts, y0, params, solution, path_bar, end_bar, tolerances: Tolerances) -> tuple[np.ndarray, ...]:
+        """The transpose of `push`: from m cotangents of the outputs of each of N motions to those of what went in.
 
-        @functools.partial(run.defjvp, symbolic_zeros=True)
-        def rule(primals, tangents):
-            return _push(self, tolerances, primals, tangents)
+        `solution` is (path, code, accepted, ticket) of the run; `path_bar` (N, m, T, 2n) and `end_bar` (N, m, 2n) →
+        cotangents of `y0` (N, m, 2n) and of `params` (N, m, P). A cotangent that is not zero, of an output that was
+        not reached or of the end of a motion that failed, makes all of them NaN: there is no derivative.
+        """
+        path, code, accepted, ticket = solution
+        members, m = end_bar.shape[:2]
+        if m > self.states + self.numbers and self.size * (1 + self.states + self.numbers) <= MOST_TANGENT_COORDINATES:
+            return self._pull_by_tangents(ts, y0, params, path_bar, end_bar, tolerances)
+        reached = np.isfinite(path)[:, None]
+        lost = ((path_bar != 0) & ~reached).any(axis=(2, 3))
+        lost |= (end_bar != 0).any(axis=2) & (code != _native.DONE)[:, None]
+        path_bar = np.where(reached, path_bar, 0.0)
+        params = _for_all(params, members)
+        params_bar = np.zeros((members, m, self.numbers))
+        if self.projection is not None and path.shape[1] > 2:
+            self._off_the_constraints(ts, path, params, path_bar, params_bar)
+        done = (code == _native.DONE)[:, None, None]
+        end_bar = end_bar + np.where(done, path_bar[:, :, -1], 0.0)
+        path_bar[:, :, -1] = 0.0
 
-        return jax.jit(run)  # a derivative outside of `jit` compiles as one, not operation by operation
+        rows = np.repeat(np.arange(members), m)
+        ts = ts if len(ts) == 1 else ts[rows]
+        y_bar, more = self._pull_rows(
+            ts, y0[rows], params[rows], accepted[rows], ticket[rows], path_bar.reshape(members * m, *path.shape[1:]),
+            end_bar.reshape(members * m, -1), tolerances,
+        )  # fmt: skip
+        y_bar, more = y_bar.reshape(members, m, -1), more.reshape(members, m, -1) + params_bar
+        y_bar[lost], more[lost] = np.nan, np.nan
+        return y_bar, more
 
-    def undifferentiated(self, tolerances: Tolerances, keep: bool = False) -> Callable:
-        """The same without derivatives."""
+    def _pull_rows(self, ts, y0, params, accepted, ticket, path_bar, end_bar, tolerances) -> tuple[np.ndarray, ...]:
+        """One cotangent a row, over the steps that are kept; members whose steps are gone are followed once more."""
+        y_bar, params_bar = np.full(end_bar.shape, np.nan), np.full((len(y0), self.numbers), np.nan)
+        waiting = np.ones(len(y0), bool)
 
-        # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
-        # the callbacks themselves may occupy.
-        def on_host(_, places, *arrays):
-            outcome = _over_batch(lambda *rows: self.run(*rows, tolerances, keep)[0], *map(np.asarray, arrays))
-            for place, values in zip(places, outcome, strict=True):
-                np.asarray(place)[...] = values
+        def back(store: StepStore, tickets, places):
+            for steps, some, members in store.runs(tickets):
+                rows = places[some]
+                y_bar[rows], params_bar[rows] = steps.flow.kernel.pull(
+                    ts if len(ts) == 1 else ts[rows], params[rows], steps.table, steps.first[members],
+                    steps.counts[members], path_bar[rows], end_bar[rows], steps.order,
+                )  # fmt: skip
+                waiting[rows] = False
 
-        def run(ts, y0, *params):
-            shapes = [(*ts.shape, self.states), (self.states,), (), (), (), ()]
-            dtypes = [np.float64] * 3 + [np.int64] * 3
-            places = tuple(jax.ShapeDtypeStruct(*of) for of in zip(shapes, dtypes, strict=True))
-            return Outcome(*buffer_callback(on_host, places, vmap_method="expand_dims")(ts, y0, *params))
+        back(KEPT, ticket, np.arange(len(y0)))
+        for places in _portions(np.flatnonzero(waiting), accepted * (self.states + 2)):
+            store = StepStore()
+            some_ts = ts if len(ts) == 1 else ts[places]
+            again, _ = self.run(some_ts, y0[places], params[places], tolerances, store, accepted[places])
+            back(store, again.ticket, places)
+        return y_bar + path_bar[:, 0], params_bar  # the first output is the initial state
 
-        return run
+    def _pull_by_tangents(self, ts, y0, params, path_bar, end_bar, tolerances) -> tuple[np.ndarray, ...]:
+        """The same where there are more cotangents than numbers that vary: from the whole Jacobian."""
+        inputs = self.states + self.numbers
+        unit = np.broadcast_to(np.eye(inputs), (len(y0), inputs, inputs))
+        path, end = self.push(ts, y0, params, unit[..., : self.states], unit[..., self.states :], tolerances)
+        used = np.einsum("nmts,nrts->nmr", path_bar, np.where(np.isfinite(path), path, 0.0))
+        used += np.einsum("nms,nrs->nmr", end_bar, np.where(np.isfinite(end), end, 0.0))
+        lost = ((path_bar != 0) & ~np.isfinite(path).all(axis=1)[:, None]).any(axis=(2, 3))
+        lost |= ((end_bar != 0) & ~np.isfinite(end).all(axis=1)[:, None]).any(axis=2)
+        used[lost] = np.nan
+        return used[..., : self.states], used[..., self.states :]
 
-    @functools.cached_property
-    def directed(self) -> "Flow":
-        """The flow of this one's derivative along a direction that is among its numbers."""
-        return _Directed(self)
+    def _off_the_constraints(self, ts, path, params, path_bar, params_bar) -> None:
+        """Through the projection that put the outputs between the first and the last on the constraints; in place.
 
-    def _varied(self, by_state: bool, params: tuple[int, ...]) -> "Flow":
-        return _Varied(self, by_state, params)
-
-
-# ---- derivatives -----------------------------------------------------------------------------------------------------
-
-
-class _Varied(Flow):
-    """The flow of q and of ∂q/∂x, for x in y0 (if asked for) and in these parameters; (1 + x's, n) coordinates.
-
-    Its program is made when it is first needed: whoever only asks for reverse mode does not wait for it.
-    """
-
-    def __init__(self, base: Flow, by_state: bool, params: tuple[int, ...]):
-        self.base, self.free, self.chosen = base, base.states * by_state, params  # an initial state has no ∂q̈/∂x
-        self.rows = 1 + self.free + len(params)
-        n = base.size
-        # A sensitivity that is zero by symmetry is as exact as the others in its row, not exact relative to itself.
-        groups = base.groups + tuple(n + row for row in range(self.rows - 1) for _ in range(n))
-
-        def careful():
-            return flow.varied(by_state, params) if (flow := base.careful()) else None
-
-        super().__init__(None, self.rows * n, None, None, groups, careful)
-
-    @property
-    def own(self) -> int:
-        return self.base.size
-
-    # A state is (2, rows, n), end to end; the first row is the motion, and row by row states are (rows, 2, n).
-
-    def start(self, y0):
-        """The state at the beginning, from that of the motion, shape (..., 2n)."""
-        n, states = self.base.size, self.base.states
-        unit = np.eye(self.rows, states, -1)[1:] * (self.free > 0)
-        library = np if isinstance(y0, np.ndarray) else jnp
-        y = library.concatenate([y0[..., None, :], library.broadcast_to(unit, (*y0.shape[:-1], *unit.shape))], axis=-2)
-        return y.reshape(*y0.shape[:-1], self.rows, 2, n).swapaxes(-3, -2).reshape(*y0.shape[:-1], self.states)
-
-    def sensitivities(self, y):
-        """∂y/∂x for every x, in front of all other axes, from states of shape (..., 2 · rows · n)."""
-        n, library = self.base.size, np if isinstance(y, np.ndarray) else jnp
-        by_rows = library.moveaxis(y.reshape(*y.shape[:-1], 2, self.rows, n), -2, 0)
-        return by_rows.reshape(self.rows, *y.shape[:-1], 2 * n)[1:]
-
-    @functools.cached_property
-    def _programs(self):
-        base, n, rows = self.base, self.base.size, self.rows
-        numbers, chosen = base.program.size - base.states - 1, np.array(self.chosen, int)
-
-        def derivative(function, q, v, t, p):
-            """`function(q, v, t, p)` at the first rows, and for the others how it varies with them."""
-
-            def of_varied(q, v, x):
-                return function(q, v, t, p.at[chosen].set(x))
-
-            by_q, by_v, by_x = jax.jacfwd(of_varied, argnums=(0, 1, 2))(q[0], v[0], p[chosen])
-            varied = (q[1:] @ by_q.T + v[1:] @ by_v.T).at[self.free :].add(by_x.T)
-            return jnp.concatenate([function(q[0], v[0], t, p)[None], varied])
-
-        def accelerations(q, v, t, p):
-            return jnp.stack(base.program(*q, *v, t, *p)[:n])
-
-        def moving(q, v, t, p):
-            return derivative(accelerations, q, v, t, p), base.program(*q[0], *v[0], t, *p)[n]
-
-        def projected(q, v, t, p):
-            state = base.projection.state
-            both = derivative(lambda q, v, t, p: jnp.stack(state(*q, *v, t, *p)), q, v, t, p)
-            return both[:, :n], both[:, n:]
-
-        def speeds(q, v, t, p):
-            return base.projection.speeds(*q[0], *v[0], t, *p)
-
-        back = None if base.projection is None else (projected, speeds)
-        return _lowered(moving, back, (rows, n), (rows, n), (), (numbers,))
-
-
-class _Directed(Flow):
-    """The flow of q and of its derivative δq along one direction (δy0, δparams): 2n coordinates, twice the numbers."""
-
-    def __init__(self, base: Flow):
-        self.base = base
-
-        def careful():
-            return flow.directed if (flow := base.careful()) else None
-
-        super().__init__(None, 2 * base.size, None, None, base.groups + (base.size,) * base.size, careful)
-
-    @property
-    def own(self) -> int:
-        return self.base.size
+        It squares the distance to them: its derivative at the projected state is that at the state before.
+        """
+        members, m, times, _ = path_bar.shape
+        place = np.broadcast_to(np.where(np.isfinite(path), path, path[:, :1])[:, None, 1:-1],
+                                (members, m, times - 2, self.states))  # fmt: skip
+        t = np.broadcast_to(ts[:, None, 1:-1], place.shape[:-1])
+        numbers = np.broadcast_to(params[:, None, None], (*place.shape[:-1], self.numbers))
+        columns = [x.reshape(-1, x.shape[-1]).T for x in (place, t[..., None], numbers, path_bar[:, :, 1:-1])]
+        back = np.stack(evaluate(self._projection_pullback, np.concatenate(columns)), axis=-1)
+        back = back.reshape(*place.shape[:-1], -1)
+        path_bar[:, :, 1:-1] = back[..., : self.states]
+        params_bar += back[..., self.states :].sum(axis=2)
 
     @functools.cached_property
-    def _programs(self):
-        base, n = self.base, self.base.size
-        numbers = base.program.size - base.states - 1
+    def _projection_pullback(self):
+        """From (q, q̇, t, params) and the cotangent of the projected state to those of the state and of params."""
+        program = self.projection.state
+        by = [i for i in range(program.size) if i != self.states]
+        return pullback(program.line, [np.dtype(float)] * program.size, by, range(self.states))
 
-        def derivative(function, q, v, t, p):
-            values, moving = jax.jvp(lambda q, v, p: function(q, v, t, p), (q[0], v[0], p[0]), (q[1], v[1], p[1]))
-            return jnp.stack([values, moving])
+    # ---- tangents ----
 
-        def moving(q, v, t, p):
-            accelerations = derivative(lambda q, v, t, p: jnp.stack(base.program(*q, *v, t, *p)[:n]), q, v, t, p)
-            return accelerations, base.program(*q[0], *v[0], t, *p[0])[n]
+    def _tangent(self, directions: int) -> "Flow":
+        """The flow of q and of its derivatives along so many directions, whose δparams are numbers of it.
 
-        def projected(q, v, t, p):
-            state = base.projection.state
-            both = derivative(lambda q, v, t, p: jnp.stack(state(*q, *v, t, *p)), q, v, t, p)
-            return both[:, :n], both[:, n:]
+        It has (1 + D) n coordinates and (1 + D) P parameters. A tangent that is zero by symmetry is as exact as the
+        other coordinates in its direction, not exact relative to itself: each direction is one group.
+        """
+        n, rows = self.size, 1 + directions
+        groups = self.groups + tuple(n + row for row in range(directions) for _ in range(n))
 
-        def speeds(q, v, t, p):
-            return base.projection.speeds(*q[0], *v[0], t, *p[0])
+        def general():
+            other = self.general()
+            return None if other is None else other.tangent(directions)
 
-        back = None if base.projection is None else (projected, speeds)
-        return _lowered(moving, back, (2, n), (2, n), (), (2, numbers))
-
-
-def _lowered(moving: Callable, back: tuple[Callable, Callable] | None, *shapes):
-    """The two programs of a flow, from functions of arrays of these shapes."""
-    arrays = [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes]
-    program, *parts = (lower(function, *arrays, budget=_BUDGET) for function in (moving, *(back or ())))
-    return program, _native.Projection(*parts) if parts else None
+        parts = functools.partial(_tangent_parts, self, rows)
+        return Flow(parts, rows * n, rows * self.numbers, None, groups, self.base_size, general)
 
 
-def _push(flow: Flow, tolerances: Tolerances, primals, tangents) -> tuple[Outcome, Outcome]:
-    """The outcome, and its tangent: that of the motion between fixed times, and slopes times the output times."""
-    (ts, y0, *params), (dts, dy0, *dparams) = primals, tangents
-    by_time, moved = not isinstance(dts, SymbolicZero), not isinstance(dy0, SymbolicZero)
-    by_state = moved or by_time  # to start later from the same state is to start from another state
-    active = tuple(i for i, dx in enumerate(dparams) if not isinstance(dx, SymbolicZero))
-    outcome, n = flow.traceable(tolerances, keep=True)(*primals), flow.size
-
-    def slope(t, y):
-        rate = jnp.concatenate([y[n:], jnp.stack(flow.everywhere(*y, t, *params)[:-1])])
-        return jnp.where(jnp.isfinite(rate), rate, 0.0)  # where it is not, the motion has ended
-
-    varied = (dy0 if moved else jnp.zeros_like(y0)) - (slope(ts[0], y0) * dts[0] if by_time else 0.0)
-    moving = jnp.concatenate([*([varied] if by_state else []), *(dparams[i][None] for i in active)])
-    d_path, d_end = _Response(flow, tolerances, primals, outcome, by_state, active)(moving)
-    d_t_end = jnp.zeros_like(outcome.t_end)
-    if by_time:
-        reached, done = jnp.isfinite(outcome.path), outcome.code == _native.DONE
-        rates = jax.vmap(slope)(ts, jnp.where(reached, outcome.path, y0)) * dts[:, None]
-        d_path = d_path + jnp.where(reached, rates, 0.0)
-        d_end = d_end + jnp.where(done, rates[-1], 0.0)
-        d_t_end = jnp.where(done, dts[-1], 0.0)
-    counts = [np.zeros((), jax.dtypes.float0)] * 3
-    return outcome, Outcome(d_path, d_end, d_t_end, *counts)
+def from_rows(y):
+    """States (..., 2 · rows · n), all q and then all q̇, from rows (..., rows, 2n): the motion, then its tangents."""
+    rows, n = y.shape[-2], y.shape[-1] // 2
+    return y.reshape(*y.shape[:-1], 2, n).swapaxes(-3, -2).reshape(*y.shape[:-2], 2 * rows * n)
 
 
-class _Response(NamedTuple):
-    """The linear map from what varies, (δy0, δparams), to (δpath, δy_end): the derivative between fixed times.
-
-    There are two programs for it: sensitivities, which give the map, and the transpose of the steps, which gives the
-    transposed map at once. JAX learns of both as the solution x of A x = b with A (u, w) = (u, w − R u): x is
-    (u, w + R u), and the transposed equation has (u + Rᵀw, w).
-    """
-
-    flow: Flow
-    tolerances: Tolerances
-    primals: tuple
-    outcome: Outcome
-    by_state: bool
-    active: tuple[int, ...]
-
-    def __call__(self, moving):
-        """(δpath, δy_end) from the numbers that vary, end to end."""
-        count = len(moving)
-
-        def without_response(x):  # only its derivatives are ever computed
-            return jnp.concatenate([x[:count], x[count:] - self._by_sensitivities(x[:count])])
-
-        def solved(_, b):
-            return jnp.concatenate([b[:count], b[count:] + self.push(b[:count])])
-
-        def transposed(_, b):
-            return jnp.concatenate([b[:count] + self.pull(b[count:]), b[count:]])
-
-        shape = self.outcome.path.shape
-        b = jnp.pad(moving, (0, shape[0] * shape[1] + shape[1]))
-        x = jax.lax.custom_linear_solve(without_response, b, solved, transposed)
-        return self._apart(x[count:])
-
-    def _apart(self, flat):
-        """What belongs to the path and to the end."""
-        shape = self.outcome.path.shape
-        return flat[: -shape[1]].reshape(shape), flat[-shape[1] :]
-
-    @property
-    def reached(self):
-        """What was not reached is NaN, which must not meet the zero cotangent of an output that nobody uses."""
-        return jnp.isfinite(self.outcome.path)
-
-    def push(self, moving):
-        """Along one direction, or by all sensitivities where those are few; only the latter can be transposed."""
-        return self._by_sensitivities(moving) if self._few else self._along(moving)
-
-    @property
-    def _few(self) -> bool:
-        return self.flow.size * (self.flow.program.size - 1) <= LARGEST_JACOBIAN
-
-    def _along(self, moving):
-        """(δpath, δy_end) of a direction of length one, times its length."""
-        ts, y0, *params = self.primals
-        n, states = self.flow.size, self.flow.states
-        length = jnp.max(jnp.abs(moving))
-        direction = moving / jnp.where(length > 0, length, 1.0)
-        dy0 = direction[:states] if self.by_state else jnp.zeros(states)
-        dparams = jnp.zeros(len(params)).at[np.array(self.active, int)].set(direction[states * self.by_state :])
-        start = jnp.stack([y0.reshape(2, n), dy0.reshape(2, n)], axis=1).ravel()
-        found = self.flow.directed.traceable(self.tolerances.patient)(ts, start, *params, *dparams)
-
-        def moved(y):
-            return y.reshape(*y.shape[:-1], 2, 2, n)[..., 1, :].reshape(*y.shape[:-1], states)
-
-        d_path = jnp.where(self.reached, moved(found.path), 0.0)
-        return length * jnp.concatenate([d_path.ravel(), moved(found.y_end)])
-
-    def _by_sensitivities(self, moving):
-        ts, y0, *params = self.primals
-        larger = self.flow.varied(self.by_state, self.active)
-        found = larger.traceable(self.tolerances.patient)(ts, larger.start(y0), *params)
-
-        d_path = jnp.tensordot(moving, jnp.where(self.reached, larger.sensitivities(found.path), 0.0), 1)
-        return jnp.concatenate([d_path.ravel(), moving @ larger.sensitivities(found.y_end)])
-
-    def pull(self, bars):
-        """By the transpose of the steps."""
-        ts, _, *params = self.primals
-        path_bar, end_bar = self._apart(bars)
-        path_bar = jnp.where(self.reached, path_bar, 0.0)
-        params_bar = jnp.zeros(len(params))
-        if self.flow.projection is not None and len(ts) > 2:  # outputs were put on the constraints
-            inner, more = jax.vmap(self._back_on_constraints)(ts[1:-1], self.outcome.path[1:-1], path_bar[1:-1])
-            path_bar, params_bar = path_bar.at[1:-1].set(inner), params_bar + more.sum(axis=0)
-        done = self.outcome.code == _native.DONE
-        end_bar = end_bar + jnp.where(done, path_bar[-1], 0.0)
-        y0_bar, more = self._on_host(path_bar.at[-1].set(0.0), end_bar)
-        params_bar = params_bar + more
-        chosen = params_bar[np.array(self.active, int)]
-        return jnp.concatenate([y0_bar, chosen]) if self.by_state else chosen
-
-    def _back_on_constraints(self, t, y, bar):
-        y = jnp.where(jnp.isfinite(y), y, self.primals[1])
-        projection = self.flow.projection.state
-        y_bar, *params_bar = jax.vjp(lambda y, *p: jnp.stack(projection(*y, t, *p)), y, *self.primals[2:])[1](bar)
-        return y_bar, jnp.stack(params_bar) if params_bar else jnp.zeros(0)
-
-    def _on_host(self, path_bar, end_bar):
-        ts, y0, *params = self.primals
-        shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in (y0.shape, (len(params),))]
-
-        def on_host(_, places, *arrays):
-            with jax.enable_x64(True):  # another thread; the program may be made here
-                found = _pull_batch(self.flow, self.tolerances, *map(np.asarray, arrays))
-            for place, values in zip(places, found, strict=True):
-                np.asarray(place)[...] = values
-
-        numbers = jnp.stack(params) if params else jnp.zeros(0)
-        callback = buffer_callback(on_host, tuple(shapes), vmap_method="expand_dims")
-        return callback(ts, y0, numbers, self.outcome.accepted, path_bar, end_bar)
+def to_rows(y, n: int):
+    """Rows (..., rows, 2n) from the states of a tangent flow over n coordinates."""
+    rows = y.shape[-1] // (2 * n)
+    return y.reshape(*y.shape[:-1], 2, rows, n).swapaxes(-3, -2).reshape(*y.shape[:-1], rows, 2 * n)
 
 
-def _pull_batch(flow: Flow, tolerances: Tolerances, ts, y0, params, steps, path_bar, y_bar) -> list[np.ndarray]:
-    """`flow.pull` for arrays with any batch axes in front, of length one where they share."""
-    arrays, inner = (ts, y0, params, steps, path_bar, y_bar), (1, 1, 1, 0, 2, 1)
-    leading = [x.shape[: x.ndim - k] for x, k in zip(arrays, inner, strict=True)]
-    batch, motions = np.broadcast_shapes(*leading), np.broadcast_shapes(*leading[:4])
-    members = math.prod(batch)
-    if members > math.prod(motions) * (flow.states + params.shape[-1]):  # a Jacobian, row by row
-        found = _by_all_sensitivities(flow, tolerances, motions, ts, y0, params, path_bar, y_bar)
-        if found is not None:
-            return found
+def _tangent_parts(base: Flow, rows: int) -> tuple[Program, _native.Projection | None]:
+    """The program and the projection of the motion and of its tangents, whose arguments have one row for each."""
+    n = base.size
 
-    def rows(x, k, shared):
-        own = x.shape[x.ndim - k :]
-        if shared and x.size == math.prod(own):
-            return x.reshape(1, *own)
-        return np.broadcast_to(x, batch + own).reshape(members, *own)
+    def with_tangents(function, q, v, t, p):
+        """`function(q, v, t, p)` at the first rows, and its derivative along each of the others."""
 
-    given = [rows(x, k, i in (0, 2)) for i, (x, k) in enumerate(zip(arrays, inner, strict=True))]
-    found = flow.pull(*given, tolerances)
-    return [x.reshape(*batch, x.shape[-1]) for x in (found.y0, found.params)]
+        def along(*direction):
+            return jax.jvp(lambda q, v, p: function(q, v, t, p), (q[0], v[0], p[0]), direction)[1]
 
+        return jnp.concatenate([function(q[0], v[0], t, p[0])[None], jax.vmap(along)(q[1:], v[1:], p[1:])])
 
-def _by_all_sensitivities(flow: Flow, tolerances, motions, ts, y0, params, path_bar, y_bar):
-    """The same for many cotangents of few motions; None where sensitivities are too many, or not to be had."""
-    states, numbers = flow.states, params.shape[-1]
-    if flow.size * (flow.program.size - 1) > LARGEST_JACOBIAN:
-        return None
-    larger = flow.varied(True, tuple(range(numbers)))
-    start = np.broadcast_to(larger.start(y0), (*motions, larger.states))
-    columns = [params[..., i] for i in range(numbers)]
-    found = _over_batch(lambda *rows: larger.run(*rows, tolerances.patient)[0], ts, start, *columns)
-    path_by, end_by = larger.sensitivities(found[0]), larger.sensitivities(found[1])
-    if not (np.isfinite(path_by).all() and np.isfinite(end_by).all()):
-        return None
-    bars = np.einsum("r...ts,...ts->...r", path_by, path_bar) + np.einsum("r...s,...s->...r", end_by, y_bar)
-    return [bars[..., :states], bars[..., states:]]
+    def accelerations(q, v, t, p):
+        return jnp.stack(base.program(*q, *v, t, *p)[:n])
+
+    def moving(q, v, t, p):
+        return with_tangents(accelerations, q, v, t, p), base.program(*q[0], *v[0], t, *p[0])[n]
+
+    shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((rows, n), (rows, n), (), (rows, base.numbers))]
+    program = lower(moving, *shapes, budget=_BUDGET)
+    if base.projection is None:
+        return program, None
+    state, speeds = base.projection
+
+    def projected(q, v, t, p):
+        both = with_tangents(lambda q, v, t, p: jnp.stack(state(*q, *v, t, *p)), q, v, t, p)
+        return both[:, :n], both[:, n:]
+
+    def velocity_scales(q, v, t, p):
+        return speeds(*q[0], *v[0], t, *p[0])
+
+    return program, _native.Projection(*(lower(of, *shapes, budget=_BUDGET) for of in (projected, velocity_scales)))
 
 
-# ---- arrays with any batch axes --------------------------------------------------------------------------------------
+# ---- rows ------------------------------------------------------------------------------------------------------------
 
 
-def _over_batch(run: Callable, ts, y0, *params) -> tuple[np.ndarray, ...]:
-    """Call `run` with rows of members for arrays with any batch axes in front, of length one where they share."""
-    ts, y0, *params = (np.asarray(x, np.float64) for x in (ts, y0, *params))
-    batch = np.broadcast_shapes(ts.shape[:-1], y0.shape[:-1], *(p.shape for p in params))
-    members = math.prod(batch)
+def _members(chosen, *arrays) -> list[np.ndarray]:
+    """The chosen rows of each array; an array of one row is shared by all."""
+    return [x[chosen] if len(x) == len(chosen) else x for x in arrays]
 
-    def rows(x, inner: tuple[int, ...], count: int):
-        if x.size == math.prod(inner):
-            x = x.reshape(1, *inner)
-            return x if count == 1 else np.broadcast_to(x, (count, *inner))
-        return np.broadcast_to(x, batch + inner).reshape(members, *inner)
 
-    count = members if any(p.size != 1 for p in params) else 1
-    numbers = np.stack([rows(p, (), count) for p in params] or [np.zeros(count)], axis=1)
-    states = rows(y0, y0.shape[-1:], members)
-    outcome = run(rows(ts, ts.shape[-1:], 1), states, numbers)
-    return tuple(np.asarray(x).reshape(batch + np.shape(x)[1:]) for x in outcome)
+def _for_all(x: np.ndarray, rows: int) -> np.ndarray:
+    """One row shared by all as a row for each."""
+    return np.broadcast_to(x, (rows, *x.shape[1:])) if len(x) == 1 else x
+
+
+def _portions(places: np.ndarray, numbers: np.ndarray) -> list[np.ndarray]:
+    """The places in portions that need no more than `LARGEST_PORTION` numbers together, or just one place."""
+    if not len(places):
+        return []
+    portion = np.cumsum(numbers[places]) // LARGEST_PORTION
+    return np.split(places, np.flatnonzero(np.diff(portion)) + 1)

@@ -25,17 +25,18 @@ import numpy as np
 from lagjax import _native
 from lagjax._arguments import Function, accept
 from lagjax._consistent import TOLERANCE, require_consistent
-from lagjax._engine import RESULT_OF_CODE, result_from
+from lagjax._engine import RESULT_OF_CODE
 from lagjax._equations import multiplier_program, projection, scalar_program
 from lagjax._flow import Flow, Tolerances, unfit
-from lagjax._layout import Layout
+from lagjax._layout import Layout, as_vector
 from lagjax._motion import Motion
 from lagjax._program import Program, Unlowerable, lower
-from lagjax._results import RESULTS, SimulationError
+from lagjax._results import RESULTS, SimulationError, result_from
 from lagjax._settings import Settings, as_arrays, is_concrete, require_budget, require_finite, require_flag
 from lagjax._simulate import raise_unless_ok
 from lagjax._system import System
 from lagjax._trajectory import State, Trajectory, Transitions
+from lagjax._transforms import run
 
 PyTree = Any
 
@@ -216,10 +217,10 @@ def _run(plan: _Plan, ts, q0, qdot0, params):
     layout = Layout.of(q0, qdot0)
     ts = jnp.asarray(ts)
     numbers, code = eqx.partition(params, eqx.is_array_like)
-    scalars = [x.astype(layout.dtype) for leaf in jax.tree.leaves(numbers) for x in jnp.ravel(jnp.asarray(leaf))]
+    vector = as_vector(numbers, layout.dtype)
     shapes = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jnp.result_type(x)), numbers)
     modes = [_mode(plan, i, layout, eqx.combine(shapes, code)) for i in range(len(plan.systems))]
-    rounds = _Rounds(plan, layout, modes, ts, params, scalars)
+    rounds = _Rounds(plan, layout, modes, ts, params, vector)
     y0 = jnp.concatenate([layout.flatten(q0), layout.flatten(qdot0)])
     start = plan.names.index(plan.start)
     astray = rounds.astray(start, ts[0], y0)
@@ -281,13 +282,13 @@ def _made(name: str, system: System, leaving: tuple[Transition, ...], layout: La
         raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
     if reason := unfit(program, n, layout.dtype):
         raise ValueError(f"The mode {name!r} has no machine code: {reason}.")
-    flow = Flow(program, n, back)
+    flow = Flow.of(program, n, back)
     if not leaving:
         return _Mode(flow, flow, *programs)
     if len(leaving) > MOST_GUARDS:
         raise ValueError(f"{len(leaving)} transitions leave the mode {name!r}, more than {MOST_GUARDS}.")
     directions = tuple(transition.direction for transition in leaving)
-    return _Mode(flow, Flow(program, n, back, _native.Guards(programs[1], directions)), *programs)
+    return _Mode(flow, Flow.of(program, n, back, _native.Guards(programs[1], directions)), *programs)
 
 
 MOST_GUARDS = 24  # two bits each in the code of an event, which is a double
@@ -337,7 +338,7 @@ class _Rounds(NamedTuple):
     modes: list[_Mode]
     ts: jax.Array
     params: PyTree
-    scalars: list[jax.Array]
+    numbers: jax.Array  # all in params, (P,)
 
     def one(self, carry: _Carry, count) -> tuple[_Carry, _Seen]:
         """Every mode runs the members that are in it; the others are given no time."""
@@ -358,7 +359,7 @@ class _Rounds(NamedTuple):
         held_t = jax.lax.stop_gradient(carry.t)
         runs = here & (carry.waiting == 0)
         horizon = jnp.where(runs, self.ts[-1], held_t)
-        found = mode.watched.traceable(tolerances)(jnp.stack([held_t, horizon]), carry.y, *self.scalars)
+        found = run(mode.watched, tolerances, jnp.stack([held_t, horizon]), carry.y, self.numbers)
         found = jax.tree.map(jax.lax.stop_gradient, found)
         changes = jnp.where(runs, jnp.maximum(found.code - _native.EVENT, 0), jnp.where(here, carry.waiting, 0))
         t_end = jnp.where(runs & (found.code == _native.DONE), self.ts[-1], found.t_end)
@@ -368,8 +369,8 @@ class _Rounds(NamedTuple):
         covered = covered & (self.ts <= t_end)
         inside = jnp.where(covered, self.ts, jax.lax.stop_gradient(jnp.clip(self.ts, held_t, t_end)))
         times = jnp.concatenate([carry.t[None], inside, t_end[None]])
-        run = mode.flow.traceable(tolerances)(times, carry.y, *self.scalars)
-        y_end = found.y_end + jnp.where(here, run.y_end - jax.lax.stop_gradient(run.y_end), 0.0)
+        moved = run(mode.flow, tolerances, times, carry.y, self.numbers)
+        y_end = found.y_end + jnp.where(here, moved.y_end - jax.lax.stop_gradient(moved.y_end), 0.0)
 
         exit = self._through(index, changes, carry.latest, t_end, y_end)
         event = (changes > 0) & ~exit.piled
@@ -383,7 +384,7 @@ class _Rounds(NamedTuple):
             mode=jnp.where(event, exit.target, index),
             going=event & ~exit.astray & ~broken,
             code=jnp.where(broken, _native.NOT_FINITE, jnp.where(event & exit.astray, INCONSISTENT, failed)),
-            path=jnp.where(covered[:, None], run.path[1:-1], carry.path),
+            path=jnp.where(covered[:, None], moved.path[1:-1], carry.path),
             modes=jnp.where(covered, index, carry.modes),
             steps=carry.steps + jnp.stack([found.accepted, found.rejected]),
             latest=exit.number,
@@ -399,8 +400,8 @@ class _Rounds(NamedTuple):
         if not leaving:
             return exit
         kinds = [(changes >> (2 * k)) & 3 for k in range(len(leaving))]
-        y_here, scalars = _held(changes > 0, (y, self.scalars))
-        values = self.modes[index].surfaces(*y_here, t, *scalars)
+        y_here, numbers = _held(changes > 0, (y, self.numbers))
+        values = self.modes[index].surfaces(*y_here, t, *numbers)
         seen = ~jnp.isnan(jnp.stack(values)).any()
         _, rates, sizes, slope = self._at_guards(index, t, y)
         before = jnp.asarray(False)
@@ -436,10 +437,10 @@ class _Rounds(NamedTuple):
 
     def _at_guards(self, index: int, t, y):
         """Guards, their rates and their sizes as numbers, and the slope of the state."""
-        t, y, scalars = jax.lax.stop_gradient((t, y, self.scalars))
-        n, out = self.layout.size, self.modes[index].guards(*y, t, *scalars)
+        t, y, numbers = jax.lax.stop_gradient((t, y, self.numbers))
+        n, out = self.layout.size, self.modes[index].guards(*y, t, *numbers)
         count = len(out) // 4
-        slope = jnp.concatenate([y[n:], jnp.stack(self.modes[index].flow.everywhere(*y, t, *scalars)[:n])])
+        slope = jnp.concatenate([y[n:], jnp.stack(self.modes[index].flow.anywhere(*y, t, *numbers)[:n])])
         return out[:count], out[count : 2 * count], out[2 * count : 3 * count], slope
 
     def astray(self, index: int, t, y):

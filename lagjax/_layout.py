@@ -71,6 +71,12 @@ class Layout:
         return jax.tree.unflatten(self.tree, leaves)
 
 
+def as_vector(numbers: PyTree, dtype) -> jax.Array:
+    """All numbers of a pytree end to end, shape (P,), in the order of its leaves."""
+    leaves = [jnp.ravel(jnp.asarray(leaf)).astype(dtype) for leaf in jax.tree.leaves(numbers)]
+    return jnp.concatenate(leaves) if leaves else jnp.zeros(0, dtype)
+
+
 def _structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tuple[int, ...], ...]]:
     """Paths, tree and shapes of `tree`, after checking that every leaf is an array of real floats."""
     paths, leaves, structure = taken_apart(tree, name)

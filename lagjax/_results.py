@@ -5,6 +5,8 @@ only `simulate` turns one into an exception.
 """
 
 import diffrax
+import jax
+import jax.numpy as jnp
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -43,6 +45,14 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 ENDED_WELL = tuple(int(result._value) for result in (RESULTS.successful, RESULTS.event_occurred))
 
 
+_STRUCTURE = jax.tree.structure(RESULTS.successful)
+
+
+def result_from(codes) -> RESULTS:
+    """The results with these codes, integers of any shape."""
+    return jax.tree.unflatten(_STRUCTURE, [jnp.asarray(codes)])
+
+
 def advice(result: RESULTS) -> str:
     """What happened and what to try, for one concrete result."""
     if result == RESULTS.dt_min_reached:
@@ -60,7 +70,7 @@ def advice(result: RESULTS) -> str:
 
 
 class SimulationError(RuntimeError):
-    """A trajectory did not reach its end; `.trajectory` holds what there is of it."""
+    """A trajectory did not reach its end; `.trajectory` holds what there is of it, None inside transformations."""
 
     def __init__(self, message, trajectory):
         super().__init__(message)

@@ -17,9 +17,10 @@ import numpy as np
 from lagjax import _engine, _linear
 from lagjax._consistent import inconsistent_members, rank_lost, require_consistent
 from lagjax._equations import equations
+from lagjax._failures import differentiable_where, nan_unless, raise_where_failed, sentence
 from lagjax._integrate import integrate
 from lagjax._layout import Layout
-from lagjax._results import ENDED_WELL, RESULTS, SimulationError, advice
+from lagjax._results import ENDED_WELL, RESULTS, SimulationError, result_from
 from lagjax._settings import (
     Settings,
     as_arrays,
@@ -226,9 +227,16 @@ def _integrate(system: System, settings: Settings, q0, qdot0, params, primal=Non
     if motion.constrained:
         lost = rank_lost(motion, (*y0, settings.ts[0], numbers), (*end, t_end, numbers))
         result = _of_constraints(result, RESULTS.promote(solved.result), lost)
-    # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start.
+    # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start. Whatever adjoint
+    # there is, their cotangents must not be lost: they go to all that went in.
     reached = jnp.isfinite(path[0]).all(axis=1) & jnp.isfinite(path[1]).all(axis=1) & (ts == settings.ts)
-    q, qdot = (jax.vmap(layout.restore)(jnp.where(reached[:, None], leaf, jnp.nan)) for leaf in path)
+    inputs = sum(jnp.sum(x) for x in jax.tree.leaves((settings.ts, y0, numbers)) if eqx.is_inexact_array(x))
+    well = jnp.isin(result._value, jnp.asarray(ENDED_WELL))
+    q, qdot = (
+        jax.vmap(layout.restore)(nan_unless(reached[:, None], jnp.where(reached[:, None], leaf, inputs)))
+        for leaf in path
+    )
+    end = tuple(differentiable_where(well, leaf) for leaf in end)
     return (
         settings.ts,
         q,
@@ -308,7 +316,7 @@ def _refused(trajectory: Trajectory, astray: jax.Array) -> Trajectory:
     def without(leaf):
         return jnp.where(astray.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.nan, leaf)
 
-    result = _engine.result_from(jnp.where(astray, RESULTS.inconsistent_start._value, trajectory.result._value))
+    result = result_from(jnp.where(astray, RESULTS.inconsistent_start._value, trajectory.result._value))
     q, qdot = jax.tree.map(without, (trajectory.q, trajectory.qdot))
     return eqx.tree_at(lambda t: (t.q, t.qdot, t.result), trajectory, (q, qdot, result))
 
@@ -319,23 +327,20 @@ def _first_member(tree: PyTree, axes: PyTree) -> PyTree:
 
 def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced."""
-    code = trajectory.result._value
-    if not is_concrete(code):
-        return trajectory.result.error_if(trajectory, ~trajectory.ok)
-    if int(code) in ENDED_WELL:
+    end, code, t_last = trajectory.end, trajectory.result._value, trajectory.ts[-1]
+    if not all(is_concrete(leaf) for leaf in jax.tree.leaves((end, code, t_last))):
+        y_end = jnp.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
+        states = trajectory.q, trajectory.qdot, end
+        states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)
+        return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
+    y_end = np.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
+    message = sentence(code, end.t, t_last, y_end, layout.names)
+    if message is None:
         return trajectory
-    end = trajectory.end
-    q, qdot = np.asarray(layout.flatten(end.q)), np.asarray(layout.flatten(end.qdot))
-    message = (
-        f"The motion could not be followed beyond t = {float(end.t):.9g} of {float(trajectory.ts[-1]):.9g}. "
-        f"{advice(trajectory.result)}"
-    )
     if trajectory.result == RESULTS.mass_matrix_singular:
         mass = np.asarray(trajectory.system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
         message += f"\n{_describe_null(mass, layout.names)}"
-    state = ", ".join(f"{name} = {value:.6g}" for name, value in zip(layout.names[:8], q[:8], strict=True))
-    velocity = ", ".join(f"{value:.6g}" for value in qdot[:8])
-    raise SimulationError(f"{message}\nThe last state was {state}; velocities {velocity}.", trajectory)
+    raise SimulationError(message, trajectory)
 
 
 def _describe_null(mass: np.ndarray, names: tuple[str, ...]) -> str:

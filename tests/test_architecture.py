@@ -13,6 +13,7 @@ PACKAGE = Path(lagjax.__file__).parent
 STREET = [
     "_arguments",
     "_results",
+    "_failures",
     "_layout",
     "_solvers",
     "_settings",
@@ -21,6 +22,7 @@ STREET = [
     "_taylor",
     "_native",
     "_flow",
+    "_transforms",
     "_linear",
     "_motion",
     "_equations",

@@ -8,7 +8,7 @@ import pytest
 import lagjax
 import lagjax._engine as engine
 import lagjax._flow as flows
-from lagjax._flow import Tolerances
+from lagjax._flow import StepStore, Tolerances
 from lagjax._layout import Layout
 
 TOLERANCES = Tolerances(1e-11, 1e-11, 4096)
@@ -48,65 +48,82 @@ def batch(members: int, seed: int = 0):
     return rng.uniform(-1, 1, (members, 4)), numbers, rng
 
 
-def by_sensitivities(flow, ts, y0, numbers, path_bar, y_bar):
-    larger = flow.varied(True, tuple(range(numbers.shape[1])))
-    found, _ = larger.run(ts, larger.start(y0), numbers, TOLERANCES.patient)
-    path, end = larger.sensitivities(found.path), larger.sensitivities(found.y_end)
-    return np.einsum("rnts,nts->nr", path, path_bar) + np.einsum("rns,ns->nr", end, y_bar)
+def by_tangents(flow, ts, y0, numbers, path_bar, y_bar):
+    """The cotangents of (y0, params) from the whole Jacobian, (N, 2n + P)."""
+    inputs = y0.shape[1] + numbers.shape[1]
+    unit = np.broadcast_to(np.eye(inputs), (len(y0), inputs, inputs))
+    path, end = flow.push(ts, y0, numbers, unit[..., : y0.shape[1]], unit[..., y0.shape[1] :], TOLERANCES)
+    return np.einsum("nrts,nts->nr", path, path_bar) + np.einsum("nrs,ns->nr", end, y_bar)
+
+
+def pull(flow, ts, y0, numbers, outcome, path_bar, y_bar):
+    """One cotangent for each member."""
+    solution = outcome.path, outcome.code, outcome.accepted, outcome.ticket
+    y0_bar, params_bar = flow.pull(ts, y0, numbers, solution, path_bar[:, None], y_bar[:, None], TOLERANCES)
+    return np.concatenate([y0_bar[:, 0], params_bar[:, 0]], axis=1)
 
 
 @pytest.mark.parametrize("times", [np.linspace(0, 2, 41), np.array([0.5, -1.0]), np.array([0.0, 1e-3, 1.1, 1.2])])
-def test_transposed_steps_are_sensitivities(double, times):
+def test_transposed_steps_are_tangents(double, times):
     # Many outputs in one step, none, and backwards in time; more members than lanes, of different lengths.
     y0, numbers, rng = batch(19)
     ts, path_bar, y_bar = times[None], rng.normal(size=(19, len(times), 4)), rng.normal(size=(19, 4))
-    path_bar[:, -1] = 0  # the caller adds that of the last output to that of the end
     outcome, _ = double.run(ts, y0, numbers, TOLERANCES)
-    found = double.pull(ts, y0, numbers, outcome.accepted, path_bar, y_bar, TOLERANCES)
-    expected = by_sensitivities(double, ts, y0, numbers, path_bar, y_bar)
-    scale = np.abs(expected).max()
-    np.testing.assert_allclose(np.concatenate([found.y0, found.params], axis=1), expected, atol=1e-9 * scale)
+    found = pull(double, ts, y0, numbers, outcome, path_bar, y_bar)
+    expected = by_tangents(double, ts, y0, numbers, path_bar, y_bar)
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 
 
 def test_portions_do_not_change_a_cotangent(double, monkeypatch):
     y0, numbers, rng = batch(23)
     ts, path_bar, y_bar = np.array([[0.0, 0.7, 1.5]]), rng.normal(size=(23, 3, 4)), rng.normal(size=(23, 4))
     outcome, _ = double.run(ts, y0, numbers, TOLERANCES)
-    given = ts, y0, numbers, outcome.accepted, path_bar, y_bar, TOLERANCES
-    whole = double.pull(*given)
-    monkeypatch.setattr(lagjax._native, "LARGEST_RECORD", 100)
-    for part, all_ in zip(double.pull(*given), whole, strict=True):
-        np.testing.assert_array_equal(part, all_)
+    whole = pull(double, ts, y0, numbers, outcome, path_bar, y_bar)
+    monkeypatch.setattr(flows, "LARGEST_PORTION", 100)
+    np.testing.assert_array_equal(pull(double, ts, y0, numbers, outcome, path_bar, y_bar), whole)
 
 
 def test_kept_steps_do_not_change_a_cotangent(double, monkeypatch):
     y0, numbers, rng = batch(23)
     ts, path_bar, y_bar = np.array([[0.0, 0.7, 1.5]]), rng.normal(size=(23, 3, 4)), rng.normal(size=(23, 4))
-
-    def pull(numbers):
-        return double.pull(ts, y0, numbers, outcome.accepted, path_bar, y_bar, TOLERANCES)
-
     outcome, _ = double.run(ts, y0, numbers, TOLERANCES)
-    plain, other = pull(numbers), pull(1.01 * numbers)
-    followed = []
-    integrate = type(double.kernel)._integrate
-    monkeypatch.setattr(
-        type(double.kernel), "_integrate", lambda self, *given: followed.append(self) or integrate(self, *given)
-    )
-    for asked, expected, runs in ((numbers, plain, 1), (1.01 * numbers, other, 2)):  # those of this run, or of another
-        followed.clear()
-        double.run(ts, y0, numbers, TOLERANCES, keep=True)
-        for kept, again in zip(pull(asked), expected, strict=True):
-            np.testing.assert_array_equal(kept, again)
-        assert len(followed) == runs and not lagjax._native._last_run
-    reused = np.array(y0 + 0.1, order="C")  # memory of the caller, who puts other numbers there
-    double.run(ts, reused, numbers, TOLERANCES, keep=True)
-    reused[:] = y0
-    asked = double.pull(ts, reused, numbers, outcome.accepted, path_bar, y_bar, TOLERANCES)
-    np.testing.assert_array_equal(asked.y0, plain.y0)
-    monkeypatch.setattr(lagjax._native, "LARGEST_KEPT", 23 * 6 * 3)  # room for three steps of each
-    double.run(ts, y0, numbers, TOLERANCES, keep=True)
-    np.testing.assert_array_equal(pull(numbers).y0, plain.y0)
+    plain = pull(double, ts, y0, numbers, outcome, path_bar, y_bar)
+    runs = []
+    run = flows.Flow.run
+    monkeypatch.setattr(flows.Flow, "run", lambda self, *given: runs.append(len(given[1])) or run(self, *given))
+
+    def again(kept):
+        runs.clear()
+        return pull(double, ts, y0, numbers, kept, path_bar, y_bar)
+
+    kept, _ = double.run(ts, y0, numbers, TOLERANCES, flows.KEPT)
+    np.testing.assert_array_equal(again(kept), plain)
+    assert runs == []
+    # Members in another order find their own steps; what is not there any more is followed once more.
+    shuffled = rng.permutation(23)
+    turned = type(kept)(*(x[shuffled] for x in kept))
+    found = pull(double, ts, y0[shuffled], numbers[shuffled], turned, path_bar[shuffled], y_bar[shuffled])
+    np.testing.assert_array_equal(found, plain[shuffled])
+    monkeypatch.setattr(flows, "KEPT", StepStore())
+    np.testing.assert_array_equal(again(kept), plain)
+    assert runs == [23]
+
+
+def test_steps_that_do_not_fit_are_followed_once_more(double, monkeypatch):
+    y0, numbers, rng = batch(23)
+    ts, path_bar, y_bar = np.array([[0.0, 0.7, 1.5]]), rng.normal(size=(23, 3, 4)), rng.normal(size=(23, 4))
+    plain = pull(double, ts, y0, numbers, double.run(ts, y0, numbers, TOLERANCES)[0], path_bar, y_bar)
+    monkeypatch.setattr(flows, "LARGEST_KEPT", 23 * 6 * 3)  # room for three steps of each
+    outcome, _ = double.run(ts, y0, numbers, TOLERANCES, flows.KEPT)
+    assert (outcome.ticket < 0).any()
+    np.testing.assert_array_equal(pull(double, ts, y0, numbers, outcome, path_bar, y_bar), plain)
+
+
+def test_the_oldest_steps_are_dropped_first(double):
+    y0, numbers, _ = batch(3)
+    store = StepStore(limit=0)
+    tickets = [double.run(np.array([[0.0, 1.0]]), y0, numbers, TOLERANCES, store)[0].ticket for _ in range(2)]
+    assert not list(store.runs(tickets[0])) and [len(k) for _, k, _ in store.runs(tickets[1])] == [3]
 
 
 def loss(system, ts, rtol=1e-11):
@@ -132,13 +149,15 @@ def test_reverse_is_forward_for_members_of_a_batch():
     np.testing.assert_allclose(shared, alone + rest, rtol=1e-10)
 
 
-def test_many_numbers_are_varied_along_one_direction(monkeypatch):
+def test_directions_side_by_side_are_those_one_by_one(monkeypatch):
     system, ts = lagjax.System(chain), jnp.array([0.0, 0.6, 1.0])
     params = {"g": 9.81, "l": jnp.array([1.0, 0.8, 1.2]), "m": jnp.array([1.0, 2.0, 0.5])}
     value = lambda p: loss(system, ts)(jnp.array([0.5, -0.2, 0.9]), jnp.zeros(3), p)
     reverse = jax.grad(value)(params)
-    monkeypatch.setattr(flows, "LARGEST_JACOBIAN", 0)
     forward = jax.jacfwd(value)(params)
+    monkeypatch.setattr(flows, "MOST_DIRECTIONS", 1)
+    for a, b in zip(jax.tree.leaves(jax.jacfwd(value)(params)), jax.tree.leaves(forward), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9)
     for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(forward), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9)
     along = jax.jvp(value, (params,), (jax.tree.map(lambda x: 1e-30 * jnp.ones_like(x), params),))[1]
@@ -152,8 +171,8 @@ def test_a_jacobian_row_by_row_is_that_column_by_column(monkeypatch):
     exact = jax.jacfwd(
         lambda x: x[0] * jnp.cos(jnp.sqrt(x[2]) * ts) + x[1] * jnp.sin(jnp.sqrt(x[2]) * ts) / jnp.sqrt(x[2])
     )
-    np.testing.assert_allclose(jax.jacrev(path)(x), exact(x), atol=1e-9)  # more rows than numbers: by sensitivities
-    monkeypatch.setattr(flows, "LARGEST_JACOBIAN", 0)
+    np.testing.assert_allclose(jax.jacrev(path)(x), exact(x), atol=1e-9)  # more rows than numbers: by tangents
+    monkeypatch.setattr(flows, "MOST_TANGENT_COORDINATES", 1)
     np.testing.assert_allclose(jax.jacrev(path)(x), exact(x), atol=1e-9)
 
 

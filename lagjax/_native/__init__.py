@@ -23,16 +23,16 @@ from lagjax._native._series_code import LANE, MAX_ORDER
 from lagjax._program import Program, Series, Unlowerable, series
 
 __all__ = [
-    "DONE", "EVENT", "NOT_FINITE", "NOT_LANDED", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Cotangents", "Guards",
-    "Kernel", "Projection", "cores", "recurrences",
+    "DONE", "EVENT", "NOT_FINITE", "NOT_LANDED", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Guards", "Kernel",
+    "Projection", "cores", "order_for", "recurrences",
 ]  # fmt: skip
-
-LARGEST_RECORD = 2**23  # numbers of the steps that are written down at once: 64 MiB
-LARGEST_KEPT = 2**26  # and of those that are kept for a derivative that is asked for next: room for half a GiB
 
 
 class Outcome(NamedTuple):
-    """For N members, T times and 2n states: what `Kernel` returns. `path` is NaN where a member did not come."""
+    """For N members, T times and 2n states: what `Kernel` returns. `path` is NaN where a member did not come.
+
+    `idle` counts the steps for which lanes stood empty; `table` holds the steps that were written down, if any.
+    """
 
     path: np.ndarray
     y_end: np.ndarray
@@ -41,14 +41,7 @@ class Outcome(NamedTuple):
     steps: np.ndarray
     rejected: np.ndarray
     idle: int
-
-
-class Cotangents(NamedTuple):
-    """Of the initial states (N, 2n) and of the parameters (N, P); and how the motions ended."""
-
-    y0: np.ndarray
-    params: np.ndarray
-    code: np.ndarray
+    table: np.ndarray | None
 
 
 class Guards(NamedTuple):
@@ -99,23 +92,17 @@ class Kernel:
         self._engine, at = compiled(integrator.module, ("run",))
         self._run = _function(at["run"], *[ctypes.c_void_p] * 4)
 
-    def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int, keep: bool = False) -> Outcome:
+    def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int, room=None) -> Outcome:
         """`y0` (N, 2n); `ts` (N, T) and `params` (N, P), or one row for all; all float64.
 
-        The steps of a run with `keep` stay in memory until the next run, for `pull` to find them there.
+        With `room` (N,) up to so many steps of each member are written down, for `pull`.
         """
-        # What is kept is compared later, when the memory of whoever called may hold other numbers.
-        arrays = [np.array(x, np.float64, order="C") for x in (ts, y0, params)] if keep else _contiguous(ts, y0, params)
-        given = (*arrays, rtol, atol, max_steps)
-        room = min(max_steps, LARGEST_KEPT // ((self.states + 2) * max(1, len(y0)))) if keep else 0
-        _last_run.clear()
-        if room == 0:
-            return self._integrate(*given)
-        first_step = np.arange(len(y0) + 1) * room
-        record = np.empty((first_step[-1], self.states + 2))  # memory that nobody writes to costs nothing
-        outcome = self._integrate(*given, record, first_step)
-        _last_run.append(_Steps(self, given, record, first_step, outcome.code, room))
-        return outcome
+        ts, y0, params = _contiguous(ts, y0, params)
+        if room is None:
+            return self._integrate(ts, y0, params, rtol, atol, max_steps)
+        first_step = np.concatenate([[0], np.cumsum(room)]).astype(np.int64)
+        table = np.empty((first_step[-1], self.states + 2))  # the system provides pages when they are written to
+        return self._integrate(ts, y0, params, rtol, atol, max_steps, table, first_step)
 
     def _integrate(self, ts, y0, params, rtol, atol, max_steps, record=None, first_step=None) -> Outcome:
         members, times = len(y0), ts.shape[1]
@@ -140,57 +127,31 @@ class Kernel:
         if ended_badly.any():  # a start that is infinite was not reached either
             reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
             path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
-        return Outcome(path, y_end, t_end, *(counts.astype(int) for counts in (code, steps, rejected)), idle)
+        return Outcome(path, y_end, t_end, *(counts.astype(int) for counts in (code, steps, rejected)), idle, record)
 
-    def pull(self, ts, y0, params, steps, path_bar, y_bar, rtol: float, atol: float, max_steps: int) -> Cotangents:
-        """The transposed derivative of a run that took so many `steps`, integers (N,).
+    def pull(self, ts, params, table, first, counts, path_bar, y_bar, order: int) -> tuple[np.ndarray, np.ndarray]:
+        """The transposed derivative of a run, over the steps it wrote down.
 
-        From the cotangents of the outputs, `path_bar` (N, T, 2n), and of the states at the end, `y_bar` (N, 2n), to
-        those of the initial states and of the parameters. The motion is followed once more to find its steps, unless
-        the last run has kept them.
+        The steps of member k are `counts[k]` rows of `table` from `first[k]` on. From the cotangents of the outputs,
+        `path_bar` (N, T, 2n), of which the first and the last are not looked at, and of the states at the end, `y_bar`
+        (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P).
         """
-        ts, y0, params = _contiguous(ts, y0, params)
-        steps = np.ascontiguousarray(steps, np.int64)
-        y_bar, params_bar = np.array(y_bar, np.float64), np.zeros((len(y0), self.numbers))
-        limits, last = (rtol, atol, max_steps), _taken()
-        if last is not None and last.belong_to(self, (ts, y0, params, *limits), steps):
-            given = ts, params, steps, *_contiguous(path_bar), y_bar, params_bar
-            self._back(*given, order_for(rtol), last.record, last.first_step)
-            code = last.code
-        else:
-            code = np.empty(len(y0), int)
-            shared = len(ts) == 1, len(params) == 1
-            for some in _portions(steps * (self.states + 2)):
-                rows = [x if one else x[some] for x, one in zip((ts, params), shared, strict=True)]
-                given = rows[0], y0[some], rows[1], steps[some], *_contiguous(path_bar[some])
-                code[some] = self._follow_and_go_back(*given, y_bar[some], params_bar[some], *limits)
-        y_bar += path_bar[:, 0]  # the first output is the initial state
-        return Cotangents(y_bar, params_bar, code)
-
-    def _follow_and_go_back(
-        self, ts, y0, params, steps, path_bar, y_bar, params_bar, rtol, atol, max_steps
-    ) -> np.ndarray:
-        """The same for one portion; `y_bar` and `params_bar` are changed in place."""
-        first_step = np.concatenate([[0], np.cumsum(steps)])
-        record = np.empty((first_step[-1], self.states + 2))
-        code = self._integrate(ts, y0, params, rtol, atol, max_steps, record, first_step).code
-        self._back(ts, params, steps, path_bar, y_bar, params_bar, order_for(rtol), record, first_step)
-        return code
-
-    def _back(self, ts, params, steps, path_bar, y_bar, params_bar, order, record, first_step) -> None:
-        """Over the recorded steps, from the last to the first."""
+        ts, params, path_bar = _contiguous(ts, params, path_bar)
+        first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
+        y_bar, params_bar = np.array(y_bar, np.float64, order="C"), np.zeros((len(y_bar), self.numbers))
         counter, (members, times) = np.zeros(1, np.int64), path_bar.shape[:2]
         job = _adjoint.Job(
-            *_addresses(counter, ts, params, record, first_step, steps, path_bar, y_bar, params_bar),
+            *_addresses(counter, ts, params, table, first, counts, path_bar, y_bar, params_bar),
             times if len(ts) > 1 else 0, self.numbers if len(params) > 1 else 0, members, times, order,
         )  # fmt: skip
         _, run, size = self._adjoint
 
-        def pull(_) -> None:
+        def back(_) -> None:
             memory, lanes = _aligned(size), np.zeros(len(LANE) * self.width, np.int64)
             run(ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data)
 
-        self._on_all_cores(pull, members)
+        self._on_all_cores(back, members)
+        return y_bar, params_bar
 
     @functools.cached_property
     def _adjoint(self):
@@ -204,32 +165,6 @@ class Kernel:
         return list(_pool().map(work, range(threads))) if threads > 1 else [work(0)]
 
 
-class _Steps(NamedTuple):
-    """The steps of a run: from where on those of each member stand in the record, with room for so many."""
-
-    kernel: Kernel
-    given: tuple
-    record: np.ndarray
-    first_step: np.ndarray
-    code: np.ndarray
-    room: int
-
-    def belong_to(self, kernel: Kernel, given: tuple, steps: np.ndarray) -> bool:
-        """Whether this is that run, and complete: the same numbers went in, whoever asks."""
-        same = self.kernel is kernel and all(map(np.array_equal, self.given, given))
-        return same and bool((steps <= self.room).all())
-
-
-_last_run: list[_Steps] = []  # of all kernels: one at most
-
-
-def _taken() -> _Steps | None:
-    try:
-        return _last_run.pop()
-    except IndexError:  # there was none, or another thread was faster
-        return None
-
-
 def _function(address: int, *types):
     return ctypes.CFUNCTYPE(None, *types)(address)
 
@@ -240,13 +175,6 @@ def _contiguous(*arrays) -> list[np.ndarray]:
 
 def _addresses(*arrays) -> list[int | None]:
     return [None if array is None else array.ctypes.data for array in arrays]
-
-
-def _portions(numbers: np.ndarray) -> list[slice]:
-    """Members in portions that need no more than `LARGEST_RECORD` numbers together, or just one."""
-    place = np.cumsum(numbers) // LARGEST_RECORD
-    ends = [*(np.flatnonzero(np.diff(place)) + 1).tolist(), len(numbers)]
-    return [slice(first, end) for first, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
 def recurrences(program: Program, size: int) -> Series:

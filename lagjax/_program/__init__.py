@@ -36,6 +36,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from lagjax._program._emit import emit, plain_elementary
+from lagjax._program._evaluate import evaluate
 from lagjax._program._graph import FOLD, Node, Unlowerable
 from lagjax._program._passes import finish, regroup, with_given
 from lagjax._program._rules import Expansion, kind_of
@@ -47,6 +48,7 @@ __all__ = [
     "StraightLine",
     "Unlowerable",
     "emit",
+    "evaluate",
     "lower",
     "lower_solution",
     "plain_elementary",
@@ -174,6 +176,11 @@ class Program:
     budget: int
     otherwise: "Callable[[], Program] | None" = None
     linear: LinearSystem | None = None
+
+    @property
+    def line(self) -> StraightLine:
+        """The operations alone."""
+        return StraightLine(self.nodes, self.kinds, self.outputs)
 
     @property
     def complete(self) -> "Program":

@@ -1,0 +1,159 @@
+"""What a motion that did not reach its end does to a program of JAX: it raises, or is NaN in values and derivatives.
+
+A failure is known when the numbers are: at once in plain Python and under `jax.vmap` or `jax.grad` alone, at run time
+inside `jax.jit`. `raise_where_failed` is one primitive for all of them. What it returns is passed through it, so that
+the check cannot be dropped as dead code where only a derivative is used: the derivative passes through it as well.
+
+An output that was not reached has no derivative. `where` alone would make it zero in reverse mode, since its other
+branch is a constant; `nan_unless` makes it NaN wherever its cotangent is not zero.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from lagjax._results import ENDED_WELL, SimulationError, advice, result_from
+
+
+def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
+    """`tree` again, where its motion ended well; else `SimulationError`, naming what failed, when and in which member.
+
+    `result` holds a result code, `end` = (t, y) the time and the state (2n,) at which the motion ended, `t_last` the
+    time it was to reach, and `names` (n,) those of the coordinates. Inside `jax.jit` the error is JAX's own, and its
+    text ends with this one.
+    """
+    passed = check_p.bind(*map(jnp.asarray, (result, end[0], t_last, end[1])), names=names)
+
+    def through(leaf):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            return leaf
+        return jnp.where(passed == 0, leaf, jnp.nan)
+
+    return jax.tree.map(through, tree)
+
+
+def sentence(result, t_end, t_last, y_end, names: tuple[str, ...]) -> str | None:
+    """What failed first among members with any batch axes, when, and where it was; None where all ended well."""
+    result, t_end, t_last, y_end = map(np.asarray, (result, t_end, t_last, y_end))
+    failed = np.argwhere(~np.isin(result, ENDED_WELL))
+    if not len(failed):
+        return None
+    member = tuple(failed[0].tolist())
+    who = ""
+    if member:
+        label = member[0] if len(member) == 1 else member
+        others = f", the first of {len(failed)} that failed" if len(failed) > 1 else ""
+        who = f" of member {label}{others} among {result.size},"
+    t_last, y = np.broadcast_to(t_last, result.shape)[member], y_end[member]
+    q, qdot = y[: len(names)], y[len(names) :]
+    state = ", ".join(f"{name} = {value:.6g}" for name, value in zip(names[:8], q[:8], strict=True))
+    velocity = ", ".join(f"{value:.6g}" for value in qdot[:8])
+    return (
+        f"The motion{who} could not be followed beyond t = {float(t_end[member]):.9g} of {float(t_last):.9g}. "
+        f"{advice(result_from(result[member]))}\nThe last state was {state}; velocities {velocity}."
+    )
+
+
+def _raise(result, t_end, t_last, y_end, *, names) -> None:
+    if text := sentence(result, t_end, t_last, y_end, names):
+        raise SimulationError(text, None)
+
+
+check_p = Primitive("lagjax_check")
+check_p.def_abstract_eval(lambda result, t_end, t_last, y_end, **_: jax.core.ShapedArray(result.shape, t_end.dtype))
+
+
+@check_p.def_impl
+def _at_once(result, *values, names):
+    _raise(result, *values, names=names)
+    return jnp.zeros(jnp.shape(result), values[0].dtype)
+
+
+def _compiled(on_host):
+    """One comparison where all is well; the host is asked only where something failed."""
+
+    def check(result, *values, names):
+        def host(*given):
+            _raise(*map(np.asarray, given), names=names)
+
+        shape = jax.ShapeDtypeStruct(result.shape, values[0].dtype)
+        well = jnp.isin(result, jnp.asarray(ENDED_WELL, result.dtype)).all()
+        return jax.lax.cond(well, lambda *_: jnp.zeros(shape.shape, shape.dtype), on_host(host, shape), result, *values)
+
+    return mlir.lower_fun(check, multiple_results=False)
+
+
+def _in_place(host, shape):
+    return buffer_callback(lambda _, place, *given: host(*given), shape)
+
+
+def _by_copies(host, shape):
+    return lambda *given: jax.pure_callback(lambda *x: host(*x), shape, *given)
+
+
+mlir.register_lowering(check_p, _compiled(_by_copies))
+mlir.register_lowering(check_p, _compiled(_in_place), platform="cpu")
+
+
+def _batched(primitive, args, axes, **settings):
+    """All arguments with the batch in front."""
+    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not batching.not_mapped)
+    given = [
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(args, axes, strict=True)
+    ]
+    return primitive.bind(*given, **settings), 0
+
+
+def _without_derivative(primals, tangents, **settings):
+    passed = check_p.bind(*primals, **settings)
+    return passed, ad.Zero(jax.typeof(passed).to_tangent_aval())
+
+
+ad.primitive_jvps[check_p] = _without_derivative
+batching.primitive_batchers[check_p] = lambda args, axes, **settings: _batched(check_p, args, axes, **settings)
+
+
+# ---- outputs that were not reached -----------------------------------------------------------------------------------
+
+
+def nan_unless(reached, x):
+    """`x` where `reached` holds, else NaN; so are its derivatives, but for the zero cotangent of what nobody uses."""
+    return nan_unless_p.bind(jnp.broadcast_to(reached, jnp.shape(x)), x)
+
+
+@jax.custom_jvp
+def differentiable_where(well, x):
+    """`x` itself, whose derivatives are NaN unless `well` holds."""
+    return x
+
+
+@differentiable_where.defjvp
+def _differentiable_where_jvp(primals, tangents):
+    return primals[1], nan_unless(primals[0], tangents[1])
+
+
+def _nan_unless(reached, x):
+    return jnp.where(reached, x, jnp.nan)
+
+
+def _nan_unless_transpose(cotangent, reached, x):
+    cotangent = ad.instantiate_zeros(cotangent)
+    return [None, jnp.where(reached | (cotangent == 0), cotangent, jnp.nan)]
+
+
+def _nan_unless_jvp(primals, tangents):
+    reached, _ = primals
+    return nan_unless_p.bind(*primals), nan_unless_p.bind(reached, ad.instantiate_zeros(tangents[1]))
+
+
+nan_unless_p = Primitive("lagjax_nan_unless")
+nan_unless_p.def_abstract_eval(lambda reached, x: jax.core.ShapedArray(x.shape, x.dtype))
+nan_unless_p.def_impl(_nan_unless)
+mlir.register_lowering(nan_unless_p, mlir.lower_fun(_nan_unless, multiple_results=False))
+ad.primitive_jvps[nan_unless_p] = _nan_unless_jvp
+ad.primitive_transposes[nan_unless_p] = _nan_unless_transpose
+batching.primitive_batchers[nan_unless_p] = lambda args, axes: _batched(nan_unless_p, args, axes)

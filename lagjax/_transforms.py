@@ -1,0 +1,422 @@
+"""Flows as functions of JAX: four primitives with their derivatives, batching and lowering.
+
+With F the map (ts, y0, params) → (path, y_end) of a flow and D its derivative by (y0, params) between fixed times,
+
+    run         F
+    push        D v            linear in v = (δy0, δparams)              transposed: pull
+    pull        Dᵀ w           linear in w = (w_path, w_end)             transposed: push
+    curvature   (∂/∂x wᵀ D) d  linear in w and in d, symmetric in d      transposed in d: itself
+
+and their derivatives close the circle, so that there are derivatives of every order in every mode:
+
+    d run  = push(v − f₀ δt₀) + f δt                  f the rate (q̇, q̈) of the state, f₀ at the start
+    d push = push(dv) + D² F [v, dx]                  by the run of the tangent flow
+    d pull = pull(dw) + curvature(w, dx) + …          by the pull of the tangent flow, and what moves with the times
+
+To move an output time by δt moves the output by f δt; to start later from the same state is to start from another one.
+Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3–5, for what is pushed, pulled, and both.
+
+Every primitive takes arrays with any batch axes in front, as many of them in each, of length one where an argument is
+shared; under `jax.vmap` it is still one call of machine code. Outside of `jit` nothing is compiled but that.
+"""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from lagjax import _native
+from lagjax._flow import KEPT, Flow, Outcome, Tolerances, from_rows, to_rows
+
+
+def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Outcome:
+    """The outcome of one member, under every transformation of JAX; `ts` (T,), `y0` (2n,), `params` (P,).
+
+    A flow with guards has no derivatives: they would have to say how its end moves.
+    """
+    return _compiled(flow, tolerances)(ts, y0, params)
+
+
+@functools.lru_cache(maxsize=256)
+def _compiled(flow: Flow, tolerances: Tolerances):
+    """`run` as one program of XLA: a derivative outside of `jit` then compiles as one, not operation by operation."""
+    return jax.jit(lambda *given: Outcome(*run_p.bind(*given, flow=flow, tolerances=tolerances, keep=False)))
+
+
+# ---- on the host: NumPy arrays with any batch axes in front ----------------------------------------------------------
+
+
+def _rows(arrays, inner, shared=()):
+    """Each array with one row a member, or one row where that is all there is to a `shared` one; and the batch axes."""
+    arrays = [np.asarray(x) for x in arrays]
+    leading = [x.shape[: x.ndim - k] for x, k in zip(arrays, inner, strict=True)]
+    batch = np.broadcast_shapes(*leading)
+
+    def rows(place, x, k):
+        own = x.shape[x.ndim - k :]
+        if place in shared and x.size == math.prod(own):
+            return x.reshape(1, *own)
+        return np.broadcast_to(x, batch + own).reshape(math.prod(batch), *own)
+
+    return [rows(place, x, k) for place, (x, k) in enumerate(zip(arrays, inner, strict=True))], batch
+
+
+def _in_batch(results, batch):
+    return [x.reshape(batch + x.shape[1:]) for x in results]
+
+
+def _run_on_host(ts, y0, params, *, flow, tolerances, keep):
+    rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2))
+    return _in_batch(flow.run(*rows, tolerances, KEPT if keep else None)[0], batch)
+
+
+def _push_on_host(ts, y0, params, path, code, accepted, ticket, dy0, dparams, *, flow, tolerances):
+    del path, code, accepted, ticket  # what the transpose needs
+    rows, batch = _rows((ts, y0, params, dy0, dparams), (1, 1, 1, 2, 2), shared=(0, 2))
+    return _in_batch(flow.push(*rows, tolerances), batch)
+
+
+def _pull_on_host(ts, y0, params, path, code, accepted, ticket, path_bar, end_bar, *, flow, tolerances):
+    arrays = ts, y0, params, path, code, accepted, ticket, path_bar, end_bar
+    rows, batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2))
+    return _in_batch(flow.pull(*rows[:3], rows[3:7], *rows[7:], tolerances), batch)
+
+
+# ---- primitives ------------------------------------------------------------------------------------------------------
+
+run_p, push_p, pull_p, curvature_p = (Primitive(f"lagjax_{name}") for name in ("run", "push", "pull", "curvature"))
+# Of run's inputs, and of what push and pull are told about a run: ts, y0, params, path, code, accepted, ticket.
+_GIVEN = 7
+
+
+def _batch_of(args, inner):
+    return np.broadcast_shapes(*(x.shape[: x.ndim - k] for x, k in zip(args, inner, strict=True)))
+
+
+def _floats(*shapes):
+    return [jax.core.ShapedArray(shape, np.dtype(float)) for shape in shapes]
+
+
+def _run_shapes(ts, y0, params, *, flow, **_):
+    batch = _batch_of((ts, y0, params), (1, 1, 1))
+    counts = [jax.core.ShapedArray(batch, np.dtype(int))] * 4
+    floats = _floats((*batch, ts.shape[-1], flow.states), (*batch, flow.states), batch)
+    return [*floats, *counts]
+
+
+def _push_shapes(*args, flow, **_):
+    batch, m = _batch_of((*args[:3], *args[_GIVEN:]), (1, 1, 1, 2, 2)), args[_GIVEN].shape[-2]
+    return _floats((*batch, m, args[0].shape[-1], flow.states), (*batch, m, flow.states))
+
+
+def _pull_shapes(*args, flow, **_):
+    batch = _batch_of(args, (1, 1, 1, 2, 0, 0, 0, 3, 2))
+    m = args[-1].shape[-2]
+    return _floats((*batch, m, flow.states), (*batch, m, flow.numbers))
+
+
+def _curvature_shapes(*args, flow, **_):
+    batch = _batch_of(args, (1, 1, 1, 2, 1, 1, 1))
+    return _floats((*batch, flow.states), (*batch, flow.numbers))
+
+
+def _curvature_composed(ts, y0, params, path_bar, end_bar, dy0, dparams, *, flow, tolerances):
+    """By going back over the steps of the tangent flow, with cotangents of the tangent alone."""
+    larger, tolerances = flow.tangent(1), tolerances.with_larger_budget
+    given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
+    outcome = Outcome(*run_p.bind(*given, flow=larger, tolerances=tolerances, keep=True))
+    bars = [from_rows(jnp.stack([jnp.zeros_like(bar), bar], axis=-2))[..., None, :, :] if bar is path_bar else
+            from_rows(jnp.stack([jnp.zeros_like(bar), bar], axis=-2))[..., None, :]
+            for bar in (path_bar, end_bar)]  # fmt: skip
+    state_bar, numbers_bar = pull_p.bind(*given, *_residuals(outcome), *bars, flow=larger, tolerances=tolerances)
+    state_bar, numbers_bar = to_rows(state_bar[..., 0, :], flow.size)[..., 0, :], numbers_bar[..., 0, : flow.numbers]
+    return [state_bar * length, numbers_bar * length]
+
+
+def _push_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
+    """`push` along one direction, (…, 2n) and (…, P), by the run of the tangent flow: for its own derivatives."""
+    given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
+    larger = flow.tangent(1)
+    outcome = Outcome(*run_p.bind(*given, flow=larger, tolerances=tolerances.with_larger_budget, keep=False))
+    path, end = (to_rows(y, flow.size)[..., 1, :] for y in (outcome.path, outcome.y_end))
+    return path * length[..., None], end * length
+
+
+def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
+    """What the tangent flow runs from, for a direction of length one; and the length."""
+    length = jnp.max(jnp.abs(dy0), axis=-1, keepdims=True)
+    if flow.numbers:
+        length = jnp.maximum(*jnp.broadcast_arrays(length, jnp.max(jnp.abs(dparams), axis=-1, keepdims=True)))
+    length = jax.lax.stop_gradient(jnp.where(length > 0, length, 1.0))
+    start = from_rows(jnp.stack(jnp.broadcast_arrays(y0, dy0 / length), axis=-2))
+    numbers = jnp.concatenate(jnp.broadcast_arrays(params, dparams / length), axis=-1)
+    return (ts, start, numbers), length
+
+
+def _residuals(outcome: Outcome):
+    """What `push` and `pull` are told of a run: how it came out. Their values do not vary with that."""
+    given = outcome.path, outcome.code, outcome.accepted, outcome.ticket
+    return tuple(jax.lax.stop_gradient(x) for x in given)
+
+
+# ---- derivatives -----------------------------------------------------------------------------------------------------
+
+
+def _zero(tangent) -> bool:
+    return isinstance(tangent, ad.Zero)
+
+
+def _value(tangent):
+    """A tangent as an array; zeros where it is known to be none."""
+    return ad.instantiate_zeros(tangent)
+
+
+def _slope(flow: Flow, t, y, params):
+    """(q̇, q̈) at a state, shape (…, 2n); zero where it is not finite: there the motion has ended."""
+    n = flow.size
+    scalars = (*(y[..., i] for i in range(2 * n)), t, *(params[..., i] for i in range(flow.numbers)))
+    acceleration = flow.anywhere(*jnp.broadcast_arrays(*scalars))[:n]
+    rate = jnp.stack(jnp.broadcast_arrays(*(y[..., n + i] for i in range(n)), *acceleration), axis=-1)
+    return jnp.where(jnp.isfinite(rate), rate, 0.0)
+
+
+def _run_jvp(primals, tangents, *, flow, tolerances, keep):
+    (ts, y0, params), (dts, dy0, dparams) = primals, tangents
+    if flow.guards is not None or all(map(_zero, tangents)):
+        outs = run_p.bind(*primals, flow=flow, tolerances=tolerances, keep=keep)
+        return outs, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
+    outs = run_p.bind(*primals, flow=flow, tolerances=tolerances, keep=True)
+    outcome = Outcome(*outs)
+    dy0, dparams = _value(dy0), _value(dparams)
+    if not _zero(dts):
+        dy0 = dy0 - _slope(flow, ts[..., 0], y0, params) * dts[..., :1]
+    direction = [x[..., None, :] for x in (dy0, dparams)]
+    d_path, d_end = push_p.bind(*primals, *_residuals(outcome), *direction, flow=flow, tolerances=tolerances)
+    d_path, d_end, d_t_end = d_path[..., 0, :, :], d_end[..., 0, :], jnp.zeros_like(outcome.t_end)
+    if not _zero(dts):
+        reached, done = jnp.isfinite(outcome.path), outcome.code == _native.DONE
+        places = jnp.where(reached, outcome.path, y0[..., None, :])
+        rates = _slope(flow, ts, places, params[..., None, :]) * dts[..., None]
+        d_path = d_path + jnp.where(reached, rates, 0.0)
+        d_end = d_end + jnp.where(done[..., None], rates[..., -1, :], 0.0)
+        d_t_end = jnp.where(done, dts[..., -1], 0.0)
+    counts = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs[3:]]
+    return outs, [d_path, d_end, d_t_end, *counts]
+
+
+def _add(one, other):
+    return [a + b for a, b in zip(one, other, strict=True)]
+
+
+def _linear_part(primitive, primals, tangents, count, settings):
+    """The derivative of a primitive by its last `count` arguments, in which it is linear; None without any."""
+    if all(map(_zero, tangents[-count:])):
+        return None
+    return primitive.bind(*primals[:-count], *map(_value, tangents[-count:]), **settings)
+
+
+def _push_jvp(primals, tangents, **settings):
+    outs = push_p.bind(*primals, **settings)
+    total = _linear_part(push_p, primals, tangents, 2, settings)
+    if not all(map(_zero, tangents[:3])):
+        dy0, dparams = primals[_GIVEN:]
+
+        def along(*moving):
+            lifted = [x[..., None, :] for x in moving]
+            return _push_composed(*lifted, dy0, dparams, **settings)
+
+        more = list(jax.jvp(along, primals[:3], tuple(map(_value, tangents[:3])))[1])
+        total = more if total is None else _add(total, more)
+    return outs, _or_zeros(total, outs)
+
+
+def _or_zeros(total, outs):
+    return [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs] if total is None else total
+
+
+def _pull_jvp(primals, tangents, **settings):
+    outs = pull_p.bind(*primals, **settings)
+    total = _linear_part(pull_p, primals, tangents, 2, settings)
+    if not all(map(_zero, tangents[:3])):
+        more = _pull_moved(primals, *tangents[:3], outs, settings)
+        total = more if total is None else _add(total, more)
+    return outs, _or_zeros(total, outs)
+
+
+def _pull_moved(primals, dts, dy0, dparams, outs, settings):
+    """How `pull` changes with ts, y0 and params: each of its m cotangents for itself."""
+    flow, (ts, y0, params), bars = settings["flow"], primals[:3], primals[_GIVEN:]
+    total, dy0, dparams = None, _value(dy0), _value(dparams)
+    if not _zero(dts):
+        # Output i moves by f δtᵢ, so that δtᵢ Df of it is one more part of the outputs' derivative, and
+        # the start moves by −f₀ δt₀.
+        path, done = primals[3], primals[4] == _native.DONE
+        reached = jnp.isfinite(path)
+        places = jnp.where(reached, path, y0[..., None, :])
+        path_bar, end_bar = bars
+        weights = jnp.where(reached[..., None, :, :], path_bar, 0.0).at[..., -1, :].add(
+            jnp.where(done[..., None, None], end_bar, 0.0))  # fmt: skip
+
+        def rates(places, numbers):
+            return _slope(flow, ts[..., None, :], places, numbers[..., None, :]) * dts[..., None, :, None]
+
+        lifted = jnp.broadcast_to(places[..., None, :, :], weights.shape), jnp.broadcast_to(
+            params[..., None, :], (*weights.shape[:-2], flow.numbers))  # fmt: skip
+        moved_bar, more = jax.vjp(rates, *lifted)[1](weights)
+        still = jnp.zeros_like(end_bar)
+        total = list(pull_p.bind(*primals[:_GIVEN], moved_bar, still, **settings))
+        total[1] = total[1] + more
+
+        def first_rate(y, numbers):
+            return -_slope(flow, ts[..., None, 0], y, numbers) * dts[..., None, :1]
+
+        lifted = (
+            jnp.broadcast_to(y0[..., None, :], outs[0].shape),
+            jnp.broadcast_to(params[..., None, :], outs[1].shape),
+        )
+        total = _add(total, jax.vjp(first_rate, *lifted)[1](outs[0]))
+        dy0 = dy0 - _slope(flow, ts[..., 0], y0, params) * dts[..., :1]
+    given = [x[..., None, :] for x in (ts, y0, params)]
+    direction = [x[..., None, :] for x in (dy0, dparams)]
+    more = curvature_p.bind(*given, *bars, *direction, **settings)
+    return list(more) if total is None else _add(total, more)
+
+
+def _curvature_jvp(primals, tangents, **settings):
+    outs = curvature_p.bind(*primals, **settings)
+    given, bars, direction = primals[:3], primals[3:5], primals[5:]
+    total = None
+    parts = (
+        (tangents[3:5], lambda moving: curvature_p.bind(*given, *moving, *direction, **settings)),
+        (tangents[5:], lambda moving: curvature_p.bind(*given, *bars, *moving, **settings)),
+        (tangents[:3], lambda moving: jax.jvp(
+            lambda *given: _curvature_composed(*given, *bars, *direction, **settings), given, tuple(moving))[1]),
+    )  # fmt: skip
+    for moving, part in parts:
+        if not all(map(_zero, moving)):
+            more = part([_value(x) for x in moving])
+            total = list(more) if total is None else _add(total, more)
+    return outs, _or_zeros(total, outs)
+
+
+# ---- transposes: of what is linear -----------------------------------------------------------------------------------
+
+
+def _summed(cotangent, aval):
+    """A cotangent with the batch axes of an argument that was shared: the sum over those that shared it."""
+    axes = tuple(i for i, (a, b) in enumerate(zip(cotangent.shape, aval.shape, strict=True)) if a != b)
+    return jnp.sum(cotangent, axis=axes, keepdims=True) if axes else cotangent
+
+
+def _to_linear(args, cotangents):
+    """The cotangents of the arguments that are linear here, None for the others."""
+    return [_summed(c, x.aval) if ad.is_undefined_primal(x) else None for x, c in zip(args, cotangents, strict=True)]
+
+
+def _transposed(primitive):
+    def rule(cotangents, *args, **settings):
+        found = primitive.bind(*args[:_GIVEN], *map(_value, cotangents), **settings)
+        return [None] * _GIVEN + _to_linear(args[_GIVEN:], found)
+
+    return rule
+
+
+def _curvature_transpose(cotangents, *args, **settings):
+    moving, given, bars, direction = [_value(c) for c in cotangents], args[:3], args[3:5], args[5:]
+    if any(map(ad.is_undefined_primal, direction)):
+        found = curvature_p.bind(*given, *bars, *moving, **settings)
+        return [None] * 5 + _to_linear(direction, found)
+    ts, *rest = given
+    second = jax.jvp(lambda *rest: _push_composed(ts, *rest, *direction, **settings), tuple(rest), tuple(moving))[1]
+    return [None] * 3 + _to_linear(bars, second) + [None] * 2
+
+
+# ---- batches ---------------------------------------------------------------------------------------------------------
+
+
+def _batched(primitive):
+    def rule(args, axes, **settings):
+        given = [
+            jnp.expand_dims(x, 0) if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(args, axes, strict=True)
+        ]
+        outs = primitive.bind(*given, **settings)
+        return outs, [0] * len(outs)
+
+    return rule
+
+
+def _several_at_once(primitive, outputs_after):
+    """Directions, or cotangents, of one motion are followed together: `outputs_after` axes come after theirs."""
+
+    def rule(args, axes, **settings):
+        if any(axis is not batching.not_mapped for axis in axes[:_GIVEN]):
+            return _batched(primitive)(args, axes, **settings)
+        size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not batching.not_mapped)
+        place, linear = args[1].ndim - 1, []  # the axis after those of the batch
+        for x, axis in zip(args[_GIVEN:], axes[_GIVEN:], strict=True):
+            if axis is batching.not_mapped:
+                x, axis = jnp.broadcast_to(x, (size, *x.shape)), 0
+            x = jnp.moveaxis(x, axis, place)
+            m = x.shape[place + 1]
+            linear.append(x.reshape(*x.shape[:place], size * m, *x.shape[place + 2 :]))
+        outs = primitive.bind(*args[:_GIVEN], *linear, **settings)
+        places = [x.ndim - after - 1 for x, after in zip(outs, outputs_after, strict=True)]
+        outs = [x.reshape(*x.shape[:k], size, m, *x.shape[k + 1 :]) for x, k in zip(outs, places, strict=True)]
+        return outs, places
+
+    return rule
+
+
+# ---- registration ----------------------------------------------------------------------------------------------------
+
+
+def _on_host(primitive, host, shapes) -> None:
+    """A primitive that `host` computes from NumPy arrays: at once, or in a callback of what XLA compiles."""
+    primitive.multiple_results = True
+    primitive.def_abstract_eval(shapes)
+
+    def at_once(*args, **settings):
+        with jax.enable_x64(True):
+            return jax.device_put([np.asarray(x) for x in host(*map(np.asarray, args), **settings)])
+
+    def compiled(*args, **settings):
+        avals = shapes(*args, **settings)
+
+        # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
+        # the callbacks themselves may occupy.
+        def callback(_, places, *arrays):
+            with jax.enable_x64(True):  # another thread; a program may be made here
+                results = host(*map(np.asarray, arrays), **settings)
+            for place, values in zip(places, results, strict=True):
+                np.asarray(place)[...] = values
+
+        return buffer_callback(callback, tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in avals))(*args)
+
+    primitive.def_impl(at_once)
+    mlir.register_lowering(primitive, mlir.lower_fun(compiled, multiple_results=True), platform="cpu")
+
+
+_on_host(run_p, _run_on_host, _run_shapes)
+_on_host(push_p, _push_on_host, _push_shapes)
+_on_host(pull_p, _pull_on_host, _pull_shapes)
+curvature_p.multiple_results = True
+curvature_p.def_abstract_eval(_curvature_shapes)
+curvature_p.def_impl(_curvature_composed)
+mlir.register_lowering(curvature_p, mlir.lower_fun(_curvature_composed, multiple_results=True), platform="cpu")
+
+for _primitive, _jvp, _transpose, _batching in (
+    (run_p, _run_jvp, None, _batched(run_p)),
+    (push_p, _push_jvp, _transposed(pull_p), _several_at_once(push_p, (2, 1))),
+    (pull_p, _pull_jvp, _transposed(push_p), _several_at_once(pull_p, (1, 1))),
+    (curvature_p, _curvature_jvp, _curvature_transpose, _batched(curvature_p)),
+):
+    ad.primitive_jvps[_primitive] = _jvp
+    if _transpose is not None:
+        ad.primitive_transposes[_primitive] = _transpose
+    batching.primitive_batchers[_primitive] = _batching
