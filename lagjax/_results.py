@@ -43,6 +43,14 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 ENDED_WELL = tuple(int(result._value) for result in (RESULTS.successful, RESULTS.event_occurred))
 
 
+_NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
+
+
+def name_of(code) -> str:
+    """The name of a result code, an integer: 'nonfinite_state', as in `lagjax.RESULTS`."""
+    return _NAMES[int(code)]
+
+
 def advice(result: RESULTS) -> str:
     """What happened and what to try, for one concrete result."""
     if result == RESULTS.dt_min_reached:

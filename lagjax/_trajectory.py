@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._display import label, summary
 from lagjax._health import Health, examine
 from lagjax._layout import Layout
 from lagjax._results import RESULTS
@@ -73,6 +74,10 @@ class Trajectory(eqx.Module):
     mode_names: tuple[str, ...] = eqx.field(static=True, default=())
     tolerances: tuple[jax.Array, jax.Array] | None = None
 
+    def __repr__(self) -> str:
+        """Three lines; `equinox.tree_pprint` prints the fields."""
+        return summary(self)
+
     @property
     def ok(self) -> jax.Array:
         """True where a member reached the last time or its event."""
@@ -133,9 +138,9 @@ class Trajectory(eqx.Module):
         variables = {"ok": (members, np.asarray(self.ok))}
         for name, tree in (("q", self.q), ("qdot", self.qdot)):
             for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-                label = ".".join([name, *(_key_text(key) for key in path)])
-                inner = tuple(f"{label}_{axis}" for axis in range(leaf.ndim - len(members) - 1))
-                variables[label] = ((*members, "time", *inner), np.asarray(leaf))
+                variable = label(name, path)
+                inner = tuple(f"{variable}_{axis}" for axis in range(leaf.ndim - len(members) - 1))
+                variables[variable] = ((*members, "time", *inner), np.asarray(leaf))
         if self.mode is not None:
             variables["mode"] = ((*members, "time"), np.asarray(self.mode), {"names": list(self.mode_names)})
         time = self.ts if self.ts.ndim == 1 else self.ts[(0,) * (self.ts.ndim - 1)]
@@ -190,8 +195,3 @@ def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, para
 
 def _varied_where(here, x):
     return jnp.where(here, x, jax.lax.stop_gradient(x)) if eqx.is_array_like(x) else x
-
-
-def _key_text(key: Any) -> str:
-    """A key of a pytree path as plain text: 'theta' for a dict's or a NamedTuple's, '0' for a list's."""
-    return str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", key))))

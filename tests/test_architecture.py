@@ -14,6 +14,7 @@ STREET = [
     "_arguments",
     "_results",
     "_layout",
+    "_display",
     "_machine_code",
     "_solvers",
     "_settings",
