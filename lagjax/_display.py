@@ -1,6 +1,6 @@
 """A trajectory in three lines: what it holds, over what time and in how many steps, and how it ended.
 
-    Trajectory of 1000 members, float64: q.theta (1000, 101), q.x (1000, 101), and qdot
+    Trajectory of 1000 members, float64: q['theta'] (1000, 101), q['x'] (1000, 101), and qdot
     t from 0 to 10 at 101 outputs, 241 steps in the median, at most 388 (12 rejected)
     998 of 1000 reached the end, 2 nonfinite_state: the first that failed is member 17, at t = 0.5
 
@@ -36,7 +36,7 @@ def summary(trajectory) -> str:
 def _contents(trajectory) -> str:
     batch = trajectory.result._value.shape
     named = [
-        f"{label('q', path)} {tuple(leaf.shape)}"
+        f"q{jax.tree_util.keystr(path)} {tuple(leaf.shape)}"
         for path, leaf in jax.tree_util.tree_leaves_with_path(trajectory.q)
     ]  # fmt: skip
     if len(named) > LEAVES_SHOWN:
@@ -106,13 +106,3 @@ def _range(values: np.ndarray) -> str:
         return "?"
     least, largest = f"{values.min():.6g}", f"{values.max():.6g}"
     return least if least == largest else f"{least} … {largest}"
-
-
-def label(name: str, path) -> str:
-    """A leaf by its path in a pytree as plain text: `q.theta` in a dict or a NamedTuple, `q.0` in a list."""
-    return ".".join([name, *(key_text(key) for key in path)])
-
-
-def key_text(key: Any) -> str:
-    """A key of a pytree path as plain text: 'theta' for a dict's or a NamedTuple's, '0' for a list's."""
-    return str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", key))))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._display import label, summary
+from lagjax._display import summary
 from lagjax._health import Health, examine
 from lagjax._layout import Layout
 from lagjax._results import RESULTS
@@ -138,9 +138,9 @@ class Trajectory(eqx.Module):
         variables = {"ok": (members, np.asarray(self.ok))}
         for name, tree in (("q", self.q), ("qdot", self.qdot)):
             for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-                variable = label(name, path)
-                inner = tuple(f"{variable}_{axis}" for axis in range(leaf.ndim - len(members) - 1))
-                variables[variable] = ((*members, "time", *inner), np.asarray(leaf))
+                label = ".".join([name, *(_key_text(key) for key in path)])
+                inner = tuple(f"{label}_{axis}" for axis in range(leaf.ndim - len(members) - 1))
+                variables[label] = ((*members, "time", *inner), np.asarray(leaf))
         if self.mode is not None:
             variables["mode"] = ((*members, "time"), np.asarray(self.mode), {"names": list(self.mode_names)})
         time = self.ts if self.ts.ndim == 1 else self.ts[(0,) * (self.ts.ndim - 1)]
@@ -195,3 +195,8 @@ def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, para
 
 def _varied_where(here, x):
     return jnp.where(here, x, jax.lax.stop_gradient(x)) if eqx.is_array_like(x) else x
+
+
+def _key_text(key: Any) -> str:
+    """A key of a pytree path as plain text: 'theta' for a dict's or a NamedTuple's, '0' for a list's."""
+    return str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", key))))

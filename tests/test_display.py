@@ -33,7 +33,7 @@ def test_one_motion():
     run = lagjax.simulate(scene, q0, jax.tree.map(jnp.zeros_like, q0), TS)
     steps = int(run.stats["num_steps"])
     assert lines(run) == [
-        "Trajectory, float64: q.x (5,), q.y (5, 2), and qdot",
+        "Trajectory, float64: q['x'] (5,), q['y'] (5, 2), and qdot",
         f"t from 0 to 2 at 5 outputs, {steps} steps (0 rejected)",
         "reached the end",
     ]
