@@ -215,13 +215,13 @@ _RESULT_STRUCTURE = jax.tree.structure(RESULTS.successful)
 # What diffrax calls them; the state at the end tells the rest.
 _AS_DIFFRAX = np.array([
     int(result._value)
-    for result in (diffrax.RESULTS.successful, diffrax.RESULTS.max_steps_reached, *[diffrax.RESULTS.dt_min_reached] * 4)
+    for result in (diffrax.RESULTS.successful, diffrax.RESULTS.max_steps_reached, *[diffrax.RESULTS.dt_min_reached] * 5)
 ], np.int32)  # fmt: skip
 # The codes of the kernel, in their order, as those of `RESULTS`.
 RESULT_OF_CODE = np.array([
     int(result._value)
     for result in (
         RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,
-        RESULTS.mass_matrix_singular, RESULTS.projection_failed,
+        RESULTS.mass_matrix_singular, RESULTS.projection_failed, RESULTS.acceleration_discontinuous,
     )
 ], np.int32)  # fmt: skip
