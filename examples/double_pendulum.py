@@ -72,7 +72,7 @@ def flip_times(resolution, duration):
 
 
 def cost_of_a_digit(members, duration):
-    """Error and time per trajectory of two solvers, on a batch of moderate swings."""
+    """Error and time per trajectory, on a batch of moderate swings: what runs by default, then two solvers."""
     q0 = np.random.default_rng(0).uniform(-1.5, 1.5, (members, 2))
     ts = jnp.linspace(0.0, duration, 11)
     return lagjax.work_precision(

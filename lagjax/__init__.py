@@ -8,6 +8,7 @@ from lagjax._check import Finding, Findings, check
 from lagjax._explain import Explanation
 from lagjax._health import Health
 from lagjax._hybrid import Transition, simulate_hybrid
+from lagjax._machine_code import MachineCode
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._simulate import simulate, simulate_batch
@@ -24,6 +25,7 @@ __all__ = [
     "Findings",
     "FineOutput",
     "Health",
+    "MachineCode",
     "SimulationError",
     "State",
     "System",

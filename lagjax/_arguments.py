@@ -32,6 +32,14 @@ class Function(eqx.Module):
     code: Any = eqx.field(static=True)
     extras: tuple[str, ...] = eqx.field(static=True)
 
+    @property
+    def name(self) -> str:
+        """The name that the user's function was defined with, or that of its class."""
+        code = self.code
+        while isinstance(code, functools.partial):
+            code = code.func
+        return getattr(code, "__name__", type(code).__name__)
+
     def __call__(self, *roles: Any, **extras: Any) -> Any:
         """Pass on the roles, and of the extras those that the function asks for."""
         function = eqx.combine(self.arrays, self.code)

@@ -34,12 +34,26 @@ LARGEST_DIFFERENTIATED = 2000
 
 
 def flow_for(system: System, settings: Settings, layout: Layout, *values: PyTree) -> "Flow | str":
-    """The flow for a run from the values (q0, qdot0, params) of one member, or a sentence that says why it has none."""
+    """The flow for a run from the values (q0, qdot0, params) of one member, or a sentence that says why it has none.
+
+    Raises `ValueError` with that sentence where `solver=MachineCode()` insists.
+    """
+    flow = _flow_or_reason(system, settings, layout, values[-1])
+    if isinstance(flow, str) and settings.insists:
+        raise ValueError(
+            f"solver=lagjax.MachineCode() cannot integrate this: {flow}. Leave solver at None, and diffrax integrates "
+            "what machine code cannot."
+        )
+    return flow
+
+
+def _flow_or_reason(system: System, settings: Settings, layout: Layout, params: PyTree) -> "Flow | str":
     if not settings.by_default:
-        return "a solver, an adjoint, fixed steps, an event or a progress meter was asked for"
+        asked = "an adjoint, fixed steps, an event or a progress meter"
+        return f"{asked} was asked for" if settings.insists else f"a solver, {asked} was asked for"
     if not all(is_concrete(x) for x in (settings.controller.rtol, settings.controller.atol)):
         return "the tolerances are being traced"
-    return scene_flow(system, layout, values[-1])
+    return scene_flow(system, layout, params)
 
 
 def has_derivatives(flow: Flow, *values: PyTree) -> bool:
@@ -194,13 +208,13 @@ def _fields(settings: Settings, layout: Layout, outcome: Outcome, idle: int | No
 # What diffrax calls them; the state at the end tells the rest.
 _AS_DIFFRAX = np.array([
     int(result._value)
-    for result in (diffrax.RESULTS.successful, diffrax.RESULTS.max_steps_reached, *[diffrax.RESULTS.dt_min_reached] * 4)
+    for result in (diffrax.RESULTS.successful, diffrax.RESULTS.max_steps_reached, *[diffrax.RESULTS.dt_min_reached] * 5)
 ], np.int32)  # fmt: skip
 # The codes of the kernel, in their order, as those of `RESULTS`.
 RESULT_OF_CODE = np.array([
     int(result._value)
     for result in (
         RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,
-        RESULTS.mass_matrix_singular, RESULTS.projection_failed,
+        RESULTS.mass_matrix_singular, RESULTS.projection_failed, RESULTS.acceleration_discontinuous,
     )
 ], np.int32)  # fmt: skip

@@ -28,6 +28,7 @@ import numpy as np
 
 from lagjax import _native
 from lagjax._program import Program, Unlowerable, evaluate, lower, pullback
+from lagjax._stopped import End, what_stopped
 
 LARGEST_PROGRAM = 6_000  # operations of an acceleration, beyond which LLVM takes too long
 _BUDGET = 100_000  # operations of a program with tangents
@@ -235,12 +236,31 @@ class Flow:
             outcome = outcome._replace(ticket=store.keep(self._compact(table, room, outcome.accepted, rtol)))
         again, flow, tolerances = self._second_chance(outcome.code, tolerances)
         if not again.any():
-            return outcome, idle
+            return self._explained(outcome, ts, params), idle
         some = _members(again, ts, y0, params)
         better, more = flow.run(*some, tolerances, store, None if room is None else room[again])
         for values, new in zip(outcome, better, strict=True):
             values[again] = new
-        return outcome, idle + more
+        return self._explained(outcome, ts, params), idle + more
+
+    def _explained(self, outcome: Outcome, ts, params) -> Outcome:
+        """The outcome with what stopped the members whose steps became too small, or too many."""
+        shrank, spent = outcome.code == _native.STEP_TOO_SMALL, outcome.code == _native.OUT_OF_STEPS
+        some = np.flatnonzero(shrank | spent)
+        if not some.size:
+            return outcome
+        times, numbers = (x[some] if len(x) > 1 else x for x in (ts, params))
+
+        def acceleration(t, y):
+            values = self.anywhere.evaluate(*y.T, t, *numbers.T)[: self.size]
+            return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
+
+        counts = outcome.accepted[some], outcome.rejected[some]
+        end = End(outcome.t_end[some], outcome.y_end[some], times[:, 0], times[:, -1], *counts)
+        not_finite, jumps = what_stopped(acceleration, end, shrank[some], spent[some])
+        outcome.code[some[jumps]] = _native.DISCONTINUOUS
+        outcome.code[some[not_finite]] = _native.NOT_FINITE
+        return outcome
 
     def _compact(self, table, room, counts, rtol: float) -> Steps:
         """The steps of a run, without the room that was not used."""

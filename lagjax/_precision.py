@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._machine_code import MachineCode
 from lagjax._settings import as_arrays
 from lagjax._simulate import simulate, simulate_batch
 from lagjax._solvers import FineOutput
@@ -32,7 +33,9 @@ _TOLERANCES = {
 # the error estimate itself begins to reject steps.
 _REFERENCE, _CHECK = 50, 500
 
+# Measured beside the default engine. Where that is diffrax's it is the first of these, and not measured twice.
 _SOLVERS = {"Dopri8": FineOutput(diffrax.Dopri8()), "Tsit5": diffrax.Tsit5()}
+_FIRST = next(iter(_SOLVERS))
 
 
 class WorkPrecisionRow(NamedTuple):
@@ -107,7 +110,7 @@ def work_precision(
     qdot0: PyTree,
     ts: jax.Array,
     params: PyTree = None,
-    solvers: Mapping[str, diffrax.AbstractSolver] | None = None,
+    solvers: Mapping[str, diffrax.AbstractSolver | MachineCode | None] | None = None,
     tolerances: Sequence[float] | None = None,
     *,
     batch_axes: tuple[PyTree, PyTree, PyTree] | None = None,
@@ -124,15 +127,17 @@ def work_precision(
     of plain `diffrax.Dopri8()` is, pays for it here as it does in use.
 
     - `system`, `q0`, `qdot0`, `ts`, `params`, `max_steps`: as for `simulate`.
-    - `solvers`: names and adaptive diffrax solvers; Dopri8 with fine output, and Tsit5, by default.
+    - `solvers`: names, and what `simulate` takes as its `solver`: an adaptive one of diffrax, `lagjax.MachineCode()`,
+      or None for the engine that `simulate` chooses. By default that engine first, under its name, then Dopri8 with
+      fine output and Tsit5.
     - `tolerances`: values of rtol, atol being rtol/1000 as in `simulate`; by default from 1e-4 to 1e-12 in float64,
       from 1e-2 to 1e-5 in float32.
     - `batch_axes`: time `simulate_batch` with these axes instead of `simulate`. Errors are then the median and the
       maximum over the members that reached their end.
     - `repeats`: how often each is timed. The median counts, without the compilation, which is once per solver.
 
-    A batch steps until its slowest member arrives: `wasted` is the largest number of steps times the members, over the
-    sum of their steps, minus one.
+    `wasted` counts the steps for which a lane stood empty, as a part of all that were taken. In diffrax a batch steps
+    until its slowest member arrives; machine code gives the lane of a member that has ended to the next one.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, `SimulationError` when the reference of
     a single trajectory cannot be followed to its end.
@@ -148,10 +153,10 @@ def work_precision(
     ```
     """
     dtype = np.dtype(jnp.result_type(jnp.float32, *(jnp.asarray(leaf).dtype for leaf in jax.tree.leaves((q0, qdot0)))))
-    solvers = dict(_SOLVERS) if solvers is None else solvers
-    _require_adaptive(solvers)
+    measured = {"default": None, **_SOLVERS} if solvers is None else solvers
+    _require_adaptive(measured)
     tolerances = _TOLERANCES[dtype] if tolerances is None else tolerances
-    _require_tolerances(tolerances, dtype)
+    _require_tolerances(tolerances, dtype, measured)
     if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
         raise ValueError(f"repeats must be a positive integer; got {repeats!r}.")
 
@@ -165,11 +170,23 @@ def work_precision(
         return simulate_batch(system, *scene, batch_axes=batch_axes, **options)
 
     truth, resolution = _reference(partial(run, None, reference=True), jnp.result_type(float))
+    if solvers is None:
+        measured = _with_default_named(partial(run, rtol=max(tolerances)))
     rows = []
-    for name, solver in solvers.items():
+    for name, solver in measured.items():
         run(solver, max(tolerances))  # compiles; tolerances are traced, so once per solver
         rows += [_row(name, rtol, partial(run, solver, rtol), truth, repeats) for rtol in tolerances]
     return WorkPrecision(tuple(rows), *_median_and_worst(resolution), members=len(truth))
+
+
+def _with_default_named(run: Callable[[MachineCode], Trajectory]) -> dict[str, diffrax.AbstractSolver | None]:
+    """The solvers that are measured by default, that of `simulate` first and under the name of what integrates."""
+    try:
+        run(MachineCode())
+    except ValueError:  # it insists, and says why there is none: then `simulate` leaves the scene to diffrax
+        others = {name: solver for name, solver in _SOLVERS.items() if name != _FIRST}
+        return {f"default: {_FIRST}": None, **others}
+    return {"default: Taylor (machine code)": None, **_SOLVERS}
 
 
 def _reference(run: Callable[[float], Trajectory], dtype) -> tuple[np.ndarray, np.ndarray]:
@@ -197,6 +214,7 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
     accepted, rejected, steps = (
         np.atleast_1d(trajectory.stats[key]) for key in ("num_accepted_steps", "num_rejected_steps", "num_steps")
     )
+    idle = trajectory.stats.get("num_wasted_lane_steps", 0)  # of a batch only
     return WorkPrecisionRow(
         name,
         float(rtol),
@@ -206,7 +224,7 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
         float(accepted.mean()),
         float(rejected.mean()),
         float(np.mean(trajectory.ok)),
-        float(steps.max() * steps.size / max(steps.sum(), 1) - 1),
+        float(idle / max(steps.sum(), 1)),
     )
 
 
@@ -227,25 +245,30 @@ def _median_and_worst(errors: np.ndarray) -> tuple[float, float]:
     return (float(np.median(known)), float(known.max())) if known.size else (np.nan, np.nan)
 
 
-def _require_adaptive(solvers: Mapping[str, diffrax.AbstractSolver]) -> None:
+def _require_adaptive(solvers: Mapping[str, diffrax.AbstractSolver | MachineCode | None]) -> None:
     if not isinstance(solvers, Mapping):
         raise TypeError(f"solvers must be a dict from names to diffrax solvers; got {type(solvers).__name__}.")
     if not solvers:
-        raise ValueError("solvers is empty: name at least one, such as {'Dopri8': diffrax.Dopri8()}.")
+        raise ValueError("solvers is empty: name at least one, such as {'default': None} or {'5': diffrax.Tsit5()}.")
     for name, solver in solvers.items():
-        if not isinstance(solver, diffrax.AbstractSolver):
-            raise TypeError(f"solvers[{name!r}] must be an instance of a diffrax solver; got {solver!r}.")
-        if not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        if not isinstance(solver, diffrax.AbstractSolver | MachineCode | None):
+            raise TypeError(
+                f"solvers[{name!r}] must be an instance of a diffrax solver, lagjax.MachineCode() or None; got "
+                f"{solver!r}."
+            )
+        if isinstance(solver, diffrax.AbstractSolver) and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
             raise ValueError(
                 f"solvers[{name!r}] is {type(solver).__name__}, which has no error estimate: a tolerance means nothing "
                 "to it. Choose an adaptive one, such as diffrax.Tsit5()."
             )
 
 
-def _require_tolerances(tolerances: Sequence[float], dtype: np.dtype) -> None:
+def _require_tolerances(tolerances: Sequence[float], dtype: np.dtype, solvers: Mapping) -> None:
     if not np.ndim(tolerances) == 1 or not len(tolerances):
         raise ValueError(f"tolerances must be a sequence of at least one value of rtol; got {tolerances!r}.")
-    least = 10 * float(jnp.finfo(dtype).eps)  # what `simulate` asks for, found before the reference is computed
+    # What `simulate` asks for, found before the reference is computed; of machine code alone it asks for less.
+    by_diffrax = any(isinstance(solver, diffrax.AbstractSolver) for solver in solvers.values())
+    least = (10 if by_diffrax else 0.25) * float(jnp.finfo(dtype).eps)
     for rtol in tolerances:
         if not (np.isfinite(rtol) and rtol >= least):
             raise ValueError(f"Every tolerance must be a number of at least {least:.1e} in {dtype.name}; got {rtol}.")

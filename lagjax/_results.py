@@ -13,8 +13,15 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """The result codes of diffrax, extended; compare with `trajectory.result == lagjax.RESULTS.successful`."""
 
     nonfinite_state = (
-        "The state or its acceleration became NaN or infinite. Look at the Lagrangian, its gradient and the parameters "
-        "there: a square root or norm at zero, a logarithm of a negative number, a branch of `where` that is not taken."
+        "The state or its acceleration is NaN or infinite there, or just ahead. Look at the Lagrangian, its gradient, "
+        "the forces and the parameters at that time and state: a square root or norm at zero, a logarithm of a "
+        "negative number, a branch of `where` that is not taken."
+    )
+    acceleration_discontinuous = (
+        "The acceleration jumps there, and no step fits over it or the budget of steps was spent on it: a kink of the "
+        "Lagrangian such as abs(q) at zero, dry friction at rest, a branch of `where` whose sides do not meet. Make "
+        "the two sides modes of simulate_hybrid, or round the kink off over a width that the motion can resolve. A "
+        "jump that is merely crossed costs some forty steps: then raise max_steps or loosen rtol."
     )
     max_transitions_reached = "The budget of transitions was spent. Raise max_transitions, or end ts earlier."
     zeno = (
@@ -51,6 +58,14 @@ _STRUCTURE = jax.tree.structure(RESULTS.successful)
 def result_from(codes) -> RESULTS:
     """The results with these codes, integers of any shape."""
     return jax.tree.unflatten(_STRUCTURE, [jnp.asarray(codes)])
+
+
+_NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
+
+
+def name_of(code) -> str:
+    """The name of a result code, an integer: 'nonfinite_state', as in `lagjax.RESULTS`."""
+    return _NAMES[int(code)]
 
 
 def advice(result: RESULTS) -> str:

@@ -16,6 +16,7 @@ import optimistix as optx
 
 from lagjax._arguments import accept
 from lagjax._layout import taken_apart
+from lagjax._machine_code import MachineCode
 from lagjax._solvers import FineOutput
 
 PyTree = Any
@@ -41,11 +42,13 @@ class Settings(eqx.Module):
     max_steps: int = eqx.field(static=True)
     progress: diffrax.AbstractProgressMeter
     by_default: bool = eqx.field(static=True)  # nothing was asked for that only diffrax can do
+    insists: bool = eqx.field(static=True)  # on machine code: where there is none, that is an error
 
     @classmethod
     def of(cls, layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress) -> "Settings":
         """Check the arguments of `simulate` that do not depend on the scene, and fill in the defaults."""
-        ts = _output_times(ts, layout.dtype)
+        ts, insists = _output_times(ts, layout.dtype), isinstance(solver, MachineCode)
+        solver = None if insists else solver
         by_default = solver is None and adjoint is None and dt is None and event is None and progress is False
         if solver is None:
             # States between steps are wanted for outputs inside and to locate an event.
@@ -74,6 +77,7 @@ class Settings(eqx.Module):
             max_steps=max_steps,
             progress=progress,
             by_default=by_default,
+            insists=insists,
         )
 
     @property

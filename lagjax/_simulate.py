@@ -31,6 +31,7 @@ from lagjax._settings import (
     require_solver_reaches,
 )
 from lagjax._solvers import Projected
+from lagjax._stopped import AHEAD, End, what_stopped
 from lagjax._system import System, require_system
 from lagjax._trajectory import State, Trajectory
 
@@ -224,6 +225,7 @@ def _integrate(system: System, settings: Settings, q0, qdot0, params, primal=Non
     path, end, t_end = solved.path, solved.end, solved.t_end
 
     result = _explained(RESULTS.promote(solved.result), start, _health(end, *form.acceleration(t_end, end, numbers)))
+    result = _of_surroundings(result, form, ts, solved, numbers)
     if motion.constrained:
         lost = rank_lost(motion, (*y0, settings.ts[0], numbers), (*end, t_end, numbers))
         result = _of_constraints(result, RESULTS.promote(solved.result), lost)
@@ -260,6 +262,24 @@ def _explained(result: RESULTS, start: RESULTS, end: RESULTS) -> RESULTS:
     unhealthy = (end != RESULTS.successful) & (stopped | (end == RESULTS.nonfinite_state))
     result = RESULTS.where(unhealthy, end, result)
     return RESULTS.where(start == RESULTS.successful, result, start)
+
+
+def _of_surroundings(result: RESULTS, form, ts, solved, numbers) -> RESULTS:
+    """What the motion ran into, where steps became too small or too many: see `_stopped`."""
+    field = eqx.filter_closure_convert(form.acceleration, ts[0], solved.end, numbers)
+    # A name has no derivative, and the search for it is a loop that reverse mode could not go back through.
+    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (field, ts, solved, numbers))
+    field, ts, solved, numbers = frozen
+    n, counts = len(solved.end[0]), [solved.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected")]
+
+    def acceleration(t, y):
+        return field(t, (y[:n], y[n:]), numbers)[0]
+
+    end = End(solved.t_end, jnp.concatenate(solved.end), ts[0], ts[-1], *counts)
+    stopped = (result == RESULTS.dt_min_reached, result == RESULTS.max_steps_reached)
+    not_finite, jumps = what_stopped(acceleration, end, *stopped)
+    result = RESULTS.where(jumps, RESULTS.acceleration_discontinuous, result)
+    return RESULTS.where(not_finite, RESULTS.nonfinite_state, result)
 
 
 def _of_constraints(result: RESULTS, reported: RESULTS, lost) -> RESULTS:
@@ -340,7 +360,25 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     if trajectory.result == RESULTS.mass_matrix_singular:
         mass = np.asarray(trajectory.system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
         message += f"\n{_describe_null(mass, layout.names)}"
+    if trajectory.result == RESULTS.nonfinite_state and isinstance(trajectory.system, System):
+        message += _describe_undefined(trajectory, layout)
     raise SimulationError(message, trajectory)
+
+
+def _describe_undefined(trajectory: Trajectory, layout: Layout) -> str:
+    """A sentence about the forces, or else the accelerations, that are not finite at the end or just ahead of it."""
+    system, end, params = trajectory.system, trajectory.end, trajectory.params
+    rate = end.qdot, system.acceleration(end.q, end.qdot, end.t, params)
+    first, last = (float(trajectory.ts[place]) for place in (0, -1))
+    smallest = float(np.copysign(4 * jnp.finfo(layout.dtype).eps * max(abs(first), abs(last)), last - first))
+    for steps in (0.0, *AHEAD):
+        moved = jax.tree.map(lambda x, dx, s=steps * smallest: x + s * dx if s else x, (end.q, end.qdot), rate)
+        for what, function in (("force on", system.generalized_force), ("acceleration of", system.acceleration)):
+            values = np.asarray(layout.flatten(function(*moved, end.t + steps * smallest, params)))
+            bad = [f"{name} ({x})" for name, x in zip(layout.names, values, strict=True) if not np.isfinite(x)]
+            if bad:
+                return f"\nNot finite {'just ahead' if steps else 'there'}: the {what} {', '.join(bad[:8])}."
+    return ""
 
 
 def _describe_null(mass: np.ndarray, names: tuple[str, ...]) -> str:

@@ -97,6 +97,14 @@ class System(eqx.Module):
             None if velocity_constraints is None else accept(velocity_constraints, "velocity_constraints")
         )
 
+    def __repr__(self) -> str:
+        """One line: the functions of the scene and what each asks for. `equinox.tree_pprint` prints the fields."""
+        roles = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
+        given = [(role, getattr(self, role)) for role in roles]
+        # Mapped to another pytree (axes, filters), a scene is no longer made of functions.
+        shown = [f"{role}={getattr(f, 'name', f)}" for role, f in given if f is not None]
+        return f"System({', '.join(shown)}, path={self.path!r})"
+
     def acceleration(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
         """q̈ from Lagrange's equations, in the structure of `q`; NaN where the mass matrix is singular."""
         return self._at(Motion.acceleration, q, qdot, t, params, restore=True)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._display import summary
 from lagjax._health import Health, examine
 from lagjax._layout import Layout
 from lagjax._results import RESULTS
@@ -72,6 +73,10 @@ class Trajectory(eqx.Module):
     transitions: "Transitions | None" = None
     mode_names: tuple[str, ...] = eqx.field(static=True, default=())
     tolerances: tuple[jax.Array, jax.Array] | None = None
+
+    def __repr__(self) -> str:
+        """Three lines; `equinox.tree_pprint` prints the fields."""
+        return summary(self)
 
     @property
     def ok(self) -> jax.Array:

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 import lagjax
+from lagjax import _precision
 
 OSCILLATOR = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
 TS = jnp.linspace(0.0, 10.0, 21)
 TOLERANCES = (1e-4, 1e-7, 1e-10)
+DEFAULT = "default: Taylor (machine code)"
+SOLVERS = {DEFAULT: None, "Dopri8": lagjax.FineOutput(diffrax.Dopri8()), "Tsit5": diffrax.Tsit5()}
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +30,9 @@ def batch():
 
 
 def test_errors_are_those_of_the_exact_solution(single):
-    assert [(row.solver, row.rtol) for row in single] == [(s, r) for s in ("Dopri8", "Tsit5") for r in TOLERANCES]
+    assert [(row.solver, row.rtol) for row in single] == [(s, r) for s in SOLVERS for r in TOLERANCES]
     for row in single:
-        solver = {"Dopri8": lagjax.FineOutput(diffrax.Dopri8()), "Tsit5": diffrax.Tsit5()}[row.solver]
-        trajectory = lagjax.simulate(OSCILLATOR, 1.0, 0.0, TS, solver=solver, rtol=row.rtol)
+        trajectory = lagjax.simulate(OSCILLATOR, 1.0, 0.0, TS, solver=SOLVERS[row.solver], rtol=row.rtol)
         exact = np.abs(trajectory.q - jnp.cos(TS)).max()
         assert row.error == row.worst_error
         assert abs(row.error - exact) <= single.reference_error
@@ -39,11 +41,12 @@ def test_errors_are_those_of_the_exact_solution(single):
 
 
 def test_errors_fall_and_steps_rise_with_the_tolerance(single):
-    for name in ("Dopri8", "Tsit5"):
+    for name in SOLVERS:
         rows = [row for row in single if row.solver == name]
         assert rows[0].error > 30 * rows[1].error > 900 * rows[2].error > 0
-        assert rows[0].accepted_steps < rows[1].accepted_steps < rows[2].accepted_steps
-    assert single.reference_error < 1e-10 and single.members == 1 and len(single) == 6
+        if name != DEFAULT:  # the order of a Taylor series rises with the digits instead
+            assert rows[0].accepted_steps < rows[1].accepted_steps < rows[2].accepted_steps
+    assert single.reference_error < 1e-10 and single.members == 1 and len(single) == 9
     assert all(row.seconds == row.seconds_per_trajectory > 0 and row.ok == 1 and row.wasted == 0 for row in single)
 
 
@@ -60,6 +63,27 @@ def test_a_batch_gives_median_and_worst_over_the_members_that_arrive(batch):
         assert row.seconds_per_trajectory == pytest.approx(row.seconds / 6)
         steps = np.append(trajectory.stats["num_steps"], 0)  # the member without a start takes none
         assert row.wasted == pytest.approx(steps.max() * 6 / steps.sum() - 1)
+
+
+def test_the_engine_that_runs_by_default_is_taken_by_name_or_by_insisting():
+    starts, both = (np.linspace(0.5, 1.0, 40), np.zeros(40)), {"mine": None, "insists": lagjax.MachineCode()}
+    result = lagjax.work_precision(
+        OSCILLATOR, *starts, TS, solvers=both, tolerances=[1e-16], batch_axes=(0, 0, None), repeats=1
+    )
+    assert [row.solver for row in result] == list(both) and result.rows[0].error == result.rows[1].error
+    trajectory = lagjax.simulate_batch(OSCILLATOR, *starts, TS, rtol=1e-16)
+    steps = trajectory.stats["num_steps"]
+    assert result.rows[0].accepted_steps == steps.mean()
+    # Lanes do not wait for the slowest member: at most the last round of each stands empty.
+    assert result.rows[0].wasted < 0.5
+
+
+def test_where_diffrax_runs_by_default_it_is_named_so_and_measured_once():
+    def insisted(solver):
+        assert solver == lagjax.MachineCode()
+        raise ValueError
+
+    assert list(_precision._with_default_named(insisted)) == ["default: Dopri8", "Tsit5"]
 
 
 def test_single_precision_is_measured_against_double():
@@ -87,7 +111,7 @@ def test_the_table_is_aligned_and_complete(single, batch):
     lines = str(single).splitlines()
     assert len({len(line) for line in lines[:-1]}) == 1
     assert lines[0].split()[:3] == ["solver", "rtol", "error"]
-    assert [line.split()[0] for line in lines[2:-1]] == ["Dopri8"] * 3 + ["Tsit5"] * 3
+    assert [line.split("  ")[0] for line in lines[2:-1]] == [name for name in SOLVERS for _ in TOLERANCES]
     assert f"1 member; the reference is good to {single.reference_error:.1e}" in lines[-1]
     assert "6 members" in str(batch) and "83%" in str(batch)
 
@@ -98,11 +122,13 @@ def test_the_table_is_aligned_and_complete(single, batch):
         ({"solvers": {}}, ValueError, "solvers is empty"),
         ({"solvers": diffrax.Tsit5()}, TypeError, "must be a dict"),
         ({"solvers": {"mine": diffrax.Tsit5}}, TypeError, r"solvers\['mine'\] must be an instance"),
+        ({"solvers": {"mine": lagjax.MachineCode}}, TypeError, r"lagjax.MachineCode\(\) or None; got"),
         ({"solvers": {"mine": diffrax.Euler()}}, ValueError, "Euler, which has no error estimate"),
         ({"tolerances": []}, ValueError, "at least one value of rtol"),
         ({"tolerances": 1e-6}, ValueError, "at least one value of rtol"),
         ({"tolerances": [1e-6, -1e-8]}, ValueError, "Every tolerance must be .*got -1e-08"),
         ({"tolerances": [1e-16]}, ValueError, "at least 2.2e-15 in float64"),
+        ({"tolerances": [1e-17], "solvers": {"default": None}}, ValueError, "at least 5.6e-17 in float64"),
         ({"tolerances": [float("nan")]}, ValueError, "got nan"),
         ({"repeats": 0}, ValueError, "repeats must be a positive integer"),
         ({"batch_axes": (0, None)}, ValueError, "batch_axes must be a tuple of three"),

@@ -17,14 +17,23 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._native import _adjoint, _integrator
-from lagjax._native._integrator import DONE, EVENT, NOT_FINITE, NOT_LANDED, OUT_OF_STEPS, SINGULAR, STEP_TOO_SMALL
+from lagjax._native._integrator import (
+    DISCONTINUOUS,
+    DONE,
+    EVENT,
+    NOT_FINITE,
+    NOT_LANDED,
+    OUT_OF_STEPS,
+    SINGULAR,
+    STEP_TOO_SMALL,
+)
 from lagjax._native._ir import compiled
 from lagjax._native._series_code import LANE, MAX_ORDER
 from lagjax._program import Program, Series, Unlowerable, series
 
 __all__ = [
-    "DONE", "EVENT", "NOT_FINITE", "NOT_LANDED", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL", "Guards", "Kernel",
-    "Projection", "cores", "order_for", "recurrences",
+    "DISCONTINUOUS", "DONE", "EVENT", "NOT_FINITE", "NOT_LANDED", "OUT_OF_STEPS", "SINGULAR", "STEP_TOO_SMALL",
+    "Guards", "Kernel", "Projection", "cores", "order_for", "recurrences",
 ]  # fmt: skip
 
 

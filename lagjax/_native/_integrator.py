@@ -52,7 +52,8 @@ START = 1e-5  # of the size of the state, the same for the first step
 CHECKS = (0.5, 1.0)  # where in the step its series is held against the equations
 
 # How a member ended.
-DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, NOT_LANDED, EVENT = range(7)
+DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, NOT_LANDED, DISCONTINUOUS, EVENT = range(8)
+# The kernel itself does not give `DISCONTINUOUS`: `_stopped` finds it about the state where it stopped.
 # EVENT + Σ 4ᵏ (1 where guard k falls, 2 where it rises), over those that do so at that instant.
 _RUNNING = -1
 

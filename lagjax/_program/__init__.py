@@ -199,7 +199,7 @@ class Program:
         return sum(shape.size for shape in self.shapes)
 
     def evaluate(self, *numbers) -> tuple:
-        """The outputs at these numbers, one after the other in NumPy: to look at a few values without compiling."""
+        """The outputs at these numbers, or arrays of numbers, operation by operation in NumPy: nothing is compiled."""
         values: list = []
         with np.errstate(all="ignore"):
             for (op, operands, attribute), kind in zip(self.nodes, self.kinds, strict=True):

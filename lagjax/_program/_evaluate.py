@@ -1,16 +1,10 @@
 """Straight lines of scalar operations at many points, one NumPy operation after the other: nothing is compiled."""
 
-import math
-
 import numpy as np
 
 from lagjax._program._graph import FOLD
 
 _CHUNK = 4096  # points at a time: the intermediate vectors of a long line then stay in the second cache
-_ELEMENTWISE = {
-    "erf": np.vectorize(math.erf, [float]),
-    "erfc": np.vectorize(math.erfc, [float]),
-}
 
 
 def evaluate(line, columns) -> list[np.ndarray]:
@@ -35,29 +29,13 @@ def _evaluate(line, columns) -> list[np.ndarray]:
             elif op == "constant":
                 value = np.asarray(attribute)
             else:
-                value = _apply(op, attribute, dtype, [values[i] for i in operands])
+                extra = () if attribute is None else (attribute,)
+                value = FOLD[op](*(values[i] for i in operands), *extra)
             values[place] = np.asarray(value, dtype)
             for i in operands:
                 if last_use[i] == place:
                     values[i] = None
     return [np.broadcast_to(values[i], columns.shape[1:]) for i in line.outputs]
-
-
-def _apply(op: str, attribute, dtype, operands):
-    if op == "select":
-        predicate, no, yes = operands
-        return np.where(predicate, yes, no)
-    if op == "div":
-        return np.divide(*operands) if dtype.kind == "f" else _whole_quotient(*operands)
-    if op in _ELEMENTWISE:
-        return _ELEMENTWISE[op](operands[0])
-    return FOLD[op](*operands, *(() if attribute is None else (attribute,)))
-
-
-def _whole_quotient(a, b):
-    """Towards zero, and −1 for a divisor of zero, as XLA has it."""
-    safe = np.where(b == 0, 1, b)
-    return np.where(b == 0, -1, np.trunc(np.divide(a, safe)))
 
 
 def _last_uses(line) -> dict[int, int]:

@@ -37,9 +37,12 @@ def _round(x, method):
 
 
 def _divide(x, y):
-    if isinstance(x, np.floating):
+    if np.issubdtype(x.dtype, np.floating):
         return np.divide(x, y)
-    return np.trunc(np.divide(x, y)) if y else x.dtype.type(-1)
+    return np.where(y == 0, -1, np.trunc(np.divide(x, np.where(y == 0, 1, y))))[()].astype(x.dtype)
+
+
+_erf, _erfc = (np.vectorize(function, otypes=[float]) for function in (math.erf, math.erfc))
 
 
 # What each operation means on constants. The keys are also the list of elementwise operations a program may contain.
@@ -47,13 +50,13 @@ FOLD = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": _divide, "rem": np.fmod, "pow": np.power,
     "max": np.maximum, "min": np.minimum, "atan2": np.arctan2, "neg": np.negative, "abs": np.abs, "sign": np.sign,
     "sqrt": np.sqrt, "rsqrt": lambda x: 1 / np.sqrt(x), "cbrt": np.cbrt, "exp": np.exp, "exp2": np.exp2,
-    "expm1": np.expm1, "log": np.log, "log1p": np.log1p, "logistic": lambda x: 1 / (1 + np.exp(-x)), "erf": math.erf,
-    "erfc": math.erfc, "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos,
+    "expm1": np.expm1, "log": np.log, "log1p": np.log1p, "logistic": lambda x: 1 / (1 + np.exp(-x)), "erf": _erf,
+    "erfc": _erfc, "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos,
     "atan": np.arctan, "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh,
     "atanh": np.arctanh, "floor": np.floor, "ceil": np.ceil, "round": _round, "is_finite": np.isfinite,
     "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
     "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "not": np.invert,
-    "select": lambda predicate, no, yes: yes if predicate else no, "convert": lambda x, kind: x,
+    "select": lambda predicate, no, yes: np.where(predicate, yes, no)[()], "convert": lambda x, kind: x,
 }  # fmt: skip
 COMPARISONS = {"eq", "ne", "lt", "le", "gt", "ge"}
 COMMUTATIVE = {"add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"}

@@ -1,0 +1,95 @@
+"""`print(trajectory)`: three lines that say what it holds, how far it came and how it ended, wherever it is printed."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+
+def falling(q, qdot):
+    return 0.5 * qdot**2 + 1 / q  # into the centre at π/√8 from q = 1
+
+
+FALL = lagjax.System(falling)
+TS = jnp.linspace(0.0, 2.0, 5)
+
+
+def lines(thing):
+    assert repr(thing) == str(thing)
+    return repr(thing).splitlines()
+
+
+@pytest.fixture(scope="module")
+def fallen():
+    return lagjax.simulate_batch(FALL, np.array([[9.0, 1.0, np.nan]] * 2).reshape(-1), np.zeros(6), TS)
+
+
+def test_one_motion():
+    scene = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["y"] @ v["y"] - 0.5 * q["x"] ** 2)
+    q0 = {"x": 1.0, "y": jnp.zeros(2)}
+    run = lagjax.simulate(scene, q0, jax.tree.map(jnp.zeros_like, q0), TS)
+    steps = int(run.stats["num_steps"])
+    assert lines(run) == [
+        "Trajectory, float64: q['x'] (5,), q['y'] (5, 2), and qdot",
+        f"t from 0 to 2 at 5 outputs, {steps} steps (0 rejected)",
+        "reached the end",
+    ]
+    assert eqx.tree_pformat(run).startswith("Trajectory(\n  ts=f64[5]")
+
+
+def test_a_motion_that_fails_says_where():
+    run = lagjax.simulate(FALL, 1.0, 0.0, TS, throw=False)
+    assert lines(run)[2] == "ended at t = 1.11072: dt_min_reached"
+
+
+def test_a_batch(fallen):
+    first, second, third = lines(fallen)
+    assert first == "Trajectory of 6 members, float64: q (6, 5), and qdot"
+    assert second.startswith("t from 0 to 2 at 5 outputs, ") and "steps in the median, at most " in second
+    assert third.startswith("2 of 6 reached the end, 2 dt_min_reached, 2 nonfinite_state: the first that failed is")
+    assert third.endswith("member 1, at t = 1.11072")
+
+
+def test_a_hybrid_motion():
+    bounce = lagjax.Transition("flight", "flight", guard=lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.5 * v))
+    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+    run = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, TS, throw=False)
+    first, second, third = lines(run)
+    assert first.endswith("; modes flight") and second.endswith("32 transitions") and third.endswith(": zeno")
+
+
+def test_what_has_no_numbers(fallen):
+    """Tracers under jit and vmap, shapes without values, and pytrees of another kind in the form of a trajectory."""
+    seen = []
+
+    def run(q0):
+        run = lagjax.simulate(FALL, q0, 0.0, TS, throw=False)
+        seen.append(lines(run))
+        return run
+
+    traced = ["the steps are being traced", "the result is being traced"]
+    assert lines(jax.eval_shape(run, 2.0))[2] == traced[1]
+    jax.vmap(run)(jnp.full(2, 9.0))
+    for first, second, third in seen:
+        assert first == "Trajectory, float64: q (5,), and qdot"
+        assert [second.split("; ")[1], third] == traced
+    assert repr(jax.tree.map(lambda _: 0, fallen)).startswith("Trajectory(\n  ts=0")
+    assert repr(eqx.filter(fallen, False)).startswith("Trajectory(\n  ts=None")
+
+
+def test_batches_of_batches_and_times_of_their_own():
+    run = jax.vmap(lambda size: lagjax.simulate_batch(FALL, jnp.full(3, 9.0), jnp.zeros(3), TS * size))(
+        jnp.arange(1, 3)
+    )
+    first, second, third = lines(run)
+    assert first.startswith("Trajectory of 2 × 3 members") and second.startswith("t from 0 to 2 … 4 at 5 outputs")
+    assert third == "6 of 6 reached the end"
+
+
+def test_a_scene_is_one_line():
+    assert repr(FALL) == "System(lagrangian=falling, path='auto')"
+    scene = lagjax.System(falling, constraints=lambda q: q, path="array")
+    assert repr(scene) == "System(lagrangian=falling, constraints=<lambda>, path='array')"

@@ -1,0 +1,52 @@
+"""`MachineCode` insists: the run that is taken by default, or a sentence that says why there is none."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+OSCILLATOR = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+BY_ARRAYS = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, path="array")
+TS = jnp.linspace(0.0, 10.0, 21)
+INSIST = {"solver": lagjax.MachineCode()}
+
+
+def test_it_is_the_run_that_is_taken_by_default():
+    single = lagjax.simulate(OSCILLATOR, 1.0, 0.0, TS, **INSIST)
+    np.testing.assert_array_equal(single.q, lagjax.simulate(OSCILLATOR, 1.0, 0.0, TS).q)
+    batch = lagjax.simulate_batch(OSCILLATOR, jnp.ones(3), jnp.zeros(3), TS, **INSIST)
+    np.testing.assert_array_equal(batch.q, np.broadcast_to(single.q, (3, 21)))
+
+
+def test_it_is_taken_inside_transformations():
+    @jax.jit
+    @jax.grad
+    def slope(q0):
+        return lagjax.simulate(OSCILLATOR, q0, 0.0, TS, **INSIST).q[-1]
+
+    assert slope(1.0) == pytest.approx(np.cos(10.0), abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("scene", "start", "options", "reason"),
+    [
+        (BY_ARRAYS, np.float64, {}, "the array path was asked for"),
+        (OSCILLATOR, np.float32, {}, "the coordinates are float32, not float64"),
+        (OSCILLATOR, np.float64, {"dt": 0.1}, "fixed steps.* was asked for"),
+        (OSCILLATOR, np.float64, {"event": lambda q, qdot: q}, "an event.* was asked for"),
+        (OSCILLATOR, np.float64, {"adjoint": diffrax.ForwardMode()}, "an adjoint.* was asked for"),
+    ],
+)
+def test_a_run_without_it_is_an_error_that_says_why(scene, start, options, reason):
+    with pytest.raises(ValueError, match=rf"MachineCode\(\) cannot integrate this: .*{reason}"):
+        lagjax.simulate(scene, start(1.0), start(0.0), TS, **INSIST, **options)
+    with pytest.raises(ValueError, match=reason):
+        lagjax.simulate_batch(scene, np.ones(2, start), np.zeros(2, start), TS, **INSIST, **options)
+
+
+def test_traced_tolerances_are_an_error_too():
+    with pytest.raises(ValueError, match="the tolerances are being traced"):
+        jax.jit(lambda rtol: lagjax.simulate(OSCILLATOR, 1.0, 0.0, TS, rtol=rtol, **INSIST).q)(1e-6)

@@ -1,0 +1,110 @@
+"""A motion that stops is named by what it ran into, and by both engines alike, member by member."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax._stopped import End, what_stopped
+
+TS = jnp.linspace(0.0, 2.0, 5)
+BUDGET = {"max_steps": 2000}
+NAMES = {
+    # what befalls it, and q0, spring, kink, the time at which the force ends
+    "successful": (1.0, 1.0, 0.0, 9.0),
+    "nonfinite_state": (1.0, 1.0, 0.0, 0.5),
+    "acceleration_discontinuous": (0.0, 0.0, 1.0, 9.0),
+    "max_steps_reached": (1.0, 1e10, 0.0, 9.0),
+}
+Q0, SPRING, KINK, ENDS = np.array(list(NAMES.values())).T
+PARAMS = {"spring": SPRING, "kink": KINK, "ends": ENDS}
+
+
+def lagrangian(q, qdot, params):
+    return 0.5 * qdot**2 - 0.5 * params["spring"] * q**2 - params["kink"] * jnp.abs(q)
+
+
+def force(q, qdot, t, params):
+    return jnp.where(t > params["ends"], jnp.nan, 0.0)
+
+
+SCENE = lagjax.System(lagrangian, forces=force)
+
+
+def names(result):
+    return [next(n for n in NAMES if bool(r == getattr(lagjax.RESULTS, n)._value)) for r in np.asarray(result._value)]
+
+
+@pytest.mark.parametrize("solver", [None, diffrax.Tsit5()], ids=["machine code", "diffrax"])
+def test_members_are_named_by_what_stopped_them(solver):
+    batch = lagjax.simulate_batch(SCENE, Q0, 0 * Q0, TS, PARAMS, batch_axes=(0, 0, 0), solver=solver, **BUDGET)
+    assert names(batch.result) == list(NAMES)
+    assert batch.end.t[1] == pytest.approx(0.5, abs=1e-14) and batch.end.t[2] < 1e-5
+
+
+def test_members_are_named_under_transformations():
+    def end(q0, params):
+        return lagjax.simulate(SCENE, q0, 0.0, TS, params, throw=False, **BUDGET).result
+
+    assert names(jax.jit(jax.vmap(end))(Q0, PARAMS)) == list(NAMES)
+
+
+def test_the_message_names_the_time_and_the_force_that_ends():
+    scene = lagjax.System(
+        lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["y"] ** 2,
+        forces=lambda q, v, t: {"x": 0.0, "y": jnp.sqrt(0.5 - t)},
+    )
+    q0 = {"x": 1.0, "y": 0.0}
+    with pytest.raises(lagjax.SimulationError, match=r"beyond t = 0.5 of(.|\n)*ahead: the force on q\['y'\] \(nan\)\."):
+        lagjax.simulate(scene, q0, q0, TS)
+
+
+def test_a_kink_at_the_start_is_called_a_kink_and_not_stiff():
+    kink = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q))
+    with pytest.raises(lagjax.SimulationError, match="acceleration jumps there") as error:
+        lagjax.simulate(kink, 0.0, 0.0, TS, **BUDGET)
+    assert "stiff" not in str(error.value)
+
+
+# ---- the search alone: accelerations of one coordinate, stopped at t = 1 after 100 steps, half of them rejected ------
+
+STOPPED = {
+    # name: q̈(t, q, v) at (q, v) = (0, 1), whether it ends just ahead, whether it jumps
+    "a constant": (lambda t, q, v: 0 * q + 3.0, False, False),
+    "a stiff spring": (lambda t, q, v: -1e16 * q, False, False),
+    "a root": (lambda t, q, v: np.sqrt(np.abs(q)), False, False),
+    "a cube root": (lambda t, q, v: np.cbrt(q), False, False),
+    "friction that is rounded off": (lambda t, q, v: -np.tanh(q / 1e-9), False, False),
+    "a step": (lambda t, q, v: np.where(q > 0, 1.0, 2.0), False, True),
+    "a small step on a slope": (lambda t, q, v: 100 + q + np.where(q > 0, 1.0, 0.0), False, True),
+    "a step of time": (lambda t, q, v: np.where(t > 1 + 1e-5, 1.0, 0.0), False, True),
+    "a step elsewhere": (lambda t, q, v: np.where(q > 0.1, 1.0, 0.0), False, False),
+    "a root that ends": (lambda t, q, v: np.sqrt(-q), True, False),
+    "a pole that changes its sign": (lambda t, q, v: 1 / (q - 1e-15), False, False),
+    "a pole that does not": (lambda t, q, v: 1 / (q - 1e-15) ** 2, False, False),
+    "an infinity": (lambda t, q, v: 1 / np.maximum(-q, 0.0), True, False),
+    "an end elsewhere": (lambda t, q, v: np.where(q > 0.1, np.nan, 1.0), False, False),
+}
+
+
+@pytest.mark.parametrize("name", STOPPED)
+def test_what_stopped(name):
+    function, ends, jumps = STOPPED[name]
+    one, count = np.ones(2), np.full(2, 50)
+
+    def acceleration(t, y):
+        return function(t, y[..., 0], y[..., 1])[..., None]
+
+    at = End(one, np.array([[0.0, 1.0]] * 2), 0 * one, 2 * one, count, count)
+    shrank = np.array([True, False])
+    not_finite, jumped = what_stopped(acceleration, at, shrank, ~shrank)
+    assert not_finite.tolist() == [ends, False], "a spent budget does not ask what lies ahead"
+    near = not (name == "a step of time")  # beyond the smallest steps
+    assert jumped.tolist() == [jumps and near, jumps]
+
+
+def test_every_result_has_its_text():
+    for name in lagjax.RESULTS._name_to_item:
+        assert name == "successful" or len(lagjax._results.advice(getattr(lagjax.RESULTS, name))) > 20, name
