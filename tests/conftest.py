@@ -1,12 +1,22 @@
-"""Every test runs in double precision unless it says otherwise."""
+"""Every test runs in double precision unless it says otherwise, with one store of compiled programs for all runs."""
 
+import hashlib
 import os
 from pathlib import Path
 
 import jax
+import llvmlite.binding
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+
+# Most of the suite's time is XLA at work, so what it compiles is kept: for the other workers of a run, and for the next
+# run. A compiled program is for one kind of CPU, which JAX does not ask about when it reads one back.
+CPU = llvmlite.binding.get_host_cpu_name() + llvmlite.binding.get_host_cpu_features().flatten()
+COMPILED = Path(__file__).parent.parent / ".cache" / "jax" / hashlib.sha256(CPU.encode()).hexdigest()[:16]
+jax.config.update("jax_compilation_cache_dir", str(COMPILED))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 @pytest.hookimpl(optionalhook=True)
