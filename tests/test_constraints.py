@@ -18,7 +18,9 @@ from lagjax._equations import equations, scalar_program
 from lagjax._layout import Layout
 from lagjax._linear import rank_tolerance
 
-WAYS = pytest.mark.parametrize("path", ["auto", "array"], ids=["machine code", "diffrax"])
+WAYS = pytest.mark.parametrize(
+    "path", [pytest.param("auto", id="machine code"), pytest.param("array", id="diffrax", marks=pytest.mark.slow)]
+)
 DRIFT = 1e-12
 
 
@@ -52,6 +54,7 @@ def hung(angle, rate=0.0):
 # ---- forces of constraints -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_force_between_rolling_cylinders_is_the_closed_form():
     scene, rng = scenes.rolling_cylinder(), np.random.default_rng(0)
     alpha, start = rng.uniform(0, 1, 200), rng.uniform(0.05, 0.5, 200)
@@ -92,6 +95,7 @@ def tensions(q, qdot, accelerations):
     return np.sum((upper + up + hanging) * towards[0], axis=0), np.sum(hanging * towards[1], axis=0)
 
 
+@pytest.mark.slow
 def test_a_double_pendulum_of_rods_is_the_double_pendulum():
     members, rng = 1000, np.random.default_rng(1)
     angles, rates = rng.uniform(-2, 2, (members, 2)), rng.uniform(-2, 2, (members, 2))
@@ -127,6 +131,7 @@ def test_the_forces_on_a_wire_and_a_sphere():
 # ---- published and closed numbers ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_andrews_squeezer_ends_where_two_tolerances_agree():
     # hard_cases.md, "OWN": self-consistent to 8e-13 in q and 7e-12 in the velocities.
     q_end = [15.810771195153698, -15.756371058411844, 0.04082224011963757, -0.534730116342094, 0.5244099658799517,
@@ -185,6 +190,7 @@ def test_a_velocity_constraint_is_nonholonomic_and_not_vakonomic():
 # ---- what must not matter --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_doubled_and_scaled_constraints_change_no_motion():
     def many(q):
         return {"rod": rod(q)["rod"], "twice": 1e6 * rod(q)["rod"]}
@@ -284,6 +290,7 @@ def test_a_singular_saddle_point_is_reported():
     np.testing.assert_allclose(run.q[:2, -1, 1], -0.25, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_masses_in_params_are_taken_for_what_they_are():
     # Where they are regular the program is the lean one; where they are not, or hardly, the one for any mass matrix
     # takes over, also where JAX does not know them while it traces, and in derivatives.
@@ -316,7 +323,10 @@ def crank_alone(q, qdot, params):
     return code(scenes.slider_crank(1.0, 1.0).system.lagrangian)(whole, moving, params)
 
 
-@pytest.mark.parametrize("solver", [None, diffrax.Dopri8()], ids=["machine code", "diffrax"])
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(None, id="machine code"), pytest.param(diffrax.Dopri8(), id="diffrax", marks=pytest.mark.slow)],
+)
 def test_slider_cranks_of_equal_bars_pass_their_dead_centre(solver):
     # At crank = π/2 the second constraint has no gradient, and the bars might go on together instead.
     scene, members = scenes.slider_crank(1.0, 1.0), 100
@@ -368,6 +378,7 @@ def parallelogram(a, qdot):
     return linkage((a, GROUND[1], a), (qdot, 0.0, qdot))
 
 
+@pytest.mark.slow
 def test_accelerations_where_a_parallelogram_is_flat():
     # In line, both constraints hold the same direction; the motion goes on as that of the parallelogram.
     minimal = lagjax.System(parallelogram)
@@ -388,6 +399,7 @@ def test_accelerations_where_a_parallelogram_is_flat():
         np.testing.assert_allclose(found, np.stack([expected, 0 * expected, expected], axis=1), rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_parallelogram_linkages_pass_the_flat_configuration():
     members = 100
     start, ts = GROUND[1] + np.random.default_rng(0).uniform(0.2, 1.2, members), np.linspace(0, 1.5, 4)
@@ -414,6 +426,7 @@ def test_units_of_constrained_coordinates_do_not_matter():
     assert abs(int(scaled.stats["num_accepted_steps"]) - int(plain.stats["num_accepted_steps"])) <= 2
 
 
+@pytest.mark.slow
 def test_more_constraints_than_coordinates():
     # A sphere four times over, in three coordinates.
     scene = scenes.particle_on_sphere()
@@ -425,7 +438,10 @@ def test_more_constraints_than_coordinates():
     )
     np.testing.assert_allclose(np.array(often.q), np.array(once.q), atol=1e-10)
     np.testing.assert_allclose(often.multipliers @ np.array([1, -2, 1e3, 1]), once.multipliers["sphere"], rtol=1e-9)
-    # A prescribed motion leaves nothing to move, but something to carry it out.
+
+
+def test_a_prescribed_motion_leaves_nothing_to_move_but_something_to_carry_it_out():
+    ts = np.linspace(0, 0.6, 3)
     led = lagjax.System(weight, constraints=lambda q, t: jnp.stack([q[0] - t**2, q[1], q[0] + q[1] - t**2]))
     run = lagjax.simulate(led, np.zeros(2), np.zeros(2), ts)
     np.testing.assert_allclose(run.q[:, 0], ts**2, atol=1e-12)
@@ -447,6 +463,7 @@ def closed_ladder(q):
     return closed
 
 
+@pytest.mark.slow
 def test_a_linkage_held_by_more_bars_than_it_needs():
     # Six constraints on five coordinates, four of them independent.
     system = lagjax.System(ladder, constraints=closed_ladder)
@@ -491,6 +508,7 @@ def test_gradients_through_projection_motion_and_multipliers():
     np.testing.assert_allclose(reverse, central, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_by_machine_code_are_those_along_the_steps_of_diffrax():
     def of(x, **options):
         return outcome(scenes.cartesian_pendulum().system, x, **options)

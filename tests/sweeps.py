@@ -1,0 +1,17 @@
+"""Sweeps over alike cases: a few, of every kind, by default; all of them with the marker `slow`."""
+
+import pytest
+
+from lagjax import scenes
+
+# One scene of every kind: the rest of `scenes.ALL` takes minutes to compile.
+KINDS = (
+    scenes.uniform_gravity, scenes.central_force, scenes.double_pendulum, scenes.damped_driven_oscillator,
+    scenes.cartesian_pendulum, scenes.chaplygin_sleigh, scenes.charge_in_fields, scenes.kepler,
+)  # fmt: skip
+
+
+def sweep(cases, kept):
+    """The cases as parameters; those that are not in `kept`, or for which `kept` is false, are slow."""
+    chosen = kept if callable(kept) else lambda case: case in kept
+    return [case if chosen(case) else pytest.param(case, marks=pytest.mark.slow) for case in cases]
