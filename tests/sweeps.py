@@ -12,6 +12,8 @@ KINDS = (
 
 
 def sweep(cases, kept):
-    """The cases as parameters; those that are not in `kept`, or for which `kept` is false, are slow."""
+    """The cases as parameters, a tuple as several; those not in `kept`, or for which `kept` is false, are slow."""
     chosen = kept if callable(kept) else lambda case: case in kept
-    return [case if chosen(case) else pytest.param(case, marks=pytest.mark.slow) for case in cases]
+    several = [case if isinstance(case, tuple) else (case,) for case in cases]
+    marks = [() if chosen(case) else pytest.mark.slow for case in cases]
+    return [pytest.param(*values, marks=mark) for values, mark in zip(several, marks, strict=True)]
