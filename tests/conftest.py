@@ -1,5 +1,26 @@
-"""Every test runs in double precision unless it says otherwise."""
+"""Every test runs in double precision unless it says otherwise, with one store of compiled programs for all runs."""
+
+import hashlib
+import os
+from pathlib import Path
 
 import jax
+import llvmlite.binding
+import pytest
 
 jax.config.update("jax_enable_x64", True)
+
+# Most of the suite's time is XLA at work, so what it compiles is kept: for the other workers of a run, and for the next
+# run. A compiled program is for one kind of CPU, which JAX does not ask about when it reads one back.
+CPU = llvmlite.binding.get_host_cpu_name() + llvmlite.binding.get_host_cpu_features().flatten()
+COMPILED = Path(__file__).parent.parent / ".cache" / "jax" / hashlib.sha256(CPU.encode()).hexdigest()[:16]
+jax.config.update("jax_compilation_cache_dir", str(COMPILED))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config):
+    """The number of workers for `-n auto`: one a core for folders of tests, none for a file or a test that is named."""
+    named = [part for part in config.args if not Path(part).is_dir()]
+    return 0 if named or config.getoption("keyword") else os.cpu_count()

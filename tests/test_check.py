@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sweeps import KINDS, sweep
 
 import lagjax
 from lagjax._check._differences import Slopes, differ, ladder, slopes
@@ -31,7 +32,7 @@ def only(findings: lagjax.Findings) -> lagjax.Finding:
 KNOWN_ADVICE = {"explicit_time", "dependent_constraints", "ill_conditioned", "stiff"}
 
 
-@pytest.mark.parametrize("make", lagjax.scenes.ALL, ids=lambda make: make.__name__)
+@pytest.mark.parametrize("make", sweep(lagjax.scenes.ALL, KINDS), ids=lambda make: make.__name__)
 def test_no_false_alarm(make):
     scene = make()
     findings = lagjax.check(scene.system, scene.q0, scene.qdot0, 0.0, scene.params)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sweeps import KINDS, sweep
 
 import lagjax
 from lagjax import scenes
@@ -37,8 +38,8 @@ def swinging(**options):
 # ---- no false alarm --------------------------------------------------------------------------------------------------
 
 
-# One of every kind: the rest of `scenes.ALL` takes minutes to compile.
-KINDS = (
+# More than one of every kind; all of `scenes.ALL` takes minutes to compile.
+SCENES = (
     scenes.uniform_gravity, scenes.morse_oscillator, scenes.central_force, scenes.bead_on_rotating_hoop,
     scenes.double_pendulum, scenes.spherical_pendulum, scenes.damped_driven_oscillator, scenes.fermi_pasta_ulam,
     scenes.rolling_cylinder, scenes.cartesian_double_pendulum, scenes.chaplygin_sleigh, scenes.charge_in_fields,
@@ -46,7 +47,7 @@ KINDS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("make", KINDS, ids=lambda make: make.__name__)
+@pytest.mark.parametrize("make", sweep(SCENES, KINDS), ids=lambda make: make.__name__)
 def test_nothing_is_suspicious_about_the_scenes(make):
     health = run(make()).health()
     assert not health.suspicious, str(health)

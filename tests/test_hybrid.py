@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sweeps import sweep
 
 import lagjax
 
@@ -113,6 +114,7 @@ def test_rolling_cylinder_leaves_where_it_must_and_then_flies():
     np.testing.assert_allclose(given["contact"], expected.T[which, when], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_departure_and_the_flight_vary_as_they_must():
     alpha, theta = members(20)
 
@@ -163,7 +165,7 @@ def test_every_bounce_of_a_ball():
         np.testing.assert_allclose(runs.q[i], height, atol=1e-11)
 
 
-@pytest.mark.parametrize("direction", [-1, 0])
+@pytest.mark.parametrize("direction", sweep([-1, 0], kept=[-1]))
 def test_bounces_that_pile_up_are_reported_and_never_fall_through(direction):
     # Heights shrink beyond the digits that a position at 0.37 has, times beyond those that a time has.
     bounce = lagjax.Transition(
@@ -201,6 +203,7 @@ def test_the_budget_of_transitions():
         jax.block_until_ready(jax.jit(lambda h: bouncing(h, 0.9, max_transitions=2).q)(1.0))
 
 
+@pytest.mark.slow
 def test_a_spent_budget_is_told_from_bounces_that_pile_up():
     # They add up to sqrt(2 h/g) (1 + e)/(1 − e): 4.06 for e = 0.8 and h = 1. Those of e = 1 never end.
     run = lambda e, end, **options: bouncing(1.0, e, ts=jnp.linspace(0.0, 1.0, 5) * end, throw=False, **options)
@@ -221,6 +224,7 @@ def test_a_spent_budget_is_told_from_bounces_that_pile_up():
     assert run.result == spent, "a contact lasts as long for a small bounce as for a large one: no sum is finite"
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_bouncing_ball():
     # After three bounces: times, states before them, outputs on the way, the end. By height, speed, e and g.
     ts = jnp.linspace(0.5, 2.7, 9)
@@ -269,6 +273,7 @@ def test_derivatives_by_the_times():
 # ---- other scenes ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_particle_leaves_a_smooth_sphere():
     # From rest on top at cos θ = 2/3; from θ⁰ with speed v at cos θ = (2 cos θ⁰ + v²/(g R)) / 3. Cartesian coordinates.
     radius = 0.7
@@ -365,6 +370,7 @@ def at(name, source, target, scale=1.0, **options):
     return lagjax.Transition(source, target, lambda q, v, params: scale * (q - params[name]), **options)
 
 
+@pytest.mark.slow
 def test_the_earliest_wins_and_of_several_at_once_the_first_listed():
     # Within what would be one step; the last two at one instant, to rounding.
     places = {"x": jnp.array([0.5, 0.3, 0.3, 0.2]), "y": jnp.array([0.3, 0.5, 0.3, 0.2 + 1e-16])}
@@ -379,7 +385,7 @@ def test_the_earliest_wins_and_of_several_at_once_the_first_listed():
     assert run.transitions.source.tolist() == [0, 1, 2, -1] and run.transitions.target.tolist() == [1, 2, 0, -1]
 
 
-@pytest.mark.parametrize("direction", [-1, 0, 1])
+@pytest.mark.parametrize("direction", sweep([-1, 0, 1], kept=[-1]))
 def test_a_surface_crossed_twice_within_a_step(direction):
     # Two crossings 2e-3, 2e-6 apart in a step of 0.06: between them the guard has the other sign.
     band = lambda q, v, params: (q - params["middle"]) ** 2 - params["half"] ** 2
@@ -402,7 +408,7 @@ def test_touching_is_not_crossing():
     assert run.stats["num_steps"] < 50
 
 
-@pytest.mark.parametrize("direction", [-1, 0, 1])
+@pytest.mark.parametrize("direction", sweep([-1, 0, 1], kept=[0]))
 def test_a_start_on_the_surface_does_not_fire(direction):
     section = at("x", "all", "all", direction=direction)
     run = lambda q, v, x: hybrid({"all": OSCILLATOR}, [section], q, v, (0.0, 5.0), {"x": x}, max_transitions=3)
@@ -421,6 +427,7 @@ def test_a_start_on_the_surface_does_not_fire(direction):
         np.testing.assert_allclose(found.t[6, 0], 1e-10, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_start_along_the_surface_does_not_fire():
     plane = lagjax.System(lambda q, v: 0.5 * v @ v)
     circle = lagjax.Transition("all", "all", lambda q, v: q @ q - 1)
@@ -455,6 +462,7 @@ def exact_springs(right, left, v=1.0):
     return jnp.where(s <= half, v / a * jnp.sin(a * s), -v / b * jnp.sin(b * (s - half)))
 
 
+@pytest.mark.slow
 def test_every_member_switches_at_its_own_time_in_its_own_order():
     right, left = np.array([1.0, 9.0, 0.2, 0.01]), np.array([4.0, 0.3, 25.0, 1.0])
     runs = jax.jit(jax.vmap(two_springs))(right, left)
@@ -491,6 +499,7 @@ def test_derivatives_through_different_modes_in_a_batch():
     np.testing.assert_allclose(energy, [[0, 0, 25 * v] for v in x[:, 2]], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_laws_that_are_singular_elsewhere_leave_no_nan_in_derivatives():
     # The first mode has a pole at q = 1, which the motion passes in the second.
     pole = lagjax.System(lambda q, v, params: 0.5 * v**2 + params / (1 - q))
@@ -528,6 +537,7 @@ def test_an_output_at_the_instant_of_a_transition_belongs_to_the_mode_before():
     np.testing.assert_array_equal(run.energy(), [0.5, 0.5, 0.5, 2.0])
 
 
+@pytest.mark.slow
 def test_pytrees_and_quantities_of_like_constraints():
     # A pendulum on a rod that is caught by a nail: another length from then on. Named coordinates and constraints.
     fall = lambda q, v: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * q["y"]
@@ -626,6 +636,7 @@ def test_what_cannot_be_a_transition(arguments, error, sentence):
         lagjax.Transition(*arguments)
 
 
+@pytest.mark.slow
 def test_a_reset_that_leaves_the_constraints_of_the_mode_is_not_repaired():
     # Onto the rod y = 0: with a velocity across it, to a place beside it, or rightly.
     flight = {"flight": PLANE, "rod": ROD}
@@ -648,9 +659,6 @@ def test_a_reset_that_leaves_the_constraints_of_the_mode_is_not_repaired():
         assert runs.transitions.count[i] == 1 and runs.mode[i].tolist() == [0, 0, -1] and np.isnan(runs.q[i, -1]).all()
         np.testing.assert_allclose([runs.end.t[i], *runs.end.q[i]], [1.0, 1.0, off[i]], atol=1e-14)
     np.testing.assert_allclose(runs.q[0, -1], [2.0, 0.0], atol=1e-14)
-    with pytest.raises(lagjax.SimulationError, match=r"does not satisfy the constraints[^$]*mode 'rod'"):
-        stuck = lagjax.Transition("flight", "rod", lambda q, v: q[1], -1)
-        hybrid(flight, [stuck], q0, v0, (0.0, 2.0), max_transitions=1)
 
     # A start that is off, where it is not a number yet.
     start = lambda y: hybrid({"a": ROD}, [], jnp.stack([0.0, y]), jnp.array([1.0, 0.0]), throw=False)
@@ -660,6 +668,10 @@ def test_a_reset_that_leaves_the_constraints_of_the_mode_is_not_repaired():
 
 
 def test_a_failure_names_the_mode():
+    with pytest.raises(lagjax.SimulationError, match=r"does not satisfy the constraints[^$]*mode 'rod'"):
+        stuck = lagjax.Transition("flight", "rod", lambda q, v: q[1], -1)
+        start = jnp.array([0.0, 1.0]), jnp.array([1.0, -1.0])
+        hybrid({"flight": PLANE, "rod": ROD}, [stuck], *start, (0.0, 2.0), max_transitions=1)
     wall = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.sqrt(q))
     with pytest.raises(lagjax.SimulationError, match=r"step size shrank[^$]*mode 'wall'") as caught:
         hybrid({"a": FREE, "wall": wall}, [lagjax.Transition("a", "wall", lambda q, v: q - 1.0)], 2.0, -1.0, (0.0, 3.0))

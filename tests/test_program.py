@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from sweeps import sweep
 
 from lagjax._program import Unlowerable, lower
 
@@ -27,13 +28,16 @@ def flat(result):
     return np.concatenate([np.ravel(np.asarray(leaf, dtype=float)) for leaf in jax.tree.leaves(result)])
 
 
-def assert_same(function, *arguments, tolerance=TOLERANCE):
-    """The program agrees with the function: plain, under jit, on lanes in one call, and under vmap."""
+def assert_same(function, *arguments, tolerance=TOLERANCE, in_jax=False):
+    """The program agrees with the function; also, if asked, where JAX compiles it: under jit, on lanes, under vmap."""
     program = lower(function, *arguments)
     expected = flat(jax.jit(function)(*arguments))
     xs = scalars(*jax.tree.leaves(arguments))
     size = np.max(np.abs(expected), initial=1.0, where=np.isfinite(expected))
     close = dict(rtol=tolerance, atol=tolerance * size)
+    np.testing.assert_allclose(flat(program.evaluate(*map(np.asarray, xs))), expected, **close)
+    if not in_jax:
+        return program
     np.testing.assert_allclose(flat(jax.jit(program.__call__)(*xs)), expected, **close)
     lanes = [jnp.stack([x, x, x]) for x in xs]
     for outputs in (jax.jit(program.__call__)(*lanes), jax.vmap(program)(*lanes)):
@@ -141,6 +145,24 @@ def test_same_as_the_function(family):
     assert_same(function, *arguments)
 
 
+def test_all_families_in_jax():
+    # On lanes, as one program: XLA takes nearly as long for each of fifty. Their numbers are of order ten.
+    functions, arguments = zip(*((function, arguments) for function, *arguments in FAMILIES.values()), strict=True)
+    program = lower(lambda *each: [f(*xs) for f, xs in zip(functions, each, strict=True)], *arguments)
+    xs = scalars(*jax.tree.leaves(arguments))
+    outputs = jax.jit(program.__call__)(*[jnp.stack([x, x, x]) for x in xs])
+    assert all(output.shape == (3,) for output in outputs)
+    expected = flat(program.evaluate(*map(np.asarray, xs)))
+    np.testing.assert_allclose(flat([output[1] for output in outputs]), expected, rtol=TOLERANCE, atol=TOLERANCE * 10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_each_family_in_jax(family):
+    function, *arguments = FAMILIES[family]
+    assert_same(function, *arguments, in_jax=True)
+
+
 # ---- mechanics ------------------------------------------------------------------------------------------------------
 
 
@@ -234,10 +256,11 @@ SCENES = {  # lagrangian, coordinates, most operations an acceleration may take
 }
 
 
+@pytest.mark.parametrize("in_jax", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["", "in JAX"])
 @pytest.mark.parametrize("scene", SCENES)
-def test_accelerations(scene):
+def test_accelerations(scene, in_jax):
     lagrangian, n, most = SCENES[scene]
-    program = assert_same(acceleration(lagrangian), *state(n), tolerance=2e-13)
+    program = assert_same(acceleration(lagrangian), *state(n), tolerance=2e-13, in_jax=in_jax)
     assert program.operations <= most
     assert program.operations <= program.traced_operations
 
@@ -401,25 +424,27 @@ def packed(program):
     return lambda x: program(*x)[0]
 
 
-@pytest.mark.parametrize("function", [surface, lambda x: safe_norm(x) * jnp.cos(x[0])])
+TRANSFORMS = {
+    "grad": jax.grad,
+    "jacfwd": jax.jacfwd,
+    "jacrev": jax.jacrev,
+    "grad of grad": lambda f: jax.grad(lambda x: jax.grad(f)(x) @ B),
+    "hessian": lambda f: jax.jit(jax.hessian(f)),
+    "jacfwd of jacfwd": lambda f: jax.jacfwd(jax.jacfwd(f)),
+    "vmap of grad": lambda f: lambda x: jax.vmap(jax.grad(f))(jnp.stack([x, 2 * x])),
+    "grad of vmap": lambda f: lambda x: jax.grad(lambda y: jnp.sum(jax.vmap(f)(y) ** 2))(jnp.stack([x, -x])),
+    "checkpoint": lambda f: jax.grad(jax.checkpoint(lambda x: lax.fori_loop(0, 3, lambda i, s: s * f(x * s), 0.9))),
+}
+
+
+@pytest.mark.parametrize("function", sweep([surface, lambda x: safe_norm(x) * jnp.cos(x[0])], kept=[surface]))
 @pytest.mark.parametrize(
-    "transform",
-    [
-        jax.grad,
-        jax.jacfwd,
-        jax.jacrev,
-        lambda f: jax.grad(lambda x: jax.grad(f)(x) @ B),
-        lambda f: jax.jit(jax.hessian(f)),
-        lambda f: jax.jacfwd(jax.jacfwd(f)),
-        lambda f: lambda x: jax.vmap(jax.grad(f))(jnp.stack([x, 2 * x])),
-        lambda f: lambda x: jax.grad(lambda y: jnp.sum(jax.vmap(f)(y) ** 2))(jnp.stack([x, -x])),
-        lambda f: jax.grad(jax.checkpoint(lambda x: lax.fori_loop(0, 3, lambda i, s: s * f(x * s), 0.9))),
-    ],
-    ids="grad jacfwd jacrev grad-of-grad hessian jacfwd-of-jacfwd vmap-of-grad grad-of-vmap checkpoint".split(),
+    "transform", sweep(TRANSFORMS, kept=["grad", "jacfwd", "hessian", "grad of vmap", "checkpoint"])
 )
 def test_derivatives(function, transform):
     program = lower(function, A)
-    np.testing.assert_allclose(jax.jit(transform(packed(program)))(A), transform(function)(A), rtol=1e-13, atol=1e-14)
+    of = TRANSFORMS[transform]
+    np.testing.assert_allclose(jax.jit(of(packed(program)))(A), of(function)(A), rtol=1e-13, atol=1e-14)
 
 
 def test_derivatives_respect_custom_rules():

@@ -16,6 +16,7 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 from jax.flatten_util import ravel_pytree
+from sweeps import KINDS, sweep
 
 import lagjax
 from lagjax import scenes
@@ -54,7 +55,7 @@ def over(scene):
 # ---- every scene ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", scenes.ALL, ids=lambda make: make.__name__)
+@pytest.mark.parametrize("make", sweep(scenes.ALL, KINDS), ids=lambda make: make.__name__)
 def test_motion_keeps_the_invariants_and_follows_the_closed_solution(make):
     scene = make()
     assert scene.system == make().system, "a scene made twice must not compile twice"
