@@ -397,8 +397,12 @@ class _Response(NamedTuple):
         """(δpath, δy_end) from the numbers that vary, end to end."""
         count = len(moving)
 
-        def without_response(x):  # only its derivatives are ever computed
-            return jnp.concatenate([x[:count], x[count:] - self._by_sensitivities(x[:count])])
+        # Only derivatives of A are ever computed. JAX transposes it at once, though, and computes there and then what
+        # does not depend on x, every sensitivity: `checkpoint` puts that off until somebody asks for it.
+        by_sensitivities = jax.checkpoint(self._by_sensitivities)
+
+        def without_response(x):
+            return jnp.concatenate([x[:count], x[count:] - by_sensitivities(x[:count])])
 
         def solved(_, b):
             return jnp.concatenate([b[:count], b[count:] + self.push(b[:count])])
