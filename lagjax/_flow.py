@@ -298,7 +298,7 @@ class Flow:
         dy0, dparams = (np.pad(x, padding).reshape(members * groups, directions, -1) for x in (dy0, dparams))
         length = np.abs(np.concatenate([dy0, dparams], axis=2)).max(axis=2, initial=0.0, keepdims=True)
         unit = np.where(length > 0, length, 1.0)
-        y0, params = np.repeat(y0, groups, axis=0), _for_all(np.repeat(params, groups, axis=0), members * groups)
+        y0, params = (np.repeat(x, groups, axis=0) for x in (y0, _for_all(params, members)))
         ts = ts if len(ts) == 1 else np.repeat(ts, groups, axis=0)
         start = np.concatenate([y0[:, None], dy0 / unit], axis=1)  # (rows, 1 + D, 2n)
         numbers = np.concatenate([params[:, None], dparams / unit], axis=1).reshape(len(start), -1)

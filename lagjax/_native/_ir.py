@@ -57,9 +57,11 @@ def lanes() -> int:
     return 8 if llvm.get_host_cpu_features().get("avx512f", False) else 4
 
 
-# Loops over lanes and orders are written out by hand, so that little is left to do. Neither LLVM's default pipeline nor
-# `instruction_combine`, which gains nothing here: in llvmlite both lose some memory for every module.
-_PASSES = ("sroa", "simplify_cfg", "new_gvn", "dead_code_elimination", "simplify_cfg")
+# Loops over lanes and orders are written out by hand and every operation is shared already, so that little is left to
+# do: variables become registers, and what nobody uses goes. More gains nothing measurable in how a kernel runs, and
+# `new_gvn` and `simplify_cfg` end the process by failed assertions on straight lines of some thousand operations.
+# LLVM's default pipeline and `instruction_combine` lose some memory for every module in llvmlite.
+_PASSES = ("sroa", "dead_code_elimination")
 
 
 def compiled(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
