@@ -133,7 +133,7 @@ def differentiable_where(well, x):
 
 @differentiable_where.defjvp
 def _differentiable_where_jvp(primals, tangents):
-    return primals[1], nan_unless(primals[0], tangents[1])
+    return differentiable_where(*primals), nan_unless(primals[0], tangents[1])
 
 
 def _nan_unless(reached, x):

@@ -367,7 +367,8 @@ class Flow:
             some_ts = ts if len(ts) == 1 else ts[places]
             again, _ = self.run(some_ts, y0[places], params[places], tolerances, store, accepted[places])
             back(store, again.ticket, places)
-        return y_bar + path_bar[:, 0], params_bar  # the first output is the initial state
+        at_start = (ts == ts[:, :1])[:, :, None]  # outputs that are the initial state; steps begin after them
+        return y_bar + np.sum(path_bar * at_start, axis=1), params_bar
 
     def _pull_by_tangents(self, ts, y0, params, path_bar, end_bar, tolerances) -> tuple[np.ndarray, ...]:
         """The same where there are more cotangents than numbers that vary: from the whole Jacobian."""

@@ -2,12 +2,12 @@
 
 A round runs every member to the end of its time or to the next zero of a guard of its mode, writes down the outputs on
 the way, and puts it into the next mode. Where a guard vanishes is found by machine code (`_native`), without
-derivatives. They come from two places: along a round from the sensitivities of the flow, and at its end from the
-implicit function: with g the guard and ġ its rate along the motion,
+derivatives. They come from two places: along a round from those of the flow, and at its end from the implicit function:
+with g the guard and ġ its rate along the motion,
 
     dt* = −dg / ġ        dy* = dy + ẏ dt*
 
-after which the reset is differentiated like any function. Together these are the jump of a sensitivity at an event
+and the same to second order (`_Rounds._crossing`), after which the reset is differentiated like any function. Together these are the jump of a sensitivity at an event
 ("saltation matrix"). Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & Pai, IEEE Trans.
 Circuits Syst. I 47 (2000) 204, §III.
 """
@@ -109,7 +109,8 @@ def simulate_hybrid(
     the last, and their `count`.
 
     Every member of a batch switches at its own time: use `jax.vmap`, `jax.jit` and `jax.grad` around it. Times and
-    states of transitions have their first derivatives by the initial state and by params; second ones are not right.
+    states of transitions have first and second derivatives by the initial state and by params; third ones are not
+    right.
 
     A guard is looked at along the whole of every step, and a step is shortened until it is smooth there: one that
     touches zero, or crosses it and comes back between two steps, is seen for what it is. A state that a reset leaves
@@ -403,16 +404,14 @@ class _Rounds(NamedTuple):
         y_here, numbers = _held(changes > 0, (y, self.numbers))
         values = self.modes[index].surfaces(*y_here, t, *numbers)
         seen = ~jnp.isnan(jnp.stack(values)).any()
-        _, rates, sizes, slope = self._at_guards(index, t, y)
+        _, rates, sizes = self._at_guards(index, t, y)
         before = jnp.asarray(False)
         for k, (number, transition) in enumerate(leaving):
             taken = (kinds[k] > 0) & ~before
             before = before | taken
             # It changes sign against its rate: the motion since the last time is lost in rounding.
             against = jnp.where(kinds[k] == 2, rates[k] < 0, rates[k] > 0) & (latest == number)
-            rate = jnp.where(taken & (rates[k] != 0), rates[k], 1.0)
-            later = jnp.where(taken, -(values[k] - jax.lax.stop_gradient(values[k])) / rate, 0.0)
-            moved_t, moved_y = t + later, y_here + slope * later
+            moved_t, moved_y = self._crossing(index, k)(taken, t, y_here, numbers)
             given = _held(taken, (moved_t, moved_y, self.params))
             y_next, target = self._reset(transition, *given), self.plan.names.index(transition.target)
             here = _Exit(
@@ -428,7 +427,7 @@ class _Rounds(NamedTuple):
         waiting = jnp.asarray(0)
         if len(kinds) == 1:
             return waiting
-        after, rates, _, _ = self._at_guards(index, t, y_next)
+        after, rates, _ = self._at_guards(index, t, y_next)
         for k, kind in enumerate(kinds):
             unmoved = jnp.abs(after[k] - jax.lax.stop_gradient(values[k])) <= SAME * sizes[k]
             goes_on = jnp.where(kind == 2, rates[k] > 0, rates[k] < 0)
@@ -436,12 +435,46 @@ class _Rounds(NamedTuple):
         return waiting
 
     def _at_guards(self, index: int, t, y):
-        """Guards, their rates and their sizes as numbers, and the slope of the state."""
+        """Guards, their rates and their sizes, as numbers without derivatives."""
         t, y, numbers = jax.lax.stop_gradient((t, y, self.numbers))
-        n, out = self.layout.size, self.modes[index].guards(*y, t, *numbers)
+        out = self.modes[index].guards(*y, t, *numbers)
         count = len(out) // 4
-        slope = jnp.concatenate([y[n:], jnp.stack(self.modes[index].flow.anywhere(*y, t, *numbers)[:n])])
-        return out[:count], out[count : 2 * count], out[2 * count : 3 * count], slope
+        return out[:count], out[count : 2 * count], out[2 * count : 3 * count]
+
+    def _crossing(self, index: int, k: int) -> Callable:
+        """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero, and stays zero as what went in varies.
+
+        With g the guard, f the rate of the state and ′ the derivative along the motion, the time moves by
+
+            s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
+
+        up to third order in δg, which is zero itself: first and second derivatives are right.
+        """
+        mode, n, still = self.modes[index], self.layout.size, jax.lax.stop_gradient
+        count = len(self.plan.leaving(index))
+
+        def rates(t, y, numbers):
+            acceleration = jnp.stack(mode.flow.anywhere(*y, t, *numbers)[:n])
+            return mode.guards(*y, t, *numbers)[count + k], jnp.concatenate([y[n:], acceleration])
+
+        def moved(taken, t, y, numbers):
+            value, (rate, slope) = mode.surfaces(*y, t, *numbers)[k], rates(t, y, numbers)
+            along = jnp.ones_like(t), slope
+            bend, turn = map(still, jax.jvp(lambda t, y: rates(t, y, numbers), (t, y), along)[1])
+            rate = jnp.where(taken & (rate != 0), rate, 1.0)
+            part = jnp.where(taken, value - still(value), 0.0) / rate
+            later = -part - 0.5 * still(bend / rate) * part**2
+            return t + later, y + slope * later + 0.5 * turn * later**2
+
+        @jax.custom_jvp
+        def crossing(taken, t, y, numbers):
+            return t, y
+
+        @crossing.defjvp
+        def _(primals, tangents):
+            return crossing(*primals), jax.jvp(moved, primals, tangents)[1]
+
+        return crossing
 
     def astray(self, index: int, t, y):
         """Whether a state is off the constraints of a mode."""
