@@ -15,6 +15,7 @@ from jax.experimental.buffer_callback import buffer_callback
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from lagjax._custom import differentiated_as
 from lagjax._results import ENDED_WELL, SimulationError, advice, result_from
 
 
@@ -125,15 +126,9 @@ def nan_unless(reached, x):
     return nan_unless_p.bind(jnp.broadcast_to(reached, jnp.shape(x)), x)
 
 
-@jax.custom_jvp
 def differentiable_where(well, x):
     """`x` itself, whose derivatives are NaN unless `well` holds."""
-    return x
-
-
-@differentiable_where.defjvp
-def _differentiable_where_jvp(primals, tangents):
-    return differentiable_where(*primals), nan_unless(primals[0], tangents[1])
+    return differentiated_as(lambda well, x: (nan_unless(well, x),), (x,), well, x)[0]
 
 
 def _nan_unless(reached, x):

@@ -7,9 +7,9 @@ with g the guard and ġ its rate along the motion,
 
     dt* = −dg / ġ        dy* = dy + ẏ dt*
 
-and the same to second order (`_Rounds._crossing`), after which the reset is differentiated like any function. Together these are the jump of a sensitivity at an event
-("saltation matrix"). Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & Pai, IEEE Trans.
-Circuits Syst. I 47 (2000) 204, §III.
+and the same to second order (`_Rounds._crossing`), after which the reset is differentiated like any function. Together
+these are the jump of a sensitivity at an event ("saltation matrix"). Source: Aizerman & Gantmakher, Q. J. Mech. Appl.
+Math. 11 (1958) 225; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204, §III.
 """
 
 import dataclasses
@@ -25,6 +25,7 @@ import numpy as np
 from lagjax import _native
 from lagjax._arguments import Function, accept
 from lagjax._consistent import TOLERANCE, require_consistent
+from lagjax._custom import differentiated_as
 from lagjax._engine import RESULT_OF_CODE
 from lagjax._equations import multiplier_program, projection, scalar_program
 from lagjax._flow import Flow, Tolerances, unfit
@@ -442,7 +443,7 @@ class _Rounds(NamedTuple):
         return out[:count], out[count : 2 * count], out[2 * count : 3 * count]
 
     def _crossing(self, index: int, k: int) -> Callable:
-        """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero, and stays zero as what went in varies.
+        """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero and stays so as what went in varies.
 
         With g the guard, f the rate of the state and ′ the derivative along the motion, the time moves by
 
@@ -466,13 +467,8 @@ class _Rounds(NamedTuple):
             later = -part - 0.5 * still(bend / rate) * part**2
             return t + later, y + slope * later + 0.5 * turn * later**2
 
-        @jax.custom_jvp
         def crossing(taken, t, y, numbers):
-            return t, y
-
-        @crossing.defjvp
-        def _(primals, tangents):
-            return crossing(*primals), jax.jvp(moved, primals, tangents)[1]
+            return differentiated_as(moved, (t, y), taken, t, y, numbers)
 
         return crossing
 

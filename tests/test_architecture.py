@@ -13,6 +13,7 @@ PACKAGE = Path(lagjax.__file__).parent
 STREET = [
     "_arguments",
     "_results",
+    "_custom",
     "_failures",
     "_stopped",
     "_layout",
