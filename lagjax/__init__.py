@@ -14,7 +14,6 @@ from lagjax._results import RESULTS, SimulationError
 from lagjax._simulate import simulate, simulate_batch
 from lagjax._solvers import FineOutput, Unrolled
 from lagjax._system import System
-from lagjax._taylor import Taylor
 from lagjax._trajectory import State, Trajectory, Transitions
 
 __version__ = "0.1.0"
@@ -29,7 +28,6 @@ __all__ = [
     "SimulationError",
     "State",
     "System",
-    "Taylor",
     "Trajectory",
     "Transition",
     "Transitions",
