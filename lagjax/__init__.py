@@ -12,7 +12,7 @@ from lagjax._machine_code import MachineCode
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._simulate import simulate, simulate_batch
-from lagjax._solvers import FineOutput, Unrolled
+from lagjax._solvers import FineOutput
 from lagjax._system import System
 from lagjax._trajectory import State, Trajectory, Transitions
 
@@ -31,7 +31,6 @@ __all__ = [
     "Trajectory",
     "Transition",
     "Transitions",
-    "Unrolled",
     "WorkPrecision",
     "WorkPrecisionRow",
     "check",

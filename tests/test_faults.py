@@ -168,7 +168,6 @@ REFUSED = {
     "no budget of transitions": (hybrid(max_transitions=0), ValueError, "max_transitions must be a positive integer"),
     # solvers, tables
     "fine output of an implicit solver": (lambda: lagjax.FineOutput(diffrax.Kvaerno5()), TypeError, "explicit FSAL"),
-    "unrolled twice": (lambda: lagjax.Unrolled(lagjax.Unrolled(diffrax.Tsit5())), TypeError, "explicit Runge-Kutta"),
     "a function without a series": (
         run(lagjax.System(lambda q, v: 0.5 * v**2 - jax.scipy.special.gammaln(q)), 1.0, 0.0, TS, None,
             solver=lagjax.MachineCode()), ValueError, "gamma",
