@@ -12,9 +12,8 @@ from lagjax._machine_code import MachineCode
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._simulate import simulate, simulate_batch
-from lagjax._solvers import FineOutput, Unrolled
+from lagjax._solvers import FineOutput
 from lagjax._system import System
-from lagjax._taylor import Taylor
 from lagjax._trajectory import State, Trajectory, Transitions
 
 __version__ = "0.1.0"
@@ -29,11 +28,9 @@ __all__ = [
     "SimulationError",
     "State",
     "System",
-    "Taylor",
     "Trajectory",
     "Transition",
     "Transitions",
-    "Unrolled",
     "WorkPrecision",
     "WorkPrecisionRow",
     "check",

@@ -11,7 +11,6 @@ first ones, differ from them in the last digit, and then accept or reject otherw
 a word. This is the only module that calls diffrax's integrator.
 """
 
-from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import diffrax
@@ -20,10 +19,8 @@ import jax
 import jax.numpy as jnp
 
 from lagjax._equations import Equations
-from lagjax._program import plain_elementary
 from lagjax._settings import Settings
 from lagjax._solvers import Projected
-from lagjax._taylor import Taylor
 
 PyTree = Any
 
@@ -47,9 +44,7 @@ def integrate(form: Equations, settings: Settings, event: diffrax.Event | None, 
     those of the diffrax adjoint.
     """
     # What f closes over (a parameter from outside, the weights of a neural Lagrangian) becomes an argument.
-    # A Taylor solver takes the equations apart once more, and must find sin and not the polynomial behind it.
-    with plain_elementary() if isinstance(settings.solver, Taylor) else nullcontext():
-        field = eqx.filter_closure_convert(form.vector_field, ts[0], y0, params)
+    field = eqx.filter_closure_convert(form.vector_field, ts[0], y0, params)
     project = eqx.filter_closure_convert(form.projected, ts[0], y0, params) if form.constrained else None
     solved = _differentiable((field, project, ts, y0, params), settings, event, primal)
     if project is not None:

@@ -20,6 +20,7 @@ from lagjax._equations import equations
 from lagjax._failures import differentiable_where, nan_unless, raise_where_failed, sentence
 from lagjax._integrate import integrate
 from lagjax._layout import Layout
+from lagjax._machine_code import MachineCode
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, result_from
 from lagjax._settings import (
     Settings,
@@ -45,7 +46,7 @@ def simulate(
     ts: jax.Array,
     params: PyTree = None,
     *,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: diffrax.AbstractSolver | MachineCode | None = None,
     rtol: float | None = None,
     atol: float | None = None,
     dt: float | None = None,
@@ -72,10 +73,10 @@ def simulate(
 
     **Rarer ones**
 
-    - `solver`: any diffrax solver for ODEs. By default, in float64 on a CPU, Taylor series in machine code made for the
-      scene, of an order that suits `rtol`; `System.explain` says where that cannot be. Then it is
-      `lagjax.FineOutput(diffrax.Dopri8())`, order 8, with states between its steps about as good as those at their ends
-      (which diffrax's own interpolation for it is not).
+    - `solver`: any diffrax solver for ODEs, or `lagjax.MachineCode()` to insist on the default. That is, in float64 on
+      a CPU, Taylor series in machine code made for the scene, of an order that suits `rtol`; `System.explain` says
+      where that cannot be. Then it is `lagjax.FineOutput(diffrax.Dopri8())`, order 8, with states between its steps
+      about as good as those at their ends (which diffrax's own interpolation for it is not).
     - `dt`: take fixed steps of this size instead of adaptive ones; `rtol` and `atol` then do not apply.
     - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient by diffrax records that many
       times for every member: lower it for the gradient of a large batch.
@@ -139,7 +140,7 @@ def simulate_batch(
     params: PyTree = None,
     *,
     batch_axes: tuple[PyTree, PyTree, PyTree] = (0, 0, None),
-    solver: diffrax.AbstractSolver | None = None,
+    solver: diffrax.AbstractSolver | MachineCode | None = None,
     rtol: float | None = None,
     atol: float | None = None,
     dt: float | None = None,

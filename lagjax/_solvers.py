@@ -1,11 +1,9 @@
-"""Two wrappers around the explicit Runge–Kutta solvers of diffrax. Neither changes the steps that are taken.
+"""Wrappers around the solvers of diffrax. Neither changes the size of the steps that are taken.
 
 `FineOutput` makes the states *between* steps better. The interpolant that comes with `diffrax.Dopri8` is of order five
 or six, the method of order eight: at tight tolerances it loses a factor of 30 to 1000 against the ends of the steps.
 
-`Unrolled` writes the stages of a step as one straight line. diffrax goes through them in a loop with a buffer for the
-slopes, which costs more than the arithmetic where the state is small and the batch large. It pays when the right-hand
-side is a call that XLA does not inline (as lagjax's are); otherwise every stage becomes a copy of it.
+`Projected` puts the state back on its constraints after each step.
 """
 
 from collections.abc import Callable
@@ -221,117 +219,5 @@ def _nan_where(failed, tree: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
-class Unrolled(diffrax.AbstractAdaptiveSolver):
-    """The steps, error estimate and interpolation of an explicit Runge–Kutta solver of diffrax, without its stage loop.
-
-    `solver` is any explicit one with an error estimate: `diffrax.Tsit5()`, `diffrax.Dopri5()`, `diffrax.Dopri8()`. For
-    a single `ODETerm`.
-
-    Raises `TypeError` for any other solver.
-
-    Source of the formulas: Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.1 (1.8), §II.4.
-
-    ```python
-    import diffrax, jax.numpy as jnp, lagjax
-
-    term = diffrax.ODETerm(lambda t, y, args: -y)
-    controller = diffrax.PIDController(rtol=1e-6, atol=1e-6)
-    solver = lagjax.Unrolled(diffrax.Dopri8())
-    diffrax.diffeqsolve(term, solver, 0.0, 1.0, 0.1, jnp.array(1.0), stepsize_controller=controller)
-    ```
-    """
-
-    solver: diffrax.AbstractERK
-
-    def __check_init__(self):
-        if not isinstance(self.solver, diffrax.AbstractERK):
-            raise TypeError(f"Unrolled takes an explicit Runge-Kutta solver of diffrax; got {self.solver!r}.")
-
-    @property
-    def term_structure(self):
-        """One term, of an ordinary differential equation."""
-        return diffrax.ODETerm
-
-    @property
-    def interpolation_cls(self) -> Callable:
-        """The interpolation of the solver, with its slopes put together only where it is evaluated."""
-        return eqx.Partial(_Interpolation, self.solver.interpolation_cls)
-
-    def order(self, terms) -> int:
-        """The order of the solver."""
-        return self.solver.order(terms)
-
-    def init(self, terms, t0, t1, y0, args):
-        """Where the last slope of a step is the first one of the next, that slope; else nothing."""
-        return terms.vf(t0, y0, args) if self._keeps_last_slope else None
-
-    def func(self, terms, t0, y0, args):
-        """The slope."""
-        return terms.vf(t0, y0, args)
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step: yₙ₊₁ = yₙ + Σ bᵢ kᵢ with kᵢ = h f(t + cᵢ h, yₙ + Σ aᵢⱼ kⱼ)."""
-        # `contr` and `prod` are diffrax's h and h·f: they also know that time may run backward.
-        tableau, h = self.solver.tableau, terms.contr(t0, t1)
-
-        def increment(slope):
-            return _in_dtype_of(y0, terms.prod(slope, h))
-
-        slope = solver_state
-        if slope is None:
-            slope = terms.vf(t0, y0, args)
-        elif made_jump is not False:
-            slope = jax.lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
-        increments = [increment(slope)]
-        for c, row in zip(tableau.c, tableau.a_lower, strict=True):
-            y = _add(y0, _combine(row, increments))
-            slope = terms.vf(t0 + float(c) * (t1 - t0), y, args)
-            increments.append(increment(slope))
-        # Where the last slope is taken at the end point (FSAL), that point is the solution itself.
-        y1 = y if tableau.ssal else _add(y0, _combine(tableau.b_sol, increments))
-        dense = {"y0": y0, "y1": y1, "increments": tuple(increments)}
-        state = slope if self._keeps_last_slope else None
-        return y1, _combine(tableau.b_error, increments), dense, state, diffrax.RESULTS.successful
-
-    @property
-    def _keeps_last_slope(self) -> bool:
-        return self.solver.tableau.fsal
-
-
-class _Interpolation(diffrax.AbstractLocalInterpolation):
-    """The interpolation `kind` of diffrax, which wants the increments stacked, from a tuple of them."""
-
-    kind: Callable
-    t0: jax.Array
-    t1: jax.Array
-    y0: object
-    y1: object
-    increments: tuple
-
-    def __init__(self, kind, *, t0, t1, y0, y1, increments):
-        self.kind, self.t0, self.t1, self.y0, self.y1, self.increments = kind, t0, t1, y0, y1, increments
-
-    def evaluate(self, t0, t1=None, left=True):
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self.increments)
-        return self.kind(t0=self.t0, t1=self.t1, y0=self.y0, y1=self.y1, k=stacked).evaluate(t0, t1, left)
-
-
-def _combine(weights, increments):
-    """Σ wᵢ kᵢ over the weights that are not zero, for every leaf of the state."""
-    terms = [(float(w), k) for w, k in zip(weights, increments, strict=True) if w != 0]
-
-    def total(*leaves):
-        sum_ = terms[0][0] * leaves[0]
-        for (weight, _), leaf in zip(terms[1:], leaves[1:], strict=True):
-            sum_ = sum_ + weight * leaf
-        return sum_
-
-    return jax.tree.map(total, *(k for _, k in terms))
-
-
 def _in_dtype_of(y, increment):
     return jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), increment, y)
-
-
-def _add(y, increment):
-    return jax.tree.map(jnp.add, y, increment)

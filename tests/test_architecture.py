@@ -23,7 +23,6 @@ STREET = [
     "_settings",
     "_elementary",
     "_program",
-    "_taylor",
     "_native",
     "_flow",
     "_transforms",

@@ -167,13 +167,10 @@ REFUSED = {
     ),
     "no budget of transitions": (hybrid(max_transitions=0), ValueError, "max_transitions must be a positive integer"),
     # solvers, tables
-    "a series of order 40": (lambda: lagjax.Taylor(40), ValueError, "from 4 to 20"),
-    "a series of order 12.0": (lambda: lagjax.Taylor(12.0), ValueError, "a whole number from 4 to 20"),
     "fine output of an implicit solver": (lambda: lagjax.FineOutput(diffrax.Kvaerno5()), TypeError, "explicit FSAL"),
-    "unrolled twice": (lambda: lagjax.Unrolled(lagjax.Unrolled(diffrax.Tsit5())), TypeError, "explicit Runge-Kutta"),
     "a function without a series": (
-        run(lagjax.System(lambda q, v: 0.5 * v**2 - jax.scipy.special.gammaln(q)), solver=lagjax.Taylor(8)), ValueError,
-        "gamma",
+        run(lagjax.System(lambda q, v: 0.5 * v**2 - jax.scipy.special.gammaln(q)), 1.0, 0.0, TS, None,
+            solver=lagjax.MachineCode()), ValueError, "gamma",
     ),
     "tolerances that are one": (
         lambda: lagjax.work_precision(SPRING, 1.0, 0.0, TS, PARAMS, tolerances=1e-6), ValueError, "at least one value",
