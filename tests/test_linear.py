@@ -1,0 +1,177 @@
+"""The linear solves on arrays: right against LAPACK outside of JAX, and without LAPACK inside of it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import _linear, scenes
+from lagjax._layout import Layout
+
+SEED = np.random.SeedSequence(11)
+
+
+def symmetric(n, eigenvalues, seed=0):
+    """A symmetric matrix with these eigenvalues."""
+    basis = np.linalg.qr(np.random.default_rng(seed).normal(size=(n, n)))[0]
+    matrix = basis @ np.diag(np.broadcast_to(eigenvalues, n)) @ basis.T
+    return 0.5 * (matrix + matrix.T)
+
+
+def definite(n, seed=0):
+    return symmetric(n, np.geomspace(0.1, 10, n), seed)
+
+
+def indefinite(n, seed=0):
+    return symmetric(n, np.geomspace(0.1, 10, n) * (-1) ** np.arange(n), seed)
+
+
+def solved(matrix, b):
+    return _linear.factorize(matrix).solve(b)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("kind", [definite, indefinite])
+@pytest.mark.parametrize("n", [1, 2, 3, 7, 16, 17, 40, 200])
+def test_the_solution_is_that_of_lapack(n, kind, dtype):
+    matrix, b = kind(n), np.random.default_rng(n).normal(size=n)
+    x = jax.jit(solved)(jnp.asarray(matrix, dtype), jnp.asarray(b, dtype))
+    exact = np.linalg.solve(matrix, b)
+    # cond = 100 at most; sqrt(n) for sums of n round-offs.
+    assert x.dtype == dtype
+    assert np.abs(x - exact).max() < 100 * 4 * np.sqrt(n) * np.finfo(dtype).eps * np.abs(exact).max()
+
+
+def test_masses_of_very_different_size_cost_no_accuracy():
+    n, scale = 20, np.geomspace(1e-9, 1e9, 20)
+    matrix, x = scale[:, None] * definite(n) * scale, 1 / scale
+    solution = jax.jit(solved)(matrix, matrix @ x)
+    assert np.abs(solution / x - 1).max() < 1e-10
+
+
+def test_pivots_that_are_zero_at_first_are_passed_over():
+    for matrix in ([[0.0, 1.0], [1.0, 0.0]], [[0.0, 2.0, 1.0], [2.0, 0.0, 3.0], [1.0, 3.0, 0.0]]):
+        matrix, b = np.array(matrix), np.arange(1.0, 1 + len(matrix))
+        np.testing.assert_allclose(solved(jnp.asarray(matrix), jnp.asarray(b)), np.linalg.solve(matrix, b), rtol=1e-14)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 16, 33])
+def test_a_singular_matrix_gives_nan_and_says_so(n):
+    direction = np.linspace(1.0, 2.0, n)
+    for matrix in (np.zeros((n, n)), definite(n) * (np.arange(n) > 0) * (np.arange(n) > 0)[:, None]):
+        factorization = _linear.factorize(jnp.asarray(matrix))
+        assert factorization.singular and np.isnan(factorization.solve(jnp.asarray(direction))).all()
+    factorization = _linear.factorize(jnp.asarray(definite(n)))
+    assert not factorization.singular
+
+
+@pytest.mark.parametrize("n", [2, 20])
+def test_a_nan_stays_a_nan_and_is_not_called_singular(n):
+    for place in ((0, 0), (n - 1, 0), (n - 1, n - 1)):
+        matrix = definite(n)
+        matrix[place] = matrix[place[::-1]] = np.nan
+        factorization = _linear.factorize(jnp.asarray(matrix))
+        assert not factorization.singular and np.isnan(factorization.solve(jnp.ones(n))).all()
+
+
+@pytest.mark.parametrize("n", [2, 5, 20])
+def test_derivatives_of_the_solution(n):
+    """x = A(s)⁻¹ b with A = A₀ + s A₁: x′ = −A⁻¹ A₁ x, x″ = 2 A⁻¹ A₁ A⁻¹ A₁ x, in every order of the modes."""
+    start, slope, b = indefinite(n), 0.1 * definite(n, 1), np.linspace(1, 2, n)
+    weights = np.linspace(-1, 1, n)
+    x = np.linalg.solve(start, b)
+    first = -np.linalg.solve(start, slope @ x)
+    second = -2 * np.linalg.solve(start, slope @ first)
+
+    def number(s):
+        return weights @ solved(start + s * slope, jnp.asarray(b))
+
+    for derivative in (jax.jacfwd, jax.grad):
+        np.testing.assert_allclose(derivative(number)(0.0), weights @ first, rtol=1e-11)
+    for outer, inner in ((jax.jacfwd, jax.grad), (jax.grad, jax.jacfwd), (jax.grad, jax.grad)):
+        np.testing.assert_allclose(jax.jit(outer(inner(number)))(0.0), weights @ second, rtol=1e-10)
+    several = jax.jit(jax.vmap(jax.grad(number)))(jnp.array([0.0, 1e-3]))
+    np.testing.assert_allclose(several[0], weights @ first, rtol=1e-11)
+
+
+# ---- least norm ------------------------------------------------------------------------------------------------------
+
+
+def gram(rows, metric=None):
+    return rows @ (np.eye(rows.shape[1]) if metric is None else metric) @ rows.T
+
+
+REDUNDANT = {
+    "none": np.array([[1.0, 0.0, 2.0], [0.0, 3.0, 1.0]]),
+    "one of three": np.array([[1.0, 0.0, 2.0], [0.0, 3.0, 1.0], [1.0, 3.0, 3.0]]),
+    "twice the same": np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [-1.0, 0.0, 1.0]]),
+    "an empty row": np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]),
+    "a large sum": np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1e6, 1e6, 0.0], [0.0, 0.0, 1e-3]]),
+    "large copies": np.array([[1.0, 1.0, 0.0], [1e6, 1e6, 0.0], [-1e6, -1e6, 0.0]]),
+    "more than coordinates": np.random.default_rng(3).normal(size=(12, 4)),
+}
+
+
+@pytest.mark.parametrize("name", REDUNDANT)
+def test_the_shortest_multipliers(name):
+    """Of all λ with the same force Gᵀλ the shortest has no part in the kernel of Gᵀ."""
+    rows = REDUNDANT[name]
+    matrix = gram(rows)
+    truth = rows @ np.linspace(1.0, 2.0, rows.shape[1])  # in the range of S: no part in the kernel
+    found = np.asarray(jax.jit(_linear.least_norm)(jnp.asarray(matrix), jnp.asarray(matrix @ truth)))
+    kept = np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300))[1]
+    kept = kept[kept > 1e-8]
+    assert np.abs(found - truth).max() < 1e-12 * (kept.max() / kept.min()) ** 2 * np.abs(truth).max()
+
+
+def test_multipliers_of_an_indefinite_mass_matrix():
+    """M = diag(1, −1) with one constraint along (1, 2), whose S = G K⁻¹ Gᵀ is negative."""
+    matrix, rows = jnp.diag(jnp.array([1.0, -1.0])), jnp.array([[1.0, 2.0]])
+    b, c = jnp.array([0.3, 0.7]), jnp.array([0.5])
+    x, multipliers, singular = _linear.saddle(matrix, b, rows, c)
+    full = np.block([[np.asarray(matrix), -np.asarray(rows).T], [np.asarray(rows), np.zeros((1, 1))]])
+    np.testing.assert_allclose(np.append(x, multipliers), np.linalg.solve(full, np.append(b, c)), rtol=1e-13)
+    assert not singular
+
+
+def test_a_nan_in_redundant_constraints_stays_a_nan():
+    matrix = gram(REDUNDANT["one of three"])
+    matrix[2, 0] = matrix[0, 2] = np.nan
+    assert np.isnan(_linear.least_norm(jnp.asarray(matrix), jnp.ones(3))).all()
+
+
+def test_derivatives_of_the_shortest_multipliers():
+    """Against NumPy's pseudo-inverse by differences of order four; the rows are redundant on both sides."""
+    rows, turn = REDUNDANT["one of three"], np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.5], [0.0, 0.2, 0.0]])
+
+    def matrix(s):
+        return rows @ (np.eye(3) + s * turn) @ (np.eye(3) + s * turn).T @ rows.T
+
+    def number(s):
+        return jnp.sum(_linear.least_norm(matrix(s), matrix(0.0) @ np.ones(3)) ** 2)
+
+    def exact(s):
+        return np.sum((np.linalg.pinv(matrix(s), rcond=1e-10) @ matrix(0.0) @ np.ones(3)) ** 2)
+
+    h = 1e-2
+    first = (8 * (exact(h) - exact(-h)) - (exact(2 * h) - exact(-2 * h))) / (12 * h)
+    second = (16 * (exact(h) + exact(-h)) - (exact(2 * h) + exact(-2 * h)) - 30 * exact(0)) / (12 * h * h)
+    np.testing.assert_allclose([jax.grad(number)(0.0), jax.jacfwd(number)(0.0)], first, rtol=1e-5)
+    for outer, inner in ((jax.jacfwd, jax.grad), (jax.grad, jax.grad)):
+        np.testing.assert_allclose(jax.jit(outer(inner(number)))(0.0), second, rtol=1e-4)
+
+
+# ---- no LAPACK -------------------------------------------------------------------------------------------------------
+
+
+def redundant(q):
+    return {"rods": jnp.stack([q[0] ** 2 + q[1] ** 2 - 1.0, q[2] - 0.5, q[0] ** 2 + q[1] ** 2 + q[2] - 1.5])}
+
+
+ARRAY = {
+    "chain": scenes.chain(3),
+    "constrained": lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * q[1], constraints=redundant, path="array"
+    ),
+}
