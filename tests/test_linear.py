@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax import _linear, scenes
+from lagjax import _consistent, _linear
 from lagjax._layout import Layout
-
-SEED = np.random.SeedSequence(11)
 
 
 def symmetric(n, eigenvalues, seed=0):
@@ -27,16 +25,23 @@ def indefinite(n, seed=0):
     return symmetric(n, np.geomspace(0.1, 10, n) * (-1) ** np.arange(n), seed)
 
 
+@jax.jit
 def solved(matrix, b):
     return _linear.factorize(matrix).solve(b)
 
 
+@jax.jit
+def solved_or_singular(matrix, b):
+    factorization = _linear.factorize(matrix)
+    return factorization.solve(b), factorization.singular
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("kind", [definite, indefinite])
-@pytest.mark.parametrize("n", [1, 2, 3, 7, 16, 17, 40, 200])
+@pytest.mark.parametrize("n", [1, 2, 7, 16, 17, 200])
 def test_the_solution_is_that_of_lapack(n, kind, dtype):
     matrix, b = kind(n), np.random.default_rng(n).normal(size=n)
-    x = jax.jit(solved)(jnp.asarray(matrix, dtype), jnp.asarray(b, dtype))
+    x = solved(jnp.asarray(matrix, dtype), jnp.asarray(b, dtype))
     exact = np.linalg.solve(matrix, b)
     # cond = 100 at most; sqrt(n) for sums of n round-offs.
     assert x.dtype == dtype
@@ -46,7 +51,7 @@ def test_the_solution_is_that_of_lapack(n, kind, dtype):
 def test_masses_of_very_different_size_cost_no_accuracy():
     n, scale = 20, np.geomspace(1e-9, 1e9, 20)
     matrix, x = scale[:, None] * definite(n) * scale, 1 / scale
-    solution = jax.jit(solved)(matrix, matrix @ x)
+    solution = solved(matrix, matrix @ x)
     assert np.abs(solution / x - 1).max() < 1e-10
 
 
@@ -56,43 +61,40 @@ def test_pivots_that_are_zero_at_first_are_passed_over():
         np.testing.assert_allclose(solved(jnp.asarray(matrix), jnp.asarray(b)), np.linalg.solve(matrix, b), rtol=1e-14)
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 16, 33])
+@pytest.mark.parametrize("n", [1, 5, 33])
 def test_a_singular_matrix_gives_nan_and_says_so(n):
-    direction = np.linspace(1.0, 2.0, n)
-    for matrix in (np.zeros((n, n)), definite(n) * (np.arange(n) > 0) * (np.arange(n) > 0)[:, None]):
-        factorization = _linear.factorize(jnp.asarray(matrix))
-        assert factorization.singular and np.isnan(factorization.solve(jnp.asarray(direction))).all()
-    factorization = _linear.factorize(jnp.asarray(definite(n)))
-    assert not factorization.singular
+    part = np.arange(n) > 0
+    for matrix, truth in ((np.zeros((n, n)), True), (definite(n) * part * part[:, None], True), (definite(n), False)):
+        x, singular = solved_or_singular(matrix, np.ones(n))
+        assert singular == truth and (np.isnan(x) == truth).all()
 
 
-@pytest.mark.parametrize("n", [2, 20])
+@pytest.mark.parametrize("n", [5, 33])
 def test_a_nan_stays_a_nan_and_is_not_called_singular(n):
     for place in ((0, 0), (n - 1, 0), (n - 1, n - 1)):
         matrix = definite(n)
         matrix[place] = matrix[place[::-1]] = np.nan
-        factorization = _linear.factorize(jnp.asarray(matrix))
-        assert not factorization.singular and np.isnan(factorization.solve(jnp.ones(n))).all()
+        x, singular = solved_or_singular(matrix, np.ones(n))
+        assert not singular and np.isnan(x).all()
 
 
-@pytest.mark.parametrize("n", [2, 5, 20])
+@pytest.mark.parametrize("n", [2, 20])
 def test_derivatives_of_the_solution(n):
     """x = A(s)⁻¹ b with A = A₀ + s A₁: x′ = −A⁻¹ A₁ x, x″ = 2 A⁻¹ A₁ A⁻¹ A₁ x, in every order of the modes."""
     start, slope, b = indefinite(n), 0.1 * definite(n, 1), np.linspace(1, 2, n)
     weights = np.linspace(-1, 1, n)
-    x = np.linalg.solve(start, b)
-    first = -np.linalg.solve(start, slope @ x)
+    first = -np.linalg.solve(start, slope @ np.linalg.solve(start, b))
     second = -2 * np.linalg.solve(start, slope @ first)
 
     def number(s):
         return weights @ solved(start + s * slope, jnp.asarray(b))
 
-    for derivative in (jax.jacfwd, jax.grad):
-        np.testing.assert_allclose(derivative(number)(0.0), weights @ first, rtol=1e-11)
-    for outer, inner in ((jax.jacfwd, jax.grad), (jax.grad, jax.jacfwd), (jax.grad, jax.grad)):
-        np.testing.assert_allclose(jax.jit(outer(inner(number)))(0.0), weights @ second, rtol=1e-10)
-    several = jax.jit(jax.vmap(jax.grad(number)))(jnp.array([0.0, 1e-3]))
-    np.testing.assert_allclose(several[0], weights @ first, rtol=1e-11)
+    def derivatives(s):
+        return jax.jacfwd(number)(s), jax.grad(number)(s), jax.hessian(number)(s), jax.grad(jax.grad(number))(s)
+
+    found = jax.jit(jax.vmap(derivatives))(jnp.array([0.0, 1e-3]))
+    exact = [weights @ first] * 2 + [weights @ second] * 2
+    np.testing.assert_allclose([x[0] for x in found], exact, rtol=1e-10)  # cond = 100, squared by the second
 
 
 # ---- least norm ------------------------------------------------------------------------------------------------------
@@ -120,16 +122,15 @@ def test_the_shortest_multipliers(name):
     matrix = gram(rows)
     truth = rows @ np.linspace(1.0, 2.0, rows.shape[1])  # in the range of S: no part in the kernel
     found = np.asarray(jax.jit(_linear.least_norm)(jnp.asarray(matrix), jnp.asarray(matrix @ truth)))
-    kept = np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300))[1]
-    kept = kept[kept > 1e-8]
-    assert np.abs(found - truth).max() < 1e-12 * (kept.max() / kept.min()) ** 2 * np.abs(truth).max()
+    rounding = np.finfo(float).eps * np.abs(matrix) @ np.abs(truth)  # of b alone
+    assert (np.abs(found - truth) * np.diag(matrix) <= 100 * rounding).all()
 
 
 def test_multipliers_of_an_indefinite_mass_matrix():
     """M = diag(1, −1) with one constraint along (1, 2), whose S = G K⁻¹ Gᵀ is negative."""
     matrix, rows = jnp.diag(jnp.array([1.0, -1.0])), jnp.array([[1.0, 2.0]])
     b, c = jnp.array([0.3, 0.7]), jnp.array([0.5])
-    x, multipliers, singular = _linear.saddle(matrix, b, rows, c)
+    x, multipliers, singular = jax.jit(_linear.saddle)(matrix, b, rows, c)
     full = np.block([[np.asarray(matrix), -np.asarray(rows).T], [np.asarray(rows), np.zeros((1, 1))]])
     np.testing.assert_allclose(np.append(x, multipliers), np.linalg.solve(full, np.append(b, c)), rtol=1e-13)
     assert not singular
@@ -138,7 +139,7 @@ def test_multipliers_of_an_indefinite_mass_matrix():
 def test_a_nan_in_redundant_constraints_stays_a_nan():
     matrix = gram(REDUNDANT["one of three"])
     matrix[2, 0] = matrix[0, 2] = np.nan
-    assert np.isnan(_linear.least_norm(jnp.asarray(matrix), jnp.ones(3))).all()
+    assert np.isnan(jax.jit(_linear.least_norm)(matrix, np.ones(3))).all()
 
 
 def test_derivatives_of_the_shortest_multipliers():
@@ -157,21 +158,44 @@ def test_derivatives_of_the_shortest_multipliers():
     h = 1e-2
     first = (8 * (exact(h) - exact(-h)) - (exact(2 * h) - exact(-2 * h))) / (12 * h)
     second = (16 * (exact(h) + exact(-h)) - (exact(2 * h) + exact(-2 * h)) - 30 * exact(0)) / (12 * h * h)
-    np.testing.assert_allclose([jax.grad(number)(0.0), jax.jacfwd(number)(0.0)], first, rtol=1e-5)
-    for outer, inner in ((jax.jacfwd, jax.grad), (jax.grad, jax.grad)):
-        np.testing.assert_allclose(jax.jit(outer(inner(number)))(0.0), second, rtol=1e-4)
+
+    def derivatives(s):
+        return jax.jacfwd(number)(s), jax.grad(number)(s), jax.hessian(number)(s), jax.grad(jax.grad(number))(s)
+
+    found = jax.jit(derivatives)(0.0)
+    np.testing.assert_allclose(found[:2], first, rtol=1e-5)
+    np.testing.assert_allclose(found[2:], second, rtol=1e-4)
 
 
 # ---- no LAPACK -------------------------------------------------------------------------------------------------------
 
 
+def particle(q, qdot):
+    return 0.5 * jnp.sum(qdot**2) - 9.81 * q[1]
+
+
 def redundant(q):
-    return {"rods": jnp.stack([q[0] ** 2 + q[1] ** 2 - 1.0, q[2] - 0.5, q[0] ** 2 + q[1] ** 2 + q[2] - 1.5])}
+    return jnp.stack([q[0] ** 2 + q[1] ** 2 - 1.0, q[2] - 0.5, q[0] ** 2 + q[1] ** 2 + q[2] - 1.5])
 
 
-ARRAY = {
-    "chain": scenes.chain(3),
-    "constrained": lagjax.System(
-        lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * q[1], constraints=redundant, path="array"
-    ),
-}
+def programs():
+    """Name, and a function of a batch of states, for everything that solves on the array path."""
+    free = lagjax.System(particle, dissipation=lambda q, v: 0.1 * jnp.sum(v**2), path="array")
+    held = lagjax.System(particle, constraints=redundant, path="array")
+    q, v, zero = jnp.array([0.6, -0.8, 0.5]), jnp.zeros(3), jnp.zeros(())
+    motion = held.motion(Layout.of(q, v), None)
+    yield "acceleration", free.acceleration
+    yield "its second derivatives", lambda q, v: jax.hessian(lambda q: free.acceleration(q, v).sum())(q)
+    yield "constrained acceleration", held.acceleration
+    yield "multipliers and their gradient", lambda q, v: jax.grad(lambda q: held.multipliers(q, v).sum())(q)
+    yield "projection", held.project
+    yield "one step of projection", lambda q, v: motion.projected(q, v, zero, None)
+    yield "loss of rank", lambda q, v: _consistent.rank_lost(motion, (q, v, zero, None), (v, v, zero, None))
+
+
+@pytest.mark.parametrize("name, function", programs(), ids=lambda x: x if isinstance(x, str) else "")
+def test_programs_hold_no_lapack(name, function):
+    """jaxlib's LAPACK kernels deadlock side by side in a batch (`_linear`); the text shows whether one is left."""
+    states = jax.ShapeDtypeStruct((8, 3), np.float64)
+    text = jax.jit(jax.vmap(function)).lower(states, states).as_text()
+    assert "custom_call" not in text and "cholesky" not in text and "triangular_solve" not in text
