@@ -1,5 +1,8 @@
 """The linear solves on arrays: right against LAPACK outside of JAX, and without LAPACK inside of it."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,9 +39,12 @@ def solved_or_singular(matrix, b):
     return factorization.solve(b), factorization.singular
 
 
+OTHERS = [pytest.param(n, marks=pytest.mark.slow) for n in (2, 7, 16, 17)]
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("kind", [definite, indefinite])
-@pytest.mark.parametrize("n", [1, 2, 7, 16, 17, 200])
+@pytest.mark.parametrize("n", [1, 40, 200, *OTHERS])  # one panel and no other; some and a part of one
 def test_the_solution_is_that_of_lapack(n, kind, dtype):
     matrix, b = kind(n), np.random.default_rng(n).normal(size=n)
     x = solved(jnp.asarray(matrix, dtype), jnp.asarray(b, dtype))
@@ -78,7 +84,7 @@ def test_a_nan_stays_a_nan_and_is_not_called_singular(n):
         assert not singular and np.isnan(x).all()
 
 
-@pytest.mark.parametrize("n", [2, 20])
+@pytest.mark.parametrize("n", [pytest.param(2, marks=pytest.mark.slow), 20])
 def test_derivatives_of_the_solution(n):
     """x = A(s)⁻¹ b with A = A₀ + s A₁: x′ = −A⁻¹ A₁ x, x″ = 2 A⁻¹ A₁ A⁻¹ A₁ x, in every order of the modes."""
     start, slope, b = indefinite(n), 0.1 * definite(n, 1), np.linspace(1, 2, n)
@@ -193,9 +199,62 @@ def programs():
     yield "loss of rank", lambda q, v: _consistent.rank_lost(motion, (q, v, zero, None), (v, v, zero, None))
 
 
-@pytest.mark.parametrize("name, function", programs(), ids=lambda x: x if isinstance(x, str) else "")
+@pytest.mark.parametrize("name, function", list(programs()), ids=lambda x: x if isinstance(x, str) else "")
 def test_programs_hold_no_lapack(name, function):
     """jaxlib's LAPACK kernels deadlock side by side in a batch (`_linear`); the text shows whether one is left."""
     states = jax.ShapeDtypeStruct((8, 3), np.float64)
     text = jax.jit(jax.vmap(function)).lower(states, states).as_text()
     assert "custom_call" not in text and "cholesky" not in text and "triangular_solve" not in text
+
+
+# Each of these hung within a few calls where LAPACK solved: the child says how far it came.
+CALLED_AGAIN_AND_AGAIN = """
+import sys, jax, jax.numpy as jnp, numpy as np, lagjax
+from lagjax import scenes
+jax.config.update("jax_enable_x64", True)
+
+def double(q, v, p):
+    return scenes.double_pendulum().system.lagrangian(q, v, t=0.0, params=p)
+
+def rods(q, p):
+    return scenes.cartesian_double_pendulum().system.constraints(q, t=0.0, params=p)
+
+def batch(scene, *shape):
+    rng = np.random.default_rng(0)
+    return jax.tree.map(lambda x: jnp.asarray(x + 0.1 * rng.normal(size=(*shape, *np.shape(x)))), scene.q0)
+
+def side_by_side(scene, system, members):
+    states = [batch(scene, members) for _ in range(4)]
+    one = jax.vmap(lambda q: system.acceleration(q, q, params=scene.params))
+    several = jax.jit(lambda states: [one(q) for q in states])
+    return lambda: jax.block_until_ready(several(states))
+
+def health():
+    scene = scenes.double_pendulum()
+    damped = lagjax.System(double, dissipation=lambda q, v: 0.05 * sum(jnp.sum(x**2) for x in jax.tree.leaves(v)))
+    rest = jax.tree.map(jnp.zeros_like, batch(scene, 26))
+    run = lagjax.simulate_batch(damped, batch(scene, 26), rest, jnp.linspace(0, 20, 2667), params=scene.params)
+    return lambda: jax.block_until_ready(run.health().energy.value)
+
+def acceleration():
+    return side_by_side(scenes.double_pendulum(), lagjax.System(double, path="array"), 65536)
+
+def constrained():
+    scene = scenes.cartesian_double_pendulum()
+    free = lambda q, v, p: scene.system.lagrangian(q, v, t=0.0, params=p)
+    return side_by_side(scene, lagjax.System(free, constraints=rods, path="array"), 16384)
+
+call = globals()[sys.argv[1]]()
+for count in range(100):
+    call()
+    print(count + 1, flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["health", "acceleration", "constrained"])
+def test_large_batches_return_a_hundred_times(case):
+    child = subprocess.run(
+        [sys.executable, "-c", CALLED_AGAIN_AND_AGAIN, case], capture_output=True, text=True, timeout=600
+    )
+    assert child.returncode == 0 and child.stdout.split()[-1] == "100", child.stderr[-2000:]
