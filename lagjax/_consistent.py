@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._layout import Layout
-from lagjax._linear import dependent_rows, rank_tolerance
+from lagjax._linear import dependent_rows, rank
 from lagjax._motion import Motion
 from lagjax._settings import is_concrete
 from lagjax._system import System
@@ -117,8 +117,8 @@ def _off(motion: Motion, q, qdot, t, params):
 def rank_lost(motion: Motion, start, end) -> jax.Array:
     """Whether fewer constraints are independent at `end` than at `start`, both (q, q̇, t, params).
 
-    Counted are the eigenvalues of S = G K⁻¹ Gᵀ above `rank_tolerance`, with every row of G in units of its length at
-    the start: a gradient that fades away is lost as well.
+    Counted are the independent rows of S = G K⁻¹ Gᵀ, with every row of G in units of its length at the start: a
+    gradient that fades away is lost as well.
     """
     start, end = jax.lax.stop_gradient((start, end))
     first, last = motion.coupling(*start), motion.coupling(*end)
@@ -126,8 +126,7 @@ def rank_lost(motion: Motion, start, end) -> jax.Array:
     scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
 
     def count(coupling):
-        values = jnp.linalg.eigvalsh(scale[:, None] * coupling * scale)
-        return jnp.sum(values > rank_tolerance(coupling.dtype))
+        return rank(scale[:, None] * coupling * scale)
 
     return jnp.isfinite(last).all() & (count(last) < count(first))
 

@@ -5,7 +5,14 @@ precision gives NaN, never a number: no pseudo-inverse, no regularisation. The c
 
 `factorize` is for arrays: M is scaled to a unit diagonal (Jacobi scaling: within a factor n of the best diagonal
 scaling for positive definite M, van der Sluis 1969), so that masses of very different size cost no accuracy, and then
-factorised by LU with pivoting. `Elimination` is for scalar programs: the same solution, written out entry by entry.
+inverted by Gauss-Jordan elimination with partial pivoting. `Elimination` is for scalar programs: the same solution,
+written out entry by entry.
+
+No array function here calls LAPACK through JAX. Each of jaxlib's LAPACK kernels (LU, triangular solve, Cholesky,
+eigenvalues) divides a batch among the threads of XLA and blocks its own thread until they are done; as many kernels as
+there are threads, side by side in one program, wait for each other for ever (jaxlib 0.10.1, `ParallelBatchMap`). What
+is `vmap`ped is for the caller to decide, so all of it is written in array operations, which never wait. Those are as
+fast as LAPACK in a batch of up to about 12 coordinates; a single matrix of 128 takes four times as long, under 1 ms.
 """
 
 import functools
@@ -18,34 +25,99 @@ import numpy as np
 
 
 class Factorization(eqx.Module):
-    """A factorised symmetric matrix, and whether it is singular to working precision (a NaN in it is not that)."""
+    """An inverted symmetric matrix, and whether it is singular to working precision (a NaN in it is not that)."""
 
     matrix: jax.Array
     scale: jax.Array
-    factors: tuple[jax.Array, jax.Array]
+    inverse: tuple[jax.Array, jax.Array]  # of the scaled matrix, and the order in which it takes its rows
     singular: jax.Array
 
     def solve(self, b: jax.Array) -> jax.Array:
-        """x with M x = b; NaN where M is singular. Differentiated implicitly: one more solve with the same factors."""
+        """x with M x = b; NaN where M is singular. Differentiated implicitly: one more solve with the same inverse."""
 
-        def by_factors(_, scaled):
-            return jax.scipy.linalg.lu_solve(self.factors, scaled)
+        def times_matrix(y):
+            return _scaled(self.matrix, self.scale) @ y
+
+        def by_inverse(_, scaled):
+            inverse, order = self.inverse
+            x = inverse @ _rows(scaled, order)
+            # One step of refinement: the residual of an inverse is larger than that of LU by the condition of M.
+            return x + inverse @ _rows(scaled - times_matrix(x), order)
 
         # `b` scaled, solved, scaled back; M is symmetric, so the transpose solve is the solve.
-        x = self.scale * jax.lax.custom_linear_solve(
-            lambda y: _scaled(self.matrix, self.scale) @ y, self.scale * b, by_factors, symmetric=True
-        )
+        x = self.scale * jax.lax.custom_linear_solve(times_matrix, self.scale * b, by_inverse, symmetric=True)
         return jnp.where(self.singular, jnp.nan, x)
 
 
 def factorize(matrix: jax.Array) -> Factorization:
-    """Scale and factorise a symmetric matrix of shape (n, n)."""
+    """Scale and invert a symmetric matrix of shape (n, n)."""
     matrix = 0.5 * (matrix + matrix.T)
     scale = jax.lax.stop_gradient(_diagonal_scale(matrix))
-    factors = jax.scipy.linalg.lu_factor(jax.lax.stop_gradient(_scaled(matrix, scale)))
-    pivots = jnp.abs(jnp.diagonal(factors[0]))
-    threshold = singular_threshold(matrix.shape[0], matrix.dtype)
-    return Factorization(matrix, scale, factors, jnp.min(pivots) <= threshold * jnp.max(pivots))
+    inverse, order, pivots = _inverted(jax.lax.stop_gradient(_scaled(matrix, scale)))
+    pivots, threshold = jnp.abs(pivots), singular_threshold(matrix.shape[0], matrix.dtype)
+    return Factorization(matrix, scale, (inverse, order), jnp.min(pivots) <= threshold * jnp.max(pivots))
+
+
+# ---- elimination on whole arrays -------------------------------------------------------------------------------------
+#
+# In place: where A x = y is solved for x, column k of A gives way, once it has been eliminated with row p as its pivot,
+# to the column of the inverse that belongs to y_p. Rows stay where they are; `order` remembers p for every k.
+
+_PANEL = 16  # columns eliminated by themselves before a matrix product takes them to the others; 8 to 32 are as fast
+
+
+def _inverted(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """(B, order, pivots), each by column, with A⁻¹ b = B b[order]: Gauss-Jordan elimination with partial pivoting.
+
+    Golub & Van Loan, Matrix Computations, §3.2 and §3.4; the pivots are those of LU. Where a pivot is zero, B is
+    anything.
+    """
+    n = len(matrix)
+    width = min(n, _PANEL)
+    count = -(-n // width)
+    size = count * width  # made up with the unit matrix
+    a = jnp.pad(matrix, (0, size - n)) + jnp.diag((np.arange(size) >= n).astype(matrix.dtype))
+
+    def one_panel(index, carry):
+        a, free, order, pivots = carry
+        panel, left, some, these = _eliminated(jax.lax.dynamic_slice_in_dim(a, index * width, width, 1), free)
+        if count > 1:
+            a = jnp.where((free & ~left)[:, None], 0, a) + panel @ _rows(a, some)
+            panel = jax.lax.dynamic_update_slice_in_dim(a, panel, index * width, 1)
+        order = jax.lax.dynamic_update_slice_in_dim(order, some, index * width, 0)
+        return panel, left, order, jax.lax.dynamic_update_slice_in_dim(pivots, these, index * width, 0)
+
+    start = a, jnp.ones(size, bool), jnp.zeros(size, np.int32), jnp.zeros(size, a.dtype)
+    a, _, order, pivots = jax.lax.fori_loop(0, count, one_panel, start) if count > 1 else one_panel(0, start)
+    return _rows(a, order[:n])[:, :n], order[:n], pivots[:n]
+
+
+def _eliminated(panel: jax.Array, free: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """A panel of columns after their elimination, the rows that are free still, the pivots' rows, and the pivots."""
+
+    def one_column(k, carry):
+        panel, free, order, pivots = carry
+        now = np.arange(panel.shape[1]) == k
+        column = jnp.sum(jnp.where(now, panel, 0), axis=1)
+        row = jnp.argmax(jnp.where(free, jnp.abs(column), -1)).astype(np.int32)  # the first NaN, if there is one
+        panel, pivot = _exchanged(panel, np.arange(len(panel)) == row, now)
+        return panel, free & (np.arange(len(panel)) != row), jnp.where(now, row, order), jnp.where(now, pivot, pivots)
+
+    width = panel.shape[1]
+    start = panel, free, jnp.zeros(width, np.int32), jnp.zeros(width, panel.dtype)
+    return jax.lax.fori_loop(0, width, one_column, start)
+
+
+def _exchanged(a: jax.Array, here: jax.Array, now: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A after one column was eliminated by one row, both marked, and its pivot; masks are faster than places here."""
+    row, column = jnp.sum(jnp.where(here[:, None], a, 0), axis=0), jnp.sum(jnp.where(now, a, 0), axis=1)
+    pivot = jnp.sum(jnp.where(now, row, 0))
+    row = jnp.where(now, 1, row) / jnp.where(pivot == 0, 1, pivot)  # a zero is left to be reported
+    return jnp.where(here[:, None] | now, 0, a) - jnp.where(here, -1, column)[:, None] * row, pivot
+
+
+def _rows(a: jax.Array, order: jax.Array) -> jax.Array:
+    return a.at[order].get(mode="promise_in_bounds")
 
 
 def singular_threshold(n: int, dtype) -> float:
@@ -205,9 +277,9 @@ def rank_tolerance(dtype) -> float:
 
 
 def least_norm(matrix: jax.Array, b: jax.Array) -> jax.Array:
-    """The shortest x with S x = b for a positive semi-definite S of any rank and b in its range.
+    """The shortest x with S x = b for a symmetric S of any rank and b in its range.
 
-    The rank is that of S scaled to a unit diagonal, where an eigenvalue below `rank_tolerance` counts as zero.
+    The rank is that of S scaled to a unit diagonal, where pivots below `rank_tolerance` count as zero.
     """
     return _inverse_on_range(matrix) @ b
 
@@ -215,15 +287,14 @@ def least_norm(matrix: jax.Array, b: jax.Array) -> jax.Array:
 @jax.custom_jvp
 def _inverse_on_range(matrix: jax.Array) -> jax.Array:
     scale = _diagonal_scale(matrix)
-    values, vectors = jnp.linalg.eigh(_scaled(matrix, scale))
-    kept = values > rank_tolerance(matrix.dtype)
-    half = jnp.where(kept, jax.lax.rsqrt(jnp.where(kept, values, 1)), 0) * vectors
-    some = scale[:, None] * (half @ half.T) * scale  # solves S x = b, but its x need not be the shortest
-    # What of x lies in the kernel of S is taken out: the kernel of the scaled matrix, scaled back.
-    kernel = jnp.where(kept, 0, 1) * scale[:, None] * vectors
-    gram = kernel.T @ kernel + jnp.diag(jnp.where(kept, 1.0, 0.0)).astype(matrix.dtype)
-    outside = jnp.eye(len(matrix), dtype=matrix.dtype) - kernel @ jnp.linalg.solve(gram, kernel.T)
-    return outside @ some @ outside
+    inverse, basis, pairs = _independent(_scaled(matrix, scale), scale)
+    some = scale[:, None] * inverse * scale  # solves S x = b, but its x need not be the shortest
+    # The part of x in the range of S is the shortest one: P x with P = W (WᵀW)⁻¹ Wᵀ, where W is the basis of the range
+    # scaled back. WᵀW is at least the unit matrix; where W has no column, that of the unit matrix takes its place.
+    basis = basis / scale[:, None] * (scale @ pairs)
+    gram = basis.T @ basis + jnp.diag(1 - jnp.sum(pairs, axis=0))
+    projector = basis @ jax.vmap(factorize(gram).solve, in_axes=1, out_axes=1)(basis.T)
+    return projector @ some @ projector
 
 
 @_inverse_on_range.defjvp
@@ -235,6 +306,39 @@ def _inverse_on_range_jvp(primals, tangents):
     outside = jnp.eye(len(matrix), dtype=matrix.dtype) - inverse @ matrix
     turned = outside @ moving @ inverse @ inverse
     return inverse, turned + turned.T - inverse @ moving @ inverse
+
+
+def rank(matrix: jax.Array) -> jax.Array:
+    """How many rows of a symmetric matrix are independent, where entries below `rank_tolerance` count as zero."""
+    return jnp.sum(_independent(matrix, jnp.ones(len(matrix), matrix.dtype))[2]).astype(int)
+
+
+def _independent(matrix: jax.Array, scale: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """(X, W, Q) of a symmetric A: A X A = A; W, a basis of its range; Q, 1 where a row was the pivot of a column.
+
+    Elimination with complete pivoting, which ends where all that is left is below `rank_tolerance`. W has a column for
+    every column that had a pivot, and is Q in the rows of the pivots; other columns are zero. A is positive
+    semi-definite where M is, but need not be. Of pivots that are nearly as good as the largest the one is taken that
+    is largest before `scale` was applied, which keeps W well-conditioned.
+    """
+    m = len(matrix)
+
+    def one_pivot(_, carry):
+        a, pairs = carry
+        free = (jnp.sum(pairs, axis=1) == 0)[:, None] & (jnp.sum(pairs, axis=0) == 0)
+        size = jnp.where(free, jnp.abs(a), -1)
+        largest = jnp.max(size)  # NaN, if there is one: comparisons are such that it gets into the result
+        good = free & ~(size < 0.1 * largest)
+        place = jnp.argmax(jnp.where(good, size / (scale[:, None] * scale), -1))
+        here, now = np.arange(m) == place // m, np.arange(m) == place % m
+        counts = ~(largest <= rank_tolerance(a.dtype))
+        a = jnp.where(counts, _exchanged(a, here, now)[0], a)
+        return a, pairs + (here[:, None] & now & counts)
+
+    a, pairs = jax.lax.fori_loop(0, m, one_pivot, (matrix, jnp.zeros_like(matrix)))
+    rows, columns = jnp.sum(pairs, axis=1) > 0, jnp.sum(pairs, axis=0) > 0
+    inverse = pairs.T @ jnp.where(rows[:, None] & columns, a, 0) @ pairs.T
+    return inverse, pairs + jnp.where(~rows[:, None] & columns, -a, 0), pairs
 
 
 class SaddleElimination:
