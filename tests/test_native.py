@@ -348,7 +348,6 @@ def test_threads_and_order_change_nothing(monkeypatch, threads):
     expected = run("pendulum", TS, y0[:40], rtol=1e-9)
     order = np.random.default_rng(3).permutation(301)
     monkeypatch.setattr(_native, "cores", lambda: threads)
-    monkeypatch.setattr(_native, "_pools", [])
     outcome = run("pendulum", TS, y0[order], rtol=1e-9)
     assert_done(outcome)
     np.testing.assert_array_equal(outcome.path[np.argsort(order)][:40], expected.path)

@@ -11,7 +11,6 @@ import ctypes
 import functools
 import math
 import os
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +28,7 @@ from lagjax._native._integrator import (
 )
 from lagjax._native._ir import compiled
 from lagjax._native._series_code import LANE, MAX_ORDER
+from lagjax._native._threads import in_slices, together
 from lagjax._program import Program, Series, Unlowerable, series
 
 __all__ = [
@@ -98,8 +98,9 @@ class Kernel:
         self.states, self.numbers, self.width = 2 * size, integrator.numbers, integrator.width
         self._memory = integrator.memory
         # The engine holds the code that the other points to.
-        self._engine, at = compiled(integrator.module, ("run",))
-        self._run = _function(at["run"], *[ctypes.c_void_p] * 4)
+        self._engine, at = compiled(integrator.module, ("begin", "run"))
+        self._begin = _function(at["begin"], None, *[ctypes.c_void_p] * 3)
+        self._run = _function(at["run"], ctypes.c_int64, *[ctypes.c_void_p] * 4, ctypes.c_int64)
 
     def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int, room=None) -> Outcome:
         """`y0` (N, 2n); `ts` (N, T) and `params` (N, P), or one row for all; all float64.
@@ -119,19 +120,22 @@ class Kernel:
         y_end, t_end = np.empty((members, self.states)), np.empty(members)
         code, steps, rejected = (np.empty(members) for _ in range(3))
         counter, recording = np.zeros(1, np.int64), record is not None
+        arrays = counter, ts, y0, params, path, y_end, t_end, code, steps, rejected, record, first_step
         job = _integrator.Job(
-            *_addresses(counter, ts, y0, params, path, y_end, t_end, code, steps, rejected, record, first_step),
+            *_addresses(*arrays),
             times if len(ts) > 1 else 0, self.numbers if len(params) > 1 else 0,
             members, times, order_for(rtol), max_steps, recording, rtol, atol,
         )  # fmt: skip
 
-        def integrate(_) -> int:
+        def integrate(stopped, _arrays=arrays) -> int:  # whose memory must live as long as somebody works on it
             memory = _aligned(self._memory)
             lanes, idle = np.zeros(len(LANE) * self.width, np.int64), np.zeros(1, np.int64)
-            self._run(ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data, idle.ctypes.data)
+            mine = ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data
+            self._begin(*mine)
+            in_slices(functools.partial(self._run, *mine, idle.ctypes.data), stopped)
             return int(idle[0])
 
-        idle = sum(self._on_all_cores(integrate, members))
+        idle = together(integrate, self._threads(members))
         ended_badly = code != DONE
         if ended_badly.any():  # a start that is infinite was not reached either
             reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
@@ -149,33 +153,38 @@ class Kernel:
         first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
         y_bar, params_bar = np.array(y_bar, np.float64, order="C"), np.zeros((len(y_bar), self.numbers))
         counter, (members, times) = np.zeros(1, np.int64), path_bar.shape[:2]
+        arrays = counter, ts, params, table, first, counts, path_bar, y_bar, params_bar
         job = _adjoint.Job(
-            *_addresses(counter, ts, params, table, first, counts, path_bar, y_bar, params_bar),
+            *_addresses(*arrays),
             times if len(ts) > 1 else 0, self.numbers if len(params) > 1 else 0, members, times, order,
         )  # fmt: skip
-        _, run, size = self._adjoint
+        _, begin, run, size = self._adjoint
 
-        def back(_) -> None:
+        def back(stopped, _arrays=arrays) -> int:
             memory, lanes = _aligned(size), np.zeros(len(LANE) * self.width, np.int64)
-            run(ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data)
+            mine = ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data
+            begin(*mine)
+            in_slices(functools.partial(run, *mine), stopped)
+            return 0
 
-        self._on_all_cores(back, members)
+        together(back, self._threads(members))
         return y_bar, params_bar
 
     @functools.cached_property
     def _adjoint(self):
-        """The engine that holds `pull`, `pull`, and what a thread needs for it; compiled when it is first asked for."""
+        """The engine that holds the code, `begin`, `run`, and what a thread needs; compiled when first asked for."""
         adjoint = _adjoint.Adjoint(*self._parts)
-        engine, at = compiled(adjoint.module, ("pull",))
-        return engine, _function(at["pull"], *[ctypes.c_void_p] * 3), adjoint.memory
+        engine, at = compiled(adjoint.module, ("begin", "run"))
+        begin = _function(at["begin"], None, *[ctypes.c_void_p] * 3)
+        run = _function(at["run"], ctypes.c_int64, *[ctypes.c_void_p] * 3, ctypes.c_int64)
+        return engine, begin, run, adjoint.memory
 
-    def _on_all_cores(self, work, members: int) -> list:
-        threads = min(cores(), max(1, members // (4 * self.width)))
-        return list(_pool().map(work, range(threads))) if threads > 1 else [work(0)]
+    def _threads(self, members: int) -> int:
+        return min(cores(), max(1, members // (4 * self.width)))
 
 
-def _function(address: int, *types):
-    return ctypes.CFUNCTYPE(None, *types)(address)
+def _function(address: int, result, *types):
+    return ctypes.CFUNCTYPE(result, *types)(address)
 
 
 def _contiguous(*arrays) -> list[np.ndarray]:
@@ -208,15 +217,3 @@ def _aligned(size: int) -> np.ndarray:
     """Zeros on the boundary of a cache line, which vectors need."""
     memory = np.zeros(size + 8)
     return memory[(-memory.ctypes.data // 8) % 8 :]
-
-
-_pools: list[ThreadPoolExecutor] = []
-
-
-def _pool() -> ThreadPoolExecutor:
-    """Threads for all kernels, started when first needed."""
-    if not _pools:
-        if hasattr(os, "register_at_fork"):
-            os.register_at_fork(after_in_child=_pools.clear)  # a child process has none of its parent's threads
-        _pools.append(ThreadPoolExecutor(cores(), thread_name_prefix="lagjax"))
-    return _pools[0]

@@ -36,7 +36,7 @@ class Job(ctypes.Structure):
 
 
 class Adjoint(SeriesCode):
-    """Builds the module; its public function is `pull(job, memory, lanes)`."""
+    """Builds the module; its public functions are `begin(job, memory, lanes)` and `run(job, memory, lanes, rounds)`."""
 
     def __init__(self, program: Program, series: Series, projection=None):
         n, states = series.size, 2 * series.size
@@ -65,15 +65,25 @@ class Adjoint(SeriesCode):
             line = StraightLine(line.nodes, line.kinds, line.outputs)
             self.projection_line = pullback(line, dtypes, self.moved, range(states))
             steps.insert(0, self._back_projection())
+        self._begin()
         self._run(steps)
 
-    def _run(self, steps: list[Code]) -> None:
-        """`(job, memory, lanes)`: until the batch is done, one step back in every lane and round."""
-        code = Code(self.module, "pull", [POINTER, POINTER, POINTER], self.width, public=True)
+    def _begin(self) -> None:
+        """`begin(job, memory, lanes)`: every lane takes a member."""
+        code = Code(self.module, "begin", [POINTER, POINTER, POINTER], self.width, public=True)
         job, memory, lane_data = code.arguments
         with code.loop(self.width) as lane:
             code.call(self.start_next, job, memory, lane_data, lane)
-        with code.repeat_while(lambda: code.any_lane(self._vector(code, memory, "active") > 0.0)):
+        code.finish()
+
+    def _run(self, steps: list[Code]) -> None:
+        """`run(job, memory, lanes, rounds)`: so many rounds, or until the batch is done; one step back in every lane.
+
+        Returns 1 if there is more to do.
+        """
+        code = Code(self.module, "run", [POINTER] * 3 + [INTEGER], self.width, INTEGER, public=True)
+        job, memory, lane_data, rounds = code.arguments
+        with self.rounds(code, memory, rounds):
             with code.loop(self.width) as lane:
                 self._recall(code, job, memory, lane_data, lane)
             code.call(self.coefficients, memory, self._job(code, job, "order"))
@@ -81,7 +91,7 @@ class Adjoint(SeriesCode):
                 code.call(step, job, memory, lane_data)
             with code.loop(self.width) as lane:
                 self._end_or_go_on(code, job, memory, lane_data, lane)
-        code.finish()
+        code.finish(self.more(code, memory))
 
     # ---- members and their steps ----
 

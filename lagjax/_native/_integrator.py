@@ -1,4 +1,4 @@
-"""The integration of a batch by Taylor series, as one function of LLVM.
+"""The integration of a batch by Taylor series, as two functions of LLVM: one begins, one runs so many rounds.
 
 Every lane of a vector carries one member. A round takes one step in each lane:
 
@@ -8,8 +8,7 @@ Every lane of a vector carries one member. A round takes one step in each lane:
     advance        outputs inside the step, then the state at its end, summed with its rounding errors carried along
     finish         a lane whose member has ended takes the next one of the batch
 
-so that no lane waits for another. Several threads may run the function at once: they share the counter that hands out
-the members.
+so that no lane waits for another. Several threads may do so at once: they share the counter that hands out the members.
 
 Step size: with the scaled norm ‖c‖ = max |cᵢ| / (atol + rtol·sᵢ), sᵢ the size of component i over the step,
 
@@ -109,6 +108,7 @@ class Integrator(SeriesCode):
         if guards is not None:
             self.guard = self._guard()
             self.begin_sides = self._begin_sides()
+        self._begin()
         self._run()
 
     # ---- along the step ----
@@ -198,14 +198,23 @@ class Integrator(SeriesCode):
         time = self._time(code, job, member, code.select(inside, index, 0)) * self._get(code, memory, "forward", lane)
         self._set(code, memory, "due", lane, code.select(inside, time, float("inf")))
 
-    def _run(self) -> None:
-        """`(job, memory, lanes, idle)`: until the batch is done; `idle` counts the lanes without a member."""
-        code = Code(self.module, "run", [POINTER, POINTER, POINTER, POINTER], self.width, public=True)
-        job, memory, lane_data, idle = code.arguments
-        order = self._job(code, job, "order")
+    def _begin(self) -> None:
+        """`begin(job, memory, lanes)`: every lane takes a member."""
+        code = Code(self.module, "begin", [POINTER, POINTER, POINTER], self.width, public=True)
+        job, memory, lane_data = code.arguments
         with code.loop(self.width) as lane:
             code.call(self.start_next, memory, lane_data, job, lane)
-        with code.repeat_while(lambda: code.any_lane(self._vector(code, memory, "active") > 0.0)):
+        code.finish()
+
+    def _run(self) -> None:
+        """`run(job, memory, lanes, idle, rounds)`: so many rounds, or until the batch is done.
+
+        Returns 1 if there is more to do. `idle` counts the lanes without a member.
+        """
+        code = Code(self.module, "run", [POINTER] * 4 + [INTEGER], self.width, INTEGER, public=True)
+        job, memory, lane_data, idle, rounds = code.arguments
+        order = self._job(code, job, "order")
+        with self.rounds(code, memory, rounds):
             code.call(self.coefficients, memory, order)
             self._choose(code, memory, job, order)
             self._halve_until_sound(code, memory, job, order)
@@ -216,7 +225,7 @@ class Integrator(SeriesCode):
             self._move_time(code, memory, lane_data, job, order)
             self._advance(code, memory)
             self._end_or_go_on(code, memory, lane_data, job, idle)
-        code.finish()
+        code.finish(self.more(code, memory))
 
     def _choose(self, code, memory, job, order) -> None:
         """The step of every lane, into `h`: 0, and a code, where it cannot go on."""

@@ -1,6 +1,8 @@
 """What all functions of a kernel share: the memory of a thread, and the power series of the state in it."""
 
 import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from llvmlite import ir
 
@@ -187,6 +189,23 @@ class SeriesCode:
             increments += [code.load(value[i], self.vector) * s for i in some]
             slopes += [code.load(slope[i], self.vector) for i in fast]
         return increments, slopes
+
+    # ---- rounds ----
+
+    @contextmanager
+    def rounds(self, code, memory, count: Value) -> Iterator[None]:
+        """A context: its body is one round, of `count` at most, as long as a lane is active."""
+        left = code.variable(count)
+        with code.repeat_while(lambda: self._any_active(code, memory) & (code.load(left, INTEGER) > 0)):
+            code.store(code.load(left, INTEGER) - 1, left)
+            yield
+
+    def more(self, code, memory) -> Value:
+        """1 if a lane is active, else 0."""
+        return code.select(self._any_active(code, memory), integer(code, 1), 0)
+
+    def _any_active(self, code, memory) -> Value:
+        return code.any_lane(self._vector(code, memory, "active") > 0.0)
 
     # ---- access to the memory, the job and the lanes ----
 

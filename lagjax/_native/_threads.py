@@ -1,0 +1,86 @@
+"""Machine code on several threads that an interrupt can stop.
+
+Python looks at signals, and raises `KeyboardInterrupt`, on the main thread and between its own instructions only. Code
+that ran for a minute would keep it waiting for a minute. So it runs in slices of a few hundredths of a second, on the
+thread that asked for it as on the others; whoever raises between two slices ends the work of all.
+
+Threads are started for each run, which costs less than a member does, and end with it: there is nothing that a fork
+could lose or that the end of the interpreter would wait for.
+"""
+
+import _thread
+import queue
+import threading
+import time
+from collections.abc import Callable
+
+SLICE = 0.03  # seconds, more or less: a tenth of what a hand at the keyboard notices, a thousand times what it costs
+FIRST_ROUNDS = 256  # of the first slice, the only one of a short run; a round of the largest programs takes 0.5 ms
+
+
+def in_slices(run: Callable[[int], int], stopped: Callable[[], bool]) -> None:
+    """Call `run(rounds)` until it returns 0, or until `stopped()`; with as many rounds as take about a `SLICE`."""
+    rounds = FIRST_ROUNDS
+    while not stopped():
+        begin = time.perf_counter()
+        if not run(rounds):
+            return
+        took = time.perf_counter() - begin
+        if took < 0.5 * SLICE:
+            rounds *= 2
+        elif took > 2.0 * SLICE:
+            rounds = max(1, rounds // 2)
+
+
+def together(work: Callable[[Callable[[], bool]], int], count: int) -> int:
+    """The sum of what `work(stopped)` returns on `count` threads, of which the caller's is one.
+
+    Raises what one of them raises, after all have ended: `stopped()` tells the others. All that the work needs must
+    hang on `work`, so that no thread outlives it.
+    """
+    if count == 1:  # nobody else is to be told, or waited for
+        return work(lambda: False)
+    stop, ended, signal = threading.Event(), [], queue.SimpleQueue()
+
+    def help_out():
+        try:
+            ended.append(work(stop.is_set))
+        except BaseException as failure:
+            stop.set()
+            ended.append(failure)
+        signal.put(None)
+
+    helpers = 0
+    try:
+        for _ in range(count - 1):
+            try:
+                _thread.start_new_thread(help_out, ())  # `threading.Thread` is left behind half started by an interrupt
+            except RuntimeError:  # there are no more threads to be had: those there are do the work
+                break
+            helpers += 1
+        total = work(stop.is_set)
+    except BaseException:
+        stop.set()
+        raise
+    finally:
+        _wait(helpers, ended, signal, stop)
+    for result in ended:
+        if isinstance(result, BaseException):
+            raise result
+        total += result
+    return total
+
+
+def _wait(helpers: int, ended: list, signal: queue.SimpleQueue, stop: threading.Event) -> None:
+    """Until all helpers have ended. An interrupt meanwhile stops them, and is raised when they have."""
+    interrupt = None
+    while len(ended) < helpers:
+        try:
+            signal.get(timeout=1.0)
+        except queue.Empty:
+            pass
+        except BaseException as reason:
+            stop.set()
+            interrupt = reason
+    if interrupt is not None:
+        raise interrupt
