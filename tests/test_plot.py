@@ -79,6 +79,7 @@ def test_energy_error_needs_a_scale_and_a_member():
         lagjax.plot.energy_error(failed)
 
 
+@pytest.mark.slow
 def test_energy_of_members_that_an_event_ends():
     q0 = jnp.array([[1.0, 0.0], [0.9, 0.1]])
     ended = lagjax.simulate_batch(SCENE, q0, jnp.zeros((2, 2)), TS, event=lambda q, qdot: q[0] < 0.5)

@@ -50,6 +50,7 @@ def test_errors_fall_and_steps_rise_with_the_tolerance(single):
     assert all(row.seconds == row.seconds_per_trajectory > 0 and row.ok == 1 and row.wasted == 0 for row in single)
 
 
+@pytest.mark.slow
 def test_a_batch_gives_median_and_worst_over_the_members_that_arrive(batch):
     amplitudes = np.array([0.5, 0.8, 1.1, 1.4, 2.0])
     for row in batch:
