@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from lagjax._arguments import accept
 from lagjax._layout import taken_apart
@@ -33,7 +35,7 @@ _LEAST, _LEAST_OF_SOLVERS = 0.25, 10
 class Settings(eqx.Module):
     """How to integrate, apart from the scene and its state: numbers are arrays, the rest is part of the program."""
 
-    ts: jax.Array
+    ts: jax.Array | np.ndarray
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController
     dt0: jax.Array | None
@@ -81,7 +83,7 @@ class Settings(eqx.Module):
         )
 
     @property
-    def tolerances(self) -> tuple[jax.Array, jax.Array] | None:
+    def tolerances(self) -> tuple[ArrayLike, ArrayLike] | None:
         """rtol and atol of a step; None where it has a fixed size."""
         controller = self.controller
         return (controller.rtol, controller.atol) if isinstance(controller, diffrax.PIDController) else None
@@ -144,7 +146,7 @@ def _as_array(x, dtype=None):
 
 
 def is_concrete(value) -> bool:
-    return not isinstance(value, jax.core.Tracer)
+    return not isinstance(value, Tracer)
 
 
 def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
@@ -183,7 +185,7 @@ def require_finite(tree: PyTree, name: str) -> None:
         raise ValueError(f"{where} is {value}: every number given must be finite.")
 
 
-def _output_times(ts, dtype) -> jax.Array:
+def _output_times(ts, dtype) -> jax.Array | np.ndarray:
     try:
         kind = jnp.result_type(ts if isinstance(ts, jax.Array) else np.asarray(ts))
     except (TypeError, ValueError):

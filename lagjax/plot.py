@@ -77,7 +77,9 @@ def path(x, y, *, values=None, label: str | None = None, cmap: str = "viridis", 
     values = np.asarray(values)
     # The palest end of a map does not show as a line on white.
     inks = matplotlib.colors.ListedColormap(matplotlib.colormaps[cmap](np.linspace(0.0, 0.9, 256)))
-    lines = matplotlib.collections.LineCollection(np.stack([points[:-1], points[1:]], axis=1), cmap=inks, linewidth=1.4)
+    lines = matplotlib.collections.LineCollection(
+        [*np.stack([points[:-1], points[1:]], axis=1)], cmap=inks, linewidth=1.4
+    )
     lines.set(array=(values[:-1] + values[1:]) / 2, capstyle="round")
     ax.add_collection(lines)
     ax.autoscale_view()
@@ -101,7 +103,7 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
         raise ValueError("The energy at the start is zero: say with scale=... which energy counts as one.")
     ax = _axes(ax)
     error = np.abs(h - h[:, :1]) / unit
-    known = np.isfinite(error).any(axis=0)  # nothing is left of members that an event has ended
+    known = np.array(np.isfinite(error).any(axis=0))  # nothing is left of members that an event has ended
     known[0] = False  # zero, which has no logarithm
     times, error = _times(trajectory)[known], error[:, known]
     low, median, high = np.nanquantile(error, (0.05, 0.5, 0.95), axis=0)
@@ -122,9 +124,9 @@ def work_precision(result: WorkPrecision, *, ax=None):
     ax = _axes(ax)
     for i, solver in enumerate(dict.fromkeys(row.solver for row in result)):
         rows = [row for row in result if row.solver == solver]
-        style = {"color": COLORS[i % len(COLORS)], "marker": MARKERS[i % len(MARKERS)]}
+        color, marker = COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)]
         errors, seconds = [row.error for row in rows], [row.seconds_per_trajectory for row in rows]
-        ax.plot(errors, seconds, label=solver, linewidth=1.5, markersize=5.5, **style)
+        ax.plot(errors, seconds, label=solver, color=color, marker=marker, linewidth=1.5, markersize=5.5)
     ax.set(xscale="log", yscale="log", xlabel="error", ylabel="time per trajectory [s]")
     left = min(ax.get_xlim()[0], result.reference_error / 3)
     ax.axvspan(left, result.reference_error, color="0.92", linewidth=0, zorder=0, label="not resolved")

@@ -1,5 +1,6 @@
 """Every test runs in double precision unless it says otherwise, with one store of compiled programs for all runs."""
 
+import gc
 import hashlib
 import os
 from pathlib import Path
@@ -9,6 +10,10 @@ import llvmlite.binding
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+
+# Tracing leaves many objects that live on, and Python's default looks through all of them so often that it took a tenth
+# of the time.
+gc.set_threshold(50_000, 20, 20)
 
 # Most of the suite's time is XLA at work, so what it compiles is kept: for the other workers of a run, and for the next
 # run. A compiled program is for one kind of CPU, which JAX does not ask about when it reads one back.

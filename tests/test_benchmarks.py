@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from sweeps import sweep
 
 TOLERANCES = (1e-4, 1e-8)
 
@@ -51,7 +52,9 @@ CONTENDERS = {
 }
 
 
-@pytest.mark.parametrize(("contender", "packages"), CONTENDERS.items())
+@pytest.mark.parametrize(
+    ("contender", "packages"), sweep(CONTENDERS.items(), kept=lambda c: c[0] in ("lagjax", "heyoka, SIMD"))
+)
 def test_error_against_time(record, tmp_path, contender, packages):
     for package in packages:
         pytest.importorskip(package, reason=f"{contender} needs {package}")
@@ -71,6 +74,7 @@ def test_error_against_time(record, tmp_path, contender, packages):
     assert circumstances["machine"]["cpu"] and circumstances["machine"]["cores"] >= 1
 
 
+@pytest.mark.slow
 def test_one_trajectory_after_the_other():
     contenders, measure = of_benchmarks("_contenders"), of_benchmarks("_measure")
     pytest.importorskip("scipy", reason="the reference needs SciPy or heyoka")
@@ -95,6 +99,7 @@ def lagjax_alone(monkeypatch):
     return comparisons
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("part", "key", "values"), [("sizes", "links", [2]), ("batches", "batch", [1, 10, 100, 1000])])
 def test_series(lagjax_alone, part, key, values):
     rows = getattr(lagjax_alone, part)(OPTIONS)
@@ -102,12 +107,14 @@ def test_series(lagjax_alone, part, key, values):
     assert all(row["median error"] < 1e-7 and row["µs/step"] < row["µs/trajectory"] for row in rows)
 
 
+@pytest.mark.slow
 def test_a_series_ends_with_a_reason(lagjax_alone, capsys):
     rows = lagjax_alone.batches(SimpleNamespace(**vars(OPTIONS) | {"budget": 1e-9}))
     assert [row["batch"] for row in rows] == [1]
     assert "lagjax ends with 1 members of double_pendulum" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_cores(lagjax_alone):
     if not hasattr(os, "sched_setaffinity"):
         pytest.skip("this system does not confine a thread to a core")
@@ -123,6 +130,7 @@ def test_right_hand_sides():
     assert row["case"] == "wedge" and row["lagjax/by hand"] > 0 and row["autodiff/lagjax"] > 0
 
 
+@pytest.mark.slow
 def test_first_result_of_a_new_process():
     derivation = of_benchmarks("_derivation")
     found = derivation._in_new_process("lagjax", 2, budget=60)
@@ -130,6 +138,7 @@ def test_first_result_of_a_new_process():
     assert all(stage > 0 for stage in derivation._stages(of_benchmarks("_cases").chain(2, 1)))
 
 
+@pytest.mark.slow
 def test_gradient():
     gradient = of_benchmarks("_gradient")
     case = replace(of_benchmarks("_cases").chain(2, 3), duration=1.0)
@@ -137,6 +146,7 @@ def test_gradient():
     assert derivative.shape == (3, 8) and row["largest"] < 1e-8 and row["steps"] > 5
 
 
+@pytest.mark.slow
 def test_mixed():
     mixed = of_benchmarks("_mixed")
     comparison = next(iter(mixed.mixed(SimpleNamespace(**vars(OPTIONS) | {"batch": 64}))))
@@ -145,7 +155,10 @@ def test_mixed():
     assert all(row.median_error < 1e-4 for row in comparison.rows if row.tol == 1e-10)
 
 
-@pytest.mark.parametrize(("name", "alone"), [("pendulum", False), ("rolling_cylinder", False), ("pendulum", True)])
+@pytest.mark.parametrize(
+    ("name", "alone"),
+    sweep([("pendulum", False), ("rolling_cylinder", False), ("pendulum", True)], kept=[("pendulum", False)]),
+)
 def test_the_price_of_constraints(name, alone):
     pytest.importorskip("scipy", reason="the reference needs SciPy or heyoka")
     constraints = of_benchmarks("_constraints")
@@ -194,6 +207,7 @@ def test_goals():
     assert found["reverse against forward mode, tolerance 1e-11"] == (0.0, "yes")
 
 
+@pytest.mark.slow
 def test_parts_that_were_not_run_again_are_kept(tmp_path):
     pytest.importorskip("scipy", reason="the reference needs SciPy or heyoka")
     main = of_benchmarks("__main__").main
@@ -234,7 +248,7 @@ def test_names_beside_lines_do_not_overlap():
 CASES = ("double_pendulum", "chain_4", "wedge", "kepler", "outer_planets", "fermi_pasta_ulam", "spherical_pendulum")
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", sweep(CASES, kept=["double_pendulum", "wedge", "kepler"]))
 def test_the_three_forms_of_a_scene_agree(name):
     case = of_benchmarks("_cases").CASES[name](3)
     rng = np.random.default_rng(0)

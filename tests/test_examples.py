@@ -26,6 +26,7 @@ def assert_pictures(paths, folder, count):
         assert path.parent == folder and path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_solar_system(tmp_path, capsys):
     pictures, relativistic, newtonian = importlib.import_module("solar_system").main(["--out", str(tmp_path)])
     assert_pictures(pictures, tmp_path, 2)
@@ -35,6 +36,7 @@ def test_solar_system(tmp_path, capsys):
     assert float(row.split()[-2]) < 0.2 and float(row.split()[-1]) > 100
 
 
+@pytest.mark.slow
 def test_double_pendulum(tmp_path, capsys):
     sizes = ["--members", "8", "--duration", "2", "--resolution", "7"]
     pictures = importlib.import_module("double_pendulum").main([*sizes, "--out", str(tmp_path)])

@@ -164,6 +164,7 @@ def test_directions_side_by_side_are_those_one_by_one(monkeypatch):
     np.testing.assert_allclose(along, 1e-30 * sum(jnp.sum(x) for x in jax.tree.leaves(reverse)), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_jacobian_row_by_row_is_that_column_by_column(monkeypatch):
     scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params * q**2)
     path = lambda x: lagjax.simulate(scene, x[0], x[1], jnp.linspace(0, 2, 9), x[2], rtol=1e-11).q

@@ -13,6 +13,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sweeps import sweep
 
 import lagjax
 
@@ -24,8 +25,15 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 from benchmarks import hard_cases, soak  # noqa: E402
 from benchmarks._hard import CASES, Case, Experiment, _constrained, _gravity, _integrable, _rotation  # noqa: E402
 
+# Those that take a second or two, one at least in every file of the table.
+FAST = (
+    "Double pendulum", "Kapitza's pendulum", "Pendulum on a rod", "Chaplygin's sleigh", "10⁴ members", "Charge",
+    "Kepler", "Arenstorf's orbit", "Figure eight", "Burrau's three bodies", "Swinging Atwood machine", "Toda lattice",
+    "Calogero and Moser", "Bead on a cycloid", "Dzhanibekov's body",
+)  # fmt: skip
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+
+@pytest.mark.parametrize("case", sweep(CASES, kept=lambda case: case.name.startswith(FAST)), ids=lambda case: case.name)
 def test_stays_below_its_bound(case):
     if isinstance(case, Experiment) and (reason := case.missing()):
         pytest.skip(reason)
@@ -96,6 +104,7 @@ def test_the_table_is_printed_and_kept(tmp_path, capsys):
     assert (tmp_path / "hard_cases.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_peers_are_judged_by_the_same_error():
     case = next(case for case in CASES if case.name == "Figure eight closes")
     assert isinstance(case, Case)
@@ -110,6 +119,7 @@ def test_peers_are_judged_by_the_same_error():
 # ---- soak ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_random_scenes_do_not_fail(tmp_path):
     record = soak.main(["--minutes", "0", "--seed", "1", "--output", str(tmp_path)])  # one scene
     assert record["scenes"] == 1 and record["steps"] > record["members"] > 0 and record["growth"] is None

@@ -12,6 +12,7 @@ import pytest
 from jax import lax
 from llvmlite import ir
 from scipy.integrate import solve_ivp
+from sweeps import sweep
 
 import lagjax
 from lagjax import _native
@@ -616,7 +617,7 @@ def varied(p):
     return {"m": jnp.outer(p["m"], jnp.linspace(1, 2, 5)), "n": jnp.arange(2, 7), "g": p["g"]}
 
 
-@pytest.mark.parametrize("name", BATCHES)
+@pytest.mark.parametrize("name", sweep(BATCHES, kept=["states", "a shared q0", "parameters"]))
 def test_simulate_batch_is_simulate(calls, name):
     axes, spread = BATCHES[name]
     values, ts = spread(*START, PARAMS), jnp.linspace(0, 3, 7)

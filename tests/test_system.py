@@ -108,6 +108,7 @@ def test_any_pytree_of_coordinates(q, qdot):
     jax.tree.map(lambda a, x: np.testing.assert_allclose(a, -4.0 * jnp.asarray(x), rtol=1e-15), acceleration, q)
 
 
+@pytest.mark.slow
 def test_transformations_of_the_derivation():
     scene = lagjax.System(central)
     states = Polar(jnp.linspace(1, 2, 5), jnp.linspace(0, 1, 5)), Polar(jnp.linspace(-1, 1, 5), jnp.ones(5))

@@ -21,6 +21,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -65,7 +66,7 @@ EVEN = {"cos", "cosh", "abs"}
 
 LONGEST = 16  # terms of a sum, or factors of a product, that are compared with others
 
-Node = tuple[str, tuple[int, ...], object]
+Node = tuple[str, tuple[int, ...], Any]
 
 
 class Graph:
@@ -90,7 +91,7 @@ class Graph:
             return rule(self, op, *operands) if attribute is None else rule(self, op, *operands, attribute)
         return self.node(op, *operands, attribute=attribute)
 
-    def node(self, op: str, *operands: int, attribute=None) -> int:
+    def node(self, op: str, *operands: int, attribute: Any = None) -> int:
         """The node with exactly these operands: an old one if there is one."""
         if op in COMMUTATIVE and operands[0] > operands[1]:
             operands = operands[::-1]
@@ -138,14 +139,13 @@ class Graph:
         self._ids[key] = len(self.nodes) - 1
         return self._ids[key]
 
-    def _fold(self, op, operands, attribute) -> int:
-        kind = self.kinds[operands[-1]]
-        values = [np.dtype(self.kinds[i]).type(self.nodes[i][2]) for i in operands]
-        extra = () if attribute is None else (attribute,)
-        result = FOLD[op](*values, *extra)
+    def _fold(self, op: str, operands: tuple[int, ...], attribute: Any) -> int:
+        kind = attribute if op == "convert" else self.kinds[operands[-1]]
         if op in COMPARISONS or op == "is_finite":
             kind = "bool"
-        return self.constant(result, attribute if op == "convert" else kind)
+        values = [np.dtype(self.kinds[i]).type(self.nodes[i][2]) for i in operands]
+        extra = () if attribute is None else (attribute,)
+        return self.constant(FOLD[op](*values, *extra), kind)
 
     # A float node seen as `coefficient * base`: what signs and constant factors are collected by.
 

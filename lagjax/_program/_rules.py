@@ -14,6 +14,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.extend import core
 
 from lagjax._program._graph import FOLD, Graph, Unlowerable, power
@@ -46,7 +47,7 @@ class Expansion:
         return self.run(jaxpr.jaxpr, [self.constants(value) for value in jaxpr.consts], arguments)
 
     def constants(self, value) -> np.ndarray:
-        if isinstance(value, jax.core.Tracer):
+        if isinstance(value, Tracer):
             raise Unlowerable("the function closes over a traced value; pass it as an argument")
         kind = kind_of(value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype)
         value = np.asarray(value)
@@ -149,7 +150,9 @@ def _pad(params, x, value):
         length = before + after + size + max(size - 1, 0) * between
         places = before + np.arange(size) * (between + 1)
         kept = (0 <= places) & (places < length)
-        shape.append(max(length, 0)), source.append(np.flatnonzero(kept)), target.append(places[kept])
+        shape.append(max(length, 0))
+        source.append(np.flatnonzero(kept))
+        target.append(places[kept])
     result = np.full(shape, value)
     result[np.ix_(*target)] = x[np.ix_(*source)]
     return result

@@ -89,7 +89,7 @@ class _Recurrences:
         self.order_k = [self.sweep.input(i, "float") for i in range(self.moving)]
         self.k, self.inverse_k = (self.sweep.input(self.moving + i, "float") for i in range(2))
         self._given: dict[tuple, int] = {}  # what else the sweep reads: ("value", node) or ("product", row, row)
-        self._rows: dict[tuple[int, bool], int] = {}
+        self._rows: dict[tuple[int | _Component, bool], int] = {}
         self.coefficients: list[int | _Unknown | None] = []  # None: constant along the motion
         while len(self.coefficients) < len(self.start.nodes):  # the rules add derivatives at the end
             self.coefficients.append(self._coefficient(len(self.coefficients)))

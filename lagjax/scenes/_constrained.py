@@ -124,7 +124,8 @@ def cartesian_of_angles(theta, theta_dot, l):
 def _cartesian_pendulum_exact(t, q0, qdot0, params):
     l = params["l"]
     angle, rate = jnp.arctan2(q0[0], -q0[1]), (q0[0] * qdot0[1] - q0[1] * qdot0[0]) / l**2
-    q, qdot = cartesian_of_angles(*(jnp.atleast_1d(x) for x in _pendulum_exact(t, angle, rate, params)), l)
+    angles, rates = (jnp.atleast_1d(x) for x in _pendulum_exact(t, angle, rate, params))
+    q, qdot = cartesian_of_angles(angles, rates, l)
     return q[0], qdot[0]
 
 
