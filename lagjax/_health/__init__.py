@@ -18,7 +18,8 @@ all, may grow with the motion: there is no bound for them, only a second traject
 
 Between outputs the power is integrated along the polynomial of degree five that has q, q̇ and q̈ of both ends. That is
 of order six; how far it may be off is told by the cubic through q and q̇, of order four, and the trapezoidal rule.
-Where it may be off by more than a hundredth of the energy, the balance cannot be told, and the verdict says so. Source:
+Where the balance is off by more than a hundredth of the energy, and the work may be, the verdict says that it cannot
+be told. Source:
 Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.4 (error per step), §II.6 (Hermite
 interpolation).
 """
@@ -69,7 +70,7 @@ class Health(eqx.Module):
     - `energy`: the largest |h − h₀ − W|, in units of energy, W the work done by forces, by an explicit time and by
       moving constraints. `energy_allowed`: what the tolerances and round-off may add up to. `work_error`: how well W is
       known from the outputs alone, zero where nothing does work; an imbalance below it means nothing.
-      `outputs_needed`: about how many outputs would tell W to a thousandth of the energy; the number of outputs where
+      `outputs_needed`: about how many outputs would tell whether the power is balanced; the number of outputs where
       these do. Where a transition lies between two outputs, what it takes is left out, and
       so is the time from it to the next output.
     - `amplitude`: the largest change of a coordinate; infinite where nothing moves. `amplitude_needed`: the size below

@@ -323,11 +323,12 @@ def _report(path: Path, laws: list[Law], momenta: tuple[int, ...], look: Callabl
     finest = max(math.sqrt(eps), SLACK * eps) if fixed else SLACK * path.tolerances[0]
     fine, none = here.finite | ~on_path, xp.zeros(path.ts.shape[:-1], dtype)
     all_fine, first = xp.all(fine, axis=axis), xp.argmin(fine, axis=axis)
+    energy = worst(drifts[..., 0], on_path)
     return {
-        "energy": worst(drifts[..., 0], on_path),
+        "energy": energy,
         "energy_allowed": limits[..., 0],
         "work_error": work_error,
-        "outputs_needed": _outputs_needed(xp, T, work_error, size[..., 0]),
+        "outputs_needed": _outputs_needed(xp, T, energy.value, work_error, size[..., 0]),
         "amplitude": _amplitude(xp, q[..., :T, :], on_path),
         "amplitude_needed": none if fixed else SMALLEST * path.tolerances[1] + none,
         "momentum": worst(drifts[..., 1:], on_path),
@@ -446,13 +447,16 @@ def _work(path: Path, found: Sample, measurable, power: Callable) -> tuple[Any, 
     return xp.where(smooth, sixth, second), xp.sum(xp.where(measurable, error, 0.0), axis=-1)
 
 
-def _outputs_needed(xp, T: int, work_error, size):
-    """About how many outputs tell the work to a tenth of `VISIBLE` of the energy; T where these outputs do.
+def _outputs_needed(xp, T: int, imbalance, work_error, size):
+    """About how many outputs tell whether the power is balanced; T where these outputs do.
 
-    The rule for the work is of order six.
+    They do not where the balance is off visibly, and the work may be off as much. The rule for the work is of order
+    six.
     """
-    excess = SLACK * work_error / xp.where(size > 0, VISIBLE * size, 1.0)
-    return T * xp.where(excess > 1, xp.maximum(2.0, xp.ceil(xp.abs(excess) ** (1 / 6))), 1.0)
+    visible = VISIBLE * size
+    excess = SLACK * work_error / xp.where(visible > 0, visible, 1.0)
+    untold = (excess > 1) & (imbalance > visible)
+    return T * xp.where(untold, xp.maximum(2.0, xp.ceil(xp.abs(excess) ** (1 / 6))), 1.0)
 
 
 def _amplitude(xp, q, on_path):
