@@ -12,9 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._derivation import columns_of, derivation_of, numbers_of
 from lagjax._layout import Layout
-from lagjax._linear import dependent_rows, rank
+from lagjax._linear import coupling_many, dependent_rows, rank
 from lagjax._motion import Motion
+from lagjax._program import Unlowerable
 from lagjax._settings import is_concrete
 from lagjax._system import System
 
@@ -28,8 +30,7 @@ def require_consistent(system: System, layout: Layout, ts, q0: PyTree, qdot0: Py
     if _free(system) or not _known((ts, q0, qdot0, params, system)):
         return
     names = system.constraint_names(layout, params)
-    numbers = map(np.asarray, _compiled(system, ts, q0, qdot0, params))
-    positions, velocities, demands, lengths, coupling, driven = numbers
+    positions, velocities, demands, lengths, coupling, driven = _looked_at(system, layout, ts, q0, qdot0, params)
     tolerance = TOLERANCE[layout.dtype]
     for name, *found, length in zip(names, positions, velocities, demands, lengths, strict=True):
         if not np.isfinite([*found, length]).all():
@@ -87,6 +88,25 @@ def inconsistent_members(system: System, layout: Layout, ts, values: dict, axes:
     positions, velocities, _, lengths, _, _ = each(*values.values())
     off = jnp.maximum(jnp.abs(positions), jnp.abs(velocities)) / lengths
     return ~(off <= TOLERANCE[layout.dtype]).all(axis=1)
+
+
+def _looked_at(system: System, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> tuple:
+    """The numbers of `_compiled`, in NumPy; without compiling anything where the scene has programs."""
+    q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)]) for x in (q0, qdot0))
+    q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, ts[0]))
+    derivation = derivation_of(system, layout, params)
+    names = ("mass_matrix", "jacobian", "target", "residual", "rates", "driving")
+    try:
+        numbers = numbers_of(eqx.filter(params, eqx.is_array_like))
+        values = derivation.evaluate(names, columns_of(q[None], qdot[None], t, numbers))
+    except Unlowerable:
+        return tuple(map(np.asarray, _compiled(system, ts, q0, qdot0, params)))
+    coupling = coupling_many(values["mass_matrix"], values["jacobian"])[0]
+    one = {name: value[0] for name, value in values.items()}
+    positions = np.where(np.arange(len(one["residual"])) < derivation.position_count, one["residual"], 0)
+    sizes, lengths = (1 + np.abs(q).max(), 1 + np.abs(qdot).max()), np.linalg.norm(one["jacobian"], axis=1)
+    driven = (one["driving"] != 0).any()
+    return positions / sizes[0], one["rates"] / sizes[1], one["target"], lengths, coupling, driven
 
 
 @eqx.filter_jit

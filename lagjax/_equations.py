@@ -7,9 +7,7 @@ forms give the same motion to round-off, and are tested against each other.
 
 import abc
 import functools
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,18 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from lagjax import _linear
+from lagjax._derivation import Derivation
 from lagjax._layout import Layout
 from lagjax._motion import Motion
 from lagjax._native import Projection
-from lagjax._program import Program, Unlowerable, lower, lower_solution
+from lagjax._program import Program, Unlowerable
 
 PyTree = Any
 State = tuple[jax.Array, jax.Array]
 
-# A larger scene is not even looked at: most of the work of reducing it would be thrown away.
-LARGEST_SCALAR_SCENE = 64
-OPERATION_BUDGET = 20_000
 # Beyond this XLA takes longer to compile a program than it saves, and batched Cholesky or LU overtakes written-out
 # elimination (measured on chains of pendulums, where it lies at 12 links).
 LARGEST_XLA_PROGRAM = 2_000
@@ -113,10 +108,16 @@ def equations(motion: Motion, layout: Layout, params: PyTree, path: str = "auto"
 
     Raises `ValueError` when "scalar" is asked for and impossible, with the reason.
     """
+    return form_of(_derived(motion, layout, params), path)
+
+
+def form_of(derivation: Derivation, path: str = "auto") -> Equations:
+    """The same from what is derived already."""
+    motion = derivation.motion
     if path == "array":
         return ArrayEquations(motion, "asked for")
     try:
-        program = scalar_program(motion, layout, params).complete
+        program = derivation.acceleration.complete
     except Unlowerable as reason:
         if path == "scalar":
             raise ValueError(f"This scene has no scalar program: {reason}.") from None
@@ -124,161 +125,54 @@ def equations(motion: Motion, layout: Layout, params: PyTree, path: str = "auto"
     if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:
         reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
         return ArrayEquations(motion, reason)
-    return ScalarEquations(program, projection_program(motion, layout, params))
+    return ScalarEquations(program, derivation.projected)
+
+
+# Thin calls for those who still hold a `Motion`; `derivation_of` keeps what is derived.
 
 
 def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
-    """q̈ and the singularity of M as one program: first M and the forces, then the elimination their zeros allow.
-
-    Its inputs are q, q̇, t and every number in params. Raises `Unlowerable` with the reason.
-
-    With constraints M may be singular (a parameter may make it so) as long as the saddle point is not. To allow for
-    that costs three times the arithmetic. Where M is regular in general the program therefore takes it for regular, and
-    its last output tells where that would cost digits; there `otherwise` is the program for any M. Machine code changes
-    over where that comes about (`_flow`), with the numbers of the run at hand; XLA, which has to write the program down
-    before it knows them, takes the one that always holds (`complete`).
-    """
-    _require_small(layout)
-    if not motion.constrained:
-        return _eliminated(motion.mass_matrix_and_force, motion, layout, params)
-
-    saddle = _saddle(motion)
-
-    def for_any_mass_matrix():
-        return _eliminated(saddle, motion, layout, params)
-
-    lean = _eliminated(saddle, motion, layout, params, wary=True)
-    return for_any_mass_matrix() if lean is None else replace(lean, otherwise=functools.cache(for_any_mass_matrix))
+    """`Derivation.acceleration`: q̈ and whether M is singular, or raises `Unlowerable`."""
+    return _derived(motion, layout, params).acceleration
 
 
 def projection_program(motion: Motion, layout: Layout, params: PyTree) -> Program | None:
-    """`Motion.projected` as a program, from q, q̇, t and the numbers in params to q and q̇; None without constraints."""
-    if not motion.constrained:
-        return None
-    n = layout.size
-
-    def step(parts):
-        def with_no_force(*state):
-            matrix, rows, target = parts(*state)
-            return matrix, jnp.zeros(n, layout.dtype), rows, target
-
-        return _eliminated(with_no_force, motion, layout, params)
-
-    velocity = step(motion.velocity_saddle)
-    position = None if motion.constraints is None else step(motion.position_saddle)
-
-    def projected(*scalars):
-        q, rest = list(scalars[:n]), scalars[n:]
-        if position is not None:
-            q = [x + dx for x, dx in zip(q, position(*scalars), strict=False)]
-        v = [x + dx for x, dx in zip(rest[:n], velocity(*q, *rest), strict=False)]
-        return *q, *v
-
-    return lower(projected, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
+    """`Derivation.projected`: q and q̇ after one step back to the constraints; None without constraints."""
+    return _derived(motion, layout, params).projected
 
 
 def projection(motion: Motion, layout: Layout, params: PyTree) -> Projection | None:
-    """What machine code needs to keep a motion on its constraints; None without any."""
-    if not motion.constrained:
-        return None
-    q, t = jax.ShapeDtypeStruct((layout.size,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
-    speeds = lower(motion.speeds, q, q, t, params, budget=OPERATION_BUDGET)
-    return Projection(projection_program(motion, layout, params), speeds)
+    """`Derivation.projection`: what machine code needs to keep a motion on its constraints; None without any."""
+    return _derived(motion, layout, params).projection
 
 
-def multiplier_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
-    """λ as a program, those of `constraints` first; redundant ones are zero."""
-    _require_small(layout)
-
-    system, solve = _system(_saddle(motion), motion, layout, params)
-
-    def multipliers(*scalars):
-        _, right, factors, _ = system(*scalars)
-        return [-pull for pull in solve(factors, right)[layout.size :]]
-
-    return lower(multipliers, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
+def multiplier_program(motion: Motion, layout: Layout, params: PyTree) -> Program | None:
+    """`Derivation.multipliers`: λ as a program."""
+    return _derived(motion, layout, params).multipliers
 
 
-def _saddle(motion: Motion) -> Callable:
-    """(M, b, G, c) of a state."""
+class _Same(NamedTuple):
+    """A motion that is known by its identity: its functions are made anew for every run."""
 
-    def parts(*state):
-        return *motion.mass_matrix_and_force(*state), *motion.rows_and_targets(*state)
+    motion: Motion
 
-    return parts
+    def __hash__(self):
+        return id(self.motion)
 
-
-def _require_small(layout: Layout) -> None:
-    if layout.size > LARGEST_SCALAR_SCENE:
-        raise Unlowerable(f"it has {layout.size} coordinates, more than {LARGEST_SCALAR_SCENE}")
+    def __eq__(self, other):
+        return self.motion is other.motion
 
 
-def _eliminated(parts_of: Callable, motion: Motion, layout: Layout, params, wary: bool = False) -> Program | None:
-    """x as a program, and whether there is none, from the parts of a linear system: see `_system`."""
-    found = _system(parts_of, motion, layout, params, wary)
-    if found is None:
-        return None
-    return lower_solution(*found, layout.size, *_scalar_shapes(layout, params), budget=OPERATION_BUDGET)
+def _derived(motion: Motion, layout: Layout, params: PyTree) -> Derivation:
+    leaves, structure = jax.tree.flatten(params)
+    shapes = tuple((np.shape(leaf), np.dtype(jnp.result_type(leaf))) for leaf in leaves)
+    return _latest(_Same(motion), layout, structure, shapes)
 
 
-def _system(parts_of: Callable, motion: Motion, layout: Layout, params, wary: bool = False):
-    """A z = r with z = (x, −λ) for M x = b, or M x − Gᵀλ = b and G x = c; `parts_of` gives (M, b) or (M, b, G, c).
-
-    Two functions: the entries of A, r, factors of A and whether it is singular, from the scalars; and z, from the
-    factors and r. With constraints M is helped by GᵀG unless it is constant and regular. A `wary` elimination does not
-    help it, and says where it should; None where that is everywhere, or nowhere.
-    """
-    n = layout.size
-    q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
-    parts = lower(parts_of, q, q, t, params, budget=OPERATION_BUDGET)
-    m = (len(parts.outputs) - n * n - n) // (n + 1)  # rows of G
-    regular = _require_definite(parts, n, m)
-    constant = not any(parts.depends(i) for i in range(n * n))
-    if wary and (constant or not regular):
-        return None
-    zeros = np.array([parts.constant(i) == 0 for i in range(len(parts.outputs))])
-    mass_zeros, row_zeros = zeros[: n * n].reshape(n, n), zeros[n * n + n : n * n + n + m * n].reshape(m, n)
-    helped = not (wary or (constant and regular))
-    if motion.constrained:
-        elimination = _linear.SaddleElimination((mass_zeros, row_zeros), layout.dtype, helped, wary)
-    else:
-        elimination = _linear.Elimination(mass_zeros, layout.dtype)
-
-    def system(*scalars):
-        values = list(parts(*scalars))
-        table = [values[n * i : n * i + n] for i in range(n + 1 + m)]  # the rows of M, b, the rows of G
-        matrix, b, rows, c = table[:n], table[n], table[n + 1 :], values[n * len(table) :]
-        factors, singular = elimination.factors(matrix, rows)
-        entries = {(i, j): x for i, row in enumerate(matrix + rows) for j, x in enumerate(row[: i + 1])}
-        return entries, b + c, factors, singular
-
-    return system, elimination.solve
-
-
-def _scalar_shapes(layout: Layout, params: PyTree) -> list[jax.ShapeDtypeStruct]:
-    """q, q̇, t and every number in params, one by one."""
-    numbers = [jnp.result_type(leaf) for leaf in jax.tree.leaves(params) for _ in range(np.size(leaf))]
-    return [jax.ShapeDtypeStruct((), dtype) for dtype in [layout.dtype] * (2 * layout.size + 1) + numbers]
-
-
-def _require_definite(parts: Program, n: int, m: int) -> bool:
-    """Elimination without pivoting is for positive definite M; look at a few states whether this M can be.
-
-    With constraints it may be singular, and is then helped by GᵀG. Returns whether it is regular without, in general:
-    at all of these states. The choice is between right answers: a wrong guess here is caught by the test on the pivots.
-    """
-    rng, regular = np.random.default_rng(0), True
-    for _ in range(3):
-        values = np.array(parts.evaluate(*rng.uniform(0.3, 1.2, parts.size)), float)
-        matrix = values[: n * n].reshape(n, n)
-        if np.isfinite(values).all():
-            lowest, size = np.linalg.eigvalsh(matrix)[0], np.abs(matrix).max()
-            regular = regular and lowest > 1e-10 * size
-            rows = values[n * n + n : n * n + n + m * n].reshape(m, n)
-            helped = np.linalg.eigvalsh(matrix + rows.T @ rows)[0] if m else lowest
-            if (n > 2 or m) and helped < -1e-12 * size:
-                raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
-    return regular
+@functools.lru_cache(maxsize=4)  # the programs of one scene are asked for one after the other
+def _latest(same: _Same, layout: Layout, structure, shapes) -> Derivation:
+    numbers = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    return Derivation(same.motion, layout, numbers)
 
 
 def _scalars(params: PyTree) -> list[jax.Array]:

@@ -7,15 +7,13 @@ a(q, q̇) is zero at rest. Only which constraints depend on which is asked of on
 
 from dataclasses import dataclass, field, replace
 
-import jax
 import numpy as np
 
-from lagjax._equations import OPERATION_BUDGET, ScalarEquations, equations, scalar_program
+from lagjax._derivation import Derivation
+from lagjax._equations import ScalarEquations, form_of
 from lagjax._flow import unfit
-from lagjax._layout import Layout
 from lagjax._linear import dependent_rows
-from lagjax._motion import Motion
-from lagjax._program import Program, Unlowerable, lower
+from lagjax._program import Program, Unlowerable
 
 
 @dataclass(frozen=True)
@@ -88,68 +86,61 @@ class Explanation:
         return "\n".join(f"{name:17s} {value}" for name, value in rows)
 
 
-def explain(motion: Motion, layout: Layout, params, path: str) -> Explanation:
-    """Read the facts off the programs of L, of M and the forces, and of the acceleration."""
-    names, n = layout.names, layout.size
-    form = equations(motion, layout, params, path)
-    scalar = isinstance(form, ScalarEquations)
-    known = {"coordinates": names, "path": "scalar" if scalar else "array", "reason": "" if scalar else form.reason}
-    known["solver"], lean = _solver(motion, layout, params, path)
-    if scalar:
-        known["operations"] = (lean or form.program).operations
-        if form.projection is not None:
-            known["projection_operations"] = form.projection.operations
-
-    q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
+def explain(derivation: Derivation, path: str) -> Explanation:
+    """The facts about a scene, read off its derivation; `path` is that of its `System`."""
+    names, n, motion = derivation.layout.names, derivation.layout.size, derivation.motion
+    known = {"coordinates": names, **_engine(derivation, path)}
     try:
-        lagrangian = lower(motion.lagrangian, q, q, t, params, budget=OPERATION_BUDGET)
-        parts = lower(motion.mass_matrix_and_force, q, q, t, params, budget=OPERATION_BUDGET)
-        held = lower(motion.rows_and_targets, q, q, t, params, budget=OPERATION_BUDGET) if motion.constrained else None
-        held_in_time, working = _moving_constraints(motion, q, t, params)
+        matrix, force = derivation.program("mass_matrix"), derivation.reads("force")
     except Unlowerable:
         return Explanation(**known)
 
     inputs = (*names, *(f"d{name}" for name in names), "t")
-    reads = [frozenset(inputs[i] for i in parts.depends(k) if i < len(inputs)) for k in range(n * n + n)]
-    mass, force = frozenset().union(*reads[: n * n]), frozenset().union(*reads[n * n :])
-    of_lagrangian = {inputs[i] for i in lagrangian.depends(0) if i < len(inputs)}
-    timed = held_in_time or "t" in mass | force | of_lagrangian
+
+    def named(*quantities: str) -> set[str]:
+        return {inputs[i] for quantity in quantities for i in derivation.reads(quantity) if i < len(inputs)}
+
+    mass, lagrangian = named("mass_matrix"), named("lagrangian")
     return Explanation(
         **known,
-        cyclic=tuple(name for name in names if name not in of_lagrangian),
-        mass_matrix=f"{'varying' if mass else 'constant'}, {_pattern(parts, n)}",
+        cyclic=tuple(name for name in names if name not in lagrangian),
+        mass_matrix=f"{'varying' if mass else 'constant'}, {_pattern(matrix, n)}",
         mass_matrix_depends_on=tuple(name for name in inputs if name in mass),
-        velocity_terms=any(name in force for name in inputs[n : 2 * n]),
-        explicit_time=timed,
-        energy_conserved=not timed and not working and motion.forces is None and motion.dissipation is None,
-        traced_operations=parts.traced_operations + (0 if held is None else held.traced_operations),
+        velocity_terms=any(i in force for i in range(n, 2 * n)),
+        explicit_time="t" in named("lagrangian", "mass_matrix", "force", "residual"),
+        energy_conserved=not derivation.works and motion.forces is None and motion.dissipation is None,
+        traced_operations=derivation.traced_operations,
     )
 
 
-def _moving_constraints(motion: Motion, q, t, params) -> tuple[bool, bool]:
-    """Whether constraints read the time, and whether those on velocities do work: they are not zero at rest."""
-    if not motion.constrained:
-        return False, False
-    held = lower(motion.residual, q, q, t, params, budget=OPERATION_BUDGET)
-    timed = any(2 * q.size in held.depends(k) for k in range(len(held.outputs)))
-    if motion.velocity_constraints is None:
-        return timed, False
-
-    def at_rest(q, t, params):
-        return motion.velocity_constraints(q, jax.numpy.zeros_like(q), t, params)
-
-    rest = lower(at_rest, q, t, params, budget=OPERATION_BUDGET)
-    return timed, any(rest.constant(k) != 0 for k in range(len(rest.outputs)))
-
-
-def _solver(motion: Motion, layout: Layout, params, path: str) -> tuple[str, Program | None]:
-    """What integrates by default, and the program of machine code, where it is that."""
+def machine_code_refusal(derivation: Derivation, path: str) -> str | None:
+    """Why machine code does not integrate a run that is left to its defaults: the end of a sentence, or None."""
+    if path == "array":
+        return "the array path was asked for"
+    if derivation.unhashable is not None:
+        return f"the scene cannot be remembered: {derivation.unhashable}"
     try:
-        program = scalar_program(motion, layout, params)
-        reason = unfit(program, layout.size, layout.dtype) if path != "array" else "the array path was asked for"
-    except Unlowerable as why:
-        reason = str(why)
-    return ("Taylor series in machine code", program) if reason is None else (f"diffrax.Dopri8, because {reason}", None)
+        program, _ = derivation.acceleration, derivation.projection
+    except Unlowerable as reason:
+        return str(reason)
+    return unfit(program, derivation.layout.size, derivation.layout.dtype)
+
+
+def _engine(derivation: Derivation, path: str) -> dict:
+    """What integrates a motion by default, in what form the equations are evaluated there, and what that costs."""
+    refusal = machine_code_refusal(derivation, path)
+    if refusal is None:
+        facts = {"solver": "Taylor series in machine code", "path": "scalar", "reason": ""}
+        program, projected = derivation.acceleration, derivation.projected
+    else:
+        form = form_of(derivation, path)
+        scalar = isinstance(form, ScalarEquations)
+        facts = {"solver": f"diffrax.Dopri8, because {refusal}", "path": "scalar" if scalar else "array"}
+        facts["reason"] = "" if scalar else form.reason
+        program, projected = (form.program, form.projection) if scalar else (None, None)
+    facts["operations"] = None if program is None else program.operations
+    facts["projection_operations"] = None if projected is None else projected.operations
+    return facts
 
 
 def _pattern(parts: Program, n: int) -> str:

@@ -341,6 +341,74 @@ def _independent(matrix: jax.Array, scale: jax.Array) -> tuple[jax.Array, jax.Ar
     return inverse, pairs + jnp.where(~rows[:, None] & columns, -a, 0), pairs
 
 
+# ---- many small systems side by side, in NumPy -----------------------------------------------------------------------
+
+
+def solve_many(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """x with M x = b for symmetric M (S, n, n) and b (S, n, k); NaN where M is singular, as `Factorization.solve`."""
+    if matrix.shape[1] == 1:
+        return b / np.where(matrix == 0, np.nan, matrix)
+    matrix = 0.5 * (matrix + np.swapaxes(matrix, 1, 2))
+    scale = _scales(matrix)
+    scaled = scale[:, :, None] * matrix * scale[:, None, :]
+    usable = np.isfinite(scaled).all(axis=(1, 2))
+    scaled = np.where(usable[:, None, None], scaled, np.eye(matrix.shape[1], dtype=matrix.dtype))
+    sizes = np.abs(np.linalg.eigvalsh(scaled))
+    usable &= sizes.min(axis=1) > singular_threshold(matrix.shape[1], matrix.dtype) * sizes.max(axis=1)
+    scaled = np.where(usable[:, None, None], scaled, np.eye(matrix.shape[1], dtype=matrix.dtype))
+    x = scale[:, :, None] * np.linalg.solve(scaled, scale[:, :, None] * b)
+    return np.where(usable[:, None, None], x, np.nan)
+
+
+def saddle_many(matrix, b, rows, c) -> tuple[np.ndarray, np.ndarray]:
+    """x (S, n) and λ (S, m), of least norm, of S saddle points, as `saddle`; `rows` (S, m, n) may be empty."""
+    if not rows.shape[1]:
+        return solve_many(matrix, b[:, :, None])[:, :, 0], np.zeros((len(b), 0), b.dtype)
+    augmented, weighted = _augmented(matrix, rows)
+    turned = np.swapaxes(rows, 1, 2)
+    solved = solve_many(augmented, np.concatenate([(b + np.einsum("skn,sk->sn", weighted, c))[:, :, None], turned], 2))
+    free, responses = solved[:, :, 0], solved[:, :, 1:]
+    left = c - np.einsum("skn,sn->sk", rows, free)
+    multipliers = _solved_on_range(rows @ responses, left[:, :, None])[:, :, 0]
+    return free + np.einsum("snk,sk->sn", responses, multipliers), multipliers
+
+
+def coupling_many(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """S = G K⁻¹ Gᵀ of `coupling`, for S matrices at once."""
+    return rows @ solve_many(_augmented(matrix, rows)[0], np.swapaxes(rows, 1, 2))
+
+
+def _augmented(matrix: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """K = M + GᵀW G and W G."""
+    size, heavy = np.sum(rows**2, axis=2), np.abs(np.diagonal(matrix, axis1=1, axis2=2)).max(axis=1)
+    weighted = (heavy[:, None] / np.where(size > 0, size, 1))[:, :, None] * rows
+    return matrix + np.swapaxes(rows, 1, 2) @ weighted, weighted
+
+
+def _solved_on_range(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The shortest x with S x = b, as `least_norm`, for symmetric S of any rank (S, m, m)."""
+    usable = np.isfinite(matrix).all(axis=(1, 2))
+    matrix = np.where(usable[:, None, None], matrix, np.eye(matrix.shape[1], dtype=matrix.dtype))
+    scale = _scales(matrix)
+    values, vectors = np.linalg.eigh(scale[:, :, None] * matrix * scale[:, None, :])
+    kept = np.abs(values) > rank_tolerance(matrix.dtype)
+    inverse = np.where(kept, 1 / np.where(kept, values, 1), 0)[:, :, None]
+    x = scale[:, :, None] * (vectors @ (inverse * (np.swapaxes(vectors, 1, 2) @ (scale[:, :, None] * b))))
+    if not kept.all():  # what of x lies in the kernel of S is taken out: the kernel of the scaled matrix, scaled back
+        kernel = np.where(kept[:, None, :], 0, scale[:, :, None] * vectors)
+        turned = np.swapaxes(kernel, 1, 2)
+        gram = turned @ kernel + kept[:, :, None] * np.eye(matrix.shape[1], dtype=matrix.dtype)
+        x = x - kernel @ np.linalg.solve(gram, turned @ x)
+    return np.where(usable[:, None, None], x, np.nan)
+
+
+def _scales(matrix: np.ndarray) -> np.ndarray:
+    """`_diagonal_scale` of many matrices."""
+    diagonal = np.abs(np.diagonal(matrix, axis1=1, axis2=2))
+    size = np.where(diagonal > 0, diagonal, np.abs(matrix).max(axis=2))
+    return 1 / np.sqrt(np.where(size > 0, size, 1))
+
+
 class SaddleElimination:
     """The same as `saddle` on scalars, without pivoting: M positive (semi)definite, G a list of rows.
 

@@ -56,6 +56,47 @@ class Motion(eqx.Module):
         _, drift = jax.jvp(momentum_along, (q, t), (qdot, jnp.ones_like(t)))
         return self.mass_matrix(q, qdot, t, params), self.generalized_force(q, qdot, t, params) - drift
 
+    def quantities(self, q, qdot, t, params) -> dict[str, jax.Array]:
+        """Everything that is asked of a single state, by name, from one round of differentiation.
+
+        - `lagrangian` (), `momentum` (n,), `mass_matrix` (n, n), `lagrangian_by_q` (n,), `lagrangian_by_t` ().
+        - `force` (n,): the right-hand side of M q̈ = F.
+        - `given_force` (n,): the user's forces; `dissipation` (1,) or (0,), `dissipation_by_qdot` (n,);
+          `nonconservative_force` (n,) = forces − ∂D/∂q̇; `generalized_force` (n,) = ∂L/∂q + forces − ∂D/∂q̇.
+        - `jacobian` G (m, n) and `target` γ (m,) of G q̈ = γ; `residual` (m,): f, a; `rates` (m,): J q̇ + ∂f/∂t, a;
+          `driving` (m,): ∂f/∂t, a(q, 0, t), by which constraints do work. m is zero without constraints.
+        """
+        state, n = (q, qdot, t, params), q.size
+        value, (by_q, momentum, by_t) = jax.value_and_grad(self.lagrangian, argnums=(0, 1, 2))(*state)
+        # One linearisation of p gives M, column by column, and the drift (∂p/∂q) q̇ + ∂p/∂t.
+        _, push = jax.linearize(lambda *y: self.momentum(*y, params), q, qdot, t)
+        matrix = jax.vmap(lambda e: push(jnp.zeros_like(q), e, jnp.zeros_like(t)), out_axes=1)(
+            jnp.eye(n, dtype=q.dtype)
+        )
+        drift = push(qdot, jnp.zeros_like(qdot), jnp.ones_like(t))
+        damped = Motion(self.lagrangian, None, self.dissipation)
+        nonconservative = self.nonconservative_force(*state)
+        nothing = jnp.zeros(0, q.dtype)
+        jacobian, target = self.rows_and_targets(*state) if self.constrained else (jnp.zeros((0, n), q.dtype), nothing)
+        return {
+            "lagrangian": value,
+            "momentum": momentum,
+            "mass_matrix": matrix,
+            "lagrangian_by_q": by_q,
+            "lagrangian_by_t": by_t,
+            "force": by_q + nonconservative - drift,
+            "given_force": jnp.zeros_like(q) if self.forces is None else self.forces(*state),
+            "dissipation": nothing if self.dissipation is None else self.dissipation(*state)[None],
+            "dissipation_by_qdot": -damped.nonconservative_force(*state),
+            "nonconservative_force": nonconservative,
+            "generalized_force": by_q + nonconservative,
+            "jacobian": jacobian,
+            "target": target,
+            "residual": self.residual(*state) if self.constrained else nothing,
+            "rates": self.rates(*state) if self.constrained else nothing,
+            "driving": self.driving(*state),
+        }
+
     def solved_acceleration(self, q, qdot, t, params) -> tuple[jax.Array, jax.Array]:
         """q̈, and whether the matrix it was solved with is singular (q̈ is NaN where it is)."""
         matrix, force = self.mass_matrix_and_force(q, qdot, t, params)
@@ -115,13 +156,26 @@ class Motion(eqx.Module):
 
     def velocity_saddle(self, q, qdot, t, params) -> tuple[jax.Array, jax.Array, jax.Array]:
         """M, G and minus what is left of J q̇ + ∂f/∂t and a: the same for the velocities."""
+        rows, _ = self.rows_and_targets(q, qdot, t, params)
+        return self.mass_matrix(q, qdot, t, params), rows, -self.rates(q, qdot, t, params)
+
+    def rates(self, q, qdot, t, params) -> jax.Array:
+        """J q̇ + ∂f/∂t, then a: what must be zero of the velocities, shape (m,)."""
         forward, left = (qdot, jnp.ones_like(t)), []
         if self.constraints is not None:
             left.append(jax.jvp(lambda q, t: self.constraints(q, t, params), (q, t), forward)[1])
         if self.velocity_constraints is not None:
             left.append(self.velocity_constraints(q, qdot, t, params))
-        rows, _ = self.rows_and_targets(q, qdot, t, params)
-        return self.mass_matrix(q, qdot, t, params), rows, -jnp.concatenate(left)
+        return jnp.concatenate(left)
+
+    def driving(self, q, qdot, t, params) -> jax.Array:
+        """∂f/∂t, then a(q, 0, t), shape (m,): constraints whose driving is zero do no work."""
+        parts = [jnp.zeros(0, q.dtype)]
+        if self.constraints is not None:
+            parts.append(jax.jvp(lambda t: self.constraints(q, t, params), (t,), (jnp.ones_like(t),))[1])
+        if self.velocity_constraints is not None:
+            parts.append(self.velocity_constraints(q, jnp.zeros_like(qdot), t, params))
+        return jnp.concatenate(parts)
 
     def projected(self, q, qdot, t, params) -> tuple[jax.Array, jax.Array]:
         """(q, q̇) after one Newton step of each kind: enough near the constraints, where it squares the distance."""
@@ -132,18 +186,9 @@ class Motion(eqx.Module):
         return q, qdot + _linear.saddle(matrix, jnp.zeros_like(q), rows, target)[0]
 
     def speeds(self, q, qdot, t, params) -> jax.Array:
-        """By which to measure an error of q̇ᵢ that the others cause through the constraints: zero if they cannot.
-
-        A term of a constraint, Gⱼ q̇ⱼ, is as large as the speed |Gⱼ q̇ⱼ / Gᵢ| of coordinate i, and a kinetic energy as
-        large as the speed √(Mⱼⱼ/Mᵢᵢ) |q̇ⱼ|. The smallest of the constraints' speeds counts, if it is not above the
-        energy's, where Gᵢ happens to pass through zero. A coupler that does not turn, for instance, is as exact as the
-        cranks that carry it, and not relative to its own speed, which is rounding.
-        """
+        """The `velocity_scales` of a state, shape (n,)."""
         matrix, rows, _ = self.velocity_saddle(q, qdot, t, params)
-        by_constraints = jnp.min(_largest_term(rows * qdot, rows), axis=0)
-        root = jnp.sqrt(jnp.abs(jnp.diagonal(matrix)))[None]
-        by_energy = _largest_term(root * qdot, root)[0]
-        return jnp.where(by_constraints < jnp.inf, jnp.minimum(by_constraints, by_energy), 0.0)
+        return velocity_scales(matrix, rows, qdot)
 
     def acceleration(self, q, qdot, t, params) -> jax.Array:
         """q̈ from M q̈ = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q."""
@@ -152,6 +197,26 @@ class Motion(eqx.Module):
     def energy(self, q, qdot, t, params) -> jax.Array:
         """h = p·q̇ − L, with dh/dt = −∂L/∂t + Q·q̇ along the motion."""
         return self.momentum(q, qdot, t, params) @ qdot - self.lagrangian(q, qdot, t, params)
+
+    def energy_and_momenta(self, momenta: tuple[int, ...], q, qdot, t, params) -> jax.Array:
+        """h, then p of the coordinates `momenta`, shape (1 + len(momenta),): what may be conserved."""
+        momentum = self.momentum(q, qdot, t, params)
+        energy = momentum @ qdot - self.lagrangian(q, qdot, t, params)
+        return jnp.concatenate([energy[None], momentum[jnp.asarray(momenta, int)]])
+
+
+def velocity_scales(matrix, rows, qdot) -> jax.Array:
+    """By which to measure an error of q̇ᵢ that the others cause through the constraints, (n,): zero if they cannot.
+
+    A term of a constraint, Gⱼ q̇ⱼ, is as large as the speed |Gⱼ q̇ⱼ / Gᵢ| of coordinate i, and a kinetic energy as
+    large as the speed √(Mⱼⱼ/Mᵢᵢ) |q̇ⱼ|. The smallest of the constraints' speeds counts, if it is not above the
+    energy's, where Gᵢ happens to pass through zero. A coupler that does not turn, for instance, is as exact as the
+    cranks that carry it, and not relative to its own speed, which is rounding.
+    """
+    by_constraints = jnp.min(_largest_term(rows * qdot, rows), axis=0)
+    root = jnp.sqrt(jnp.abs(jnp.diagonal(matrix)))[None]
+    by_energy = _largest_term(root * qdot, root)[0]
+    return jnp.where(by_constraints < jnp.inf, jnp.minimum(by_constraints, by_energy), 0.0)
 
 
 def _largest_term(terms, weights):

@@ -14,10 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function, accept
+from lagjax._derivation import columns_of, derivation_of, numbers_of
+from lagjax._equations import form_of
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
+from lagjax._linear import coupling_many, saddle_many
 from lagjax._motion import Motion, nearest_consistent
-from lagjax._settings import as_arrays, require_number
+from lagjax._program import Unlowerable
+from lagjax._settings import as_arrays, is_concrete, require_number
 
 PyTree = Any
 
@@ -166,8 +170,7 @@ class System(eqx.Module):
         ```
         """
         layout = Layout.of(q, qdot)
-        numbers = jax.tree.map(jnp.asarray, eqx.filter(params, eqx.is_array_like))
-        facts = explain(self.motion(layout, params), layout, numbers, self.path)
+        facts = explain(derivation_of(self, layout, as_arrays(params, layout.dtype)), self.path)
         if self.constraints is None and self.velocity_constraints is None:
             return facts
         names = self.constraint_names(layout, params)
@@ -254,8 +257,29 @@ class System(eqx.Module):
         layout = Layout.of(q, qdot)
         require_number(t, "t")
         q, qdot, t = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state")
-        value = _evaluate(self, quantity, q, qdot, t, as_arrays(params, layout.dtype))
-        return layout.restore(value) if restore else value
+        params = as_arrays(params, layout.dtype)
+        value = self._by_program(quantity, layout, q, qdot, t, params)
+        value = _evaluate(self, quantity, q, qdot, t, params) if value is None else value
+        return jax.tree.map(jnp.asarray, layout.restore(value) if restore else value)
+
+    def _by_program(self, quantity: Callable, layout: Layout, q, qdot, t, params) -> np.ndarray | None:
+        """A quantity at a state of numbers, from the scene's programs in NumPy: nothing is compiled.
+
+        None where something is being traced, or the scene has no programs.
+        """
+        known = all(is_concrete(leaf) for leaf in jax.tree.leaves((self, q, qdot, t, params)))
+        if self.path == "array" or quantity not in _OF_QUANTITIES or not known:
+            return None
+        names, function = _OF_QUANTITIES[quantity]
+        q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)])[None] for x in (q, qdot))
+        q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, t))
+        numbers = numbers_of(eqx.filter(params, eqx.is_array_like))
+        try:
+            values = derivation_of(self, layout, params).evaluate(names, columns_of(q, qdot, t, numbers))
+        except Unlowerable:
+            return None
+        with np.errstate(all="ignore"):
+            return function(values, qdot)[0]
 
     def _check_outputs(self, layout: Layout, params: PyTree) -> None:
         """Trace each function once, on shapes alone, and say what is wrong with what it returns."""
@@ -280,12 +304,39 @@ def require_system(system: Any) -> None:
         raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {system!r}.")
 
 
+_SADDLE = ("mass_matrix", "force", "jacobian", "target")
+
+
+def _solved(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    return saddle_many(*(of[name] for name in _SADDLE))
+
+
+# What the functions of `Motion` are in terms of `Motion.quantities` and q̇, at S states: names, and how to go on.
+_OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
+    Motion.acceleration: (_SADDLE, lambda of, v: _solved(of)[0]),
+    Motion.multipliers: (_SADDLE, lambda of, v: _solved(of)[1]),
+    Motion.constraint_force: (_SADDLE, lambda of, v: np.einsum("skn,sk->sn", of["jacobian"], _solved(of)[1])),
+    Motion.coupling: (("mass_matrix", "jacobian"), lambda of, v: coupling_many(of["mass_matrix"], of["jacobian"])),
+    Motion.mass_matrix: (("mass_matrix",), lambda of, v: of["mass_matrix"]),
+    Motion.momentum: (("momentum",), lambda of, v: of["momentum"]),
+    Motion.generalized_force: (("generalized_force",), lambda of, v: of["generalized_force"]),
+    Motion.residual: (("residual",), lambda of, v: of["residual"]),
+    Motion.energy: (
+        ("lagrangian", "momentum"),
+        lambda of, v: np.einsum("si,si->s", of["momentum"], v) - of["lagrangian"],
+    ),
+}
+
+
 @eqx.filter_jit
 def _evaluate(system: System, quantity: Callable, q, qdot, t, params):
     """One of `Motion`'s functions, compiled: one by one, its operations would take seconds to prepare."""
     layout = Layout.of(q, qdot)
-    numbers = eqx.filter(params, eqx.is_array)
-    return quantity(system.motion(layout, params), layout.flatten(q), layout.flatten(qdot), t, numbers)
+    numbers, state = eqx.filter(params, eqx.is_array), (layout.flatten(q), layout.flatten(qdot))
+    if quantity is Motion.acceleration:  # in the form in which diffrax integrates it
+        form = form_of(derivation_of(system, layout, params), "array" if system.path == "array" else "auto")
+        return form.acceleration(t, state, numbers)[0]
+    return quantity(system.motion(layout, params), *state, t, numbers)
 
 
 def _require_scalar(value: PyTree, role: str) -> None:

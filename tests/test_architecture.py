@@ -28,6 +28,7 @@ STREET = [
     "_transforms",
     "_linear",
     "_motion",
+    "_derivation",
     "_equations",
     "_explain",
     "_system",

@@ -329,6 +329,19 @@ def test_constraints_that_do_not_hold(name):
     assert not findings.ok and words in finding.message and finding.where[0].startswith("constraints['")
 
 
+def test_terms_that_cancel_to_rounding_are_no_wrong_derivative():
+    # A parallelogram of bars at rest, upright: the height of a crank has the derivative cos(π/2) = 6e-17 and no other.
+    lengths, q = jnp.array([1.0, 2.0, 1.0]), jnp.array([np.pi / 2, 0.0, -np.pi / 2])
+
+    def loop(q):
+        return {"x": jnp.sum(lengths * jnp.cos(q)) - 2.0, "y": jnp.sum(lengths * jnp.sin(q))}
+
+    bars = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * jnp.sin(q[0]), constraints=loop)
+    assert not lagjax.check(bars, q, jnp.zeros(3)).found
+    # In what is very small nothing is left of L: that is not a wrong derivative either.
+    assert kinds(lambda q, v: 0.5 * v**2 - 0.5 * q**2, 1e-200, 0.0) == {"small_state"}
+
+
 def test_a_saddle_point_that_is_singular():
     findings = held(lambda q: {"wall": q[0] - 0.6}, lagrangian=lambda q, v: 0.5 * v[0] ** 2 - q[1])
     assert only(findings).kind == "velocity_unused" and only(findings).where == ("q[1]",)
@@ -360,7 +373,8 @@ def test_numbers_that_are_given():
     assert {finding.where[0] for finding in findings} == {"q", "params['m']", "params['list'][1]"}
     whole = lagjax.check(lagjax.System(lambda q, v, params: params * v**2), 1.0, 0.0, params=2)
     assert only(whole).kind == "integer_parameter"
-    assert kinds(free, 1e-11, 0.0) == {"small_state"}
+    small = only(lagjax.check(lagjax.System(free), 1e-9, 0.0))
+    assert small.kind == "small_state" and "pass atol=1e-21" in small.message
     assert kinds(free, np.float32(1.0), np.float32(0.0)) == {"single_precision"}
 
 

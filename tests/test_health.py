@@ -92,13 +92,44 @@ def test_power_balance_with_friction_and_a_driving_force():
     health = trajectory.health()
     lost = np.ptp(np.asarray(trajectory.energy()))
     assert health.works and lost > 0.5
-    # Hermite's rule of order six at steps of 1/4 and frequencies up to 4 (of the power): 10 · 4 · (1/4 · 4)^6/100800.
+    # A quintic is off by h⁶ q⁽⁶⁾/46080 at most: steps of 1/4, and frequencies up to 4 of the power.
     assert health.energy.value < health.work_error < 4e-4 * lost
     assert flagged(health) == set()
     finer = lagjax.simulate(driven, 1.0, 0.0, jnp.linspace(0.0, 10.0, 401)).health()
-    assert finer.energy.value < finer.work_error < 1e-5 * health.work_error and flagged(finer) == set()
+    assert finer.work_error < 1e-5 * health.work_error and flagged(finer) == set()
+    assert finer.energy.value < finer.energy_allowed + finer.work_error
     forgotten = dataclasses.replace(trajectory, system=lagjax.System(driven.lagrangian.code, forces=driven.forces.code))
     assert flagged(forgotten.health()) == {"energy"}
+
+
+def test_a_power_balance_that_so_few_outputs_cannot_tell():
+    # Three outputs in twenty periods of a force that pumps and drains: the work between them is anybody's guess.
+    driven = lagjax.System(
+        lambda q, v: 0.5 * v**2 - 0.5 * q**2,
+        forces=lambda q, v, t: jnp.sin(7 * t),
+        dissipation=lambda q, v: 0.05 * v**2,
+    )
+    few, more = (lagjax.simulate(driven, 1.0, 0.0, jnp.linspace(0.0, 20.0, T)).health() for T in (3, 81))
+    assert few.energy.value > 1e3 * few.energy_allowed and flagged(few) == set()
+    (sentence,) = few.findings()
+    assert "cannot be told from 3 outputs" in sentence and f"about {few.outputs_needed:.0f} outputs" in sentence
+    assert sentence[:60] in str(few) and "nothing suspicious" not in str(few)
+    assert more.outputs_needed == 81 and more.findings() == () and more.energy.value < more.work_error
+
+
+@pytest.mark.parametrize("amplitude", [1e-9, 1e-12, 1e-200])
+def test_a_motion_that_is_small_beside_atol(amplitude):
+    def swung(**options):
+        run = lagjax.simulate(OSCILLATOR, amplitude, 0.0, TS, {"k": 1.0}, **options)
+        return np.abs(run.q - amplitude * np.cos(TS)).max() / amplitude, run.health()
+
+    error, health = swung()
+    assert error > 1e-5 and "amplitude" in flagged(health)
+    advice = next(sentence for sentence in health.findings() if sentence.startswith("Amplitude"))
+    error, health = swung(atol=float(advice.split("atol=")[1].rstrip(".")))
+    assert error < 1e-9 and flagged(health) == set() and health.findings() == ()
+    # What rests is not small, it is exact.
+    assert lagjax.simulate(OSCILLATOR, 0.0, 0.0, TS, {"k": 1.0}).health().findings() == ()
 
 
 def test_work_of_constraints_that_move():
@@ -286,6 +317,33 @@ def test_batch_vmap_and_jit_agree():
         for a, b in zip(jax.tree.leaves(batch), jax.tree.leaves(other), strict=True):
             np.testing.assert_allclose(np.asarray(a, float), np.asarray(b, float), rtol=1e-6, atol=1e-14)
     assert twice.energy.value.shape == (2, 3) and "in member (" in str(twice)
+
+
+def test_numbers_and_traced_values_are_measured_alike():
+    # By programs in NumPy, and in JAX: with constraints, forces, a conserved momentum, and modes.
+    held = lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * q[1],
+        constraints=lambda q, t: q[0] ** 2 + q[1] ** 2 - (1 + 0.1 * jnp.sin(t)) ** 2,
+        dissipation=lambda q, v: 0.05 * v[0] ** 2,
+    )
+    start = jnp.array([1.0, 0.0, 0.3]), jnp.array([0.1, 0.0, 1.0])
+    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q, dissipation=lambda q, v: 0.1 * v**2)
+    bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.8 * v))
+    for run in (
+        lagjax.simulate(held, *start, jnp.linspace(0.0, 2.0, 21)),
+        lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, jnp.linspace(0.0, 1.5, 31)),
+    ):
+        eager, traced = run.health(), jax.jit(lambda run: run.health())(run)
+        assert eager.works and (eager.work_error > 0).all() and flagged(eager) == set()
+        assert jax.tree.structure(eager) == jax.tree.structure(traced)
+        for of in (
+            lambda health: (health.energy.value, health.energy_allowed, health.work_error, health.outputs_needed),
+            lambda health: (health.amplitude, health.momentum.value, health.momentum_allowed),
+            lambda health: (health.constraint_distance.value, health.constraint_rate.value, health.constraint_allowed),
+            lambda health: (*health.smallest_eigenvalue, health.condition.value, health.gradients_finite),
+        ):
+            for a, b in zip(of(eager), of(traced), strict=True):
+                np.testing.assert_allclose(np.asarray(a, float), np.asarray(b, float), rtol=1e-4, atol=1e-11)
 
 
 def test_a_new_value_never_recompiles():

@@ -1,7 +1,7 @@
 """`check`: what is wrong with a scene at a state, before anything is integrated.
 
-Everything is computed once, compiled together: values, derivatives, their finite differences, the mass matrix at states
-nearby, the linearised motion. What follows is NumPy and sentences, each file for one question:
+Everything is computed once, by the programs of the scene: values, derivatives, their finite differences, the mass
+matrix at states nearby, the linearised motion. What follows is NumPy and sentences, each file for one question:
 
     Scene.of ─► _derivatives ─► _constraints ─► _mass ─► _borders ─► _stiffness ─► Findings
     _measure    _differences
@@ -25,6 +25,9 @@ from lagjax._system import System, require_system
 __all__ = ["Finding", "Findings", "check"]
 
 PyTree = Any
+
+# Of atol: in a motion that is smaller, the errors that atol allows add up to a hundredth within a hundred steps.
+_SMALLEST = 1e4
 
 
 def check(system: System, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> Findings:
@@ -92,11 +95,11 @@ def _inputs(layout: Layout, q, qdot, t, params) -> list[Finding]:
     found += _precision(layout, q, qdot, params)
     state = np.abs([float(x) for leaf in jax.tree.leaves((q, qdot)) for x in np.ravel(leaf)])
     atol = 1e-3 * DEFAULT_RTOL[layout.dtype]
-    if state.any() and state.max() < 1e3 * atol:
+    if state.any() and state.max() < _SMALLEST * atol:
         message = (
             f"The largest number of the state is {state.max():.1e}, near the default atol of {atol:.0e}, which is in "
-            "the units of the state: errors of that size are allowed. Use units in which the motion is of order one, "
-            "or pass a smaller atol."
+            "the units of the state: errors of that size are allowed in every step. Use units in which the motion is "
+            f"of order one, or pass atol={1e-3 * DEFAULT_RTOL[layout.dtype] * state.max():.0e}."
         )
         found.append(Finding("small_state", "advice", layout.names, message))
     return found

@@ -14,7 +14,9 @@ import numpy as np
 
 from lagjax._check._findings import Finding
 from lagjax._check._measure import Scene
-from lagjax._check._operations import borders
+from lagjax._check._operations import borders, pieces_of
+from lagjax._derivation import numbers_of
+from lagjax._program import Unlowerable, lower
 
 _REACH = 10  # looked at are 2⁻⁹ … 1 sizes of a coordinate
 
@@ -31,31 +33,55 @@ class Jump(NamedTuple):
 
 def findings(scene: Scene) -> list[Finding]:
     """The nearest jump, if there is one."""
-    motion, state = scene.motion, scene.state
+    motion = scene.motion
     functions = [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
-    *y, params = state
-    pieces = [piece for function in functions for piece in borders(function, *state)]
+    pieces = [piece for function in functions for piece in pieces_of(function, *scene.state)]
     if not pieces:
         return []
-    n, start = len(y[0]), jnp.concatenate([y[0], y[1], jnp.reshape(y[2], 1)])
-
-    def at(point):
-        return point[:n], point[n:-1], point[-1], params
-
-    @jax.jit
-    def sides(point):
-        found = [piece for function in functions for piece in borders(function, *at(point))]
-        return jnp.concatenate([jnp.ravel(side) for _, _, side in found])
-
-    @jax.jit
-    def look(point):
-        mass, force = motion.mass_matrix_and_force(*at(point))
-        return motion.lagrangian(*at(point)), motion.momentum(*at(point)), mass, force
-
-    labels = [f"{name}{place}" for name, place, side in pieces for _ in range(np.size(side))]
+    *y, _ = scene.state
+    start = np.concatenate([np.ravel(x) for x in y])
+    sides, look = _followed(scene, functions)
+    labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
     jumps = [jump for name, size, vector in _directions(scene) for sign in (1, -1)
              if (jump := _first_jump(sides, look, start, sign * vector, (name, size), labels)) is not None]  # fmt: skip
     return [_finding(min(jumps))] if jumps else []
+
+
+def _followed(scene: Scene, functions: list[Callable]) -> tuple[Callable, Callable]:
+    """Two functions of states (S, 2n + 1): on which sides of the borders they are, and L, p, M and the force there.
+
+    By programs where the scene has them, else compiled by XLA.
+    """
+    n, derivation, params = scene.layout.size, scene.derivation, scene.state[3]
+
+    def sides_at(q, v, t, params):
+        found = [piece for function in functions for piece in borders(function, q, v, t, params)]
+        return jnp.concatenate([jnp.ravel(side) for _, _, side in found])
+
+    names = ("lagrangian", "momentum", "mass_matrix", "force")
+    try:
+        derivation.program(*names)
+        program, numbers = lower(sides_at, *scene.state), numbers_of(params)
+
+        def sides(points):
+            return program.evaluate_many([*points.T, *numbers]).T
+
+        def look(points):
+            values = derivation.evaluate(names, [*points.T, *numbers])
+            return [values[name] for name in names]
+
+        return sides, look
+    except Unlowerable:
+        motion = scene.motion
+
+        def at(point):
+            return point[:n], point[n:-1], point[-1], params
+
+        def looked(point):
+            mass, force = motion.mass_matrix_and_force(*at(point))
+            return motion.lagrangian(*at(point)), motion.momentum(*at(point)), mass, force
+
+        return tuple(jax.jit(jax.vmap(of)) for of in (lambda point: sides_at(*at(point)), looked))
 
 
 def _directions(scene: Scene) -> list[tuple[str, float, np.ndarray]]:
@@ -68,26 +94,31 @@ def _directions(scene: Scene) -> list[tuple[str, float, np.ndarray]]:
 
 def _first_jump(sides: Callable, look: Callable, start, vector, axis, labels: list[str]) -> Jump | None:
     """The nearest border along `vector`, if something jumps there."""
-    here, eps = np.asarray(sides(start)), float(jnp.finfo(start.dtype).eps)
-    vector = jnp.asarray(vector, start.dtype)
+    eps, vector = float(np.finfo(start.dtype).eps), np.asarray(vector, start.dtype)
+
+    def at(steps):
+        return start + np.asarray(steps, start.dtype)[:, None] * vector
+
     # One step so small that only a border at the state itself lies within it, then longer and longer ones.
-    reach = [4 * eps * (1 + float(jnp.max(jnp.abs(start)))), *2.0 ** np.arange(1 - _REACH, 1)]
-    past = next((k for k, s in enumerate(reach) if not np.array_equal(sides(start + s * vector), here, True)), None)
+    reach = [4 * eps * (1 + float(np.max(np.abs(start)))), *2.0 ** np.arange(1 - _REACH, 1)]
+    here, *ahead = np.asarray(sides(at([0.0, *reach])))
+    past = next((k for k, side in enumerate(ahead) if not np.array_equal(side, here, True)), None)
     if past is None:
         return None
     inside, beyond = (reach[past - 1] if past else 0.0), reach[past]
-    for _ in range(60 if past else 0):
-        middle = 0.5 * (inside + beyond)
-        same = np.array_equal(sides(start + middle * vector), here, True)
-        inside, beyond = (middle, beyond) if same else (inside, middle)
-    there = np.asarray(sides(start + beyond * vector))
+    for _ in range(12 if past else 0):  # five halvings at once
+        between = np.linspace(inside, beyond, 33)[1:]
+        changed = [not np.array_equal(side, here, True) for side in np.asarray(sides(at(between)))]
+        first = changed.index(True) if True in changed else len(between) - 1
+        inside, beyond = (between[first - 1] if first else inside), between[first]
+    there = np.asarray(sides(at([beyond])))[0]
     place = int(np.argmax(there != here))
     # What changes, against its size here, there, and on a little: a force that sets in at zero does not jump.
-    seen = [look(start + s * vector) for s in (inside if past else -beyond, beyond, 0.0, beyond + 0.1)]
-    for what, *values in zip(("L", "the momentum", "the mass matrix", "the force"), *seen, strict=True):
-        one, other, *_ = values = [np.asarray(value) for value in values]
+    seen = look(at([inside if past else -beyond, beyond, 0.0, beyond + 0.1]))
+    for what, values in zip(("L", "the momentum", "the mass matrix", "the force"), seen, strict=True):
+        one, other, *_ = values = np.asarray(values)
         if np.isfinite(one).all() and np.isfinite(other).all():
-            if np.abs(one - other).max() > np.sqrt(eps) * np.nanmax([np.abs(value).max() for value in values]):
+            if np.abs(one - other).max() > np.sqrt(eps) * np.nanmax(np.abs(values)):
                 sizes = beyond if past else 0.0
                 return Jump(sizes, axis[0], sizes * axis[1], labels[place], what)
     return None

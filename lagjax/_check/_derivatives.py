@@ -5,7 +5,7 @@ import numpy as np
 from lagjax._check._differences import Slopes, differ, slopes
 from lagjax._check._findings import Finding, listed
 from lagjax._check._measure import Scene
-from lagjax._check._operations import Offender, borders, offenders
+from lagjax._check._operations import Offender, offenders, pieces_of
 
 _SHOWN = 3  # findings of one kind about one function
 
@@ -98,7 +98,7 @@ def _remedy(offender: Offender) -> str:
 
 def _blame_for_kink(scene: Scene, role: str) -> str:
     function = getattr(scene.motion, role)
-    places = list(dict.fromkeys(f"{name}{place}" for name, place, _ in borders(function, *scene.state)))
+    places = list(dict.fromkeys(f"{name}{place}" for name, place, _ in pieces_of(function, *scene.state)))
     return f" (the function is pieced together by {listed(places, 3)})" if places else ""
 
 
@@ -110,24 +110,24 @@ def _blocks(scene: Scene):
     m, n = scene.measured, scene.layout.size
     first, dragged = 1 + n, scene.motion.dissipation is not None
     held = first + dragged
-    by_y = np.concatenate([m.by_q, m.momentum[0]])[:, None]
-    # The drift is a difference, and has the rounding of its terms.
-    lost = (
-        4 * np.finfo(scene.layout.dtype).eps * (abs(m.by_q) + abs(m.extra) + abs(m.by_v_of_dissipation) + abs(m.force))
-    )
-    along = Slopes(np.concatenate([m.mass[0], scene.drift[None]]), np.concatenate([0 * m.mass[0], lost[None]]))
+    # Derivatives by automatic differentiation have the rounding of their terms, which may cancel.
+    of_q, of_v, of_mass, of_drift, of_drag, of_rows = m.round_off
+    by_y = Slopes(*(np.concatenate(parts)[:, None] for parts in ((m.by_q, m.momentum[0]), (of_q, of_v))))
+    along = Slopes(np.concatenate([m.mass[0], scene.drift[None]]), np.concatenate([of_mass, of_drift[None]]))
     blocks = [
         ("L", "lagrangian", by_y, range(2 * n), range(1)),
         ("p = dL/dqdot", "lagrangian", along, range(n, 2 * n + 1), range(1, first)),
     ]
     if dragged:
-        blocks.append(("D", "dissipation", m.by_v_of_dissipation[:, None], range(n, 2 * n), range(first, held)))
+        by_v = Slopes(m.by_v_of_dissipation[:, None], of_drag[:, None])
+        blocks.append(("D", "dissipation", by_v, range(n, 2 * n), range(first, held)))
     count = len(scene.residual)
     if np.isfinite(scene.residual).all() and np.isfinite(m.rows[0]).all():
         positions = position_count(scene)
+        by_q, by_v = (Slopes(m.rows[0, k].T, of_rows[k].T) for k in (slice(positions), slice(positions, None)))
         blocks += [
-            ("a constraint", "constraints", m.rows[0, :positions].T, range(n), range(held, held + positions)),
-            ("a velocity constraint", "velocity_constraints", m.rows[0, positions:].T, range(n, 2 * n),
+            ("a constraint", "constraints", by_q, range(n), range(held, held + positions)),
+            ("a velocity constraint", "velocity_constraints", by_v, range(n, 2 * n),
              range(held + positions, held + count)),
         ]  # fmt: skip
     return [block for block in blocks if len(block[-1])]
@@ -135,8 +135,7 @@ def _blocks(scene: Scene):
 
 def position_count(scene: Scene) -> int:
     """How many of the constraints are on positions; they come first."""
-    q, _, t, params = scene.state
-    return 0 if scene.motion.constraints is None else len(scene.motion.constraints(q, t, params))
+    return scene.derivation.position_count
 
 
 def _compared(scene: Scene, name, role, derivative, directions, outputs) -> list[Finding]:
@@ -145,11 +144,10 @@ def _compared(scene: Scene, name, role, derivative, directions, outputs) -> list
     place = _places(scene)[list(directions)]
     both, ahead, behind = slopes(
         m.minus[chosen], m.here[list(outputs)], m.plus[chosen], scene.steps[:, list(directions)], place,
-        float(np.finfo(dtype).eps),
+        float(np.finfo(dtype).eps), m.noise[list(outputs)],
     )  # fmt: skip
     kinks = differ(ahead, behind, dtype)
-    given = derivative if isinstance(derivative, Slopes) else Slopes(derivative, np.zeros_like(derivative))
-    derivative, wrong = given.value, differ(given, both, dtype) & ~kinks
+    derivative, wrong = derivative.value, differ(derivative, both, dtype) & ~kinks
     names, found = [scene.names[i] for i in directions], []
     for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
         message = (

@@ -31,13 +31,15 @@ def ladder(size: np.ndarray, dtype) -> np.ndarray:
     return (size * 0.25 * 2.0 ** -np.arange(rungs)[:, None]).astype(dtype)
 
 
-def slopes(minus, here, plus, steps, place, eps: float) -> tuple[Slopes, Slopes, Slopes]:
+def slopes(minus, here, plus, steps, place, eps: float, noise=0.0) -> tuple[Slopes, Slopes, Slopes]:
     """Two-sided, forward and backward, from f(x − h e), f(x) and f(x + h e).
 
     `minus` and `plus` have the shape (directions, rungs, outputs), `here` (outputs,), `steps` (rungs, directions),
-    `place` (directions,): the coordinate itself, whose rounding moves f.
+    `place` (directions,): the coordinate itself, whose rounding moves f. `noise` (outputs,): how far the rounding of
+    terms that cancel may move f beyond that of its value.
     """
     h, here = steps.T[:, 1:, None], np.asarray(here, float)
+    least = float(np.finfo(steps.dtype).tiny)  # what is smaller underflows
     minus, plus = np.asarray(minus, float), np.asarray(plus, float)
     near, far = (plus[:, 1:], minus[:, 1:]), (plus[:, :-1], minus[:, :-1])
     size = np.maximum(np.maximum(np.abs(near[0]), np.abs(near[1])), np.abs(here))
@@ -49,7 +51,8 @@ def slopes(minus, here, plus, steps, place, eps: float) -> tuple[Slopes, Slopes,
         def best(x):
             # f has the rounding of its value, and of every coordinate in it.
             terms = np.abs(place)[:, None, None] * np.abs(x)
-            return _best(x, eps * (size + np.sum(np.where(np.isfinite(terms), terms, 0), axis=0)) / h)
+            moved = eps * (size + np.sum(np.where(np.isfinite(terms), terms, 0), axis=0)) + noise
+            return _best(x, (moved + least) / h)
 
         return best(both), best(ahead), best(behind)
 

@@ -1,4 +1,8 @@
-"""Everything `check` has to compute, compiled together: of a scene, at a state and around it."""
+"""Everything `check` has to compute: of a scene, at a state and around it.
+
+By the scene's programs, in NumPy, which compiles nothing. A scene that has none (arrays in its functions, operations
+without a scalar form, far too many of them) is compiled by XLA.
+"""
 
 from typing import Any, NamedTuple
 
@@ -8,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._check._differences import ladder
+from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._layout import Layout
 from lagjax._motion import Motion
+from lagjax._program import Unlowerable
 from lagjax._settings import as_arrays
 from lagjax._system import System
 
@@ -24,6 +30,7 @@ class Scene(NamedTuple):
 
     system: System
     layout: Layout
+    derivation: Derivation
     motion: Motion
     given: tuple  # q, qdot, t, params in the user's pytrees
     state: tuple  # q, q̇, t and the numbers in params
@@ -36,11 +43,13 @@ class Scene(NamedTuple):
         """Measure `system` at a state."""
         q, qdot, t, params = as_arrays((q, qdot, 1.0 * t, params), layout.dtype)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)
-        sizes = _sizes(layout, q, qdot)
-        steps = ladder(sizes, layout.dtype)
-        measured = jax.tree.map(np.asarray, _measure(system, q, qdot, t, params, steps, _offsets(layout, q, sizes)))
-        motion = system.motion(layout, params)
-        return cls(system, layout, motion, (q, qdot, t, params), state, sizes, steps, measured)
+        sizes, derivation = _sizes(layout, q, qdot), derivation_of(system, layout, params)
+        steps, offsets = ladder(sizes, layout.dtype), _offsets(layout, q, sizes)
+        try:
+            measured = _evaluated(derivation, state, steps, offsets)
+        except Unlowerable:
+            measured = jax.tree.map(np.asarray, _measure(system, q, qdot, t, params, steps, offsets))
+        return cls(system, layout, derivation, derivation.motion, (q, qdot, t, params), state, sizes, steps, measured)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -87,8 +96,11 @@ class Scene(NamedTuple):
 
     def jacobian(self) -> np.ndarray:
         """∂q̈/∂(q, q̇), (n, 2n): by the implicit function."""
-        (q, qdot, t, params), (acceleration, multipliers) = self.given, self.solved()
-        varied = np.asarray(_variation(self.system, q, qdot, t, params, acceleration, multipliers))
+        acceleration, multipliers = self.solved()
+        try:
+            varied = _program_variation(self.derivation, self.state, acceleration, multipliers)
+        except Unlowerable:
+            varied = np.asarray(_variation(self.system, *self.given, acceleration, multipliers))
         return self._solve(-varied)[: self.layout.size]
 
     def _solve(self, b: np.ndarray) -> np.ndarray:
@@ -123,6 +135,8 @@ class Measured(NamedTuple):
     minus: Any  # L, p, D if there is one, and the constraints at steps back, (2n + 1, rungs, outputs)
     here: Any  # the same at the state, (outputs,)
     plus: Any  # and ahead
+    noise: Any  # how far rounding may move `here`, (outputs,)
+    round_off: Any  # and the derivatives by_q (n,), momentum (n,), mass (n, n), drift (n,), by_v_of_dissipation, rows
 
 
 def _sizes(layout: Layout, q: PyTree, qdot: PyTree) -> np.ndarray:
@@ -155,6 +169,67 @@ def _offsets(layout: Layout, q: PyTree, sizes: np.ndarray) -> np.ndarray:
     moved[:_NEARBY, n:] = 0
     moved[_NEARBY:, :n] = 0
     return np.concatenate([np.zeros((1, 2 * n)), moved]).astype(layout.dtype)
+
+
+_COMPARED = ("lagrangian", "momentum", "dissipation", "residual")
+_DRIFT = ("lagrangian_by_q", "given_force", "dissipation_by_qdot", "force")
+
+
+def _evaluated(derivation: Derivation, state, steps: np.ndarray, offsets: np.ndarray) -> Measured:
+    """Everything by the programs of a derivation; raises `Unlowerable`."""
+    q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
+    n = len(q)
+    near = derivation.evaluate(
+        ("momentum", "mass_matrix", "jacobian"), columns_of(q + offsets[:, :n], v + offsets[:, n:], t, numbers)
+    )
+    damping = columns_of(q + 0 * offsets[:, :n], v + offsets[:, n:], t, numbers)
+    terms = derivation.evaluate(("dissipation_by_qdot",), damping)["dissipation_by_qdot"] * (v + offsets[:, n:])
+    names = ("lagrangian_by_q", "force", "given_force", "dissipation_by_qdot", "target")
+    one = columns_of(q[None], v[None], t, numbers)
+    here = {name: value[0] for name, value in derivation.evaluate(names, one).items()}
+
+    directions = np.eye(2 * n + 1, dtype=q.dtype)
+    directions[-1, :n] = v
+    moves = np.stack([-steps, steps]).transpose(2, 0, 1)[..., None] * directions[:, None, None]
+    along = (np.concatenate([q, v, t[None]]) + moves).reshape(-1, 2 * n + 1)
+    sides = derivation.program(*_COMPARED).evaluate_many([*along.T, *numbers]).T
+    sides = sides.reshape(2 * n + 1, 2, len(steps), -1)
+    derived = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissipation_by_qdot", "force", "jacobian")
+    lost = {name: value[0] for name, value in derivation.round_off(derived, one).items()}
+    return Measured(
+        by_q=here["lagrangian_by_q"],
+        momentum=near["momentum"],
+        mass=near["mass_matrix"],
+        force=here["force"],
+        extra=here["given_force"],
+        by_v_of_dissipation=here["dissipation_by_qdot"],
+        rows=near["jacobian"],
+        targets=here["target"],
+        velocity=v + offsets[:, n:],
+        power=np.stack([terms.sum(axis=1), np.abs(terms).sum(axis=1)], axis=1),
+        minus=sides[:, 0],
+        here=derivation.program(*_COMPARED).evaluate_many(one)[:, 0],
+        plus=sides[:, 1],
+        noise=derivation.program(*_COMPARED).round_off_many(one)[:, 0],
+        round_off=(
+            lost["lagrangian_by_q"], lost["momentum"], lost["mass_matrix"],
+            sum(lost[name] + np.finfo(q.dtype).eps * abs(here[name]) for name in _DRIFT),
+            lost["dissipation_by_qdot"], lost["jacobian"],
+        ),
+    )  # fmt: skip
+
+
+def _program_variation(derivation: Derivation, state, acceleration, multipliers) -> np.ndarray:
+    """`_variation` by one transposed derivative of the program of M, F, G and γ, all equations side by side."""
+    q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
+    n, m = len(q), len(multipliers)
+    unit = np.eye(n + m, dtype=q.dtype)
+    cotangents = [unit[i] * acceleration[j] for i in range(n) for j in range(n)]
+    cotangents += [unit[n + k] * acceleration[i] - unit[i] * multipliers[k] for k in range(m) for i in range(n)]
+    cotangents += [-unit[i] for i in range(n + m)]
+    program = derivation.program("mass_matrix", "jacobian", "force", "target")
+    found = program.pull_back_many([*q, *v, t, *numbers], cotangents)[: 2 * n]
+    return np.stack([np.zeros(n + m) if bar is None else np.broadcast_to(bar, n + m) for bar in found], axis=1)
 
 
 @eqx.filter_jit
@@ -191,13 +266,21 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
     small = n <= _LARGEST_AT_ONCE
     sides = jax.vmap(along)(directions, steps.T) if small else jax.lax.map(lambda x: along(*x), (directions, steps.T))
     momentum, mass, force, rows, targets, velocity = jax.vmap(nearby)(offsets)
+    by_q = Motion(motion.lagrangian, None, None).generalized_force(*state)
+    extra = jnp.zeros_like(q) if motion.forces is None else motion.forces(*state)
+    dragged = -damped.nonconservative_force(*state)
+
+    def rounding(*terms):  # of derivatives whose own terms are not known
+        size = sum(jnp.max(jnp.abs(term), initial=0.0) for term in terms)
+        return jnp.full(terms[0].shape, 4 * jnp.finfo(q.dtype).eps * size)
+
     return Measured(
-        by_q=Motion(motion.lagrangian, None, None).generalized_force(*state),
+        by_q=by_q,
         momentum=momentum,
         mass=mass,
         force=force[0],
-        extra=jnp.zeros_like(q) if motion.forces is None else motion.forces(*state),
-        by_v_of_dissipation=-damped.nonconservative_force(*state),
+        extra=extra,
+        by_v_of_dissipation=dragged,
         rows=rows,
         targets=targets[0],
         velocity=velocity,
@@ -205,7 +288,12 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
         minus=sides[:, 0],
         here=everything(y),
         plus=sides[:, 1],
-    )
+        noise=jnp.zeros_like(everything(y)),
+        round_off=(
+            *map(rounding, (by_q, momentum[0], mass[0])), rounding(by_q, extra, dragged, force[0]),
+            *map(rounding, (dragged, rows[0])),
+        ),
+    )  # fmt: skip
 
 
 @eqx.filter_jit

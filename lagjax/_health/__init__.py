@@ -16,13 +16,16 @@ of the state y = (q, q̇), and what is conserved keeps what it is given: after N
 times √(2n) `SLACK` for solvers that measure errors in root mean square, and round-off. Other errors, those of q above
 all, may grow with the motion: there is no bound for them, only a second trajectory to compare with.
 
-Between outputs the power is integrated by Hermite's rule from P, Ṗ and P̈ at both ends, derivatives along the motion. It
-is of order six; how far it may be off is told by the rules of order four and two. Source: Hairer, Nørsett & Wanner,
-*Solving Ordinary Differential Equations I*, §II.4 (error per step); Davis & Rabinowitz, *Methods of Numerical
-Integration*, §2.9 (the trapezoidal rule with end corrections).
+Between outputs the power is integrated along the polynomial of degree five that has q, q̇ and q̈ of both ends. That is
+of order six; how far it may be off is told by the cubic through q and q̇, of order four, and the trapezoidal rule.
+Where the balance is off by more than a hundredth of the energy, and the work may be, the verdict says that it cannot
+be told. Source:
+Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.4 (error per step), §II.6 (Hermite
+interpolation).
 """
 
 import textwrap
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,8 +33,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._health._compare import global_error
-from lagjax._health._measure import SLACK, VISIBLE, Extreme, measured
+from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measured
 from lagjax._results import RESULTS, advice
+from lagjax._settings import is_concrete
 
 __all__ = ["Extreme", "Health", "examine"]
 
@@ -48,6 +52,7 @@ def examine(trajectory, reference=None) -> "Health":
         accepted_steps=jnp.asarray(trajectory.stats["num_accepted_steps"]),
         rejected_steps=jnp.asarray(trajectory.stats["num_rejected_steps"]),
         global_error=None if reference is None else global_error(trajectory, reference),
+        outputs=trajectory.ts.shape[-1],
         works=names.works,
         momentum_names=names.momenta,
         constraint_names=names.constraints,
@@ -64,10 +69,13 @@ class Health(eqx.Module):
     - `result`, `ok`, `accepted_steps`, `rejected_steps`: as in the trajectory.
     - `energy`: the largest |h − h₀ − W|, in units of energy, W the work done by forces, by an explicit time and by
       moving constraints. `energy_allowed`: what the tolerances and round-off may add up to. `work_error`: how well W is
-      known from the outputs alone, zero where nothing does work; an imbalance below it means nothing, and outputs
-      closer to each other would tell more. Where a transition lies between two outputs, what it takes is left out, and
+      known from the outputs alone, zero where nothing does work; an imbalance below it means nothing.
+      `outputs_needed`: about how many outputs would tell whether the power is balanced; the number of outputs where
+      these do. Where a transition lies between two outputs, what it takes is left out, and
       so is the time from it to the next output.
-    - `momentum`: the same for each momentum that is conserved, pᵢ with ∂L/∂qᵢ = 0 and no force of any kind on it; a
+    - `amplitude`: the largest change of a coordinate; infinite where nothing moves. `amplitude_needed`: the size below
+      which atol allows errors of a ten-thousandth of it or more in every step; zero for fixed steps.
+    - `momentum`, as `energy`: for each momentum that is conserved, pᵢ with ∂L/∂qᵢ = 0 and no force of any kind on it; a
       last axis for those in `momentum_names`, which is None where the scene is too large to see which; and
       `momentum_allowed`.
     - `constraint_distance`: for each of `constraint_names` (a last axis) the largest distance |f| / |∂f/∂q| of q from
@@ -91,6 +99,9 @@ class Health(eqx.Module):
     energy: Extreme
     energy_allowed: jax.Array
     work_error: jax.Array
+    outputs_needed: jax.Array
+    amplitude: jax.Array
+    amplitude_needed: jax.Array
     momentum: Extreme
     momentum_allowed: jax.Array
     constraint_distance: Extreme
@@ -103,6 +114,7 @@ class Health(eqx.Module):
     gradients_finite: jax.Array
     gradients_time: jax.Array
     global_error: Extreme | None
+    outputs: int = eqx.field(static=True)
     works: bool = eqx.field(static=True)
     momentum_names: tuple[str, ...] | None = eqx.field(static=True)
     constraint_names: tuple[str, ...] = eqx.field(static=True)
@@ -110,35 +122,65 @@ class Health(eqx.Module):
     @property
     def suspicious(self) -> jax.Array:
         """Whether anything is, for each member."""
-        return jnp.any(jnp.stack(list(self.checks().values())), axis=0)
+        flags, xp = self._flags()
+        return jnp.asarray(xp.any(xp.stack(list(flags.values())), axis=0))
 
-    @eqx.filter_jit
     def checks(self) -> dict[str, jax.Array]:
         """What is suspicious, by name: a Boolean for each member. A NaN at a state that was reached is."""
-        energy = self.energy_allowed + SLACK * self.work_error
-        tries = self.accepted_steps + self.rejected_steps
-        found = {
-            "result": ~self.ok,
-            "energy": _exceeds(self.energy, energy),
-            "momentum": _exceeds(self.momentum, self.momentum_allowed).any(axis=-1),
-            "constraints": _exceeds(self.constraint_distance, self.constraint_allowed[..., :1]).any(axis=-1)
-            | _exceeds(self.constraint_rate, self.constraint_allowed[..., 1:]).any(axis=-1),
-            "mass_matrix": _exceeds(self.scaled_condition, self.scaled_condition_allowed),
-            "gradients": ~self.gradients_finite,
-            "steps": self.rejected_steps > jnp.maximum(UNSTEADY * tries, 20),
-        }
-        if self.global_error is not None:
-            found["global_error"] = _exceeds(self.global_error, VISIBLE)
-        return found
+        return {name: jnp.asarray(flag) for name, flag in self._flags()[0].items()}
+
+    def _flags(self) -> tuple[dict, Any]:
+        """`checks`, and the library they are computed in: NumPy where nothing is being traced."""
+        concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves(self))
+        xp = np if concrete else jnp
+        of = jax.tree.map(np.asarray, self) if concrete else self
+        energy = of.energy_allowed + SLACK * of.work_error
+        tries = of.accepted_steps + of.rejected_steps
+        with np.errstate(invalid="ignore"):
+            found = {
+                "result": ~of.ok,
+                "energy": _exceeds(xp, of.energy, energy) & ~(of.outputs_needed > of.outputs),
+                "amplitude": of.amplitude < of.amplitude_needed,
+                "momentum": _exceeds(xp, of.momentum, of.momentum_allowed).any(axis=-1),
+                "constraints": _exceeds(xp, of.constraint_distance, of.constraint_allowed[..., :1]).any(axis=-1)
+                | _exceeds(xp, of.constraint_rate, of.constraint_allowed[..., 1:]).any(axis=-1),
+                "mass_matrix": _exceeds(xp, of.scaled_condition, of.scaled_condition_allowed),
+                "gradients": ~of.gradients_finite,
+                "steps": of.rejected_steps > xp.maximum(UNSTEADY * tries, 20),
+            }
+            if of.global_error is not None:
+                found["global_error"] = _exceeds(xp, of.global_error, VISIBLE)
+        return found, xp
 
     def findings(self) -> tuple[str, ...]:
-        """What is suspicious, as sentences that say what to do; none where nothing is."""
-        flags = self.checks()  # which `jit` has put in another order
+        """What is suspicious or cannot be told, as sentences that say what to do; none where all is well."""
+        flags = self._flags()[0]
         found = {name: np.asarray(flags[name]) for name in _SENTENCES if name in flags and np.any(flags[name])}
-        sentences = [_SENTENCES[name].format(_who(flags)) for name, flags in found.items()]
+        sentences = {name: _SENTENCES[name].format(_who(flags)) for name, flags in found.items()}
         if "result" in found:
-            sentences[0] += " " + self._advice()
-        return tuple(sentences)
+            sentences["result"] += " " + self._advice()
+        if "amplitude" in found:
+            # Beside the motion what the atol that was given is beside one of order one.
+            wanted = np.where(found["amplitude"], np.asarray(self.amplitude * self.amplitude_needed), np.inf)
+            sentences["amplitude"] += f"{np.min(wanted) / SMALLEST:.0e}."
+        return (*sentences.values(), *self._untold())
+
+    def _untold(self) -> tuple[str, ...]:
+        """A sentence where the power balance cannot be told."""
+        given, needed = np.asarray(self.outputs), np.asarray(self.outputs_needed)
+        untold = needed > given
+        if not untold.any():
+            return ()
+        most = needed[untold].max()
+        advice = (
+            f"Ask for at least about {most:.0f} outputs over the same time, evenly spread."
+            if np.isfinite(most)
+            else "The power is not finite or not smooth somewhere: give it in modes of simulate_hybrid."
+        )
+        return (
+            f"Power balance: cannot be told{_who(untold)} from {given} outputs, between which the work is not known to "
+            f"a hundredth of the energy. {advice}",
+        )
 
     def __str__(self) -> str:
         rows = [("result", self._results()), ("steps", self._steps())]
@@ -149,14 +191,14 @@ class Health(eqx.Module):
             rows.append(("momenta", "too many coordinates to see which are conserved"))
         rows += _by_name("momenta", self.momentum_names or (), self.momentum, self.momentum_allowed)
         for k, (what, off) in enumerate((("q", self.constraint_distance), ("qdot", self.constraint_rate))):
-            allowed = jnp.broadcast_to(self.constraint_allowed[..., k, None], off.value.shape)
+            allowed = np.broadcast_to(np.asarray(self.constraint_allowed)[..., k, None], off.value.shape)
             rows += _by_name(f"constraints, {what}", self.constraint_names, off, allowed)
-        smallest = Extreme(-self.smallest_eigenvalue.value, self.smallest_eigenvalue.t)
+        smallest = Extreme(-np.asarray(self.smallest_eigenvalue.value), self.smallest_eigenvalue.t)
         rows += [
             ("mass matrix", f"smallest eigenvalue {_worst(smallest, sign=-1)}"),
             ("", f"condition {_worst(self.condition)}"),
             ("", f"scaled to a unit diagonal {_worst(self.scaled_condition, self.scaled_condition_allowed)}"),
-            ("gradients", "finite" if bool(jnp.all(self.gradients_finite)) else "not finite"),
+            ("gradients", "finite" if np.all(self.gradients_finite) else "not finite"),
         ]
         if self.global_error is not None:
             rows.append(("global error", f"{_worst(self.global_error, VISIBLE)}, in units of the largest |y|"))
@@ -189,8 +231,8 @@ def _greatest(values) -> float:
     return float(np.max(np.nan_to_num(np.asarray(values, float), nan=-np.inf)))
 
 
-def _exceeds(extreme: Extreme, allowed) -> jax.Array:
-    return ~jnp.isnan(extreme.t) & ~(extreme.value <= allowed)
+def _exceeds(xp, extreme: Extreme, allowed):
+    return ~xp.isnan(extreme.t) & ~(extreme.value <= allowed)
 
 
 def _worst(extreme: Extreme, allowed=None, sign: int = 1) -> str:
@@ -209,7 +251,9 @@ def _by_name(label: str, names: tuple[str, ...], extreme: Extreme, allowed) -> l
     """A row for the one that comes nearest to what is allowed, or exceeds it most."""
     if not names:
         return []
-    part = np.asarray(extreme.value / allowed).reshape(-1, len(names))
+    extreme, allowed = Extreme(*map(np.asarray, extreme)), np.asarray(allowed)
+    with np.errstate(all="ignore"):
+        part = (extreme.value / allowed).reshape(-1, len(names))
     part = np.where(np.isnan(np.asarray(extreme.t)).reshape(part.shape), -np.inf, part)
     which = int(np.argmax(np.max(part, axis=0)))
     picked = Extreme(extreme.value[..., which], extreme.t[..., which])
@@ -233,6 +277,10 @@ _SENTENCES = {
     "energy": (
         "Energy: off by more than the tolerances allow{0}. Something is not smooth within a step (a force that jumps, "
         "a contact), or the steps are too long: tighten rtol or shorten dt."
+    ),
+    "amplitude": (
+        "Amplitude: the motion{0} is so small beside atol that the errors it allows add up to a hundredth of it within "
+        "a hundred steps. Use units in which the motion is of order one, or pass atol="
     ),
     "momentum": "Momentum: what is conserved is off by more than the tolerances allow{0}: tighten rtol or shorten dt.",
     "constraints": "Constraints: the motion has left them{0}: tighten rtol or shorten dt.",

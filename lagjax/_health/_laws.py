@@ -1,135 +1,260 @@
-"""What can be asked of one state of a motion whose laws are known."""
+"""What can be asked of the states of a motion whose laws are known, in two ways.
 
-from typing import NamedTuple
+`Law.samples` evaluates the programs of the scene in NumPy, for many states at once and without compiling anything.
+`sample_at` is the same for one state in JAX: for values that are being traced, and for scenes that have no programs.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import LARGEST_SCALAR_SCENE, OPERATION_BUDGET
+from lagjax._derivation import Derivation, columns_of, derivation_of
 from lagjax._layout import Layout
+from lagjax._linear import saddle_many
 from lagjax._motion import Motion
-from lagjax._program import Unlowerable, lower
+from lagjax._program import Program, Unlowerable, lower
 from lagjax._system import System
+
+_CHUNK = 2**21  # numbers that programs give out together, 16 MB
+_KEPT = 2**20  # values that a transposed derivative keeps in between, 8 MB
+_DERIVATIVE_BUDGET = 20_000  # operations of the program by which a doubtful derivative is looked at once more
+
+
+class Sample(NamedTuple):
+    """What is measured at one state; with a leading axis (S, …) at S of them."""
+
+    kept: Any  # h, then momenta, (k,)
+    slopes: Any  # of these: Σ |∂c/∂yᵢ| (rtol|yᵢ| + atol), (k,)
+    sizes: Any  # Σ |∂c/∂yᵢ yᵢ|, with the terms of c, (k,)
+    power: Any  # dh/dt, ()
+    acceleration: Any  # q̈, (n,); zero where nothing does work
+    distances: Any  # from the constraints, (m,)
+    rates: Any  # (m,)
+    mass: Any  # smallest eigenvalue of M, condition, scaled condition, (3,)
+    finite: Any  # whether the derivatives of the acceleration are, ()
 
 
 class Law(NamedTuple):
-    """The equations of one mode, and which of its quantities are constant, read off its programs."""
+    """The equations of one mode, and which of its quantities are constant."""
 
-    motion: Motion
+    derivation: Derivation
     works: bool  # whether anything does: h is not constant
     conserved: tuple[int, ...] | None  # the coordinates on which nothing acts; None where that is not known
     names: tuple[str, ...]  # of its constraints
 
+    @property
+    def motion(self) -> Motion:
+        """The functions of the scene, in flat coordinates."""
+        return self.derivation.motion
+
     @classmethod
     def of(cls, system: System, layout: Layout, params, mode: str) -> "Law":
         """The law of a system; `mode` is a prefix for the names."""
-        motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
-        names = system.constraint_names(layout, params) if motion.constrained else []
-        works, conserved = _constants(system, motion, layout, numbers)
-        return cls(motion, works, conserved, tuple((f"{mode}: " if mode else "") + name for name in names))
+        derivation = derivation_of(system, layout, params)
+        names = system.constraint_names(layout, params) if derivation.motion.constrained else []
+        works, conserved = _constants(system, derivation)
+        return cls(derivation, works, conserved, tuple((f"{mode}: " if mode else "") + name for name in names))
+
+    # ---- by programs, in NumPy ----
+
+    def lowered(self) -> bool:
+        """Whether the scene has the programs that `samples` evaluates."""
+        try:
+            return bool(self.derivation.program("mass_matrix").shapes)
+        except Unlowerable:
+            return False
+
+    def samples(self, momenta: tuple[int, ...], tolerances, q, qdot, t, numbers: Sequence) -> Sample:
+        """A `Sample` of S states: `q`, `qdot` (S, n), `t` (S,), `numbers` and `tolerances` () or (S,) each."""
+        width = sum(self.derivation.count(name) for name in _QUANTITIES)
+        return _in_parts(
+            lambda *part: self._samples(momenta, *part),
+            max(1, _CHUNK // width),
+            len(q),
+            tolerances,
+            q,
+            qdot,
+            t,
+            numbers,
+        )
+
+    def powers(self, q, qdot, t, numbers: Sequence) -> np.ndarray:
+        """dh/dt at S states, shape (S,)."""
+        width = sum(self.derivation.count(name) for name in _QUANTITIES)
+        return _in_parts(self._powers, max(1, _CHUNK // width), len(q), q, qdot, t, numbers)
+
+    def _samples(self, momenta, tolerances, q, qdot, t, numbers) -> Sample:
+        columns, derivation = columns_of(q, qdot, t, numbers), self.derivation
+        of = derivation.evaluate(_QUANTITIES, columns)
+        (rtol, atol), far, fast = (np.reshape(x, (-1, 1)) for x in tolerances), np.abs(q), np.abs(qdot)
+        with np.errstate(all="ignore"):
+            energy = np.einsum("si,si->s", of["momentum"], qdot) - of["lagrangian"]
+            kept = np.concatenate([energy[:, None], of["momentum"][:, list(momenta)]], axis=1)
+            by_q = np.abs(derivation.conserved_by_q(momenta).evaluate_many(columns)).T.reshape(len(q), -1, q.shape[1])
+            of_energy = np.einsum("sij,sj->si", of["mass_matrix"], qdot)[:, None]
+            by_qdot = np.abs(np.concatenate([of_energy, of["mass_matrix"][:, list(momenta)]], axis=1))
+            sizes = np.einsum("ski,si->sk", by_q, far) + np.einsum("ski,si->sk", by_qdot, fast)
+            sizes[:, 0] += np.einsum("si,si->s", np.abs(of["momentum"]), fast) + np.abs(of["lagrangian"])
+            slopes = np.einsum("ski,si->sk", by_q, rtol * far + atol)
+            slopes += np.einsum("ski,si->sk", by_qdot, rtol * fast + atol)
+            lengths = np.linalg.norm(of["jacobian"], axis=2)
+            held = np.where(np.arange(lengths.shape[1]) < derivation.position_count, of["residual"], 0)
+            off = [np.where(x == 0, 0.0, np.abs(x) / lengths) for x in (held, of["rates"])]
+            power, acceleration = np.zeros(len(q), q.dtype), np.zeros_like(q)
+            if self.works:
+                acceleration, multipliers = _solved(of)
+                power = _power_of(of, qdot, multipliers)
+            return Sample(
+                kept, slopes, sizes, power, acceleration, *off, _conditions_of(of["mass_matrix"]), self._finite(columns)
+            )
+
+    def _powers(self, q, qdot, t, numbers) -> np.ndarray:
+        if not self.works:
+            return np.zeros(len(q), q.dtype)
+        driven = not self.derivation.absent("driving").all()
+        names = _SOURCES + (_SYSTEM if driven else ())
+        of = self.derivation.evaluate(names, columns_of(q, qdot, t, numbers))
+        with np.errstate(all="ignore"):
+            return _power_of(of, qdot, _solved(of)[1] if driven else np.zeros_like(of["driving"]))
+
+    def _finite(self, columns) -> np.ndarray:
+        """Whether M, F, G and γ have finite derivatives by all inputs: one transposed derivative, which a NaN spoils.
+
+        The program's own operations answer first. Where they say no, a power may only have been written as a root, or
+        the user's rule for a derivative may know better: there the derivative of the functions themselves decides.
+        """
+        program = self.derivation.program(*_SYSTEM)
+        count = max(np.size(x) for x in columns)
+
+        def look(*part):
+            bars = [bar for bar in program.pull_back_many(part, [1.0] * len(program.outputs)) if bar is not None]
+            finite = np.all([np.isfinite(np.broadcast_to(bar, part[0].shape)) for bar in bars], axis=0)
+            return np.broadcast_to(finite, part[0].shape)
+
+        finite = _in_parts(look, max(1, _KEPT // len(program.nodes)), count, *columns)
+        if finite.all():
+            return finite
+        doubtful = [x if np.ndim(x) == 0 else x[~finite] for x in columns]
+        try:
+            slopes = self._total_slopes.evaluate_many(doubtful)
+        except Unlowerable:
+            return finite
+        finite = finite.copy()
+        finite[~finite] = np.isfinite(slopes).all(axis=0)
+        return finite
+
+    @property
+    def _total_slopes(self) -> Program:
+        motion = self.derivation.motion
+        return lower(
+            lambda *state: _slopes_of_all(motion, *state), *self.derivation.state_shapes, budget=_DERIVATIVE_BUDGET
+        )
 
 
-def _constants(system: System, motion: Motion, layout: Layout, numbers) -> tuple[bool, tuple[int, ...] | None]:
-    """Whether anything does work, and the coordinates on which no force of any kind acts."""
-    n = layout.size
-    asked = (system.lagrangian, system.constraints, system.velocity_constraints)
-    could_work = any("t" in function.extras for function in asked if function is not None) or any(
-        part is not None for part in (motion.forces, motion.dissipation, motion.velocity_constraints)
-    )
-    if n > LARGEST_SCALAR_SCENE:
-        return could_work, None
-
-    def acting(*state):
-        rows = motion.rows_and_targets(*state)[0] if motion.constrained else jnp.zeros((0, n), layout.dtype)
-        return rows, motion.generalized_force(*state), _sources(motion, *state)
-
-    q, t = jax.ShapeDtypeStruct((n,), layout.dtype), jax.ShapeDtypeStruct((), layout.dtype)
-    try:
-        program = lower(acting, q, q, t, numbers, budget=OPERATION_BUDGET)
-    except Unlowerable:
-        return could_work, None
-    absent = np.array([program.constant(k) == 0 for k in range(len(program.outputs))])
-    forces = n * (jax.eval_shape(acting, q, q, t, numbers)[0].shape[0] + 1)
-    untouched = absent[:forces].reshape(-1, n).all(axis=0)
-    return not absent[forces:].all(), tuple(np.flatnonzero(untouched).tolist())
+_SYSTEM = ("mass_matrix", "force", "jacobian", "target")
+_SOURCES = ("lagrangian_by_t", "nonconservative_force", "driving")
+_QUANTITIES = ("lagrangian", "momentum", "residual", "rates", *_SYSTEM, *_SOURCES)
 
 
-def _sources(motion: Motion, q, qdot, t, params) -> jax.Array:
-    """What can do work: ∂L/∂t, Q, ∂f/∂t and a(q, 0, t), end to end."""
-    parts = [jax.grad(motion.lagrangian, argnums=2)(q, qdot, t, params)[None]]
-    parts.append(motion.nonconservative_force(q, qdot, t, params))
-    if motion.constraints is not None:
-        parts.append(jax.jacfwd(motion.constraints, argnums=1)(q, t, params))
-    if motion.velocity_constraints is not None:
-        parts.append(motion.velocity_constraints(q, jnp.zeros_like(qdot), t, params))
-    return jnp.concatenate(parts)
+def _in_parts(function: Callable, size: int, count: int, *arguments):
+    """`function` on parts of at most `size` of `count` states, put together; single numbers are shared."""
+
+    def cut(x, start):
+        return x if np.ndim(x) == 0 else x[start : start + size]
+
+    parts = [
+        function(*jax.tree.map(lambda x, k=start: cut(x, k), arguments, is_leaf=lambda x: isinstance(x, np.ndarray)))
+        for start in range(0, count, size)
+    ]
+    return parts[0] if len(parts) == 1 else jax.tree.map(lambda *some: np.concatenate(some), *parts)
 
 
-def _power(motion: Motion, q, qdot, t, params) -> jax.Array:
+def _solved(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    return saddle_many(*(of[name] for name in _SYSTEM))
+
+
+def _power_of(of: dict[str, np.ndarray], qdot, multipliers) -> np.ndarray:
     """dh/dt = −∂L/∂t + Q·q̇ + λ·(G q̇), where G q̇ = −∂f/∂t, and −a(q, 0, t) for velocities."""
-    n, sources = q.size, _sources(motion, q, qdot, t, params)
-    power = -sources[0] + sources[1 : n + 1] @ qdot
-    return power - motion.multipliers(q, qdot, t, params) @ sources[n + 1 :] if motion.constrained else power
+    power = -of["lagrangian_by_t"] + np.einsum("si,si->s", of["nonconservative_force"], qdot)
+    return power - np.einsum("sk,sk->s", multipliers, of["driving"])
 
 
-class Found(NamedTuple):
-    """What is found at a state."""
-
-    kept: jax.Array  # h, then momenta
-    slopes: jax.Array  # of these: Σ |∂c/∂yᵢ| (rtol|yᵢ| + atol)
-    sizes: jax.Array  # Σ |∂c/∂yᵢ yᵢ|, with the terms of c
-    power: jax.Array  # P, and its first two derivatives along the motion
-    distances: jax.Array  # from the constraints
-    rates: jax.Array
-    mass: jax.Array  # smallest eigenvalue, condition, scaled condition
-    finite: jax.Array  # derivatives of the acceleration
+def _conditions_of(matrix: np.ndarray) -> np.ndarray:
+    """`_conditions` of S matrices, shape (S, 3)."""
+    diagonal = np.abs(np.diagonal(matrix, axis1=1, axis2=2))
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
+    values, scaled = (_eigenvalues_of(m) for m in (matrix, scale[:, :, None] * matrix * scale[:, None, :]))
+    spread = (np.abs(x).max(axis=1) / np.abs(x).min(axis=1) for x in (values, scaled))
+    return np.stack([values.min(axis=1), *spread], axis=1)
 
 
-def found_at(law: Law, momenta: tuple[int, ...], tolerances, q, qdot, t, params) -> Found:
-    """All of it at one state; `momenta` says of which coordinates."""
+def _eigenvalues_of(matrix: np.ndarray) -> np.ndarray:
+    """Eigenvalues of S symmetric matrices, (S, n); NaN where a matrix is not finite."""
+    if matrix.shape[1] == 2:  # a closed form keeps the digits of the smaller one
+        a, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
+        middle, radius = 0.5 * (a + d), np.hypot(0.5 * (a - d), c)
+        larger = np.where(middle < 0, middle - radius, middle + radius)
+        return np.stack([larger, np.where(larger == 0, 0.0, (a * d - c * c) / larger)], axis=1)
+    usable = np.isfinite(matrix).all(axis=(1, 2), keepdims=True)
+    symmetric = np.where(
+        usable, 0.5 * (matrix + np.swapaxes(matrix, 1, 2)), np.eye(matrix.shape[1], dtype=matrix.dtype)
+    )
+    return np.where(usable[:, :, 0], np.linalg.eigvalsh(symmetric), np.nan)
+
+
+def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int, ...] | None]:
+    """Whether anything does work, and the coordinates on which no force of any kind acts."""
+    try:
+        return derivation.works, derivation.conserved
+    except Unlowerable:
+        motion, asked = derivation.motion, (system.lagrangian, system.constraints, system.velocity_constraints)
+        could_work = any("t" in function.extras for function in asked if function is not None) or any(
+            part is not None for part in (motion.forces, motion.dissipation, motion.velocity_constraints)
+        )
+        return could_work, None
+
+
+# ---- one state, in JAX -----------------------------------------------------------------------------------------------
+
+
+def sample_at(law: Law, momenta: tuple[int, ...], tolerances, q, qdot, t, params) -> Sample:
+    """A `Sample` of one state; `momenta` says of which coordinates."""
     motion, state = law.motion, (q, qdot, t, params)
-
-    def kept(q, qdot):
-        momentum = motion.momentum(q, qdot, t, params)
-        return jnp.stack([motion.energy(q, qdot, t, params), *(momentum[i] for i in momenta)])
-
-    by_q, by_qdot = map(jnp.abs, jax.jacrev(kept, argnums=(0, 1))(q, qdot))
+    kept = motion.energy_and_momenta(momenta, *state)
+    by_q, by_qdot = map(jnp.abs, jax.jacrev(motion.energy_and_momenta, argnums=(1, 2))(momenta, *state))
     (rtol, atol), far, fast = tolerances, jnp.abs(q), jnp.abs(qdot)
     terms = jnp.abs(motion.momentum(*state)) @ fast + jnp.abs(motion.lagrangian(*state))
     distances, rates = _off(motion, *state) if motion.constrained else [jnp.zeros(0, q.dtype)] * 2
-    return Found(
-        kept=kept(q, qdot),
+    return Sample(
+        kept=kept,
         slopes=by_q @ (rtol * far + atol) + by_qdot @ (rtol * fast + atol),
         sizes=(by_q @ far + by_qdot @ fast).at[0].add(terms),
-        power=_power_and_rates(law, *state) if law.works else jnp.zeros(3, q.dtype),
+        power=power_at(law, *state),
+        acceleration=motion.acceleration(*state) if law.works else jnp.zeros_like(q),
         distances=distances,
         rates=rates,
         mass=_conditions(motion.mass_matrix(*state)),
-        finite=_finite_gradient(law, *state),
+        finite=jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in _slopes_of_all(motion, *state)])),
     )
 
 
-def _power_and_rates(law: Law, q, qdot, t, params) -> jax.Array:
-    def along(function):
-        def rate(q, qdot, t):
-            acceleration = law.motion.acceleration(q, qdot, t, params)
-            return jax.jvp(function, (q, qdot, t), (qdot, acceleration, jnp.ones_like(t)))[1]
-
-        return rate
-
-    def power(q, qdot, t):
-        return _power(law.motion, q, qdot, t, params)
-
-    once = along(power)
-    return jnp.stack([power(q, qdot, t), once(q, qdot, t), along(once)(q, qdot, t)])
+def power_at(law: Law, q, qdot, t, params) -> jax.Array:
+    """dh/dt = −∂L/∂t + Q·q̇ + λ·(G q̇), where G q̇ = −∂f/∂t, and −a(q, 0, t) for velocities."""
+    motion, state = law.motion, (q, qdot, t, params)
+    if not law.works:
+        return jnp.zeros((), q.dtype)
+    power = motion.nonconservative_force(*state) @ qdot - jax.grad(motion.lagrangian, argnums=2)(*state)
+    return power - motion.multipliers(*state) @ motion.driving(*state) if motion.constrained else power
 
 
 def _off(motion: Motion, q, qdot, t, params) -> tuple[jax.Array, jax.Array]:
     """How far q and q̇ are from the constraints, in their own units."""
     rows = motion.rows_and_targets(q, qdot, t, params)[0]
-    rates = motion.velocity_saddle(q, qdot, t, params)[2]
+    rates = motion.rates(q, qdot, t, params)
     values, lengths = jnp.zeros_like(rates), jnp.sqrt(jnp.sum(rows**2, axis=1))
     if motion.constraints is not None:
         held = motion.constraints(q, t, params)
@@ -158,15 +283,18 @@ def _eigenvalues(matrix: jax.Array) -> jax.Array:
     return jnp.linalg.eigvalsh(0.5 * (matrix + matrix.T))
 
 
-def _finite_gradient(law: Law, q, qdot, t, params) -> jax.Array:
-    """Whether all that the acceleration is solved from has finite derivatives: one pull-back, which a NaN spoils."""
-    varied, fixed = eqx.partition(params, eqx.is_inexact_array)
+def _slopes_of_all(motion: Motion, q, qdot, t, params) -> list[jax.Array]:
+    """The derivatives of the sum of all that the acceleration is solved from, by everything it depends on."""
+    varied, fixed = eqx.partition(params, _is_inexact)
 
     def total(q, qdot, t, varied):
         state = q, qdot, t, eqx.combine(varied, fixed)
-        parts = law.motion.mass_matrix_and_force(*state)
-        parts += law.motion.rows_and_targets(*state) if law.motion.constrained else ()
+        parts = motion.mass_matrix_and_force(*state)
+        parts += motion.rows_and_targets(*state) if motion.constrained else ()
         return sum(jnp.sum(part) for part in parts)
 
-    slopes = jax.grad(total, argnums=(0, 1, 2, 3))(q, qdot, t, varied)
-    return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes)]))
+    return jax.tree.leaves(jax.grad(total, argnums=(0, 1, 2, 3))(q, qdot, t, varied))
+
+
+def _is_inexact(leaf) -> bool:
+    return jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)

@@ -1,7 +1,13 @@
-"""From the states of a trajectory to the arrays of a report: everything here is under `jit` and `vmap`."""
+"""From the states of a trajectory to the arrays of a report.
+
+The arrays have the axes (…, state, component): in NumPy all members of a batch are looked at together, by the programs
+of the scene; where values are being traced, or the scene has no programs, one member is written down in JAX, under
+`jit` and `vmap`. What follows from the measured states is one and the same text for both.
+"""
 
 import dataclasses
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,14 +16,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._health._laws import Found, Law, found_at
+from lagjax._health._laws import Law, Sample, power_at, sample_at
 from lagjax._layout import Layout
+from lagjax._settings import is_concrete
 
 PyTree = Any
 
 SLACK = 10.0  # on top of √(2n), by which one component may exceed a root mean square
 VISIBLE = 1e-2  # of its own size: no tolerance makes a conserved quantity right that is off by more
 ROUND_OFF = 100.0  # units of it, in one evaluation
+# Of atol: in a motion that is smaller, the errors that atol allows add up to `VISIBLE` within a hundred steps.
+SMALLEST = 1e4
 _CHUNK = 2**18  # numbers of mass matrices looked at together: what is made of them stays in the caches
 
 
@@ -36,50 +45,59 @@ class Names(eqx.Module):
     constraints: tuple[str, ...] = eqx.field(static=True)
 
 
-class _Member(NamedTuple):
-    """What there is of one member."""
+class Path(NamedTuple):
+    """The states of one member, or of N in NumPy with a first axis more, and what is promised of them.
 
-    q: PyTree
-    qdot: PyTree
-    ts: jax.Array
-    tolerances: tuple[jax.Array, jax.Array] | None
-    params: PyTree
-    mode: jax.Array | None
-    steps: jax.Array
-    transitions: Any
+    The T outputs come first, then the states just before each transition.
+    """
+
+    q: Any  # (…, S, n)
+    qdot: Any  # (…, S, n)
+    t: Any  # (…, S)
+    mode: Any  # (…, S)
+    ts: Any  # (…, T)
+    ends: Any  # (…, T − 1): where the law of each output ends, at the next output or at a transition before it
+    steps: Any  # (…)
+    tolerances: tuple[Any, Any] | None  # (…) each
+
+    @property
+    def library(self):
+        """NumPy or `jax.numpy`."""
+        return np if isinstance(self.q, np.ndarray) else jnp
+
+    @property
+    def time(self) -> int:
+        """The axis of the states."""
+        return self.q.ndim - 2
 
 
 def measured(trajectory) -> tuple[dict[str, Any], Names]:
-    """The fields of `Health` that are found along the path, and names for them."""
+    """The fields of `Health` that are measured along the path, and names for them."""
+    steps = trajectory.stats["num_accepted_steps"]
+    if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
+        members = _Members(trajectory)
+        laws = _laws(trajectory, members.layout, members.params)
+        if all(law.lowered() for law in laws):
+            return members.report(laws), _names(laws, members.layout)
     axes, tree = jax.tree.flatten(trajectory.params_axes, is_leaf=lambda axis: axis is None)  # hashable
-    steps = jnp.asarray(trajectory.stats["num_accepted_steps"])
     lean = dataclasses.replace(trajectory, stats={}, params_axes=None)
-    return _measured(lean, tuple(axes), tree, steps)
+    return _measured(lean, tuple(axes), tree, jnp.asarray(steps))
 
 
-@eqx.filter_jit
-def _measured(trajectory, axes, tree, steps):
-    trajectory = dataclasses.replace(trajectory, params_axes=jax.tree.unflatten(tree, axes))
+def _laws(trajectory, layout: Layout, params) -> list[Law]:
     modes = {"": trajectory.system}
     if isinstance(trajectory.system, dict):
         modes = {name: trajectory.system[name] for name in trajectory.mode_names}
-    names, members = {}, max(1, jnp.size(trajectory.result._value))
+    return [Law.of(system, layout, params, name if len(modes) > 1 else "") for name, system in modes.items()]
 
-    def one(q, qdot, given, params, mode, steps, transitions):
-        ts, tolerances = given
-        layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
-        laws = [Law.of(system, layout, params, name if len(modes) > 1 else "") for name, system in modes.items()]
-        momenta = _conserved(laws)
-        names["all"] = Names(
-            any(law.works for law in laws),
-            None if momenta is None else tuple(layout.names[i] for i in momenta),
-            tuple(name for law in laws for name in law.names),
-        )
-        member = _Member(q, qdot, ts, tolerances, eqx.filter(params, eqx.is_array), mode, steps, transitions)
-        return _one_member(laws, momenta or (), layout, member, members)
 
-    found = trajectory.over_members(one, steps, trajectory.transitions)
-    return found, names["all"]
+def _names(laws: list[Law], layout: Layout) -> Names:
+    momenta = _conserved(laws)
+    return Names(
+        any(law.works for law in laws),
+        None if momenta is None else tuple(layout.names[i] for i in momenta),
+        tuple(name for law in laws for name in law.names),
+    )
 
 
 def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
@@ -89,92 +107,178 @@ def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
     return tuple(sorted({i for law in laws for i in law.conserved or ()}))
 
 
-def _one_member(laws: list[Law], momenta: tuple[int, ...], layout: Layout, given: _Member, members: int) -> dict:
-    dtype, T = layout.dtype, given.ts.size
-    promised = (0.0, 0.0) if given.tolerances is None else given.tolerances
-    promised = tuple(jnp.asarray(x, dtype) for x in promised)
-    q, qdot, t, mode = _states(layout, given)
-    reached = jnp.isfinite(q).all(axis=1) & jnp.isfinite(qdot).all(axis=1) & (mode >= 0)
-    # What was not reached is looked at as if it were the start, and then not counted.
-    q, qdot, t = (jnp.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, x[0]) for x in (q, qdot, t))
-    look = partial(_in_its_mode, laws, momenta, promised, given.params)
-    found = _in_chunks(look, (q, qdot, t, jnp.maximum(mode, 0)), _CHUNK // (members * layout.size**2))
-
-    ends = _ends(given)
-    drifts, work_error = _drifts(laws, momenta, found, t, mode, reached, ends)
-    here = jax.tree.map(lambda leaf: leaf[:T], found)
-    on_path, worst = reached[:T], partial(_extreme, given.ts)
-    limits = _limits(here, on_path, given.steps.astype(dtype), layout, given.tolerances is None)
-    owner = np.repeat(np.arange(len(laws)), [len(law.names) for law in laws])
-    held = on_path[:, None] & (mode[:T, None] == owner)
-    sizes = [jnp.max(jnp.where(on_path[:, None], jnp.abs(x[:T]), 0.0)) for x in (q, qdot)]
-    eps = float(jnp.finfo(dtype).eps)
-    near = math.sqrt(eps) if given.tolerances is None else jnp.maximum(promised[0], ROUND_OFF * eps)
-    singular = any(law.motion.constrained for law in laws)  # M may be, where constraints hold what it does not
-    finest = max(math.sqrt(eps), SLACK * eps) if given.tolerances is None else SLACK * promised[0]
-    fine = here.finite | ~on_path
-    return {
-        "energy": worst(drifts[:, 0], on_path),
-        "energy_allowed": limits[0],
-        "work_error": work_error,
-        "momentum": worst(drifts[:, 1:], on_path),
-        "momentum_allowed": limits[1:],
-        "constraint_distance": worst(here.distances, held),
-        "constraint_rate": worst(here.rates, held),
-        "constraint_allowed": near * (1 + jnp.stack(sizes)),
-        "smallest_eigenvalue": worst(here.mass[:, 0], on_path, largest=False),
-        "condition": worst(here.mass[:, 1], on_path),
-        "scaled_condition": worst(here.mass[:, 2], on_path),
-        "scaled_condition_allowed": jnp.asarray(jnp.inf if singular else finest / eps, dtype),
-        "gradients_finite": jnp.all(fine),
-        "gradients_time": jnp.where(jnp.all(fine), jnp.nan, given.ts[jnp.argmin(fine)]),
-    }
+# ---- in NumPy, all members at once -----------------------------------------------------------------------------------
 
 
-# ---- states and pieces of the path ----
+_SHARED = "shared"  # in the place of a batch axis
 
 
-def _states(layout: Layout, given: _Member):
-    """q, q̇, t and the mode at the outputs, and after them at the transitions, just before their resets."""
+class _Members:
+    """The members of a trajectory of numbers along one axis."""
 
+    def __init__(self, trajectory):
+        self.batch = np.shape(trajectory.result._value)
+        self.count, rank = math.prod(self.batch), len(self.batch)
+        first = jax.tree.map(lambda leaf: np.asarray(leaf)[(0,) * (rank + 1)], (trajectory.q, trajectory.qdot))
+        self.layout, self._trajectory = Layout.of(*first), trajectory
+        # Of the axes of a batch, the innermost shares times and some parameters (`Trajectory.over_members`).
+        self._outer = rank - (rank > 0 and np.ndim(trajectory.ts) < 1 + rank)
+        self.numbers, self.params = self._parameters()
+
+    def _parameters(self) -> tuple[list[np.ndarray], PyTree]:
+        """Every number in params, () where all members share it, else (N,); and the params of one member."""
+        given, axes = self._trajectory.params, self._trajectory.params_axes
+        numbers, code = eqx.partition(given, eqx.is_array_like)
+        spread = jax.tree.map(
+            lambda axis, part: jax.tree.map(lambda _: _SHARED if axis is None else axis, part),
+            axes, numbers, is_leaf=lambda axis: axis is None,
+        )  # fmt: skip
+        leaves, structure = jax.tree.flatten(numbers)
+        columns, ones = [], []
+        for leaf, axis in zip(leaves, jax.tree.leaves(spread), strict=True):
+            each = np.asarray(leaf)
+            if self._outer < len(self.batch) and axis is _SHARED:
+                each = np.expand_dims(each, self._outer)
+            elif self._outer < len(self.batch):
+                each = np.moveaxis(each, axis + self._outer if axis >= 0 else axis, self._outer)
+            leading, own = each.shape[: len(self.batch)], each.shape[len(self.batch) :]
+            ones.append(each[(0,) * len(self.batch)])
+            if math.prod(leading) == 1:
+                columns += list(each.reshape(-1))
+            else:
+                columns += list(np.broadcast_to(each, self.batch + own).reshape(self.count, -1).T)
+        return columns, eqx.combine(jax.tree.unflatten(structure, ones), code)
+
+    def _flat(self, tree: PyTree, axes: int = 1) -> np.ndarray:
+        """The leaves of coordinates end to end, (N, states, n)."""
+        lead = len(self.batch) + axes
+        parts = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+        parts = [x.reshape(self.count, *x.shape[len(self.batch) : lead], -1) for x in parts]
+        return np.concatenate(parts, axis=-1)
+
+    def _shared(self, x, own: int) -> np.ndarray:
+        """What times and tolerances are, with `own` axes of their own, for every member."""
+        x = np.asarray(x)
+        if x.ndim < len(self.batch) + own:
+            x = np.expand_dims(x, x.ndim - own)
+        return np.broadcast_to(x, self.batch + x.shape[len(self.batch) :]).reshape(
+            self.count, *x.shape[len(self.batch) :]
+        )
+
+    def path(self) -> Path:
+        """The states of all members."""
+        given = self._trajectory
+        ts = self._shared(given.ts, 1)
+        q, qdot = self._flat(given.q), self._flat(given.qdot)
+        mode = np.zeros(ts.shape, int) if given.mode is None else np.asarray(given.mode).reshape(ts.shape)
+        t, ends = ts, np.broadcast_to(np.arange(1, ts.shape[1]), (self.count, ts.shape[1] - 1))
+        if given.transitions is not None:
+            over = given.transitions
+            times = np.asarray(over.t).reshape(self.count, -1)
+            source = np.asarray(over.source).reshape(times.shape)
+            ends = _ends(np, ts, times)
+            more = (self._flat(over.q), self._flat(over.qdot), times, source)
+            q, qdot, t, mode = (np.concatenate(pair, axis=1) for pair in zip((q, qdot, t, mode), more, strict=True))
+        promised = given.tolerances
+        tolerances = None if promised is None else tuple(self._shared(x, 0).astype(q.dtype) for x in promised)
+        steps = np.asarray(given.stats["num_accepted_steps"], q.dtype).reshape(self.count)
+        return Path(q, qdot, t, mode, ts, ends, steps, tolerances)
+
+    def report(self, laws: list[Law]) -> dict[str, Any]:
+        """The fields, with the batch axes of the trajectory."""
+        path, momenta = self.path(), _conserved(laws) or ()
+        starts = np.cumsum([0, *(len(law.names) for law in laws)])
+
+        def by_mode(function: Callable, q, qdot, t, mode):
+            """`function(law, index, states…)` on the states of each mode, put together, (N, S, …)."""
+            shape, total = t.shape, None
+            q, qdot = (np.ascontiguousarray(x.reshape(-1, x.shape[-1])) for x in (q, qdot))
+            t, mode = t.reshape(-1), mode.reshape(-1)
+            member = np.repeat(np.arange(self.count), shape[1])
+            for index, law in enumerate(laws):
+                here = np.flatnonzero(mode == index)
+                if not len(here):
+                    continue
+                numbers = [x if np.ndim(x) == 0 else x[member[here]] for x in self.numbers]
+                some = function(law, index, member[here], q[here], qdot[here], t[here], numbers)
+                if len(here) == len(mode):
+                    total = some
+                    break
+                if total is None:
+                    total = jax.tree.map(lambda x: np.zeros((len(mode), *x.shape[1:]), x.dtype), some)
+                for whole, part in zip(jax.tree.leaves(total), jax.tree.leaves(some), strict=True):
+                    whole[here] = part
+            return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), total)
+
+        def sampled(law, index, member, q, qdot, t, numbers) -> Sample:
+            promised = (0.0, 0.0) if path.tolerances is None else (x[member] for x in path.tolerances)
+            sample = law.samples(momenta, tuple(promised), q, qdot, t, numbers)
+            around = (0, 0), (starts[index], starts[-1] - starts[index + 1])
+            return sample._replace(distances=np.pad(sample.distances, around), rates=np.pad(sample.rates, around))
+
+        def powers(law, index, member, q, qdot, t, numbers):
+            return law.powers(q, qdot, t, numbers)
+
+        with np.errstate(all="ignore"):
+            fields = _report(path, laws, momenta, partial(by_mode, sampled), partial(by_mode, powers))
+        return jax.tree.map(lambda x: jnp.asarray(np.reshape(x, self.batch + np.shape(x)[1:])), fields)
+
+
+# ---- in JAX, one member ----------------------------------------------------------------------------------------------
+
+
+@eqx.filter_jit
+def _measured(trajectory, axes, tree, steps):
+    trajectory = dataclasses.replace(trajectory, params_axes=jax.tree.unflatten(tree, axes))
+    names, members = {}, max(1, jnp.size(trajectory.result._value))
+
+    def one(q, qdot, given, params, mode, steps, transitions):
+        layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
+        laws = _laws(trajectory, layout, params)
+        names["all"] = _names(laws, layout)
+        path = _path_of_one(layout, q, qdot, given, mode, steps, transitions)
+        momenta, numbers = _conserved(laws) or (), eqx.filter(params, eqx.is_array)
+        promised = (0.0, 0.0) if path.tolerances is None else path.tolerances
+        size = _CHUNK // (members * layout.size**2)
+
+        def chunked(function):
+            return lambda *states: _in_chunks(partial(_in_its_mode, laws, function), states, size)
+
+        look = chunked(lambda law, *state: sample_at(law, momenta, promised, *state, numbers))
+        return _report(path, laws, momenta, look, chunked(lambda law, *state: power_at(law, *state, numbers)))
+
+    found = trajectory.over_members(one, steps, trajectory.transitions)
+    return found, names["all"]
+
+
+def _path_of_one(layout: Layout, q, qdot, given, mode, steps, transitions) -> Path:
     def flat(tree):
         return jax.vmap(layout.flatten)(tree)
 
-    mode = jnp.zeros(given.ts.size, int) if given.mode is None else given.mode
-    states = flat(given.q), flat(given.qdot), given.ts, mode
-    if given.transitions is None:
-        return states
-    ends = given.transitions
-    more = flat(ends.q), flat(ends.qdot), ends.t, ends.source
-    return tuple(jnp.concatenate(pair) for pair in zip(states, more, strict=True))
+    ts, tolerances = given
+    mode = jnp.zeros(ts.size, int) if mode is None else mode
+    states, ends = (flat(q), flat(qdot), ts, mode), jnp.arange(1, ts.size)
+    if transitions is not None:
+        more = flat(transitions.q), flat(transitions.qdot), transitions.t, transitions.source
+        states = tuple(jnp.concatenate(pair) for pair in zip(states, more, strict=True))
+        ends = _ends(jnp, ts, transitions.t)
+    promised = None if tolerances is None else tuple(jnp.asarray(x, layout.dtype) for x in tolerances)
+    return Path(*states, ts, ends, steps.astype(layout.dtype), promised)
 
 
-def _ends(given: _Member) -> jax.Array:
-    """Where the law of each output ends: the place of the next output, or of a transition before it."""
-    T = given.ts.size
-    following = jnp.arange(1, T)
-    if given.transitions is None:
-        return following
-    times = jnp.where(jnp.isnan(given.transitions.t), jnp.inf, given.transitions.t)
-    first = jnp.minimum(jnp.searchsorted(times, given.ts[:-1]), times.size - 1)
-    between = (times[first] >= given.ts[:-1]) & (times[first] < given.ts[1:])
-    return jnp.where(between, T + first, following)
-
-
-def _in_its_mode(laws: list[Law], momenta, tolerances, params, q, qdot, t, mode) -> Found:
-    """By the law of its mode; constraints of the others are zero."""
+def _in_its_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
+    """What the law of the mode of one state says; constraints of the others are zero."""
     starts = np.cumsum([0, *(len(law.names) for law in laws)])
-    each = []
+    total = None
     for index, law in enumerate(laws):
-        found = found_at(law, momenta, tolerances, q, qdot, t, params)
-        held = [
-            jnp.zeros(starts[-1], q.dtype).at[starts[index] : starts[index + 1]].set(off)
-            for off in (found.distances, found.rates)
-        ]
-        each.append(found._replace(distances=held[0], rates=held[1]))
-    total = each[0]
-    for index, found in enumerate(each[1:], 1):
-        total = _where(mode == index, found, total)
+        found = function(law, q, qdot, t)
+        if isinstance(found, Sample):
+            held = [
+                jnp.zeros(starts[-1], q.dtype).at[starts[index] : starts[index + 1]].set(off)
+                for off in (found.distances, found.rates)
+            ]
+            found = found._replace(distances=held[0], rates=held[1])
+        total = found if total is None else _where(mode == index, found, total)
     return total
 
 
@@ -193,58 +297,197 @@ def _in_chunks(function, arrays, size: int):
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * size, *x.shape[2:])[:count], found)
 
 
-# ---- what the path shows ----
+# ---- what the path shows: arrays of either library -------------------------------------------------------------------
 
 
-def _drifts(laws, momenta, found: Found, t, mode, reached, ends) -> tuple[jax.Array, jax.Array]:
+def _report(path: Path, laws: list[Law], momenta: tuple[int, ...], look: Callable, power: Callable) -> dict:
+    """All fields; `look(q, qdot, t, mode)` gives `Sample`s of states, `power` dh/dt at states."""
+    xp, axis, T, dtype = path.library, path.time, path.ts.shape[-1], path.q.dtype
+    q, qdot, t, mode = path[:4]
+    reached = xp.isfinite(q).all(axis=-1) & xp.isfinite(qdot).all(axis=-1) & (mode >= 0)
+    # What was not reached is looked at as if it were the start, and then not counted.
+    q, qdot = (xp.where(reached[..., None], x, x[..., :1, :]) for x in (q, qdot))
+    path = path._replace(q=q, qdot=qdot, t=xp.where(reached, t, t[..., :1]))
+    found = look(q, qdot, path.t, xp.maximum(mode, 0))
+    drifts, work_error = _drifts(path, laws, momenta, found, reached, power)
+    here = jax.tree.map(lambda leaf: leaf[(slice(None),) * axis + (slice(T),)], found)
+    on_path, worst = reached[..., :T], partial(_extreme, xp, axis, path.ts)
+    limits, size = _limits(path, here, on_path)
+    owner = np.repeat(np.arange(len(laws)), [len(law.names) for law in laws])
+    held = on_path[..., None] & (mode[..., :T, None] == owner)
+    spans = [xp.max(xp.where(on_path[..., None], xp.abs(x[..., :T, :]), 0.0), axis=(-2, -1)) for x in (q, qdot)]
+    eps = float(np.finfo(dtype).eps)
+    fixed = path.tolerances is None
+    near = math.sqrt(eps) if fixed else xp.maximum(path.tolerances[0], ROUND_OFF * eps)[..., None]
+    singular = any(law.motion.constrained for law in laws)  # M may be, where constraints hold what it does not
+    finest = max(math.sqrt(eps), SLACK * eps) if fixed else SLACK * path.tolerances[0]
+    fine, none = here.finite | ~on_path, xp.zeros(path.ts.shape[:-1], dtype)
+    all_fine, first = xp.all(fine, axis=axis), xp.argmin(fine, axis=axis)
+    energy = worst(drifts[..., 0], on_path)
+    return {
+        "energy": energy,
+        "energy_allowed": limits[..., 0],
+        "work_error": work_error,
+        "outputs_needed": _outputs_needed(xp, T, energy.value, work_error, size[..., 0]),
+        "amplitude": _amplitude(xp, q[..., :T, :], on_path),
+        "amplitude_needed": none if fixed else SMALLEST * path.tolerances[1] + none,
+        "momentum": worst(drifts[..., 1:], on_path),
+        "momentum_allowed": limits[..., 1:],
+        "constraint_distance": worst(here.distances, held),
+        "constraint_rate": worst(here.rates, held),
+        "constraint_allowed": near * (1 + xp.stack(spans, axis=-1)),
+        "smallest_eigenvalue": worst(here.mass[..., 0], on_path, largest=False),
+        "condition": worst(here.mass[..., 1], on_path),
+        "scaled_condition": worst(here.mass[..., 2], on_path),
+        "scaled_condition_allowed": none + (math.inf if singular else finest / eps),
+        "gradients_finite": all_fine,
+        "gradients_time": xp.where(all_fine, math.nan, _at(xp, path.ts, first)),
+    }
+
+
+def _at(xp, ts, place):
+    return xp.take_along_axis(ts, place[..., None], axis=-1)[..., 0]
+
+
+def _ends(xp, ts, transitions):
+    """Where the law of each output ends: the place of the next output, or of a transition before it; (…, T − 1)."""
+    T = ts.shape[-1]
+    times = xp.where(xp.isnan(transitions), math.inf, transitions)
+    before = xp.sum(times[..., None, :] < ts[..., :-1, None], axis=-1)
+    first = xp.minimum(before, times.shape[-1] - 1)
+    when = xp.take_along_axis(times, first, axis=-1)
+    between = (when >= ts[..., :-1]) & (when < ts[..., 1:])
+    return xp.where(between, T + first, xp.arange(1, T))
+
+
+def _drifts(path: Path, laws, momenta, found: Sample, reached, power: Callable) -> tuple[Any, Any]:
     """|h − h₀ − W| and |p − p₀| at every output, a column each; and how far W may be off.
 
     A piece of the path from an output to `ends` is measured if its mode has the law; what else happens before the next
     output is left out.
     """
-    T = len(ends) + 1
-    start, values = found.kept[: T - 1], found.kept
-    work, work_error = _work(found.power, t, ends, reached)
-    expected = jnp.zeros_like(start).at[:, 0].set(work)
-    keeps = np.array([[True, *(i in (law.conserved or ()) for i in momenta)] for law in laws])
-    counted = jnp.asarray(keeps)[jnp.maximum(mode[ends], 0)] & (reached[ends] & reached[: T - 1])[:, None]
-    rise = values[1:T] - start
-    excused = rise - jnp.where(counted, values[ends] - start - expected, 0.0)
+    xp, axis, ends = path.library, path.time, path.ends
+    T = path.ts.shape[-1]
+    until = partial(_at_ends, xp, axis, ends)
+    values = found.kept
+    start = values[..., : T - 1, :]
+    measurable = until(reached) & reached[..., : T - 1]
+    work, work_error = xp.zeros_like(start[..., 0]), xp.zeros_like(start[..., 0, 0])
+    if any(law.works for law in laws):
+        work, work_error = _work(path, found, measurable, power)
+    expected = xp.concatenate([work[..., None], xp.zeros_like(start[..., 1:])], axis=-1)
+    keeps = xp.asarray(np.array([[True, *(i in (law.conserved or ()) for i in momenta)] for law in laws]))
+    counted = keeps[xp.maximum(until(path.mode), 0)] & measurable[..., None]
+    rise = values[..., 1:T, :] - start
+    excused = rise - xp.where(counted, until(values) - start - expected, 0.0)
     # The same without the rounding of a sum of differences, where the piece goes on to the next output.
-    excused = jnp.where(counted & (ends < T)[:, None], expected, excused)
-    before = jnp.concatenate([jnp.zeros_like(values[:1]), jnp.cumsum(excused, axis=0)])
-    return jnp.abs(values[:T] - values[0] - before), work_error
+    excused = xp.where(counted & (ends < T)[..., None], expected, excused)
+    before = xp.concatenate([xp.zeros_like(values[..., :1, :]), xp.cumsum(excused, axis=axis)], axis=axis)
+    return xp.abs(values[..., :T, :] - values[..., :1, :] - before), work_error
 
 
-def _work(power, t, ends, reached) -> tuple[jax.Array, jax.Array]:
-    """∫ P dt over every piece, by the rule of order six, and the error of the sum, from those of order four and two."""
-    smooth = jnp.isfinite(power).all(axis=1)  # elsewhere there is only P itself, and no word about the error
-    power = power.at[:, 1:].set(jnp.where(smooth[:, None], power[:, 1:], 0.0))
-    a, b, h = power[: len(ends)], power[ends], t[ends] - t[: len(ends)]
-    second = h / 2 * (a[:, 0] + b[:, 0])
-    fourth = second + h**2 / 12 * (a[:, 1] - b[:, 1])
-    sixth = second + h**2 / 10 * (a[:, 1] - b[:, 1]) + h**3 / 120 * (a[:, 2] + b[:, 2])
-    rough, fine = jnp.abs(fourth - second), jnp.abs(sixth - fourth)
-    # Errors fall from order to order by the same factor, or a larger one.
-    error = fine * jnp.minimum(1.0, fine / jnp.where(rough > 0, rough, fine + 1.0))
-    error = jnp.where(smooth[: len(ends)] & smooth[ends], error, jnp.inf)
-    return sixth, jnp.sum(jnp.where(reached[: len(ends)] & reached[ends], error, 0.0))
+def _at_ends(xp, axis: int, ends, x):
+    """x at the end of every piece."""
+    return xp.take_along_axis(x, ends.reshape(ends.shape + (1,) * (x.ndim - ends.ndim)), axis=axis)
 
 
-def _limits(here: Found, on_path, steps, layout: Layout, fixed_steps: bool) -> jax.Array:
-    """What steps and round-off may add up to, for h and the momenta; of fixed steps nothing is promised."""
-    slope, size = (jnp.max(jnp.where(on_path[:, None], x, 0.0), axis=0) for x in (here.slopes, here.sizes))
-    allowed = VISIBLE * size
-    if not fixed_steps:
-        allowed = jnp.minimum(allowed, SLACK * math.sqrt(2 * layout.size) * (steps + 1) * slope)
-    return allowed + ROUND_OFF * float(jnp.finfo(layout.dtype).eps) * (1 + jnp.sqrt(steps)) * size
+# Points and weights of Gauss and Legendre on (0, 1): exact for polynomials of degree seven.
+_POINTS, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(4))
+_POINTS = _POINTS + 0.5
 
 
-def _extreme(ts, values, at, largest: bool = True) -> Extreme:
-    """Along the first axis, where `at` says so; a NaN there is the most extreme of all."""
-    at = jnp.broadcast_to(at.reshape(at.shape + (1,) * (values.ndim - at.ndim)), values.shape)
-    ranked = jnp.where(at, values if largest else -values, -jnp.inf)
-    place = jnp.argmax(ranked, axis=0)  # the first NaN, if there is one
-    value = jnp.take_along_axis(values, place[None], axis=0)[0]
-    found = jnp.any(at, axis=0)
-    return Extreme(jnp.where(found, value, jnp.nan), jnp.where(found, ts[place], jnp.nan))
+def _work(path: Path, found: Sample, measurable, power: Callable) -> tuple[Any, Any]:
+    """∫ P dt over every piece, and how far the sum may be off.
+
+    Between its ends the motion is taken for the polynomial of degree five that has their q, q̇ and q̈: its error of
+    order six in q integrates to an error of order six in W. The cubic through q and q̇, and the trapezoidal rule, are of
+    order four and two, and tell the error.
+    """
+    xp, axis, T, n = path.library, path.time, path.ts.shape[-1], path.q.shape[-1]
+    until = partial(_at_ends, xp, axis, path.ends)
+    (q, v, t, a, p), last = (path.q, path.qdot, path.t, found.acceleration, found.power), T - 1
+    points, weights = (x.astype(q.dtype) for x in (_POINTS, _WEIGHTS))
+    h = until(t) - t[..., :last]
+    a0, a1 = a[..., :last, :], until(a)
+    mode = xp.maximum(until(path.mode), 0)
+
+    def integrated(coefficients):
+        """∫ P over a polynomial in s from 0 to 1, with coefficients (…, T − 1, n) of s⁰, s¹, …"""
+
+        def summed(powers):
+            return sum(c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=False))
+
+        at = summed([points**k for k in range(6)])
+        along = summed([k * points ** max(k - 1, 0) for k in range(6)])
+        shape = at.shape[:-3] + (-1,)
+        times = t[..., :last, None] + h[..., None] * points
+        velocities = along / h[..., None, None]
+        modes = xp.broadcast_to(mode[..., None], times.shape)
+        values = power(at.reshape(*shape, n), velocities.reshape(*shape, n), times.reshape(shape), modes.reshape(shape))
+        return h * xp.sum(values.reshape(times.shape) * weights, axis=-1)
+
+    q0, q1, v0, v1 = q[..., :last, :], until(q), h[..., None] * v[..., :last, :], h[..., None] * until(v)
+    a0, a1 = (h**2)[..., None] * a0 / 2, (h**2)[..., None] * a1
+    rise = q1 - q0
+    cubic = [q0, v0, 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise]
+    # The three conditions at s = 1 on the coefficients of s³, s⁴ and s⁵.
+    left, slope, bend = rise - v0 - a0, v1 - v0 - 2 * a0, a1 - 2 * a0
+    quintic = [
+        q0, v0, a0,
+        10 * left - 4 * slope + bend / 2, -15 * left + 7 * slope - bend, 6 * left - 3 * slope + bend / 2,
+    ]  # fmt: skip
+    second = h / 2 * (p[..., :last] + until(p))
+    fourth, sixth = integrated(cubic), integrated(quintic)
+    smooth = xp.isfinite(fourth) & xp.isfinite(sixth) & xp.isfinite(second)  # elsewhere nothing tells the error
+    rough, fine = xp.abs(fourth - second), xp.abs(sixth - fourth)
+    # Once pieces are short enough, errors fall from order to order by the same factor, or a larger one. Where they do
+    # not fall by four, the pieces are longer than what they should show, and a small difference is an accident.
+    error = xp.where(fine <= rough / 4, fine * fine / xp.where(rough > 0, rough, 1.0), xp.maximum(fine, rough))
+    error = xp.where(smooth, error, math.inf)
+    return xp.where(smooth, sixth, second), xp.sum(xp.where(measurable, error, 0.0), axis=-1)
+
+
+def _outputs_needed(xp, T: int, imbalance, work_error, size):
+    """About how many outputs tell whether the power is balanced; T where these outputs do.
+
+    They do not where the balance is off visibly, and the work may be off as much. The rule for the work is of order
+    six.
+    """
+    visible = VISIBLE * size
+    excess = SLACK * work_error / xp.where(visible > 0, visible, 1.0)
+    untold = (excess > 1) & (imbalance > visible)
+    return T * xp.where(untold, xp.maximum(2.0, xp.ceil(xp.abs(excess) ** (1 / 6))), 1.0)
+
+
+def _amplitude(xp, q, on_path):
+    """The largest change of a coordinate along the path; infinite where nothing moves beyond rounding."""
+    high = xp.max(xp.where(on_path[..., None], q, -math.inf), axis=-2)
+    low = xp.min(xp.where(on_path[..., None], q, math.inf), axis=-2)
+    largest = xp.max(high - low, axis=-1)
+    rounding = ROUND_OFF * float(np.finfo(q.dtype).eps) * xp.max(xp.maximum(xp.abs(high), xp.abs(low)), axis=-1)
+    return xp.where(largest > rounding, largest, math.inf)
+
+
+def _limits(path: Path, here: Sample, on_path) -> tuple[Any, Any]:
+    """What steps and round-off may add up to, for h and the momenta, and the sizes of these, (…, k) each.
+
+    Of fixed steps nothing is promised.
+    """
+    xp, n = path.library, path.q.shape[-1]
+    slope, size = (xp.max(xp.where(on_path[..., None], x, 0.0), axis=-2) for x in (here.slopes, here.sizes))
+    allowed, steps = VISIBLE * size, path.steps[..., None]
+    if path.tolerances is not None:
+        allowed = xp.minimum(allowed, SLACK * math.sqrt(2 * n) * (steps + 1) * slope)
+    return allowed + ROUND_OFF * float(np.finfo(size.dtype).eps) * (1 + xp.sqrt(steps)) * size, size
+
+
+def _extreme(xp, axis: int, ts, values, at, largest: bool = True) -> Extreme:
+    """Along the axis of time, where `at` says so; a NaN there is the most extreme of all."""
+    extra = (1,) * (values.ndim - ts.ndim)
+    at = xp.broadcast_to(at.reshape(at.shape + (1,) * (values.ndim - at.ndim)), values.shape)
+    ranked = xp.where(at, values if largest else -values, -math.inf)
+    place = xp.expand_dims(xp.argmax(ranked, axis=axis), axis)  # the first NaN, if there is one
+    times = xp.broadcast_to(ts.reshape(ts.shape + extra), values.shape)
+    value, when = (xp.squeeze(xp.take_along_axis(x, place, axis=axis), axis) for x in (values, times))
+    found = xp.any(at, axis=axis)
+    return Extreme(xp.where(found, value, math.nan), xp.where(found, when, math.nan))

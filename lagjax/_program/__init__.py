@@ -26,7 +26,7 @@ function and lowered in turn, when they are first asked for.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -36,9 +36,9 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from lagjax._program._emit import emit, plain_elementary
-from lagjax._program._evaluate import evaluate
+from lagjax._program._evaluate import evaluate, pull_back, round_off, steps_of
 from lagjax._program._graph import FOLD, Node, Unlowerable
-from lagjax._program._passes import finish, regroup, with_given
+from lagjax._program._passes import finish, live, regroup, with_given
 from lagjax._program._rules import Expansion, kind_of
 from lagjax._program._series import Series, StraightLine, series
 
@@ -212,6 +212,35 @@ class Program:
                     value = FOLD[op](*(values[i] for i in operands), *extra)
                 values.append(np.dtype("float64" if kind == "float" else kind).type(value))
         return tuple(values[i] for i in self.outputs)
+
+    def evaluate_many(self, columns) -> np.ndarray:
+        """The outputs at S states, shape (outputs, S), in NumPy without compiling anything.
+
+        `columns` holds one entry for each input: a number, or S of them, shape (S,). Floats have the precision of the
+        columns.
+        """
+        return evaluate(self.line, columns, self._steps)
+
+    @functools.cached_property
+    def _steps(self) -> Callable:
+        return functools.cache(functools.partial(steps_of, self.line))
+
+    def round_off_many(self, columns) -> np.ndarray:
+        """How far rounding may move every output at S states, shape (outputs, S), to first order."""
+        return round_off(self.line, columns)
+
+    def pull_back_many(self, columns, cotangents) -> list:
+        """Σₖ cotangentₖ ∂outputₖ/∂input for every input, in NumPy; None where nothing flows to an input.
+
+        Of the operations as they stand here, without the user's own rules for derivatives. All of the values are kept
+        in between: some hundred states at once are enough.
+        """
+        return pull_back(self.line, columns, cotangents)
+
+    def only(self, positions: Sequence[int], function: Callable) -> "Program":
+        """The program of some of the outputs; `function` is the JAX function that gives just these, leaf by leaf."""
+        nodes, kinds, outputs = live(self.nodes, self.kinds, [self.outputs[i] for i in positions])
+        return replace(self, nodes=nodes, kinds=kinds, outputs=outputs, function=function, otherwise=None, linear=None)
 
     @functools.cached_property
     def operations(self) -> int:

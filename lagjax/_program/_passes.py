@@ -116,6 +116,13 @@ def _compact(graph, outputs):
     return renumbered, tuple(graph.kinds[i] for i in position), tuple(position[i] for i in outputs)
 
 
+def live(nodes, kinds, outputs):
+    """Nodes, kinds and outputs of what these outputs depend on."""
+    graph = Graph(len(nodes) + 1)
+    graph.nodes, graph.kinds = list(nodes), list(kinds)
+    return _compact(graph, list(outputs))
+
+
 def with_given(nodes, kinds, outputs, given: dict[int, int]):
     """The same where some nodes, whose values are known, are inputs at the positions given."""
     graph = Graph(len(nodes) + 1)

@@ -1,0 +1,415 @@
+"""`Derivation`: everything that is derived from a scene, lowered to scalar programs on first use and kept.
+
+    (system, layout, structure of params) ─► derivation_of ─► Derivation ─► programs and facts
+
+One lowering gives all quantities of a state together: L, p, M, the forces, G, γ, … (`Motion.quantities`); a program for
+some of them is cut out of that one. What is solved for (accelerations, multipliers, the steps back to the constraints)
+is written down as formulas in JAX on scalars, which call these programs, and lowered once more: an elimination that is
+written in `jnp` costs nothing to test, and its derivatives are JAX's.
+
+All programs take the same inputs: q, q̇, t and then every number of params, one scalar each.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax import _linear
+from lagjax._layout import Layout
+from lagjax._motion import Motion, velocity_scales
+from lagjax._native import Projection
+from lagjax._program import Program, Unlowerable, lower, lower_solution
+
+PyTree = Any
+
+# A larger scene is not even looked at: most of the work of reducing it would be thrown away.
+LARGEST_SCALAR_SCENE = 64
+OPERATION_BUDGET = 20_000
+
+
+class _Saddle(NamedTuple):
+    """A linear system M x − Gᵀλ = b, G x = c by the names of b (None: zero) and c, and the sign c is taken with.
+
+    `velocities` tells whether constraints on velocities belong to it.
+    """
+
+    b: str | None
+    c: str
+    sign: int
+    velocities: bool = True
+
+
+_ACCELERATION = _Saddle("force", "target", 1)
+_VELOCITY_STEP = _Saddle(None, "rates", -1)
+_POSITION_STEP = _Saddle(None, "residual", -1, velocities=False)
+
+
+def _lowered_once(make: Callable) -> property:
+    """A property that is made once; what could not be lowered raises the same `Unlowerable` again, without the work."""
+    name = make.__name__
+
+    @functools.wraps(make)
+    def get(self):
+        if name not in self._made:
+            try:
+                self._made[name] = make(self)
+            except Unlowerable as reason:
+                self._made[name] = reason
+        made = self._made[name]
+        if isinstance(made, Unlowerable):
+            raise Unlowerable(str(made)) from None
+        return made
+
+    return property(get)
+
+
+class Derivation:
+    """What is derived from a scene: its programs, and the facts that can be read off them.
+
+    Every program is lowered when it is first asked for. Each raises `Unlowerable`, with the end of a sentence, where
+    the scene has none: it is too large, or takes operations that have no scalar form.
+    """
+
+    def __init__(
+        self, motion: Motion, layout: Layout, params: PyTree, refusal: str | None = None, unhashable: str | None = None
+    ):
+        """`params` holds numbers or shapes of numbers; `refusal` says why a scene must not be lowered at all.
+
+        `unhashable` says why this derivation cannot be kept for the next time.
+        """
+        self.motion, self.layout, self.refusal, self.unhashable = motion, layout, refusal, unhashable
+        self._numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
+        self._made: dict[str, Any] = {}
+        self._programs: dict[tuple[str, ...], Program] = {}
+        self._by_q: dict[tuple[int, ...], Program] = {}
+        self._shapes: dict[str, tuple[int, ...]] = {}
+        # Compiled functions are traced once for each of their derivatives, and all quantities share these.
+        functions = (motion.lagrangian, motion.forces, motion.dissipation, motion.constraints)
+        functions += (motion.velocity_constraints,)
+        self._traced_once = Motion(*(None if f is None else jax.jit(f) for f in functions))
+
+    # ---- quantities of a state ----
+
+    @_lowered_once
+    def _whole(self) -> Program:
+        """All of `Motion.quantities` in the order of their names."""
+        if self.refusal is not None:
+            raise Unlowerable(self.refusal)
+
+        def quantities(*state):
+            values = self._traced_once.quantities(*state)
+            self._shapes = {name: values[name].shape for name in sorted(values)}
+            return [values[name] for name in self._shapes]
+
+        return lower(quantities, *self.state_shapes, budget=OPERATION_BUDGET)
+
+    def program(self, *names: str) -> Program:
+        """The program for these of `Motion.quantities`, end to end, each in C order."""
+        if names not in self._programs:
+            whole, starts = self._whole, self._starts
+            positions = [k for name in names for k in range(starts[name], starts[name] + self.count(name))]
+            structure = jax.tree.structure(tuple(self.state_shapes))
+
+            def chosen(*leaves):
+                values = self._traced_once.quantities(*jax.tree.unflatten(structure, leaves))
+                return [values[name] for name in names]
+
+            self._programs[names] = whole.only(positions, chosen)
+        return self._programs[names]
+
+    @functools.cached_property
+    def _starts(self) -> dict[str, int]:
+        ends = np.cumsum([0, *(self.count(name) for name in self._shapes)]).tolist()
+        return dict(zip(self._shapes, ends, strict=False))
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """The shape of one of `Motion.quantities`."""
+        self._whole  # noqa: B018  (its trace says what the shapes are)
+        return self._shapes[name]
+
+    def count(self, name: str) -> int:
+        """How many numbers one of `Motion.quantities` has."""
+        return int(np.prod(self.shape(name), dtype=int))
+
+    def evaluate(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
+        """These quantities at S states, each of shape (S, …), in NumPy; `columns` as `Program.evaluate_many` takes."""
+        return self._by_name(names, self.program(*names).evaluate_many(columns))
+
+    def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
+        """How far rounding may move these quantities at S states, each of shape (S, …)."""
+        return self._by_name(names, self.program(*names).round_off_many(columns))
+
+    def _by_name(self, names: Sequence[str], outputs: np.ndarray) -> dict[str, np.ndarray]:
+        rows, values, start = outputs.T, {}, 0
+        for name in names:
+            end = start + self.count(name)
+            values[name] = rows[:, start:end].reshape(len(rows), *self.shape(name))
+            start = end
+        return values
+
+    def conserved_by_q(self, momenta: tuple[int, ...]) -> Program:
+        """∂(h, p of the coordinates `momenta`)/∂q, shape (1 + len(momenta), n)."""
+        if momenta not in self._by_q:
+            kept = jax.jacrev(self._traced_once.energy_and_momenta, argnums=1)
+            self._by_q[momenta] = lower(functools.partial(kept, momenta), *self.state_shapes, budget=OPERATION_BUDGET)
+        return self._by_q[momenta]
+
+    # ---- what is solved for ----
+
+    @_lowered_once
+    def acceleration(self) -> Program:
+        """q̈, then whether M, or its saddle point with the constraints, is singular.
+
+        With constraints M may be singular (a parameter may make it so) as long as the saddle point is not. To allow for
+        that costs three times the arithmetic. Where M is regular in general the program is therefore the regular-M
+        variant, and its last output tells where that would cost digits; there `otherwise()` is the general variant.
+        Machine code changes over where that comes about, with the numbers of the run at hand; XLA, which has to write
+        the program down before it knows them, takes the one that always holds (`Program.complete`).
+        """
+        self._require_small()
+        if not self.motion.constrained or self._constant_mass or not self._regular(_ACCELERATION):
+            return self._general_acceleration
+        variant = self._solution(_ACCELERATION, regular_only=True)
+        return replace(variant, otherwise=lambda: self._general_acceleration)
+
+    @_lowered_once
+    def _general_acceleration(self) -> Program:
+        return self._solution(_ACCELERATION)
+
+    @_lowered_once
+    def multipliers(self) -> Program | None:
+        """λ, those of `constraints` first; redundant ones are zero. None without constraints."""
+        if not self.motion.constrained:
+            return None
+        self._require_small()
+        system, solve = self._system(_ACCELERATION)
+
+        def multipliers(*scalars):
+            _, right, factors, _ = system(*scalars)
+            return [-pull for pull in solve(factors, right)[self.layout.size :]]
+
+        return lower(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
+
+    @_lowered_once
+    def projected(self) -> Program | None:
+        """(q, q̇) after one Newton step of each kind back to the constraints, as `Motion.projected`; or None."""
+        if not self.motion.constrained:
+            return None
+        self._require_small()
+        n = self.layout.size
+        velocity = self._solution(_VELOCITY_STEP)
+        position = None if self.motion.constraints is None else self._solution(_POSITION_STEP)
+
+        def projected(*scalars):
+            q, rest = list(scalars[:n]), scalars[n:]
+            if position is not None:
+                q = [x + dx for x, dx in zip(q, position(*scalars), strict=False)]
+            v = [x + dx for x, dx in zip(rest[:n], velocity(*q, *rest), strict=False)]
+            return *q, *v
+
+        return lower(projected, *self.scalar_shapes, budget=OPERATION_BUDGET)
+
+    @_lowered_once
+    def velocity_scales(self) -> Program | None:
+        """`Motion.speeds` of a state, (n,); None without constraints."""
+        if not self.motion.constrained:
+            return None
+        n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
+
+        def scales(*scalars):
+            values = jnp.stack(parts(*scalars))
+            return velocity_scales(
+                values[: n * n].reshape(n, n), values[n * n :].reshape(-1, n), jnp.stack(scalars[n : 2 * n])
+            )
+
+        return lower(scales, *self.scalar_shapes, budget=OPERATION_BUDGET)
+
+    @_lowered_once
+    def projection(self) -> Projection | None:
+        """What machine code needs to keep a motion on its constraints; None without any."""
+        return None if self.projected is None else Projection(self.projected, self.velocity_scales)
+
+    # ---- facts ----
+
+    def reads(self, name: str) -> frozenset[int]:
+        """The positions of the inputs that any number of this quantity depends on."""
+        program = self.program(name)
+        return frozenset().union(*(program.depends(k) for k in range(len(program.outputs))))
+
+    def absent(self, name: str) -> np.ndarray:
+        """Which numbers of this quantity are zero whatever the state, in its shape."""
+        program = self.program(name)
+        return np.array([program.constant(k) == 0 for k in range(len(program.outputs))], bool).reshape(self.shape(name))
+
+    @_lowered_once
+    def works(self) -> bool:
+        """Whether anything does work: an explicit time, a force, a constraint that drives the motion."""
+        return not all(self.absent(name).all() for name in ("lagrangian_by_t", "nonconservative_force", "driving"))
+
+    @_lowered_once
+    def conserved(self) -> tuple[int, ...]:
+        """The coordinates whose momenta are constant: neither L, nor a force, nor a constraint acts on them."""
+        untouched = self.absent("generalized_force") & self.absent("jacobian").all(axis=0)
+        return tuple(np.flatnonzero(untouched).tolist())
+
+    @property
+    def traced_operations(self) -> int:
+        """The scalar operations of all quantities as derived, before reduction."""
+        return self._whole.traced_operations
+
+    # ---- inputs ----
+
+    @property
+    def state_shapes(self) -> tuple:
+        """Shapes of (q, q̇, t, params), as the functions of the motion take them."""
+        q, t = jax.ShapeDtypeStruct((self.layout.size,), self.layout.dtype), jax.ShapeDtypeStruct((), self.layout.dtype)
+        return q, q, t, self._numbers
+
+    @property
+    def scalar_shapes(self) -> list[jax.ShapeDtypeStruct]:
+        """Those of the inputs of every program: q, q̇, t and every number in params, one by one."""
+        leaves = jax.tree.leaves(self._numbers)
+        numbers = [leaf.dtype for leaf in leaves for _ in range(leaf.size)]
+        return [jax.ShapeDtypeStruct((), dtype) for dtype in [self.layout.dtype] * (2 * self.layout.size + 1) + numbers]
+
+    def _require_small(self) -> None:
+        if self.layout.size > LARGEST_SCALAR_SCENE:
+            raise Unlowerable(f"it has {self.layout.size} coordinates, more than {LARGEST_SCALAR_SCENE}")
+
+    # ---- linear systems ----
+
+    def _solution(self, saddle: _Saddle, regular_only: bool = False) -> Program:
+        """x of a linear system, and then whether it is singular."""
+        system, solve = self._system(saddle, regular_only)
+        return lower_solution(system, solve, self.layout.size, *self.scalar_shapes, budget=OPERATION_BUDGET)
+
+    def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
+        """A z = r with z = (x, −λ), as two functions of scalars.
+
+        The first gives the entries of A, r, factors of A and whether it is singular; the second z, from the factors and
+        r. With constraints M is augmented by GᵀW G, unless it is constant and regular, or `regular_only` is asked for:
+        that says where M is not regular enough.
+        """
+        n, parts, m = self.layout.size, self._parts(saddle), self._rows(saddle)
+        regular = self._regular(saddle)
+        mass_zeros, row_zeros = self.absent("mass_matrix"), self.absent("jacobian")[:m]
+        augmented = not (regular_only or (self._constant_mass and regular))
+        if self.motion.constrained:
+            elimination = _linear.SaddleElimination((mass_zeros, row_zeros), self.layout.dtype, augmented, regular_only)
+        else:
+            elimination = _linear.Elimination(mass_zeros, self.layout.dtype)
+
+        def system(*scalars):
+            values = list(parts(*scalars))
+            table = [values[n * i : n * i + n] for i in range(n + self.shape("jacobian")[0])]
+            matrix, rows, right = table[:n], table[n : n + m], values[n * len(table) :]
+            c = right[:m] if saddle.sign > 0 else [-x for x in right[:m]]
+            b = [jnp.zeros((), self.layout.dtype)] * n if saddle.b is None else right[-n:]
+            factors, singular = elimination.factors(matrix, rows)
+            entries = {(i, j): x for i, row in enumerate(matrix + rows) for j, x in enumerate(row[: i + 1])}
+            return entries, b + c, factors, singular
+
+        return system, elimination.solve
+
+    def _parts(self, saddle: _Saddle) -> Program:
+        return self.program("mass_matrix", "jacobian", saddle.c, *(() if saddle.b is None else (saddle.b,)))
+
+    def _rows(self, saddle: _Saddle) -> int:
+        """How many constraints belong to this system; those on positions come first."""
+        return self.shape("jacobian")[0] if saddle.velocities else self.position_count
+
+    @functools.cached_property
+    def position_count(self) -> int:
+        """How many of the constraints are on positions; they come first."""
+        if self.motion.constraints is None:
+            return 0
+        q, _, t, numbers = self.state_shapes
+        return jax.eval_shape(self._traced_once.constraints, q, t, numbers).size
+
+    @_lowered_once
+    def _constant_mass(self) -> bool:
+        return not self.reads("mass_matrix")
+
+    @_lowered_once
+    def _samples(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """M and G at a few states that nothing speaks for, where they are finite."""
+        n, parts, rng = self.layout.size, self.program("mass_matrix", "jacobian"), np.random.default_rng(0)
+        columns = rng.uniform(0.3, 1.2, (3, parts.size)).T
+        rows = parts.evaluate_many(columns).T
+        return [(x[: n * n].reshape(n, n), x[n * n :].reshape(-1, n)) for x in rows if np.isfinite(x).all()]
+
+    def _regular(self, saddle: _Saddle) -> bool:
+        """Whether M is regular in general: at all of the sampled states. Raises `Unlowerable` where it needs pivoting.
+
+        Elimination without pivoting is for positive definite M. With constraints M may be singular, and is then
+        augmented by GᵀG. The choice is between right answers: a wrong guess is caught by the test on the pivots.
+        """
+        n, m, regular = self.layout.size, self._rows(saddle), True
+        for matrix, jacobian in self._samples:
+            lowest, size, rows = np.linalg.eigvalsh(matrix)[0], np.abs(matrix).max(), jacobian[:m]
+            regular = regular and lowest > 1e-10 * size
+            augmented = np.linalg.eigvalsh(matrix + rows.T @ rows)[0] if m else lowest
+            if (n > 2 or m) and augmented < -1e-12 * size:
+                raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
+        return bool(regular)
+
+
+def columns_of(q, qdot, t, numbers: Sequence) -> list:
+    """The inputs of a program at S states: `q`, `qdot` (S, n), `t` () or (S,), and `numbers` each () or (S,)."""
+    return [*np.asarray(q).T, *np.asarray(qdot).T, np.asarray(t), *numbers]
+
+
+def numbers_of(params: PyTree) -> list:
+    """Every number in the parameters, one by one."""
+    return [x for leaf in jax.tree.leaves(params) for x in np.ravel(np.asarray(leaf))]
+
+
+# ---- made once ---------------------------------------------------------------------------------------------------
+
+
+class _Structure(NamedTuple):
+    """All that decides how a scene is derived. The scene and its layout are structure alone."""
+
+    system: Any
+    layout: Any
+    code: tuple
+    shapes: tuple
+
+
+def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
+    """The derivation of a scene with parameters of this structure, whatever their values.
+
+    It is made once for scenes, layouts and structures that are equal. Scenes whose functions hold arrays of their own
+    have no programs, as these arrays could change; those whose code cannot be hashed are derived anew each time.
+    """
+    numbers, code = eqx.partition(params, eqx.is_array_like)
+    if jax.tree.leaves(system):
+        return Derivation(
+            system.motion(layout, params), layout, numbers, "the functions of the scene hold arrays of their own"
+        )
+    leaves, structure = jax.tree.flatten(numbers)
+    shapes = tuple((np.shape(leaf), np.dtype(jnp.result_type(leaf))) for leaf in leaves)
+    others, tree = jax.tree.flatten(code)
+    key = _Structure(jax.tree.structure(system), jax.tree.structure(layout), (tuple(others), tree, structure), shapes)
+    try:
+        hash(key)
+    except TypeError as reason:
+        return _derived(key, str(reason))
+    return _derived_once(key)
+
+
+def _derived(key: _Structure, unhashable: str | None = None) -> Derivation:
+    others, tree, structure = key.code
+    numbers = jax.tree.unflatten(structure, [np.zeros(*shape) for shape in key.shapes])
+    params = eqx.combine(numbers, jax.tree.unflatten(tree, others))
+    system, layout = jax.tree.unflatten(key.system, []), jax.tree.unflatten(key.layout, [])
+    return Derivation(system.motion(layout, params), layout, numbers, unhashable=unhashable)
+
+
+_derived_once = functools.lru_cache(maxsize=64)(_derived)

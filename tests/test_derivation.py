@@ -1,0 +1,235 @@
+"""What is derived from a scene once: programs evaluated without a compiler, and `explain` against what runs."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import _engine, _equations, _flow, _simulate, scenes
+from lagjax._check import _measure as of_check
+from lagjax._derivation import columns_of, derivation_of, numbers_of
+from lagjax._health import _measure as of_health
+from lagjax._layout import Layout
+from lagjax._program import lower
+from lagjax._program._evaluate import CHUNK, PARTIALS
+
+# ---- evaluation in NumPy ---------------------------------------------------------------------------------------------
+
+ONE = {
+    "sqrt": jnp.sqrt, "rsqrt": jax.lax.rsqrt, "cbrt": jnp.cbrt, "exp": jnp.exp, "exp2": jnp.exp2, "expm1": jnp.expm1,
+    "log": jnp.log, "log1p": jnp.log1p, "logistic": jax.nn.sigmoid, "erf": jax.scipy.special.erf,
+    "erfc": jax.scipy.special.erfc, "sin": jnp.sin, "cos": jnp.cos, "tan": jnp.tan, "asin": jnp.arcsin,
+    "acos": jnp.arccos, "atan": jnp.arctan, "sinh": jnp.sinh, "cosh": jnp.cosh, "tanh": jnp.tanh, "asinh": jnp.arcsinh,
+    "acosh": lambda x: jnp.arccosh(1 + x), "atanh": jnp.arctanh, "abs": lambda x: jnp.abs(x - 0.5), "neg": jnp.negative,
+    "sign": lambda x: x * jnp.sign(x - 0.5), "floor": lambda x: x * jnp.floor(3 * x),
+    "ceil": lambda x: x * jnp.ceil(3 * x), "round": lambda x: x * jnp.round(3 * x),
+    "convert": lambda x: x * (3 * x).astype(int), "is_finite": lambda x: jnp.where(jnp.isfinite(1 / x), x, 0.0),
+}  # fmt: skip
+TWO = {
+    "add": jnp.add, "sub": jnp.subtract, "mul": jnp.multiply, "div": jnp.divide, "pow": jnp.power, "max": jnp.maximum,
+    "min": jnp.minimum, "atan2": jnp.arctan2, "rem": lambda x, y: jax.lax.rem(5 * x, y),
+    "select": lambda x, y: jnp.where((x > y) & (x > 0.3), x * y, y),
+}  # fmt: skip
+
+
+def test_every_operation_for_many_states_at_once_and_its_transpose():
+    assert PARTIALS.keys() <= {*ONE, *TWO}
+    x = np.random.default_rng(0).uniform(0.1, 0.9, (2, CHUNK + 7))
+
+    def everything(x, y):
+        return jnp.stack([*(f(x) for f in ONE.values()), *(f(x, y) for f in TWO.values())])
+
+    program = lower(everything, 1.0, 1.0)
+    values = program.evaluate_many(x)
+    assert values.shape == (len(ONE) + len(TWO), CHUNK + 7)
+    np.testing.assert_array_equal(values[:, 5], program.evaluate(*x[:, 5]))
+    np.testing.assert_allclose(values, jax.jit(everything)(*x).reshape(values.shape), rtol=1e-13)
+    # A number that all states share is as good as a column of it.
+    np.testing.assert_array_equal(
+        program.evaluate_many([x[0], 0.4]), program.evaluate_many([x[0], np.full_like(x[0], 0.4)])
+    )
+
+    weights = np.linspace(-1.0, 1.0, len(values))
+    pulled = program.pull_back_many(x, weights)
+    exact = jax.jit(jax.vmap(jax.grad(lambda x, y: weights @ everything(x, y), argnums=(0, 1))))(*x)
+    np.testing.assert_allclose(pulled, exact, rtol=1e-12, atol=1e-13)
+    # Of many outputs at one state: cotangents side by side.
+    rows = program.pull_back_many(x[:, 3], np.eye(len(weights)))
+    np.testing.assert_allclose(np.stack(rows) @ weights, [column[3] for column in pulled], rtol=1e-12, atol=1e-13)
+
+
+def test_round_off_is_bounded_and_seen_where_terms_cancel():
+    def function(x, y):
+        return jnp.stack([(x + y) ** 2 - x**2 - 2 * x * y - y**2, jnp.sin(x * y) / (x - y), jnp.sqrt(x) * y])
+
+    program, x = lower(function, 1.0, 1.0), np.random.default_rng(1).uniform(1.0, 2.0, (2, 500)).astype(np.float32)
+    single, double = program.evaluate_many(x), program.evaluate_many(x.astype(float))
+    bound = program.round_off_many(x)
+    assert single.dtype == np.float32 and (np.abs(single - double) <= bound).all()
+    # One unit in the last place for every operation, and not many times more.
+    assert (bound[2] < 4 * np.finfo(np.float32).eps * np.abs(double[2])).all() and (bound[0] > 1e-7).all()
+
+
+# ---- one derivation --------------------------------------------------------------------------------------------------
+
+
+def of(system, q, qdot, params=None):
+    return derivation_of(system, Layout.of(q, qdot), params)
+
+
+def pendulum(q, qdot, params):
+    return 0.5 * qdot**2 + params["g"] * jnp.cos(q)
+
+
+def test_a_scene_is_derived_once_for_all_values():
+    first = of(lagjax.System(pendulum), 0.1, 0.2, {"g": 9.81})
+    assert of(lagjax.System(pendulum), jnp.array(0.3), jnp.array(0.4), {"g": jnp.array(1.62)}) is first
+    assert first.acceleration is first.acceleration and first.program("force") is first.program("force")
+    assert of(lagjax.System(pendulum), jnp.float32(0.1), jnp.float32(0.2), {"g": 9.81}) is not first
+    assert of(lagjax.System(lambda q, qdot, params: pendulum(q, qdot, params)), 0.1, 0.2, {"g": 9.81}) is not first
+
+
+@pytest.mark.parametrize("make", [scenes.double_pendulum, scenes.chaplygin_sleigh])
+def test_quantities_are_those_of_the_motion(make):
+    scene = make()
+    derivation = of(scene.system, scene.q0, scene.qdot0, scene.params)
+    layout, motion, params = derivation.layout, derivation.motion, jax.tree.map(jnp.asarray, scene.params)
+    rng = np.random.default_rng(0)
+    q, qdot = (np.asarray(layout.flatten(x)) + 0.1 * rng.uniform(-1, 1, layout.size) for x in (scene.q0, scene.qdot0))
+    state = q, qdot, jnp.asarray(0.3), params
+    exact = jax.jit(motion.quantities)(*state)
+    values = derivation.evaluate(sorted(exact), columns_of(q[None], qdot[None], 0.3, numbers_of(params)))
+    for name, value in exact.items():
+        scale = np.abs(value).max(initial=1e-300)
+        np.testing.assert_allclose(values[name][0], value, rtol=1e-12, atol=1e-13 * scale, err_msg=name)
+    np.testing.assert_allclose(exact["mass_matrix"], jax.jit(motion.mass_matrix)(*state), rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(exact["force"], jax.jit(motion.mass_matrix_and_force)(*state)[1], rtol=1e-12, atol=1e-12)
+    scalars = [*q, *qdot, 0.3, *numbers_of(params)]
+    singular = bool(derivation.acceleration.evaluate(*scalars)[-1])
+    program = derivation.acceleration.complete if singular else derivation.acceleration
+    expected = jax.jit(motion.acceleration)(*state)
+    np.testing.assert_allclose(program.evaluate(*scalars)[:-1], expected, rtol=1e-10, atol=1e-11)
+
+
+def test_check_and_health_compile_nothing_where_there_are_programs(monkeypatch):
+    def compiled(*_):
+        raise AssertionError("compiled by XLA")
+
+    monkeypatch.setattr(of_check, "_measure", compiled)
+    monkeypatch.setattr(of_check, "_variation", compiled)
+    monkeypatch.setattr(of_health, "_measured", compiled)
+    for make in (scenes.rolling_cylinder, scenes.damped_driven_oscillator):
+        scene = make()
+        assert lagjax.check(scene.system, scene.q0, scene.qdot0, 0.0, scene.params).ok
+        run = lagjax.simulate(scene.system, scene.q0, scene.qdot0, jnp.linspace(0.0, 1.0, 5), scene.params)
+        assert not run.health().suspicious
+    # Arrays that a function holds could change: such a scene is compiled.
+    with pytest.raises(AssertionError, match="compiled by XLA"):
+        lagjax.check(lagjax.System(Learned(jnp.array([0.5]))), 0.3, 0.4)
+
+
+def test_a_state_without_a_compiler_is_the_compiled_one():
+    scene = scenes.cartesian_pendulum()
+    state = scene.q0, scene.qdot0, 0.0, scene.params
+    for name in ("acceleration", "energy", "constraint_force"):
+        eager = getattr(scene.system, name)(*state)
+        traced = jax.jit(getattr(scene.system, name))(*state)
+        for a, b in zip(jax.tree.leaves(eager), jax.tree.leaves(traced), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
+    # Redundant constraints: the shortest multipliers in both.
+    rod = lambda q: jnp.array([q @ q - 1.0, 3 * (q @ q) - 3.0])
+    twice = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], constraints=rod)
+    q, v = jnp.array([0.6, -0.8]), jnp.array([0.4, 0.3])
+    np.testing.assert_allclose(twice.multipliers(q, v), jax.jit(twice.multipliers)(q, v), rtol=1e-9)
+
+
+def test_what_is_zero_is_folded_away_for_the_acceleration_too():
+    # The angle has no derivative at the origin, and 0 times it does not need one: as in the motion.
+    system = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q + 0.0 * jnp.arctan2(q[1], q[0]))
+    q, v = jnp.zeros(2), jnp.array([1.0, 0.5])
+    assert lagjax.simulate(system, q, v, jnp.array([0.0, 1.0])).ok
+    for acceleration in (system.acceleration, jax.jit(system.acceleration)):
+        np.testing.assert_array_equal(acceleration(q, v), np.zeros(2))
+    np.testing.assert_array_equal(jax.vmap(system.acceleration)(q[None], v[None]), np.zeros((1, 2)))
+    np.testing.assert_allclose(jax.jacfwd(system.acceleration)(q, v), -np.eye(2))
+
+
+# ---- explain says what runs ------------------------------------------------------------------------------------------
+
+
+class Learned(eqx.Module):
+    weights: jax.Array
+
+    def __call__(self, q, qdot):
+        return 0.5 * jnp.sum(qdot**2) - self.weights[0] * jnp.sum(q**2)
+
+
+class Unhashable:
+    __hash__ = None
+
+    def __call__(self, q, qdot):
+        return 0.5 * jnp.sum(qdot**2) - jnp.sum(q**2)
+
+
+def free(q, v):
+    return 0.5 * jnp.sum(v**2) - 0.5 * jnp.sum(q**2)
+
+
+def pairs(count):
+    i, j = np.triu_indices(count, 1)
+    return lambda q, v: 0.5 * jnp.sum(v**2) - jnp.sum(jnp.cos(q[i] * q[j]))
+
+
+SCENES = {
+    # name: scene, q, engine, words of explain
+    "free": (lagjax.System(free), np.ones(2), "machine code", ""),
+    "scalar path asked for": (lagjax.System(free, path="scalar"), np.ones(2), "machine code", ""),
+    "array path asked for": (lagjax.System(free, path="array"), np.ones(2), "diffrax", "asked for"),
+    "holds arrays": (lagjax.System(Learned(jnp.ones(1))), np.ones(2), "diffrax", "hold arrays of their own"),
+    "float32": (lagjax.System(free), np.ones(2, np.float32), "diffrax", "not float64"),
+    "many coordinates": (lagjax.System(free), np.ones(80), "diffrax", "80 coordinates"),
+    "many operations": (lagjax.System(pairs(10)), np.ones(10), "diffrax", "operations, more than"),
+    "too many for XLA": (lagjax.System(pairs(5)), np.ones(5), "machine code", ""),
+    "no scalar form": (lagjax.System(lambda q, v: free(q, v) - jnp.sum(jax.scipy.special.i0(q))), np.ones(2),
+                       "diffrax", "bessel"),
+    "pivoting": (lagjax.System(lambda q, v: v[0] * v[1] + v[2] * v[0] + 0.5 * v[2] ** 2 - q @ q), np.ones(3),
+                 "diffrax", "pivoting"),
+    "indefinite, two coordinates": (lagjax.System(lambda q, v: v[0] * v[1] - q[0] * q[1]), np.ones(2),
+                                    "machine code", ""),
+    "constrained": (lagjax.System(free, constraints=lambda q: q @ q - 2.0), np.ones(2), "machine code", ""),
+    "singular M that a constraint holds": (
+        lagjax.System(lambda q, v: 0.5 * v[0] ** 2 * (1 + q[0] ** 2) - q[0], constraints=lambda q: q[1] - 1.0),
+        np.ones(2), "machine code", "",
+    ),
+    "a function that cannot be hashed": (lagjax.System(Unhashable()), np.ones(2), "machine code", ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_explain_names_the_engine_that_runs(name, monkeypatch):
+    system, q, engine, words = SCENES[name]
+    # Scenes of some thousands of operations take seconds to derive: smaller ones stand for them.
+    monkeypatch.setattr(_flow, "LARGEST_PROGRAM", 150)
+    monkeypatch.setattr(_equations, "LARGEST_XLA_PROGRAM", 30)
+    facts = system.explain(q, np.zeros_like(q))
+
+    class Ran(Exception):
+        pass
+
+    def stop(which):
+        def run(*_, **__):
+            raise Ran(which)
+
+        return run
+
+    monkeypatch.setattr(_engine, "run", stop("machine code"))
+    monkeypatch.setattr(_simulate, "_integrate", stop("diffrax"))
+    with pytest.raises(Ran, match=engine):
+        lagjax.simulate(system, q, np.zeros_like(q), jnp.array([0.0, 0.1]))
+    assert facts.solver.startswith("Taylor series in machine code" if engine == "machine code" else "diffrax.Dopri8")
+    assert words in facts.solver and (not words or "because" in facts.solver)
+    assert facts.path == "scalar" or facts.reason
+    if engine == "machine code":
+        assert facts.path == "scalar" and facts.operations > 0
