@@ -213,11 +213,14 @@ import sys, jax, jax.numpy as jnp, numpy as np, lagjax
 from lagjax import scenes
 jax.config.update("jax_enable_x64", True)
 
-def double(q, v, p):
-    return scenes.double_pendulum().system.lagrangian(q, v, t=0.0, params=p)
+def double(q, qdot, params):
+    return scenes.double_pendulum().system.lagrangian(q, qdot, t=0.0, params=params)
 
-def rods(q, p):
-    return scenes.cartesian_double_pendulum().system.constraints(q, t=0.0, params=p)
+def rods(q, params):
+    return scenes.cartesian_double_pendulum().system.constraints(q, t=0.0, params=params)
+
+def friction(q, qdot):
+    return 0.05 * sum(jnp.sum(x**2) for x in jax.tree.leaves(qdot))
 
 def batch(scene, *shape):
     rng = np.random.default_rng(0)
@@ -231,7 +234,7 @@ def side_by_side(scene, system, members):
 
 def health():
     scene = scenes.double_pendulum()
-    damped = lagjax.System(double, dissipation=lambda q, v: 0.05 * sum(jnp.sum(x**2) for x in jax.tree.leaves(v)))
+    damped = lagjax.System(double, dissipation=friction)
     rest = jax.tree.map(jnp.zeros_like, batch(scene, 26))
     run = lagjax.simulate_batch(damped, batch(scene, 26), rest, jnp.linspace(0, 20, 2667), params=scene.params)
     return lambda: jax.block_until_ready(run.health().energy.value)
@@ -241,7 +244,7 @@ def acceleration():
 
 def constrained():
     scene = scenes.cartesian_double_pendulum()
-    free = lambda q, v, p: scene.system.lagrangian(q, v, t=0.0, params=p)
+    free = lambda q, qdot, params: scene.system.lagrangian(q, qdot, t=0.0, params=params)
     return side_by_side(scene, lagjax.System(free, constraints=rods, path="array"), 16384)
 
 call = globals()[sys.argv[1]]()

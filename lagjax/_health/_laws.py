@@ -267,7 +267,8 @@ def _conditions(matrix: jax.Array) -> jax.Array:
     """The smallest eigenvalue, max|λ| / min|λ|, and the same after scaling to a unit diagonal."""
     diagonal = jnp.abs(jnp.diagonal(matrix))
     scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
-    values, scaled = (_eigenvalues(m) for m in (matrix, scale[:, None] * matrix * scale))
+    # One call for both: LAPACK's kernels side by side in one program wait for each other for ever (`_linear`).
+    values, scaled = jax.vmap(_eigenvalues)(jnp.stack([matrix, scale[:, None] * matrix * scale]))
     spread = (jnp.max(jnp.abs(x)) / jnp.min(jnp.abs(x)) for x in (values, scaled))
     return jnp.stack([jnp.min(values), *spread])
 
