@@ -67,8 +67,9 @@ def interrupt_a_single_member(count=10):
 
 
 def interrupt_a_compiled_function(count=3):
-    """XLA turns the interrupt into an error of its own, which says so."""
-    compiled = jax.jit(lambda q: lagjax.simulate(SCENE.system, q, 0.0, LONG, SCENE.params, max_steps=LIMIT).q)
+    """XLA turns the interrupt into an error of its own, which says so. While JAX traces, it may not survive one."""
+    function = jax.jit(lambda q: lagjax.simulate(SCENE.system, q, 0.0, LONG, SCENE.params, max_steps=LIMIT).q)
+    compiled = function.lower(1.0).compile()
 
     def run():
         try:
