@@ -35,6 +35,9 @@ _BUDGET = 100_000  # operations of a program with tangents
 # Directions that are followed side by side, and coordinates (those of the motion included) that may come of it: more
 # share the work on the motion among more tangents, and take LLVM longer.
 MOST_DIRECTIONS, MOST_TANGENT_COORDINATES = 8, 40
+# Columns of the Jacobian ∂q̈/∂(q, q̇, p) for each direction, up to which the tangents are its products with the
+# directions; where there are more, each is derived along its own.
+_DENSE = 4
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
 LARGEST_KEPT = 2**26  # and of those that are kept for a derivative that is asked for next: half a GiB
 # How a motion ends that its program cannot follow.
@@ -173,7 +176,7 @@ class Flow:
         self.groups = tuple(range(size)) if groups is None else groups
         self.base_size = size if base_size is None else base_size
         self.general = functools.cache(general)
-        self.tangent = functools.lru_cache(maxsize=4)(self._tangent)
+        self.tangent = functools.lru_cache(maxsize=8)(self._tangent)
 
     @classmethod
     def of(cls, program: Program, size: int, projection=None, guards=None) -> "Flow":
@@ -291,9 +294,8 @@ class Flow:
         """
         members, m = dy0.shape[:2]
         widest = max(1, min(MOST_DIRECTIONS, MOST_TANGENT_COORDINATES // self.size - 1))
-        directions = 1 << min(m - 1, widest - 1).bit_length()
-        directions = directions if directions <= widest else directions // 2
-        groups = -(-m // directions)
+        groups = -(-m // widest)
+        directions = -(-m // groups)
         padding = ((0, 0), (0, groups * directions - m), (0, 0))
         dy0, dparams = (np.pad(x, padding).reshape(members * groups, directions, -1) for x in (dy0, dparams))
         length = np.abs(np.concatenate([dy0, dparams], axis=2)).max(axis=2, initial=0.0, keepdims=True)
@@ -446,7 +448,12 @@ def _tangent_parts(base: Flow, rows: int) -> tuple[Program, _native.Projection |
         def along(*direction):
             return jax.jvp(lambda q, v, p: function(q, v, t, p), (q[0], v[0], p[0]), direction)[1]
 
-        return jnp.concatenate([function(q[0], v[0], t, p[0])[None], jax.vmap(along)(q[1:], v[1:], p[1:])])
+        if 2 * n + base.numbers > _DENSE * (rows - 1):
+            tangents = jax.vmap(along)(q[1:], v[1:], p[1:])
+        else:
+            by_q, by_v, by_p = jax.jacfwd(function, argnums=(0, 1, 3))(q[0], v[0], t, p[0])
+            tangents = q[1:] @ by_q.T + v[1:] @ by_v.T + p[1:] @ by_p.T
+        return jnp.concatenate([function(q[0], v[0], t, p[0])[None], tangents])
 
     def accelerations(q, v, t, p):
         return jnp.stack(base.program(*q, *v, t, *p)[:n])

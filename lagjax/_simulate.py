@@ -348,7 +348,10 @@ def _first_member(tree: PyTree, axes: PyTree) -> PyTree:
 
 def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced."""
-    end, code, t_last = trajectory.end, trajectory.result._value, trajectory.ts[-1]
+    end, code = trajectory.end, trajectory.result._value
+    if is_concrete(code) and int(code) in ENDED_WELL:
+        return trajectory
+    t_last = trajectory.ts[-1]
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((end, code, t_last))):
         y_end = jnp.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
         states = trajectory.q, trajectory.qdot, end
@@ -356,8 +359,6 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
         return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
     y_end = np.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
     message = sentence(code, end.t, t_last, y_end, layout.names)
-    if message is None:
-        return trajectory
     if trajectory.result == RESULTS.mass_matrix_singular:
         mass = np.asarray(trajectory.system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
         message += f"\n{_describe_null(mass, layout.names)}"
