@@ -153,11 +153,14 @@ class Derivation:
             start = end
         return values
 
-    def conserved_by_q(self, momenta: tuple[int, ...]) -> Program:
-        """∂(h, p of the coordinates `momenta`)/∂q, shape (1 + len(momenta), n)."""
+    def momenta_by_q(self, momenta: tuple[int, ...]) -> Program:
+        """∂pᵢ/∂q for the coordinates i in `momenta`, shape (len(momenta), n)."""
         if momenta not in self._by_q:
-            kept = jax.jacrev(self._traced_once.energy_and_momenta, argnums=1)
-            self._by_q[momenta] = lower(functools.partial(kept, momenta), *self.state_shapes, budget=OPERATION_BUDGET)
+
+            def chosen(*state):
+                return self._traced_once.momentum(*state)[jnp.asarray(momenta, int)]
+
+            self._by_q[momenta] = lower(jax.jacrev(chosen), *self.state_shapes, budget=OPERATION_BUDGET)
         return self._by_q[momenta]
 
     # ---- what is solved for ----

@@ -94,7 +94,7 @@ class Law(NamedTuple):
         with np.errstate(all="ignore"):
             energy = np.einsum("si,si->s", of["momentum"], qdot) - of["lagrangian"]
             kept = np.concatenate([energy[:, None], of["momentum"][:, list(momenta)]], axis=1)
-            by_q = np.abs(derivation.conserved_by_q(momenta).evaluate_many(columns)).T.reshape(len(q), -1, q.shape[1])
+            by_q = np.abs(np.concatenate([of["energy_by_q"][:, None], self._momenta_by_q(momenta, columns)], axis=1))
             of_energy = np.einsum("sij,sj->si", of["mass_matrix"], qdot)[:, None]
             by_qdot = np.abs(np.concatenate([of_energy, of["mass_matrix"][:, list(momenta)]], axis=1))
             sizes = np.einsum("ski,si->sk", by_q, far) + np.einsum("ski,si->sk", by_qdot, fast)
@@ -111,6 +111,14 @@ class Law(NamedTuple):
             return Sample(
                 kept, slopes, sizes, power, acceleration, *off, _conditions_of(of["mass_matrix"]), self._finite(columns)
             )
+
+    def _momenta_by_q(self, momenta, columns) -> np.ndarray:
+        """∂pᵢ/∂q of some momenta at S states, (S, len(momenta), n)."""
+        n, count = self.derivation.layout.size, max(np.size(x) for x in columns)
+        if not momenta:
+            return np.zeros((count, 0, n), columns[0].dtype)
+        rows = self.derivation.momenta_by_q(momenta).evaluate_many(columns)
+        return np.broadcast_to(rows, (rows.shape[0], count)).T.reshape(count, len(momenta), n)
 
     def _powers(self, q, qdot, t, numbers) -> np.ndarray:
         if not self.works:
@@ -157,7 +165,7 @@ class Law(NamedTuple):
 
 _SYSTEM = ("mass_matrix", "force", "jacobian", "target")
 _SOURCES = ("lagrangian_by_t", "nonconservative_force", "driving")
-_QUANTITIES = ("lagrangian", "momentum", "residual", "rates", *_SYSTEM, *_SOURCES)
+_QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *_SYSTEM, *_SOURCES)
 
 
 def _in_parts(function: Callable, size: int, count: int, *arguments):
