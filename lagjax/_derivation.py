@@ -90,9 +90,8 @@ class Derivation:
         self._by_q: dict[tuple[int, ...], Program] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
-        functions = (motion.lagrangian, motion.forces, motion.dissipation, motion.constraints)
-        functions += (motion.velocity_constraints,)
-        self._traced_once = Motion(*(None if f is None else jax.jit(f) for f in functions))
+        others = (motion.forces, motion.dissipation, motion.constraints, motion.velocity_constraints)
+        self._traced_once = Motion(jax.jit(motion.lagrangian), *(None if f is None else jax.jit(f) for f in others))
 
     # ---- quantities of a state ----
 
@@ -330,10 +329,11 @@ class Derivation:
     @functools.cached_property
     def position_count(self) -> int:
         """How many of the constraints are on positions; they come first."""
-        if self.motion.constraints is None:
+        constraints = self._traced_once.constraints
+        if constraints is None:
             return 0
         q, _, t, numbers = self.state_shapes
-        return jax.eval_shape(self._traced_once.constraints, q, t, numbers).size
+        return jax.eval_shape(constraints, q, t, numbers).size
 
     @_lowered_once
     def _constant_mass(self) -> bool:

@@ -251,9 +251,9 @@ def _by_name(label: str, names: tuple[str, ...], extreme: Extreme, allowed) -> l
     """A row for the one that comes nearest to what is allowed, or exceeds it most."""
     if not names:
         return []
-    extreme, allowed = Extreme(*map(np.asarray, extreme)), np.asarray(allowed)
+    allowed = np.asarray(allowed)
     with np.errstate(all="ignore"):
-        part = (extreme.value / allowed).reshape(-1, len(names))
+        part = (np.asarray(extreme.value) / allowed).reshape(-1, len(names))
     part = np.where(np.isnan(np.asarray(extreme.t)).reshape(part.shape), -np.inf, part)
     which = int(np.argmax(np.max(part, axis=0)))
     picked = Extreme(extreme.value[..., which], extreme.t[..., which])

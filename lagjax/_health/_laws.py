@@ -103,14 +103,15 @@ class Law(NamedTuple):
             slopes += np.einsum("ski,si->sk", by_qdot, rtol * fast + atol)
             lengths = np.linalg.norm(of["jacobian"], axis=2)
             held = np.where(np.arange(lengths.shape[1]) < derivation.position_count, of["residual"], 0)
-            off = [np.where(x == 0, 0.0, np.abs(x) / lengths) for x in (held, of["rates"])]
+            distances, rates = (np.where(x == 0, 0.0, np.abs(x) / lengths) for x in (held, of["rates"]))
             power, acceleration = np.zeros(len(q), q.dtype), np.zeros_like(q)
             if self.works:
                 acceleration, multipliers = _solved(of)
                 power = _power_of(of, qdot, multipliers)
             return Sample(
-                kept, slopes, sizes, power, acceleration, *off, _conditions_of(of["mass_matrix"]), self._finite(columns)
-            )
+                kept, slopes, sizes, power, acceleration, distances, rates,
+                _conditions_of(of["mass_matrix"]), self._finite(columns),
+            )  # fmt: skip
 
     def _momenta_by_q(self, momenta, columns) -> np.ndarray:
         """∂pᵢ/∂q of some momenta at S states, (S, len(momenta), n)."""
@@ -207,11 +208,9 @@ def _eigenvalues_of(matrix: np.ndarray) -> np.ndarray:
         middle, radius = 0.5 * (a + d), np.hypot(0.5 * (a - d), c)
         larger = np.where(middle < 0, middle - radius, middle + radius)
         return np.stack([larger, np.where(larger == 0, 0.0, (a * d - c * c) / larger)], axis=1)
-    usable = np.isfinite(matrix).all(axis=(1, 2), keepdims=True)
-    symmetric = np.where(
-        usable, 0.5 * (matrix + np.swapaxes(matrix, 1, 2)), np.eye(matrix.shape[1], dtype=matrix.dtype)
-    )
-    return np.where(usable[:, :, 0], np.linalg.eigvalsh(symmetric), np.nan)
+    usable, unit = np.asarray(np.isfinite(matrix).all(axis=(1, 2))), np.eye(matrix.shape[1], dtype=matrix.dtype)
+    symmetric = np.where(usable[:, None, None], 0.5 * (matrix + np.swapaxes(matrix, 1, 2)), unit)
+    return np.where(usable[:, None], np.linalg.eigvalsh(symmetric), np.nan)
 
 
 def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int, ...] | None]:
