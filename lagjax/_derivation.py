@@ -90,9 +90,8 @@ class Derivation:
         self._by_q: dict[tuple[int, ...], Program] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
-        functions = (motion.lagrangian, motion.forces, motion.dissipation, motion.constraints)
-        functions += (motion.velocity_constraints,)
-        self._traced_once = Motion(*(None if f is None else jax.jit(f) for f in functions))
+        others = (motion.forces, motion.dissipation, motion.constraints, motion.velocity_constraints)
+        self._traced_once = Motion(jax.jit(motion.lagrangian), *(None if f is None else jax.jit(f) for f in others))
 
     # ---- quantities of a state ----
 
@@ -153,11 +152,14 @@ class Derivation:
             start = end
         return values
 
-    def conserved_by_q(self, momenta: tuple[int, ...]) -> Program:
-        """∂(h, p of the coordinates `momenta`)/∂q, shape (1 + len(momenta), n)."""
+    def momenta_by_q(self, momenta: tuple[int, ...]) -> Program:
+        """∂pᵢ/∂q for the coordinates i in `momenta`, shape (len(momenta), n)."""
         if momenta not in self._by_q:
-            kept = jax.jacrev(self._traced_once.energy_and_momenta, argnums=1)
-            self._by_q[momenta] = lower(functools.partial(kept, momenta), *self.state_shapes, budget=OPERATION_BUDGET)
+
+            def chosen(*state):
+                return self._traced_once.momentum(*state)[jnp.asarray(momenta, int)]
+
+            self._by_q[momenta] = lower(jax.jacrev(chosen), *self.state_shapes, budget=OPERATION_BUDGET)
         return self._by_q[momenta]
 
     # ---- what is solved for ----
@@ -327,10 +329,11 @@ class Derivation:
     @functools.cached_property
     def position_count(self) -> int:
         """How many of the constraints are on positions; they come first."""
-        if self.motion.constraints is None:
+        constraints = self._traced_once.constraints
+        if constraints is None:
             return 0
         q, _, t, numbers = self.state_shapes
-        return jax.eval_shape(self._traced_once.constraints, q, t, numbers).size
+        return jax.eval_shape(constraints, q, t, numbers).size
 
     @_lowered_once
     def _constant_mass(self) -> bool:

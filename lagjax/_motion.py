@@ -59,7 +59,8 @@ class Motion(eqx.Module):
     def quantities(self, q, qdot, t, params) -> dict[str, jax.Array]:
         """Everything that is asked of a single state, by name, from one round of differentiation.
 
-        - `lagrangian` (), `momentum` (n,), `mass_matrix` (n, n), `lagrangian_by_q` (n,), `lagrangian_by_t` ().
+        - `lagrangian` (), `momentum` (n,), `mass_matrix` (n, n), `lagrangian_by_q` (n,), `lagrangian_by_t` (),
+          `energy_by_q` (n,).
         - `force` (n,): the right-hand side of M q̈ = F.
         - `given_force` (n,): the user's forces; `dissipation` (1,) or (0,), `dissipation_by_qdot` (n,);
           `nonconservative_force` (n,) = forces − ∂D/∂q̇; `generalized_force` (n,) = ∂L/∂q + forces − ∂D/∂q̇.
@@ -68,12 +69,11 @@ class Motion(eqx.Module):
         """
         state, n = (q, qdot, t, params), q.size
         value, (by_q, momentum, by_t) = jax.value_and_grad(self.lagrangian, argnums=(0, 1, 2))(*state)
-        # One linearisation of p gives M, column by column, and the drift (∂p/∂q) q̇ + ∂p/∂t.
-        _, push = jax.linearize(lambda *y: self.momentum(*y, params), q, qdot, t)
-        matrix = jax.vmap(lambda e: push(jnp.zeros_like(q), e, jnp.zeros_like(t)), out_axes=1)(
-            jnp.eye(n, dtype=q.dtype)
-        )
-        drift = push(qdot, jnp.zeros_like(qdot), jnp.ones_like(t))
+        # One linearisation of (∂L/∂q, p) gives M, column by column, the drift (∂p/∂q) q̇ + ∂p/∂t, and (∂p/∂q)ᵀ q̇.
+        _, push = jax.linearize(lambda *y: jax.grad(self.lagrangian, argnums=(0, 1))(*y, params), q, qdot, t)
+        still, now = jnp.zeros_like(q), jnp.zeros_like(t)
+        matrix = jax.vmap(lambda e: push(still, e, now)[1], out_axes=1)(jnp.eye(n, dtype=q.dtype))
+        drift = push(qdot, still, jnp.ones_like(t))[1]
         damped = Motion(self.lagrangian, None, self.dissipation)
         nonconservative = self.nonconservative_force(*state)
         nothing = jnp.zeros(0, q.dtype)
@@ -84,6 +84,7 @@ class Motion(eqx.Module):
             "mass_matrix": matrix,
             "lagrangian_by_q": by_q,
             "lagrangian_by_t": by_t,
+            "energy_by_q": push(still, qdot, now)[0] - by_q,
             "force": by_q + nonconservative - drift,
             "given_force": jnp.zeros_like(q) if self.forces is None else self.forces(*state),
             "dissipation": nothing if self.dissipation is None else self.dissipation(*state)[None],

@@ -81,7 +81,7 @@ def _followed(scene: Scene, functions: list[Callable]) -> tuple[Callable, Callab
             mass, force = motion.mass_matrix_and_force(*at(point))
             return motion.lagrangian(*at(point)), motion.momentum(*at(point)), mass, force
 
-        return tuple(jax.jit(jax.vmap(of)) for of in (lambda point: sides_at(*at(point)), looked))
+        return jax.jit(jax.vmap(lambda point: sides_at(*at(point)))), jax.jit(jax.vmap(looked))
 
 
 def _directions(scene: Scene) -> list[tuple[str, float, np.ndarray]]:

@@ -100,7 +100,8 @@ class Scene(NamedTuple):
         try:
             varied = _program_variation(self.derivation, self.state, acceleration, multipliers)
         except Unlowerable:
-            varied = np.asarray(_variation(self.system, *self.given, acceleration, multipliers))
+            q, qdot, t, params = self.given
+            varied = np.asarray(_variation(self.system, q, qdot, t, params, acceleration, multipliers))
         return self._solve(-varied)[: self.layout.size]
 
     def _solve(self, b: np.ndarray) -> np.ndarray:
@@ -270,10 +271,6 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
     extra = jnp.zeros_like(q) if motion.forces is None else motion.forces(*state)
     dragged = -damped.nonconservative_force(*state)
 
-    def rounding(*terms):  # of derivatives whose own terms are not known
-        size = sum(jnp.max(jnp.abs(term), initial=0.0) for term in terms)
-        return jnp.full(terms[0].shape, 4 * jnp.finfo(q.dtype).eps * size)
-
     return Measured(
         by_q=by_q,
         momentum=momentum,
@@ -290,10 +287,16 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
         plus=sides[:, 1],
         noise=jnp.zeros_like(everything(y)),
         round_off=(
-            *map(rounding, (by_q, momentum[0], mass[0])), rounding(by_q, extra, dragged, force[0]),
-            *map(rounding, (dragged, rows[0])),
+            *map(_rounding, (by_q, momentum[0], mass[0])), _rounding(by_q, extra, dragged, force[0]),
+            *map(_rounding, (dragged, rows[0])),
         ),
     )  # fmt: skip
+
+
+def _rounding(*terms):
+    """What rounding may be of derivatives whose own terms are not known, in the shape of the first of `terms`."""
+    size = sum(jnp.max(jnp.abs(term), initial=0.0) for term in terms)
+    return jnp.full(terms[0].shape, 4 * jnp.finfo(terms[0].dtype).eps * size)
 
 
 @eqx.filter_jit

@@ -76,7 +76,7 @@ class Health(eqx.Module):
     - `amplitude`: the largest change of a coordinate; infinite where nothing moves. `amplitude_needed`: the size below
       which atol allows errors of a ten-thousandth of it or more in every step; zero for fixed steps.
     - `momentum`, as `energy`: for each momentum that is conserved, pᵢ with ∂L/∂qᵢ = 0 and no force of any kind on it; a
-      last axis for those in `momentum_names`, which is None where the scene is too large to see which; and
+      last axis for those in `momentum_names`, which is None where that is not known; and
       `momentum_allowed`.
     - `constraint_distance`: for each of `constraint_names` (a last axis) the largest distance |f| / |∂f/∂q| of q from
       f = 0, zero for a velocity constraint; `constraint_rate`: the same for velocities, |Gq̇ + ∂f/∂t| / |G|.
@@ -188,7 +188,7 @@ class Health(eqx.Module):
         law = "power balance" if self.works else "energy"
         rows.append((law, f"off by {_worst(self.energy, self.energy_allowed)}{known}"))
         if self.momentum_names is None:
-            rows.append(("momenta", "too many coordinates to see which are conserved"))
+            rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
         rows += _by_name("momenta", self.momentum_names or (), self.momentum, self.momentum_allowed)
         for k, (what, off) in enumerate((("q", self.constraint_distance), ("qdot", self.constraint_rate))):
             allowed = np.broadcast_to(np.asarray(self.constraint_allowed)[..., k, None], off.value.shape)
@@ -251,9 +251,9 @@ def _by_name(label: str, names: tuple[str, ...], extreme: Extreme, allowed) -> l
     """A row for the one that comes nearest to what is allowed, or exceeds it most."""
     if not names:
         return []
-    extreme, allowed = Extreme(*map(np.asarray, extreme)), np.asarray(allowed)
+    allowed = np.asarray(allowed)
     with np.errstate(all="ignore"):
-        part = (extreme.value / allowed).reshape(-1, len(names))
+        part = (np.asarray(extreme.value) / allowed).reshape(-1, len(names))
     part = np.where(np.isnan(np.asarray(extreme.t)).reshape(part.shape), -np.inf, part)
     which = int(np.argmax(np.max(part, axis=0)))
     picked = Extreme(extreme.value[..., which], extreme.t[..., which])

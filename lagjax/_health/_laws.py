@@ -94,7 +94,7 @@ class Law(NamedTuple):
         with np.errstate(all="ignore"):
             energy = np.einsum("si,si->s", of["momentum"], qdot) - of["lagrangian"]
             kept = np.concatenate([energy[:, None], of["momentum"][:, list(momenta)]], axis=1)
-            by_q = np.abs(derivation.conserved_by_q(momenta).evaluate_many(columns)).T.reshape(len(q), -1, q.shape[1])
+            by_q = np.abs(np.concatenate([of["energy_by_q"][:, None], self._momenta_by_q(momenta, columns)], axis=1))
             of_energy = np.einsum("sij,sj->si", of["mass_matrix"], qdot)[:, None]
             by_qdot = np.abs(np.concatenate([of_energy, of["mass_matrix"][:, list(momenta)]], axis=1))
             sizes = np.einsum("ski,si->sk", by_q, far) + np.einsum("ski,si->sk", by_qdot, fast)
@@ -103,14 +103,23 @@ class Law(NamedTuple):
             slopes += np.einsum("ski,si->sk", by_qdot, rtol * fast + atol)
             lengths = np.linalg.norm(of["jacobian"], axis=2)
             held = np.where(np.arange(lengths.shape[1]) < derivation.position_count, of["residual"], 0)
-            off = [np.where(x == 0, 0.0, np.abs(x) / lengths) for x in (held, of["rates"])]
+            distances, rates = (np.where(x == 0, 0.0, np.abs(x) / lengths) for x in (held, of["rates"]))
             power, acceleration = np.zeros(len(q), q.dtype), np.zeros_like(q)
             if self.works:
                 acceleration, multipliers = _solved(of)
                 power = _power_of(of, qdot, multipliers)
             return Sample(
-                kept, slopes, sizes, power, acceleration, *off, _conditions_of(of["mass_matrix"]), self._finite(columns)
-            )
+                kept, slopes, sizes, power, acceleration, distances, rates,
+                _conditions_of(of["mass_matrix"]), self._finite(columns),
+            )  # fmt: skip
+
+    def _momenta_by_q(self, momenta, columns) -> np.ndarray:
+        """∂pᵢ/∂q of some momenta at S states, (S, len(momenta), n)."""
+        n, count = self.derivation.layout.size, max(np.size(x) for x in columns)
+        if not momenta:
+            return np.zeros((count, 0, n), columns[0].dtype)
+        rows = self.derivation.momenta_by_q(momenta).evaluate_many(columns)
+        return np.broadcast_to(rows, (rows.shape[0], count)).T.reshape(count, len(momenta), n)
 
     def _powers(self, q, qdot, t, numbers) -> np.ndarray:
         if not self.works:
@@ -157,7 +166,7 @@ class Law(NamedTuple):
 
 _SYSTEM = ("mass_matrix", "force", "jacobian", "target")
 _SOURCES = ("lagrangian_by_t", "nonconservative_force", "driving")
-_QUANTITIES = ("lagrangian", "momentum", "residual", "rates", *_SYSTEM, *_SOURCES)
+_QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *_SYSTEM, *_SOURCES)
 
 
 def _in_parts(function: Callable, size: int, count: int, *arguments):
@@ -199,11 +208,9 @@ def _eigenvalues_of(matrix: np.ndarray) -> np.ndarray:
         middle, radius = 0.5 * (a + d), np.hypot(0.5 * (a - d), c)
         larger = np.where(middle < 0, middle - radius, middle + radius)
         return np.stack([larger, np.where(larger == 0, 0.0, (a * d - c * c) / larger)], axis=1)
-    usable = np.isfinite(matrix).all(axis=(1, 2), keepdims=True)
-    symmetric = np.where(
-        usable, 0.5 * (matrix + np.swapaxes(matrix, 1, 2)), np.eye(matrix.shape[1], dtype=matrix.dtype)
-    )
-    return np.where(usable[:, :, 0], np.linalg.eigvalsh(symmetric), np.nan)
+    usable, unit = np.asarray(np.isfinite(matrix).all(axis=(1, 2))), np.eye(matrix.shape[1], dtype=matrix.dtype)
+    symmetric = np.where(usable[:, None, None], 0.5 * (matrix + np.swapaxes(matrix, 1, 2)), unit)
+    return np.where(usable[:, None], np.linalg.eigvalsh(symmetric), np.nan)
 
 
 def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int, ...] | None]:

@@ -33,8 +33,8 @@ _CHUNK = 2**18  # numbers of mass matrices looked at together: what is made of t
 class Extreme(NamedTuple):
     """The worst value along each path and the time of the output where it is found; NaN where nothing was reached."""
 
-    value: jax.Array
-    t: jax.Array
+    value: jax.Array | np.ndarray
+    t: jax.Array | np.ndarray
 
 
 class Names(eqx.Module):
@@ -58,7 +58,7 @@ class Path(NamedTuple):
     ts: Any  # (…, T)
     ends: Any  # (…, T − 1): where the law of each output ends, at the next output or at a transition before it
     steps: Any  # (…)
-    tolerances: tuple[Any, Any] | None  # (…) each
+    promised: Any  # rtol and atol, (…) each; None for fixed steps
 
     @property
     def library(self):
@@ -211,10 +211,11 @@ class _Members:
             return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), total)
 
         def sampled(law, index, member, q, qdot, t, numbers) -> Sample:
-            promised = (0.0, 0.0) if path.tolerances is None else (x[member] for x in path.tolerances)
+            promised = (0.0, 0.0) if path.promised is None else (x[member] for x in path.promised)
             sample = law.samples(momenta, tuple(promised), q, qdot, t, numbers)
-            around = (0, 0), (starts[index], starts[-1] - starts[index + 1])
-            return sample._replace(distances=np.pad(sample.distances, around), rates=np.pad(sample.rates, around))
+            before, after = int(starts[index]), int(starts[-1] - starts[index + 1])
+            held = (np.pad(off, ((0, 0), (before, after))) for off in (sample.distances, sample.rates))
+            return sample._replace(**dict(zip(("distances", "rates"), held, strict=True)))
 
         def powers(law, index, member, q, qdot, t, numbers):
             return law.powers(q, qdot, t, numbers)
@@ -238,14 +239,14 @@ def _measured(trajectory, axes, tree, steps):
         names["all"] = _names(laws, layout)
         path = _path_of_one(layout, q, qdot, given, mode, steps, transitions)
         momenta, numbers = _conserved(laws) or (), eqx.filter(params, eqx.is_array)
-        promised = (0.0, 0.0) if path.tolerances is None else path.tolerances
+        promised = (0.0, 0.0) if path.promised is None else path.promised
         size = _CHUNK // (members * layout.size**2)
 
         def chunked(function):
             return lambda *states: _in_chunks(partial(_in_its_mode, laws, function), states, size)
 
-        look = chunked(lambda law, *state: sample_at(law, momenta, promised, *state, numbers))
-        return _report(path, laws, momenta, look, chunked(lambda law, *state: power_at(law, *state, numbers)))
+        look = chunked(lambda law, q, v, t: sample_at(law, momenta, promised, q, v, t, numbers))
+        return _report(path, laws, momenta, look, chunked(lambda law, q, v, t: power_at(law, q, v, t, numbers)))
 
     found = trajectory.over_members(one, steps, trajectory.transitions)
     return found, names["all"]
@@ -257,13 +258,13 @@ def _path_of_one(layout: Layout, q, qdot, given, mode, steps, transitions) -> Pa
 
     ts, tolerances = given
     mode = jnp.zeros(ts.size, int) if mode is None else mode
-    states, ends = (flat(q), flat(qdot), ts, mode), jnp.arange(1, ts.size)
+    q, v, t, ends = flat(q), flat(qdot), ts, jnp.arange(1, ts.size)
     if transitions is not None:
-        more = flat(transitions.q), flat(transitions.qdot), transitions.t, transitions.source
-        states = tuple(jnp.concatenate(pair) for pair in zip(states, more, strict=True))
+        q, v = jnp.concatenate([q, flat(transitions.q)]), jnp.concatenate([v, flat(transitions.qdot)])
+        t, mode = jnp.concatenate([t, transitions.t]), jnp.concatenate([mode, transitions.source])
         ends = _ends(jnp, ts, transitions.t)
     promised = None if tolerances is None else tuple(jnp.asarray(x, layout.dtype) for x in tolerances)
-    return Path(*states, ts, ends, steps.astype(layout.dtype), promised)
+    return Path(q, v, t, mode, ts, ends, steps.astype(layout.dtype), promised)
 
 
 def _in_its_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
@@ -317,10 +318,10 @@ def _report(path: Path, laws: list[Law], momenta: tuple[int, ...], look: Callabl
     held = on_path[..., None] & (mode[..., :T, None] == owner)
     spans = [xp.max(xp.where(on_path[..., None], xp.abs(x[..., :T, :]), 0.0), axis=(-2, -1)) for x in (q, qdot)]
     eps = float(np.finfo(dtype).eps)
-    fixed = path.tolerances is None
-    near = math.sqrt(eps) if fixed else xp.maximum(path.tolerances[0], ROUND_OFF * eps)[..., None]
+    fixed = path.promised is None
+    near = math.sqrt(eps) if fixed else xp.maximum(path.promised[0], ROUND_OFF * eps)[..., None]
     singular = any(law.motion.constrained for law in laws)  # M may be, where constraints hold what it does not
-    finest = max(math.sqrt(eps), SLACK * eps) if fixed else SLACK * path.tolerances[0]
+    finest = max(math.sqrt(eps), SLACK * eps) if fixed else SLACK * path.promised[0]
     fine, none = here.finite | ~on_path, xp.zeros(path.ts.shape[:-1], dtype)
     all_fine, first = xp.all(fine, axis=axis), xp.argmin(fine, axis=axis)
     energy = worst(drifts[..., 0], on_path)
@@ -330,7 +331,7 @@ def _report(path: Path, laws: list[Law], momenta: tuple[int, ...], look: Callabl
         "work_error": work_error,
         "outputs_needed": _outputs_needed(xp, T, energy.value, work_error, size[..., 0]),
         "amplitude": _amplitude(xp, q[..., :T, :], on_path),
-        "amplitude_needed": none if fixed else SMALLEST * path.tolerances[1] + none,
+        "amplitude_needed": none if fixed else SMALLEST * path.promised[1] + none,
         "momentum": worst(drifts[..., 1:], on_path),
         "momentum_allowed": limits[..., 1:],
         "constraint_distance": worst(here.distances, held),
@@ -407,7 +408,7 @@ def _work(path: Path, found: Sample, measurable, power: Callable) -> tuple[Any, 
     until = partial(_at_ends, xp, axis, path.ends)
     (q, v, t, a, p), last = (path.q, path.qdot, path.t, found.acceleration, found.power), T - 1
     points, weights = (x.astype(q.dtype) for x in (_POINTS, _WEIGHTS))
-    h = until(t) - t[..., :last]
+    h, zero = until(t) - t[..., :last], xp.zeros((), q.dtype)
     a0, a1 = a[..., :last, :], until(a)
     mode = xp.maximum(until(path.mode), 0)
 
@@ -415,7 +416,7 @@ def _work(path: Path, found: Sample, measurable, power: Callable) -> tuple[Any, 
         """∫ P over a polynomial in s from 0 to 1, with coefficients (…, T − 1, n) of s⁰, s¹, …"""
 
         def summed(powers):
-            return sum(c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=False))
+            return sum((c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=False)), start=zero)
 
         at = summed([points**k for k in range(6)])
         along = summed([k * points ** max(k - 1, 0) for k in range(6)])
@@ -476,7 +477,7 @@ def _limits(path: Path, here: Sample, on_path) -> tuple[Any, Any]:
     xp, n = path.library, path.q.shape[-1]
     slope, size = (xp.max(xp.where(on_path[..., None], x, 0.0), axis=-2) for x in (here.slopes, here.sizes))
     allowed, steps = VISIBLE * size, path.steps[..., None]
-    if path.tolerances is not None:
+    if path.promised is not None:
         allowed = xp.minimum(allowed, SLACK * math.sqrt(2 * n) * (steps + 1) * slope)
     return allowed + ROUND_OFF * float(np.finfo(size.dtype).eps) * (1 + xp.sqrt(steps)) * size, size
 

@@ -44,11 +44,11 @@ def evaluate(line, columns: Sequence, steps: Callable | None = None) -> np.ndarr
     precision of the float columns. Values are dropped as soon as nothing needs them.
     """
     columns, precision, count = _prepared(line, columns)
-    steps = steps_of(line, precision) if steps is None else steps(precision)
+    sequence = steps_of(line, precision) if steps is None else steps(precision)
     results = np.empty((len(line.outputs), count), precision)
     with np.errstate(all="ignore"):
         for start in range(0, count, CHUNK):
-            values = _values(steps, [x if x.ndim == 0 else x[start : start + CHUNK] for x in columns])
+            values = _values(sequence, [x if x.ndim == 0 else x[start : start + CHUNK] for x in columns])
             for row, i in enumerate(line.outputs):
                 results[row, start : start + CHUNK] = values[i]
     return results
