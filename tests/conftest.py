@@ -9,9 +9,9 @@ from pathlib import Path
 # CPU lacks them. It reads its level of logging when it is imported.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-import jax  # noqa: E402
-import llvmlite.binding  # noqa: E402
-import pytest  # noqa: E402
+import jax
+import llvmlite.binding
+import pytest
 
 jax.config.update("jax_enable_x64", True)
 
