@@ -5,6 +5,10 @@ import hashlib
 import os
 from pathlib import Path
 
+# XLA counts two of its own preferences among the features of a CPU and logs, of each program it reads back, that this
+# CPU lacks them. It reads its level of logging when it is imported.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 import jax
 import llvmlite.binding
 import pytest

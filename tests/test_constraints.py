@@ -607,6 +607,7 @@ def test_projection_of_moving_and_velocity_constraints():
     np.testing.assert_allclose(v, (1.0, 0.0, 3.0), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_projection_is_nan_where_there_is_nothing_to_find():
     system = lagjax.System(weight, constraints=lambda q: 1 + q[0] ** 2)
     assert np.isnan(system.project(jnp.array([0.7, 0.2]), jnp.zeros(2))[0]).all()

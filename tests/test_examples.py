@@ -45,6 +45,7 @@ def test_double_pendulum(tmp_path, capsys):
     assert "100.00%" in printed and "default: Taylor (machine code)" in printed and "; 0 of the " in printed
 
 
+@pytest.mark.slow
 def test_flip_map_is_symmetric_and_empty_where_pendulums_hang_low():
     _, times = importlib.import_module("double_pendulum").flip_times(7, 2.0)
     np.testing.assert_array_equal(times, times[::-1, ::-1])

@@ -243,7 +243,7 @@ def test_simulate_inside_jit_and_vmap():
 
 def run_from(q0):
     # Fixed steps: adaptive ones may differ by a step where a decision hangs on the last digit.
-    return lagjax.simulate(SCENE, q0, 0.5, TS, PARAMS, dt=0.02, solver=diffrax.Tsit5())
+    return lagjax.simulate(SCENE, q0, 0.5, TS, PARAMS, dt=0.02, solver=diffrax.Heun())
 
 
 # ---- failures that only the integration can find --------------------------------------------------------------------
@@ -269,7 +269,8 @@ ONE = {"phi": 1.0, "x": 1.0}
 
 def test_a_wall_in_the_domain_ends_in_a_sentence():
     message, trajectory = failing(lambda q, v: 0.5 * v**2 - jnp.sqrt(q), 1.0, -1.0)
-    assert "step size shrank" in message and "velocities" in message
+    assert "NaN or infinite" in message and "velocities" in message
+    assert "Not finite just ahead: the force on q" in message
     reached = np.isfinite(trajectory.q)
     assert reached[0] and not reached[-1] and trajectory.end.t < 1.0
 
