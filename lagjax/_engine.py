@@ -7,7 +7,7 @@ scalar program) is diffrax's, in `_integrate`. Both follow the same motion withi
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import _native, _transforms
-from lagjax._equations import projection, scalar_program
-from lagjax._flow import Flow, Outcome, Tolerances, unfit
+from lagjax._derivation import Derivation, derivation_of
+from lagjax._explain import machine_code_refusal
+from lagjax._flow import Flow, Outcome, Tolerances
 from lagjax._integrate import Solved
 from lagjax._layout import Layout, as_vector
-from lagjax._program import Unlowerable
 from lagjax._results import RESULTS, result_from
 from lagjax._settings import Settings, is_concrete
 from lagjax._system import System
@@ -88,54 +88,13 @@ def _primal(flow: Flow, tolerances: Tolerances) -> Callable:
 
 def scene_flow(system: System, layout: Layout, params: PyTree) -> "Flow | str":
     """The flow of a scene, or a sentence that says why it has none. Made once."""
-    if system.path == "array":
-        return "the array path was asked for"
-    if jax.tree.leaves(system):
-        return "the functions of the scene hold arrays of their own"
-    try:
-        return _made(_Scene.of(system, layout, params))
-    except TypeError as reason:
-        if "unhashable" in str(reason):
-            return f"the scene cannot be remembered: {reason}"
-        raise
-
-
-class _Scene(NamedTuple):
-    """All that decides what machine code looks like; hashable. The scene and its layout are structure alone."""
-
-    system: Any
-    layout: Any
-    code: Any
-    shapes: tuple
-
-    @classmethod
-    def of(cls, system: System, layout: Layout, params: PyTree) -> "_Scene":
-        numbers, code = eqx.partition(params, eqx.is_array_like)
-        leaves, structure = jax.tree.flatten(numbers)
-        shapes = tuple((np.shape(leaf), np.dtype(jnp.result_type(leaf))) for leaf in leaves)
-        others, tree = jax.tree.flatten(code)
-        scene = cls(jax.tree.structure(system), jax.tree.structure(layout), (tuple(others), tree, structure), shapes)
-        hash(scene)
-        return scene
-
-    def rebuilt(self) -> tuple[System, Layout, PyTree]:
-        """The scene, its layout, and parameters of the right shapes, whatever their values."""
-        others, tree, structure = self.code
-        numbers = jax.tree.unflatten(structure, [np.zeros(*shape) for shape in self.shapes])
-        params = eqx.combine(numbers, jax.tree.unflatten(tree, others))
-        return jax.tree.unflatten(self.system, []), jax.tree.unflatten(self.layout, []), params
+    return _flow_of(derivation_of(system, layout, params), system.path)
 
 
 @functools.lru_cache(maxsize=64)
-def _made(scene: _Scene) -> "Flow | str":
-    system, layout, params = scene.rebuilt()
-    try:
-        motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
-        program = scalar_program(motion, layout, numbers)
-        back = projection(motion, layout, numbers)
-    except Unlowerable as reason:
-        return str(reason)
-    return unfit(program, layout.size, layout.dtype) or Flow.of(program, layout.size, back)
+def _flow_of(derivation: Derivation, path: str) -> "Flow | str":
+    refusal = machine_code_refusal(derivation, path)
+    return refusal or Flow.of(derivation.acceleration, derivation.layout.size, derivation.projection)
 
 
 # ---- one trajectory --------------------------------------------------------------------------------------------------

@@ -26,8 +26,8 @@ from lagjax import _native
 from lagjax._arguments import Function, accept
 from lagjax._consistent import TOLERANCE, require_consistent
 from lagjax._custom import differentiated_as
+from lagjax._derivation import derivation_of
 from lagjax._engine import RESULT_OF_CODE
-from lagjax._equations import multiplier_program, projection, scalar_program
 from lagjax._flow import Flow, Tolerances, unfit
 from lagjax._layout import Layout, as_vector
 from lagjax._motion import Motion
@@ -257,11 +257,9 @@ class _Shape(NamedTuple):
 def _made(name: str, system: System, leaving: tuple[Transition, ...], layout: Layout, known, structure) -> _Mode:
     params = structure.unflatten([np.zeros(*x) if isinstance(x, _Shape) else x for x in known])
     n, numbers = layout.size, eqx.filter(params, eqx.is_array_like)
-    motion = system.motion(layout, params)
+    derivation = derivation_of(system, layout, params)
     try:
-        program = scalar_program(motion, layout, numbers)
-        back = projection(motion, layout, numbers)
-        multipliers = multiplier_program(motion, layout, numbers) if motion.constrained else None
+        program, back, multipliers = derivation.acceleration, derivation.projection, derivation.multipliers
 
         def surfaces(y, numbers):
             q, v, t = y[:n], y[n:-1], y[-1]

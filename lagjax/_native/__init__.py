@@ -195,6 +195,7 @@ def _addresses(*arrays) -> list[int | None]:
     return [None if array is None else array.ctypes.data for array in arrays]
 
 
+@functools.lru_cache(maxsize=16)  # asked for when it is decided what runs, and when that is compiled
 def recurrences(program: Program, size: int) -> Series:
     """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
     for (op, _, _), kind in zip(program.nodes, program.kinds, strict=True):
