@@ -18,7 +18,6 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from lagjax._derivation import Derivation
 from lagjax._layout import Layout
 from lagjax._motion import Motion
-from lagjax._native import Projection
 from lagjax._program import Program, Unlowerable
 
 PyTree = Any
@@ -128,27 +127,12 @@ def form_of(derivation: Derivation, path: str = "auto") -> Equations:
     return ScalarEquations(program, derivation.projected)
 
 
-# Thin calls for those who still hold a `Motion`; `derivation_of` keeps what is derived.
+# For those who hold a `Motion`; `derivation_of` keeps what is derived from a `System`.
 
 
 def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
     """`Derivation.acceleration`: q̈ and whether M is singular, or raises `Unlowerable`."""
     return _derived(motion, layout, params).acceleration
-
-
-def projection_program(motion: Motion, layout: Layout, params: PyTree) -> Program | None:
-    """`Derivation.projected`: q and q̇ after one step back to the constraints; None without constraints."""
-    return _derived(motion, layout, params).projected
-
-
-def projection(motion: Motion, layout: Layout, params: PyTree) -> Projection | None:
-    """`Derivation.projection`: what machine code needs to keep a motion on its constraints; None without any."""
-    return _derived(motion, layout, params).projection
-
-
-def multiplier_program(motion: Motion, layout: Layout, params: PyTree) -> Program | None:
-    """`Derivation.multipliers`: λ as a program."""
-    return _derived(motion, layout, params).multipliers
 
 
 class _Same(NamedTuple):
