@@ -276,15 +276,18 @@ class Flow:
         """The members to run once more, by which flow and with which tolerances.
 
         A program that assumes a regular mass matrix gives way to one that does not. And where constraints become
-        dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇. It is by accident that
-        one does, so that steps of other sizes pass.
+        dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇, or allow no step from
+        there. The kernel takes such steps again; where that does not help, steps of other sizes all along may.
         """
         if (code == _native.DONE).all():
             return np.zeros(len(code), bool), self, tolerances
         given_up = np.isin(code, GIVEN_UP)
         if given_up.any() and (general := self.general()) is not None:
             return given_up, general, tolerances
-        return (code == _native.NOT_LANDED) & (tolerances.tries > 1), self, tolerances.perturbed
+        stuck = code == _native.NOT_LANDED
+        if self.projection is not None:
+            stuck |= code == _native.STEP_TOO_SMALL
+        return stuck & (tolerances.tries > 1), self, tolerances.perturbed
 
     def push(self, ts, y0, params, dy0, dparams, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
         """The derivative of `run` along m directions for each of N members, between fixed times.

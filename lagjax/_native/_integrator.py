@@ -22,6 +22,7 @@ narrow feature ahead.
 
 import ctypes
 import functools
+from collections.abc import Iterator
 
 from llvmlite import ir
 
@@ -47,6 +48,10 @@ GUARD_NOISE, LITTLE = 64 * 2.0**-52, 1e-4  # rounding; of the step
 FIRST_STEP, GROWTH, GROWTH_AFTER_REJECTION = 1 / 16, 5.0, 2.0  # of the whole time; of the step before
 SMALLEST_STEP = 4 * 2.0**-52  # of the largest time: below this a step no longer moves the time reliably
 LANDING = 16.0  # tolerances from the end of a series to the constraints, at most
+# Next to where constraints become dependent, rounding allows no step longer than the way there: steps become ever
+# shorter, and none gets through. When they have become `SHORTER` by so much the last long one is taken once more, by a
+# tenth shorter each time, so that it ends farther away and the next one gets through; so often at most.
+SHORTER, RETAKEN, MOST_RETURNS = 1 / 64, 0.9, 16
 START = 1e-5  # of the size of the state, the same for the first step
 CHECKS = (0.5, 1.0)  # where in the step its series is held against the equations
 
@@ -96,7 +101,7 @@ class Integrator(SeriesCode):
             "scale": 2 * series.size,
             "increment": 2 * series.size,
             "between": 2 * series.size,  # the state at an output time
-            **({} if projection is None else {"landed": 2 * series.size, "speeds": self.own}),
+            **({} if projection is None else self._sizes_of_constraints(series.size)),
             **dict.fromkeys(("guard", "side", "noise", "root", "change"), len(self.directions)),
             "samples": _SAMPLES * len(self.directions),
             **dict.fromkeys(_OF_A_LANE, 1),
@@ -110,6 +115,11 @@ class Integrator(SeriesCode):
             self.begin_sides = self._begin_sides()
         self._begin()
         self._run()
+
+    def _sizes_of_constraints(self, n: int) -> dict[str, int]:
+        before = {"y_before": 2 * n, "low_before": 2 * n, "side_before": len(self.directions)}
+        lanes = dict.fromkeys(("t_before", "t_low_before", "steps_before", "h_before", "returns", "returned"), 1)
+        return {"landed": 2 * n, "speeds": self.own, **before, **lanes}
 
     # ---- along the step ----
 
@@ -163,7 +173,8 @@ class Integrator(SeriesCode):
         member = Value(code, code.builder.atomic_rmw("add", counter.it, ir.Constant(INTEGER, 1), "monotonic"))
         there = member < self._job(code, job, "members")
         code.store(code.select(there, member, -1), self._lane(code, lane_data, "member", lane))
-        for name in ("h", "t_low", "steps", "rejected"):
+        constrained = () if self.projection is None else ("h_before", "returns", "returned")
+        for name in ("h", "t_low", "steps", "rejected", *constrained):
             self._set(code, memory, name, lane, 0.0)
         self._set(code, memory, "active", lane, code.select(there, double(code, 1.0), 0.0))
         self._set(code, memory, "code", lane, float(_RUNNING))
@@ -218,12 +229,16 @@ class Integrator(SeriesCode):
             code.call(self.coefficients, memory, order)
             self._choose(code, memory, job, order)
             self._halve_until_sound(code, memory, job, order)
+            if self.land is not None:
+                self._return_or_remember(code, memory)
             if self.guards is not None:
                 self._stop_at_events(code, memory, order)
             with code.only_if(self._job(code, job, "recording") > 0), code.loop(self.width) as lane:
                 self._record(code, memory, lane_data, job, lane)
             self._move_time(code, memory, lane_data, job, order)
             self._advance(code, memory)
+            if self.land is not None:
+                self._shorten(code, memory)
             self._end_or_go_on(code, memory, lane_data, job, idle)
         code.finish(self.more(code, memory))
 
@@ -672,6 +687,48 @@ class Integrator(SeriesCode):
             error = code.select(first, far / (START * (1.0 + size)), error)
             off = code.select(error <= off, off, error)  # NaN goes through
         return landed, off
+
+    def _return_or_remember(self, code, memory) -> None:
+        """Back to where the last long step began, if steps have become too short since; or remember this beginning."""
+        size, long = (code.intrinsic("fabs", self._vector(code, memory, name)) for name in ("h", "h_before"))
+        returns, steps = self._vector(code, memory, "returns"), self._vector(code, memory, "steps")
+        active, last, returned = (self._vector(code, memory, name) > 0.0 for name in ("active", "last", "returned"))
+        back = (size < SHORTER * long) & active & ~last & (returns < float(MOST_RETURNS))
+        forth = (size > 0.0) & ~back
+        away = code.intrinsic("fabs", self._vector(code, memory, "t") - self._vector(code, memory, "t_before"))
+        new = forth & ~returned & ((size >= 0.5 * long) | (away > 2.0 * long))
+        undone = steps - self._vector(code, memory, "steps_before")
+        for name, value in (
+            ("h_before", code.select(new, size, long)),
+            ("returns", code.select(back, returns + 1.0, code.select(new, 0.0, returns))),
+            ("returned", code.select(back, code.lanes_of(1.0), 0.0)),
+            ("rejected", self._vector(code, memory, "rejected") + code.select(back, undone + 1.0, 0.0)),
+            ("code", code.select(back, float(_RUNNING), self._vector(code, memory, "code"))),
+            ("h", code.select(back, 0.0, self._vector(code, memory, "h"))),
+        ):
+            self._keep(code, memory, name, value)
+        for now, then in self._beginnings(code, memory):
+            here, there = code.load(now, self.vector), code.load(then, self.vector)
+            code.store(code.select(back, there, here), now)
+            code.store(code.select(new, here, there), then)
+
+    def _beginnings(self, code, memory) -> Iterator[tuple[Value, Value]]:
+        """The addresses of what a step begins with, and of what the last long one began with."""
+        for i in range(self.states):
+            yield self.state(code, memory, i), self.place(code, memory, "y_before", i)
+        one = dict.fromkeys(("t", "t_low", "steps"), 1)
+        for name, count in {"low": self.states, "side": len(self.directions), **one}.items():
+            for i in range(count):
+                yield self.place(code, memory, name, i), self.place(code, memory, name + "_before", i)
+
+    def _shorten(self, code, memory) -> None:
+        """In the lanes that have just returned: the size of the next step, at most."""
+        returned = self._vector(code, memory, "returned") > 0.0
+        size, returns = self._vector(code, memory, "h_before"), self._vector(code, memory, "returns")
+        for k in range(1, MOST_RETURNS + 1):
+            size = code.select(returns >= float(k), RETAKEN * size, size)
+        for name in ("h", "longest"):
+            self._keep(code, memory, name, code.select(returned, size, self._vector(code, memory, name)))
 
     def _land(self) -> Code:
         """`(memory)`: the end of the step back on the constraints, into `landed`; how far it was, into `worst`."""
