@@ -666,7 +666,8 @@ def test_projection_goes_to_the_nearest_state_in_the_metric_of_the_masses():
     np.testing.assert_allclose(again, (q, v), atol=1e-15)
 
 
-@pytest.mark.parametrize("derivative", sweep([jax.jacfwd, jax.jacrev], kept=[jax.jacfwd]))
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_projection_is_differentiated_as_the_function_it_is(derivative):
     system = lagjax.System(two_masses, constraints=bow)
     state = jnp.array([0.8, -0.5, 1.0, 2.0])
@@ -675,6 +676,7 @@ def test_projection_is_differentiated_as_the_function_it_is(derivative):
     np.testing.assert_allclose(derivative(project)(state), np.stack(central, axis=1), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_projection_of_moving_and_velocity_constraints():
     moving = lagjax.System(weight, constraints=lambda q, t: q[0] - jnp.sin(t))
     q, v = moving.project(jnp.array([3.0, 1.0]), jnp.array([5.0, -1.0]), 0.4)

@@ -20,7 +20,10 @@ def forms(scene, *paths):
     return layout, params, [equations(motion, layout, params, path) for path in paths]
 
 
-@pytest.mark.parametrize("make", sweep(scenes.ALL, KINDS), ids=lambda make: make.__name__)
+NO_ROLLING = [make for make in KINDS if make is not scenes.chaplygin_sleigh]  # its projection takes XLA five seconds
+
+
+@pytest.mark.parametrize("make", sweep(scenes.ALL, kept=NO_ROLLING), ids=lambda make: make.__name__)
 def test_both_forms_of_every_scene_agree(make):
     scene = make()
     layout, params, (auto, array) = forms(scene, "auto", "array")
@@ -82,6 +85,7 @@ def test_both_forms_find_a_singular_mass_matrix(lagrangian):
         assert singular and not np.isfinite(acceleration).all()
 
 
+@pytest.mark.slow
 def test_a_mass_matrix_that_needs_pivoting_takes_the_array_path():
     # L = ẋẏ + żẋ + ½ ż² − U: regular, with a zero on the diagonal of M.
     scene = lagjax.System(lambda q, v: v[0] * v[1] + v[2] * v[0] + 0.5 * v[2] ** 2 - 0.5 * jnp.sum(q**2))

@@ -37,6 +37,7 @@ def test_a_failure_is_the_same_sentence_at_run_time_inside_jit(options, transfor
         jax.block_until_ready(jax.jit(transform(lambda x: last(x, True, **options)))(x))
 
 
+@pytest.mark.slow
 def test_diffrax_does_not_lose_a_failure_where_only_the_derivative_is_used():
     with pytest.raises(RuntimeError, match=SENTENCE):
         jax.block_until_ready(jax.jit(jax.grad(lambda x: last(x, True, **ENGINES["diffrax"])))(1.0))

@@ -294,6 +294,7 @@ def test_a_particle_leaves_a_smooth_sphere():
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_poincare_section_of_henon_heiles():
     scene = lagjax.System(
         lambda q, v: 0.5 * (v @ v) - 0.5 * (q @ q) - q[0] ** 2 * q[1] + q[1] ** 3 / 3,
@@ -314,6 +315,7 @@ def test_poincare_section_of_henon_heiles():
     np.testing.assert_allclose(run.q[-1], plain.q[-1], atol=1e-9)  # a reset that changes nothing changes nothing
 
 
+@pytest.mark.slow
 def test_a_kicked_rotor_is_the_standard_map():
     # Kicks by the clock: p → p + K sin θ at t = 1, 2, …, free between. The first free step would be of six periods.
     kick = lagjax.Transition(
@@ -337,6 +339,7 @@ def test_a_guard_that_jumps():
     np.testing.assert_allclose(times(run), np.arange(10) + 0.5, rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_two_balls_that_land_at_the_same_instant_both_bounce():
     scene = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - G * jnp.sum(q))
     first = lagjax.Transition("f", "f", lambda q, v: q[0], -1, lambda q, v: (q, v.at[0].multiply(-0.8)))
@@ -676,6 +679,10 @@ def test_a_failure_names_the_mode():
     with pytest.raises(lagjax.SimulationError, match=r"just ahead: the force on q[^$]*mode 'wall'") as caught:
         hybrid({"a": FREE, "wall": wall}, [lagjax.Transition("a", "wall", lambda q, v: q - 1.0)], 2.0, -1.0, (0.0, 3.0))
     assert caught.value.trajectory.system["wall"] is wall
+
+
+@pytest.mark.slow
+def test_a_failure_names_the_coordinate_without_mass_and_the_mode():
     massless = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1] ** 2)
     with pytest.raises(lagjax.SimulationError, match=r"q\[1\][^$]*mode 'b'"):
         pass_on = lagjax.Transition("a", "b", lambda q, v: q[0] - 0.5)

@@ -87,6 +87,7 @@ def test_where_diffrax_runs_by_default_it_is_named_so_and_measured_once():
     assert list(_precision._with_default_named(insisted)) == ["default: Dopri8", "Tsit5"]
 
 
+@pytest.mark.slow
 def test_single_precision_is_measured_against_double():
     start, solver = (jnp.float32(1.0), jnp.float32(0.0)), diffrax.Tsit5()
     result = lagjax.work_precision(OSCILLATOR, *start, TS, solvers={"5": solver}, tolerances=[1e-5], repeats=1)
@@ -153,6 +154,7 @@ def test_a_reference_that_does_not_arrive_is_an_error():
         lagjax.work_precision(falling, jnp.ones(2), jnp.zeros(2), ts, batch_axes=(0, 0, None))
 
 
+@pytest.mark.slow
 def test_the_error_is_over_all_coordinates_of_any_pytree():
     scene = lagjax.System(lambda q, qdot: 0.5 * (qdot["x"] ** 2 + qdot["y"] ** 2) - 0.5 * q["y"] ** 2)
     q0, qdot0 = {"x": 0.0, "y": 1.0}, {"x": 1.0, "y": 0.0}  # free along x: all the error is along y

@@ -105,6 +105,7 @@ def test_implicit_solver():
     np.testing.assert_allclose(trajectory.q, exact(TS), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_progress_is_printed(capsys):
     run(progress=True, solver=diffrax.Euler(), dt=0.01)
     jax.effects_barrier()
@@ -233,6 +234,7 @@ def test_a_new_value_never_recompiles():
     assert len(traces) == first
 
 
+@pytest.mark.slow
 def test_simulate_inside_jit_and_vmap():
     inside = jax.jit(lambda q0: run_from(q0).q[-1])
     np.testing.assert_allclose(inside(1.0), run_from(1.0).q[-1], rtol=1e-13)

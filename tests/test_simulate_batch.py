@@ -38,6 +38,7 @@ def test_batch_of_states_is_vmap_of_simulate():
     assert batch.q.shape == (8, 5) and batch.ts.shape == (5,) and batch.ok.shape == (8,)
 
 
+@pytest.mark.slow
 def test_batch_is_loop():
     # With fixed steps: adaptive ones may differ by a step where a decision hangs on the last digit.
     fixed = {"dt": 0.01, "solver": diffrax.Tsit5()}
