@@ -18,8 +18,8 @@ def differentiated_as(function: Callable, values: tuple, *arguments) -> tuple:
 
     `function` may only vary with its arguments, which are arrays.
     """
-    values = [jax.lax.stop_gradient(jnp.asarray(x)) for x in values]
-    return tuple(with_p.bind(*values, *map(jnp.asarray, arguments), function=function, count=len(values)))
+    fixed = [jax.lax.stop_gradient(jnp.asarray(x)) for x in values]
+    return tuple(with_p.bind(*fixed, *map(jnp.asarray, arguments), function=function, count=len(fixed)))
 
 
 def _values(*arrays, function, count):
