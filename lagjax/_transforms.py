@@ -130,9 +130,8 @@ def _curvature_composed(ts, y0, params, path_bar, end_bar, dy0, dparams, *, flow
     larger, tolerances = flow.tangent(1), tolerances.with_larger_budget
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
     outcome = Outcome(*run_p.bind(*given, flow=larger, tolerances=tolerances, keep=True))
-    bars = [from_rows(jnp.stack([jnp.zeros_like(bar), bar], axis=-2))[..., None, :, :] if bar is path_bar else
-            from_rows(jnp.stack([jnp.zeros_like(bar), bar], axis=-2))[..., None, :]
-            for bar in (path_bar, end_bar)]  # fmt: skip
+    path_bar, end_bar = (from_rows(jnp.stack([jnp.zeros_like(bar), bar], axis=-2)) for bar in (path_bar, end_bar))
+    bars = path_bar[..., None, :, :], end_bar[..., None, :]
     state_bar, numbers_bar = pull_p.bind(*given, *_residuals(outcome), *bars, flow=larger, tolerances=tolerances)
     state_bar, numbers_bar = to_rows(state_bar[..., 0, :], flow.size)[..., 0, :], numbers_bar[..., 0, : flow.numbers]
     return [state_bar * length, numbers_bar * length]
@@ -250,41 +249,45 @@ def _pull_jvp(primals, tangents, **settings):
 
 def _pull_moved(primals, dts, dy0, dparams, outs, settings):
     """How `pull` changes with ts, y0 and params: each of its m cotangents for itself."""
-    flow, (ts, y0, params), bars = settings["flow"], primals[:3], primals[_GIVEN:]
-    total, dy0, dparams = None, _value(dy0), _value(dparams)
+    (ts, y0, params), bars, total = primals[:3], primals[_GIVEN:], None
+    dy0, dparams = _value(dy0), _value(dparams)
     if not _zero(dts):
-        # Output i moves by f δtᵢ, so that δtᵢ Df of it is one more part of the outputs' derivative, and
-        # the start moves by −f₀ δt₀.
-        path, done = primals[3], primals[4] == _native.DONE
-        reached = jnp.isfinite(path)
-        places = jnp.where(reached, path, y0[..., None, :])
-        path_bar, end_bar = bars
-        weights = jnp.where(reached[..., None, :, :], path_bar, 0.0).at[..., -1, :].add(
-            jnp.where(done[..., None, None], end_bar, 0.0))  # fmt: skip
-
-        def rates(places, numbers):
-            return _slope(flow, ts[..., None, :], places, numbers[..., None, :]) * dts[..., None, :, None]
-
-        lifted = jnp.broadcast_to(places[..., None, :, :], weights.shape), jnp.broadcast_to(
-            params[..., None, :], (*weights.shape[:-2], flow.numbers))  # fmt: skip
-        moved_bar, more = jax.vjp(rates, *lifted)[1](weights)
-        still = jnp.zeros_like(end_bar)
-        total = list(pull_p.bind(*primals[:_GIVEN], moved_bar, still, **settings))
-        total[1] = total[1] + more
-
-        def first_rate(y, numbers):
-            return -_slope(flow, ts[..., None, 0], y, numbers) * dts[..., None, :1]
-
-        lifted = (
-            jnp.broadcast_to(y0[..., None, :], outs[0].shape),
-            jnp.broadcast_to(params[..., None, :], outs[1].shape),
-        )
-        total = _add(total, jax.vjp(first_rate, *lifted)[1](outs[0]))
-        dy0 = dy0 - _slope(flow, ts[..., 0], y0, params) * dts[..., :1]
+        total = _pull_moved_in_time(primals, dts, outs, settings)
+        dy0 = dy0 - _slope(settings["flow"], ts[..., 0], y0, params) * dts[..., :1]
     given = [x[..., None, :] for x in (ts, y0, params)]
     direction = [x[..., None, :] for x in (dy0, dparams)]
     more = curvature_p.bind(*given, *bars, *direction, **settings)
     return list(more) if total is None else _add(total, more)
+
+
+def _pull_moved_in_time(primals, dts, outs, settings):
+    """How `pull` changes with the output times, but for the curvature along the start's −f₀ δt₀.
+
+    Output i moves by f δtᵢ, so that its derivative by (y0, params) gains the part (∂f/∂y Dᵢ + ∂f/∂p) δtᵢ; and the start
+    from which the others follow has the derivative −∂f₀ δt₀.
+    """
+    flow, (ts, y0, params), (path_bar, end_bar) = settings["flow"], primals[:3], primals[_GIVEN:]
+    path, done = primals[3], primals[4] == _native.DONE
+    reached = jnp.isfinite(path)
+    weights = jnp.where(reached[..., None, :, :], path_bar, 0.0)
+    weights = weights.at[..., -1, :].add(jnp.where(done[..., None, None], end_bar, 0.0))
+
+    def rates(places, numbers):
+        return _slope(flow, ts[..., None, :], places, numbers[..., None, :]) * dts[..., None, :, None]
+
+    def first_rate(y, numbers):
+        return -_slope(flow, ts[..., None, 0], y, numbers) * dts[..., None, :1]
+
+    def transposed(function, place, cotangent, numbers_shape):
+        place = jnp.broadcast_to(place, cotangent.shape)
+        return jax.vjp(function, place, jnp.broadcast_to(params[..., None, :], numbers_shape))[1](cotangent)
+
+    places = jnp.where(reached, path, y0[..., None, :])[..., None, :, :]
+    moved_bar, params_bar = transposed(rates, places, weights, (*weights.shape[:-2], flow.numbers))
+    still = jnp.zeros_like(end_bar)
+    y0_bar, more = pull_p.bind(*primals[:_GIVEN], moved_bar, still, **settings)
+    start = transposed(first_rate, y0[..., None, :], outs[0], outs[1].shape)
+    return _add([y0_bar, more + params_bar], start)
 
 
 def _curvature_jvp(primals, tangents, **settings):

@@ -1,0 +1,162 @@
+"""Derivatives of motions in machine code: of every order, in every order of modes, against closed forms."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import scenes
+
+SPRING = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2 - 0.1 * params["c"] * q)
+X = jnp.array([1.0, 0.3, 2.3, 0.7, 0.1])  # q, q̇, k, c and the time of the start
+TIMES = jnp.array([0.4, 1.0, 2.1])
+MODES = {"forward": jax.jacfwd, "reverse": jax.jacrev}
+
+
+def followed(x, times=TIMES):
+    ts = jnp.concatenate([x[4:], times])
+    trajectory = lagjax.simulate(SPRING, x[0], x[1], ts, {"k": x[2], "c": x[3]}, rtol=1e-12)
+    return jnp.concatenate([trajectory.q[1:], trajectory.end.qdot[None]])
+
+
+def exact(x, times=TIMES):
+    """q and the last q̇ of an oscillator about −c/10k."""
+    w, rest = jnp.sqrt(x[2]), -0.1 * x[3] / x[2]
+
+    def at(s):
+        return rest + (x[0] - rest) * jnp.cos(w * s) + x[1] * jnp.sin(w * s) / w
+
+    s = times - x[4]
+    return jnp.concatenate([at(s), jax.grad(at)(s[-1])[None]])
+
+
+def loss(function):
+    return lambda x: jnp.sum(function(x) ** 3)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_first_derivatives_by_the_state_parameters_and_times(mode):
+    np.testing.assert_allclose(MODES[mode](followed)(X), jax.jacfwd(exact)(X), atol=1e-11)
+    np.testing.assert_allclose(
+        MODES[mode](followed, argnums=1)(X, TIMES), jax.jacfwd(exact, argnums=1)(X, TIMES), atol=1e-11
+    )
+
+
+SECOND = [pytest.param(*two, marks=() if two == ("forward", "reverse") else pytest.mark.slow)
+          for two in itertools.product(MODES, MODES)]  # fmt: skip
+
+
+@pytest.mark.parametrize("outer, inner", SECOND)
+def test_second_derivatives_in_every_order_of_modes(outer, inner):
+    found = jax.jit(MODES[outer](MODES[inner](loss(followed))))(X)
+    np.testing.assert_allclose(found, jax.hessian(loss(exact))(X), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_all_outputs_and_of_output_times():
+    for outer, inner in itertools.product(MODES.values(), MODES.values()):
+        found = outer(inner(followed, argnums=(0, 1)), argnums=(0, 1))(X, TIMES)
+        expected = jax.jacfwd(jax.jacfwd(exact, argnums=(0, 1)), argnums=(0, 1))(X, TIMES)
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("modes", list(itertools.product(MODES, MODES, MODES)))
+def test_third_derivatives(modes):
+    found, expected = loss(followed), loss(exact)
+    for mode in modes:
+        found, expected = MODES[mode](found), jax.jacfwd(expected)
+    np.testing.assert_allclose(jax.jit(found)(X), expected(X), rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_batches_of_second_derivatives_are_those_of_their_members():
+    batch = X + 0.1 * jnp.arange(3)[:, None]
+    found = jax.jit(jax.vmap(jax.hessian(loss(followed))))(batch)
+    np.testing.assert_allclose(found, jax.vmap(jax.hessian(loss(exact)))(batch), rtol=1e-9, atol=1e-9)
+
+
+def test_a_hundred_parameters():
+    # A row of springs side by side: only their sum is felt, so that every derivative is the same for each.
+    system = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * jnp.mean(params) * q**2)
+    value = lambda p: lagjax.simulate(system, 1.0, 0.0, jnp.array([0.0, 2.0]), p, rtol=1e-11).q[-1]
+    of_mean = lambda k: jnp.cos(2.0 * jnp.sqrt(k))
+    p, direction = jnp.full(100, 1.7), jnp.sin(jnp.arange(100.0))
+    np.testing.assert_allclose(jax.jit(jax.grad(value))(p), jax.grad(of_mean)(1.7) / 100, rtol=1e-9)
+    along = jax.jit(lambda p, d: jax.jvp(jax.grad(value), (p,), (d,))[1])(p, direction)
+    np.testing.assert_allclose(along, jax.grad(jax.grad(of_mean))(1.7) * jnp.mean(direction) / 100, rtol=1e-8)
+
+
+def test_second_derivatives_on_a_constraint_are_those_of_the_angle():
+    # By gravity and speed: a family of starts that stay on the circle.
+    bead = lambda q, v, params: 0.5 * jnp.sum(v**2) - params * q[1]
+    circle = lagjax.System(bead, constraints=lambda q: jnp.sum(q**2) - 1.0)
+    pendulum = lagjax.System(lambda q, v, params: 0.5 * v**2 + params * jnp.cos(q))
+    ts = jnp.linspace(0, 1.5, 4)
+
+    def on_circle(x):
+        start = jnp.array([0.0, -1.0]), x[1] * jnp.array([1.0, 0.0])
+        return jnp.sum(lagjax.simulate(circle, *start, ts, x[0], rtol=1e-11).q ** 3)
+
+    def by_angle(x):
+        angle = lagjax.simulate(pendulum, 0.0, x[1], ts, x[0], rtol=1e-11).q
+        return jnp.sum(jnp.stack([jnp.sin(angle), -jnp.cos(angle)]) ** 3)
+
+    x = jnp.array([9.81, 1.3])
+    np.testing.assert_allclose(jax.jit(jax.hessian(on_circle))(x), jax.hessian(by_angle)(x), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_the_cartesian_double_pendulum_are_those_of_its_angles():
+    cartesian, angles = scenes.cartesian_double_pendulum(), scenes.double_pendulum()
+    ts, start = jnp.linspace(0, 0.7, 4), jnp.array([1.0, 1.2])
+
+    def places(angle, l):
+        return jnp.cumsum(l[:, None] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)], axis=1), axis=0)
+
+    def by_places(x):
+        params = {"m": x[3:], "l": x[:2], "g": x[2]}
+        q0 = places(start, x[:2])
+        return jnp.sum(lagjax.simulate(cartesian.system, q0, 0 * q0, ts, params, rtol=1e-11).q ** 3)
+
+    def by_angles(x):
+        params = dict(zip(("l1", "l2", "g", "m1", "m2"), x, strict=True))
+        q0 = (
+            jax.tree.unflatten(jax.tree.structure(angles.q0), list(start)) if not hasattr(angles.q0, "shape") else start
+        )
+        q = lagjax.simulate(angles.system, q0, jax.tree.map(jnp.zeros_like, q0), ts, params, rtol=1e-11).q
+        flat = jnp.stack(jax.tree.leaves(q), axis=1) if not hasattr(q, "shape") else q
+        return jnp.sum(jax.vmap(lambda angle: places(angle, x[:2]))(flat) ** 3)
+
+    x = jnp.array([1.0, 0.9, 9.81, 1.2, 0.8])
+    np.testing.assert_allclose(jax.jit(jax.hessian(by_places))(x), jax.jit(jax.hessian(by_angles))(x), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_second_derivatives_through_a_bounce():
+    # By the height, g, the restitution and the speed, of what comes after the first bounce.
+    ball = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q)
+    bounce = lagjax.Transition(
+        "flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v, params: (q, -params["e"] * v)
+    )
+    ts = jnp.array([0.0, 0.3, 0.8, 1.0])
+
+    def run(x):
+        params = {"g": x[1], "e": x[2]}
+        found = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", x[0], x[3], ts, params, max_transitions=2)
+        return jnp.sum(jnp.append(found.q, found.transitions.t[0]) ** 3)
+
+    def closed(x):
+        h, g, e, v = x
+        touch = (v + jnp.sqrt(v * v + 2 * g * h)) / g
+        s, up = ts - touch, e * (g * touch - v)
+        q = jnp.where(s < 0, h + v * ts - 0.5 * g * ts**2, up * s - 0.5 * g * s**2)
+        return jnp.sum(jnp.append(q, touch) ** 3)
+
+    x = jnp.array([1.0, 9.81, 0.8, 0.1])
+    np.testing.assert_allclose(jax.jit(jax.grad(run))(x), jax.grad(closed)(x), rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(jax.jit(jax.hessian(run))(x), jax.hessian(closed)(x), rtol=1e-8, atol=1e-9)
