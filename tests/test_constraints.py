@@ -353,6 +353,7 @@ def turning_cranks(members):
     return start, rate, q0, scenes.SliderCrank(rate, -rate, -2 * rate * np.sin(start))
 
 
+@pytest.mark.slow
 def test_a_dead_centre_is_passed_rightly_or_not_at_all():
     # A step must not end where round-off decides between the branches; one that does is taken again.
     scene, ts = scenes.slider_crank(1.0, 1.0), np.linspace(0, 1.5, 6)

@@ -202,7 +202,9 @@ def test_transformations_agree(name):
 
 
 @pytest.mark.parametrize("name", OWN)
-@pytest.mark.parametrize("kind", ["float32", "float16", "complex128", "int32", "python"])
+@pytest.mark.parametrize(
+    "kind", sweep(["float32", "float16", "complex128", "int32", "python"], kept=["float32", "python"])
+)
 def test_everything_else_is_jax_numpy(name, kind):
     if name == "atan2" and kind == "complex128":
         pytest.skip("atan2 is real")
