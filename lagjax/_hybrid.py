@@ -28,6 +28,7 @@ from lagjax._consistent import TOLERANCE, require_consistent
 from lagjax._custom import differentiated_as
 from lagjax._derivation import derivation_of
 from lagjax._engine import RESULT_OF_CODE
+from lagjax._failures import nan_unless
 from lagjax._flow import Flow, Tolerances, unfit
 from lagjax._layout import Layout, as_vector
 from lagjax._motion import Motion
@@ -232,7 +233,8 @@ def _run(plan: _Plan, ts, q0, qdot0, params):
         latest=jnp.asarray(-1), waiting=jnp.asarray(0),
     )  # fmt: skip
     last, seen = jax.lax.scan(rounds.one, first, jnp.arange(plan.max_transitions + 1))
-    return _fields(layout, ts, last, jax.tree.map(lambda x: x[: plan.max_transitions], seen))
+    last, seen = _without_silent_zeros(last, jax.tree.map(lambda x: x[: plan.max_transitions], seen), (ts, y0, vector))
+    return _fields(layout, ts, last, seen)
 
 
 def _mode(plan: _Plan, index: int, layout: Layout, params: PyTree) -> _Mode:
@@ -555,6 +557,22 @@ def _pile_up(times, end) -> jax.Array:
     rounding = 4 * float(jnp.finfo(times.dtype).eps) * jnp.abs(times[-1])
     lost = (third <= rounding) & (apart > 1)  # one alone may be two transitions at the same instant
     return lost | ((ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end))
+
+
+def _without_silent_zeros(last: _Carry, seen: _Seen, inputs) -> tuple[_Carry, _Seen]:
+    """Outputs (T, 2n) that were not reached and transitions that did not happen, with derivatives that are NaN.
+
+    They are constants, whose derivatives would be zero: each becomes NaN by way of a function of all `inputs`. That is
+    a sine and not a sum, whose second derivative would be zero again.
+    """
+    anything = jnp.sin(sum(jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)) for x in inputs))
+
+    def unless(reached, x):
+        return nan_unless(reached, jnp.where(reached, x, anything))
+
+    happened = seen.source >= 0
+    seen = seen._replace(t=unless(happened, seen.t), y=unless(happened[:, None], seen.y))
+    return last._replace(path=unless((last.modes >= 0)[:, None], last.path)), seen
 
 
 def _fields(layout: Layout, ts, last: _Carry, seen: _Seen):

@@ -203,6 +203,18 @@ def test_the_budget_of_transitions():
         jax.block_until_ready(jax.jit(lambda h: bouncing(h, 0.9, max_transitions=2).q)(1.0))
 
 
+@pytest.mark.parametrize("mode", sweep([jax.jacrev, jax.jacfwd, jax.hessian], kept=[jax.jacrev]))
+def test_what_was_not_reached_has_no_derivative_and_never_zero(mode):
+    # The second bounce, at 1.264, is not allowed: outputs after it are not reached.
+    def outcome(h):
+        run = bouncing(h, 0.9, max_transitions=1, throw=False)
+        return run.q, run.transitions.t
+
+    q, t = jax.jit(mode(outcome))(1.0)
+    np.testing.assert_array_equal(np.isfinite(q), np.linspace(0.0, 2.0, 9) < 1.264)
+    np.testing.assert_allclose(t[0], (-0.25 if mode is jax.hessian else 0.5) * np.sqrt(2 / G), rtol=1e-8)
+
+
 @pytest.mark.slow
 def test_a_spent_budget_is_told_from_bounces_that_pile_up():
     # They add up to sqrt(2 h/g) (1 + e)/(1 − e): 4.06 for e = 0.8 and h = 1. Those of e = 1 never end.
