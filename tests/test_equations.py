@@ -114,6 +114,7 @@ def slope(k):
     return -1.5 / np.sqrt(k) * np.sin(3 * np.sqrt(k))  # d cos(√k t)/dk at t = 3
 
 
+@pytest.mark.slow
 def test_a_closed_over_parameter_is_differentiated_like_a_passed_one():
     np.testing.assert_allclose(jax.grad(lambda k: closed(k, solver=diffrax.Tsit5()))(4.0), slope(4.0), rtol=1e-7)
 

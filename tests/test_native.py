@@ -584,6 +584,7 @@ def assert_same(found, expected, tolerance=1e-7):
             np.testing.assert_allclose(a, b, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_simulate_is_diffrax(calls):
     ts = jnp.linspace(0, 5, 11)
     found = lagjax.simulate(CHAIN, *START, ts, PARAMS)

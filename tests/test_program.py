@@ -145,6 +145,7 @@ def test_same_as_the_function(family):
     assert_same(function, *arguments)
 
 
+@pytest.mark.slow
 def test_all_families_in_jax():
     # On lanes, as one program: XLA takes nearly as long for each of fifty. Their numbers are of order ten.
     functions, arguments = zip(*((function, arguments) for function, *arguments in FAMILIES.values()), strict=True)
