@@ -334,8 +334,12 @@ def _curvature_transpose(cotangents, *args, **settings):
     if any(map(ad.is_undefined_primal, direction)):
         found = curvature_p.bind(*given, *bars, *moving, **settings)
         return [None] * 5 + _to_linear(direction, found)
-    ts, *rest = given
-    second = jax.jvp(lambda *rest: _push_composed(ts, *rest, *direction, **settings), tuple(rest), tuple(moving))[1]
+    ts, *state = given
+    state = tuple(
+        jnp.broadcast_to(x, jnp.broadcast_shapes(x.shape, m.shape)) for x, m in zip(state, moving, strict=True)
+    )
+    moving = tuple(jnp.broadcast_to(m, x.shape) for m, x in zip(moving, state, strict=True))
+    second = jax.jvp(lambda *state: _push_composed(ts, *state, *direction, **settings), state, moving)[1]
     return [None] * 3 + _to_linear(bars, second) + [None] * 2
 
 
