@@ -39,12 +39,17 @@ def _jvp(primals, tangents, *, function, count):
     return with_p.bind(*primals, function=function, count=count), list(changes)
 
 
-def _batched(arrays, axes, *, function, count):
+def batch_in_front(arrays, axes) -> list:
+    """The arguments of a batching rule, each with the batch as its first axis, those that are shared as well."""
     size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not batching.not_mapped)
-    arrays = [
+    return [
         jnp.broadcast_to(x, (size, *x.shape)) if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0)
         for x, axis in zip(arrays, axes, strict=True)
     ]
+
+
+def _batched(arrays, axes, *, function, count):
+    arrays = batch_in_front(arrays, axes)
     return with_p.bind(*arrays, function=jax.vmap(function), count=count), [0] * count
 
 

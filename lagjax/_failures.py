@@ -15,7 +15,7 @@ from jax.experimental.buffer_callback import buffer_callback
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from lagjax._custom import differentiated_as
+from lagjax._custom import batch_in_front, differentiated_as
 from lagjax._results import ENDED_WELL, SimulationError, advice, result_from
 
 
@@ -99,23 +99,16 @@ mlir.register_lowering(check_p, _compiled(_by_copies))
 mlir.register_lowering(check_p, _compiled(_in_place), platform="cpu")
 
 
-def _batched(primitive, args, axes, **settings):
-    """All arguments with the batch in front."""
-    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not batching.not_mapped)
-    given = [
-        jnp.broadcast_to(x, (size, *x.shape)) if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(args, axes, strict=True)
-    ]
-    return primitive.bind(*given, **settings), 0
-
-
 def _without_derivative(primals, tangents, **settings):
     passed = check_p.bind(*primals, **settings)
     return passed, ad.Zero(jax.typeof(passed).to_tangent_aval())
 
 
 ad.primitive_jvps[check_p] = _without_derivative
-batching.primitive_batchers[check_p] = lambda args, axes, **settings: _batched(check_p, args, axes, **settings)
+batching.primitive_batchers[check_p] = lambda args, axes, **given: (
+    check_p.bind(*batch_in_front(args, axes), **given),
+    0,
+)
 
 
 # ---- outputs that were not reached -----------------------------------------------------------------------------------
@@ -124,6 +117,16 @@ batching.primitive_batchers[check_p] = lambda args, axes, **settings: _batched(c
 def nan_unless(reached, x):
     """`x` where `reached` holds, else NaN; so are its derivatives, but for the zero cotangent of what nobody uses."""
     return nan_unless_p.bind(jnp.broadcast_to(reached, jnp.shape(x)), x)
+
+
+def lost_unless(reached, x, inputs):
+    """`nan_unless` for what is a constant where it was not reached: its cotangent goes to all floats of `inputs`.
+
+    By way of a function of them whose derivatives of every order are not zero: a sine, and not a sum.
+    """
+    floats = [x for x in jax.tree.leaves(inputs) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
+    anything = jnp.sin(sum(jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)) for x in floats))
+    return nan_unless(reached, jnp.where(reached, x, anything))
 
 
 def differentiable_where(well, x):
@@ -151,4 +154,4 @@ nan_unless_p.def_impl(_nan_unless)
 mlir.register_lowering(nan_unless_p, mlir.lower_fun(_nan_unless, multiple_results=False))
 ad.primitive_jvps[nan_unless_p] = _nan_unless_jvp
 ad.primitive_transposes[nan_unless_p] = _nan_unless_transpose
-batching.primitive_batchers[nan_unless_p] = lambda args, axes: _batched(nan_unless_p, args, axes)
+batching.primitive_batchers[nan_unless_p] = lambda args, axes: (nan_unless_p.bind(*batch_in_front(args, axes)), 0)

@@ -228,8 +228,13 @@ class Flow:
         """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the outcome, and how many lane steps idled.
 
         With a `store` the steps are kept there, up to `room` (N,) of each member: by default to equal parts of what may
-        be kept.
+        be kept. Codes tell what stopped a member, and not only that its steps became too small, or too many.
         """
+        outcome, idle = self._followed(ts, y0, params, tolerances, store, room)
+        return self._explained(outcome, ts, params), idle
+
+    def _followed(self, ts, y0, params, tolerances, store=None, room=None) -> tuple[Outcome, int]:
+        """`run` without a look at what stopped a member: for another try, and for derivatives."""
         rtol, atol, max_steps, _ = tolerances
         if store is not None and room is None:
             room = np.full(len(y0), min(max_steps, LARGEST_KEPT // ((self.states + 2) * max(1, len(y0)))))
@@ -239,12 +244,12 @@ class Flow:
             outcome = outcome._replace(ticket=store.keep(self._compact(table, room, outcome.accepted, rtol)))
         again, flow, tolerances = self._second_chance(outcome.code, tolerances)
         if not again.any():
-            return self._explained(outcome, ts, params), idle
+            return outcome, idle
         some = _members(again, ts, y0, params)
-        better, more = flow.run(*some, tolerances, store, None if room is None else room[again])
+        better, more = flow._followed(*some, tolerances, store, None if room is None else room[again])
         for values, new in zip(outcome, better, strict=True):
             values[again] = new
-        return self._explained(outcome, ts, params), idle + more
+        return outcome, idle + more
 
     def _explained(self, outcome: Outcome, ts, params) -> Outcome:
         """The outcome with what stopped the members whose steps became too small, or too many."""
@@ -308,7 +313,7 @@ class Flow:
         start = np.concatenate([y0[:, None], dy0 / unit], axis=1)  # (rows, 1 + D, 2n)
         numbers = np.concatenate([params[:, None], dparams / unit], axis=1).reshape(len(start), -1)
         flow = self.tangent(directions)
-        outcome, _ = flow.run(ts, from_rows(start), numbers, tolerances.with_larger_budget)
+        outcome, _ = flow._followed(ts, from_rows(start), numbers, tolerances.with_larger_budget)
         failed = outcome.code != _native.DONE
         lengths = unit.reshape(len(start), directions, 1)
         path, end = (to_rows(x, self.size)[..., 1:, :] for x in (outcome.path, outcome.y_end))
@@ -370,7 +375,7 @@ class Flow:
         for places in _portions(np.flatnonzero(waiting), accepted * (self.states + 2)):
             store = StepStore()
             some_ts = ts if len(ts) == 1 else ts[places]
-            again, _ = self.run(some_ts, y0[places], params[places], tolerances, store, accepted[places])
+            again, _ = self._followed(some_ts, y0[places], params[places], tolerances, store, accepted[places])
             back(store, again.ticket, places)
         at_start = (ts == ts[:, :1])[:, :, None]  # outputs that are the initial state; steps begin after them
         return y_bar + np.sum(path_bar * at_start, axis=1), params_bar

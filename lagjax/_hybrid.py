@@ -28,7 +28,7 @@ from lagjax._consistent import TOLERANCE, require_consistent
 from lagjax._custom import differentiated_as
 from lagjax._derivation import derivation_of
 from lagjax._engine import RESULT_OF_CODE
-from lagjax._failures import nan_unless
+from lagjax._failures import lost_unless
 from lagjax._flow import Flow, Tolerances, unfit
 from lagjax._layout import Layout, as_vector
 from lagjax._motion import Motion
@@ -560,19 +560,11 @@ def _pile_up(times, end) -> jax.Array:
 
 
 def _without_silent_zeros(last: _Carry, seen: _Seen, inputs) -> tuple[_Carry, _Seen]:
-    """Outputs (T, 2n) that were not reached and transitions that did not happen, with derivatives that are NaN.
-
-    They are constants, whose derivatives would be zero: each becomes NaN by way of a function of all `inputs`. That is
-    a sine and not a sum, whose second derivative would be zero again.
-    """
-    anything = jnp.sin(sum(jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)) for x in inputs))
-
-    def unless(reached, x):
-        return nan_unless(reached, jnp.where(reached, x, anything))
-
+    """Outputs (T, 2n) that were not reached and transitions that did not happen, with derivatives that are NaN."""
     happened = seen.source >= 0
-    seen = seen._replace(t=unless(happened, seen.t), y=unless(happened[:, None], seen.y))
-    return last._replace(path=unless((last.modes >= 0)[:, None], last.path)), seen
+    t, y = (lost_unless(which, x, inputs) for which, x in ((happened, seen.t), (happened[:, None], seen.y)))
+    path = lost_unless((last.modes >= 0)[:, None], last.path, inputs)
+    return last._replace(path=path), seen._replace(t=t, y=y)
 
 
 def _fields(layout: Layout, ts, last: _Carry, seen: _Seen):

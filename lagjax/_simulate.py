@@ -17,7 +17,7 @@ import numpy as np
 from lagjax import _engine, _linear
 from lagjax._consistent import inconsistent_members, rank_lost, require_consistent
 from lagjax._equations import equations
-from lagjax._failures import differentiable_where, nan_unless, raise_where_failed, sentence
+from lagjax._failures import differentiable_where, lost_unless, raise_where_failed, sentence
 from lagjax._integrate import integrate
 from lagjax._layout import Layout
 from lagjax._machine_code import MachineCode
@@ -233,12 +233,9 @@ def _integrate(system: System, settings: Settings, q0, qdot0, params, primal=Non
     # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start. Whatever adjoint
     # there is, their cotangents must not be lost: they go to all that went in.
     reached = jnp.isfinite(path[0]).all(axis=1) & jnp.isfinite(path[1]).all(axis=1) & (ts == settings.ts)
-    inputs = sum(jnp.sum(x) for x in jax.tree.leaves((settings.ts, y0, numbers)) if eqx.is_inexact_array(x))
     well = jnp.isin(result._value, jnp.asarray(ENDED_WELL))
-    q, qdot = (
-        jax.vmap(layout.restore)(nan_unless(reached[:, None], jnp.where(reached[:, None], leaf, inputs)))
-        for leaf in path
-    )
+    inputs = settings.ts, y0, numbers
+    q, qdot = (jax.vmap(layout.restore)(lost_unless(reached[:, None], leaf, inputs)) for leaf in path)
     end = tuple(differentiable_where(well, leaf) for leaf in end)
     return (
         settings.ts,
