@@ -23,11 +23,13 @@ from benchmarks import _contenders
 from benchmarks._cases import CASES, Case, chain, double_pendulum
 from benchmarks._contenders import Contender, autodiff_acceleration, named
 from benchmarks._measure import Comparison, compare, seconds
-from lagjax._engine import scene_flow
-from lagjax._equations import Equations, equations
+from lagjax._derivation import derivation_of
+from lagjax._equations import Equations, form_of
 from lagjax._layout import Layout
+from lagjax._machine_code import MachineCode
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, compiled, lanes
 from lagjax._native._lanes import emit, sincos_function
+from lagjax._problem import Problem
 from lagjax._program import StraightLine, lower
 
 TOLERANCE = 1e-9
@@ -98,14 +100,15 @@ def _nanoseconds(forms: dict[str, tuple[Callable, Any]], case: Case, repeats: in
 def _in_machine_code(case: Case) -> Callable[[], None] | None:
     """The same chain in the lanes of vectors, as the integrator evaluates them; None without machine code."""
     layout = Layout.of(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
-    flow = scene_flow(case.scene.system, layout, case.scene.params)
-    if isinstance(flow, str):
+    problem = Problem.about(case.scene.system, layout, case.scene.params)
+    if MachineCode().refuses(problem) is not None:
         return None
+    acceleration = problem.derivation.acceleration
     n, width = layout.size, lanes()
     numbers = [np.ravel(leaf) for leaf in jax.tree.leaves(eqx.filter(case.scene.params, eqx.is_array_like))]
     constants = [float(x) for leaf in numbers for x in leaf]  # as for the others: XLA knows them
     shape = jax.ShapeDtypeStruct((n,), np.float64)
-    program = lower(lambda q, v: jnp.stack(flow.program(*q, *v, 0.0, *constants)[:n]), shape, shape)
+    program = lower(lambda q, v: jnp.stack(acceleration(*q, *v, 0.0, *constants)[:n]), shape, shape)
     vector, module = ir.VectorType(DOUBLE, width), ir.Module("right_hand_side")
     module.triple = ""
     sincos = sincos_function(module, width)
@@ -132,7 +135,7 @@ def derived_equations(case: Case) -> tuple[Equations, Any]:
     """The right-hand side as `lagjax.simulate` uses it, and the parameters as arrays."""
     params = jax.tree.map(jnp.asarray, case.scene.params)
     layout = Layout.of(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
-    return equations(case.scene.system.motion(layout, params), layout, params), params
+    return form_of(derivation_of(case.scene.system, layout, params)), params
 
 
 def _derived(case: Case):

@@ -20,7 +20,7 @@ from benchmarks._cases import Case, chain
 from benchmarks._contenders import Contender, named
 from benchmarks._measure import seconds
 from lagjax import _native
-from lagjax._equations import scalar_program
+from lagjax._derivation import Derivation
 from lagjax._layout import Layout
 
 LINKS = (2, 4, 8, 16)
@@ -63,7 +63,7 @@ def _stages(case: Case) -> tuple[float, float]:
     params = jax.tree.map(jnp.asarray, case.scene.params)
     layout = Layout.of(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
     motion = case.scene.system.motion(layout, params)
-    derive, program = seconds(lambda: scalar_program(motion, layout, eqx.filter(params, eqx.is_array_like)))
+    derive, program = seconds(lambda: Derivation(motion, layout, eqx.filter(params, eqx.is_array_like)).acceleration)
     return derive, seconds(lambda: _native.Kernel(program, layout.size))[0]
 
 

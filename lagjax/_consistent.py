@@ -17,15 +17,14 @@ from lagjax._layout import Layout
 from lagjax._linear import coupling_many, dependent_rows, rank
 from lagjax._motion import Motion
 from lagjax._program import Unlowerable
-from lagjax._settings import is_concrete
-from lagjax._system import System
+from lagjax._validate import is_concrete
 
 PyTree = Any
 
 TOLERANCE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
 
 
-def require_consistent(system: System, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> None:
+def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> None:
     """Raise `ValueError`, naming the constraint, where a single start is off. Values being traced are not looked at."""
     if _free(system) or not _known((ts, q0, qdot0, params, system)):
         return
@@ -74,13 +73,13 @@ def _contradiction(names, values, what, lengths, dependent, tolerance) -> str | 
     return None
 
 
-def _nowhere(system: System, q0, qdot0, t, params) -> bool:
+def _nowhere(system, q0, qdot0, t, params) -> bool:
     """Whether no state on the constraints is found: what asks for different steps may still meet somewhere."""
     found = jax.tree.leaves(eqx.filter_jit(system.project)(q0, qdot0, t, params)[0])
     return not all(np.isfinite(leaf).all() for leaf in found)
 
 
-def inconsistent_members(system: System, layout: Layout, ts, values: dict, axes: dict) -> jax.Array | None:
+def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -> jax.Array | None:
     """Which members of a batch start off their constraints; None where that cannot be or cannot be known."""
     if _free(system) or not _known((ts, values, system)):
         return None
@@ -90,7 +89,7 @@ def inconsistent_members(system: System, layout: Layout, ts, values: dict, axes:
     return ~(off <= TOLERANCE[layout.dtype]).all(axis=1)
 
 
-def _looked_at(system: System, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> tuple:
+def _looked_at(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> tuple:
     """The numbers of `_compiled`, in NumPy; without compiling anything where the scene has programs."""
     q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)]) for x in (q0, qdot0))
     q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, ts[0]))
@@ -110,7 +109,7 @@ def _looked_at(system: System, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
 
 
 @eqx.filter_jit
-def _compiled(system: System, ts, q0: PyTree, qdot0: PyTree, params: PyTree):
+def _compiled(system, ts, q0: PyTree, qdot0: PyTree, params: PyTree):
     """For every constraint its value and rate over the size of the state, what it asks of q̈, |gradient|; and of all S
     and whether they move what is at rest.
     """
@@ -151,11 +150,11 @@ def rank_lost(motion: Motion, start, end) -> jax.Array:
     return jnp.isfinite(last).all() & (count(last) < count(first))
 
 
-def _free(system: System) -> bool:
+def _free(system) -> bool:
     return system.constraints is None and system.velocity_constraints is None
 
 
-def _timed(system: System) -> bool:
+def _timed(system) -> bool:
     """Whether a constraint asks for the time: it may prescribe a motion."""
     return any("t" in held.extras for held in (system.constraints, system.velocity_constraints) if held is not None)
 

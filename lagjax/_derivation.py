@@ -84,7 +84,7 @@ class Derivation:
         `unhashable` says why this derivation cannot be kept for the next time.
         """
         self.motion, self.layout, self.refusal, self.unhashable = motion, layout, refusal, unhashable
-        self._numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
+        self.numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
         self._made: dict[str, Any] = {}
         self._programs: dict[tuple[str, ...], Program] = {}
         self._by_q: dict[tuple[int, ...], Program] = {}
@@ -271,12 +271,12 @@ class Derivation:
     def state_shapes(self) -> tuple:
         """Shapes of (q, q̇, t, params), as the functions of the motion take them."""
         q, t = jax.ShapeDtypeStruct((self.layout.size,), self.layout.dtype), jax.ShapeDtypeStruct((), self.layout.dtype)
-        return q, q, t, self._numbers
+        return q, q, t, self.numbers
 
     @property
     def scalar_shapes(self) -> list[jax.ShapeDtypeStruct]:
         """Those of the inputs of every program: q, q̇, t and every number in params, one by one."""
-        leaves = jax.tree.leaves(self._numbers)
+        leaves = jax.tree.leaves(self.numbers)
         numbers = [leaf.dtype for leaf in leaves for _ in range(leaf.size)]
         return [jax.ShapeDtypeStruct((), dtype) for dtype in [self.layout.dtype] * (2 * self.layout.size + 1) + numbers]
 

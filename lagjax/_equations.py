@@ -6,17 +6,14 @@ forms give the same motion to round-off, and are tested against each other.
 """
 
 import abc
-import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from lagjax._derivation import Derivation
-from lagjax._layout import Layout
 from lagjax._motion import Motion
 from lagjax._program import Program, Unlowerable
 
@@ -102,16 +99,11 @@ class ScalarEquations(Equations):
         return jnp.stack(acceleration), singular
 
 
-def equations(motion: Motion, layout: Layout, params: PyTree, path: str = "auto") -> Equations:
-    """The form that suits the scene; `path` "scalar" or "array" insists on one.
+def form_of(derivation: Derivation, path: str = "auto") -> Equations:
+    """The form that suits a scene; `path` "scalar" or "array" insists on one.
 
     Raises `ValueError` when "scalar" is asked for and impossible, with the reason.
     """
-    return form_of(_derived(motion, layout, params), path)
-
-
-def form_of(derivation: Derivation, path: str = "auto") -> Equations:
-    """The same from what is derived already."""
     motion = derivation.motion
     if path == "array":
         return ArrayEquations(motion, "asked for")
@@ -125,38 +117,6 @@ def form_of(derivation: Derivation, path: str = "auto") -> Equations:
         reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
         return ArrayEquations(motion, reason)
     return ScalarEquations(program, derivation.projected)
-
-
-# For those who hold a `Motion`; `derivation_of` keeps what is derived from a `System`.
-
-
-def scalar_program(motion: Motion, layout: Layout, params: PyTree) -> Program:
-    """`Derivation.acceleration`: q̈ and whether M is singular, or raises `Unlowerable`."""
-    return _derived(motion, layout, params).acceleration
-
-
-class _Same(NamedTuple):
-    """A motion that is known by its identity: its functions are made anew for every run."""
-
-    motion: Motion
-
-    def __hash__(self):
-        return id(self.motion)
-
-    def __eq__(self, other):
-        return self.motion is other.motion
-
-
-def _derived(motion: Motion, layout: Layout, params: PyTree) -> Derivation:
-    leaves, structure = jax.tree.flatten(params)
-    shapes = tuple((np.shape(leaf), np.dtype(jnp.result_type(leaf))) for leaf in leaves)
-    return _latest(_Same(motion), layout, structure, shapes)
-
-
-@functools.lru_cache(maxsize=4)  # the programs of one scene are asked for one after the other
-def _latest(same: _Same, layout: Layout, structure, shapes) -> Derivation:
-    numbers = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    return Derivation(same.motion, layout, numbers)
 
 
 def _scalars(params: PyTree) -> list[jax.Array]:

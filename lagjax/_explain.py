@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lagjax._derivation import Derivation
+from lagjax._engine import choose
 from lagjax._equations import ScalarEquations, form_of
-from lagjax._flow import unfit
 from lagjax._linear import dependent_rows
+from lagjax._problem import Problem
 from lagjax._program import Program, Unlowerable
 
 
@@ -86,10 +86,11 @@ class Explanation:
         return "\n".join(f"{name:17s} {value}" for name, value in rows)
 
 
-def explain(derivation: Derivation, path: str) -> Explanation:
-    """The facts about a scene, read off its derivation; `path` is that of its `System`."""
+def explain(problem: Problem) -> Explanation:
+    """The facts about the scene of a problem, and which engine is chosen for it."""
+    derivation = problem.derivation
     names, n, motion = derivation.layout.names, derivation.layout.size, derivation.motion
-    known = {"coordinates": names, **_engine(derivation, path)}
+    known = {"coordinates": names, **_engine(problem)}
     try:
         matrix, force = derivation.program("mass_matrix"), derivation.reads("force")
     except Unlowerable:
@@ -113,27 +114,14 @@ def explain(derivation: Derivation, path: str) -> Explanation:
     )
 
 
-def machine_code_refusal(derivation: Derivation, path: str) -> str | None:
-    """Why machine code does not integrate a run that is left to its defaults: the end of a sentence, or None."""
-    if path == "array":
-        return "the array path was asked for"
-    if derivation.unhashable is not None:
-        return f"the scene cannot be remembered: {derivation.unhashable}"
-    try:
-        program, _ = derivation.acceleration, derivation.projection
-    except Unlowerable as reason:
-        return str(reason)
-    return unfit(program, derivation.layout.size, derivation.layout.dtype)
-
-
-def _engine(derivation: Derivation, path: str) -> dict:
+def _engine(problem: Problem) -> dict:
     """What integrates a motion by default, in what form the equations are evaluated there, and what that costs."""
-    refusal = machine_code_refusal(derivation, path)
+    derivation, refusal = problem.derivation, choose(problem).refusal
     if refusal is None:
         facts = {"solver": "Taylor series in machine code", "path": "scalar", "reason": ""}
         program, projected = derivation.acceleration, derivation.projected
     else:
-        form = form_of(derivation, path)
+        form = form_of(derivation, problem.system.path)
         scalar = isinstance(form, ScalarEquations)
         facts = {"solver": f"diffrax.Dopri8, because {refusal}", "path": "scalar" if scalar else "array"}
         facts["reason"] = "" if scalar else form.reason

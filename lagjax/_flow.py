@@ -27,7 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import _native
+from lagjax._problem import Solution
 from lagjax._program import Program, Unlowerable, evaluate, lower, pullback
+from lagjax._results import RESULTS, SUCCESSFUL, code_of
 from lagjax._stopped import End, what_stopped
 
 LARGEST_PROGRAM = 6_000  # operations of an acceleration, beyond which LLVM takes too long
@@ -40,25 +42,13 @@ MOST_DIRECTIONS, MOST_TANGENT_COORDINATES = 8, 40
 _DENSE = 4
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
 LARGEST_KEPT = 2**26  # and of those that are kept for a derivative that is asked for next: half a GiB
-# How a motion ends that its program cannot follow.
-GIVEN_UP = (_native.SINGULAR, _native.NOT_FINITE, _native.STEP_TOO_SMALL, _native.NOT_LANDED)
-
-
-class Outcome(NamedTuple):
-    """What a run of N members gives: states, how each member ended, and counts.
-
-    `path` (N, T, 2n) holds the states (q, q̇) at the output times, NaN where a member did not come; `y_end` (N, 2n) and
-    `t_end` (N,) where it ended, `code` (N,) how. `ticket` (N,) names the member's steps in `KEPT`, −1 where they are
-    not kept.
-    """
-
-    path: np.ndarray
-    y_end: np.ndarray
-    t_end: np.ndarray
-    code: np.ndarray
-    accepted: np.ndarray
-    rejected: np.ndarray
-    ticket: np.ndarray
+# The codes of the kernel, in their order, as results. Beyond `EVENT` they say which guards changed sign.
+_RESULT_OF_CODE = np.array([code_of(result) for result in (
+    RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,
+    RESULTS.mass_matrix_singular, RESULTS.projection_failed, RESULTS.acceleration_discontinuous, RESULTS.event_occurred,
+)])  # fmt: skip
+_SPENT, _SHRANK, _NOT_FINITE, _SINGULAR, _NOT_PROJECTED, _JUMPS = _RESULT_OF_CODE[1:7].tolist()
+_GIVEN_UP = (_SINGULAR, _NOT_FINITE, _SHRANK, _NOT_PROJECTED)  # what another variant of the program may still follow
 
 
 class Tolerances(NamedTuple):
@@ -224,51 +214,55 @@ class Flow:
 
     def run(
         self, ts, y0, params, tolerances: Tolerances, store: StepStore | None = None, room: np.ndarray | None = None
-    ) -> tuple[Outcome, int]:
-        """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the outcome, and how many lane steps idled.
+    ) -> Solution:
+        """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the motions of N members.
 
         With a `store` the steps are kept there, up to `room` (N,) of each member: by default to equal parts of what may
-        be kept. Codes tell what stopped a member, and not only that its steps became too small, or too many.
+        be kept. Results tell what stopped a member, and not only that its steps became too small, or too many.
         """
-        outcome, idle = self._followed(ts, y0, params, tolerances, store, room)
-        return self._explained(outcome, ts, params), idle
+        solution = self._explained(self._followed(ts, y0, params, tolerances, store, room), ts, params)
+        overflowed = ~np.isfinite(solution.y_end).all(axis=1)  # even where it came to the last time
+        solution.result[overflowed] = _NOT_FINITE
+        return solution
 
-    def _followed(self, ts, y0, params, tolerances, store=None, room=None) -> tuple[Outcome, int]:
+    def _followed(self, ts, y0, params, tolerances, store=None, room=None) -> Solution:
         """`run` without a look at what stopped a member: for another try, and for derivatives."""
         rtol, atol, max_steps, _ = tolerances
         if store is not None and room is None:
             room = np.full(len(y0), min(max_steps, LARGEST_KEPT // ((self.states + 2) * max(1, len(y0)))))
-        *fields, idle, table = self.kernel(ts, y0, params, rtol, atol, max_steps, room)
-        outcome = Outcome(*fields, np.full(len(y0), -1))
+        done = self.kernel(ts, y0, params, rtol, atol, max_steps, room)
+        result, event = _RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
+        ticket = np.full(len(y0), -1)
         if store is not None:
-            outcome = outcome._replace(ticket=store.keep(self._compact(table, room, outcome.accepted, rtol)))
-        again, flow, tolerances = self._second_chance(outcome.code, tolerances)
+            ticket = store.keep(self._compact(done.table, room, done.steps, rtol))
+        solution = Solution(*done[:3], result, done.steps, done.rejected, event, ticket, done.idle)
+        again, flow, tolerances = self._second_chance(result, tolerances)
         if not again.any():
-            return outcome, idle
+            return solution
         some = _members(again, ts, y0, params)
-        better, more = flow._followed(*some, tolerances, store, None if room is None else room[again])
-        for values, new in zip(outcome, better, strict=True):
+        better = flow._followed(*some, tolerances, store, None if room is None else room[again])
+        for values, new in zip(solution[:-1], better[:-1], strict=True):
             values[again] = new
-        return outcome, idle + more
+        return solution._replace(idle=done.idle + better.idle)
 
-    def _explained(self, outcome: Outcome, ts, params) -> Outcome:
-        """The outcome with what stopped the members whose steps became too small, or too many."""
-        shrank, spent = outcome.code == _native.STEP_TOO_SMALL, outcome.code == _native.OUT_OF_STEPS
+    def _explained(self, solution: Solution, ts, params) -> Solution:
+        """The solution with what stopped the members whose steps became too small, or too many."""
+        shrank, spent = solution.result == _SHRANK, solution.result == _SPENT
         some = np.flatnonzero(shrank | spent)
         if not some.size:
-            return outcome
+            return solution
         times, numbers = (x[some] if len(x) > 1 else x for x in (ts, params))
 
         def acceleration(t, y):
             values = self.anywhere.evaluate(*y.T, t, *numbers.T)[: self.size]
             return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
 
-        counts = outcome.accepted[some], outcome.rejected[some]
-        end = End(outcome.t_end[some], outcome.y_end[some], times[:, 0], times[:, -1], *counts)
+        counts = solution.accepted[some], solution.rejected[some]
+        end = End(solution.t_end[some], solution.y_end[some], times[:, 0], times[:, -1], *counts)
         not_finite, jumps = what_stopped(acceleration, end, shrank[some], spent[some])
-        outcome.code[some[jumps]] = _native.DISCONTINUOUS
-        outcome.code[some[not_finite]] = _native.NOT_FINITE
-        return outcome
+        solution.result[some[jumps]] = _JUMPS
+        solution.result[some[not_finite]] = _NOT_FINITE
+        return solution
 
     def _compact(self, table, room, counts, rtol: float) -> Steps:
         """The steps of a run, without the room that was not used."""
@@ -277,21 +271,21 @@ class Flow:
             table = np.concatenate([table[:0], *(table[s : s + k] for s, k in zip(starts, taken, strict=True))])
         return Steps(self, _native.order_for(rtol), table, np.cumsum(taken) - taken, counts, counts <= room)
 
-    def _second_chance(self, code, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
+    def _second_chance(self, result, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
         """The members to run once more, by which flow and with which tolerances.
 
         A program that assumes a regular mass matrix gives way to one that does not. And where constraints become
         dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇, or allow no step from
         there. The kernel takes such steps again; where that does not help, steps of other sizes all along may.
         """
-        if (code == _native.DONE).all():
-            return np.zeros(len(code), bool), self, tolerances
-        given_up = np.isin(code, GIVEN_UP)
+        if (result == SUCCESSFUL).all():
+            return np.zeros(len(result), bool), self, tolerances
+        given_up = np.isin(result, _GIVEN_UP)
         if given_up.any() and (general := self.general()) is not None:
             return given_up, general, tolerances
-        stuck = code == _native.NOT_LANDED
+        stuck = result == _NOT_PROJECTED
         if self.projection is not None:
-            stuck |= code == _native.STEP_TOO_SMALL
+            stuck |= result == _SHRANK
         return stuck & (tolerances.tries > 1), self, tolerances.perturbed
 
     def push(self, ts, y0, params, dy0, dparams, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
@@ -313,12 +307,11 @@ class Flow:
         start = np.concatenate([y0[:, None], dy0 / unit], axis=1)  # (rows, 1 + D, 2n)
         numbers = np.concatenate([params[:, None], dparams / unit], axis=1).reshape(len(start), -1)
         flow = self.tangent(directions)
-        outcome, _ = flow._followed(ts, from_rows(start), numbers, tolerances.with_larger_budget)
-        failed = outcome.code != _native.DONE
+        solution = flow._followed(ts, from_rows(start), numbers, tolerances.with_larger_budget)
         lengths = unit.reshape(len(start), directions, 1)
-        path, end = (to_rows(x, self.size)[..., 1:, :] for x in (outcome.path, outcome.y_end))
+        path, end = (to_rows(x, self.size)[..., 1:, :] for x in (solution.path, solution.y_end))
         path, end = path * lengths[:, None], end * lengths
-        end[failed] = np.nan
+        end[solution.result != SUCCESSFUL] = np.nan
         path = np.moveaxis(path, -2, 1).reshape(members, groups * directions, *path.shape[1:-2], self.states)
         return path[:, :m], end.reshape(members, groups * directions, self.states)[:, :m]
 
@@ -327,23 +320,23 @@ class Flow:
     def pull(self, ts, y0, params, solution, path_bar, end_bar, tolerances: Tolerances) -> tuple[np.ndarray, ...]:
         """The transpose of `push`: from m cotangents of the outputs of each of N motions to those of what went in.
 
-        `solution` is (path, code, accepted, ticket) of the run; `path_bar` (N, m, T, 2n) and `end_bar` (N, m, 2n) →
+        `solution` is (path, result, accepted, ticket) of the run; `path_bar` (N, m, T, 2n) and `end_bar` (N, m, 2n) →
         cotangents of `y0` (N, m, 2n) and of `params` (N, m, P). A cotangent that is not zero, of an output that was
         not reached or of the end of a motion that failed, makes all of them NaN: there is no derivative.
         """
-        path, code, accepted, ticket = solution
+        path, result, accepted, ticket = solution
         members, m = end_bar.shape[:2]
         if m > self.states + self.numbers and self.size * (1 + self.states + self.numbers) <= MOST_TANGENT_COORDINATES:
             return self._pull_by_tangents(ts, y0, params, path_bar, end_bar, tolerances)
         reached = np.isfinite(path)[:, None]
         lost = ((path_bar != 0) & ~reached).any(axis=(2, 3))
-        lost |= (end_bar != 0).any(axis=2) & (code != _native.DONE)[:, None]
+        lost |= (end_bar != 0).any(axis=2) & (result != SUCCESSFUL)[:, None]
         path_bar = np.where(reached, path_bar, 0.0)
         params = _for_all(params, members)
         params_bar = np.zeros((members, m, self.numbers))
         if self.projection is not None and path.shape[1] > 2:
             self._off_the_constraints(ts, path, params, path_bar, params_bar)
-        done = (code == _native.DONE)[:, None, None]
+        done = (result == SUCCESSFUL)[:, None, None]
         end_bar = end_bar + np.where(done, path_bar[:, :, -1], 0.0)
         path_bar[:, :, -1] = 0.0
 
@@ -375,7 +368,7 @@ class Flow:
         for places in _portions(np.flatnonzero(waiting), accepted * (self.states + 2)):
             store = StepStore()
             some_ts = ts if len(ts) == 1 else ts[places]
-            again, _ = self._followed(some_ts, y0[places], params[places], tolerances, store, accepted[places])
+            again = self._followed(some_ts, y0[places], params[places], tolerances, store, accepted[places])
             back(store, again.ticket, places)
         at_start = (ts == ts[:, :1])[:, :, None]  # outputs that are the initial state; steps begin after them
         return y_bar + np.sum(path_bar * at_start, axis=1), params_bar

@@ -22,23 +22,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import _native
 from lagjax._arguments import Function, accept
 from lagjax._consistent import TOLERANCE, require_consistent
 from lagjax._custom import differentiated_as
-from lagjax._derivation import derivation_of
-from lagjax._engine import RESULT_OF_CODE
+from lagjax._derivation import Derivation
 from lagjax._failures import lost_unless
-from lagjax._flow import Flow, Tolerances, unfit
 from lagjax._layout import Layout, as_vector
+from lagjax._machine_code import MachineCode, flow_of
 from lagjax._motion import Motion
+from lagjax._native import Guards
+from lagjax._problem import Problem, Solution
 from lagjax._program import Program, Unlowerable, lower
-from lagjax._results import RESULTS, SimulationError, result_from
-from lagjax._settings import Settings, as_arrays, is_concrete, require_budget, require_finite, require_flag
+from lagjax._results import RESULTS, SUCCESSFUL, SimulationError, code_of, result_from
 from lagjax._simulate import raise_unless_ok
 from lagjax._system import System
 from lagjax._trajectory import State, Trajectory, Transitions
-from lagjax._transforms import run
+from lagjax._validate import as_arrays, is_concrete, require_budget, require_flag
 
 PyTree = Any
 
@@ -132,22 +131,20 @@ def simulate_hybrid(
     """
     require_flag(throw, "throw")
     layout = Layout.of(q0, qdot0)
-    settings = Settings.of(layout, ts, None, rtol, atol, None, max_steps, None, None, False)
     _require_modes(modes, transitions, start, max_transitions)
-    if not all(is_concrete(x) for x in (settings.controller.rtol, settings.controller.atol)):
+    problem = Problem.of(modes[start], layout, q0, qdot0, ts, params, rtol, atol, max_steps)
+    if not all(map(is_concrete, problem.tolerances)):
         raise ValueError("rtol and atol of simulate_hybrid must be numbers: they decide the order of the method.")
-    if is_concrete(settings.ts) and np.asarray(settings.ts)[-1] < np.asarray(settings.ts)[0]:
+    if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
         raise ValueError("simulate_hybrid goes forward in time: a reset cannot be undone; ts must increase.")
-    params = as_arrays(params, layout.dtype)
-    for name, value in (("q0", q0), ("qdot0", qdot0), ("params", params)):
-        require_finite(value, name)
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
-    require_consistent(modes[start], layout, settings.ts, q0, qdot0, params)
-    controller = settings.controller
-    tolerances = Tolerances(float(controller.rtol), float(controller.atol), max_steps)
-    plan = _Plan(tuple(modes), tuple(modes.values()), tuple(transitions), start, max_transitions, tolerances)
-    *fields, last = _run(plan, settings.ts, q0, qdot0, params)
-    trajectory = Trajectory(*fields[:6], dict(modes), params, None, *fields[6:], tuple(modes), settings.tolerances)
+    require_consistent(modes[start], layout, problem.ts, q0, qdot0, problem.params)
+    tolerances = tuple(map(float, problem.tolerances))
+    plan = _Plan(tuple(modes), tuple(modes.values()), tuple(transitions), start, max_transitions, tolerances, max_steps)
+    *fields, last = _run(plan, layout, problem.ts, problem.y0, problem.params)
+    trajectory = Trajectory(
+        *fields[:6], dict(modes), problem.params, None, *fields[6:], tuple(modes), problem.tolerances
+    )
     return _raise_unless_ok(trajectory, layout, last) if throw else trajectory
 
 
@@ -196,7 +193,8 @@ class _Plan(eqx.Module):
     transitions: tuple[Transition, ...]
     start: str = eqx.field(static=True)
     max_transitions: int = eqx.field(static=True)
-    tolerances: Tolerances = eqx.field(static=True)
+    tolerances: tuple[float, float] = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
 
     def leaving(self, mode: int) -> list[tuple[int, Transition]]:
         """The transitions from a mode, with their places among all."""
@@ -204,31 +202,39 @@ class _Plan(eqx.Module):
 
 
 class _Mode(NamedTuple):
-    """One mode, ready to run: with derivatives, and with its guards; these as programs, alone and as `Guards` wants."""
+    """One mode: a problem that lacks a state and times, its guards as programs, and how each has to change sign.
 
-    flow: Flow
-    watched: Flow
+    `surfaces` gives the values of the guards from (q, q̇, t, params), `guards` what `_native.Guards` wants.
+    """
+
+    problem: Problem
     surfaces: Program | None
     guards: Program | None
+    directions: tuple[int, ...]
+
+    def solve(self, ts, y0) -> Solution:
+        """The motion over these times, with its derivatives."""
+        return MachineCode().solve(dataclasses.replace(self.problem, ts=ts, y0=y0))
+
+    def solve_to_event(self, ts, y0) -> Solution:
+        """The motion to the last of these times, or to the first zero of a guard; it has no derivatives."""
+        guards = None if self.guards is None else Guards(self.guards, self.directions)
+        return MachineCode().solve(dataclasses.replace(self.problem, ts=ts, y0=y0, guards=guards))
 
 
 # ---- one run ---------------------------------------------------------------------------------------------------------
 
 
 @eqx.filter_jit
-def _run(plan: _Plan, ts, q0, qdot0, params):
-    layout = Layout.of(q0, qdot0)
-    ts = jnp.asarray(ts)
-    numbers, code = eqx.partition(params, eqx.is_array_like)
-    vector = as_vector(numbers, layout.dtype)
-    shapes = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jnp.result_type(x)), numbers)
-    modes = [_mode(plan, i, layout, eqx.combine(shapes, code)) for i in range(len(plan.systems))]
+def _run(plan: _Plan, layout: Layout, ts, y0, params):
+    ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
+    vector = as_vector(eqx.filter(params, eqx.is_array_like), layout.dtype)
+    modes = [_mode(plan, i, layout, params) for i in range(len(plan.systems))]
     rounds = _Rounds(plan, layout, modes, ts, params, vector)
-    y0 = jnp.concatenate([layout.flatten(q0), layout.flatten(qdot0)])
     start = plan.names.index(plan.start)
     astray = rounds.astray(start, ts[0], y0)
     first = _Carry(
-        t=ts[0], y=y0, mode=jnp.asarray(start), going=~astray, code=jnp.where(astray, INCONSISTENT, _native.DONE),
+        t=ts[0], y=y0, mode=jnp.asarray(start), going=~astray, result=jnp.where(astray, INCONSISTENT, SUCCESSFUL),
         path=jnp.full((ts.size, y0.size), jnp.nan), modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int),
         latest=jnp.asarray(-1), waiting=jnp.asarray(0),
     )  # fmt: skip
@@ -238,59 +244,58 @@ def _run(plan: _Plan, ts, q0, qdot0, params):
 
 
 def _mode(plan: _Plan, index: int, layout: Layout, params: PyTree) -> _Mode:
-    """Machine code for a mode, made once. Raises `ValueError` where there is none."""
-    leaving = tuple(transition for _, transition in plan.leaving(index))
-    leaves, structure = jax.tree.flatten(params)
-    known = tuple(_Shape(np.shape(x), np.result_type(x)) if eqx.is_array_like(x) else x for x in leaves)
+    """A mode, ready to run. Raises `ValueError` where it has no machine code."""
+    name, leaving = plan.names[index], tuple(transition for _, transition in plan.leaving(index))
+    rtol, atol = plan.tolerances
+    problem = Problem.about(plan.systems[index], layout, params, rtol=rtol, atol=atol, max_steps=plan.max_steps)
+    if len(leaving) > MOST_GUARDS:
+        raise ValueError(f"{len(leaving)} transitions leave the mode {name!r}, more than {MOST_GUARDS}.")
     try:
-        return _made(plan.names[index], plan.systems[index], leaving, layout, known, structure)
-    except TypeError as reason:
-        if "unhashable" not in str(reason):
-            raise
-        return _made.__wrapped__(plan.names[index], plan.systems[index], leaving, layout, known, structure)
-
-
-class _Shape(NamedTuple):
-    shape: tuple[int, ...]
-    dtype: np.dtype
+        if refusal := MachineCode().refuses(problem):
+            raise Unlowerable(refusal)
+        code = eqx.filter(problem.params, eqx.is_array_like, inverse=True)
+        leaves, structure = jax.tree.flatten(code)
+        programs = _guard_programs(problem.derivation, problem.system, leaving, tuple(leaves), structure)
+    except Unlowerable as why:
+        raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
+    return _Mode(problem, *programs, tuple(transition.direction for transition in leaving))
 
 
 @functools.lru_cache(maxsize=64)
-def _made(name: str, system: System, leaving: tuple[Transition, ...], layout: Layout, known, structure) -> _Mode:
-    params = structure.unflatten([np.zeros(*x) if isinstance(x, _Shape) else x for x in known])
-    n, numbers = layout.size, eqx.filter(params, eqx.is_array_like)
-    derivation = derivation_of(system, layout, params)
-    try:
-        program, back, multipliers = derivation.acceleration, derivation.projection, derivation.multipliers
+def _guard_programs(
+    derivation: Derivation, system: System, leaving: tuple[Transition, ...], leaves: tuple, structure
+) -> tuple[Program | None, Program | None]:
+    """The guards of a mode as programs of (q, q̇, t, params): their values, and what `_native.Guards` wants.
 
-        def surfaces(y, numbers):
-            q, v, t = y[:n], y[n:-1], y[-1]
-            given = {"t": t, "params": eqx.combine(numbers, eqx.filter(params, eqx.is_array_like, inverse=True))}
-            if multipliers is not None:
-                flat = jnp.stack(multipliers(*y, *_scalars(numbers)))
-                given["multipliers"] = system.by_constraint(flat, layout, params)
-            return jnp.stack([_scalar(one.guard, layout.restore(q), layout.restore(v), given) for one in leaving])
-
-        def guards(y, numbers):
-            slope = jnp.stack(program.complete(*y, *_scalars(numbers))[:n])
-            along = jnp.concatenate([y[n:-1], slope, jnp.ones(1)])
-            by_y = jax.jacfwd(surfaces)(y, numbers)
-            terms, moving = by_y * y, by_y * along
-            return surfaces(y, numbers), moving.sum(1), jnp.abs(terms).sum(1), jnp.abs(moving).sum(1)
-
-        y = jax.ShapeDtypeStruct((2 * n + 1,), layout.dtype)
-        programs = [lower(of, y, numbers) for of in (surfaces, guards)] if leaving else [None, None]
-    except Unlowerable as why:
-        raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
-    if reason := unfit(program, n, layout.dtype):
-        raise ValueError(f"The mode {name!r} has no machine code: {reason}.")
-    flow = Flow.of(program, n, back)
+    `leaves` and `structure` are those of what is in params and is not a number. Raises `Unlowerable`.
+    """
     if not leaving:
-        return _Mode(flow, flow, *programs)
-    if len(leaving) > MOST_GUARDS:
-        raise ValueError(f"{len(leaving)} transitions leave the mode {name!r}, more than {MOST_GUARDS}.")
-    directions = tuple(transition.direction for transition in leaving)
-    return _Mode(flow, Flow.of(program, n, back, _native.Guards(programs[1], directions)), *programs)
+        return None, None
+    n, layout, numbers, code = (
+        derivation.layout.size,
+        derivation.layout,
+        derivation.numbers,
+        structure.unflatten(leaves),
+    )
+    program, multipliers = derivation.acceleration, derivation.multipliers
+
+    def surfaces(y, numbers):
+        q, v, t = y[:n], y[n:-1], y[-1]
+        extras = {"t": t, "params": eqx.combine(numbers, code)}
+        if multipliers is not None:
+            flat = jnp.stack(multipliers(*y, *_scalars(numbers)))
+            extras["multipliers"] = system.by_constraint(flat, layout, extras["params"])
+        return jnp.stack([_scalar(one.guard, layout.restore(q), layout.restore(v), extras) for one in leaving])
+
+    def guards(y, numbers):
+        acceleration = jnp.stack(program.complete(*y, *_scalars(numbers))[:n])
+        rate = jnp.concatenate([y[n:-1], acceleration, jnp.ones(1)])
+        by_y = jax.jacfwd(surfaces)(y, numbers)
+        terms, moving = by_y * y, by_y * rate
+        return surfaces(y, numbers), moving.sum(1), jnp.abs(terms).sum(1), jnp.abs(moving).sum(1)
+
+    y = jax.ShapeDtypeStruct((2 * n + 1,), layout.dtype)
+    return lower(surfaces, y, numbers), lower(guards, y, numbers)
 
 
 MOST_GUARDS = 24  # two bits each in the code of an event, which is a double
@@ -300,10 +305,10 @@ def _scalars(numbers: PyTree) -> list[jax.Array]:
     return [x for leaf in jax.tree.leaves(numbers) for x in jnp.ravel(leaf)]
 
 
-def _scalar(guard: Function, q, qdot, given) -> jax.Array:
-    if "multipliers" in guard.extras and "multipliers" not in given:
+def _scalar(guard: Function, q, qdot, extras) -> jax.Array:
+    if "multipliers" in guard.extras and "multipliers" not in extras:
         raise ValueError("A guard asks for `multipliers`, but its mode has no constraints.")
-    value = guard(q, qdot, **given)
+    value = guard(q, qdot, **extras)
     if len(jax.tree.leaves(value)) != 1 or value is not jax.tree.leaves(value)[0]:
         raise TypeError(f"A guard must return one real number; got {type(value).__name__}.")
     value = jnp.asarray(value)
@@ -317,7 +322,7 @@ class _Carry(NamedTuple):
     y: jax.Array
     mode: jax.Array
     going: jax.Array
-    code: jax.Array
+    result: jax.Array  # the integer of a `lagjax.RESULTS`
     path: jax.Array
     modes: jax.Array
     steps: jax.Array
@@ -353,42 +358,42 @@ class _Rounds(NamedTuple):
             seen = jax.tree.map(lambda new, old, hit=here & event: jnp.where(hit, new, old), event_seen, seen)
             fired = fired | (here & event)
         spent = fired & (count == self.plan.max_transitions)
-        after = after._replace(going=after.going & ~spent, code=jnp.where(spent, TOO_MANY_TRANSITIONS, after.code))
+        after = after._replace(going=after.going & ~spent, result=jnp.where(spent, TOO_MANY, after.result))
         return after, seen
 
     def _in_mode(self, index: int, carry: _Carry, here) -> tuple[_Carry, jax.Array, _Seen]:
-        mode, tolerances = self.modes[index], self.plan.tolerances
-        held_t = jax.lax.stop_gradient(carry.t)
+        mode = self.modes[index]
+        t_start = jax.lax.stop_gradient(carry.t)
         runs = here & (carry.waiting == 0)
-        horizon = jnp.where(runs, self.ts[-1], held_t)
-        found = run(mode.watched, tolerances, jnp.stack([held_t, horizon]), carry.y, self.numbers)
-        found = jax.tree.map(jax.lax.stop_gradient, found)
-        changes = jnp.where(runs, jnp.maximum(found.code - _native.EVENT, 0), jnp.where(here, carry.waiting, 0))
-        t_end = jnp.where(runs & (found.code == _native.DONE), self.ts[-1], found.t_end)
+        horizon = jnp.where(runs, self.ts[-1], t_start)
+        located = mode.solve_to_event(jnp.stack([t_start, horizon]), carry.y)
+        located = jax.tree.map(jax.lax.stop_gradient, located)
+        changes = jnp.where(runs, located.event, jnp.where(here, carry.waiting, 0))
+        t_end = jnp.where(runs & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
 
         # The same stretch once more, with derivatives and outputs; where it ends is known better already.
-        covered = here & ((self.ts > held_t) | (self.ts == jnp.where(held_t == self.ts[0], held_t, jnp.nan)))
+        covered = here & ((self.ts > t_start) | (self.ts == jnp.where(t_start == self.ts[0], t_start, jnp.nan)))
         covered = covered & (self.ts <= t_end)
-        inside = jnp.where(covered, self.ts, jax.lax.stop_gradient(jnp.clip(self.ts, held_t, t_end)))
+        inside = jnp.where(covered, self.ts, jax.lax.stop_gradient(jnp.clip(self.ts, t_start, t_end)))
         times = jnp.concatenate([carry.t[None], inside, t_end[None]])
-        moved = run(mode.flow, tolerances, times, carry.y, self.numbers)
-        y_end = found.y_end + jnp.where(here, moved.y_end - jax.lax.stop_gradient(moved.y_end), 0.0)
+        moved = mode.solve(times, carry.y)
+        y_end = located.y_end + jnp.where(here, moved.y_end - jax.lax.stop_gradient(moved.y_end), 0.0)
 
         exit = self._through(index, changes, carry.latest, t_end, y_end)
         event = (changes > 0) & ~exit.piled
-        failed = jnp.where(exit.piled, ZENO, jnp.where(runs & ~event, found.code, carry.code))
+        failed = jnp.where(exit.piled, ZENO, jnp.where(runs & ~event, located.result, carry.result))
         # A reset may give NaN, and a guard that is NaN never fires.
         sound = jnp.isfinite(jnp.where(event, exit.y_next, y_end)).all() & exit.seen
-        broken = here & ~sound & (event | (failed == _native.DONE))
+        broken = here & ~sound & (event | (failed == SUCCESSFUL))
         state = carry._replace(
             t=jnp.where(event, exit.t, t_end),
             y=jnp.where(event, exit.y_next, y_end),
             mode=jnp.where(event, exit.target, index),
             going=event & ~exit.astray & ~broken,
-            code=jnp.where(broken, _native.NOT_FINITE, jnp.where(event & exit.astray, INCONSISTENT, failed)),
+            result=jnp.where(broken, NOT_FINITE, jnp.where(event & exit.astray, INCONSISTENT, failed)),
             path=jnp.where(covered[:, None], moved.path[1:-1], carry.path),
             modes=jnp.where(covered, index, carry.modes),
-            steps=carry.steps + jnp.stack([found.accepted, found.rejected]),
+            steps=carry.steps + jnp.stack([located.accepted, located.rejected]),
             latest=exit.number,
             waiting=exit.waiting,
         )
@@ -452,10 +457,11 @@ class _Rounds(NamedTuple):
         up to third order in δg, which is zero itself: first and second derivatives are right.
         """
         mode, n, still = self.modes[index], self.layout.size, jax.lax.stop_gradient
+        flow = flow_of(mode.problem)
         count = len(self.plan.leaving(index))
 
         def rates(t, y, numbers):
-            acceleration = jnp.stack(mode.flow.anywhere(*y, t, *numbers)[:n])
+            acceleration = jnp.stack(flow.anywhere(*y, t, *numbers)[:n])
             return mode.guards(*y, t, *numbers)[count + k], jnp.concatenate([y[n:], acceleration])
 
         def moved(taken, t, y, numbers):
@@ -534,10 +540,12 @@ def _distance(motion: Motion, q, v, t, numbers):
 
 
 SAME = 64 * np.finfo(np.float64).eps  # of a guard's size
-# Codes beyond those of the kernel.
-TOO_MANY_TRANSITIONS, INCONSISTENT, ZENO = range(len(RESULT_OF_CODE), len(RESULT_OF_CODE) + 3)
-_BEYOND = RESULTS.max_transitions_reached, RESULTS.inconsistent_start, RESULTS.zeno
-_RESULT_OF_CODE = np.array([*RESULT_OF_CODE, *(result._value for result in _BEYOND)], np.int32)
+TOO_MANY, INCONSISTENT, ZENO, NOT_FINITE = (
+    code_of(result)
+    for result in (
+        RESULTS.max_transitions_reached, RESULTS.inconsistent_start, RESULTS.zeno, RESULTS.nonfinite_state,
+    )
+)  # fmt: skip
 _STEADY = 0.05  # how far the logarithms of two ratios of a geometric sequence may differ, as a part of them
 
 
@@ -569,8 +577,8 @@ def _without_silent_zeros(last: _Carry, seen: _Seen, inputs) -> tuple[_Carry, _S
 
 def _fields(layout: Layout, ts, last: _Carry, seen: _Seen):
     n = layout.size
-    piled = (last.code == TOO_MANY_TRANSITIONS) & _pile_up(seen.t, ts[-1])
-    result = result_from(jnp.asarray(_RESULT_OF_CODE)[jnp.where(piled, ZENO, last.code)])
+    piled = (last.result == TOO_MANY) & _pile_up(seen.t, ts[-1])
+    result = result_from(jnp.where(piled, ZENO, last.result))
     accepted, rejected = last.steps
     stats = {
         "num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected,

@@ -11,7 +11,8 @@ first ones, differ from them in the last digit, and then accept or reject otherw
 a word. This is the only module that calls diffrax's integrator.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -19,77 +20,87 @@ import jax
 import jax.numpy as jnp
 
 from lagjax._equations import Equations
-from lagjax._settings import Settings
+from lagjax._layout import halves
+from lagjax._problem import Solution
+from lagjax._results import RESULTS, SUCCESSFUL
 from lagjax._solvers import Projected
 
 PyTree = Any
 
 
-class Solved(NamedTuple):
-    """The states at the output times (inf where not reached), the last state and its time, how it ended, and counts."""
+class Method(eqx.Module):
+    """How diffrax steps: its solver, what sizes the steps, their fixed size (None where adaptive), and their budget."""
 
-    path: PyTree
-    end: PyTree
-    t_end: jax.Array
-    result: diffrax.RESULTS
-    stats: dict[str, jax.Array]
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController
+    dt0: jax.Array | None
+    max_steps: int = eqx.field(static=True)
+    progress: diffrax.AbstractProgressMeter
 
 
-def integrate(form: Equations, settings: Settings, event: diffrax.Event | None, ts, y0, params, primal=None) -> Solved:
-    """ẏ = f(t, y) from y0 at ts[0] to ts[-1], or to the event.
+def integrate(
+    form: Equations,
+    method: Method,
+    adjoint: diffrax.AbstractAdjoint | None,
+    event: diffrax.Event | None,
+    ts: jax.Array,
+    y0: tuple[jax.Array, jax.Array],
+    params: PyTree,
+    forward: Callable | None = None,
+) -> Solution:
+    """ẏ = f(t, y) from y0 = (q, q̇) at ts[0] to ts[-1], or to the event. Outputs that were not reached are infinite.
 
-    `primal(ts, y0, params)` → `Solved` takes the place of diffrax where nothing is differentiated.
+    `forward(ts, y0, params)` → `Solution` takes the place of diffrax where nothing is differentiated.
 
-    With the default adjoint, and without an event, reverse mode goes over the recorded steps; otherwise derivatives are
+    With `adjoint` None, and without an event, reverse mode goes over the recorded steps; otherwise derivatives are
     those of the diffrax adjoint.
     """
     # What f closes over (a parameter from outside, the weights of a neural Lagrangian) becomes an argument.
     field = eqx.filter_closure_convert(form.vector_field, ts[0], y0, params)
     project = eqx.filter_closure_convert(form.projected, ts[0], y0, params) if form.constrained else None
-    solved = _differentiable((field, project, ts, y0, params), settings, event, primal)
+    solution = _differentiable((field, project, ts, y0, params), method, adjoint, event, forward)
     if project is not None:
-        solved = solved._replace(path=jax.vmap(project, in_axes=(0, 0, None))(ts, solved.path, params))
-    return solved
+        path = jax.vmap(project, in_axes=(0, 0, None))(ts, halves(solution.path), params)
+        solution = solution._replace(path=jnp.concatenate(path, axis=-1))
+    return solution
 
 
-def _differentiable(moving, settings: Settings, event, primal) -> Solved:
-    if settings.adjoint is not None or event is not None:
-        adjoint = diffrax.RecursiveCheckpointAdjoint() if settings.adjoint is None else settings.adjoint
-        return _solve(moving, settings, settings.controller, adjoint, event)
+def _differentiable(moving, method: Method, adjoint, event, forward) -> Solution:
+    if adjoint is not None or event is not None:
+        adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+        return _solve(moving, method, adjoint, event)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
-    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, settings)
-    return _over_recorded_steps(moving, frozen, primal)
+    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, method)
+    return _over_recorded_steps(moving, frozen, forward)
 
 
-def _solve(moving, settings: Settings, controller, adjoint, event=None, record: bool = False):
+def _solve(moving, method: Method, adjoint, event=None, record: bool = False):
     """Call diffrax; `moving` is all that can be differentiated. With `record`, the accepted times come along."""
     field, project, ts, y0, params = moving
-    solver = settings.solver if project is None else Projected(settings.solver, project)
-    fixed_dt = settings.dt0 if controller is settings.controller else None
+    solver = method.solver if project is None else Projected(method.solver, project)
     saved = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]
     if record:
         saved.append(diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t))
-    solution = diffrax.diffeqsolve(
+    done = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
         _looping(solver, adjoint),
         t0=ts[0],
         t1=ts[-1],
-        dt0=fixed_dt,
+        dt0=method.dt0,
         y0=y0,
         args=params,
         saveat=diffrax.SaveAt(subs=saved),
-        stepsize_controller=controller,
+        stepsize_controller=method.controller,
         adjoint=adjoint,
         event=event,
-        max_steps=settings.max_steps,
+        max_steps=method.max_steps,
         throw=False,
-        progress_meter=settings.progress if controller is settings.controller else diffrax.NoProgressMeter(),
+        progress_meter=method.progress,
     )
-    end = jax.tree.map(lambda leaf: leaf[0], solution.ys[1])
-    counts = ("num_steps", "num_accepted_steps", "num_rejected_steps")
-    stats = {name: solution.stats[name] for name in counts}
-    solved = Solved(solution.ys[0], end, solution.ts[1][0], solution.result, stats)
-    return (solved, solution.ys[2]) if record else solved
+    path, end = jnp.concatenate(done.ys[0], axis=-1), jnp.concatenate([leaf[0] for leaf in done.ys[1]])
+    counts = (done.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
+    solution = Solution(path, end, done.ts[1][0], RESULTS.promote(done.result)._value, *counts)
+    return (solution, done.ys[2]) if record else solution
 
 
 def _looping(solver, adjoint):
@@ -108,40 +119,39 @@ def _looping(solver, adjoint):
 
 
 @eqx.filter_custom_vjp
-def _over_recorded_steps(moving, settings, primal):
+def _over_recorded_steps(moving, method, forward):
     """The plain loop: `diffrax.ForwardMode` is the one that keeps nothing for a backward pass."""
-    if primal is not None:
-        return primal(*moving[2:])
-    return _solve(moving, settings, settings.controller, diffrax.ForwardMode())
+    if forward is not None:
+        return forward(*moving[2:])
+    return _solve(moving, method, diffrax.ForwardMode())
 
 
 @_over_recorded_steps.def_fwd
-def _forward(perturbed, moving, settings, primal):
-    del perturbed, primal
-    solved, times = _solve(moving, settings, settings.controller, diffrax.ForwardMode(), record=True)
-    return solved, (times, solved.t_end, solved.result)
+def _forward(perturbed, moving, method, forward):
+    del perturbed, forward
+    solution, times = _solve(moving, method, diffrax.ForwardMode(), record=True)
+    return solution, (times, solution.t_end, solution.result)
 
 
 @_over_recorded_steps.def_bwd
-def _backward(residuals, cotangents, perturbed, moving, settings, primal):
-    del perturbed, primal
+def _backward(residuals, cotangents, perturbed, moving, method, forward):
+    del perturbed, forward
     times, t_end, result = residuals
 
     def replay(moving):
         field, project, ts, y0, params = moving
         # A member that stopped early is replayed as far as it came; nothing flows back from beyond.
-        whole = result == diffrax.RESULTS.successful
-        forward = ts[-1] > ts[0]
-        reached = jnp.where(forward, jnp.minimum(ts, t_end), jnp.maximum(ts, t_end))
-        ts = jnp.where(whole, ts, reached)
+        ahead = ts[-1] > ts[0]
+        reached = jnp.where(ahead, jnp.minimum(ts, t_end), jnp.maximum(ts, t_end))
+        ts = jnp.where(result == SUCCESSFUL, ts, reached)
         # The last step ends at ts[-1] itself, which may be differentiated, not at its recorded value.
         controller = _Replay(jnp.where(times == t_end, jnp.inf, times))
-        solved = _solve((field, project, ts, y0, params), settings, controller, diffrax.RecursiveCheckpointAdjoint())
-        return solved.path, solved.end, solved.t_end
+        again = Method(method.solver, controller, None, method.max_steps, diffrax.NoProgressMeter())
+        solution = _solve((field, project, ts, y0, params), again, diffrax.RecursiveCheckpointAdjoint())
+        return solution[:3]
 
     replayed, pull_back = eqx.filter_vjp(replay, moving)
-    given = (cotangents.path, cotangents.end, cotangents.t_end)
-    filled = jax.tree.map(lambda x, c: jnp.zeros_like(x) if c is None else c, replayed, given)
+    filled = jax.tree.map(lambda x, c: jnp.zeros_like(x) if c is None else c, replayed, tuple(cotangents[:3]))
     return pull_back(filled)[0]
 
 

@@ -71,6 +71,12 @@ class Layout:
         return jax.tree.unflatten(self.tree, leaves)
 
 
+def halves(y):
+    """(q, q̇), each (…, n), of states (…, 2n)."""
+    n = y.shape[-1] // 2
+    return y[..., :n], y[..., n:]
+
+
 def as_vector(numbers: PyTree, dtype) -> jax.Array:
     """All numbers of a pytree end to end, shape (P,), in the order of its leaves."""
     leaves = [jnp.ravel(jnp.asarray(leaf)).astype(dtype) for leaf in jax.tree.leaves(numbers)]

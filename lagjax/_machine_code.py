@@ -1,9 +1,31 @@
-"""`MachineCode`: the engine that is chosen by default where a scene has it, as a value that insists on it."""
+"""`MachineCode`: the engine of float64 on CPUs, Taylor series in machine code that is made for the scene.
 
-import equinox as eqx
+Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is traced; ─► `_transforms`, the flow as primitives
+of JAX, where something is.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax import _transforms
+from lagjax._derivation import Derivation
+from lagjax._diffrax import Diffrax
+from lagjax._flow import Flow, Tolerances, unfit
+from lagjax._layout import as_vector
+from lagjax._native import Guards
+from lagjax._problem import AbstractEngine, Batch, Problem, Solution
+from lagjax._program import Unlowerable
+from lagjax._validate import is_concrete
+
+# Operations of an acceleration beyond which LLVM takes too long over its transpose: derivatives are then diffrax's.
+# Whether a run that is being traced will be differentiated cannot be known.
+LARGEST_DIFFERENTIATED = 2000
 
 
-class MachineCode(eqx.Module):
+class MachineCode(AbstractEngine):
     r"""Taylor series in machine code made for the scene: `simulate(..., solver=lagjax.MachineCode())`.
 
     Left to its default, `solver=None`, a run goes to machine code where it can and to diffrax where it cannot.
@@ -34,3 +56,81 @@ class MachineCode(eqx.Module):
     trajectory = lagjax.simulate(scene, 1.0, 0.0, jnp.linspace(0, 10, 101), solver=lagjax.MachineCode())
     ```
     """
+
+    def refuses(self, problem: Problem) -> str | None:
+        """Why it cannot solve the problem, as the end of a sentence; None where it can."""
+        if problem.event is not None:
+            return "an event was asked for"
+        if not all(map(is_concrete, problem.tolerances)):
+            return "the tolerances are being traced"
+        flow = _flow_of(problem)
+        return flow if isinstance(flow, str) else None
+
+    def solve(self, problem: Problem) -> Solution:
+        """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
+        flow, tolerances = _flow_of(problem), _tolerances(problem)
+        if problem.is_known:
+            solution = flow.run(*(np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector)), tolerances)
+            return Solution(*(x[0] for x in solution[:-1]))
+        if problem.guards is None and not _has_derivatives(flow):
+            return Diffrax(forward=_forward(flow, tolerances)).solve(problem)
+        return _transforms.run(flow, tolerances, *map(jnp.asarray, (problem.ts, problem.y0, problem.vector)))
+
+    def solve_batch(self, batch: Batch) -> Solution:
+        """The motions of all members, in the lanes of vectors and on all cores."""
+        flow, tolerances = _flow_of(batch.member), _tolerances(batch.member)
+        if batch.is_known:
+            ts = np.asarray(batch.member.ts)[None]
+            return flow.run(ts, *map(np.asarray, (batch.y0, batch.vectors)), tolerances)
+        if not _has_derivatives(flow):
+            return Diffrax(forward=_forward(flow, tolerances)).solve_batch(batch)
+        return batch.over_members(self.solve)
+
+
+def flow_of(problem: Problem) -> Flow:
+    """The flow of a problem's scene. Raises `ValueError` where it has none, saying why."""
+    flow = _flow_of(problem)
+    if isinstance(flow, str):
+        raise ValueError(f"There is no machine code for this scene: {flow}.")
+    return flow
+
+
+def _flow_of(problem: Problem) -> Flow | str:
+    return _made(problem.derivation, problem.system.path, problem.guards)
+
+
+@functools.lru_cache(maxsize=64)
+def _made(derivation: Derivation, path: str, guards: Guards | None) -> Flow | str:
+    """The flow of a scene, or a sentence that says why it has none. Made once."""
+    if path == "array":
+        return "the array path was asked for"
+    if derivation.unhashable is not None:
+        return f"the scene cannot be remembered: {derivation.unhashable}"
+    try:
+        program, projection = derivation.acceleration, derivation.projection
+    except Unlowerable as reason:
+        return str(reason)
+    n = derivation.layout.size
+    return unfit(program, n, derivation.layout.dtype) or Flow.of(program, n, projection, guards)
+
+
+def _tolerances(problem: Problem) -> Tolerances:
+    return Tolerances(*map(float, problem.tolerances), problem.max_steps)
+
+
+# ---- scenes whose derivatives are diffrax's --------------------------------------------------------------------------
+
+
+def _has_derivatives(flow: Flow) -> bool:
+    """Whether derivatives of this flow, should they be asked for, come from machine code as well."""
+    return flow.program.operations <= LARGEST_DIFFERENTIATED
+
+
+@functools.lru_cache(maxsize=64)  # one function object for one program: it becomes part of what XLA compiles
+def _forward(flow: Flow, tolerances: Tolerances) -> Callable:
+    """`(ts, (q, qdot), params)` → `Solution`: the motion where no derivative is taken."""
+
+    def forward(ts, y0, params):
+        return _transforms.run(flow, tolerances, ts, jnp.concatenate(y0), as_vector(params, y0[0].dtype))
+
+    return forward

@@ -16,12 +16,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._engine import choose
+from lagjax._layout import Layout
 from lagjax._machine_code import MachineCode
-from lagjax._settings import as_arrays
+from lagjax._problem import LEAST_RTOL, LEAST_RTOL_OF_DIFFRAX, Batch, Problem, axes_per_leaf
 from lagjax._simulate import simulate, simulate_batch
 from lagjax._solvers import FineOutput
-from lagjax._system import System
+from lagjax._system import System, require_system
 from lagjax._trajectory import Trajectory
+from lagjax._validate import as_arrays
 
 PyTree = Any
 
@@ -160,6 +163,8 @@ def work_precision(
     if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
         raise ValueError(f"repeats must be a positive integer; got {repeats!r}.")
 
+    if solvers is None:
+        measured = _with_default_named(_problem(system, q0, qdot0, ts, params, batch_axes))
     given = as_arrays((q0, qdot0, jnp.asarray(ts), params), dtype)
     precise = as_arrays(given, jnp.result_type(float))
 
@@ -170,8 +175,6 @@ def work_precision(
         return simulate_batch(system, *scene, batch_axes=batch_axes, **options)
 
     truth, resolution = _reference(partial(run, None, reference=True), jnp.result_type(float))
-    if solvers is None:
-        measured = _with_default_named(partial(run, rtol=max(tolerances)))
     rows = []
     for name, solver in measured.items():
         run(solver, max(tolerances))  # compiles; tolerances are traced, so once per solver
@@ -179,14 +182,21 @@ def work_precision(
     return WorkPrecision(tuple(rows), *_median_and_worst(resolution), members=len(truth))
 
 
-def _with_default_named(run: Callable[[MachineCode], Trajectory]) -> dict[str, diffrax.AbstractSolver | None]:
+def _problem(system: System, q0: PyTree, qdot0: PyTree, ts, params: PyTree, batch_axes) -> Problem:
+    """What is to be integrated, as one problem or as that of one member."""
+    require_system(system)
+    if batch_axes is None:
+        return Problem.of(system, Layout.of(q0, qdot0), q0, qdot0, ts, params)
+    values = {"q0": q0, "qdot0": qdot0, "params": params}
+    return Batch.of(system, values, *axes_per_leaf(values, batch_axes), ts).member
+
+
+def _with_default_named(problem: Problem) -> dict[str, diffrax.AbstractSolver | None]:
     """The solvers that are measured by default, that of `simulate` first and under the name of what integrates."""
-    try:
-        run(MachineCode())
-    except ValueError:  # it insists, and says why there is none: then `simulate` leaves the scene to diffrax
-        others = {name: solver for name, solver in _SOLVERS.items() if name != _FIRST}
-        return {f"default: {_FIRST}": None, **others}
-    return {"default: Taylor (machine code)": None, **_SOLVERS}
+    if isinstance(choose(problem).engine, MachineCode):
+        return {"default: Taylor (machine code)": None, **_SOLVERS}
+    others = {name: solver for name, solver in _SOLVERS.items() if name != _FIRST}
+    return {f"default: {_FIRST}": None, **others}
 
 
 def _reference(run: Callable[[float], Trajectory], dtype) -> tuple[np.ndarray, np.ndarray]:
@@ -268,7 +278,7 @@ def _require_tolerances(tolerances: Sequence[float], dtype: np.dtype, solvers: M
         raise ValueError(f"tolerances must be a sequence of at least one value of rtol; got {tolerances!r}.")
     # What `simulate` asks for, found before the reference is computed; of machine code alone it asks for less.
     by_diffrax = any(isinstance(solver, diffrax.AbstractSolver) for solver in solvers.values())
-    least = (10 if by_diffrax else 0.25) * float(jnp.finfo(dtype).eps)
+    least = (LEAST_RTOL_OF_DIFFRAX if by_diffrax else LEAST_RTOL[dtype]) * float(jnp.finfo(dtype).eps)
     for rtol in tolerances:
         if not (np.isfinite(rtol) and rtol >= least):
             raise ValueError(f"Every tolerance must be a number of at least {least:.1e} in {dtype.name}; got {rtol}.")

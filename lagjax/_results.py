@@ -49,7 +49,13 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
-ENDED_WELL = tuple(int(result._value) for result in (RESULTS.successful, RESULTS.event_occurred))
+def code_of(result: diffrax.RESULTS) -> int:
+    """The integer by which a result is known inside arrays."""
+    return int(result._value)
+
+
+SUCCESSFUL = code_of(RESULTS.successful)
+ENDED_WELL = (SUCCESSFUL, code_of(RESULTS.event_occurred))
 
 
 _STRUCTURE = jax.tree.structure(RESULTS.successful)

@@ -1,8 +1,8 @@
 """`simulate` and `simulate_batch`: from a scene and an initial state to a trajectory.
 
-Both follow the same four stages: check what can be checked before any work is done, turn numbers into arrays (so that
-a new value never recompiles), integrate in machine code (`_engine`) or by diffrax (`_integrate`), and dress the result
-in the user's pytree. Only this module raises when a trajectory fails.
+Both follow the same four stages: state the problem, with everything checked that can be before any work is done; choose
+the engine; let it solve the problem; and dress the solution in the user's pytree. Only this module raises when a
+trajectory fails.
 """
 
 from collections.abc import Callable
@@ -14,27 +14,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import _engine, _linear
-from lagjax._consistent import inconsistent_members, rank_lost, require_consistent
-from lagjax._equations import equations
-from lagjax._failures import differentiable_where, lost_unless, raise_where_failed, sentence
-from lagjax._integrate import integrate
-from lagjax._layout import Layout
+from lagjax import _linear
+from lagjax._consistent import inconsistent_members, require_consistent
+from lagjax._diffrax import Diffrax
+from lagjax._engine import asked_for, choose
+from lagjax._failures import raise_where_failed, sentence
+from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode
+from lagjax._problem import AbstractEngine, Batch, Problem, Solution, axes_per_leaf
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, result_from
-from lagjax._settings import (
-    Settings,
-    as_arrays,
-    is_concrete,
-    require_finite,
-    require_flag,
-    require_numbers,
-    require_solver_reaches,
-)
-from lagjax._solvers import Projected
-from lagjax._stopped import AHEAD, End, what_stopped
+from lagjax._stopped import AHEAD
 from lagjax._system import System, require_system
 from lagjax._trajectory import State, Trajectory
+from lagjax._validate import as_arrays, is_concrete, require_flag
 
 PyTree = Any
 
@@ -113,22 +105,12 @@ def simulate(
     require_system(system)
     require_flag(throw, "throw")
     layout = Layout.of(q0, qdot0)
-    settings = Settings.of(layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress)
-    params = as_arrays(params, layout.dtype)
-    for name, value in (("q0", q0), ("qdot0", qdot0), ("params", params)):
-        require_finite(value, name)
-
+    asked = asked_for(solver, dt, adjoint, progress, rtol, atol)
+    problem = Problem.of(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
-    require_consistent(system, layout, settings.ts, q0, qdot0, params)
-    flow = _engine.flow_for(system, settings, layout, q0, qdot0, params)
-    if isinstance(flow, str):
-        require_solver_reaches(settings, layout.dtype)
-        fields = _integrate(system, settings, q0, qdot0, params)
-    elif not _engine.has_derivatives(flow, settings.ts, q0, qdot0, params):
-        fields = _integrate(system, settings, q0, qdot0, params, _engine.primal(flow, settings))
-    else:
-        fields = _engine.run(flow, settings, layout, q0, qdot0, params)
-    trajectory = Trajectory(*fields, system, params, tolerances=settings.tolerances)
+    require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
+    engine = choose(problem, asked).engine
+    trajectory = _trajectory(problem, engine, engine.solve(problem), problem.params)
     return raise_unless_ok(trajectory, layout) if throw else trajectory
 
 
@@ -167,165 +149,44 @@ def simulate_batch(
     ```
     """
     require_system(system)
+    asked = asked_for(solver, dt, adjoint, progress, rtol, atol)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
-    axes, size = _axes_per_leaf(values, batch_axes)
-    member = {name: _first_member(value, axes[name]) for name, value in values.items()}
-    layout = Layout.of(member["q0"], member["qdot0"])
-    settings = Settings.of(layout, ts, solver, rtol, atol, dt, max_steps, event, adjoint, progress)
-    values = {name: as_arrays(value, layout.dtype) for name, value in values.items()}
-    for name, value in values.items():
-        require_finite(jax.tree.map(lambda leaf, axis: leaf if axis is None else None, value, axes[name]), name)
-
-    astray = inconsistent_members(system, layout, settings.ts, values, axes)
-    flow = _engine.flow_for(system, settings, layout, *member.values())
-    if isinstance(flow, str):
-        require_solver_reaches(settings, layout.dtype)
-        fields = _integrate_batch(system, settings, *values.values(), _Static(tuple(batch_axes)))
-        steps = fields[5]["num_steps"]  # every lane waits for the slowest
-        fields[5]["num_wasted_lane_steps"] = steps.size * jnp.max(steps) - jnp.sum(steps)
-    elif all(is_concrete(leaf) for leaf in jax.tree.leaves((settings.ts, values))):
-        fields = _engine.run_batch(flow, settings, layout, values, axes, size)
-    elif _engine.has_derivatives(flow, settings.ts, *values.values()):
-        run = jax.vmap(lambda *one: _engine.run(flow, settings, layout, *one), in_axes=tuple(batch_axes))
-        fields = run(*values.values())
-    else:
-        primal = _engine.primal(flow, settings)
-        fields = _integrate_batch(system, settings, *values.values(), _Static(tuple(batch_axes)), primal)
-    shared = {"params_axes": batch_axes[2], "tolerances": settings.tolerances}
-    trajectory = Trajectory(jnp.asarray(settings.ts), *fields[1:], system, values["params"], **shared)
+    axes, size = axes_per_leaf(values, batch_axes)
+    batch = Batch.of(system, values, axes, size, ts, rtol, atol, max_steps, event)
+    values = {name: as_arrays(value, batch.member.layout.dtype) for name, value in values.items()}
+    astray = inconsistent_members(system, batch.member.layout, batch.member.ts, values, axes)
+    engine = choose(batch.member, asked).engine
+    trajectory = _trajectory(batch.member, engine, engine.solve_batch(batch), values["params"], batch_axes[2])
     return trajectory if astray is None else _refused(trajectory, astray)
 
 
-class _Static(eqx.Module):
-    """Hands a hashable value to a compiled function as part of its structure."""
+def _trajectory(problem: Problem, engine: AbstractEngine, solution: Solution, params: PyTree, params_axes=None):
+    """The solution in the pytree of the user, of one problem or of a batch; `params` are those of all members.
 
-    value: Any = eqx.field(static=True)
-
-
-@eqx.filter_jit
-def _integrate_batch(system, settings, q0, qdot0, params, batch_axes: _Static, primal=None):
-    def member(q0, qdot0, params):
-        return _integrate(system, settings, q0, qdot0, params, primal)
-
-    return jax.vmap(member, in_axes=batch_axes.value)(q0, qdot0, params)
-
-
-@eqx.filter_jit
-def _integrate(system: System, settings: Settings, q0, qdot0, params, primal=None):
-    """One trajectory by diffrax, the first six fields of `Trajectory`; with `primal` diffrax only differentiates."""
-    layout = Layout.of(q0, qdot0)
-    numbers, motion = eqx.filter(params, eqx.is_array), system.motion(layout, params)
-    form = equations(motion, layout, numbers, system.path)
-    y0 = layout.flatten(q0), layout.flatten(qdot0)
-
-    # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
-    start = _health(y0, *form.acceleration(settings.ts[0], y0, numbers))
-    ts = jnp.where(start == RESULTS.successful, settings.ts, settings.ts[0])
-    event = None if settings.event is None else _in_coordinates(settings.event, layout, params)
-    solved = integrate(form, settings, event, ts, y0, numbers, primal)
-    path, end, t_end = solved.path, solved.end, solved.t_end
-
-    result = _explained(RESULTS.promote(solved.result), start, _health(end, *form.acceleration(t_end, end, numbers)))
-    result = _of_surroundings(result, form, ts, solved, numbers)
-    if motion.constrained:
-        lost = rank_lost(motion, (*y0, settings.ts[0], numbers), (*end, t_end, numbers))
-        result = _of_constraints(result, RESULTS.promote(solved.result), lost)
-    # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start. Whatever adjoint
-    # there is, their cotangents must not be lost: they go to all that went in.
-    reached = jnp.isfinite(path[0]).all(axis=1) & jnp.isfinite(path[1]).all(axis=1) & (ts == settings.ts)
-    well = jnp.isin(result._value, jnp.asarray(ENDED_WELL))
-    inputs = settings.ts, y0, numbers
-    q, qdot = (jax.vmap(layout.restore)(lost_unless(reached[:, None], leaf, inputs)) for leaf in path)
-    end = tuple(differentiable_where(well, leaf) for leaf in end)
-    return (
-        settings.ts,
-        q,
-        qdot,
-        result,
-        State(t_end, *map(layout.restore, end)),
-        solved.stats,
+    Where nothing is traced, the few numbers stay in NumPy: each one sent to JAX costs as much as a hundred steps.
+    """
+    restore, (q, qdot), (q_end, qdot_end) = problem.layout.restore, halves(solution.path), halves(solution.y_end)
+    arrays = problem.ts, restore(q), restore(qdot), solution.result
+    # All in one call, which costs as much as for one of them.
+    sent = jax.device_put(arrays) if isinstance(solution.y_end, np.ndarray) else jax.tree.map(jnp.asarray, arrays)
+    stats = {
+        "num_steps": solution.accepted + solution.rejected,
+        "num_accepted_steps": solution.accepted,
+        "num_rejected_steps": solution.rejected,
+    }
+    if solution.idle is not None:
+        stats["num_wasted_lane_steps"] = solution.idle
+    fixed_steps = isinstance(engine, Diffrax) and engine.dt is not None
+    return Trajectory(
+        *sent[:3],
+        result_from(sent[3]),
+        State(solution.t_end, restore(q_end), restore(qdot_end)),
+        stats,
+        problem.system,
+        params,
+        params_axes,
+        tolerances=None if fixed_steps else problem.tolerances,
     )
-
-
-def _health(y, acceleration, singular) -> RESULTS:
-    """Whether a motion can go on from a state with this acceleration, and if not, why."""
-    finite = jax.tree.reduce(lambda all_, leaf: all_ & jnp.isfinite(leaf).all(), (y, acceleration), jnp.array(True))
-    failed = RESULTS.where(singular, RESULTS.mass_matrix_singular, RESULTS.nonfinite_state)
-    return RESULTS.where(finite, RESULTS.successful, failed)
-
-
-def _explained(result: RESULTS, start: RESULTS, end: RESULTS) -> RESULTS:
-    """The most telling of what diffrax reports and of what the first and the last state show."""
-    stopped = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
-    unhealthy = (end != RESULTS.successful) & (stopped | (end == RESULTS.nonfinite_state))
-    result = RESULTS.where(unhealthy, end, result)
-    return RESULTS.where(start == RESULTS.successful, result, start)
-
-
-def _of_surroundings(result: RESULTS, form, ts, solved, numbers) -> RESULTS:
-    """What the motion ran into, where steps became too small or too many: see `_stopped`."""
-    field = eqx.filter_closure_convert(form.acceleration, ts[0], solved.end, numbers)
-    # A name has no derivative, and the search for it is a loop that reverse mode could not go back through.
-    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (field, ts, solved, numbers))
-    field, ts, solved, numbers = frozen
-    n, counts = len(solved.end[0]), [solved.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected")]
-
-    def acceleration(t, y):
-        return field(t, (y[:n], y[n:]), numbers)[0]
-
-    end = End(solved.t_end, jnp.concatenate(solved.end), ts[0], ts[-1], *counts)
-    stopped = (result == RESULTS.dt_min_reached, result == RESULTS.max_steps_reached)
-    not_finite, jumps = what_stopped(acceleration, end, *stopped)
-    result = RESULTS.where(jumps, RESULTS.acceleration_discontinuous, result)
-    return RESULTS.where(not_finite, RESULTS.nonfinite_state, result)
-
-
-def _of_constraints(result: RESULTS, reported: RESULTS, lost) -> RESULTS:
-    """What failed, where the constraints are the reason: Newton's method, or fewer of them independent than before."""
-    failed = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
-    result = RESULTS.where(failed & lost, RESULTS.constraint_rank_lost, result)
-    return RESULTS.where(reported == RESULTS.promote(Projected.FAILED), RESULTS.projection_failed, result)
-
-
-def _in_coordinates(event: diffrax.Event, layout: Layout, params: PyTree) -> diffrax.Event:
-    """The user's event functions, made to read the solver's state."""
-
-    def flat(function):
-        def condition(t, y, args, **_):
-            return function(*map(layout.restore, y), t=t, params=eqx.combine(args, params))
-
-        return condition
-
-    conditions = jax.tree.map(flat, event.cond_fn, is_leaf=callable)
-    return diffrax.Event(conditions, event.root_finder, event.direction)
-
-
-def _axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTree], int]:
-    """`batch_axes` spread over every leaf, and the size of the batch, which must be the same everywhere."""
-    if not isinstance(batch_axes, tuple) or len(batch_axes) != 3:
-        raise ValueError(f"batch_axes must be a tuple of three, for (q0, qdot0, params); got {batch_axes!r}.")
-    axes, sizes = {}, {}
-    for (name, value), prefix in zip(values.items(), batch_axes, strict=True):
-        try:
-            axes[name] = jax.tree.broadcast(prefix, value, is_leaf=lambda axis: axis is None)
-        except ValueError:
-            raise ValueError(f"batch_axes for {name} is {prefix!r}, which does not fit its structure.") from None
-        leaves, tree = jax.tree_util.tree_flatten_with_path(value)
-        for (path, leaf), axis in zip(leaves, tree.flatten_up_to(axes[name]), strict=True):
-            label = name + jax.tree_util.keystr(path)
-            if axis is not None:
-                require_numbers(leaf, label)
-                if not -jnp.ndim(leaf) <= axis < jnp.ndim(leaf):
-                    raise ValueError(f"{label} has shape {jnp.shape(leaf)}: it has no axis {axis} for the batch.")
-                sizes[label] = jnp.shape(leaf)[axis]
-    if not sizes:
-        raise ValueError("batch_axes maps over nothing: name the axis of the members in q0, qdot0 or params.")
-    if len(set(sizes.values())) > 1:
-        listed = ", ".join(f"{label} has {size}" for label, size in sizes.items())
-        raise ValueError(f"The batch must have one size everywhere; {listed}.")
-    if 0 in sizes.values():
-        raise ValueError("The batch is empty.")
-    return axes, next(iter(sizes.values()))
 
 
 def _refused(trajectory: Trajectory, astray: jax.Array) -> Trajectory:
@@ -337,10 +198,6 @@ def _refused(trajectory: Trajectory, astray: jax.Array) -> Trajectory:
     result = result_from(jnp.where(astray, RESULTS.inconsistent_start._value, trajectory.result._value))
     q, qdot = jax.tree.map(without, (trajectory.q, trajectory.qdot))
     return eqx.tree_at(lambda t: (t.q, t.qdot, t.result), trajectory, (q, qdot, result))
-
-
-def _first_member(tree: PyTree, axes: PyTree) -> PyTree:
-    return jax.tree.map(lambda leaf, axis: leaf if axis is None else jnp.take(leaf, 0, axis), tree, axes)
 
 
 def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:

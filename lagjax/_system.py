@@ -20,8 +20,9 @@ from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
 from lagjax._linear import coupling_many, saddle_many
 from lagjax._motion import Motion, nearest_consistent
+from lagjax._problem import Problem
 from lagjax._program import Unlowerable
-from lagjax._settings import as_arrays, is_concrete, require_number
+from lagjax._validate import as_arrays, is_concrete, require_number
 
 PyTree = Any
 
@@ -170,7 +171,7 @@ class System(eqx.Module):
         ```
         """
         layout = Layout.of(q, qdot)
-        facts = explain(derivation_of(self, layout, as_arrays(params, layout.dtype)), self.path)
+        facts = explain(Problem.about(self, layout, params))
         if self.constraints is None and self.velocity_constraints is None:
             return facts
         names = self.constraint_names(layout, params)

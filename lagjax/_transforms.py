@@ -30,12 +30,13 @@ from jax.experimental.buffer_callback import buffer_callback
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from lagjax import _native
-from lagjax._flow import KEPT, Flow, Outcome, Tolerances, from_rows, to_rows
+from lagjax._flow import KEPT, Flow, Tolerances, from_rows, to_rows
+from lagjax._problem import Solution
+from lagjax._results import SUCCESSFUL
 
 
-def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Outcome:
-    """The outcome of one member, under every transformation of JAX; `ts` (T,), `y0` (2n,), `params` (P,).
+def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:
+    """The motion of one member, under every transformation of JAX; `ts` (T,), `y0` (2n,), `params` (P,).
 
     A flow with guards has no derivatives: they would have to say how its end moves.
     """
@@ -45,7 +46,7 @@ def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Outcome:
 @functools.lru_cache(maxsize=256)
 def _compiled(flow: Flow, tolerances: Tolerances):
     """`run` as one program of XLA: a derivative outside of `jit` then compiles as one, not operation by operation."""
-    return jax.jit(lambda *given: Outcome(*run_p.bind(*given, flow=flow, tolerances=tolerances, keep=False)))
+    return jax.jit(lambda *given: _run(*given, flow=flow, tolerances=tolerances, keep=False))
 
 
 # ---- on the host: NumPy arrays with any batch axes in front ----------------------------------------------------------
@@ -72,17 +73,17 @@ def _in_batch(results, batch):
 
 def _run_on_host(ts, y0, params, *, flow, tolerances, keep):
     rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2))
-    return _in_batch(flow.run(*rows, tolerances, KEPT if keep else None)[0], batch)
+    return _in_batch(flow.run(*rows, tolerances, KEPT if keep else None)[:_OUTPUTS], batch)
 
 
-def _push_on_host(ts, y0, params, path, code, accepted, ticket, dy0, dparams, *, flow, tolerances):
-    del path, code, accepted, ticket  # what the transpose needs
+def _push_on_host(ts, y0, params, path, result, accepted, ticket, dy0, dparams, *, flow, tolerances):
+    del path, result, accepted, ticket  # what the transpose needs
     rows, batch = _rows((ts, y0, params, dy0, dparams), (1, 1, 1, 2, 2), shared=(0, 2))
     return _in_batch(flow.push(*rows, tolerances), batch)
 
 
-def _pull_on_host(ts, y0, params, path, code, accepted, ticket, path_bar, end_bar, *, flow, tolerances):
-    arrays = ts, y0, params, path, code, accepted, ticket, path_bar, end_bar
+def _pull_on_host(ts, y0, params, path, result, accepted, ticket, path_bar, end_bar, *, flow, tolerances):
+    arrays = ts, y0, params, path, result, accepted, ticket, path_bar, end_bar
     rows, batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2))
     return _in_batch(flow.pull(*rows[:3], rows[3:7], *rows[7:], tolerances), batch)
 
@@ -90,8 +91,13 @@ def _pull_on_host(ts, y0, params, path, code, accepted, ticket, path_bar, end_ba
 # ---- primitives ------------------------------------------------------------------------------------------------------
 
 run_p, push_p, pull_p, curvature_p = (Primitive(f"lagjax_{name}") for name in ("run", "push", "pull", "curvature"))
-# Of run's inputs, and of what push and pull are told about a run: ts, y0, params, path, code, accepted, ticket.
-_GIVEN = 7
+# Of run: a `Solution` but for the last field, which is that of a batch. Push and pull are told about a run its ts, y0,
+# params, path, result, accepted, ticket.
+_OUTPUTS, _GIVEN = len(Solution._fields) - 1, 7
+
+
+def _run(ts, y0, params, **settings) -> Solution:
+    return Solution(*run_p.bind(ts, y0, params, **settings))
 
 
 def _batch_of(args, inner):
@@ -104,7 +110,7 @@ def _floats(*shapes):
 
 def _run_shapes(ts, y0, params, *, flow, **_):
     batch = _batch_of((ts, y0, params), (1, 1, 1))
-    counts = [jax.core.ShapedArray(batch, np.dtype(int))] * 4
+    counts = [jax.core.ShapedArray(batch, np.dtype(int))] * (_OUTPUTS - 3)
     floats = _floats((*batch, ts.shape[-1], flow.states), (*batch, flow.states), batch)
     return [*floats, *counts]
 
@@ -129,10 +135,10 @@ def _curvature_composed(ts, y0, params, path_bar, end_bar, dy0, dparams, *, flow
     """By going back over the steps of the tangent flow, with cotangents of the tangent alone."""
     larger, tolerances = flow.tangent(1), tolerances.with_larger_budget
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
-    outcome = Outcome(*run_p.bind(*given, flow=larger, tolerances=tolerances, keep=True))
+    solution = _run(*given, flow=larger, tolerances=tolerances, keep=True)
     path_bar, end_bar = (from_rows(jnp.stack([jnp.zeros_like(bar), bar], axis=-2)) for bar in (path_bar, end_bar))
     bars = path_bar[..., None, :, :], end_bar[..., None, :]
-    state_bar, numbers_bar = pull_p.bind(*given, *_residuals(outcome), *bars, flow=larger, tolerances=tolerances)
+    state_bar, numbers_bar = pull_p.bind(*given, *_residuals(solution), *bars, flow=larger, tolerances=tolerances)
     state_bar, numbers_bar = to_rows(state_bar[..., 0, :], flow.size)[..., 0, :], numbers_bar[..., 0, : flow.numbers]
     return [state_bar * length, numbers_bar * length]
 
@@ -141,8 +147,8 @@ def _push_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
     """`push` along one direction, (…, 2n) and (…, P), by the run of the tangent flow: for its own derivatives."""
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
     larger = flow.tangent(1)
-    outcome = Outcome(*run_p.bind(*given, flow=larger, tolerances=tolerances.with_larger_budget, keep=False))
-    path, end = (to_rows(y, flow.size)[..., 1, :] for y in (outcome.path, outcome.y_end))
+    solution = _run(*given, flow=larger, tolerances=tolerances.with_larger_budget, keep=False)
+    path, end = (to_rows(y, flow.size)[..., 1, :] for y in (solution.path, solution.y_end))
     return path * length[..., None], end * length
 
 
@@ -157,9 +163,9 @@ def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
     return (ts, start, numbers), length
 
 
-def _residuals(outcome: Outcome):
+def _residuals(solution: Solution):
     """What `push` and `pull` are told of a run: how it came out. Their values do not vary with that."""
-    given = outcome.path, outcome.code, outcome.accepted, outcome.ticket
+    given = solution.path, solution.result, solution.accepted, solution.ticket
     return tuple(jax.lax.stop_gradient(x) for x in given)
 
 
@@ -190,16 +196,16 @@ def _run_jvp(primals, tangents, *, flow, tolerances, keep):
         outs = run_p.bind(*primals, flow=flow, tolerances=tolerances, keep=keep)
         return outs, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
     outs = run_p.bind(*primals, flow=flow, tolerances=tolerances, keep=True)
-    outcome = Outcome(*outs)
+    solution = Solution(*outs)
     dy0, dparams = _value(dy0), _value(dparams)
     if not _zero(dts):
         dy0 = dy0 - _slope(flow, ts[..., 0], y0, params) * dts[..., :1]
     direction = [x[..., None, :] for x in (dy0, dparams)]
-    d_path, d_end = push_p.bind(*primals, *_residuals(outcome), *direction, flow=flow, tolerances=tolerances)
-    d_path, d_end, d_t_end = d_path[..., 0, :, :], d_end[..., 0, :], jnp.zeros_like(outcome.t_end)
+    d_path, d_end = push_p.bind(*primals, *_residuals(solution), *direction, flow=flow, tolerances=tolerances)
+    d_path, d_end, d_t_end = d_path[..., 0, :, :], d_end[..., 0, :], jnp.zeros_like(solution.t_end)
     if not _zero(dts):
-        reached, done = jnp.isfinite(outcome.path), outcome.code == _native.DONE
-        places = jnp.where(reached, outcome.path, y0[..., None, :])
+        reached, done = jnp.isfinite(solution.path), solution.result == SUCCESSFUL
+        places = jnp.where(reached, solution.path, y0[..., None, :])
         rates = _slope(flow, ts, places, params[..., None, :]) * dts[..., None]
         d_path = d_path + jnp.where(reached, rates, 0.0)
         d_end = d_end + jnp.where(done[..., None], rates[..., -1, :], 0.0)
@@ -267,7 +273,7 @@ def _pull_moved_in_time(primals, dts, outs, settings):
     from which the others follow has the derivative −∂f₀ δt₀.
     """
     flow, (ts, y0, params), (path_bar, end_bar) = settings["flow"], primals[:3], primals[_GIVEN:]
-    path, done = primals[3], primals[4] == _native.DONE
+    path, done = primals[3], primals[4] == SUCCESSFUL
     reached = jnp.isfinite(path)
     weights = jnp.where(reached[..., None, :, :], path_bar, 0.0)
     weights = weights.at[..., -1, :].add(jnp.where(done[..., None, None], end_bar, 0.0))

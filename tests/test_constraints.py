@@ -15,7 +15,8 @@ from sweeps import sweep
 
 import lagjax
 from lagjax import scenes
-from lagjax._equations import equations, scalar_program
+from lagjax._derivation import Derivation, derivation_of
+from lagjax._equations import form_of
 from lagjax._layout import Layout
 from lagjax._linear import rank_tolerance
 
@@ -298,7 +299,7 @@ def test_masses_in_params_are_taken_for_what_they_are():
     # takes over, also where JAX does not know them while it traces, and in derivatives.
     rods = scenes.cartesian_double_pendulum()
     layout = Layout.of(rods.q0, rods.qdot0)
-    lean = scalar_program(rods.system.motion(layout, rods.params), layout, rods.params)
+    lean = derivation_of(rods.system, layout, rods.params).acceleration
     assert 2 * lean.operations < lean.complete.operations
     scene = scenes.rolling_cylinder()
     rest = scenes.Rolling(0.0, 0.0, 0.0)
@@ -467,7 +468,7 @@ def test_accelerations_where_a_parallelogram_is_flat():
     layout = Layout.of(jnp.zeros(3), jnp.zeros(3))
     motion = lagjax.System(linkage, constraints=closed_linkage).motion(layout)
     for path in ("scalar", "array"):
-        form = equations(motion, layout, None, path)
+        form = form_of(Derivation(motion, layout, None), path)
 
         def accelerate(angle, form=form):
             state = jnp.stack([angle, GROUND[1] + 0 * angle, angle]), jnp.array([3.0, 0.0, 3.0])

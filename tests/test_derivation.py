@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax import _engine, _equations, _flow, _simulate, scenes
+from lagjax import _diffrax, _equations, _flow, _machine_code, scenes
 from lagjax._check import _measure as of_check
 from lagjax._derivation import columns_of, derivation_of, numbers_of
 from lagjax._health import _measure as of_health
@@ -219,13 +219,13 @@ def test_explain_names_the_engine_that_runs(name, monkeypatch):
         pass
 
     def stop(which):
-        def run(*_, **__):
+        def solve(*_):
             raise Ran(which)
 
-        return run
+        return solve
 
-    monkeypatch.setattr(_engine, "run", stop("machine code"))
-    monkeypatch.setattr(_simulate, "_integrate", stop("diffrax"))
+    monkeypatch.setattr(_machine_code.MachineCode, "solve", stop("machine code"))
+    monkeypatch.setattr(_diffrax.Diffrax, "solve", stop("diffrax"))
     with pytest.raises(Ran, match=engine):
         lagjax.simulate(system, q, np.zeros_like(q), jnp.array([0.0, 0.1]))
     assert facts.solver.startswith("Taylor series in machine code" if engine == "machine code" else "diffrax.Dopri8")

@@ -9,7 +9,8 @@ from sweeps import KINDS, sweep
 
 import lagjax
 from lagjax import scenes
-from lagjax._equations import ArrayEquations, ScalarEquations, equations
+from lagjax._derivation import Derivation
+from lagjax._equations import ArrayEquations, ScalarEquations, form_of
 from lagjax._layout import Layout
 
 
@@ -17,7 +18,7 @@ def forms(scene, *paths):
     layout = Layout.of(scene.q0, scene.qdot0)
     params = jax.tree.map(jnp.asarray, scene.params)
     motion = scene.system.motion(layout, params)
-    return layout, params, [equations(motion, layout, params, path) for path in paths]
+    return layout, params, [form_of(Derivation(motion, layout, params), path) for path in paths]
 
 
 FAST = [make for make in KINDS if make is not scenes.chaplygin_sleigh]  # its projection takes XLA five seconds
@@ -80,7 +81,7 @@ def test_both_forms_find_a_singular_mass_matrix(lagrangian):
     layout = Layout.of(jnp.zeros(n), jnp.zeros(n))
     motion = lagjax.System(lagrangian).motion(layout)
     for path in ("scalar", "array"):
-        form = equations(motion, layout, None, path)
+        form = form_of(Derivation(motion, layout, None), path)
         acceleration, singular = form.acceleration(jnp.asarray(0.0), (jnp.zeros(n), jnp.ones(n)), None)
         assert singular and not np.isfinite(acceleration).all()
 

@@ -35,9 +35,9 @@ def test_it_is_taken_inside_transformations():
     [
         (BY_ARRAYS, np.float64, {}, "the array path was asked for"),
         (OSCILLATOR, np.float32, {}, "the coordinates are float32, not float64"),
-        (OSCILLATOR, np.float64, {"dt": 0.1}, "fixed steps.* was asked for"),
-        (OSCILLATOR, np.float64, {"event": lambda q, qdot: q}, "an event.* was asked for"),
-        (OSCILLATOR, np.float64, {"adjoint": diffrax.ForwardMode()}, "an adjoint.* was asked for"),
+        (OSCILLATOR, np.float64, {"dt": 0.1}, "fixed steps were asked for"),
+        (OSCILLATOR, np.float64, {"event": lambda q, qdot: q}, "an event was asked for"),
+        (OSCILLATOR, np.float64, {"adjoint": diffrax.ForwardMode()}, "an adjoint was asked for"),
     ],
 )
 def test_a_run_without_it_is_an_error_that_says_why(scene, start, options, reason):

@@ -80,11 +80,13 @@ def test_the_engine_that_runs_by_default_is_taken_by_name_or_by_insisting():
 
 
 def test_where_diffrax_runs_by_default_it_is_named_so_and_measured_once():
-    def insisted(solver):
-        assert solver == lagjax.MachineCode()
-        raise ValueError
-
-    assert list(_precision._with_default_named(insisted)) == ["default: Dopri8", "Tsit5"]
+    by_arrays = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, path="array")
+    for scene, names in (
+        (by_arrays, ["default: Dopri8", "Tsit5"]),
+        (OSCILLATOR, ["default: Taylor (machine code)", "Dopri8", "Tsit5"]),
+    ):
+        problem = _precision._problem(scene, 1.0, 0.0, TS, None, None)
+        assert list(_precision._with_default_named(problem)) == names
 
 
 @pytest.mark.slow

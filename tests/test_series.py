@@ -12,7 +12,7 @@ import pytest
 from jax import lax
 
 from lagjax import scenes
-from lagjax._equations import scalar_program
+from lagjax._derivation import derivation_of
 from lagjax._layout import Layout
 from lagjax._program import Program, StraightLine, Unlowerable, _series, emit, lower, lower_solution, pullback, series
 from lagjax._program._graph import COMPARISONS, FOLD
@@ -311,7 +311,7 @@ def test_the_solution_of_a_linear_system_without_its_elimination(name):
     make, by_elimination, by_system = SYSTEMS[name]
     scene = make()
     layout = Layout.of(scene.q0, scene.qdot0)
-    program = scalar_program(scene.system.motion(layout, scene.params), layout, scene.params)
+    program = derivation_of(scene.system, layout, scene.params).acceleration
     rng, n = np.random.default_rng(3), layout.size
     states = np.concatenate([layout.flatten(scene.q0), layout.flatten(scene.qdot0)]) + rng.uniform(-0.1, 0.1, 2 * n)
     numbers = [*states, 0.2, *np.concatenate([np.ravel(p) for p in jax.tree.leaves(scene.params)])]

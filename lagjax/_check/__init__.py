@@ -19,8 +19,9 @@ from lagjax._check import _borders, _constraints, _derivatives, _mass, _stiffnes
 from lagjax._check._findings import Finding, Findings, listed
 from lagjax._check._measure import Scene
 from lagjax._layout import Layout
-from lagjax._settings import DEFAULT_RTOL, is_concrete, not_finite
+from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
+from lagjax._validate import is_concrete, not_finite
 
 __all__ = ["Finding", "Findings", "check"]
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from lagjax._check._findings import Finding, listed
 from lagjax._check._measure import Scene
-from lagjax._settings import DEFAULT_RTOL
+from lagjax._problem import DEFAULT_RTOL
 
 
 def findings(scene: Scene) -> list[Finding]:

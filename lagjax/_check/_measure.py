@@ -16,8 +16,8 @@ from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._layout import Layout
 from lagjax._motion import Motion
 from lagjax._program import Unlowerable
-from lagjax._settings import as_arrays
 from lagjax._system import System
+from lagjax._validate import as_arrays
 
 PyTree = Any
 

@@ -35,7 +35,7 @@ import numpy as np
 from lagjax._health._compare import global_error
 from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measured
 from lagjax._results import RESULTS, advice
-from lagjax._settings import is_concrete
+from lagjax._validate import is_concrete
 
 __all__ = ["Extreme", "Health", "examine"]
 

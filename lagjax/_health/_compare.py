@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._health._measure import Extreme
-from lagjax._settings import is_concrete
+from lagjax._validate import is_concrete
 
 TIGHTER = 0.1  # the tolerance of a reference, in those of what it is to judge
 _FLOOR = 1e-3  # atol/rtol, where steps had no tolerances

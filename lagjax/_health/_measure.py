@@ -18,7 +18,7 @@ import numpy as np
 
 from lagjax._health._laws import Law, Sample, power_at, sample_at
 from lagjax._layout import Layout
-from lagjax._settings import is_concrete
+from lagjax._validate import is_concrete
 
 PyTree = Any
 

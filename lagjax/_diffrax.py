@@ -1,0 +1,205 @@
+"""`Diffrax`: the engine of everything that machine code is not for, any solver of diffrax, on any device.
+
+What diffrax reports of a motion that stopped ("the step became too small") is completed with what it ran into: a mass
+matrix that is singular, a force that is not finite or jumps, constraints that became dependent.
+"""
+
+from collections.abc import Callable
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from lagjax._consistent import rank_lost
+from lagjax._equations import Equations, form_of
+from lagjax._failures import differentiable_where, lost_unless
+from lagjax._integrate import Method, integrate
+from lagjax._layout import Layout, halves
+from lagjax._problem import LEAST_RTOL_OF_DIFFRAX, AbstractEngine, Batch, Problem, PyTree, Solution, too_tight
+from lagjax._results import ENDED_WELL, RESULTS, code_of, result_from
+from lagjax._solvers import FineOutput, Projected
+from lagjax._stopped import End, what_stopped
+from lagjax._validate import is_concrete, require_number
+
+
+class Diffrax(AbstractEngine):
+    """A solver of diffrax, with adaptive steps or with fixed ones of size `dt`.
+
+    `solver` None is Dopri8, with better states between its steps where they are wanted; `adjoint` None goes back over
+    the recorded steps in reverse mode. `forward` integrates in place of diffrax where no derivative is taken.
+    """
+
+    solver: diffrax.AbstractSolver | None = None
+    dt: jax.Array | np.ndarray | None = None
+    adjoint: diffrax.AbstractAdjoint | None = None
+    progress: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
+    forward: Callable | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def of(cls, solver=None, dt=None, adjoint=None, progress: bool | diffrax.AbstractProgressMeter = False):
+        """The engine that these arguments of `simulate` ask for. Raises where one of them cannot be right."""
+        if solver is not None:
+            _require_solver(solver, adaptive=dt is None)
+        if isinstance(progress, bool):
+            progress = diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter()
+        _require_instance(progress, "progress", diffrax.AbstractProgressMeter, "True or False")
+        if adjoint is not None:
+            _require_instance(adjoint, "adjoint", diffrax.AbstractAdjoint, "None")
+        if dt is not None:
+            require_number(dt, "dt")
+            if is_concrete(dt) and not (np.isfinite(dt) and dt > 0):
+                raise ValueError(f"dt must be a positive step size, also backward in time; got {dt}.")
+            dt = dt if isinstance(dt, jax.Array) else np.asarray(dt, float)
+        return cls(solver, dt, adjoint, progress)
+
+    def refuses(self, problem: Problem) -> str | None:
+        """Why the tolerance, or the number of fixed steps, cannot be met, as the end of a sentence."""
+        if self.dt is None:
+            return too_tight(problem.tolerances[0], problem.layout.dtype, LEAST_RTOL_OF_DIFFRAX)
+        if not (is_concrete(self.dt) and is_concrete(problem.ts)):
+            return None
+        first, last = (float(problem.ts[place]) for place in (0, -1))
+        needed = abs(last - first) / float(self.dt)
+        if needed <= problem.max_steps + 0.5:
+            return None
+        return f"dt={self.dt} needs {needed:.0f} steps, more than max_steps={problem.max_steps}: raise one of them"
+
+    def solve(self, problem: Problem) -> Solution:
+        """The motion of one member, compiled once for all problems of its structure."""
+        return _solve(self, problem)
+
+    def solve_batch(self, batch: Batch) -> Solution:
+        """The motions of all members, which step together until the slowest has arrived."""
+        solution = _solve_batch(self, batch)
+        steps = solution.accepted + solution.rejected
+        return solution._replace(idle=steps.size * jnp.max(steps) - jnp.sum(steps))
+
+    def method(self, problem: Problem) -> Method:
+        """How it steps over this problem."""
+        dtype, ts, solver = problem.layout.dtype, jnp.asarray(problem.ts), self.solver
+        if solver is None:
+            # States between steps are wanted for outputs inside and to locate an event.
+            between = ts.size > 2 or problem.event is not None
+            solver = FineOutput(diffrax.Dopri8()) if between else diffrax.Dopri8()
+        if self.dt is not None:
+            dt0 = jnp.asarray(self.dt, dtype) * jnp.sign(ts[-1] - ts[0])
+            return Method(solver, diffrax.ConstantStepSize(), dt0, problem.max_steps, self.progress)
+        rtol, atol = problem.tolerances
+        # Below this a step no longer moves the time reliably.
+        smallest = 4 * jnp.finfo(dtype).eps * jnp.maximum(abs(ts[0]), abs(ts[-1]))
+        controller = diffrax.PIDController(rtol, atol, norm=_norm_or_inf, dtmin=smallest, force_dtmin=False)
+        return Method(solver, controller, None, problem.max_steps, self.progress)
+
+
+def _norm_or_inf(error: PyTree) -> jax.Array:
+    """Root mean square, with NaN as infinity: an undefined step is then rejected and shortened like any bad one."""
+    norm = optx.rms_norm(error)
+    return jnp.where(jnp.isnan(norm), jnp.inf, norm)
+
+
+@eqx.filter_jit
+def _solve_batch(engine: Diffrax, batch: Batch) -> Solution:
+    return batch.over_members(lambda problem: _solve(engine, problem))
+
+
+@eqx.filter_jit
+def _solve(engine: Diffrax, problem: Problem) -> Solution:
+    derivation, numbers, given = problem.derivation, problem.numbers, jnp.asarray(problem.ts)
+    form, y0 = form_of(derivation, problem.system.path), halves(jnp.asarray(problem.y0))
+
+    # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
+    start = _state_result(y0, *form.acceleration(given[0], y0, numbers))
+    ts = jnp.where(start == RESULTS.successful, given, given[0])
+    event = None if problem.event is None else _in_coordinates(problem.event, problem.layout, problem.params)
+    method = engine.method(problem)
+    solution = integrate(form, method, engine.adjoint, event, ts, y0, numbers, engine.forward)
+    result = _explained(solution, form, start, ts, numbers)
+    if derivation.motion.constrained:
+        end = halves(solution.y_end)
+        lost = rank_lost(derivation.motion, (*y0, given[0], numbers), (*end, solution.t_end, numbers))
+        failed = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
+        result = RESULTS.where(failed & lost, RESULTS.constraint_rank_lost, result)
+        not_projected = solution.result == code_of(RESULTS.promote(Projected.FAILED))
+        result = RESULTS.where(not_projected, RESULTS.projection_failed, result)
+    # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start. Whatever adjoint
+    # there is, their cotangents must not be lost: they go to all that went in.
+    reached = jnp.isfinite(solution.path).all(axis=1) & (ts == given)
+    well = jnp.isin(result._value, jnp.asarray(ENDED_WELL))
+    return solution._replace(
+        path=lost_unless(reached[:, None], solution.path, (given, y0, numbers)),
+        y_end=differentiable_where(well, solution.y_end),
+        result=result._value,
+    )
+
+
+# ---- what stopped a motion -------------------------------------------------------------------------------------------
+
+
+def _state_result(y, acceleration, singular) -> RESULTS:
+    """Whether a motion can go on from a state with this acceleration, and if not, why."""
+    finite = jax.tree.reduce(lambda all_, leaf: all_ & jnp.isfinite(leaf).all(), (y, acceleration), jnp.array(True))
+    failed = RESULTS.where(singular, RESULTS.mass_matrix_singular, RESULTS.nonfinite_state)
+    return RESULTS.where(finite, RESULTS.successful, failed)
+
+
+def _explained(solution: Solution, form: Equations, start: RESULTS, ts, numbers) -> RESULTS:
+    """The most telling of what diffrax reports, of the first and the last state, and of what the motion ran into."""
+    last = halves(solution.y_end)
+    end = _state_result(last, *form.acceleration(solution.t_end, last, numbers))
+    result = result_from(solution.result)
+    stopped = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
+    unhealthy = (end != RESULTS.successful) & (stopped | (end == RESULTS.nonfinite_state))
+    result = RESULTS.where(unhealthy, end, result)
+    result = RESULTS.where(start == RESULTS.successful, result, start)
+
+    field = eqx.filter_closure_convert(form.acceleration, ts[0], last, numbers)
+    # A name has no derivative, and the search for it is a loop that reverse mode could not go back through.
+    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (field, ts, solution, numbers))
+    field, ts, solution, numbers = frozen
+
+    def acceleration(t, y):
+        return field(t, halves(y), numbers)[0]
+
+    at = End(solution.t_end, solution.y_end, ts[0], ts[-1], solution.accepted, solution.rejected)
+    stopped = (result == RESULTS.dt_min_reached, result == RESULTS.max_steps_reached)
+    not_finite, jumps = what_stopped(acceleration, at, *stopped)
+    result = RESULTS.where(jumps, RESULTS.acceleration_discontinuous, result)
+    return RESULTS.where(not_finite, RESULTS.nonfinite_state, result)
+
+
+def _in_coordinates(event: diffrax.Event, layout: Layout, params: PyTree) -> diffrax.Event:
+    """The user's event functions, made to read the solver's state."""
+
+    def flat(function):
+        def condition(t, y, args, **_):
+            return function(*map(layout.restore, y), t=t, params=eqx.combine(args, params))
+
+        return condition
+
+    conditions = jax.tree.map(flat, event.cond_fn, is_leaf=callable)
+    return diffrax.Event(conditions, event.root_finder, event.direction)
+
+
+# ---- what can be wrong with a solver ---------------------------------------------------------------------------------
+
+
+def _require_instance(value, name: str, kind: type, example: str) -> None:
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be an instance of diffrax.{kind.__name__}, or {example}; got {value!r}.")
+
+
+def _require_solver(solver, adaptive: bool) -> None:
+    name = type(solver).__name__
+    if not isinstance(solver, diffrax.AbstractSolver):
+        raise TypeError(f"solver must be an instance of a diffrax solver, such as diffrax.Tsit5(); got {solver!r}.")
+    structure = solver.term_structure
+    if not (isinstance(structure, type) and issubclass(diffrax.ODETerm, structure)):
+        raise ValueError(
+            f"{name} splits the equations into several terms, which those of a general Lagrangian do not allow; "
+            "use a solver of ordinary differential equations, such as diffrax.Dopri8() or diffrax.ImplicitMidpoint()."
+        )
+    if adaptive and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        raise ValueError(f"{name} has no error estimate to adapt its steps to: give a fixed step with dt=...")

@@ -1,0 +1,349 @@
+"""`Problem → engine → Solution`: a question that every engine understands, and its answer, both flat.
+
+    Problem   a scene, its parameters, an initial state (2n,), output times (T,), tolerances, a budget, an event
+    Solution  the states (T, 2n) at the output times, the last state, how the motion ended, counts of steps
+
+An engine is a value. It says which problems it refuses, and solves the others, one or a batch, under every
+transformation of JAX. Pytrees of the user exist on both sides of this module, but not behind it: the state is one
+vector (q, q̇), and the programs of a scene take the parameters as one vector too (`Problem.numbers`).
+"""
+
+import abc
+from collections.abc import Callable, Hashable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.typing import ArrayLike
+
+from lagjax._arguments import accept
+from lagjax._derivation import Derivation, derivation_of
+from lagjax._layout import Layout, as_vector, taken_apart
+from lagjax._validate import (
+    as_arrays,
+    is_concrete,
+    output_times,
+    require_budget,
+    require_finite,
+    require_numbers,
+    require_tolerance,
+)
+
+PyTree = Any
+
+# Defaults by dtype. The absolute tolerance is far below the relative one, so that states in small units keep their
+# digits; it is there for components that pass through zero.
+DEFAULT_RTOL = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
+_ATOL_OVER_RTOL = 1e-3
+# The smallest rtol, in units of round-off. Machine code, which is for float64, sums with the rounding errors carried
+# along: below one unit its truncation, which has a sign, does not add up to more than the round-off of a long run,
+# which has none. The solvers of diffrax reject steps for the round-off of their error estimate below some ten units.
+LEAST_RTOL, LEAST_RTOL_OF_DIFFRAX = {np.dtype("float64"): 0.25, np.dtype("float32"): 10}, 10
+
+
+class Problem(eqx.Module):
+    """How does the motion of a scene go on from one state?
+
+    - `system`, `layout`, `params`: the scene, the structure of its coordinates, and its parameters as the user gave
+      them, every number an array.
+    - `ts` (T,): the output times, of which the first is that of the initial state `y0` (2n,), q and then q̇.
+    - `tolerances`: rtol and atol of a step; an engine with fixed steps does not look at them.
+    - `max_steps`: the budget of steps, rejected ones included.
+    - `event`: functions of the user's state that end the motion, for diffrax.
+    - `guards`: the same as a program for machine code (`_native.Guards`), whose signs end the motion.
+    """
+
+    system: Any
+    layout: Layout
+    params: PyTree
+    ts: jax.Array | np.ndarray
+    y0: jax.Array | np.ndarray
+    tolerances: tuple[ArrayLike, ArrayLike]
+    max_steps: int = eqx.field(static=True)
+    event: diffrax.Event | None = None
+    guards: Hashable = eqx.field(static=True, default=None)
+
+    @classmethod
+    def of(
+        cls, system, layout: Layout, q0, qdot0, ts, params=None, rtol=None, atol=None, max_steps=65_536, event=None
+    ) -> "Problem":
+        """The problem that a user states, after checking all that does not depend on an engine.
+
+        Raises `TypeError` or `ValueError` with the name of the argument that cannot be right.
+        """
+        problem = cls.about(system, layout, params, ts, rtol, atol, max_steps, event)
+        state = as_arrays((q0, qdot0), layout.dtype, "state")
+        for name, value in (("q0", q0), ("qdot0", qdot0), ("params", problem.params)):
+            require_finite(value, name)
+        return replace(problem, y0=end_to_end(jax.tree.leaves(state), layout.dtype))
+
+    @classmethod
+    def about(
+        cls, system, layout: Layout, params, ts=(0.0, 1.0), rtol=None, atol=None, max_steps=65_536, event=None
+    ) -> "Problem":
+        """A problem about this scene from a state of zeros: enough to ask which engine it is for."""
+        dtype, ts = layout.dtype, output_times(ts, layout.dtype)
+        require_budget(max_steps, "max_steps")
+        tolerances, event = _tolerances(dtype, rtol, atol), _event(event, dtype)
+        return cls(
+            system, layout, as_arrays(params, dtype), ts, np.zeros(2 * layout.size, dtype), tolerances, max_steps, event
+        )
+
+    @property
+    def derivation(self) -> Derivation:
+        """What is derived from the scene: made once for all problems whose scene and structure are equal."""
+        return derivation_of(self.system, self.layout, self.params)
+
+    @property
+    def numbers(self) -> PyTree:
+        """The numbers among the parameters: what can be traced. The rest is part of the program."""
+        return eqx.filter(self.params, eqx.is_array_like)
+
+    @property
+    def vector(self) -> jax.Array | np.ndarray:
+        """Every number in the parameters, shape (P,), in the dtype of the state."""
+        return end_to_end(jax.tree.leaves(self.numbers), self.layout.dtype)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether nothing in it is being traced, so that it can be solved at once."""
+        return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.ts, self.y0, self.numbers)))
+
+
+class Batch(eqx.Module):
+    """Many problems of one scene, which differ in their initial states and in numbers of their parameters.
+
+    `member` is a problem of the structure of all; `y0` (N, 2n) holds the initial states, and `params` the parameters,
+    with the members as first axis of every leaf whose entry in `axes` is 0. The others, whose entry is None, are for
+    all members.
+    """
+
+    member: Problem
+    y0: jax.Array | np.ndarray
+    params: PyTree
+    axes: tuple[int | None, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls, system, values: dict, axes: dict, size: int, ts, rtol=None, atol=None, max_steps=65_536, event=None
+    ) -> "Batch":
+        """From `values` by name, q0, qdot0 and params, and the axes of the members in every leaf (`axes_per_leaf`).
+
+        Raises `TypeError` or `ValueError` as `Problem.of`; a number of one member alone may be NaN.
+        """
+        member = {name: jax.tree.map(_shape_of_one, value, axes[name]) for name, value in values.items()}
+        layout = Layout.of(member["q0"], member["qdot0"])
+        one = Problem.about(system, layout, member["params"], ts, rtol, atol, max_steps, event)
+        arrays = {name: as_arrays(value, layout.dtype, name) for name, value in values.items()}
+        for name, value in arrays.items():
+            require_finite(jax.tree.map(lambda leaf, axis: leaf if axis is None else None, value, axes[name]), name)
+        state = jax.tree.leaves((arrays["q0"], arrays["qdot0"]))
+        params, structure = jax.tree.flatten(arrays["params"])
+        of_params = structure.flatten_up_to(axes["params"])
+        in_front = [x if axis is None else _in_front(x, axis) for x, axis in zip(params, of_params, strict=True)]
+        of_state = [
+            axis for name in ("q0", "qdot0") for axis in jax.tree.structure(values[name]).flatten_up_to(axes[name])
+        ]
+        y0 = rows(state, of_state, size, layout.dtype)
+        spread = tuple(None if axis is None else 0 for axis in of_params)
+        return cls(one, y0, structure.unflatten(in_front), spread)
+
+    def __len__(self) -> int:
+        return len(self.y0)
+
+    def over_members(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
+        """`solve` under `jax.vmap` over the members."""
+        axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
+        return jax.vmap(lambda *of: solve(self._at(*of)), in_axes=(0, axes))(self.y0, self.params)
+
+    def _at(self, y0, params) -> Problem:
+        return replace(self.member, y0=y0, params=params)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether nothing in it is being traced."""
+        numbers = eqx.filter(self.params, eqx.is_array_like)
+        return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.member.ts, self.y0, numbers)))
+
+    @property
+    def vectors(self) -> jax.Array | np.ndarray:
+        """The numbers in the parameters of each member, shape (N, P), or (1, P) where all share them."""
+        leaves = jax.tree.leaves(self.params)
+        numbers = [(leaf, axis) for leaf, axis in zip(leaves, self.axes, strict=True) if eqx.is_array_like(leaf)]
+        if all(axis is None for _, axis in numbers):
+            return end_to_end([leaf for leaf, _ in numbers], self.member.layout.dtype)[None]
+        return rows(*zip(*numbers, strict=True), len(self), self.member.layout.dtype)
+
+
+class Solution(NamedTuple):
+    """The motion that answers a problem; of a batch, with the members as first axis of everything.
+
+    - `path` (T, 2n): the states at the output times, NaN (with diffrax perhaps infinite) where not reached.
+    - `y_end` (2n,), `t_end` (): the state and the time at which the motion ended.
+    - `result` (): how it ended, as the integer of a `lagjax.RESULTS`.
+    - `accepted`, `rejected` (): counts of steps.
+    - `event` (): which guards changed sign at the end, Σ 4ᵏ (1 where guard k falls, 2 where it rises); 0 without any.
+    - `ticket` (): names the steps that are kept for the transpose of this motion, −1 where they are not.
+    - `idle`: of a batch as a whole, the steps for which a lane stood empty; None for one motion.
+    """
+
+    path: Any
+    y_end: Any
+    t_end: Any
+    result: Any
+    accepted: Any
+    rejected: Any
+    event: Any = None
+    ticket: Any = None
+    idle: Any = None
+
+
+class AbstractEngine(eqx.Module):
+    """What integrates: `MachineCode` or `Diffrax`."""
+
+    @abc.abstractmethod
+    def refuses(self, problem: Problem) -> str | None:
+        """Why this engine cannot solve the problem, as the end of a sentence; None where it can."""
+
+    @abc.abstractmethod
+    def solve(self, problem: Problem) -> Solution:
+        """The motion of one member, under `jax.jit`, `jax.vmap` and derivatives."""
+
+    @abc.abstractmethod
+    def solve_batch(self, batch: Batch) -> Solution:
+        """The motions of all members."""
+
+
+# ---- vectors ---------------------------------------------------------------------------------------------------------
+
+
+def _is_on_host(leaf) -> bool:
+    """Whether NumPy can read an array without moving it between devices, or gathering it from several."""
+    if not isinstance(leaf, jax.Array):
+        return True
+    return is_concrete(leaf) and [device.platform for device in leaf.devices()] == ["cpu"]
+
+
+def end_to_end(leaves: list, dtype) -> jax.Array | np.ndarray:
+    """All numbers of the leaves as one vector; by NumPy where it can read them, at a tenth of the cost of JAX."""
+    if not all(map(_is_on_host, leaves)):
+        return as_vector(leaves, dtype)
+    return np.concatenate([np.zeros(0, dtype), *(np.asarray(leaf, dtype).ravel() for leaf in leaves)])
+
+
+def rows(leaves, axes, size: int, dtype) -> jax.Array | np.ndarray:
+    """The numbers of every member end to end, shape (size, numbers); `axes` are those of the members, leaf by leaf."""
+    library = np if all(map(_is_on_host, leaves)) else jnp
+    columns = [library.zeros((size, 0), dtype)]
+    for leaf, axis in zip(leaves, axes, strict=True):
+        array = library.asarray(leaf, dtype)
+        if axis is None:
+            columns.append(library.broadcast_to(array.reshape(1, -1), (size, array.size)))
+        else:
+            columns.append(library.moveaxis(array, axis, 0).reshape(size, array.size // size))
+    return library.concatenate(columns, axis=1)
+
+
+def _in_front(leaf, axis: int):
+    library = np if _is_on_host(leaf) else jnp
+    return library.moveaxis(library.asarray(leaf), axis, 0)
+
+
+def _shape_of_one(leaf, axis):
+    """A leaf of one member: zeros of its shape, which cost nothing, or what all members share."""
+    if axis is None:
+        return leaf
+    shape = jnp.shape(leaf)
+    return np.broadcast_to(np.zeros((), jnp.result_type(leaf)), (*shape[:axis], *shape[axis:][1:]))
+
+
+def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTree], int]:
+    """`batch_axes` spread over every leaf, and the size of the batch, which must be the same everywhere."""
+    if not isinstance(batch_axes, tuple) or len(batch_axes) != 3:
+        raise ValueError(f"batch_axes must be a tuple of three, for (q0, qdot0, params); got {batch_axes!r}.")
+    axes, sizes = {}, {}
+    for (name, value), prefix in zip(values.items(), batch_axes, strict=True):
+        try:
+            axes[name] = jax.tree.broadcast(prefix, value, is_leaf=lambda axis: axis is None)
+        except ValueError:
+            raise ValueError(f"batch_axes for {name} is {prefix!r}, which does not fit its structure.") from None
+        leaves, tree = jax.tree_util.tree_flatten_with_path(value)
+        for (path, leaf), axis in zip(leaves, tree.flatten_up_to(axes[name]), strict=True):
+            label = name + jax.tree_util.keystr(path)
+            if axis is not None:
+                require_numbers(leaf, label)
+                if not -jnp.ndim(leaf) <= axis < jnp.ndim(leaf):
+                    raise ValueError(f"{label} has shape {jnp.shape(leaf)}: it has no axis {axis} for the batch.")
+                sizes[label] = jnp.shape(leaf)[axis]
+    if not sizes:
+        raise ValueError("batch_axes maps over nothing: name the axis of the members in q0, qdot0 or params.")
+    if len(set(sizes.values())) > 1:
+        listed = ", ".join(f"{label} has {size}" for label, size in sizes.items())
+        raise ValueError(f"The batch must have one size everywhere; {listed}.")
+    if 0 in sizes.values():
+        raise ValueError("The batch is empty.")
+    return axes, next(iter(sizes.values()))
+
+
+# ---- what can be wrong -----------------------------------------------------------------------------------------------
+
+
+def _tolerances(dtype, rtol, atol) -> tuple[ArrayLike, ArrayLike]:
+    """rtol and atol as arrays, the missing ones by default. Raises where no engine meets them."""
+    rtol = DEFAULT_RTOL[dtype] if rtol is None else require_tolerance(rtol, "rtol")
+    atol = rtol * _ATOL_OVER_RTOL if atol is None else require_tolerance(atol, "atol")
+    if reason := too_tight(rtol, dtype, LEAST_RTOL[dtype]):
+        raise ValueError(f"{reason}.")
+    return as_arrays((1.0 * rtol, 1.0 * atol), dtype)
+
+
+def too_tight(rtol, dtype, least: float) -> str | None:
+    """Why rtol is too small, where it is below `least` units of round-off."""
+    eps = float(jnp.finfo(dtype).eps)
+    if not is_concrete(rtol) or float(rtol) >= least * eps:
+        return None
+    more = "; call jax.config.update('jax_enable_x64', True) and pass float64 states" if dtype == np.float32 else ""
+    return (
+        f"{dtype.name} cannot meet rtol={float(rtol):.3g}: its round-off is {eps:.1e}, so rtol must be at least "
+        f"{least * eps:.1e}{more}"
+    )
+
+
+def _event(event, dtype) -> diffrax.Event | None:
+    """The event with its functions' signatures checked, and with a root finder that uses the dtype's digits."""
+    if event is None:
+        return None
+    condition = event.cond_fn if isinstance(event, diffrax.Event) else event
+    _, functions, _ = taken_apart(condition, "event", is_leaf=lambda leaf: leaf is None or callable(leaf))
+    if not functions or not all(map(callable, functions)):
+        raise TypeError(f"event must be a function event(q, qdot), or a pytree of such; got {condition!r}.")
+    if not isinstance(event, diffrax.Event):
+        event = diffrax.Event(event)
+    conditions = jax.tree.map(lambda function: accept(function, "event"), event.cond_fn, is_leaf=callable)
+    tolerance = 4 * float(jnp.finfo(dtype).eps)
+    root_finder = event.root_finder or _SignChange(rtol=tolerance, atol=tolerance)
+    return diffrax.Event(conditions, root_finder, event.direction)
+
+
+class _SignChange(optx.Bisection):
+    """Bisection that stops when the interval is as small as the dtype resolves, whatever the size of the function.
+
+    The sign change that fired an event brackets its root, so that this always arrives. It also does where there is
+    nothing to find, as in the members of a batch that had no event, or in a Boolean one: there diffrax asks for the end
+    of the step.
+    """
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        lower, upper = (jnp.asarray(options[end], f_struct.dtype) for end in ("lower", "upper"))
+        state = optx.Bisection(self.rtol, self.atol, flip=True).init(fn, y, args, options, f_struct, aux_struct, tags)
+        return eqx.tree_at(lambda s: s.flip, state, fn(lower, args)[0] > fn(upper, args)[0])
+
+    def terminate(self, fn, y, args, options, state, tags):
+        scale = jnp.maximum(jnp.abs(state.lower), jnp.abs(state.upper))
+        small = jnp.abs(state.upper - state.lower) <= self.rtol * scale
+        return small & jnp.isfinite(state.error), optx.RESULTS.successful
