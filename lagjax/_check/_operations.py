@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core, source_info_util
 
+from lagjax._program import OPERATIONS, in_jax
+
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 
@@ -62,9 +64,9 @@ def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
     found = []
 
     def visit(equation, operands, moves, results, place):
-        side = _SIDES.get(equation.primitive.name)
+        side = _side_of(equation.primitive.name)
         if side is not None and any(m and _floating(x) for m, x in zip(moves, operands, strict=True)):
-            found.append((_name(equation), place, jnp.asarray(side(operands, results), float)))
+            found.append((_name(equation), place, jnp.asarray(side(results[0], *operands), float)))
 
     _follow(function, arguments, visit, into_rules=True)
     return found
@@ -82,25 +84,23 @@ def pieces_of(function: Callable, *arguments) -> list[tuple[str, str, int]]:
     return found
 
 
-def _of_result(operands, results):
-    return results[0]
-
-
-def _first_larger(operands, results):
-    return operands[0] >= operands[1]
-
-
+# Of primitives that compute with several operations; the other borders stand in the table of operations.
 _SIDES = {
-    **dict.fromkeys(("gt", "ge", "lt", "le", "eq", "ne", "sign"), _of_result),
-    **dict.fromkeys(("floor", "ceil", "round", "argmax", "argmin"), _of_result),
-    "abs": lambda operands, results: operands[0] >= 0,
-    "max": _first_larger,
-    "min": _first_larger,
-    "clamp": lambda operands, results: 1.0 * (operands[1] > operands[0]) + (operands[1] > operands[2]),
-    "reduce_max": lambda operands, results: jnp.argmax(operands[0]),
-    "reduce_min": lambda operands, results: jnp.argmin(operands[0]),
-    "rem": lambda operands, results: jnp.trunc(operands[0] / operands[1]),
-}  # fmt: skip
+    "argmax": lambda result, x: result,
+    "argmin": lambda result, x: result,
+    "clamp": lambda result, low, x, high: 1.0 * (x > low) + (x > high),
+    "reduce_max": lambda result, x: jnp.argmax(x),
+    "reduce_min": lambda result, x: jnp.argmin(x),
+}
+
+
+def _side_of(name: str) -> Callable | None:
+    """`(result, *operands)` → on which side of its border a primitive is; None where it has no border."""
+    row = OPERATIONS.get(name)
+    if row is None or row.side is None:
+        return _SIDES.get(name)
+    side = row.side
+    return lambda result, *operands: side(in_jax, float, result, *operands)
 
 
 # ---- following a jaxpr -----------------------------------------------------------------------------------------------

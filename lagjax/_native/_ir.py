@@ -23,26 +23,28 @@ from llvmlite import ir
 
 DOUBLE, INTEGER, BIT, POINTER = ir.DoubleType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
 _CONTRACT = ("contract",)
-# Functions of the C library, called lane by lane: one evaluation a step, which the series multiplies.
-_LIBRARY = {
-    "sin": 1, "cos": 1, "tan": 1, "asin": 1, "acos": 1, "atan": 1, "atan2": 2, "sinh": 1, "cosh": 1, "tanh": 1,
-    "asinh": 1, "acosh": 1, "atanh": 1, "exp": 1, "exp2": 1, "expm1": 1, "log": 1, "log1p": 1, "cbrt": 1, "erf": 1,
-    "erfc": 1, "pow": 2, "fmod": 2, "rint": 1, "round": 1, "floor": 1, "ceil": 1, "fma": 3,
-}  # fmt: skip
+# What LLVM itself calls for an intrinsic that the processor has no instruction for.
+_BEHIND_INTRINSICS = ("rint", "round", "floor", "ceil", "trunc", "fma", "fmod")
 
 
 @functools.cache
 def _target() -> llvm.Target:
-    """This kind of processor, after LLVM and the C library are made ready."""
+    """This kind of processor, after LLVM is made ready."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
+    for name in _BEHIND_INTRINSICS:
+        _link(name)
+    return llvm.Target.from_default_triple()
+
+
+@functools.cache
+def _link(name: str) -> None:
+    """Tell LLVM where a function of the C library is."""
     if os.name == "nt":
         library = ctypes.CDLL("ucrtbase")
     else:
         library = ctypes.CDLL(ctypes.util.find_library("m"))  # None, the process itself, serves as well
-    for name in _LIBRARY:
-        llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
-    return llvm.Target.from_default_triple()
+    llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
 
 
 # Characters of a module's text beyond which code is generated at level 1 instead of 2. On chains of pendulums that runs
@@ -306,7 +308,8 @@ class Code:
         return self._call_by_name(full, kind, xs)
 
     def library(self, name: str, *xs: Value) -> Value:
-        """A function of the C library, on doubles or lane by lane."""
+        """A function of the C library, on doubles or lane by lane: one evaluation a step serves all orders."""
+        _link(name)
         if not isinstance(xs[0].it.type, ir.VectorType):
             return self._call_by_name(name, DOUBLE, xs)
         result = ir.Constant(self.vector, ir.Undefined)

@@ -6,7 +6,8 @@ from llvmlite import ir
 
 from lagjax import _elementary
 from lagjax._native._ir import BIT, Code, Value
-from lagjax._program import StraightLine
+from lagjax._program import StraightLine, Unlowerable
+from lagjax._program._operations import OPERATIONS
 
 # Beyond this an angle is left to the C library, which knows enough digits of π.
 LARGEST_ANGLE = 2.0**20
@@ -30,14 +31,20 @@ def emit(code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos:
             value = turns[operands[0]][op == "cos"]
         elif op == "convert":
             value = _convert(code, xs[0], line.kinds[operands[0]], kind)
-        elif op == "round":
-            value = code.intrinsic("rint" if attribute == 1 else "round", *xs)
-        elif op in _OPERATIONS:
-            value = _OPERATIONS[op](code, *xs)
         else:
-            value = code.library(op, *xs)
+            value = _apply(code, op, xs, attribute)
         values.append(value)
     return [values[i] for i in line.outputs]
+
+
+def _apply(code: Code, op: str, xs: list[Value], attribute) -> Value:
+    """An operation by its row: of the C library, lane by lane, or written with vectors."""
+    how = OPERATIONS[op].llvm
+    if how is None:
+        raise Unlowerable(f"`{op}` has no machine code here")
+    if isinstance(how, str):
+        return code.library(how, *xs)
+    return how(code, *xs) if attribute is None else how(code, *xs, attribute)
 
 
 def _convert(code, x, before, after):
@@ -46,49 +53,6 @@ def _convert(code, x, before, after):
     if after == "bool":
         return code.compare("!=", x, 0.0)
     return code.intrinsic("trunc", x) if before == "float" and after != "float" else x
-
-
-def _sign(code, x):
-    return code.select(x > 0.0, 1.0, code.select(x < 0.0, -1.0, x))
-
-
-def _logical_not(code, x):
-    return ~x
-
-
-def _not_unordered(comparison: str) -> Callable:
-    return lambda code, a, b: code.compare(comparison, a, b)
-
-
-def _finite(code, x):
-    return code.intrinsic("fabs", x) < float("inf")
-
-
-_OPERATIONS: dict[str, Callable] = {
-    "add": lambda code, a, b: a + b,
-    "sub": lambda code, a, b: a - b,
-    "mul": lambda code, a, b: a * b,
-    "div": lambda code, a, b: a / b,
-    "neg": lambda code, a: -a,
-    "sqrt": lambda code, a: code.intrinsic("sqrt", a),
-    "rsqrt": lambda code, a: 1.0 / code.intrinsic("sqrt", a),
-    "abs": lambda code, a: code.intrinsic("fabs", a),
-    "floor": lambda code, a: code.intrinsic("floor", a),
-    "ceil": lambda code, a: code.intrinsic("ceil", a),
-    "max": lambda code, a, b: code.intrinsic("maximum", a, b),
-    "min": lambda code, a, b: code.intrinsic("minimum", a, b),
-    "rem": lambda code, a, b: code.library("fmod", a, b),
-    "logistic": lambda code, a: 1.0 / (1.0 + code.library("exp", -a)),
-    "sign": _sign,
-    "is_finite": _finite,
-    "and": lambda code, a, b: a & b,
-    "or": lambda code, a, b: a | b,
-    "xor": lambda code, a, b: (a | b) & ~(a & b),
-    "not": _logical_not,
-    "select": lambda code, predicate, no, yes: code.select(predicate, yes, no),
-    **{name: _not_unordered(symbol) for name, symbol in
-       {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}.items()},
-}  # fmt: skip
 
 
 def sincos_function(module: ir.Module, lanes: int) -> Code:

@@ -35,20 +35,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from lagjax._program._emit import emit, plain_elementary
+from lagjax._program._emit import emit, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, pull_back, round_off, steps_of
-from lagjax._program._graph import FOLD, Node, Unlowerable
+from lagjax._program._graph import Node, Unlowerable
+from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import finish, live, regroup, with_given
 from lagjax._program._rules import Expansion, kind_of
 from lagjax._program._series import Series, StraightLine, series
 
 __all__ = [
+    "OPERATIONS",
     "Program",
     "Series",
     "StraightLine",
     "Unlowerable",
     "emit",
     "evaluate",
+    "in_jax",
     "lower",
     "lower_solution",
     "plain_elementary",
@@ -209,7 +212,7 @@ class Program:
                     value = attribute
                 else:
                     extra = () if attribute is None else (attribute,)
-                    value = FOLD[op](*(values[i] for i in operands), *extra)
+                    value = OPERATIONS[op].value(*(values[i] for i in operands), *extra)
                 values.append(np.dtype("float64" if kind == "float" else kind).type(value))
         return tuple(values[i] for i in self.outputs)
 

@@ -13,6 +13,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 from lagjax import _elementary
 from lagjax._program._graph import Node
+from lagjax._program._operations import OPERATIONS
 
 _state = threading.local()
 
@@ -32,9 +33,6 @@ def plain_elementary() -> Iterator[None]:
         _state.plain = before
 
 
-NAMES = {"and": lax.bitwise_and, "or": lax.bitwise_or, "xor": lax.bitwise_xor, "not": lax.bitwise_not}
-
-
 def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ...], scalars: tuple) -> tuple:
     """The outputs for these inputs, all of the shape the inputs broadcast to."""
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in scalars))
@@ -52,14 +50,13 @@ def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ..
             values[i] = lax.convert_element_type(jnp.asarray(scalars[attribute]), dtypes[i])
         elif op == "convert":
             values[i] = lax.convert_element_type(values[operands[0]], dtypes[i])
-        elif op == "round":
-            values[i] = lax.round(values[operands[0]], lax.RoundingMethod(attribute))
         elif op in ("sin", "cos") and operands[0] in paired:
             if operands[0] not in pairs:
                 pairs[operands[0]] = _apart("sincos")(values[operands[0]])
             values[i] = pairs[operands[0]][op == "cos"]
         else:
-            values[i] = _function(op, fast)(*_aligned([values[operand] for operand in operands]))
+            xs = _aligned([values[operand] for operand in operands])
+            values[i] = _apart(op)(*xs) if op in fast else _apply(op, xs, attribute)
     return tuple(jnp.broadcast_to(jnp.asarray(values[i]), shape) for i in outputs)
 
 
@@ -75,12 +72,15 @@ def _paired(nodes) -> frozenset[int]:
     return frozenset(sines & cosines)
 
 
-def _function(op: str, fast) -> Callable:
-    if op == "select":
-        return lax.select_n
-    if op in fast:
-        return _apart(op)
-    return NAMES.get(op) or getattr(lax, op)
+def _apply(op: str, xs: list, attribute) -> jax.Array:
+    function = getattr(lax, OPERATIONS[op].lax or op)
+    return function(*xs) if attribute is None else function(*xs, lax.RoundingMethod(attribute))
+
+
+def in_jax(op: str, *xs, attribute=None) -> jax.Array:
+    """The operation on arrays that broadcast: `f` of the formulas of `_operations`, in JAX."""
+    dtype = jnp.result_type(*xs)
+    return _apply(op, _aligned([jnp.asarray(x, dtype) for x in xs]), attribute)
 
 
 @functools.cache

@@ -4,35 +4,15 @@ Every node becomes one NumPy operation on a vector of states. That costs a micro
 node and state: less than XLA or LLVM take to compile a program, as long as it is not evaluated millions of times.
 """
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lagjax._program._graph import COMPARISONS, FOLD
+from lagjax._program._operations import OPERATIONS
 
 # States looked at together. A value of 2048 states has 16 KB, so that some tens of live values stay in a core's second
 # cache, and the microsecond that NumPy takes to begin an operation is no more than what the operation takes itself.
 CHUNK = 2048
-
-
-def _select(predicate, no, yes):
-    return np.where(predicate, yes, no)
-
-
-def _divide(x, y):
-    if np.issubdtype(np.result_type(x), np.floating):
-        return np.divide(x, y)
-    return np.where(y == 0, -1, np.trunc(np.divide(x, np.where(y == 0, 1, y)))).astype(np.result_type(x))
-
-
-# `FOLD` is for one number; these are the operations that need another form for a vector of them.
-ON_VECTORS = FOLD | {
-    "select": _select,
-    "div": _divide,
-    "erf": np.vectorize(math.erf, otypes=[float]),
-    "erfc": np.vectorize(math.erfc, otypes=[float]),
-}
 
 
 def evaluate(line, columns: Sequence, steps: Callable | None = None) -> np.ndarray:
@@ -87,7 +67,7 @@ def steps_of(line, precision) -> list[tuple[Callable | None, tuple, object, tupl
             attribute = _dtype(kind, precision).type(attribute)
         elif op == "convert":
             attribute = _dtype(kind, precision)
-        function = None if op in ("input", "constant") else _converted if op == "convert" else ON_VECTORS[op]
+        function = None if op in ("input", "constant") else _converted if op == "convert" else OPERATIONS[op].value
         steps.append((function, operands, (op == "input", attribute), tuple(dropped.get(k, ()))))
     return steps
 
@@ -113,8 +93,6 @@ def _values(steps, columns) -> list:
 
 # ---- round-off -------------------------------------------------------------------------------------------------------
 
-_EXACT = {"input", "constant", "neg", "abs", "max", "min", "select", "convert", "sign", "floor", "ceil", "round", "rem"}
-
 
 def round_off(line, columns: Sequence) -> np.ndarray:
     """How far rounding may move every output, to first order, shape (outputs, S); the inputs count as exact.
@@ -127,8 +105,9 @@ def round_off(line, columns: Sequence) -> np.ndarray:
     with np.errstate(all="ignore"):
         values = _values(steps_of((nodes, kinds, range(len(nodes))), precision), columns)
         for (op, operands, _), kind, value in zip(nodes, kinds, values, strict=True):
-            error = 0.0 if kind != "float" or op in _EXACT else eps * np.abs(value)
-            for i, partial in zip(operands, PARTIALS.get(op, ()), strict=False):
+            exact = not operands or OPERATIONS[op].exact
+            error = 0.0 if kind != "float" or exact else eps * np.abs(value)
+            for i, partial in zip(operands, _derivatives(op), strict=False):
                 if partial is not None and kind == "float" and np.any(errors[i]):
                     moved = np.abs(partial(errors[i], value, *(values[j] for j in operands)))
                     error = error + np.where(errors[i] == 0, 0.0, moved)
@@ -159,72 +138,17 @@ def pull_back(line, columns: Sequence, cotangents: Sequence) -> list:
                 continue
             if op == "input":
                 inputs[attribute] = bars[k]
-            for i, partial in zip(operands, PARTIALS.get(op, ()), strict=False):
+            for i, partial in zip(operands, _derivatives(op), strict=False):
                 if partial is not None and kinds[i] == "float" and nodes[i][0] != "constant":
                     _flow(bars, kinds, i, partial(bars[k], values[k], *(values[j] for j in operands)))
             bars[k] = None
     return inputs
 
 
+def _derivatives(op: str) -> tuple:
+    return () if op in ("input", "constant") else OPERATIONS[op].derivatives()
+
+
 def _flow(bars: list, kinds, i: int, bar) -> None:
     if bar is not None and kinds[i] == "float":
         bars[i] = bar if bars[i] is None else bars[i] + bar
-
-
-def _square(x):
-    return x * x
-
-
-def _shared(bar, mine, other):
-    """To the larger of two goes all, to equal ones a half."""
-    return bar * np.where(mine == other, 0.5, np.where(mine > other, 1.0, 0.0))
-
-
-# For every operation one function an operand, of (cotangent, result, operands...), to the cotangent of that operand.
-PARTIALS: dict[str, tuple] = {
-    "add": (lambda g, w, x, y: g, lambda g, w, x, y: g),
-    "sub": (lambda g, w, x, y: g, lambda g, w, x, y: -g),
-    "mul": (lambda g, w, x, y: g * y, lambda g, w, x, y: g * x),
-    "div": (lambda g, w, x, y: g / y, lambda g, w, x, y: -g * w / y),
-    "rem": (lambda g, w, x, y: g, lambda g, w, x, y: -g * np.trunc(x / y)),
-    "pow": (
-        lambda g, w, x, y: g * np.where(y == 0, 0.0, y * np.power(x, np.where(y == 0, 1.0, y - 1))),
-        lambda g, w, x, y: g * w * np.log(np.where(x == 0, 1.0, x)),
-    ),
-    "max": (lambda g, w, x, y: _shared(g, x, y), lambda g, w, x, y: _shared(g, y, x)),
-    "min": (lambda g, w, x, y: _shared(g, y, x), lambda g, w, x, y: _shared(g, x, y)),
-    "atan2": (
-        lambda g, w, y, x: g * (x / (_square(x) + _square(y))),
-        lambda g, w, y, x: -g * (y / (_square(x) + _square(y))),
-    ),
-    "neg": (lambda g, w, x: -g,),
-    "abs": (lambda g, w, x: g * np.sign(x),),
-    "sqrt": (lambda g, w, x: g * (0.5 / w),),
-    "rsqrt": (lambda g, w, x: g * (-0.5 * w / x),),
-    "cbrt": (lambda g, w, x: g * (w / (3 * x)),),
-    "exp": (lambda g, w, x: g * w,),
-    "exp2": (lambda g, w, x: g * (math.log(2.0) * w),),
-    "expm1": (lambda g, w, x: g * (w + 1),),
-    "log": (lambda g, w, x: g / x,),
-    "log1p": (lambda g, w, x: g / (1 + x),),
-    "logistic": (lambda g, w, x: g * w * (1 - w),),
-    "erf": (lambda g, w, x: g * (2 / math.sqrt(math.pi)) * np.exp(-_square(x)),),
-    "erfc": (lambda g, w, x: -g * (2 / math.sqrt(math.pi)) * np.exp(-_square(x)),),
-    "sin": (lambda g, w, x: g * np.cos(x),),
-    "cos": (lambda g, w, x: -g * np.sin(x),),
-    "tan": (lambda g, w, x: g * (1 + _square(w)),),
-    "asin": (lambda g, w, x: g / np.sqrt(1 - _square(x)),),
-    "acos": (lambda g, w, x: -g / np.sqrt(1 - _square(x)),),
-    "atan": (lambda g, w, x: g / (1 + _square(x)),),
-    "sinh": (lambda g, w, x: g * np.cosh(x),),
-    "cosh": (lambda g, w, x: g * np.sinh(x),),
-    "tanh": (lambda g, w, x: g * (1 - _square(w)),),
-    "asinh": (lambda g, w, x: g / np.sqrt(1 + _square(x)),),
-    "acosh": (lambda g, w, x: g / (np.sqrt(x - 1) * np.sqrt(x + 1)),),
-    "atanh": (lambda g, w, x: g / (1 - _square(x)),),
-    "convert": (lambda g, w, x: g,),
-    "select": (None, lambda g, w, p, no, yes: np.where(p, 0.0, g), lambda g, w, p, no, yes: np.where(p, g, 0.0)),
-}
-# All else is constant between its jumps.
-CONSTANT_IN_PIECES = {"sign", "floor", "ceil", "round", "is_finite", "and", "or", "xor", "not", *COMPARISONS}
-assert PARTIALS.keys() | CONSTANT_IN_PIECES == FOLD.keys()

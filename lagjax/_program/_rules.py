@@ -3,7 +3,7 @@
 An array in the traced function becomes a NumPy array of ids here. An elementwise primitive maps `Graph.apply` over the
 ids; a primitive that only moves data is NumPy's own function of the ids; a loop or a call runs its body again.
 
-To support another primitive: an elementwise one needs a line in `_graph.FOLD`, one that moves data a line in `MOVES`,
+To support another primitive: an elementwise one needs a row in `_operations`, one that moves data a line in `MOVES`,
 anything else a function marked `@_lowers("its_name")`, which gets the expansion, the parameters of the equation and the
 id arrays, and returns an id array (or a list of them). Each needs a row in `tests/test_program.py`.
 """
@@ -17,7 +17,9 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend import core
 
-from lagjax._program._graph import FOLD, Graph, Unlowerable, power
+from lagjax._program._graph import Graph, Unlowerable
+from lagjax._program._operations import OPERATIONS
+from lagjax._program._simplify import power
 
 WORK_PER_OPERATION = 50  # scalars looked at for each one the budget allows; most of a derivative folds away
 
@@ -95,7 +97,7 @@ class Expansion:
             result = MOVES[name](equation.params, *arguments)
         elif name in LOWER:
             result = LOWER[name](self, equation.params, *arguments)
-        elif name in FOLD:
+        elif name in OPERATIONS:
             result = self.map(name, *arguments)
         else:
             raise Unlowerable(f"the primitive `{name}` has no scalar form here")

@@ -27,14 +27,14 @@ by means of high-order Taylor methods*, Exp. Math. 14 (2005) 99–117, §2.1; Gr
 (2008), ch. 13.
 """
 
-import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from lagjax._program._graph import Graph, Node, Unlowerable
+from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import finish
+from lagjax._program._recurrences import finite
 
 
 class StraightLine(NamedTuple):
@@ -121,7 +121,7 @@ class _Recurrences:
         op, operands, attribute = self.start.nodes[i]
         if op == "input":
             return self.order_k[attribute] if attribute < self.moving else None
-        if op == "constant" or self.start.kinds[i] != "float" or op in _STEPS:
+        if op == "constant" or self.start.kinds[i] != "float" or OPERATIONS[op].is_step:
             return None
         of = [self.coefficients[operand] for operand in operands]
         used = of[1:] if op == "select" else of
@@ -130,20 +130,22 @@ class _Recurrences:
         unknown = [c for c in used if isinstance(c, _Unknown)]
         if unknown:
             return unknown[0]
-        if op in _RULES:
-            return _RULES[op](self, i, operands, of)
-        return self._by_slopes(i, operands, of) if op in _SLOPES else _Unknown(op)
+        if rule := OPERATIONS[op].recurrence:
+            return rule(self, i, operands, of)
+        return self._by_slopes(i, operands, of) if OPERATIONS[op].slopes else _Unknown(op)
 
     def _by_slopes(self, i, operands, of):
         """w = f(u, …) by its partial derivatives."""
-        op = self.start.nodes[i][0]
+        row = OPERATIONS[self.start.nodes[i][0]]
         total, apply = None, self.sweep.apply
-        for u, c, slope in zip(operands, of, _SLOPES[op], strict=True):
+        for u, c, slope in zip(operands, of, row.slopes, strict=True):
             if c is None:
                 continue
             g = slope(self.start.apply, self.number, i, *operands)
             inner = self.start.operand_of("neg", g)
             sign, g = ("sub", inner) if inner is not None else ("add", g)
+            if row.steep:
+                g = finite(self.start.apply, self.number, g)
             term = apply("mul", c, self.value(g))
             if self.start.value(g) is None:
                 term = apply("add", term, apply("mul", self.inverse_k, self.product(u, g, by_order=True)))
@@ -258,169 +260,3 @@ class _Unknown(NamedTuple):
     """No series: which operation is to blame."""
 
     op: str
-
-
-# ---- rules: (recurrences, node, operands, their coefficients) -> coefficient; not every coefficient is None ----------
-
-
-def _add(r, i, operands, of):
-    op, (a, b) = r.start.nodes[i][0], of
-    if b is None:
-        return a
-    if a is None:
-        return b if op == "add" else r.sweep.apply("neg", b)
-    return r.sweep.apply(op, a, b)
-
-
-def _neg(r, i, operands, of):
-    return r.sweep.apply("neg", of[0])
-
-
-def _mul(r, i, operands, of):
-    (u, v), (a, b), apply = operands, of, r.sweep.apply
-    if a is None:
-        return apply("mul", r.value(u), b)
-    if b is None:
-        return apply("mul", r.value(v), a)
-    if u == v:
-        outer = apply("mul", r.value(r.start.apply("mul", r.number(2.0), u)), a)
-    else:
-        outer = apply("add", apply("mul", r.value(u), b), apply("mul", r.value(v), a))
-    return apply("add", outer, r.product(u, v))
-
-
-def _div(r, i, operands, of):
-    (_, v), (a, b), apply = operands, of, r.sweep.apply
-    inverse = r.value(r.start.apply("div", r.number(1.0), v))
-    if b is None:
-        return apply("mul", a, inverse)
-    taken = apply("add", apply("mul", r.value(i), b), r.product(i, v))
-    return apply("mul", apply("neg", taken) if a is None else apply("sub", a, taken), inverse)
-
-
-def _sqrt(r, i, operands, of):
-    half_inverse = r.value(_finite(r.start.apply, r.number, r.start.apply("div", r.number(0.5), i)))
-    return r.sweep.apply("mul", r.sweep.apply("sub", of[0], r.product(i, i)), half_inverse)
-
-
-def _rem(r, i, operands, of):
-    """u − n v, with the whole number n that is right at order zero."""
-    (u, v), (a, b), f = operands, of, r.start.apply
-    if b is None:
-        return a
-    taken = r.sweep.apply("mul", r.value(f("round", f("div", f("sub", u, i), v), attribute=1)), b)
-    return r.sweep.apply("neg", taken) if a is None else r.sweep.apply("sub", a, taken)
-
-
-def _select(r, i, operands, of):
-    predicate, no, yes = operands
-    for branch, other in ((no, yes), (yes, no)):
-        number = r.start.value(other)
-        if number is not None and math.isnan(number):  # a guard: NaN shows at order zero
-            return of[1:][branch == yes]
-    zero = r.sweep.constant(0.0, "float")
-    return _choose(r, predicate, *(zero if c is None else c for c in of[1:]))
-
-
-def _choose(r, predicate: int, no: int, yes: int) -> int:
-    """`yes` where the predicate, a node of the program, holds at order zero, else `no`."""
-    flag = r.start.apply("select", predicate, r.number(0.0), r.number(1.0))
-    holds = r.sweep.apply("gt", r.value(flag), r.sweep.constant(0.5, "float"))
-    return r.sweep.apply("select", holds, no, yes)
-
-
-def _abs(r, i, operands, of):
-    below = r.start.apply("lt", operands[0], r.number(0.0))
-    return _choose(r, below, of[0], r.sweep.apply("neg", of[0]))
-
-
-def _extremum(comparison: str) -> Callable:
-    def rule(r, i, operands, of):
-        zero = r.sweep.constant(0.0, "float")
-        a, b = (zero if c is None else c for c in of)
-        return _choose(r, r.start.apply(comparison, *operands), b, a)
-
-    return rule
-
-
-_RULES: dict[str, Callable] = {
-    "add": _add, "sub": _add, "neg": _neg, "mul": _mul, "div": _div, "sqrt": _sqrt, "select": _select, "abs": _abs,
-    "rem": _rem, "max": _extremum("gt"), "min": _extremum("lt"),
-}  # fmt: skip
-_STEPS = {"floor", "ceil", "round", "sign"}  # constant between their jumps
-
-
-# ---- slopes: partial derivatives as nodes of `start`; f applies an operation, c makes a constant, w is the result ----
-
-
-def _one_plus(f, c, x):
-    return f("add", c(1.0), x)
-
-
-def _one_minus_square(f, c, x):
-    return f("sub", c(1.0), f("mul", x, x))
-
-
-def _over(f, c, x):
-    return f("div", c(1.0), x)
-
-
-def _square(f, x):
-    return f("mul", x, x)
-
-
-def _finite(f, c, slope):
-    """0 for a slope that is infinite, or 0/0, where the function itself is not: there is no series there.
-
-    It may not be needed, as on the flat side of max(q, 0)**1.5; where it is, the step fails its check.
-    """
-    return f("select", f("is_finite", slope), c(0.0), slope)
-
-
-def _over_root(f, c, x):
-    return _finite(f, c, _over(f, c, f("sqrt", x)))
-
-
-def _gauss(sign: float) -> Callable:
-    def slope(f, c, w, u):
-        return f("mul", c(sign * 2 / math.sqrt(math.pi)), f("exp", f("neg", _square(f, u))))
-
-    return slope
-
-
-def _radius_squared(f, y, x):
-    return f("add", _square(f, x), _square(f, y))
-
-
-_SLOPES: dict[str, tuple[Callable, ...]] = {
-    "sin": (lambda f, c, w, u: f("cos", u),),
-    "cos": (lambda f, c, w, u: f("neg", f("sin", u)),),
-    "tan": (lambda f, c, w, u: _one_plus(f, c, _square(f, w)),),
-    "asin": (lambda f, c, w, u: _over_root(f, c, _one_minus_square(f, c, u)),),
-    "acos": (lambda f, c, w, u: f("neg", _over_root(f, c, _one_minus_square(f, c, u))),),
-    "atan": (lambda f, c, w, u: _over(f, c, _one_plus(f, c, _square(f, u))),),
-    "atan2": (
-        lambda f, c, w, y, x: _finite(f, c, f("div", x, _radius_squared(f, y, x))),
-        lambda f, c, w, y, x: f("neg", _finite(f, c, f("div", y, _radius_squared(f, y, x)))),
-    ),
-    "exp": (lambda f, c, w, u: w,),
-    "exp2": (lambda f, c, w, u: f("mul", c(math.log(2.0)), w),),
-    "expm1": (lambda f, c, w, u: _one_plus(f, c, w),),
-    "log": (lambda f, c, w, u: _over(f, c, u),),
-    "log1p": (lambda f, c, w, u: _over(f, c, _one_plus(f, c, u)),),
-    "logistic": (lambda f, c, w, u: f("sub", w, _square(f, w)),),
-    "sinh": (lambda f, c, w, u: f("cosh", u),),
-    "cosh": (lambda f, c, w, u: f("sinh", u),),
-    "tanh": (lambda f, c, w, u: _one_minus_square(f, c, w),),
-    "asinh": (lambda f, c, w, u: _over(f, c, f("sqrt", _one_plus(f, c, _square(f, u)))),),
-    "acosh": (lambda f, c, w, u: _over_root(f, c, f("sub", _square(f, u), c(1.0))),),
-    "atanh": (lambda f, c, w, u: _over(f, c, _one_minus_square(f, c, u)),),
-    "erf": (_gauss(1.0),),
-    "erfc": (_gauss(-1.0),),
-    "rsqrt": (lambda f, c, w, u: f("div", f("mul", c(-0.5), w), u),),
-    "cbrt": (lambda f, c, w, u: _finite(f, c, f("div", w, f("mul", c(3.0), u))),),
-    "pow": (
-        lambda f, c, w, u, v: _finite(f, c, f("div", f("mul", v, w), u)),
-        lambda f, c, w, u, v: _finite(f, c, f("mul", w, f("log", u))),
-    ),
-}

@@ -1,0 +1,313 @@
+"""The operations of scalar programs, one row each: everything that lagjax knows about `sin` stands in the row of `sin`.
+
+    who asks                          what it reads of a row
+    graph of a program                `value` on constants, `simplify`, `commutative`, `is_logical`
+    evaluation in NumPy               `value`; `exact` and the derivatives, for round-off and the transposed derivative
+    JAX again                         `lax`
+    Taylor series                     `recurrence`, or else `slopes`; `is_step`
+    machine code                      `llvm`
+    check of a scene                  `side`
+
+The name of an operation is that of the JAX primitive it comes from, if there is one: an elementwise primitive with a
+row needs nothing else to be lowered. `_rules` lowers the primitives that compute with several operations.
+
+Formulas about an operation are written once for all of these, in the terms of whoever evaluates them: `f(op, *xs)`
+applies an operation, `c(x)` makes a number, `w` is the result and `u`, `v` (or `y`, `x`) are the operands. A slope of
+`tan` is `f("add", c(1.0), f("mul", w, w))`: nodes of a graph in the Taylor series, arrays in NumPy.
+
+Two operations carry an attribute: `round` (1: ties to even, 0: away from zero) and `convert` (the kind of the result).
+`convert` has no code here because it depends on both kinds. Sine and cosine of one angle are computed together by
+`_emit` and `_native._lanes`; `_elementary.FAST` has faster forms of some operations for XLA on CPUs.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lagjax._program import _recurrences, _simplify
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Operation:
+    """One operation of a scalar program.
+
+    - `name`, `arity`: the name in a node, and how many operands it takes.
+    - `value(*xs)`: the result in NumPy, for numbers and for arrays of one shape; with the attribute as the last
+      argument where a node has one.
+    - `llvm`: the name of a function of the C library, called lane by lane; or `(code, *xs)` → value, with a
+      `_native._ir.Code`, whose values are vectors with the operators of Python. None: this is done elsewhere.
+    - `lax`: the name of the function in `jax.lax`, if it is not `name`.
+    - `simplify(graph, name, *operands)`: a node that is simpler for some operands (see `_simplify`).
+    - `commutative`: the order of two operands does not matter.
+    - `is_logical`: the result is a bool, whatever the operands are.
+    - `is_step`: the result is constant between its jumps, with all derivatives zero.
+    - `exact`: the result is not rounded.
+    - `slopes`: ∂w/∂u for every operand, each as `slope(f, c, w, *operands)`.
+    - `steep`: a slope may be infinite, or 0/0, where the result is finite.
+    - `recurrence`: the order recursion (see `_recurrences`), where it is not to follow from `slopes`.
+    - `cotangents`: for every operand `(ḡ, w, *operands)` → the cotangent of that operand, in NumPy, where it is not to
+      be ḡ times the slope; None for an operand without one.
+    - `side(f, c, w, *operands)`: on which side of a border between two pieces the operands are, for an operation that
+      has kinks or jumps.
+    """
+
+    name: str
+    arity: int
+    value: Callable
+    llvm: "str | Callable[..., Any] | None"
+    lax: str | None = None
+    simplify: Callable | None = None
+    commutative: bool = False
+    is_logical: bool = False
+    is_step: bool = False
+    exact: bool = False
+    slopes: tuple[Callable, ...] = ()
+    steep: bool = False
+    recurrence: Callable | None = None
+    cotangents: "tuple[Callable | None, ...]" = ()
+    side: Callable | None = None
+
+    def derivatives(self) -> "tuple[Callable | None, ...]":
+        """For every operand `(ḡ, w, *operands)` → its cotangent, in NumPy; none for what is constant in pieces."""
+        if self.cotangents:
+            return self.cotangents
+        return tuple(lambda g, w, *xs, slope=slope: g * slope(in_numpy, float, w, *xs) for slope in self.slopes)
+
+
+def in_numpy(op: str, *xs, attribute=None):
+    """The operation on numbers or arrays: `f` of the formulas below, in NumPy."""
+    return OPERATIONS[op].value(*xs) if attribute is None else OPERATIONS[op].value(*xs, attribute)
+
+
+# ---- values in NumPy -------------------------------------------------------------------------------------------------
+
+
+def _round(x, method):
+    if method == 1:  # RoundingMethod.TO_NEAREST_EVEN
+        return np.round(x)
+    whole = np.trunc(x)
+    return whole + np.copysign(abs(x - whole) >= 0.5, x)
+
+
+def _divide(x, y):
+    if np.issubdtype(np.result_type(x), np.floating):
+        return np.divide(x, y)
+    return np.where(y == 0, -1, np.trunc(np.divide(x, np.where(y == 0, 1, y))))[()].astype(np.result_type(x))
+
+
+def _select(predicate, no, yes):
+    return np.where(predicate, yes, no)[()]
+
+
+# ---- pieces of formulas ----------------------------------------------------------------------------------------------
+
+
+def _square(f, x):
+    return f("mul", x, x)
+
+
+def _one_plus(f, c, x):
+    return f("add", c(1.0), x)
+
+
+def _one_minus_square(f, c, x):
+    return f("sub", c(1.0), f("mul", x, x))
+
+
+def _square_minus_one(f, c, x):
+    return f("mul", f("sub", x, c(1.0)), f("add", c(1.0), x))  # next to 1 the difference of squares has lost its digits
+
+
+def _inverse(f, c, x):
+    return f("div", c(1.0), x)
+
+
+def _inverse_root(f, c, x):
+    return _inverse(f, c, f("sqrt", x))
+
+
+def _gauss(f, c, u):
+    return f("mul", c(2 / math.sqrt(math.pi)), f("exp", f("neg", _square(f, u))))
+
+
+def _radius_squared(f, y, x):
+    return f("add", _square(f, x), _square(f, y))
+
+
+def _whole_part(f, w, u, v):
+    """The whole number n of u = n v + w."""
+    return f("round", f("div", f("sub", u, w), v), attribute=1)
+
+
+def _is_larger(f, c, w, u, v):
+    return f("ge", u, v)
+
+
+def _result(f, c, w, *operands):
+    return w
+
+
+def _share(g, chosen, other):
+    """To the one of two operands that was chosen goes all of the cotangent, to equal ones a half."""
+    return g * np.where(chosen == other, 0.5, np.where(chosen > other, 1.0, 0.0))
+
+
+def _power_by_base(g, w, x, y):
+    return g * np.where(y == 0, 0.0, y * np.power(x, np.where(y == 0, 1.0, y - 1)))
+
+
+# ---- rows that are alike ---------------------------------------------------------------------------------------------
+
+
+def _comparison(name: str, value: Callable, symbol: str, commutative: bool = False) -> Operation:
+    return Operation(
+        name, 2, value, lambda code, a, b: code.compare(symbol, a, b), simplify=_simplify.compare,
+        commutative=commutative, is_logical=True, is_step=True, side=_result,
+    )  # fmt: skip
+
+
+def _bitwise(name: str, value: Callable, llvm: Callable, simplify: Callable | None = _simplify.logical) -> Operation:
+    return Operation(
+        name, 2, value, llvm, lax=f"bitwise_{name}", simplify=simplify, commutative=True, is_step=True
+    )  # fmt: skip
+
+
+def _step(name: str, value: Callable, llvm: Callable, simplify: Callable | None = None) -> Operation:
+    return Operation(name, 1, value, llvm, simplify=simplify, is_step=True, exact=True, side=_result)
+
+
+def _intrinsic(name: str) -> Callable:
+    return lambda code, *xs: code.intrinsic(name, *xs)
+
+
+def _function(name: str, value: Callable, slope: Callable, llvm: str | Callable | None = None, **rest) -> Operation:
+    """A smooth function of one number; in machine code that of the C library, where nothing else is said."""
+    return Operation(name, 1, value, name if llvm is None else llvm, slopes=(slope,), **rest)
+
+
+_odd, _even = _simplify.odd, _simplify.even
+
+_ROWS = (
+    # Arithmetic
+    Operation(
+        "add", 2, np.add, lambda code, a, b: a + b, simplify=_simplify.add, commutative=True,
+        recurrence=_recurrences.add, cotangents=(lambda g, w, x, y: g, lambda g, w, x, y: g),
+    ),
+    Operation(
+        "sub", 2, np.subtract, lambda code, a, b: a - b, simplify=_simplify.subtract,
+        recurrence=_recurrences.add, cotangents=(lambda g, w, x, y: g, lambda g, w, x, y: -g),
+    ),
+    Operation(
+        "mul", 2, np.multiply, lambda code, a, b: a * b, simplify=_simplify.multiply, commutative=True,
+        recurrence=_recurrences.multiply, slopes=(lambda f, c, w, u, v: v, lambda f, c, w, u, v: u),
+    ),
+    Operation(
+        "div", 2, _divide, lambda code, a, b: a / b, simplify=_simplify.divide,
+        recurrence=_recurrences.divide, cotangents=(lambda g, w, x, y: g / y, lambda g, w, x, y: -g * w / y),
+    ),
+    Operation(
+        "neg", 1, np.negative, lambda code, a: -a, simplify=_simplify.negate, exact=True,
+        recurrence=_recurrences.negate, cotangents=(lambda g, w, x: -g,),
+    ),
+    Operation(
+        "rem", 2, np.fmod, "fmod", exact=True, recurrence=_recurrences.remainder,
+        slopes=(lambda f, c, w, u, v: c(1.0), lambda f, c, w, u, v: f("neg", _whole_part(f, w, u, v))),
+        side=lambda f, c, w, u, v: _whole_part(f, w, u, v),
+    ),
+    Operation(
+        "pow", 2, np.power, "pow", simplify=_simplify.raise_to_power, steep=True,
+        slopes=(
+            lambda f, c, w, u, v: f("div", f("mul", v, w), u),
+            lambda f, c, w, u, v: f("mul", w, f("log", u)),
+        ),
+        cotangents=(_power_by_base, lambda g, w, x, y: g * w * np.log(np.where(x == 0, 1.0, x))),
+    ),
+    # Roots
+    _function("sqrt", np.sqrt, lambda f, c, w, u: f("div", c(0.5), w), _intrinsic("sqrt"), steep=True,
+              recurrence=_recurrences.square_root),
+    _function("rsqrt", lambda x: 1 / np.sqrt(x), lambda f, c, w, u: f("div", f("mul", c(-0.5), w), u),
+              lambda code, a: 1.0 / code.intrinsic("sqrt", a)),
+    _function("cbrt", np.cbrt, lambda f, c, w, u: f("div", w, f("mul", c(3.0), u)), simplify=_odd, steep=True),
+    # Exponentials
+    _function("exp", np.exp, lambda f, c, w, u: w),
+    _function("exp2", np.exp2, lambda f, c, w, u: f("mul", c(math.log(2.0)), w)),
+    _function("expm1", np.expm1, lambda f, c, w, u: _one_plus(f, c, w)),
+    _function("log", np.log, lambda f, c, w, u: _inverse(f, c, u)),
+    _function("log1p", np.log1p, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, u))),
+    _function("logistic", lambda x: 1 / (1 + np.exp(-x)), lambda f, c, w, u: f("sub", w, _square(f, w)),
+              lambda code, a: 1.0 / (1.0 + code.library("exp", -a))),
+    _function("erf", np.vectorize(math.erf, otypes=[float]), lambda f, c, w, u: _gauss(f, c, u), simplify=_odd),
+    _function("erfc", np.vectorize(math.erfc, otypes=[float]), lambda f, c, w, u: f("neg", _gauss(f, c, u))),
+    # Circular functions
+    _function("sin", np.sin, lambda f, c, w, u: f("cos", u), simplify=_odd),
+    _function("cos", np.cos, lambda f, c, w, u: f("neg", f("sin", u)), simplify=_even),
+    _function("tan", np.tan, lambda f, c, w, u: _one_plus(f, c, _square(f, w)), simplify=_odd),
+    _function("asin", np.arcsin, lambda f, c, w, u: _inverse_root(f, c, _one_minus_square(f, c, u)), simplify=_odd,
+              steep=True),
+    _function("acos", np.arccos, lambda f, c, w, u: f("neg", _inverse_root(f, c, _one_minus_square(f, c, u))),
+              steep=True),
+    _function("atan", np.arctan, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, _square(f, u))), simplify=_odd),
+    Operation(
+        "atan2", 2, np.arctan2, "atan2", steep=True,
+        slopes=(
+            lambda f, c, w, y, x: f("div", x, _radius_squared(f, y, x)),
+            lambda f, c, w, y, x: f("neg", f("div", y, _radius_squared(f, y, x))),
+        ),
+    ),
+    # Hyperbolic functions
+    _function("sinh", np.sinh, lambda f, c, w, u: f("cosh", u), simplify=_odd),
+    _function("cosh", np.cosh, lambda f, c, w, u: f("sinh", u), simplify=_even),
+    _function("tanh", np.tanh, lambda f, c, w, u: _one_minus_square(f, c, w), simplify=_odd),
+    _function("asinh", np.arcsinh, lambda f, c, w, u: _inverse_root(f, c, _one_plus(f, c, _square(f, u))),
+              simplify=_odd),
+    _function("acosh", np.arccosh, lambda f, c, w, u: _inverse_root(f, c, _square_minus_one(f, c, u)), steep=True),
+    _function("atanh", np.arctanh, lambda f, c, w, u: _inverse(f, c, _one_minus_square(f, c, u)), simplify=_odd),
+    # Pieces
+    Operation(
+        "abs", 1, np.abs, _intrinsic("fabs"), simplify=_even, exact=True, recurrence=_recurrences.absolute,
+        slopes=(lambda f, c, w, u: f("sign", u),), side=lambda f, c, w, u: f("ge", u, c(0.0)),
+    ),
+    Operation(
+        "max", 2, np.maximum, _intrinsic("maximum"), simplify=_simplify.extremum, commutative=True, exact=True,
+        recurrence=_recurrences.extremum("gt"),
+        cotangents=(lambda g, w, x, y: _share(g, x, y), lambda g, w, x, y: _share(g, y, x)), side=_is_larger,
+    ),
+    Operation(
+        "min", 2, np.minimum, _intrinsic("minimum"), simplify=_simplify.extremum, commutative=True, exact=True,
+        recurrence=_recurrences.extremum("lt"),
+        cotangents=(lambda g, w, x, y: _share(g, y, x), lambda g, w, x, y: _share(g, x, y)), side=_is_larger,
+    ),
+    _step("sign", np.sign, lambda code, x: code.select(x > 0.0, 1.0, code.select(x < 0.0, -1.0, x)), _odd),
+    _step("floor", np.floor, _intrinsic("floor")),
+    _step("ceil", np.ceil, _intrinsic("ceil")),
+    _step("round", _round, lambda code, x, method: code.intrinsic("rint" if method == 1 else "round", x)),
+    Operation(
+        "select", 3, _select, lambda code, predicate, no, yes: code.select(predicate, yes, no), lax="select_n",
+        simplify=_simplify.select, exact=True, recurrence=_recurrences.select,
+        cotangents=(None, lambda g, w, p, no, yes: np.where(p, 0.0, g), lambda g, w, p, no, yes: np.where(p, g, 0.0)),
+    ),
+    Operation(
+        "convert", 1, lambda x, kind: x, None, lax="convert_element_type", simplify=_simplify.convert, exact=True,
+        cotangents=(lambda g, w, x: g,),
+    ),
+    # Logic
+    Operation(
+        "is_finite", 1, np.isfinite, lambda code, x: code.intrinsic("fabs", x) < float("inf"), is_logical=True,
+        is_step=True,
+    ),
+    _comparison("eq", np.equal, "==", commutative=True),
+    _comparison("ne", np.not_equal, "!=", commutative=True),
+    _comparison("lt", np.less, "<"),
+    _comparison("le", np.less_equal, "<="),
+    _comparison("gt", np.greater, ">"),
+    _comparison("ge", np.greater_equal, ">="),
+    _bitwise("and", np.bitwise_and, lambda code, a, b: a & b),
+    _bitwise("or", np.bitwise_or, lambda code, a, b: a | b),
+    _bitwise("xor", np.bitwise_xor, lambda code, a, b: (a | b) & ~(a & b), simplify=None),
+    Operation("not", 1, np.invert, lambda code, a: ~a, lax="bitwise_not", simplify=_simplify.invert, is_step=True),
+)  # fmt: skip
+
+OPERATIONS: dict[str, Operation] = {row.name: row for row in _ROWS}

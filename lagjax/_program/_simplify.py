@@ -1,0 +1,155 @@
+"""Algebra on the nodes of a graph: one rule for every operation that has a simpler form for some operands.
+
+A rule takes the graph, the name of the operation and the ids of its operands, of which not all are constants, and
+returns the id of the simplest node with that value. It asks the graph for the nodes it needs: `Graph.apply` where those
+may become simpler in turn, `Graph.node` where they are final.
+"""
+
+import math
+
+import numpy as np
+
+
+def add(graph, op, a, b):
+    """x + 0 is x; like terms are collected."""
+    if graph.value(a) == 0:
+        return b
+    if graph.value(b) == 0:
+        return a
+    return graph.sum(a, b, 1) if graph.kinds[a] == "float" else graph.node(op, a, b)
+
+
+def subtract(graph, op, a, b):
+    """x − 0 is x, 0 − x is −x; like terms are collected."""
+    if graph.value(b) == 0:
+        return a
+    if graph.value(a) == 0:
+        return negate(graph, "neg", b)
+    return graph.sum(a, b, -1) if graph.kinds[a] == "float" else graph.node(op, a, b)
+
+
+def negate(graph, op, a):
+    """−(−x) is x."""
+    if (value := graph.value(a)) is not None:
+        return graph.constant(np.negative(np.dtype(graph.kinds[a]).type(value)), graph.kinds[a])
+    positive = graph.operand_of("neg", a)
+    return graph.node("neg", a) if positive is None else positive
+
+
+def multiply(graph, op, a, b):
+    """0 x is 0, 1 x is x; constants multiply out, signs move outside, equal products are one."""
+    if graph.value(a) == 0 or graph.value(b) == 0:
+        return graph.constant(0, graph.kinds[a])
+    if graph.kinds[a] != "float":
+        return b if graph.value(a) == 1 else a if graph.value(b) == 1 else graph.node("mul", a, b)
+    for constant, other in ((a, b), (b, a)):
+        if (value := graph.value(constant)) is not None and value == value:
+            coefficient, base = graph.term(other)
+            return graph.scale(value * coefficient, base)
+    (m, x), (n, y) = graph.term(a), graph.term(b)
+    if abs(m) != 1 and abs(n) != 1:  # two constant factors become one; a single one stays where it can be shared
+        return graph.scale(m * n, graph.product(x, y))
+    if m < 0 or n < 0:
+        return graph.scale(math.copysign(1, m * n), multiply(graph, op, graph.scale(abs(m), x), graph.scale(abs(n), y)))
+    return graph.product(a, b)
+
+
+def divide(graph, op, a, b):
+    """0 / x is 0; division by a power of two is a product; signs move outside."""
+    if graph.value(a) == 0:
+        return a
+    divisor = graph.value(b)
+    if graph.kinds[a] != "float":
+        return a if divisor == 1 else graph.node("div", a, b)
+    if divisor and abs(math.frexp(divisor)[0]) == 0.5:  # a power of two: multiplying by its inverse is exact
+        return multiply(graph, "mul", a, graph.constant(1 / divisor, "float"))
+    if (positive := graph.operand_of("neg", a)) is not None:
+        return negate(graph, "neg", divide(graph, op, positive, b))
+    if (positive := graph.operand_of("neg", b)) is not None:
+        return negate(graph, "neg", divide(graph, op, a, positive))
+    return graph.node("div", a, b)
+
+
+def raise_to_power(graph, op, a, b):
+    """Whole and half exponents up to 16 become products and a root: more exact, and many times as fast as `pow`."""
+    exponent = graph.value(b)
+    if exponent is None or abs(exponent) > 16 or (2 * exponent) % 1:
+        return graph.node("pow", a, b)
+    result = power(graph, a, int(abs(exponent)))
+    if exponent % 1:
+        result = graph.apply("mul", result, graph.apply("sqrt", a))
+    return result if exponent >= 0 else graph.apply("div", graph.constant(1, "float"), result)
+
+
+def power(graph, a: int, exponent: int) -> int:
+    """The node `a**exponent` for `exponent >= 0`, by repeated squaring: other powers of `a` share the squares."""
+    result = graph.constant(1, graph.kinds[a])
+    while exponent:
+        if exponent & 1:
+            result = graph.apply("mul", result, a)
+        exponent >>= 1
+        if exponent:
+            a = graph.apply("mul", a, a)
+    return result
+
+
+def odd(graph, op, a):
+    """f(−x) is −f(x)."""
+    positive = graph.operand_of("neg", a)
+    return graph.node(op, a) if positive is None else negate(graph, "neg", graph.node(op, positive))
+
+
+def even(graph, op, a):
+    """f(−x) is f(x)."""
+    positive = graph.operand_of("neg", a)
+    return graph.node(op, a if positive is None else positive)
+
+
+def extremum(graph, op, a, b):
+    """max(x, x) is x."""
+    return a if a == b else graph.node(op, a, b)
+
+
+def logical(graph, op, a, b):
+    """`p and p` is p, `p and True` is p, `p and False` is False; `or` likewise."""
+    if a == b:
+        return a
+    for x, y in ((a, b), (b, a)):
+        if graph.kinds[x] == "bool" and (value := graph.value(x)) is not None:
+            return x if value == (op == "or") else y
+    return graph.node(op, a, b)
+
+
+def invert(graph, op, a):
+    """`not not p` is p."""
+    original = graph.operand_of("not", a)
+    return graph.node("not", a) if original is None else original
+
+
+def select(graph, op, predicate, no, yes):
+    """One branch where the predicate is known or both branches are the same; the predicate where that is the result."""
+    known = graph.value(predicate)
+    if known is not None or no == yes:
+        return yes if known else no
+    if (original := graph.operand_of("not", predicate)) is not None:
+        return select(graph, op, original, yes, no)
+    if graph.kinds[no] == "bool" and (graph.value(no), graph.value(yes)) == (False, True):
+        return predicate
+    if graph.kinds[no] == "bool" and (graph.value(no), graph.value(yes)) == (True, False):
+        return invert(graph, "not", predicate)
+    return graph.node("select", predicate, no, yes)
+
+
+def convert(graph, op, a, kind):
+    """Nothing to do where the kind is that already."""
+    return a if graph.kinds[a] == kind else graph.node("convert", a, attribute=kind)
+
+
+def compare(graph, op, a, b):
+    """`int(p) > 0` is `p`: the predicates of `lax.cond` and `lax.switch` are written like this."""
+    for i, other in ((a, b), (b, a)):
+        flag = graph.operand_of("convert", i)
+        if flag is not None and graph.kinds[flag] == "bool" and graph.value(other) is not None:
+            cases = [graph.constant(value, graph.kinds[i]) for value in (0, 1)]
+            return select(graph, "select", flag, *(graph.apply(op, *((c, b) if i == a else (a, c))) for c in cases))
+    return graph.node(op, a, b)
