@@ -4,8 +4,6 @@ What diffrax reports of a motion that stopped ("the step became too small") is c
 matrix that is singular, a force that is not finite or jumps, constraints that became dependent.
 """
 
-from collections.abc import Callable
-
 import diffrax
 import equinox as eqx
 import jax
@@ -29,14 +27,13 @@ class Diffrax(AbstractEngine):
     """A solver of diffrax, with adaptive steps or with fixed ones of size `dt`.
 
     `solver` None is Dopri8, with better states between its steps where they are wanted; `adjoint` None goes back over
-    the recorded steps in reverse mode. `forward` integrates in place of diffrax where no derivative is taken.
+    the recorded steps in reverse mode.
     """
 
     solver: diffrax.AbstractSolver | None = None
     dt: jax.Array | np.ndarray | None = None
     adjoint: diffrax.AbstractAdjoint | None = None
     progress: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
-    forward: Callable | None = eqx.field(static=True, default=None)
 
     @classmethod
     def of(cls, solver=None, dt=None, adjoint=None, progress: bool | diffrax.AbstractProgressMeter = False):
@@ -61,8 +58,8 @@ class Diffrax(AbstractEngine):
             return too_tight(problem.tolerances[0], problem.layout.dtype, LEAST_RTOL_OF_DIFFRAX)
         if not (is_concrete(self.dt) and is_concrete(problem.ts)):
             return None
-        first, last = (float(problem.ts[place]) for place in (0, -1))
-        needed = abs(last - first) / float(self.dt)
+        ts = np.asarray(problem.ts)
+        needed = abs(ts[-1] - ts[0]) / float(self.dt)
         if needed <= problem.max_steps + 0.5:
             return None
         return f"dt={self.dt} needs {needed:.0f} steps, more than max_steps={problem.max_steps}: raise one of them"
@@ -115,7 +112,7 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
     ts = jnp.where(start == RESULTS.successful, given, given[0])
     event = None if problem.event is None else _in_coordinates(problem.event, problem.layout, problem.params)
     method = engine.method(problem)
-    solution = integrate(form, method, engine.adjoint, event, ts, y0, numbers, engine.forward)
+    solution = integrate(form, method, engine.adjoint, event, ts, y0, numbers)
     result = _explained(solution, form, start, ts, numbers)
     if derivation.motion.constrained:
         end = halves(solution.y_end)

@@ -11,7 +11,6 @@ first ones, differ from them in the last digit, and then accept or reject otherw
 a word. This is the only module that calls diffrax's integrator.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -46,11 +45,8 @@ def integrate(
     ts: jax.Array,
     y0: tuple[jax.Array, jax.Array],
     params: PyTree,
-    forward: Callable | None = None,
 ) -> Solution:
     """ẏ = f(t, y) from y0 = (q, q̇) at ts[0] to ts[-1], or to the event. Outputs that were not reached are infinite.
-
-    `forward(ts, y0, params)` → `Solution` takes the place of diffrax where nothing is differentiated.
 
     With `adjoint` None, and without an event, reverse mode goes over the recorded steps; otherwise derivatives are
     those of the diffrax adjoint.
@@ -58,20 +54,20 @@ def integrate(
     # What f closes over (a parameter from outside, the weights of a neural Lagrangian) becomes an argument.
     field = eqx.filter_closure_convert(form.vector_field, ts[0], y0, params)
     project = eqx.filter_closure_convert(form.projected, ts[0], y0, params) if form.constrained else None
-    solution = _differentiable((field, project, ts, y0, params), method, adjoint, event, forward)
+    solution = _differentiable((field, project, ts, y0, params), method, adjoint, event)
     if project is not None:
         path = jax.vmap(project, in_axes=(0, 0, None))(ts, halves(solution.path), params)
         solution = solution._replace(path=jnp.concatenate(path, axis=-1))
     return solution
 
 
-def _differentiable(moving, method: Method, adjoint, event, forward) -> Solution:
+def _differentiable(moving, method: Method, adjoint, event) -> Solution:
     if adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
         return _solve(moving, method, adjoint, event)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
     frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, method)
-    return _over_recorded_steps(moving, frozen, forward)
+    return _over_recorded_steps(moving, frozen)
 
 
 def _solve(moving, method: Method, adjoint, event=None, record: bool = False):
@@ -119,23 +115,21 @@ def _looping(solver, adjoint):
 
 
 @eqx.filter_custom_vjp
-def _over_recorded_steps(moving, method, forward):
+def _over_recorded_steps(moving, method):
     """The plain loop: `diffrax.ForwardMode` is the one that keeps nothing for a backward pass."""
-    if forward is not None:
-        return forward(*moving[2:])
     return _solve(moving, method, diffrax.ForwardMode())
 
 
 @_over_recorded_steps.def_fwd
-def _forward(perturbed, moving, method, forward):
-    del perturbed, forward
+def _forward(perturbed, moving, method):
+    del perturbed
     solution, times = _solve(moving, method, diffrax.ForwardMode(), record=True)
     return solution, (times, solution.t_end, solution.result)
 
 
 @_over_recorded_steps.def_bwd
-def _backward(residuals, cotangents, perturbed, moving, method, forward):
-    del perturbed, forward
+def _backward(residuals, cotangents, perturbed, moving, method):
+    del perturbed
     times, t_end, result = residuals
 
     def replay(moving):

@@ -5,24 +5,17 @@ of JAX, where something is.
 """
 
 import functools
-from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 
 from lagjax import _transforms
 from lagjax._derivation import Derivation
-from lagjax._diffrax import Diffrax
 from lagjax._flow import Flow, Tolerances, unfit
-from lagjax._layout import as_vector
 from lagjax._native import Guards
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
 from lagjax._program import Unlowerable
 from lagjax._validate import is_concrete
-
-# Operations of an acceleration beyond which LLVM takes too long over its transpose: derivatives are then diffrax's.
-# Whether a run that is being traced will be differentiated cannot be known.
-LARGEST_DIFFERENTIATED = 2000
 
 
 class MachineCode(AbstractEngine):
@@ -41,7 +34,7 @@ class MachineCode(AbstractEngine):
 
     It is for float64 on CPUs, scenes whose acceleration is a scalar program of at most some thousands of smooth or
     piecewise smooth operations, adaptive steps, no `event` and derivatives by its own adjoint. `System.explain` says
-    whether a scene is one of these. Derivatives of scenes of more than 2000 operations are those of diffrax even so.
+    whether a scene is one of these.
 
     **Raises** nothing itself; the run raises `ValueError`, before anything is integrated, where it has no machine code.
 
@@ -72,19 +65,14 @@ class MachineCode(AbstractEngine):
         if problem.is_known:
             solution = flow.run(*(np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector)), tolerances)
             return Solution(*(x[0] for x in solution[:-1]))
-        if problem.guards is None and not _has_derivatives(flow):
-            return Diffrax(forward=_forward(flow, tolerances)).solve(problem)
         return _transforms.run(flow, tolerances, *map(jnp.asarray, (problem.ts, problem.y0, problem.vector)))
 
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, in the lanes of vectors and on all cores."""
-        flow, tolerances = _flow_of(batch.member), _tolerances(batch.member)
-        if batch.is_known:
-            ts = np.asarray(batch.member.ts)[None]
-            return flow.run(ts, *map(np.asarray, (batch.y0, batch.vectors)), tolerances)
-        if not _has_derivatives(flow):
-            return Diffrax(forward=_forward(flow, tolerances)).solve_batch(batch)
-        return batch.over_members(self.solve)
+        if not batch.is_known:
+            return batch.over_members(self.solve)
+        ts, tolerances = np.asarray(batch.member.ts)[None], _tolerances(batch.member)
+        return _flow_of(batch.member).run(ts, *map(np.asarray, (batch.y0, batch.vectors)), tolerances)
 
 
 def flow_of(problem: Problem) -> Flow:
@@ -116,21 +104,3 @@ def _made(derivation: Derivation, path: str, guards: Guards | None) -> Flow | st
 
 def _tolerances(problem: Problem) -> Tolerances:
     return Tolerances(*map(float, problem.tolerances), problem.max_steps)
-
-
-# ---- scenes whose derivatives are diffrax's --------------------------------------------------------------------------
-
-
-def _has_derivatives(flow: Flow) -> bool:
-    """Whether derivatives of this flow, should they be asked for, come from machine code as well."""
-    return flow.program.operations <= LARGEST_DIFFERENTIATED
-
-
-@functools.lru_cache(maxsize=64)  # one function object for one program: it becomes part of what XLA compiles
-def _forward(flow: Flow, tolerances: Tolerances) -> Callable:
-    """`(ts, (q, qdot), params)` → `Solution`: the motion where no derivative is taken."""
-
-    def forward(ts, y0, params):
-        return _transforms.run(flow, tolerances, ts, jnp.concatenate(y0), as_vector(params, y0[0].dtype))
-
-    return forward

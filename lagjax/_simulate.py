@@ -78,9 +78,9 @@ def simulate(
     - `adjoint`: how derivatives are taken. By default machine code goes back over its own steps in reverse mode
       (`jax.grad`, `jax.vjp`), at the cost of four or five motions however many parameters there are, and integrates
       sensitivities along with the motion in forward mode (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist.
-      All that diffrax integrates, and the derivatives of scenes of more than 2000 operations, go back over the recorded
-      steps, in reverse mode only. Pass `diffrax.ForwardMode()` for forward mode there, or any other diffrax adjoint.
-      With an event the default is `diffrax.RecursiveCheckpointAdjoint()`.
+      What diffrax integrates is differentiated over the recorded steps, in reverse mode only. Pass
+      `diffrax.ForwardMode()` for forward mode there, or any other diffrax adjoint. With an event the default is
+      `diffrax.RecursiveCheckpointAdjoint()`.
     - `throw`: raise when the motion does not reach its end. With `throw=False` look at `trajectory.ok`.
     - `progress`: print how far the integration has come; or any diffrax progress meter.
 

@@ -352,16 +352,6 @@ def test_a_misspelt_parameter_is_a_key_error():
         run(params={"m": 1.0, "K": 1.0})
 
 
-@pytest.mark.slow
-def test_large_scenes_go_back_over_recorded_steps(monkeypatch):
-    # Too large for the transpose in machine code: the motion is of machine code all the same, its derivative diffrax's.
-    monkeypatch.setattr(lagjax._machine_code, "LARGEST_DIFFERENTIATED", 0)
-    end = lambda k: run(params={"m": 2.0, "k": k}, ts=jnp.array([0.0, 3.0]), rtol=1e-11).q[-1]
-    np.testing.assert_array_equal(jax.jit(end)(8.0), end(8.0))
-    of_omega = jax.grad(lambda w: jnp.cos(3 * w) + 0.5 / w * jnp.sin(3 * w))(2.0)
-    np.testing.assert_allclose(jax.grad(end)(8.0), of_omega / 8.0, rtol=1e-8)
-
-
 def test_sensitivities_of_second_order():
     # q = cos √k t from rest at 1: d²q/dk² by sensitivities of sensitivities.
     scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params * q**2)

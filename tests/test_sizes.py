@@ -76,7 +76,7 @@ def test_a_gradient_that_llvm_must_survive():
 LARGE = [
     *(("bodies in the plane", count) for count in (6, 7, 8, 10, 12)),
     ("bodies in space", 4),
-    *(("chain", count) for count in (9, 10, 12)),
+    *(("chain", count) for count in (9, 10, 12, 14)),
 ]
 
 
