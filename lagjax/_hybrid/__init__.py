@@ -1,0 +1,162 @@
+"""Motion that changes its laws: modes, each a `System` of its own, and transitions between them.
+
+    Transition, modes ─► Plan ─► _rounds: a scan, round after round ─► Ending, Record ─► Trajectory
+                          └─ _mode: the problem of one mode, its guards, the crossing of a guard, the reset
+
+Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47
+(2000) 204, §III.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._consistent import require_consistent
+from lagjax._hybrid._mode import Transition
+from lagjax._hybrid._rounds import Ending, Plan, Record, hybrid_motion
+from lagjax._layout import Layout, halves
+from lagjax._problem import Problem
+from lagjax._results import SimulationError, result_from
+from lagjax._simulate import raise_unless_ok
+from lagjax._system import System
+from lagjax._trajectory import State, Trajectory, Transitions
+from lagjax._validate import as_arrays, is_concrete, require_budget, require_flag
+
+__all__ = ["Transition", "simulate_hybrid"]
+
+PyTree = Any
+
+
+def simulate_hybrid(
+    modes: dict[str, System],
+    transitions: list[Transition],
+    start: str,
+    q0: PyTree,
+    qdot0: PyTree,
+    ts: jax.Array,
+    params: PyTree = None,
+    *,
+    max_transitions: int = 32,
+    rtol: float | None = None,
+    atol: float | None = None,
+    max_steps: int = 65_536,
+    throw: bool = True,
+) -> Trajectory:
+    r"""The motion from (q0, qdot0) in mode `start`, at the times `ts`, through every transition on the way.
+
+    - `modes`: a `System` for each name; all share the structure of `q0` and `params`.
+    - `transitions`: which mode gives way to which, and where; the earliest one wins, the first listed of several at one
+      instant. The others then follow at once if the mode is the same and the reset has not changed their guards.
+    - `max_transitions`: the budget of transitions. A motion that needs more ends there and says so, with the result
+      `max_transitions_reached`; or `zeno` where no budget is enough: where their times pile up as the bounces of a ball
+      do, seen by intervals that shrink steadily to a sum before `ts[-1]`, or to less than rounding leaves of the time.
+
+    The other arguments are those of `simulate`, `max_steps` counting for each stretch between transitions. The result
+    is a `Trajectory` with two more fields: `mode`, for every output time the place of its mode in `modes` (−1 where it
+    was not reached; at the instant of a transition, the mode before it), and `transitions`: `t`, `q`, `qdot` just
+    before the reset, and `source`, `target` as places in `modes`, all of length `max_transitions` with NaN or −1 beyond
+    the last, and their `count`.
+
+    Every member of a batch switches at its own time: use `jax.vmap`, `jax.jit` and `jax.grad` around it. Times and
+    states of transitions have first and second derivatives by the initial state and by params; third ones are not
+    right.
+
+    A guard is looked at along the whole of every step, and a step is shortened until it is smooth there: one that
+    touches zero, or crosses it and comes back between two steps, is seen for what it is. A state that a reset leaves
+    off the constraints of its new mode ends the motion with the result `inconsistent_start`.
+
+    **Raises** `TypeError`, `ValueError` for arguments that cannot be right, `SimulationError` as `simulate` does. It
+    needs scenes that have machine code (see `System.explain`): float64, on the CPU.
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+    bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.9 * v))
+    run = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, jnp.linspace(0.0, 2.0, 9))
+    run.transitions.t[: int(run.transitions.count)]
+    ```
+    """
+    require_flag(throw, "throw")
+    layout = Layout.of(q0, qdot0)
+    _require_modes(modes, transitions, start, max_transitions)
+    problem = Problem.of(modes[start], layout, q0, qdot0, ts, params, rtol, atol, max_steps)
+    if not all(map(is_concrete, problem.tolerances)):
+        raise ValueError("rtol and atol of simulate_hybrid must be numbers: they decide the order of the method.")
+    if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
+        raise ValueError("simulate_hybrid goes forward in time: a reset cannot be undone; ts must increase.")
+    q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
+    require_consistent(modes[start], layout, problem.ts, q0, qdot0, problem.params)
+    rtol, atol = (float(np.asarray(x)) for x in problem.tolerances)
+    plan = Plan(modes, tuple(transitions), start, max_transitions, rtol, atol, max_steps)
+    ending, record = hybrid_motion(plan, layout, problem.ts, problem.y0, problem.params)
+    trajectory = _trajectory(modes, problem, ending, record)
+    return _raise_unless_ok(trajectory, layout, ending.mode) if throw else trajectory
+
+
+def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: Record) -> Trajectory:
+    """What became of the motion, in the pytree of the user."""
+    restore, (accepted, rejected) = problem.layout.restore, ending.steps
+    (q, qdot), (q_end, qdot_end), (q_before, qdot_before) = map(halves, (ending.path, ending.y, record.y))
+    transitions = Transitions(
+        t=record.t, q=restore(q_before), qdot=restore(qdot_before), source=record.source, target=record.target,
+        count=jnp.sum(record.source >= 0),
+    )  # fmt: skip
+    return Trajectory(
+        ts=jnp.asarray(problem.ts),
+        q=restore(q),
+        qdot=restore(qdot),
+        result=result_from(ending.result),
+        end=State(ending.t, restore(q_end), restore(qdot_end)),
+        stats={
+            "num_steps": accepted + rejected,
+            "num_accepted_steps": accepted,
+            "num_rejected_steps": rejected,
+        },
+        system=dict(modes),
+        params=problem.params,
+        mode=ending.modes,
+        transitions=transitions,
+        mode_names=tuple(modes),
+        tolerances=problem.tolerances,
+    )
+
+
+def _raise_unless_ok(trajectory: Trajectory, layout: Layout, last) -> Trajectory:
+    """The trajectory where it ended well; else `SimulationError`, which names the mode `last` in which it ended."""
+    if not is_concrete(trajectory.ok) or trajectory.ok:
+        return raise_unless_ok(trajectory, layout)
+    name = trajectory.mode_names[int(last)]
+    try:
+        return raise_unless_ok(dataclasses.replace(trajectory, system=trajectory.system[name]), layout)
+    except SimulationError as error:
+        raise SimulationError(f"{error}\nIt was in the mode {name!r}.", trajectory) from None
+
+
+def _require_modes(modes, transitions, start, max_transitions) -> None:
+    if not isinstance(modes, dict) or not modes or not all(isinstance(m, System) for m in modes.values()):
+        raise TypeError("modes must be a dict of lagjax.System by name.")
+    if not isinstance(transitions, list | tuple):
+        raise TypeError(f"transitions must be a list of lagjax.Transition; got {type(transitions).__name__}.")
+    known = ", ".join(map(repr, modes))
+    if not isinstance(start, str) or start not in modes:
+        raise ValueError(f"The motion is to start in the mode {start!r}, which does not exist; there are {known}.")
+    for transition in transitions:
+        if not isinstance(transition, Transition):
+            raise TypeError(f"transitions must be lagjax.Transition; got {transition!r}.")
+        for role in ("source", "target"):
+            if getattr(transition, role) not in modes:
+                name = getattr(transition, role)
+                raise ValueError(f"A transition has the {role} {name!r}, which does not exist; there are {known}.")
+    if jax.tree.leaves((modes, transitions)):
+        raise ValueError("A function of a mode or a transition holds arrays of its own: give them as params.")
+    reached, growing = {start}, True
+    while growing:
+        more = {t.target for t in transitions if t.source in reached} - reached
+        reached, growing = reached | more, bool(more)
+    if lost := [name for name in modes if name not in reached]:
+        raise ValueError(f"No transition leads from {start!r} to {', '.join(map(repr, lost))}: unreachable.")
+    require_budget(max_transitions, "max_transitions")
