@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import lagjax
-import lagjax._flow as flows
-from lagjax._flow import StepStore, Tolerances
 from lagjax._layout import Layout
-from lagjax._machine_code import flow_of
+from lagjax._machine_code import _derivatives, _flow, flow_of
+from lagjax._machine_code._flow import Flow, Tolerances
+from lagjax._machine_code._steps import KEPT, StepStore
 from lagjax._problem import Problem
 
 TOLERANCES = Tolerances(1e-11, 1e-11, 4096)
@@ -53,14 +53,16 @@ def by_tangents(flow, ts, y0, numbers, path_bar, y_bar):
     """The cotangents of (y0, params) from the whole Jacobian, (N, 2n + P)."""
     inputs = y0.shape[1] + numbers.shape[1]
     unit = np.broadcast_to(np.eye(inputs), (len(y0), inputs, inputs))
-    path, end = flow.push(ts, y0, numbers, unit[..., : y0.shape[1]], unit[..., y0.shape[1] :], TOLERANCES)
+    path, end = _derivatives.jvp(flow, ts, y0, numbers, unit[..., : y0.shape[1]], unit[..., y0.shape[1] :], TOLERANCES)
     return np.einsum("nrts,nts->nr", path, path_bar) + np.einsum("nrs,ns->nr", end, y_bar)
 
 
-def pull(flow, ts, y0, numbers, run, path_bar, y_bar):
+def vjp(flow, ts, y0, numbers, run, path_bar, y_bar):
     """One cotangent for each member."""
     residuals = run.path, run.result, run.accepted, run.ticket
-    y0_bar, params_bar = flow.pull(ts, y0, numbers, residuals, path_bar[:, None], y_bar[:, None], TOLERANCES)
+    y0_bar, params_bar = _derivatives.vjp(
+        flow, ts, y0, numbers, residuals, path_bar[:, None], y_bar[:, None], TOLERANCES
+    )
     return np.concatenate([y0_bar[:, 0], params_bar[:, 0]], axis=1)
 
 
@@ -70,7 +72,7 @@ def test_transposed_steps_are_tangents(double, times):
     y0, numbers, rng = batch(19)
     ts, path_bar, y_bar = times[None], rng.normal(size=(19, len(times), 4)), rng.normal(size=(19, 4))
     run = double.run(ts, y0, numbers, TOLERANCES)
-    found = pull(double, ts, y0, numbers, run, path_bar, y_bar)
+    found = vjp(double, ts, y0, numbers, run, path_bar, y_bar)
     expected = by_tangents(double, ts, y0, numbers, path_bar, y_bar)
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 
@@ -79,33 +81,33 @@ def test_portions_do_not_change_a_cotangent(double, monkeypatch):
     y0, numbers, rng = batch(23)
     ts, path_bar, y_bar = np.array([[0.0, 0.7, 1.5]]), rng.normal(size=(23, 3, 4)), rng.normal(size=(23, 4))
     run = double.run(ts, y0, numbers, TOLERANCES)
-    whole = pull(double, ts, y0, numbers, run, path_bar, y_bar)
-    monkeypatch.setattr(flows, "LARGEST_PORTION", 100)
-    np.testing.assert_array_equal(pull(double, ts, y0, numbers, run, path_bar, y_bar), whole)
+    whole = vjp(double, ts, y0, numbers, run, path_bar, y_bar)
+    monkeypatch.setattr(_derivatives, "LARGEST_PORTION", 100)
+    np.testing.assert_array_equal(vjp(double, ts, y0, numbers, run, path_bar, y_bar), whole)
 
 
 def test_kept_steps_do_not_change_a_cotangent(double, monkeypatch):
     y0, numbers, rng = batch(23)
     ts, path_bar, y_bar = np.array([[0.0, 0.7, 1.5]]), rng.normal(size=(23, 3, 4)), rng.normal(size=(23, 4))
     run = double.run(ts, y0, numbers, TOLERANCES)
-    plain = pull(double, ts, y0, numbers, run, path_bar, y_bar)
+    plain = vjp(double, ts, y0, numbers, run, path_bar, y_bar)
     runs = []
-    run = flows.Flow._followed
-    monkeypatch.setattr(flows.Flow, "_followed", lambda self, *given: runs.append(len(given[1])) or run(self, *given))
+    run = Flow.follow
+    monkeypatch.setattr(Flow, "follow", lambda self, *given: runs.append(len(given[1])) or run(self, *given))
 
     def again(kept):
         runs.clear()
-        return pull(double, ts, y0, numbers, kept, path_bar, y_bar)
+        return vjp(double, ts, y0, numbers, kept, path_bar, y_bar)
 
-    kept = double.run(ts, y0, numbers, TOLERANCES, flows.KEPT)
+    kept = double.run(ts, y0, numbers, TOLERANCES, KEPT)
     np.testing.assert_array_equal(again(kept), plain)
     assert runs == []
     # Members in another order find their own steps; what is not there any more is followed once more.
     shuffled = rng.permutation(23)
     turned = type(kept)(*(x[shuffled] for x in kept[:-1]))
-    found = pull(double, ts, y0[shuffled], numbers[shuffled], turned, path_bar[shuffled], y_bar[shuffled])
+    found = vjp(double, ts, y0[shuffled], numbers[shuffled], turned, path_bar[shuffled], y_bar[shuffled])
     np.testing.assert_array_equal(found, plain[shuffled])
-    monkeypatch.setattr(flows, "KEPT", StepStore())
+    monkeypatch.setattr(_derivatives, "KEPT", StepStore())
     np.testing.assert_array_equal(again(kept), plain)
     assert runs == [23]
 
@@ -113,11 +115,11 @@ def test_kept_steps_do_not_change_a_cotangent(double, monkeypatch):
 def test_steps_that_do_not_fit_are_followed_once_more(double, monkeypatch):
     y0, numbers, rng = batch(23)
     ts, path_bar, y_bar = np.array([[0.0, 0.7, 1.5]]), rng.normal(size=(23, 3, 4)), rng.normal(size=(23, 4))
-    plain = pull(double, ts, y0, numbers, double.run(ts, y0, numbers, TOLERANCES), path_bar, y_bar)
-    monkeypatch.setattr(flows, "LARGEST_KEPT", 23 * 6 * 3)  # room for three steps of each
-    run = double.run(ts, y0, numbers, TOLERANCES, flows.KEPT)
+    plain = vjp(double, ts, y0, numbers, double.run(ts, y0, numbers, TOLERANCES), path_bar, y_bar)
+    monkeypatch.setattr(_flow, "LARGEST_KEPT", 23 * 6 * 3)  # room for three steps of each
+    run = double.run(ts, y0, numbers, TOLERANCES, KEPT)
     assert (run.ticket < 0).any()
-    np.testing.assert_array_equal(pull(double, ts, y0, numbers, run, path_bar, y_bar), plain)
+    np.testing.assert_array_equal(vjp(double, ts, y0, numbers, run, path_bar, y_bar), plain)
 
 
 def test_the_oldest_steps_are_dropped_first(double):
@@ -157,7 +159,7 @@ def test_directions_side_by_side_are_those_one_by_one(monkeypatch):
     value = lambda p: loss(system, ts)(jnp.array([0.5, -0.2, 0.9]), jnp.zeros(3), p)
     reverse = jax.grad(value)(params)
     forward = jax.jacfwd(value)(params)
-    monkeypatch.setattr(flows, "MOST_DIRECTIONS", 1)
+    monkeypatch.setattr(_derivatives, "MOST_DIRECTIONS", 1)
     for a, b in zip(jax.tree.leaves(jax.jacfwd(value)(params)), jax.tree.leaves(forward), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9)
     for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(forward), strict=True):
@@ -175,7 +177,7 @@ def test_a_jacobian_row_by_row_is_that_column_by_column(monkeypatch):
         lambda x: x[0] * jnp.cos(jnp.sqrt(x[2]) * ts) + x[1] * jnp.sin(jnp.sqrt(x[2]) * ts) / jnp.sqrt(x[2])
     )
     np.testing.assert_allclose(jax.jacrev(path)(x), exact(x), atol=1e-9)  # more rows than numbers: by tangents
-    monkeypatch.setattr(flows, "MOST_TANGENT_COORDINATES", 1)
+    monkeypatch.setattr(_derivatives, "MOST_TANGENT_COORDINATES", 1)
     np.testing.assert_allclose(jax.jacrev(path)(x), exact(x), atol=1e-9)
 
 

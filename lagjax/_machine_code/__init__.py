@@ -9,9 +9,9 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import _transforms
 from lagjax._derivation import Derivation
-from lagjax._flow import Flow, Tolerances, unfit
+from lagjax._machine_code import _transforms
+from lagjax._machine_code._flow import Flow, Tolerances, unfit
 from lagjax._native import Guards
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
 from lagjax._program import Unlowerable

@@ -3,18 +3,19 @@
 With F the map (ts, y0, params) → (path, y_end) of a flow and D its derivative by (y0, params) between fixed times,
 
     run         F
-    push        D v            linear in v = (δy0, δparams)              transposed: pull
-    pull        Dᵀ w           linear in w = (w_path, w_end)             transposed: push
+    jvp        D v            linear in v = (δy0, δparams)              transposed: vjp
+    vjp        Dᵀ w           linear in w = (w_path, w_end)             transposed: jvp
     curvature   (∂/∂x wᵀ D) d  linear in w and in d, symmetric in d      transposed in d: itself
 
 and their derivatives close the circle, so that there are derivatives of every order in every mode:
 
-    d run  = push(v − f₀ δt₀) + f δt                  f the rate (q̇, q̈) of the state, f₀ at the start
-    d push = push(dv) + D² F [v, dx]                  by the run of the tangent flow
-    d pull = pull(dw) + curvature(w, dx) + …          by the pull of the tangent flow, and what moves with the times
+    d run  = jvp(v − f₀ δt₀) + f δt                  f the rate (q̇, q̈) of the state, f₀ at the start
+    d jvp = jvp(dv) + D² F [v, dx]                  by the run of the tangent flow
+    d vjp = vjp(dw) + curvature(w, dx) + …          by the vjp of the tangent flow, and what moves with the times
 
 To move an output time by δt moves the output by f δt; to start later from the same state is to start from another one.
-Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3–5, for what is pushed, pulled, and both.
+Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3–5, for forward, reverse, and forward over
+reverse.
 
 Every primitive takes arrays with any batch axes in front, as many of them in each, of length one where an argument is
 shared; under `jax.vmap` it is still one call of machine code. Outside of `jit` nothing is compiled but that.
@@ -30,7 +31,10 @@ from jax.experimental.buffer_callback import buffer_callback
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from lagjax._flow import KEPT, Flow, Tolerances, from_rows, to_rows
+from lagjax._machine_code import _derivatives
+from lagjax._machine_code._flow import Flow, Tolerances
+from lagjax._machine_code._steps import KEPT
+from lagjax._machine_code._tangent import from_rows, to_rows
 from lagjax._problem import Solution
 from lagjax._results import SUCCESSFUL
 
@@ -76,22 +80,22 @@ def _run_on_host(ts, y0, params, *, flow, tolerances, keep):
     return _in_batch(flow.run(*rows, tolerances, KEPT if keep else None)[:_OUTPUTS], batch)
 
 
-def _push_on_host(ts, y0, params, path, result, accepted, ticket, dy0, dparams, *, flow, tolerances):
+def _jvp_on_host(ts, y0, params, path, result, accepted, ticket, dy0, dparams, *, flow, tolerances):
     del path, result, accepted, ticket  # what the transpose needs
     rows, batch = _rows((ts, y0, params, dy0, dparams), (1, 1, 1, 2, 2), shared=(0, 2))
-    return _in_batch(flow.push(*rows, tolerances), batch)
+    return _in_batch(_derivatives.jvp(flow, *rows, tolerances), batch)
 
 
-def _pull_on_host(ts, y0, params, path, result, accepted, ticket, path_bar, end_bar, *, flow, tolerances):
-    arrays = ts, y0, params, path, result, accepted, ticket, path_bar, end_bar
+def _vjp_on_host(ts, y0, params, path, result, accepted, ticket, path_ct, end_ct, *, flow, tolerances):
+    arrays = ts, y0, params, path, result, accepted, ticket, path_ct, end_ct
     rows, batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2))
-    return _in_batch(flow.pull(*rows[:3], rows[3:7], *rows[7:], tolerances), batch)
+    return _in_batch(_derivatives.vjp(flow, *rows[:3], rows[3:7], *rows[7:], tolerances), batch)
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
 
-run_p, push_p, pull_p, curvature_p = (Primitive(f"lagjax_{name}") for name in ("run", "push", "pull", "curvature"))
-# Of run: a `Solution` but for the last field, which is that of a batch. Push and pull are told about a run its ts, y0,
+run_p, jvp_p, vjp_p, curvature_p = (Primitive(f"lagjax_{name}") for name in ("run", "jvp", "vjp", "curvature"))
+# Of run: a `Solution` but for the last field, which is that of a batch. jvp and vjp are told about a run its ts, y0,
 # params, path, result, accepted, ticket.
 _OUTPUTS, _GIVEN = len(Solution._fields) - 1, 7
 
@@ -115,12 +119,12 @@ def _run_shapes(ts, y0, params, *, flow, **_):
     return [*floats, *counts]
 
 
-def _push_shapes(*args, flow, **_):
+def _jvp_shapes(*args, flow, **_):
     batch, m = _batch_of((*args[:3], *args[_GIVEN:]), (1, 1, 1, 2, 2)), args[_GIVEN].shape[-2]
     return _floats((*batch, m, args[0].shape[-1], flow.states), (*batch, m, flow.states))
 
 
-def _pull_shapes(*args, flow, **_):
+def _vjp_shapes(*args, flow, **_):
     batch = _batch_of(args, (1, 1, 1, 2, 0, 0, 0, 3, 2))
     m = args[-1].shape[-2]
     return _floats((*batch, m, flow.states), (*batch, m, flow.numbers))
@@ -131,20 +135,20 @@ def _curvature_shapes(*args, flow, **_):
     return _floats((*batch, flow.states), (*batch, flow.numbers))
 
 
-def _curvature_composed(ts, y0, params, path_bar, end_bar, dy0, dparams, *, flow, tolerances):
+def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, tolerances):
     """By going back over the steps of the tangent flow, with cotangents of the tangent alone."""
     larger, tolerances = flow.tangent(1), tolerances.with_larger_budget
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
     solution = _run(*given, flow=larger, tolerances=tolerances, keep=True)
-    path_bar, end_bar = (from_rows(jnp.stack([jnp.zeros_like(bar), bar], axis=-2)) for bar in (path_bar, end_bar))
-    bars = path_bar[..., None, :, :], end_bar[..., None, :]
-    state_bar, numbers_bar = pull_p.bind(*given, *_residuals(solution), *bars, flow=larger, tolerances=tolerances)
-    state_bar, numbers_bar = to_rows(state_bar[..., 0, :], flow.size)[..., 0, :], numbers_bar[..., 0, : flow.numbers]
-    return [state_bar * length, numbers_bar * length]
+    path_ct, end_ct = (from_rows(jnp.stack([jnp.zeros_like(ct), ct], axis=-2)) for ct in (path_ct, end_ct))
+    cts = path_ct[..., None, :, :], end_ct[..., None, :]
+    state_ct, numbers_ct = vjp_p.bind(*given, *_residuals(solution), *cts, flow=larger, tolerances=tolerances)
+    state_ct, numbers_ct = to_rows(state_ct[..., 0, :], flow.size)[..., 0, :], numbers_ct[..., 0, : flow.numbers]
+    return [state_ct * length, numbers_ct * length]
 
 
-def _push_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
-    """`push` along one direction, (…, 2n) and (…, P), by the run of the tangent flow: for its own derivatives."""
+def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
+    """`jvp` along one direction, (…, 2n) and (…, P), by the run of the tangent flow: for its own derivatives."""
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
     larger = flow.tangent(1)
     solution = _run(*given, flow=larger, tolerances=tolerances.with_larger_budget, keep=False)
@@ -164,7 +168,7 @@ def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
 
 
 def _residuals(solution: Solution):
-    """What `push` and `pull` are told of a run: how it came out. Their values do not vary with that."""
+    """What `jvp` and `vjp` are told of a run: how it came out. Their values do not vary with that."""
     given = solution.path, solution.result, solution.accepted, solution.ticket
     return tuple(jax.lax.stop_gradient(x) for x in given)
 
@@ -190,7 +194,7 @@ def _slope(flow: Flow, t, y, params):
     return jnp.where(jnp.isfinite(rate), rate, 0.0)
 
 
-def _run_jvp(primals, tangents, *, flow, tolerances, keep):
+def _derivative_of_run(primals, tangents, *, flow, tolerances, keep):
     (ts, y0, params), (dts, dy0, dparams) = primals, tangents
     if flow.guards is not None or all(map(_zero, tangents)):
         outs = run_p.bind(*primals, flow=flow, tolerances=tolerances, keep=keep)
@@ -201,7 +205,7 @@ def _run_jvp(primals, tangents, *, flow, tolerances, keep):
     if not _zero(dts):
         dy0 = dy0 - _slope(flow, ts[..., 0], y0, params) * dts[..., :1]
     direction = [x[..., None, :] for x in (dy0, dparams)]
-    d_path, d_end = push_p.bind(*primals, *_residuals(solution), *direction, flow=flow, tolerances=tolerances)
+    d_path, d_end = jvp_p.bind(*primals, *_residuals(solution), *direction, flow=flow, tolerances=tolerances)
     d_path, d_end, d_t_end = d_path[..., 0, :, :], d_end[..., 0, :], jnp.zeros_like(solution.t_end)
     if not _zero(dts):
         reached, done = jnp.isfinite(solution.path), solution.result == SUCCESSFUL
@@ -225,15 +229,15 @@ def _linear_part(primitive, primals, tangents, count, settings):
     return primitive.bind(*primals[:-count], *map(_value, tangents[-count:]), **settings)
 
 
-def _push_jvp(primals, tangents, **settings):
-    outs = push_p.bind(*primals, **settings)
-    total = _linear_part(push_p, primals, tangents, 2, settings)
+def _derivative_of_jvp(primals, tangents, **settings):
+    outs = jvp_p.bind(*primals, **settings)
+    total = _linear_part(jvp_p, primals, tangents, 2, settings)
     if not all(map(_zero, tangents[:3])):
         dy0, dparams = primals[_GIVEN:]
 
         def along(*moving):
             lifted = [x[..., None, :] for x in moving]
-            return _push_composed(*lifted, dy0, dparams, **settings)
+            return _jvp_composed(*lifted, dy0, dparams, **settings)
 
         more = list(jax.jvp(along, primals[:3], tuple(map(_value, tangents[:3])))[1])
         total = more if total is None else _add(total, more)
@@ -244,39 +248,39 @@ def _or_zeros(total, outs):
     return [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs] if total is None else total
 
 
-def _pull_jvp(primals, tangents, **settings):
-    outs = pull_p.bind(*primals, **settings)
-    total = _linear_part(pull_p, primals, tangents, 2, settings)
+def _derivative_of_vjp(primals, tangents, **settings):
+    outs = vjp_p.bind(*primals, **settings)
+    total = _linear_part(vjp_p, primals, tangents, 2, settings)
     if not all(map(_zero, tangents[:3])):
-        more = _pull_moved(primals, *tangents[:3], outs, settings)
+        more = _vjp_moved(primals, *tangents[:3], outs, settings)
         total = more if total is None else _add(total, more)
     return outs, _or_zeros(total, outs)
 
 
-def _pull_moved(primals, dts, dy0, dparams, outs, settings):
-    """How `pull` changes with ts, y0 and params: each of its m cotangents for itself."""
-    (ts, y0, params), bars, total = primals[:3], primals[_GIVEN:], None
+def _vjp_moved(primals, dts, dy0, dparams, outs, settings):
+    """How `vjp` changes with ts, y0 and params: each of its m cotangents for itself."""
+    (ts, y0, params), cts, total = primals[:3], primals[_GIVEN:], None
     dy0, dparams = _value(dy0), _value(dparams)
     if not _zero(dts):
-        total = _pull_moved_in_time(primals, dts, outs, settings)
+        total = _vjp_moved_in_time(primals, dts, outs, settings)
         dy0 = dy0 - _slope(settings["flow"], ts[..., 0], y0, params) * dts[..., :1]
     given = [x[..., None, :] for x in (ts, y0, params)]
     direction = [x[..., None, :] for x in (dy0, dparams)]
-    more = curvature_p.bind(*given, *bars, *direction, **settings)
+    more = curvature_p.bind(*given, *cts, *direction, **settings)
     return list(more) if total is None else _add(total, more)
 
 
-def _pull_moved_in_time(primals, dts, outs, settings):
-    """How `pull` changes with the output times, but for the curvature along the start's −f₀ δt₀.
+def _vjp_moved_in_time(primals, dts, outs, settings):
+    """How `vjp` changes with the output times, but for the curvature along the start's −f₀ δt₀.
 
     Output i moves by f δtᵢ, so that its derivative by (y0, params) gains the part (∂f/∂y Dᵢ + ∂f/∂p) δtᵢ; and the start
     from which the others follow has the derivative −∂f₀ δt₀.
     """
-    flow, (ts, y0, params), (path_bar, end_bar) = settings["flow"], primals[:3], primals[_GIVEN:]
+    flow, (ts, y0, params), (path_ct, end_ct) = settings["flow"], primals[:3], primals[_GIVEN:]
     path, done = primals[3], primals[4] == SUCCESSFUL
     reached = jnp.isfinite(path)
-    weights = jnp.where(reached[..., None, :, :], path_bar, 0.0)
-    weights = weights.at[..., -1, :].add(jnp.where(done[..., None, None], end_bar, 0.0))
+    weights = jnp.where(reached[..., None, :, :], path_ct, 0.0)
+    weights = weights.at[..., -1, :].add(jnp.where(done[..., None, None], end_ct, 0.0))
 
     def rates(places, numbers):
         return _slope(flow, ts[..., None, :], places, numbers[..., None, :]) * dts[..., None, :, None]
@@ -289,22 +293,22 @@ def _pull_moved_in_time(primals, dts, outs, settings):
         return jax.vjp(function, place, jnp.broadcast_to(params[..., None, :], numbers_shape))[1](cotangent)
 
     places = jnp.where(reached, path, y0[..., None, :])[..., None, :, :]
-    moved_bar, params_bar = transposed(rates, places, weights, (*weights.shape[:-2], flow.numbers))
-    still = jnp.zeros_like(end_bar)
-    y0_bar, more = pull_p.bind(*primals[:_GIVEN], moved_bar, still, **settings)
+    moved_ct, params_ct = transposed(rates, places, weights, (*weights.shape[:-2], flow.numbers))
+    still = jnp.zeros_like(end_ct)
+    y0_ct, more = vjp_p.bind(*primals[:_GIVEN], moved_ct, still, **settings)
     start = transposed(first_rate, y0[..., None, :], outs[0], outs[1].shape)
-    return _add([y0_bar, more + params_bar], start)
+    return _add([y0_ct, more + params_ct], start)
 
 
-def _curvature_jvp(primals, tangents, **settings):
+def _derivative_of_curvature(primals, tangents, **settings):
     outs = curvature_p.bind(*primals, **settings)
-    given, bars, direction = primals[:3], primals[3:5], primals[5:]
+    given, cts, direction = primals[:3], primals[3:5], primals[5:]
     total = None
     parts = (
         (tangents[3:5], lambda moving: curvature_p.bind(*given, *moving, *direction, **settings)),
-        (tangents[5:], lambda moving: curvature_p.bind(*given, *bars, *moving, **settings)),
+        (tangents[5:], lambda moving: curvature_p.bind(*given, *cts, *moving, **settings)),
         (tangents[:3], lambda moving: jax.jvp(
-            lambda *given: _curvature_composed(*given, *bars, *direction, **settings), given, tuple(moving))[1]),
+            lambda *given: _curvature_composed(*given, *cts, *direction, **settings), given, tuple(moving))[1]),
     )  # fmt: skip
     for moving, part in parts:
         if not all(map(_zero, moving)):
@@ -336,17 +340,17 @@ def _transposed(primitive):
 
 
 def _curvature_transpose(cotangents, *args, **settings):
-    moving, given, bars, direction = [_value(c) for c in cotangents], args[:3], args[3:5], args[5:]
+    moving, given, cts, direction = [_value(c) for c in cotangents], args[:3], args[3:5], args[5:]
     if any(map(ad.is_undefined_primal, direction)):
-        found = curvature_p.bind(*given, *bars, *moving, **settings)
+        found = curvature_p.bind(*given, *cts, *moving, **settings)
         return [None] * 5 + _to_linear(direction, found)
     ts, *state = given
     state = tuple(
         jnp.broadcast_to(x, jnp.broadcast_shapes(x.shape, m.shape)) for x, m in zip(state, moving, strict=True)
     )
     moving = tuple(jnp.broadcast_to(m, x.shape) for m, x in zip(moving, state, strict=True))
-    second = jax.jvp(lambda *state: _push_composed(ts, *state, *direction, **settings), state, moving)[1]
-    return [None] * 3 + _to_linear(bars, second) + [None] * 2
+    second = jax.jvp(lambda *state: _jvp_composed(ts, *state, *direction, **settings), state, moving)[1]
+    return [None] * 3 + _to_linear(cts, second) + [None] * 2
 
 
 # ---- batches ---------------------------------------------------------------------------------------------------------
@@ -416,18 +420,18 @@ def _on_host(primitive, host, shapes) -> None:
 
 
 _on_host(run_p, _run_on_host, _run_shapes)
-_on_host(push_p, _push_on_host, _push_shapes)
-_on_host(pull_p, _pull_on_host, _pull_shapes)
+_on_host(jvp_p, _jvp_on_host, _jvp_shapes)
+_on_host(vjp_p, _vjp_on_host, _vjp_shapes)
 curvature_p.multiple_results = True
 curvature_p.def_abstract_eval(_curvature_shapes)
 curvature_p.def_impl(_curvature_composed)
 mlir.register_lowering(curvature_p, mlir.lower_fun(_curvature_composed, multiple_results=True), platform="cpu")
 
 for _primitive, _jvp, _transpose, _batching in (
-    (run_p, _run_jvp, None, _batched(run_p)),
-    (push_p, _push_jvp, _transposed(pull_p), _several_at_once(push_p, (2, 1))),
-    (pull_p, _pull_jvp, _transposed(push_p), _several_at_once(pull_p, (1, 1))),
-    (curvature_p, _curvature_jvp, _curvature_transpose, _batched(curvature_p)),
+    (run_p, _derivative_of_run, None, _batched(run_p)),
+    (jvp_p, _derivative_of_jvp, _transposed(vjp_p), _several_at_once(jvp_p, (2, 1))),
+    (vjp_p, _derivative_of_vjp, _transposed(jvp_p), _several_at_once(vjp_p, (1, 1))),
+    (curvature_p, _derivative_of_curvature, _curvature_transpose, _batched(curvature_p)),
 ):
     ad.primitive_jvps[_primitive] = _jvp
     if _transpose is not None:

@@ -1,0 +1,236 @@
+"""`Flow`: the flow map of a scalar program in machine code, (output times, initial state, params) → states.
+
+Everything here works on NumPy arrays with one row a member; `_derivatives` has its derivatives, `_transforms` makes
+functions of both that JAX can transform.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from lagjax import _native
+from lagjax._machine_code._steps import LARGEST_KEPT, Steps, StepStore
+from lagjax._machine_code._tangent import tangent_programs
+from lagjax._problem import Solution
+from lagjax._program import Program, Unlowerable
+from lagjax._results import RESULTS, SUCCESSFUL, code_of
+from lagjax._stopped import End, what_stopped
+
+LARGEST_PROGRAM = 6_000  # operations of an acceleration, beyond which LLVM takes too long
+# The codes of the kernel, in their order, as results. Beyond `EVENT` they say which guards changed sign.
+_RESULT_OF_CODE = np.array([code_of(result) for result in (
+    RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,
+    RESULTS.mass_matrix_singular, RESULTS.projection_failed, RESULTS.acceleration_discontinuous, RESULTS.event_occurred,
+)])  # fmt: skip
+_SPENT, _SHRANK, _NOT_FINITE, _SINGULAR, _NOT_PROJECTED, _JUMPS = _RESULT_OF_CODE[1:7].tolist()
+_GIVEN_UP = (_SINGULAR, _NOT_FINITE, _SHRANK, _NOT_PROJECTED)  # what another variant of the program may still follow
+
+
+class Tolerances(NamedTuple):
+    """The local error of a step, and what a run may cost."""
+
+    rtol: float
+    atol: float
+    max_steps: int
+    tries: int = 4
+
+    @property
+    def perturbed(self) -> "Tolerances":
+        """For another try, whose steps end at other places."""
+        return self._replace(rtol=0.7 * self.rtol, atol=0.7 * self.atol, tries=self.tries - 1)
+
+    @property
+    def with_larger_budget(self) -> "Tolerances":
+        """For a motion with its tangents, which takes more steps."""
+        return self._replace(max_steps=4 * self.max_steps)
+
+
+def unfit(program: Program, size: int, dtype) -> str | None:
+    """Why there is no machine code for a scene, as the end of a sentence; None where there is."""
+    if jax.default_backend() != "cpu":
+        return f"the default device is a {jax.default_backend()}"
+    if dtype != np.float64:
+        return f"the coordinates are {np.dtype(dtype).name}, not float64"
+    if program.operations > LARGEST_PROGRAM:
+        return f"its acceleration takes {program.operations} operations, more than {LARGEST_PROGRAM}"
+    try:
+        _native.recurrences(program, size)
+    except Unlowerable as reason:
+        return str(reason)
+    return None
+
+
+# ---- flows -----------------------------------------------------------------------------------------------------------
+
+
+class Flow:
+    """The flow of a program for q̈ with n coordinates.
+
+    `parts` gives the program, which takes q, q̇, t and then the P parameters and gives q̈ and whether the mass matrix is
+    singular, and the projection that keeps the motion on its constraints, or None. It is called when machine code is
+    first needed. `guards` end a motion early. `groups` (n,) numbers the coordinates whose errors are measured together,
+    and the first `base_size` coordinates are the motion, the others tangents of it. `general` gives the flow of the
+    variant for any mass matrix: members that the regular variant cannot follow start again with it.
+    """
+
+    def __init__(
+        self,
+        parts: Callable[[], tuple[Program, _native.Projection | None]],
+        size: int,
+        numbers: int,
+        guards: _native.Guards | None = None,
+        groups: tuple[int, ...] | None = None,
+        base_size: int | None = None,
+        general: "Callable[[], Flow | None]" = lambda: None,
+    ):
+        self._parts, self.size, self.numbers, self.guards = functools.cache(parts), size, numbers, guards
+        self.groups = tuple(range(size)) if groups is None else groups
+        self.base_size = size if base_size is None else base_size
+        self.general = functools.cache(general)
+        self.tangent = functools.lru_cache(maxsize=8)(self._tangent)
+
+    @classmethod
+    def of(cls, program: Program, size: int, projection=None, guards=None) -> "Flow":
+        """The flow of a scene's program, with that of its general variant behind it."""
+
+        def general():
+            try:
+                other = program.complete
+            except Unlowerable:
+                return None
+            fits = other is not program and other.operations <= LARGEST_PROGRAM
+            return cls.of(other, size, projection, guards) if fits else None
+
+        return cls(lambda: (program, projection), size, program.size - 2 * size - 1, guards, general=general)
+
+    @property
+    def program(self) -> Program:
+        """q̈ and whether the mass matrix is singular."""
+        return self._parts()[0]
+
+    @property
+    def projection(self) -> _native.Projection | None:
+        """The way back to the constraints, where there are some."""
+        return self._parts()[1]
+
+    @functools.cached_property
+    def anywhere(self) -> Program:
+        """The program that holds for any mass matrix, if there is one, else the flow's own."""
+        try:
+            return self.program.complete
+        except Unlowerable:
+            return self.program
+
+    @property
+    def states(self) -> int:
+        """Numbers in a state: q, then q̇."""
+        return 2 * self.size
+
+    @functools.cached_property
+    def kernel(self) -> _native.Kernel:
+        """The machine code."""
+        return _native.Kernel(self.program, self.size, self.projection, self.guards, self.groups, self.base_size)
+
+    # ---- forward ----
+
+    def run(
+        self, ts, y0, params, tolerances: Tolerances, store: StepStore | None = None, room: np.ndarray | None = None
+    ) -> Solution:
+        """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the motions of N members.
+
+        With a `store` the steps are kept there, up to `room` (N,) of each member: by default to equal parts of what may
+        be kept. Results tell what stopped a member, and not only that its steps became too small, or too many.
+        """
+        solution = self._explained(self.follow(ts, y0, params, tolerances, store, room), ts, params)
+        overflowed = ~np.isfinite(solution.y_end).all(axis=1)  # even where it came to the last time
+        solution.result[overflowed] = _NOT_FINITE
+        return solution
+
+    def follow(self, ts, y0, params, tolerances, store=None, room=None) -> Solution:
+        """`run` without a look at what stopped a member: for another try, and for derivatives."""
+        rtol, atol, max_steps, _ = tolerances
+        if store is not None and room is None:
+            room = np.full(len(y0), min(max_steps, LARGEST_KEPT // ((self.states + 2) * max(1, len(y0)))))
+        done = self.kernel(ts, y0, params, rtol, atol, max_steps, room)
+        result, event = _RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
+        ticket = np.full(len(y0), -1)
+        if store is not None:
+            ticket = store.keep(self._compact(done.table, room, done.steps, rtol))
+        solution = Solution(*done[:3], result, done.steps, done.rejected, event, ticket, done.idle)
+        again, flow, tolerances = self._second_chance(result, tolerances)
+        if not again.any():
+            return solution
+        some = members(again, ts, y0, params)
+        better = flow.follow(*some, tolerances, store, None if room is None else room[again])
+        for values, new in zip(solution[:-1], better[:-1], strict=True):
+            values[again] = new
+        return solution._replace(idle=done.idle + better.idle)
+
+    def _explained(self, solution: Solution, ts, params) -> Solution:
+        """The solution with what stopped the members whose steps became too small, or too many."""
+        shrank, spent = solution.result == _SHRANK, solution.result == _SPENT
+        some = np.flatnonzero(shrank | spent)
+        if not some.size:
+            return solution
+        times, numbers = (x[some] if len(x) > 1 else x for x in (ts, params))
+
+        def acceleration(t, y):
+            values = self.anywhere.evaluate(*y.T, t, *numbers.T)[: self.size]
+            return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
+
+        counts = solution.accepted[some], solution.rejected[some]
+        end = End(solution.t_end[some], solution.y_end[some], times[:, 0], times[:, -1], *counts)
+        not_finite, jumps = what_stopped(acceleration, end, shrank[some], spent[some])
+        solution.result[some[jumps]] = _JUMPS
+        solution.result[some[not_finite]] = _NOT_FINITE
+        return solution
+
+    def _compact(self, table, room, counts, rtol: float) -> Steps:
+        """The steps of a run, without the room that was not used."""
+        taken, starts = np.minimum(counts, room), np.cumsum(room) - room
+        if not np.array_equal(taken, room):
+            table = np.concatenate([table[:0], *(table[s : s + k] for s, k in zip(starts, taken, strict=True))])
+        return Steps(self.kernel, _native.order_for(rtol), table, np.cumsum(taken) - taken, counts, counts <= room)
+
+    def _second_chance(self, result, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
+        """The members to run once more, by which flow and with which tolerances.
+
+        A program that assumes a regular mass matrix gives way to one that does not. And where constraints become
+        dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇, or allow no step from
+        there. The kernel takes such steps again; where that does not help, steps of other sizes all along may.
+        """
+        if (result == SUCCESSFUL).all():
+            return np.zeros(len(result), bool), self, tolerances
+        given_up = np.isin(result, _GIVEN_UP)
+        if given_up.any() and (general := self.general()) is not None:
+            return given_up, general, tolerances
+        stuck = result == _NOT_PROJECTED
+        if self.projection is not None:
+            stuck |= result == _SHRANK
+        return stuck & (tolerances.tries > 1), self, tolerances.perturbed
+
+    def _tangent(self, directions: int) -> "Flow":
+        """The flow of q and of its derivatives along so many directions, whose δparams are numbers of it.
+
+        It has (1 + D) n coordinates and (1 + D) P parameters. A tangent that is zero by symmetry is as exact as the
+        other coordinates in its direction, not exact relative to itself: each direction is one group.
+        """
+        n, rows = self.size, 1 + directions
+        groups = self.groups + tuple(n + row for row in range(directions) for _ in range(n))
+
+        def general():
+            other = self.general()
+            return None if other is None else other.tangent(directions)
+
+        def parts():
+            return tangent_programs(self.program, self.projection, n, directions)
+
+        return Flow(parts, rows * n, rows * self.numbers, None, groups, self.base_size, general)
+
+
+def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
+    """The rows that are `chosen`, Booleans (N,), of each array; an array of one row is shared by all."""
+    return [x[chosen] if len(x) == len(chosen) else x for x in arrays]
