@@ -16,18 +16,19 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._native import _adjoint, _integrator
-from lagjax._native._integrator import (
+from lagjax._native._constants import (
     DISCONTINUOUS,
     DONE,
     EVENT,
+    MAX_ORDER,
     NOT_FINITE,
     NOT_LANDED,
     OUT_OF_STEPS,
     SINGULAR,
     STEP_TOO_SMALL,
 )
+from lagjax._native._frame import LANE
 from lagjax._native._ir import compiled
-from lagjax._native._series_code import LANE, MAX_ORDER
 from lagjax._native._threads import in_slices, together
 from lagjax._program import Program, Series, Unlowerable, series
 
@@ -95,10 +96,11 @@ class Kernel:
     ):
         self._parts = program, recurrences(program, size), projection
         integrator = _integrator.Integrator(*self._parts, guards, groups, own)
-        self.states, self.numbers, self.width = 2 * size, integrator.numbers, integrator.width
-        self._memory = integrator.memory
+        motion = integrator.motion
+        self.states, self.numbers, self.width = motion.states, motion.numbers, motion.width
+        self._memory = motion.layout.size
         # The engine holds the code that the other points to.
-        self._engine, at = compiled(integrator.module, ("begin", "run"))
+        self._engine, at = compiled(motion.module, ("begin", "run"))
         self._begin = _function(at["begin"], None, *[ctypes.c_void_p] * 3)
         self._run = _function(at["run"], ctypes.c_int64, *[ctypes.c_void_p] * 4, ctypes.c_int64)
 
@@ -174,10 +176,10 @@ class Kernel:
     def _adjoint(self):
         """The engine that holds the code, `begin`, `run`, and what a thread needs; compiled when first asked for."""
         adjoint = _adjoint.Adjoint(*self._parts)
-        engine, at = compiled(adjoint.module, ("begin", "run"))
+        engine, at = compiled(adjoint.motion.module, ("begin", "run"))
         begin = _function(at["begin"], None, *[ctypes.c_void_p] * 3)
         run = _function(at["run"], ctypes.c_int64, *[ctypes.c_void_p] * 3, ctypes.c_int64)
-        return engine, begin, run, adjoint.memory
+        return engine, begin, run, adjoint.motion.layout.size
 
     def _threads(self, members: int) -> int:
         return min(cores(), max(1, members // (4 * self.width)))

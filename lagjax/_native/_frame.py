@@ -1,0 +1,152 @@
+"""What a function of a kernel sees: the memory of its thread by name, one lane of it, and the job of all threads.
+
+A thread works on as many members as a vector has lanes. Its memory is an array of vectors, one element a lane; a
+`Layout` gives each of them a name. A `Frame` is a function of the kernel under construction, which reads and writes
+these like dictionaries:
+
+    frame["h"] = 0.5 * frame["h"]               the steps of all lanes, a vector
+    frame["y", i, k]                            coefficient k of component i of the state
+    lane["steps"] + 1.0                         one lane's count of steps, a double; `lane` = frame.lane(j)
+    lane["member"]                              which member it carries, an integer
+    frame.job("order"), frame.read("ts", i)     a field of the job, and an element of an array it points to
+
+Every function takes three pointers, to the job, the memory and the integers of the lanes, and then what it is called
+with.
+"""
+
+import ctypes
+from collections.abc import Mapping
+
+from llvmlite import ir
+
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
+
+Index = int | Value
+# Integers of a lane: which member it carries (-1: none), which output comes next, and which step.
+LANE = ("member", "output", "step")
+_KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
+
+
+def job(name: str, pointers: tuple[str, ...], integers: tuple[str, ...], doubles: tuple[str, ...] = ()) -> type:
+    """The structure of what all threads work on: eight bytes for each field."""
+    fields = [
+        *((field, ctypes.c_void_p) for field in pointers),
+        *((field, ctypes.c_int64) for field in integers),
+        *((field, ctypes.c_double) for field in doubles),
+    ]
+    return type(name, (ctypes.Structure,), {"_fields_": fields})
+
+
+class Layout:
+    """Where the vectors of a thread lie: `fields` gives each name a number of vectors, or rows and columns of them.
+
+    `size` is the memory that a thread needs, in doubles; `width` the lanes of a vector.
+    """
+
+    def __init__(self, width: int, fields: Mapping[str, int | tuple[int, int]]):
+        self.width, self._columns, self._offsets = width, {}, {}
+        total = 0
+        for name, shape in fields.items():
+            rows, self._columns[name] = shape if isinstance(shape, tuple) else (shape, 1)
+            self._offsets[name] = total
+            total += rows * self._columns[name]
+        self.size = total * width
+
+    def place(self, name: str, *indices: Index) -> Index:
+        """The first element of a vector, counted in doubles: `name`, `name[i]` or `name[i, k]`."""
+        row, column = (*indices, 0, 0)[:2]
+        columns = self._columns[name]
+        index = row if columns == 1 else column if isinstance(row, int) and row == 0 else column + row * columns
+        return (index + self._offsets[name]) * self.width
+
+
+class Frame:
+    """A function of a kernel under construction, with named access to all that it sees."""
+
+    def __init__(self, module: ir.Module, layout: Layout, job: type, name: str, *kinds: ir.Type, **options):
+        self.code = Code(module, name, [POINTER] * 3 + list(kinds), layout.width, **options)
+        self.layout, self.width, self.vector = layout, layout.width, self.code.vector
+        self._fields = dict(job._fields_)
+        self._job, self._memory, self._integers, *self.arguments = self.code.arguments
+
+    # ---- vectors, one element a lane ----
+
+    def __getitem__(self, key: "str | tuple") -> Value:
+        return self.code.load(self.address(*_parts(key)), self.vector)
+
+    def __setitem__(self, key: "str | tuple", value: "Value | float") -> None:
+        self.code.store(self.code.lanes_of(value), self.address(*_parts(key)))
+
+    def address(self, name: str, *indices: Index) -> Value:
+        """Where a vector begins."""
+        return self.code.element(self._memory, self.layout.place(name, *indices))
+
+    def constant(self, x: float) -> Value:
+        """The same number in every lane."""
+        return self.code.lanes_of(x)
+
+    def lane(self, index: Value) -> "Lane":
+        """One lane of the memory."""
+        return Lane(self, index)
+
+    # ---- the job ----
+
+    def job(self, name: str) -> Value:
+        """A field of the job."""
+        position, kind = list(self._fields).index(name), _KINDS[self._fields[name]]
+        return self.code.load(self.code.element(self._job, position, INTEGER), kind)
+
+    def read(self, name: str, index: Index, kind: ir.Type = DOUBLE) -> Value:
+        """An element of an array that the job points to."""
+        return self.code.load(self.code.element(self.job(name), index, kind), kind)
+
+    def write(self, name: str, index: Index, value: Value) -> None:
+        """Set an element of an array that the job points to."""
+        self.code.store(value, self.code.element(self.job(name), index))
+
+    def next_member(self) -> Value:
+        """The number of the next member that no thread has taken; from `members` on, none is left."""
+        counter = self.job("next_member")
+        return Value(self.code, self.code.builder.atomic_rmw("add", counter.it, ir.Constant(INTEGER, 1), "monotonic"))
+
+    def time(self, member: Value, index: Index) -> Value:
+        """An output time of a member."""
+        return self.read("ts", member * self.job("ts_stride") + index)
+
+    # ---- functions ----
+
+    def call(self, function: Code, *arguments: Value) -> None:
+        """Another function of the kernel, on the same job, memory and lanes."""
+        self.code.call(function, self._job, self._memory, self._integers, *arguments)
+
+    def finish(self, result: Value | None = None) -> Code:
+        """End the function."""
+        return self.code.finish(result)
+
+
+class Lane:
+    """One lane of a frame: doubles of its memory, and its integers."""
+
+    def __init__(self, frame: Frame, index: Value):
+        self._frame, self._index = frame, index
+
+    def __getitem__(self, key: "str | tuple") -> Value:
+        name, *indices = _parts(key)
+        kind = INTEGER if name in LANE else DOUBLE
+        return self._frame.code.load(self.address(name, *indices), kind)
+
+    def __setitem__(self, key: "str | tuple", value: "Value | float") -> None:
+        name, *indices = _parts(key)
+        value = self._frame.code.as_value(value, INTEGER if name in LANE else DOUBLE)
+        self._frame.code.store(value, self.address(name, *indices))
+
+    def address(self, name: str, *indices: Index) -> Value:
+        """Where a number of the lane lies."""
+        frame = self._frame
+        if name in LANE:
+            return frame.code.element(frame._integers, self._index + LANE.index(name) * frame.width, INTEGER)
+        return frame.code.element(frame._memory, self._index + frame.layout.place(name, *indices))
+
+
+def _parts(key: "str | tuple") -> tuple:
+    return key if isinstance(key, tuple) else (key,)

@@ -1,0 +1,97 @@
+"""What a run writes down: the states at the output times, the steps for a transpose, and how each member ended."""
+
+from lagjax._native._constants import DONE
+from lagjax._native._frame import Frame, Index, Lane
+from lagjax._native._ir import DOUBLE, INTEGER, Value
+from lagjax._native._projection import Projector
+from lagjax._native._series import Motion
+
+
+class Output:
+    """Writes into the arrays of the job."""
+
+    def __init__(self, motion: Motion, projector: Projector | None):
+        self.motion, self.projector = motion, projector
+
+    @staticmethod
+    def fields(n: int) -> dict:
+        """What a thread remembers for it: the state at an output time, whether a lane has one, and times.
+
+        `due` and `reached` are times in the direction of time: that of the next output, and the end of the step.
+        """
+        return {"between": 2 * n, **dict.fromkeys(("due", "reached", "is_due"), 1)}
+
+    # ---- states at output times ----
+
+    def place(self, frame: Frame, member: Value, time_index: Index, i: int) -> Value:
+        """Where in `path` component i of the state at an output time belongs."""
+        return (member * frame.job("times") + time_index) * self.motion.states + i
+
+    def await_next(self, frame: Frame, lane: Lane, index: Value) -> None:
+        """`due` is the next output time before the end, in the direction of time; infinite after the last one."""
+        code = frame.code
+        lane["output"] = index
+        inside = index < frame.job("times") - 1
+        time = frame.time(lane["member"], code.select(inside, index, 0)) * lane["forward"]
+        lane["due"] = code.select(inside, time, float("inf"))
+
+    def write_due(self, frame: Frame, order: Value, after: Value) -> None:
+        """The states at the output times before `after`, the end of the step, one of every lane at a time."""
+        code, moving = frame.code, frame.code.compare("!=", frame["h"], 0.0)
+        forward, t, low = frame["forward"], frame["t"], frame["t_low"]
+        frame["reached"] = after * forward
+
+        def due():
+            return moving & (frame["due"] <= frame["reached"])
+
+        with code.repeat_while(lambda: code.any_lane(due())):
+            there = due()
+            s = code.select(there, (frame["due"] * forward - t) - low, 0.0)
+            for i, value in enumerate(self._states(frame, order, s)):
+                frame["between", i] = value
+            frame["is_due"] = code.select(there, frame.constant(1.0), 0.0)
+            with code.loop(self.motion.width) as j:
+                lane = frame.lane(j)
+                with code.only_if(lane["is_due"] > 0.0):
+                    member, index = lane["member"], lane["output"]
+                    for i in range(self.motion.states):
+                        frame.write("path", self.place(frame, member, index, i), lane["between", i])
+                    self.await_next(frame, lane, index + 1)
+
+    def _states(self, frame: Frame, order: Value, s: Value) -> list[Value]:
+        """The state a time s after the present one: that of the series, on the constraints if that is near."""
+        increments, _ = self.motion.increments(frame, order, s)
+        values = [frame["y", i] + (dy + frame["low", i]) for i, dy in enumerate(increments)]
+        if self.projector is None:
+            return values
+        projected, off = self.projector.projected(frame, values, increments, s)
+        return [frame.code.select(off <= 1.0, on, value) for on, value in zip(projected, values, strict=True)]
+
+    # ---- steps, for their transposes ----
+
+    def record(self, frame: Frame, lane: Lane) -> None:
+        """Time, size and first state of the step, where a member has room for it."""
+        code, member = frame.code, lane["member"]
+        with code.only_if((member >= 0) & code.compare("!=", lane["h"], 0.0)):
+            steps = code.as_integer(lane["steps"])
+            first, after = (frame.read("first_step", member + k, INTEGER) for k in range(2))
+            with code.only_if(first + steps < after):
+                places = [lane.address(name) for name in ("t", "h")]
+                places += [lane.address("y", i) for i in range(self.motion.states)]
+                for k, place in enumerate(places):
+                    frame.write("record", (first + steps) * len(places) + k, code.load(place, DOUBLE))
+
+    # ---- the end of a member ----
+
+    def write_end(self, frame: Frame, lane: Lane) -> None:
+        """Where a member has ended, how, and after how many steps."""
+        code, member = frame.code, lane["member"]
+        frame.write("t_end", member, lane["t"])
+        for name in ("code", "steps", "rejected"):
+            frame.write(name, member, lane[name])
+        done = code.compare("==", lane["code"], float(DONE))
+        for i in range(self.motion.states):
+            x = lane["y", i]
+            frame.write("y_end", member * self.motion.states + i, x)
+            with code.only_if(done):
+                frame.write("path", self.place(frame, member, frame.job("times") - 1, i), x)

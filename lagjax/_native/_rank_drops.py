@@ -1,0 +1,62 @@
+"""Steps next to a configuration where constraints become dependent.
+
+Rounding allows no step there that is longer than the way to that configuration, so that steps become ever shorter and
+none gets through. The last long one is then taken once more, a little shorter.
+"""
+
+from collections.abc import Iterator
+
+from lagjax._native._constants import MOST_RETURNS, RETAKEN, RUNNING, SHORTER
+from lagjax._native._frame import Frame
+from lagjax._native._ir import Value
+
+
+def fields(n: int, guards: int) -> dict:
+    """What a thread remembers: the beginning of the last long step, its size, and the returns to it."""
+    before = {"y_before": 2 * n, "low_before": 2 * n, "side_before": guards}
+    return before | dict.fromkeys(("t_before", "t_low_before", "steps_before", "h_before", "returns", "returned"), 1)
+
+
+AT_FIRST_ZERO = ("h_before", "returns", "returned")  # for every new member
+
+
+def return_or_remember(frame: Frame, states: int, guards: int) -> None:
+    """Back to where the last long step began, if steps have become too short since; or remember this beginning."""
+    code = frame.code
+    size, long = (code.intrinsic("fabs", frame[name]) for name in ("h", "h_before"))
+    returns, steps = frame["returns"], frame["steps"]
+    active, last, returned = (frame[name] > 0.0 for name in ("active", "last", "returned"))
+    back = (size < SHORTER * long) & active & ~last & (returns < float(MOST_RETURNS))
+    forth = (size > 0.0) & ~back
+    away = code.intrinsic("fabs", frame["t"] - frame["t_before"])
+    new = forth & ~returned & ((size >= 0.5 * long) | (away > 2.0 * long))
+    undone = steps - frame["steps_before"]
+    frame["h_before"] = code.select(new, size, long)
+    frame["returns"] = code.select(back, returns + 1.0, code.select(new, 0.0, returns))
+    frame["returned"] = code.select(back, frame.constant(1.0), 0.0)
+    frame["rejected"] = frame["rejected"] + code.select(back, undone + 1.0, 0.0)
+    frame["code"] = code.select(back, float(RUNNING), frame["code"])
+    frame["h"] = code.select(back, 0.0, frame["h"])
+    for now, then in _beginnings(frame, states, guards):
+        here, there = code.load(now, frame.vector), code.load(then, frame.vector)
+        code.store(code.select(back, there, here), now)
+        code.store(code.select(new, here, there), then)
+
+
+def _beginnings(frame: Frame, states: int, guards: int) -> Iterator[tuple[Value, Value]]:
+    """The addresses of what a step begins with, and of what the last long one began with."""
+    for i in range(states):
+        yield frame.address("y", i), frame.address("y_before", i)
+    for name, count in {"low": states, "side": guards, **dict.fromkeys(("t", "t_low", "steps"), 1)}.items():
+        for i in range(count):
+            yield frame.address(name, i), frame.address(name + "_before", i)
+
+
+def shorten(frame: Frame) -> None:
+    """In the lanes that have just returned: the size of the next step, at most."""
+    code, returned = frame.code, frame["returned"] > 0.0
+    size, returns = frame["h_before"], frame["returns"]
+    for k in range(1, MOST_RETURNS + 1):
+        size = code.select(returns >= float(k), RETAKEN * size, size)
+    for name in ("h", "longest"):
+        frame[name] = code.select(returned, size, frame[name])

@@ -1,0 +1,234 @@
+"""Step control: how long a step may be, whether its series keeps what it promises, and the step itself.
+
+With the scaled norm ‖c‖ = max |cᵢ| / (atol + rtol·sᵢ), sᵢ the size of component i over the step,
+
+    h = 0.9 min(‖yₚ‖^(−1/p), ‖yₚ₋₁‖^(−1/(p−1)))
+
+makes the last terms of the series as small as the tolerance. Source: Jorba & Zou, Exp. Math. 14 (2005) §3.2. The check
+is ours: the scaled defect of the polynomial P, d = P″ − q̈(P, P′) at the middle and at the end of the step, must obey
+h ‖d‖ / (p+1) ≤ 1. It costs two accelerations, and sees what no coefficient shows: a border of a piecewise function, a
+narrow feature ahead.
+"""
+
+import functools
+
+from lagjax._native._constants import (
+    CHECKS,
+    EPS,
+    GROWTH,
+    GROWTH_AFTER_REJECTION,
+    LARGEST_UNIT,
+    NOT_FINITE,
+    NOT_LANDED,
+    PLACES,
+    ROUND_OFF,
+    RUNNING,
+    SAFETY,
+    SINGULAR,
+    STEP_TOO_SMALL,
+)
+from lagjax._native._frame import Frame
+from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
+from lagjax._native._projection import Projector, end_of_step
+from lagjax._native._series import Motion, double, integer
+
+
+class StepControl:
+    """The steps of a motion. Coordinates of one of the `error_groups` are measured by the largest of them."""
+
+    def __init__(self, motion: Motion, error_groups: tuple[int, ...], projector: Projector | None):
+        self.motion, self.error_groups, self.projector = motion, error_groups, projector
+        self.defect = self._defect()
+
+    @staticmethod
+    def fields(n: int) -> dict:
+        """What a thread remembers for it; `active`, `last` and `singular` are 1 or 0."""
+        return {
+            "low": 2 * n,  # what rounding took from the state
+            "scale": 2 * n,  # 1 / (atol + rtol·size)
+            "increment": 2 * n,  # P(h) − y
+            **dict.fromkeys(("t_low", "t_end", "forward", "smallest", "longest", "growth", "last"), 1),
+            **dict.fromkeys(("defect", "series_defect", "code", "steps", "rejected"), 1),
+        }
+
+    # ---- the size of a step ----
+
+    def choose(self, frame: Frame, order: Value) -> None:
+        """The step of every lane, into `h`: 0, and a code, where it cannot go on."""
+        code = frame.code
+        last, before = self._errors(frame, order)
+        p = code.as_double(order)
+        a, b = _power(code, last, -1.0 / p), _power(code, before, -1.0 / (p - 1.0))
+        size, longest = SAFETY * code.select(a < b, a, b), frame["longest"]
+        size = code.select(size < longest, size, longest)
+        frame["growth"] = GROWTH
+        forward, end = frame["forward"], frame["t_end"]
+        left = ((end - frame["t"]) - frame["t_low"]) * forward
+        is_last = size >= left
+        step = code.select(is_last, left, size)
+        active, singular = frame["active"] > 0.0, frame["singular"] > 0.0
+        sound = (last < float("inf")) & (before < float("inf")) & ~singular
+        small = ~is_last & (step < frame["smallest"])
+        going = active & sound & ~small
+        ending = code.select(small, frame.constant(STEP_TOO_SMALL), float(RUNNING))
+        frame["code"] = code.select(sound, ending, code.select(singular, frame.constant(SINGULAR), float(NOT_FINITE)))
+        frame["h"] = code.select(going, step * forward, 0.0)
+        frame["last"] = code.select(going & is_last, frame.constant(1), 0.0)
+
+    def _errors(self, frame: Frame, order: Value) -> tuple[Value, Value]:
+        """The scaled norms of the last two coefficients; `scale` keeps 1 / (atol + rtol·size)."""
+        code = frame.code
+        rtol, atol = (code.lanes_of(frame.job(name)) for name in ("rtol", "atol"))
+        errors = [frame.constant(0.0), frame.constant(0.0)]
+        for i, size in enumerate(self._sizes(frame)):
+            rate = code.intrinsic("fabs", frame["y", i, 1])
+            scale = 1.0 / (atol + rtol * size)
+            frame["scale", i] = scale
+            for k in range(2):
+                error = code.intrinsic("fabs", frame["y", i, order - k]) * scale
+                errors[k] = code.select(error <= errors[k], errors[k], error)  # NaN goes through
+            # An infinite slope may leave no trace in the last coefficients.
+            errors[0] = code.select(rate < float("inf"), errors[0], float("nan"))
+        return errors[0], errors[1]
+
+    def _sizes(self, frame: Frame) -> list[Value]:
+        """How large every component of the state is over the step, or the largest one of its group."""
+        code, n = frame.code, self.motion.n
+        before = code.intrinsic("fabs", frame["h"])
+
+        def largest(i):
+            # A component that passes through zero is as large as it will be a step away.
+            y, rate = (code.intrinsic("fabs", frame["y", i, k]) for k in range(2))
+            if self.projector is not None and i % n < self.projector.base_size:
+                scale = frame["velocity_scale", i % n]
+                y, rate = (y, code.maximum(rate, scale)) if i < n else (code.maximum(y, scale), rate)
+            return code.maximum(y, rate * before)
+
+        halves = ([largest(i) for i in half] for half in (range(n), range(n, 2 * n)))
+        return [size for half in halves for size in self._by_group(code, half)]
+
+    def _by_group(self, code: Code, values: list[Value]) -> list[Value]:
+        """For every coordinate the largest value in its group."""
+        largest: dict[int, Value] = {}
+        for group, value in zip(self.error_groups, values, strict=True):
+            largest[group] = code.maximum(largest[group], value) if group in largest else value
+        return [largest[group] for group in self.error_groups]
+
+    # ---- whether its series holds ----
+
+    def _defect(self) -> Code:
+        """`(order, place)`: h ‖P″ − q̈(P, P′)‖ / (p+1) at that place of the step, into `defect` if larger.
+
+        The increment P − y stays in memory.
+        """
+        motion, n = self.motion, self.motion.n
+        frame = motion.function("defect", INTEGER, DOUBLE)
+        code, (order, place), h = frame.code, frame.arguments, frame["h"]
+        s = code.lanes_of(place) * h
+        increments, slopes = motion.increments(frame, order, s)
+        for i, increment in enumerate(increments):
+            frame["increment", i] = increment
+        moved = [frame["y", i] + increment for i, increment in enumerate(increments)]
+        line = motion.program.line
+        acceleration = motion.evaluate(frame, line._replace(outputs=line.outputs[:n]), moved, s)
+        noise = self._noise(frame, acceleration, increments, moved)
+        defect, weight = frame["defect"], code.intrinsic("fabs", h) / code.as_double(order + 1)
+        for i in range(n):
+            # What rounding leaves of an acceleration is not a defect of the series.
+            excess = code.intrinsic("fabs", acceleration[i] - slopes[i]) - noise[i]
+            error = weight * excess * frame["scale", n + i]
+            defect = code.select(error <= defect, defect, error)  # NaN goes through
+        frame["defect"] = defect
+        return frame.finish()
+
+    def _noise(self, frame: Frame, acceleration, increments, moved) -> list[Value]:
+        """What rounding may leave of every component of an acceleration at a place of the step."""
+        code, n = frame.code, self.motion.n
+        size = self._by_group(code, [code.intrinsic("fabs", a) for a in acceleration])
+        # Half a unit in the last place of q moves an acceleration by what it varies along the step, in proportion.
+        place = functools.reduce(code.maximum, (code.intrinsic("fabs", q) for q in moved[:n]))
+        moves = functools.reduce(code.maximum, (code.intrinsic("fabs", dq) for dq in increments[:n]))
+        unit = (PLACES * EPS) * place / moves
+        unit = code.select(unit < LARGEST_UNIT, unit, 0.0)  # what hardly moves is not what makes it vary
+        changes = (code.intrinsic("fabs", acceleration[i] - frame["y", n + i, 1]) for i in range(n))
+        return [ROUND_OFF * size[i] + unit * change for i, change in enumerate(changes)]
+
+    def halve_until_sound(self, frame: Frame, order: Value) -> None:
+        """Check the steps of all lanes, and halve those that fail, until none does."""
+        code = frame.code
+        again = code.variable(integer(code, 1))
+        with code.repeat_while(lambda: code.load(again, INTEGER) > 0):
+            code.store(integer(code, 0), again)
+            frame["defect"] = 0.0
+            for place in CHECKS:
+                frame.call(self.defect, order, double(code, place))
+            if self.projector is not None:
+                frame["series_defect"] = frame["defect"]
+                frame.call(self.projector.project)
+            bad = ~(frame["defect"] <= 1.0) & code.compare("!=", frame["h"], 0.0)
+            with code.only_if(code.any_lane(bad)):
+                code.store(integer(code, 1), again)
+                half = 0.5 * frame["h"]
+                small = bad & (code.intrinsic("fabs", half) < frame["smallest"])
+                frame["h"] = code.select(small, 0.0, code.select(bad, half, frame["h"]))
+                frame["code"] = code.select(small, self._reason(frame), frame["code"])
+                frame["rejected"] = frame["rejected"] + code.select(bad, frame.constant(1), 0.0)
+                note_halved(frame, bad)
+
+    def _reason(self, frame: Frame) -> Value:
+        """Why no step is small enough: the series, or only the way from its end to the constraints."""
+        reason = frame.constant(STEP_TOO_SMALL)
+        if self.projector is None:
+            return reason
+        return frame.code.select(frame["series_defect"] <= 1.0, frame.constant(NOT_LANDED), reason)
+
+    # ---- the step ----
+
+    def end_time(self, frame: Frame) -> tuple[Value, Value]:
+        """The time at the end of the step, and what rounding takes from it."""
+        t, low, h = frame["t"], frame["t_low"], frame["h"]
+        rough = t + h
+        part = rough - t
+        rest = low + ((t - (rough - part)) + (h - part))  # Knuth's two-sum
+        after = rough + rest
+        rest = rest - (after - rough)
+        is_last = frame["last"] > 0.0
+        return frame.code.select(is_last, frame["t_end"], after), frame.code.select(is_last, 0.0, rest)
+
+    def advance(self, frame: Frame, after: Value, rest: Value) -> None:
+        """The time and the state at the end of the step, what rounding takes carried along; and one step more."""
+        code, h = frame.code, frame["h"]
+        moving = code.compare("!=", h, 0.0)
+        frame["t"] = code.select(moving, after, frame["t"])
+        frame["t_low"] = code.select(moving, rest, frame["t_low"])
+        frame["longest"] = code.intrinsic("fabs", h) * frame["growth"]
+        for i in range(self.motion.states):
+            total, rest = end_of_step(frame, i)
+            if self.projector is not None:
+                total = frame["projected", i]
+            y, low = frame["y", i], frame["low", i]
+            frame["y", i] = code.select(moving, total, y)
+            frame["low", i] = code.select(moving, rest, low)
+        frame["steps"] = frame["steps"] + code.select(moving, frame.constant(1), 0.0)
+
+
+def note_halved(frame: Frame, where: Value) -> None:
+    """In some lanes the step has become shorter: it is not the last one any more, and the next grows less."""
+    frame["last"] = frame.code.select(where, 0.0, frame["last"])
+    frame["growth"] = frame.code.select(where, GROWTH_AFTER_REJECTION, frame["growth"])
+
+
+def _power(code: Code, x: Value, exponent: Value) -> Value:
+    """x**exponent to one per cent, for 0 < −exponent < 1/4, which is all that the size of a step needs.
+
+    The bits of a double, read as an integer, are nearly its logarithm; the parabolas mend the fractional part.
+    """
+    unit = float(2**52)
+    bits = code.as_double(code.bits(x)) / unit - 1023.0
+    whole = code.intrinsic("floor", bits)
+    part = bits - whole
+    log2 = whole + part * (1.34 - 0.34 * part)
+    target = code.lanes_of(exponent) * log2
+    whole = code.intrinsic("floor", target)
+    part = target - whole
+    return code.from_bits((whole + part * (0.66 + 0.34 * part) + 1023.0) * unit)
