@@ -50,6 +50,58 @@ def test_imports_point_up_the_street():
             assert STREET.index(there) < STREET.index(here), f"{path} imports {there} from below"
 
 
+JAX = {"jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax"}
+ALONE = """
+import importlib.abc, sys, types
+
+class Refused(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        assert name.split(".")[0] not in JAX, name
+
+JAX, package = @JAX@, "@PACKAGE@"
+sys.meta_path.insert(0, Refused())
+for name in ("lagjax", "lagjax._program"):  # without what their own first lines import
+    sys.modules[name] = types.ModuleType(name)
+    sys.modules[name].__path__ = [package + name.removeprefix("lagjax").replace(".", "/")]
+
+import numpy as np
+from lagjax import _native
+from lagjax._program._series import StraightLine
+
+nodes = (("input", (), 0), ("input", (), 3), ("mul", (1, 0), None), ("neg", (2,), None), ("constant", (), False))
+line = StraightLine(nodes, ("float", "float", "float", "float", "bool"), (3, 4))  # q" = -k q
+program = type("Program", (), dict(line=line, size=4, dtypes=[np.dtype(float)] * 4, linear=None, budget=100))()
+kernel, ts = _native.Kernel(program, 1), np.linspace(0.0, 3.0, 7)[None]
+done = kernel(ts, [[1.0, 0.0]], [[1.0]], 1e-12, 1e-15, 100, np.array([100]))
+np.testing.assert_allclose(done.path[0, :, 0], np.cos(ts[0]), atol=1e-11)
+bars = np.zeros((1, 7, 2)), np.array([[1.0, 0.0]])
+start, numbers = kernel.pull(ts, [[1.0]], done.table, [0], done.steps, *bars, _native.order_for(1e-12))
+np.testing.assert_allclose(start, [[np.cos(3.0), np.sin(3.0)]], atol=1e-11)
+np.testing.assert_allclose(numbers, [[-1.5 * np.sin(3.0)]], atol=1e-11)  # of cos(sqrt(k) t)
+"""
+
+
+def test_machine_code_stands_alone():
+    # Files that it is built on, and their own; the packages' first lines are for those who have JAX.
+    queue, seen = [path for path in (PACKAGE / "_native").glob("*.py")], set()
+    while queue:
+        path = queue.pop()
+        if path in seen:
+            continue
+        seen.add(path)
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            assert not JAX & {name.split(".")[0] for name in names}, path
+            files = {PACKAGE.parent / (name.replace(".", "/") + ".py") for name in names}
+            queue += [file for file in files if file.exists() and PACKAGE in file.parents]
+    assert PACKAGE / "_program" / "_operations.py" in seen
+    # And it runs so, forward and back.
+    code = ALONE.replace("@JAX@", repr(JAX)).replace("@PACKAGE@", str(PACKAGE))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_only_one_module_integrates():
     for path in PACKAGE.rglob("*.py"):
         called = {ast.unparse(n.func) for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)}

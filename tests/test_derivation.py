@@ -13,7 +13,7 @@ from lagjax._check import _measure as of_check
 from lagjax._derivation import columns_of, derivation_of, numbers_of
 from lagjax._health import _measure as of_health
 from lagjax._layout import Layout
-from lagjax._program import OPERATIONS, lower
+from lagjax._program import OPERATIONS, evaluate, lower, pullback
 from lagjax._program._evaluate import CHUNK
 
 # ---- evaluation in NumPy ---------------------------------------------------------------------------------------------
@@ -52,6 +52,9 @@ def test_every_operation_for_many_states_at_once_and_its_transpose():
     pulled = program.pull_back_many(x, weights)
     exact = jax.jit(jax.vmap(jax.grad(lambda x, y: weights @ everything(x, y), argnums=(0, 1))))(*x)
     np.testing.assert_allclose(pulled, exact, rtol=1e-12, atol=1e-13)
+    # As a straight line of its own.
+    transposed = pullback(program.line, program.dtypes, [0, 1], range(len(weights)))
+    np.testing.assert_allclose(evaluate(transposed, [*x, *weights]), exact, rtol=1e-12, atol=1e-13)
     # Of many outputs at one state: cotangents side by side.
     rows = program.pull_back_many(x[:, 3], np.eye(len(weights)))
     np.testing.assert_allclose(np.stack(rows) @ weights, [column[3] for column in pulled], rtol=1e-12, atol=1e-13)

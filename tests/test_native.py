@@ -16,7 +16,7 @@ from sweeps import sweep
 
 import lagjax
 from lagjax import _native
-from lagjax._native import _ir, _lanes
+from lagjax._native import _ir, _kernel, _lanes
 from lagjax._program import OPERATIONS, Unlowerable, lower
 
 EPS = 2.0**-52
@@ -50,7 +50,7 @@ def lanewise(body, *columns):
     padded = np.zeros((len(columns), -(-count // WIDTH) * WIDTH))
     padded[:, :count] = columns
     found = np.empty((len(out), padded.shape[1]))
-    x, y = _native._aligned(len(columns) * WIDTH), _native._aligned(len(out) * WIDTH)
+    x, y = _kernel.aligned(len(columns) * WIDTH), _kernel.aligned(len(out) * WIDTH)
     for k in range(0, padded.shape[1], WIDTH):
         x[: len(columns) * WIDTH] = padded[:, k : k + WIDTH].ravel()
         function(x.ctypes.data, y.ctypes.data)
@@ -356,7 +356,7 @@ def test_threads_and_order_change_nothing(monkeypatch, threads):
     y0 = crowd(301)
     expected = run("pendulum", TS, y0[:40], rtol=1e-9)
     order = np.random.default_rng(3).permutation(301)
-    monkeypatch.setattr(_native, "cores", lambda: threads)
+    monkeypatch.setattr(_kernel, "cores", lambda: threads)
     outcome = run("pendulum", TS, y0[order], rtol=1e-9)
     assert_done(outcome)
     np.testing.assert_array_equal(outcome.path[np.argsort(order)][:40], expected.path)

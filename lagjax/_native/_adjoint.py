@@ -21,10 +21,11 @@ from lagjax._native._frame import Frame, Index, Lane, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import emit
 from lagjax._native._series import Motion, double
-from lagjax._program import Program, Series, pullback
+from lagjax._program._series import Recurrent, Series
+from lagjax._program._transpose import pullback
 
 # `y_bar` is the cotangent of the end, and becomes that of the start.
-Job = job(
+JOB = job(
     "AdjointJob",
     ("next_member", "ts", "params", "record", "first_step", "steps", "path_bar", "y_bar", "params_bar"),
     ("ts_stride", "params_stride", "members", "times", "order"),
@@ -34,7 +35,9 @@ Job = job(
 class Adjoint:
     """Builds the module; its public functions are `begin(job, memory, lanes)` and `run(job, memory, lanes, rounds)`."""
 
-    def __init__(self, program: Program, series: Series, projection=None):
+    job = JOB
+
+    def __init__(self, program: Recurrent, series: Series, projection=None):
         n, states = series.size, 2 * series.size
         fields = {
             "bar": states,  # the cotangent of the state
@@ -44,9 +47,9 @@ class Adjoint:
             "params_bar": program.size - states - 1,
             "active": 1,
         }
-        self.motion = Motion("adjoint", program, series, Job, fields, keep_sums=True)
+        self.motion = Motion("adjoint", program, series, JOB, fields, keep_sums=True)
         self.n, self.states, self.series = n, states, series
-        dtypes = [shape.dtype for shape in program.shapes for _ in range(shape.size)]
+        dtypes = program.dtypes
         self.varied = [i for i, dtype in enumerate(dtypes) if dtype.kind == "f" and i != states]  # all but the time
         self.start_line, self.sweep_line = self._transposed(dtypes)
         self.start_next = self._start_next()

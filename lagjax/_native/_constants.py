@@ -4,14 +4,14 @@ EPS = 2.0**-52
 
 # ---- how a member ended ----------------------------------------------------------------------------------------------
 
-DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, NOT_LANDED, DISCONTINUOUS, EVENT = range(8)
+DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, PROJECTION_FAILED, DISCONTINUOUS, EVENT = range(8)
 # The kernel itself does not give `DISCONTINUOUS`: `_stopped` finds it about the state where it stopped.
 # EVENT + Σ 4ᵏ (1 where guard k falls, 2 where it rises), over those that do so at that instant.
 RUNNING = -1
 
 # ---- series ----------------------------------------------------------------------------------------------------------
 
-MAX_ORDER = 20
+LEAST_ORDER, MAX_ORDER = 7, 20
 
 # ---- step control ----------------------------------------------------------------------------------------------------
 
@@ -36,7 +36,7 @@ GUARD_NOISE, LITTLE = 64 * EPS, 1e-4  # rounding; of the step
 
 # ---- constraints -----------------------------------------------------------------------------------------------------
 
-LANDING = 16.0  # tolerances from the end of a series to the constraints, at most
+PROJECTION_TOLERANCES = 16.0  # tolerances from the end of a series to the constraints, at most
 START = 1e-5  # of the size of the state, the same for the first step
 # Next to where constraints become dependent, rounding allows no step longer than the way there: steps become ever
 # shorter, and none gets through. When they have become `SHORTER` by so much the last long one is taken once more, by a

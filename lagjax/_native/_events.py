@@ -28,7 +28,7 @@ from lagjax._native._frame import Frame
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._series import Motion, double, integer
 from lagjax._native._step import StepControl, note_halved
-from lagjax._program import StraightLine
+from lagjax._program._series import StraightLine
 
 
 class _Change(NamedTuple):

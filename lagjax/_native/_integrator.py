@@ -23,9 +23,9 @@ from lagjax._native._output import Output
 from lagjax._native._projection import Projector
 from lagjax._native._series import Motion, double, integer
 from lagjax._native._step import StepControl
-from lagjax._program import Program, Series
+from lagjax._program._series import Recurrent, Series
 
-Job = job(
+JOB = job(
     "Job",
     ("next_member", "ts", "y0", "params", "path", "y_end", "t_end", "code", "steps", "rejected", "record",
      "first_step"),
@@ -42,9 +42,11 @@ class Integrator:
     the motion, the others derivatives of it, which follow where the projection takes it.
     """
 
+    job = JOB
+
     def __init__(
         self,
-        program: Program,
+        program: Recurrent,
         series: Series,
         projection=None,
         guards=None,
@@ -57,8 +59,10 @@ class Integrator:
         fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards) | {"active": 1}
         if projection is not None:
             fields |= Projector.fields(n, self.base_size) | _rank_drops.fields(n, self.guards)
-        self.motion = motion = Motion("motion", program, series, Job, fields)
-        self.projector = None if projection is None else Projector(motion, *projection, self.base_size)
+        self.motion = motion = Motion("motion", program, series, JOB, fields)
+        self.projector = projection and Projector(
+            motion, projection.state, projection.velocity_scale, self.base_size
+        )  # fmt: skip
         self.step = StepControl(motion, tuple(range(n)) if error_groups is None else error_groups, self.projector)
         self.events = guards and Events(motion, self.step, guards.program.line, guards.directions)
         self.output = Output(motion, self.projector)

@@ -14,9 +14,10 @@ import ctypes
 import ctypes.util
 import functools
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import llvmlite.binding as llvm
 from llvmlite import ir
@@ -94,10 +95,10 @@ def compiled(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.Execut
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """What an instruction yields."""
+    """What an instruction yields; `it` is llvmlite's value, which has no annotations that hold."""
 
     code: "Code"
-    it: ir.Value
+    it: Any
 
     def __add__(self, other):
         return self.code.arithmetic("add", self, other)
@@ -151,14 +152,16 @@ class Value:
 class Code:
     """The body of one function, growing at its end."""
 
-    def __init__(self, module: ir.Module, name: str, arguments: list[ir.Type], lanes: int, result=None, public=False):
+    def __init__(
+        self, module: ir.Module, name: str, arguments: Sequence[ir.Type], lanes: int, result=None, public=False
+    ):
         self.lanes, self.vector = lanes, ir.VectorType(DOUBLE, lanes)
         self.module = module
         function = ir.Function(module, ir.FunctionType(result or ir.VoidType(), arguments), name)
         if not public:
             function.linkage = "internal"
         self.function = function
-        self.builder = ir.IRBuilder(function.append_basic_block("entry"))
+        self.builder: Any = ir.IRBuilder(function.append_basic_block("entry"))
         self.arguments = [Value(self, argument) for argument in function.args]
 
     # ---- numbers ----
@@ -327,8 +330,5 @@ class Code:
 
     def any_lane(self, bits: Value) -> Value:
         """Whether the bit is set in any lane."""
-        found = None
-        for lane in range(self.lanes):
-            bit = Value(self, self.builder.extract_element(bits.it, ir.Constant(INTEGER, lane)))
-            found = bit if found is None else found | bit
-        return found
+        each = (self.builder.extract_element(bits.it, ir.Constant(INTEGER, lane)) for lane in range(self.lanes))
+        return functools.reduce(Value.__or__, [Value(self, bit) for bit in each])

@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 from llvmlite import ir
 
-from lagjax import _elementary
+from lagjax._digits import COS, PI_2, PI_2_ROUNDED, SIN
 from lagjax._native._ir import BIT, Code, Value
-from lagjax._program import StraightLine, Unlowerable
+from lagjax._program._graph import Unlowerable
 from lagjax._program._operations import OPERATIONS
+from lagjax._program._series import StraightLine
 
 # Beyond this an angle is left to the C library, which knows enough digits of π.
 LARGEST_ANGLE = 2.0**20
@@ -77,8 +78,8 @@ def sincos_function(module: ir.Module, lanes: int) -> Code:
 
 def _polynomials(code: Code, x: Value) -> tuple[Value, Value]:
     # k times a part of π/2 is exact, so contraction into a fused multiply-add changes nothing.
-    first, second, third, fourth = _elementary.PI_2
-    k = code.intrinsic("rint", x * (1 / _elementary.PI_2_ROUNDED[0]))
+    first, second, third, fourth = PI_2
+    k = code.intrinsic("rint", x * (1 / PI_2_ROUNDED[0]))
     head = x - k * first
     r = head - k * second
     tail = (head - r) - k * second
@@ -86,10 +87,10 @@ def _polynomials(code: Code, x: Value) -> tuple[Value, Value]:
     head, r = r, r - k * third
     tail = tail + ((head - r) - k * third) - k * fourth
     z = r * r
-    sine = r + (r * z * _horner(z, _elementary.SIN) + tail)
+    sine = r + (r * z * _horner(z, SIN) + tail)
     half = 0.5 * z
     one_less = 1.0 - half
-    cosine = one_less + (((1.0 - one_less) - half) + (z * z * _horner(z, _elementary.COS) - r * tail))
+    cosine = one_less + (((1.0 - one_less) - half) + (z * z * _horner(z, COS) - r * tail))
     quadrant = k - 4.0 * code.intrinsic("floor", 0.25 * k)  # 0, 1, 2, 3
     odd = code.compare("==", quadrant, 1.0) | code.compare("==", quadrant, 3.0)
     s, c = code.select(odd, cosine, sine), code.select(odd, sine, cosine)

@@ -5,11 +5,11 @@ them; here it is a straight line like any other. It must not move the state much
 then the projection has failed, and the step is halved.
 """
 
-from lagjax._native._constants import LANDING, ROUND_OFF, START
+from lagjax._native._constants import PROJECTION_TOLERANCES, ROUND_OFF, START
 from lagjax._native._frame import Frame
 from lagjax._native._ir import Code, Value
 from lagjax._native._series import Motion
-from lagjax._program import Program
+from lagjax._program._series import Recurrent
 
 
 class Projector:
@@ -18,7 +18,7 @@ class Projector:
     The others are derivatives of them, which follow: how far they move says nothing about the step.
     """
 
-    def __init__(self, motion: Motion, state: Program, velocity_scale: Program, base_size: int):
+    def __init__(self, motion: Motion, state: Recurrent, velocity_scale: Recurrent, base_size: int):
         self.motion, self.base_size = motion, base_size
         self.state, self.velocity_scale = state.line, velocity_scale.line
         self.project = self._project()
@@ -31,7 +31,7 @@ class Projector:
     def projected(
         self, frame: Frame, values: list[Value], increments: list[Value], s: Value
     ) -> tuple[list[Value], Value]:
-        """The projection of a state of the series at t + s, and its distance from there in `LANDING` tolerances.
+        """The projection of a state of the series at t + s, and its distance in `PROJECTION_TOLERANCES`.
 
         The series ends within the tolerance of the constraints. If it is much farther to the state that the projection
         finds, that is not the state of this motion: near a configuration where constraints become dependent there are
@@ -43,7 +43,7 @@ class Projector:
         for i in (*range(self.base_size), *range(n, n + self.base_size)):
             far = code.intrinsic("fabs", projected[i] - values[i])
             size = code.intrinsic("fabs", projected[i]) + code.intrinsic("fabs", increments[i])
-            error = (far - ROUND_OFF * size) * frame["scale", i] * (1 / LANDING)
+            error = (far - ROUND_OFF * size) * frame["scale", i] * (1 / PROJECTION_TOLERANCES)
             # A start may be off by more, as much as is taken for consistent.
             error = code.select(first, far / (START * (1.0 + size)), error)
             off = code.select(error <= off, off, error)  # NaN goes through

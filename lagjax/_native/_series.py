@@ -9,6 +9,7 @@
 import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from llvmlite import ir
 
@@ -16,7 +17,7 @@ from lagjax._native._constants import MAX_ORDER
 from lagjax._native._frame import Frame, Index, Layout
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value, lanes
 from lagjax._native._lanes import emit, sincos_function
-from lagjax._program import Program, Series, StraightLine
+from lagjax._program._series import Recurrent, Series, StraightLine
 
 
 class Motion:
@@ -27,7 +28,7 @@ class Motion:
     sums of every order stay in memory, not only those of the last.
     """
 
-    def __init__(self, name: str, program: Program, series: Series, job: type, fields: dict, keep_sums: bool = False):
+    def __init__(self, name: str, program: Recurrent, series: Series, job: type, fields: dict, keep_sums: bool = False):
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
         self.numbers = program.size - self.states - 1  # parameters
         self.keep_sums, self.job = keep_sums, job
@@ -83,13 +84,13 @@ class Motion:
         code.builder.position_at_end(end)
         return frame.finish()
 
-    def table(self, name: str, pairs) -> Value:
+    def table(self, name: str, pairs) -> ir.GlobalVariable:
         """The rows of each product, as distances in memory from the first row."""
         flat = [row * MAX_ORDER * self.width for pair in pairs for row in pair]
         kind = ir.ArrayType(INTEGER, max(1, len(flat)))
-        table = ir.GlobalVariable(self.module, kind, name)
+        table: Any = ir.GlobalVariable(self.module, kind, name)
         table.global_constant, table.linkage = True, "internal"
-        table.initializer = ir.Constant(kind, [ir.Constant(INTEGER, x) for x in flat or [0]])  # pyright: ignore
+        table.initializer = ir.Constant(kind, [ir.Constant(INTEGER, x) for x in flat or [0]])
         return table
 
     def _row(self, frame: Frame, table, index: Value) -> Value:

@@ -19,8 +19,8 @@ from lagjax._native._constants import (
     GROWTH_AFTER_REJECTION,
     LARGEST_UNIT,
     NOT_FINITE,
-    NOT_LANDED,
     PLACES,
+    PROJECTION_FAILED,
     ROUND_OFF,
     RUNNING,
     SAFETY,
@@ -180,7 +180,7 @@ class StepControl:
         reason = frame.constant(STEP_TOO_SMALL)
         if self.projector is None:
             return reason
-        return frame.code.select(frame["series_defect"] <= 1.0, frame.constant(NOT_LANDED), reason)
+        return frame.code.select(frame["series_defect"] <= 1.0, frame.constant(PROJECTION_FAILED), reason)
 
     # ---- the step ----
 

@@ -39,9 +39,10 @@ from lagjax._program._emit import emit, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, pull_back, round_off, steps_of
 from lagjax._program._graph import Node, Unlowerable
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._passes import finish, live, regroup, with_given
+from lagjax._program._passes import finish, live, regroup
 from lagjax._program._rules import Expansion, kind_of
 from lagjax._program._series import Series, StraightLine, series
+from lagjax._program._transpose import pullback
 
 __all__ = [
     "OPERATIONS",
@@ -58,8 +59,6 @@ __all__ = [
     "pullback",
     "series",
 ]
-
-_TRANSPOSED = 100  # operations that one may become when it is differentiated
 
 
 def lower(function: Callable, *examples, budget: int = 20_000) -> "Program":
@@ -122,30 +121,6 @@ def lower_solution(system: Callable, solve: Callable, size: int, *examples, budg
     )
 
 
-def pullback(line: StraightLine, dtypes, by, of, known=()) -> StraightLine:
-    """The transposed derivative: from the inputs and the cotangents of the outputs `of` to those of the inputs `by`.
-
-    The outputs `known` are inputs too, after all others: what they are is not computed once more.
-    """
-
-    def pulled(*scalars):
-        inputs, bars = scalars[: len(dtypes)], scalars[len(dtypes) :]
-
-        def moving(*some):
-            given = dict(zip(by, some, strict=True))
-            results = emit(*line, tuple(given.get(i, x) for i, x in enumerate(inputs)))
-            return tuple(results[i] for i in of), tuple(results[i] for i in known)
-
-        _, pull, values = jax.vjp(moving, *(inputs[i] for i in by), has_aux=True)
-        return pull(bars), values
-
-    shapes = [jax.ShapeDtypeStruct((), dtype) for dtype in (*dtypes, *[jnp.result_type(float)] * len(of))]
-    program = lower(pulled, *shapes, budget=_TRANSPOSED * len(line.nodes) + 1000)
-    results, values = program.outputs[: len(by)], program.outputs[len(by) :]
-    given = {node: len(shapes) + k for k, node in enumerate(values) if program.nodes[node][1]}
-    return StraightLine(*with_given(program.nodes, program.kinds, results, given))
-
-
 class LinearSystem(NamedTuple):
     """A z = r, of which the outputs of a program are the solution: nodes of that program, made by `lower_solution`.
 
@@ -200,6 +175,11 @@ class Program:
     def size(self) -> int:
         """How many scalars it takes."""
         return sum(shape.size for shape in self.shapes)
+
+    @property
+    def dtypes(self) -> tuple[np.dtype, ...]:
+        """The type of every scalar it takes."""
+        return tuple(shape.dtype for shape in self.shapes for _ in range(shape.size))
 
     def evaluate(self, *numbers) -> tuple:
         """The outputs at these numbers, or arrays of numbers, operation by operation in NumPy: nothing is compiled."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lagjax._program._operations import OPERATIONS
+from lagjax._program._operations import OPERATIONS, in_numpy
 
 # States looked at together. A value of 2048 states has 16 KB, so that some tens of live values stay in a core's second
 # cache, and the microsecond that NumPy takes to begin an operation is no more than what the operation takes itself.
@@ -107,9 +107,9 @@ def round_off(line, columns: Sequence) -> np.ndarray:
         for (op, operands, _), kind, value in zip(nodes, kinds, values, strict=True):
             exact = not operands or OPERATIONS[op].exact
             error = 0.0 if kind != "float" or exact else eps * np.abs(value)
-            for i, partial in zip(operands, _derivatives(op), strict=False):
+            for i, partial in zip(operands, _transpose(op), strict=False):
                 if partial is not None and kind == "float" and np.any(errors[i]):
-                    moved = np.abs(partial(errors[i], value, *(values[j] for j in operands)))
+                    moved = np.abs(partial(in_numpy, float, errors[i], value, *(values[j] for j in operands)))
                     error = error + np.where(errors[i] == 0, 0.0, moved)
             errors.append(error)
     return np.stack([np.broadcast_to(errors[i], count) for i in outputs])
@@ -138,15 +138,15 @@ def pull_back(line, columns: Sequence, cotangents: Sequence) -> list:
                 continue
             if op == "input":
                 inputs[attribute] = bars[k]
-            for i, partial in zip(operands, _derivatives(op), strict=False):
+            for i, partial in zip(operands, _transpose(op), strict=False):
                 if partial is not None and kinds[i] == "float" and nodes[i][0] != "constant":
-                    _flow(bars, kinds, i, partial(bars[k], values[k], *(values[j] for j in operands)))
+                    _flow(bars, kinds, i, partial(in_numpy, float, bars[k], values[k], *(values[j] for j in operands)))
             bars[k] = None
     return inputs
 
 
-def _derivatives(op: str) -> tuple:
-    return () if op in ("input", "constant") else OPERATIONS[op].derivatives()
+def _transpose(op: str) -> tuple:
+    return () if op in ("input", "constant") else OPERATIONS[op].transpose()
 
 
 def _flow(bars: list, kinds, i: int, bar) -> None:

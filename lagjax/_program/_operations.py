@@ -2,7 +2,8 @@
 
     who asks                          what it reads of a row
     graph of a program                `value` on constants, `simplify`, `commutative`, `is_logical`
-    evaluation in NumPy               `value`; `exact` and the derivatives, for round-off and the transposed derivative
+    evaluation in NumPy               `value`; `exact` and `transpose`, for round-off and the transposed derivative
+    transposed program                `transpose`: `cotangents`, or else `slopes`
     JAX again                         `lax`
     Taylor series                     `recurrence`, or else `slopes`; `is_step`
     machine code                      `llvm`
@@ -13,7 +14,7 @@ row needs nothing else to be lowered. `_rules` lowers the primitives that comput
 
 Formulas about an operation are written once for all of these, in the terms of whoever evaluates them: `f(op, *xs)`
 applies an operation, `c(x)` makes a number, `w` is the result and `u`, `v` (or `y`, `x`) are the operands. A slope of
-`tan` is `f("add", c(1.0), f("mul", w, w))`: nodes of a graph in the Taylor series, arrays in NumPy.
+`tan` is `f("add", c(1.0), f("mul", w, w))`: nodes of a graph in a Taylor series and in a transpose, arrays in NumPy.
 
 Two operations carry an attribute: `round` (1: ties to even, 0: away from zero) and `convert` (the kind of the result).
 `convert` has no code here because it depends on both kinds. Sine and cosine of one angle are computed together by
@@ -48,8 +49,8 @@ class Operation:
     - `slopes`: ∂w/∂u for every operand, each as `slope(f, c, w, *operands)`.
     - `steep`: a slope may be infinite, or 0/0, where the result is finite.
     - `recurrence`: the order recursion (see `_recurrences`), where it is not to follow from `slopes`.
-    - `cotangents`: for every operand `(ḡ, w, *operands)` → the cotangent of that operand, in NumPy, where it is not to
-      be ḡ times the slope; None for an operand without one.
+    - `cotangents`: for every operand `(f, c, g, w, *operands)` → its cotangent, from the cotangent g of the result,
+      where that is not to be g times the slope; None for an operand without one.
     - `side(f, c, w, *operands)`: on which side of a border between two pieces the operands are, for an operation that
       has kinks or jumps.
     """
@@ -70,11 +71,13 @@ class Operation:
     cotangents: "tuple[Callable | None, ...]" = ()
     side: Callable | None = None
 
-    def derivatives(self) -> "tuple[Callable | None, ...]":
-        """For every operand `(ḡ, w, *operands)` → its cotangent, in NumPy; none for what is constant in pieces."""
+    def transpose(self) -> "tuple[Callable | None, ...]":
+        """For every operand `(f, c, g, w, *operands)` → its cotangent; empty for what is constant in pieces."""
         if self.cotangents:
             return self.cotangents
-        return tuple(lambda g, w, *xs, slope=slope: g * slope(in_numpy, float, w, *xs) for slope in self.slopes)
+        return tuple(
+            lambda f, c, g, w, *xs, slope=slope: f("mul", g, slope(f, c, w, *xs)) for slope in self.slopes
+        )  # fmt: skip
 
 
 def in_numpy(op: str, *xs, attribute=None):
@@ -150,13 +153,26 @@ def _result(f, c, w, *operands):
     return w
 
 
-def _share(g, chosen, other):
-    """To the one of two operands that was chosen goes all of the cotangent, to equal ones a half."""
-    return g * np.where(chosen == other, 0.5, np.where(chosen > other, 1.0, 0.0))
+def _where(f, condition, yes, no):
+    return f("select", condition, no, yes)
 
 
-def _power_by_base(g, w, x, y):
-    return g * np.where(y == 0, 0.0, y * np.power(x, np.where(y == 0, 1.0, y - 1)))
+def _share(f, c, g, larger, smaller):
+    """The cotangent of the operand `larger` of a maximum: all of g where it is that, a half of it where both are."""
+    whole = _where(f, f("gt", larger, smaller), c(1.0), c(0.0))
+    return f("mul", g, _where(f, f("eq", larger, smaller), c(0.5), whole))
+
+
+def _power_by_base(f, c, g, w, u, v):
+    """Where the exponent is zero the power is constant, also at zero."""
+    constant = f("eq", v, c(0.0))
+    power = f("pow", u, _where(f, constant, c(1.0), f("sub", v, c(1.0))))
+    return f("mul", g, _where(f, constant, c(0.0), f("mul", v, power)))
+
+
+def _power_by_exponent(f, c, g, w, u, v):
+    """Where the base is zero the power is constant."""
+    return f("mul", g, f("mul", w, f("log", _where(f, f("eq", u, c(0.0)), c(1.0), u))))
 
 
 # ---- rows that are alike ---------------------------------------------------------------------------------------------
@@ -194,11 +210,11 @@ _ROWS = (
     # Arithmetic
     Operation(
         "add", 2, np.add, lambda code, a, b: a + b, simplify=_simplify.add, commutative=True,
-        recurrence=_recurrences.add, cotangents=(lambda g, w, x, y: g, lambda g, w, x, y: g),
+        recurrence=_recurrences.add, cotangents=(lambda f, c, g, w, u, v: g, lambda f, c, g, w, u, v: g),
     ),
     Operation(
         "sub", 2, np.subtract, lambda code, a, b: a - b, simplify=_simplify.subtract,
-        recurrence=_recurrences.add, cotangents=(lambda g, w, x, y: g, lambda g, w, x, y: -g),
+        recurrence=_recurrences.add, cotangents=(lambda f, c, g, w, u, v: g, lambda f, c, g, w, u, v: f("neg", g)),
     ),
     Operation(
         "mul", 2, np.multiply, lambda code, a, b: a * b, simplify=_simplify.multiply, commutative=True,
@@ -206,11 +222,15 @@ _ROWS = (
     ),
     Operation(
         "div", 2, _divide, lambda code, a, b: a / b, simplify=_simplify.divide,
-        recurrence=_recurrences.divide, cotangents=(lambda g, w, x, y: g / y, lambda g, w, x, y: -g * w / y),
+        recurrence=_recurrences.divide,
+        cotangents=(
+            lambda f, c, g, w, u, v: f("div", g, v),
+            lambda f, c, g, w, u, v: f("neg", f("div", f("mul", g, w), v)),
+        ),
     ),
     Operation(
         "neg", 1, np.negative, lambda code, a: -a, simplify=_simplify.negate, exact=True,
-        recurrence=_recurrences.negate, cotangents=(lambda g, w, x: -g,),
+        recurrence=_recurrences.negate, cotangents=(lambda f, c, g, w, u: f("neg", g),),
     ),
     Operation(
         "rem", 2, np.fmod, "fmod", exact=True, recurrence=_recurrences.remainder,
@@ -223,7 +243,7 @@ _ROWS = (
             lambda f, c, w, u, v: f("div", f("mul", v, w), u),
             lambda f, c, w, u, v: f("mul", w, f("log", u)),
         ),
-        cotangents=(_power_by_base, lambda g, w, x, y: g * w * np.log(np.where(x == 0, 1.0, x))),
+        cotangents=(_power_by_base, _power_by_exponent),
     ),
     # Roots
     _function("sqrt", np.sqrt, lambda f, c, w, u: f("div", c(0.5), w), _intrinsic("sqrt"), steep=True,
@@ -273,12 +293,14 @@ _ROWS = (
     Operation(
         "max", 2, np.maximum, _intrinsic("maximum"), simplify=_simplify.extremum, commutative=True, exact=True,
         recurrence=_recurrences.extremum("gt"),
-        cotangents=(lambda g, w, x, y: _share(g, x, y), lambda g, w, x, y: _share(g, y, x)), side=_is_larger,
+        cotangents=(lambda f, c, g, w, u, v: _share(f, c, g, u, v), lambda f, c, g, w, u, v: _share(f, c, g, v, u)),
+        side=_is_larger,
     ),
     Operation(
         "min", 2, np.minimum, _intrinsic("minimum"), simplify=_simplify.extremum, commutative=True, exact=True,
         recurrence=_recurrences.extremum("lt"),
-        cotangents=(lambda g, w, x, y: _share(g, y, x), lambda g, w, x, y: _share(g, x, y)), side=_is_larger,
+        cotangents=(lambda f, c, g, w, u, v: _share(f, c, g, v, u), lambda f, c, g, w, u, v: _share(f, c, g, u, v)),
+        side=_is_larger,
     ),
     _step("sign", np.sign, lambda code, x: code.select(x > 0.0, 1.0, code.select(x < 0.0, -1.0, x)), _odd),
     _step("floor", np.floor, _intrinsic("floor")),
@@ -287,11 +309,15 @@ _ROWS = (
     Operation(
         "select", 3, _select, lambda code, predicate, no, yes: code.select(predicate, yes, no), lax="select_n",
         simplify=_simplify.select, exact=True, recurrence=_recurrences.select,
-        cotangents=(None, lambda g, w, p, no, yes: np.where(p, 0.0, g), lambda g, w, p, no, yes: np.where(p, g, 0.0)),
+        cotangents=(
+            None,
+            lambda f, c, g, w, p, no, yes: _where(f, p, c(0.0), g),
+            lambda f, c, g, w, p, no, yes: _where(f, p, g, c(0.0)),
+        ),
     ),
     Operation(
         "convert", 1, lambda x, kind: x, None, lax="convert_element_type", simplify=_simplify.convert, exact=True,
-        cotangents=(lambda g, w, x: g,),
+        cotangents=(lambda f, c, g, w, u: g,),
     ),
     # Logic
     Operation(

@@ -27,7 +27,8 @@ by means of high-order Taylor methods*, Exp. Math. 14 (2005) 99–117, §2.1; Gr
 (2008), ch. 13.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -43,6 +44,25 @@ class StraightLine(NamedTuple):
     nodes: tuple[Node, ...]
     kinds: tuple[str, ...]
     outputs: tuple[int, ...]
+
+
+class Recurrent(Protocol):
+    """What a Taylor series, and machine code, read of a program: `Program` without JAX.
+
+    `dtypes` has the type of every input, `size` their number. Where the outputs are the solution of a linear system,
+    `linear` is that (see `LinearSystem`). `budget` bounds the operations.
+    """
+
+    @property
+    def line(self) -> StraightLine: ...
+    @property
+    def size(self) -> int: ...
+    @property
+    def dtypes(self) -> Sequence[np.dtype]: ...
+    @property
+    def linear(self) -> Any: ...
+    @property
+    def budget(self) -> int: ...
 
 
 class Series(NamedTuple):
@@ -62,7 +82,7 @@ class Series(NamedTuple):
     rows: int
 
 
-def series(program, size: int, moving: int) -> Series:
+def series(program: Recurrent, size: int, moving: int) -> Series:
     """The recurrences of the first `size` outputs; all inputs but the first `moving` are constant along the motion.
 
     For ẏ = f(t, y) with m components these are m outputs and m + 1 inputs (y and t, in any order); for q̈(q, q̇, t) with
@@ -75,17 +95,17 @@ def series(program, size: int, moving: int) -> Series:
 class _Recurrences:
     """Two graphs grow side by side: `start`, the program and the derivatives g; and `sweep`, linear in order k."""
 
-    def __init__(self, program, size: int, moving: int):
+    def __init__(self, program: Recurrent, size: int, moving: int):
         self.size, self.moving = size, moving
         self.start, self.sweep = Graph(10 * program.budget), Graph(20 * program.budget)
-        for (op, operands, attribute), kind in zip(program.nodes, program.kinds, strict=True):
+        for (op, operands, attribute), kind in zip(program.line.nodes, program.line.kinds, strict=True):
             if op == "input":
                 self.start.input(attribute, kind)
             elif op == "constant":
                 self.start.constant(attribute, kind)
             else:
                 self.start.node(op, *operands, attribute=attribute)
-        self.outputs = list(program.outputs)
+        self.outputs = list(program.line.outputs)
         self.order_k = [self.sweep.input(i, "float") for i in range(self.moving)]
         self.k, self.inverse_k = (self.sweep.input(self.moving + i, "float") for i in range(2))
         self._given: dict[tuple, int] = {}  # what else the sweep reads: ("value", node) or ("product", row, row)

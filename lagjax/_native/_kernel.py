@@ -1,0 +1,210 @@
+"""The machine code of a motion as a function of arrays, and its transposed derivative as another."""
+
+import ctypes
+import functools
+import math
+import os
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from llvmlite import ir
+
+from lagjax._native._adjoint import Adjoint
+from lagjax._native._constants import DONE, LEAST_ORDER, MAX_ORDER
+from lagjax._native._frame import LANE, Layout
+from lagjax._native._integrator import Integrator
+from lagjax._native._ir import compiled
+from lagjax._native._threads import in_slices, together
+from lagjax._program._graph import Unlowerable
+from lagjax._program._series import Recurrent, Series, series
+
+
+class Outcome(NamedTuple):
+    """What `Kernel` returns of N members, T output times and 2n states.
+
+    - `path` (N, T, 2n): the states (q, q̇) at the output times, NaN where a member did not come.
+    - `y_end` (N, 2n), `t_end` (N,): where each member ended; `code` (N,): how.
+    - `steps`, `rejected` (N,): how many steps it took, and how many were too long.
+    - `idle`: how many steps lanes stood empty for.
+    - `table` (rows, 2n + 2): the time, size and first state of every step that was written down; None without.
+    """
+
+    path: np.ndarray
+    y_end: np.ndarray
+    t_end: np.ndarray
+    code: np.ndarray
+    steps: np.ndarray
+    rejected: np.ndarray
+    idle: int
+    table: np.ndarray | None
+
+
+class Guards(NamedTuple):
+    """Functions of the state that end the motion where they change sign, and for each −1, 0 or +1: when it counts.
+
+    With y the state and the time, the outputs of the program are all g; their rates ġ = Σ ∂g/∂yᵢ ẏᵢ; then Σ |∂g/∂yᵢ yᵢ|
+    and Σ |∂g/∂yᵢ ẏᵢ|, of which round-off is a part.
+    """
+
+    program: Recurrent
+    directions: tuple[int, ...]
+
+
+class Projection(NamedTuple):
+    """What keeps a motion on its constraints: two programs of (q, q̇, t, parameters).
+
+    `state` gives the projected state (q, q̇), 2n numbers. `velocity_scale` gives n numbers: an error of a velocity
+    counts relative to its scale where that is larger than the velocity itself.
+    """
+
+    state: Recurrent
+    velocity_scale: Recurrent
+
+
+class Kernel:
+    """The integration of (q, q̇) with q̈ from a program, whose inputs are q, q̇, t and numbers that stay constant.
+
+    The outputs of the program are the n accelerations, then whether the mass matrix is singular. `projection` is
+    applied to the state after every step, and to the outputs after the first. `guards`, again from the same inputs, end
+    the motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are relative
+    to each coordinate, or to the largest one of those with the same number in `error_groups` (n,). Of the coordinates
+    the first `base_size` are the motion, the others its derivatives. Raises `Unlowerable` where an operation has no
+    Taylor series or is not one of doubles.
+    """
+
+    def __init__(
+        self,
+        program: Recurrent,
+        size: int,
+        projection: Projection | None = None,
+        guards: Guards | None = None,
+        error_groups: tuple[int, ...] | None = None,
+        base_size: int | None = None,
+    ):
+        self._parts = program, recurrences(program, size), projection
+        integrator = Integrator(*self._parts, guards, error_groups, base_size)
+        motion = integrator.motion
+        self.states, self.numbers, self.width = motion.states, motion.numbers, motion.width
+        self._forward = _Compiled(motion.module, motion.layout, integrator.job, pointers=4)
+
+    def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int, room=None) -> Outcome:
+        """The motions from the states `y0` (N, 2n), all arrays of float64.
+
+        `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. With `room` (N,)
+        up to so many steps of each member are written down, for `pull`.
+        """
+        ts, y0, params = _contiguous(ts, y0, params)
+        members, times = len(y0), ts.shape[1]
+        path = np.full((members, times, self.states), np.nan)
+        y_end, t_end = np.empty((members, self.states)), np.empty(members)
+        code, steps, rejected = (np.empty(members) for _ in range(3))
+        table = first_step = None
+        if room is not None:
+            first_step = np.concatenate([[0], np.cumsum(room)]).astype(np.int64)
+            table = np.empty((first_step[-1], self.states + 2))  # the system provides pages when they are written to
+        arrays = dict(
+            next_member=np.zeros(1, np.int64), ts=ts, y0=y0, params=params, path=path, y_end=y_end, t_end=t_end,
+            code=code, steps=steps, rejected=rejected, record=table, first_step=first_step,
+        )  # fmt: skip
+        numbers = dict(
+            **self._strides(ts, params), members=members, times=times, order=order_for(rtol), max_steps=max_steps,
+            recording=table is not None, rtol=rtol, atol=atol,
+        )  # fmt: skip
+        idle = self._forward(arrays, numbers, self._threads(members))
+        ended_badly = code != DONE
+        if ended_badly.any():  # a start that is infinite was not reached either
+            reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
+            path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
+        code, steps, rejected = (counts.astype(int) for counts in (code, steps, rejected))
+        return Outcome(path, y_end, t_end, code, steps, rejected, idle, table)
+
+    def pull(self, ts, params, table, first, counts, path_bar, y_bar, order: int) -> tuple[np.ndarray, np.ndarray]:
+        """The transposed derivative of a run, over the steps it wrote down.
+
+        The steps of member k are `counts[k]` rows of `table` from `first[k]` on. From the cotangents of the outputs,
+        `path_bar` (N, T, 2n), of which the first and the last are not looked at, and of the states at the end, `y_bar`
+        (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P).
+        """
+        ts, params, path_bar, table = _contiguous(ts, params, path_bar, table)
+        first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
+        y_bar, params_bar = np.array(y_bar, np.float64, order="C"), np.zeros((len(y_bar), self.numbers))
+        arrays = dict(
+            next_member=np.zeros(1, np.int64), ts=ts, params=params, record=table, first_step=first, steps=counts,
+            path_bar=path_bar, y_bar=y_bar, params_bar=params_bar,
+        )  # fmt: skip
+        members, times = path_bar.shape[:2]
+        numbers = dict(**self._strides(ts, params), members=members, times=times, order=order)
+        self._backward(arrays, numbers, self._threads(members))
+        return y_bar, params_bar
+
+    @functools.cached_property
+    def _backward(self) -> "_Compiled":
+        """The transpose, compiled when it is first asked for."""
+        adjoint = Adjoint(*self._parts)
+        return _Compiled(adjoint.motion.module, adjoint.motion.layout, adjoint.job, pointers=3)
+
+    def _strides(self, ts, params) -> dict[str, int]:
+        return dict(
+            ts_stride=ts.shape[1] if len(ts) > 1 else 0, params_stride=self.numbers if len(params) > 1 else 0
+        )  # fmt: skip
+
+    def _threads(self, members: int) -> int:
+        return min(cores(), max(1, members // (4 * self.width)))
+
+
+class _Compiled:
+    """The functions `begin` and `run` of a module: all members of a job, on several threads."""
+
+    def __init__(self, module: ir.Module, layout: Layout, job: Callable, pointers: int):
+        self._layout, self._job, self._counts_idle = layout, job, pointers == 4
+        # The engine holds the code that the other points to.
+        self._engine, at = compiled(module, ("begin", "run"))
+        self._begin = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(at["begin"])
+        self._run = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * pointers, ctypes.c_int64)(at["run"])
+
+    def __call__(self, arrays: Mapping[str, np.ndarray | None], numbers: Mapping[str, float], threads: int) -> int:
+        """Work on the arrays; how many steps lanes stood empty for."""
+        addresses = {name: None if array is None else array.ctypes.data for name, array in arrays.items()}
+        job = self._job(**addresses, **numbers)
+
+        def work(stopped, _arrays=arrays) -> int:  # whose memory must live as long as somebody works on it
+            memory = aligned(self._layout.size)
+            lanes, idle = np.zeros(len(LANE) * self._layout.width, np.int64), np.zeros(1, np.int64)
+            mine = [ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data]
+            self._begin(*mine)
+            if self._counts_idle:
+                mine.append(idle.ctypes.data)
+            in_slices(functools.partial(self._run, *mine), stopped)
+            return int(idle[0])
+
+        return together(work, threads)
+
+
+def _contiguous(*arrays) -> list[np.ndarray]:
+    return [np.ascontiguousarray(x, dtype=np.float64) for x in arrays]
+
+
+@functools.lru_cache(maxsize=16)  # asked for when it is decided what runs, and when that is compiled
+def recurrences(program: Recurrent, size: int) -> Series:
+    """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
+    for (op, _, _), kind in zip(program.line.nodes, program.line.kinds, strict=True):
+        if kind not in ("float", "bool") and op not in ("input", "constant", "convert"):
+            raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
+    return series(program, size, moving=2 * size + 1)
+
+
+def order_for(rtol: float) -> int:
+    """The order whose series costs least: at the step that it allows, terms fall by e² each (Jorba & Zou, §3.2)."""
+    return min(MAX_ORDER, max(LEAST_ORDER, math.ceil(2 - math.log(rtol) / 2)))
+
+
+def cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def aligned(size: int) -> np.ndarray:
+    """Zeros on the boundary of a cache line, which vectors need."""
+    memory = np.zeros(size + 8)
+    return memory[(-memory.ctypes.data // 8) % 8 :]
