@@ -70,7 +70,7 @@ def tangent_programs(
         both = with_tangents(lambda q, v, t, p: jnp.stack(projection.state(*q, *v, t, *p)), q, v, t, p)
         return both[:, :n], both[:, n:]
 
-    def velocity_scales(q, v, t, p):
-        return projection.speeds(*q[0], *v[0], t, *p[0])
+    def velocity_scale(q, v, t, p):
+        return projection.velocity_scale(*q[0], *v[0], t, *p[0])
 
-    return larger, Projection(*(lower(of, *shapes, budget=_BUDGET) for of in (projected, velocity_scales)))
+    return larger, Projection(*(lower(of, *shapes, budget=_BUDGET) for of in (projected, velocity_scale)))
