@@ -21,8 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import _linear
+from lagjax._constraints import velocity_scales
 from lagjax._layout import Layout
-from lagjax._motion import Motion, velocity_scales
+from lagjax._motion import Motion
 from lagjax._native import Projection
 from lagjax._program import Program, Unlowerable, lower, lower_solution
 
@@ -45,7 +46,7 @@ class _Saddle(NamedTuple):
     velocities: bool = True
 
 
-_ACCELERATION = _Saddle("force", "target", 1)
+_ACCELERATION = _Saddle("force", "gamma", 1)
 _VELOCITY_STEP = _Saddle(None, "rates", -1)
 _POSITION_STEP = _Saddle(None, "residual", -1, velocities=False)
 
@@ -90,8 +91,7 @@ class Derivation:
         self._by_q: dict[tuple[int, ...], Program] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
-        others = (motion.forces, motion.dissipation, motion.constraints, motion.velocity_constraints)
-        self._traced_once = Motion(jax.jit(motion.lagrangian), *(None if f is None else jax.jit(f) for f in others))
+        self._traced_once: Motion = jax.tree.map(jax.jit, motion)
 
     # ---- quantities of a state ----
 
@@ -206,7 +206,7 @@ class Derivation:
         self._require_small()
         n = self.layout.size
         velocity = self._solution(_VELOCITY_STEP)
-        position = None if self.motion.constraints is None else self._solution(_POSITION_STEP)
+        position = None if self.motion.constraints.on_positions is None else self._solution(_POSITION_STEP)
 
         def projected(*scalars):
             q, rest = list(scalars[:n]), scalars[n:]
@@ -219,7 +219,7 @@ class Derivation:
 
     @_lowered_once
     def velocity_scales(self) -> Program | None:
-        """`Motion.speeds` of a state, (n,); None without constraints."""
+        """The `velocity_scales` of a state, (n,); None without constraints."""
         if not self.motion.constrained:
             return None
         n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
@@ -329,11 +329,8 @@ class Derivation:
     @functools.cached_property
     def position_count(self) -> int:
         """How many of the constraints are on positions; they come first."""
-        constraints = self._traced_once.constraints
-        if constraints is None:
-            return 0
         q, _, t, numbers = self.state_shapes
-        return jax.eval_shape(constraints, q, t, numbers).size
+        return jax.eval_shape(self._traced_once.constraints.f, q, t, numbers).size
 
     @_lowered_once
     def _constant_mass(self) -> bool:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from lagjax._consistent import rank_lost
+from lagjax._constraints import rank_lost
 from lagjax._equations import Equations, form_of
 from lagjax._failures import differentiable_where, lost_unless
 from lagjax._integrate import Method, integrate
@@ -116,7 +116,8 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
     result = _explained(solution, form, start, ts, numbers)
     if derivation.motion.constrained:
         end = halves(solution.y_end)
-        lost = rank_lost(derivation.motion, (*y0, given[0], numbers), (*end, solution.t_end, numbers))
+        schur = derivation.motion.schur_complement
+        lost = rank_lost(schur, (*y0, given[0], numbers), (*end, solution.t_end, numbers))
         failed = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
         result = RESULTS.where(failed & lost, RESULTS.constraint_rank_lost, result)
         not_projected = solution.result == code_of(RESULTS.promote(Projected.FAILED))

@@ -238,7 +238,7 @@ def saddle(matrix: jax.Array, b: jax.Array, rows: jax.Array, c: jax.Array) -> tu
     return free + responses @ multipliers, multipliers, held.singular
 
 
-def coupling(matrix: jax.Array, rows: jax.Array) -> jax.Array:
+def schur_complement(matrix: jax.Array, rows: jax.Array) -> jax.Array:
     """S = G K⁻¹ Gᵀ of `saddle`, whose rank is the number of independent constraints."""
     held = factorize(matrix + rows.T @ (_weights(matrix, rows)[:, None] * rows))
     return rows @ jax.vmap(held.solve, in_axes=1, out_axes=1)(rows.T)
@@ -373,8 +373,8 @@ def saddle_many(matrix, b, rows, c) -> tuple[np.ndarray, np.ndarray]:
     return free + np.einsum("snk,sk->sn", responses, multipliers), multipliers
 
 
-def coupling_many(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """S = G K⁻¹ Gᵀ of `coupling`, for S matrices at once."""
+def schur_complements(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """S = G K⁻¹ Gᵀ of `schur_complement`, for S matrices at once."""
     return rows @ solve_many(_augmented(matrix, rows)[0], np.swapaxes(rows, 1, 2))
 
 

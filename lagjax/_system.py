@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function, accept
+from lagjax._constraints import Constraints
 from lagjax._derivation import columns_of, derivation_of, numbers_of
 from lagjax._equations import form_of
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
-from lagjax._linear import coupling_many, saddle_many
-from lagjax._motion import Motion, nearest_consistent
+from lagjax._linear import saddle_many, schur_complements
+from lagjax._motion import Motion
 from lagjax._problem import Problem
 from lagjax._program import Unlowerable
 from lagjax._validate import as_arrays, is_concrete, require_number
@@ -155,7 +156,7 @@ class System(eqx.Module):
         """
         self._require_constraints()
         layout = Layout.of(q, qdot)
-        q, qdot = self._at(nearest_consistent, q, qdot, t, params)
+        q, qdot = self._at(Motion.nearest_consistent, q, qdot, t, params)
         return layout.restore(q), layout.restore(qdot)
 
     def explain(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> Explanation:
@@ -175,8 +176,8 @@ class System(eqx.Module):
         if self.constraints is None and self.velocity_constraints is None:
             return facts
         names = self.constraint_names(layout, params)
-        coupling = self._at(Motion.coupling, q, qdot, t, params)
-        return facts.with_constraints(names, None if isinstance(coupling, jax.core.Tracer) else np.asarray(coupling))
+        schur = self._at(Motion.schur_complement, q, qdot, t, params)
+        return facts.with_constraints(names, np.asarray(schur) if is_concrete(schur) else None)
 
     def motion(self, layout: Layout, params: PyTree = None) -> Motion:
         """The scene in the flat coordinates of `layout`, after a look at what its functions return there.
@@ -187,26 +188,28 @@ class System(eqx.Module):
 
         code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
 
-        def flat(function):
-            def of_vectors(q, qdot, t, numbers):
-                return function(layout.restore(q), layout.restore(qdot), t=t, params=eqx.combine(numbers, code))
+        def of_vectors(function, result):
+            """The user's `function` of (q, qdot), with its pytree turned into the array that `result` makes of it."""
+            if function is None:
+                return None
 
-            return of_vectors
+            def of_state(q, qdot, t, numbers):
+                extras = {"t": t, "params": eqx.combine(numbers, code)}
+                return result(function(layout.restore(q), layout.restore(qdot), **extras))
 
-        def held(q, t, numbers):
-            return _end_to_end(self.constraints(layout.restore(q), t=t, params=eqx.combine(numbers, code)))
+            return of_state
 
-        velocities = flat(self.velocity_constraints)
+        def positions(q, t, numbers):
+            return _end_to_end(constraints(layout.restore(q), t=t, params=eqx.combine(numbers, code)))
 
-        forces = flat(self.forces) if self.forces is not None else None
+        constraints = self.constraints
         return Motion(
-            lagrangian=flat(self.lagrangian),
-            forces=None if forces is None else lambda *state: layout.flatten(forces(*state)),
-            dissipation=flat(self.dissipation) if self.dissipation is not None else None,
-            constraints=held if self.constraints is not None else None,
-            velocity_constraints=None
-            if self.velocity_constraints is None
-            else lambda *state: _end_to_end(velocities(*state)),
+            lagrangian=of_vectors(self.lagrangian, lambda value: value),
+            forces=of_vectors(self.forces, layout.flatten),
+            dissipation=of_vectors(self.dissipation, lambda value: value),
+            constraints=Constraints(
+                None if constraints is None else positions, of_vectors(self.velocity_constraints, _end_to_end)
+            ),
         )
 
     def _require_constraints(self) -> None:
@@ -305,7 +308,7 @@ def require_system(system: Any) -> None:
         raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {system!r}.")
 
 
-_SADDLE = ("mass_matrix", "force", "jacobian", "target")
+_SADDLE = ("mass_matrix", "force", "jacobian", "gamma")
 
 
 def _solved(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -317,7 +320,10 @@ _OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
     Motion.acceleration: (_SADDLE, lambda of, v: _solved(of)[0]),
     Motion.multipliers: (_SADDLE, lambda of, v: _solved(of)[1]),
     Motion.constraint_force: (_SADDLE, lambda of, v: np.einsum("skn,sk->sn", of["jacobian"], _solved(of)[1])),
-    Motion.coupling: (("mass_matrix", "jacobian"), lambda of, v: coupling_many(of["mass_matrix"], of["jacobian"])),
+    Motion.schur_complement: (
+        ("mass_matrix", "jacobian"),
+        lambda of, v: schur_complements(of["mass_matrix"], of["jacobian"]),
+    ),
     Motion.mass_matrix: (("mass_matrix",), lambda of, v: of["mass_matrix"]),
     Motion.momentum: (("momentum",), lambda of, v: of["momentum"]),
     Motion.generalized_force: (("generalized_force",), lambda of, v: of["generalized_force"]),

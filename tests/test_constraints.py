@@ -678,6 +678,57 @@ def test_projection_is_differentiated_as_the_function_it_is(derivative):
     np.testing.assert_allclose(derivative(project)(state), np.stack(central, axis=1), atol=1e-8)
 
 
+def free(q, qdot):
+    return 0.5 * jnp.sum(qdot**2)
+
+
+def circle(q):
+    return q @ q - 1
+
+
+def nearest_on_circle(x):
+    u = x[:2] / jnp.linalg.norm(x[:2])
+    return jnp.concatenate([u, x[2:] - u * (u @ x[2:])])  # the velocity without its radial part
+
+
+def derivatives_of(function):
+    """Value and two derivatives of a curve of states, forward, and the third of a number along it, reverse."""
+    start, turn = jnp.array([1.3, 0.7, 0.2, -0.4]), jnp.array([0.6, -0.8, 0.3, 1.1])
+
+    def orders(s):
+        both = lambda s: jax.jvp(lambda s: function(start + s * turn), (s,), (1.0,))
+        (value, first), (_, second) = jax.jvp(both, (s,), (1.0,))
+        return second @ turn, (value, first, second)
+
+    return orders, jax.value_and_grad(orders, has_aux=True)
+
+
+@pytest.mark.parametrize("reverse", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_projection_has_the_derivatives_of_its_closed_form(reverse):
+    system = lagjax.System(free, constraints=circle)
+    found, exact = (
+        jax.jit(derivatives_of(of)[reverse])(0.0)
+        for of in (lambda x: jnp.concatenate(system.project(x[:2], x[2:])), nearest_on_circle)
+    )
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-14)
+
+
+def test_velocities_that_cannot_be_met_have_nan_for_derivatives():
+    torn = lagjax.System(free, velocity_constraints=lambda q, v: jnp.stack([v[0], v[0] - q[0]]))
+    velocity, slope = jax.jvp(jax.jit(lambda q: torn.project(q, jnp.zeros(2))[1]), (jnp.ones(2),), (jnp.ones(2),))
+    assert np.isnan(velocity).all() and np.isnan(slope).all()
+
+
+@pytest.mark.slow
+def test_a_state_without_a_nearest_one_has_nan_for_derivatives_and_leaves_its_neighbours_alone():
+    root = lambda q: jnp.sqrt(q[0] - 1.0) + q[1]
+    states = jnp.array([[1.3, -0.4, 0.2, -0.4], [0.5, 0.2, 0.2, -0.4]])
+    system = lagjax.System(free, constraints=root)
+    slopes = jax.jit(jax.vmap(jax.jacfwd(lambda x: jnp.concatenate(system.project(x[:2], x[2:])))))(states)
+    assert np.isfinite(slopes[0]).all() and np.isnan(slopes[1]).all()
+
+
 @pytest.mark.slow
 def test_projection_of_moving_and_velocity_constraints():
     moving = lagjax.System(weight, constraints=lambda q, t: q[0] - jnp.sin(t))
@@ -702,7 +753,7 @@ ORIGIN, REST = np.zeros(2), np.zeros(2)
 
 
 STARTS = [
-    (lambda q: {"rod": q @ q - 1}, [0.0, -1.1], REST, r"q0 does not satisfy constraints\['rod'\]: .*project"),
+    (lambda q: {"rod": q @ q - 1}, [0.0, -1.1], REST, r"not satisfy .*\['rod'\]: it is 0.21 .* of 0.0955. .*project"),
     (lambda q: {"rod": q @ q - 1}, [0.0, -1.0], [0.1, 0.2], r"qdot0 does not satisfy constraints\['rod'\]"),
     (lambda q: jnp.stack([q[0], q[1], q[0] + q[1]]), ORIGIN, REST, r"3 constraints .* for 2 coordinates, and 2"),
     (lambda q: jnp.stack([q[0], 2 * q[0], q[0] + 1.0]), ORIGIN, REST, r"\[2\] contradicts .*\[0\]"),

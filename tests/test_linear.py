@@ -10,7 +10,7 @@ import pytest
 from sweeps import sweep
 
 import lagjax
-from lagjax import _consistent, _linear
+from lagjax import _constraints, _linear
 from lagjax._layout import Layout
 
 
@@ -197,7 +197,8 @@ def programs():
     yield "multipliers and their gradient", lambda q, v: jax.grad(lambda q: held.multipliers(q, v).sum())(q)
     yield "projection", held.project
     yield "one step of projection", lambda q, v: motion.projected(q, v, zero, None)
-    yield "loss of rank", lambda q, v: _consistent.rank_lost(motion, (q, v, zero, None), (v, v, zero, None))
+    schur = motion.schur_complement
+    yield "loss of rank", lambda q, v: _constraints.rank_lost(schur, (q, v, zero, None), (v, v, zero, None))
 
 
 @pytest.mark.parametrize("name, function", list(programs()), ids=lambda x: x if isinstance(x, str) else "")

@@ -15,7 +15,7 @@ def findings(scene: Scene) -> list[Finding]:
     """All there is to say about constraints on positions and on velocities."""
     if not scene.motion.constrained:
         return []
-    residual, rows = scene.residual, scene.measured.rows
+    residual, rows = scene.residual, scene.measured.jacobian
     names = scene.system.constraint_names(scene.layout, scene.given[3])
     bad = [k for k in range(len(names)) if not (np.isfinite(residual[k]) and np.isfinite(rows[0, k]).all())]
     if bad:

@@ -122,9 +122,9 @@ def _blocks(scene: Scene):
         by_v = Slopes(m.by_v_of_dissipation[:, None], of_drag[:, None])
         blocks.append(("D", "dissipation", by_v, range(n, 2 * n), range(first, held)))
     count = len(scene.residual)
-    if np.isfinite(scene.residual).all() and np.isfinite(m.rows[0]).all():
+    if np.isfinite(scene.residual).all() and np.isfinite(m.jacobian[0]).all():
         positions = position_count(scene)
-        by_q, by_v = (Slopes(m.rows[0, k].T, of_rows[k].T) for k in (slice(positions), slice(positions, None)))
+        by_q, by_v = (Slopes(m.jacobian[0, k].T, of_rows[k].T) for k in (slice(positions), slice(positions, None)))
         blocks += [
             ("a constraint", "constraints", by_q, range(n), range(held, held + positions)),
             ("a velocity constraint", "velocity_constraints", by_v, range(n, 2 * n),

@@ -30,7 +30,7 @@ def findings(scene: Scene) -> list[Finding]:
         return _singular(scene, held, usable)
     others = [held[k] for k in usable]
     condition = _condition(held[0], names, DEFAULT_RTOL[scene.layout.dtype])
-    return [*_nearly_singular(held[0], others, names), *_signs(m.mass[0], m.rows[0], names), *condition]
+    return [*_nearly_singular(held[0], others, names), *_signs(m.mass[0], m.jacobian[0], names), *condition]
 
 
 def _scale(matrix: np.ndarray) -> np.ndarray:

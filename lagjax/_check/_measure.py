@@ -70,7 +70,7 @@ class Scene(NamedTuple):
     @property
     def residual(self) -> np.ndarray:
         """The constraints at the state."""
-        count = self.measured.rows.shape[1]
+        count = self.measured.jacobian.shape[1]
         return self.measured.here[len(self.measured.here) - count :]
 
     @property
@@ -83,15 +83,15 @@ class Scene(NamedTuple):
     def held(self) -> np.ndarray:
         """K = M + GᵀW G of every state (see `_mass`), every row of G as heavy as M."""
         m = self.measured
-        size = np.sum(m.rows**2, axis=2, keepdims=True)
+        size = np.sum(m.jacobian**2, axis=2, keepdims=True)
         heavy = np.abs(np.diagonal(m.mass, axis1=1, axis2=2)).max(axis=1)[:, None, None]
         weight = np.where(heavy > 0, heavy, 1) / np.where(size > 0, size, 1)
-        return m.mass + np.swapaxes(m.rows, 1, 2) @ (weight * m.rows)
+        return m.mass + np.swapaxes(m.jacobian, 1, 2) @ (weight * m.jacobian)
 
     def solved(self) -> tuple[np.ndarray, np.ndarray]:
         """q̈ and λ."""
         m, n = self.measured, self.layout.size
-        x = self._solve(np.concatenate([m.force, m.targets])[:, None])[:, 0]
+        x = self._solve(np.concatenate([m.force, m.gamma])[:, None])[:, 0]
         return x[:n], x[n:]
 
     def jacobian(self) -> np.ndarray:
@@ -106,7 +106,7 @@ class Scene(NamedTuple):
 
     def _solve(self, b: np.ndarray) -> np.ndarray:
         """(q̈, λ) of the saddle point M q̈ − Gᵀλ = b₁, G q̈ = b₂, scaled; of the λ some that are right."""
-        mass, rows = self.measured.mass[0], self.measured.rows[0]
+        mass, rows = self.measured.mass[0], self.measured.jacobian[0]
         diagonal = np.sqrt(np.abs(np.diagonal(self.held[0])))
         units = np.concatenate([1 / np.where(diagonal > 0, diagonal, 1), np.ones(len(rows))])
         units[len(mass) :] = 1 / np.maximum(np.linalg.norm(rows * units[: len(mass)], axis=1), 1e-300)
@@ -129,8 +129,8 @@ class Measured(NamedTuple):
     force: Any  # M q̈ − Gᵀλ, (n,)
     extra: Any  # Q as the user gives it
     by_v_of_dissipation: Any
-    rows: Any  # G, (states, m, n)
-    targets: Any  # G q̈, (m,)
+    jacobian: Any  # G, (states, m, n)
+    gamma: Any  # γ of G q̈ = γ, (m,)
     velocity: Any  # (states, n)
     power: Any  # that D takes, Σ q̇ ∂D/∂q̇, and the sum of its parts without their signs, (states, 2)
     minus: Any  # L, p, D if there is one, and the constraints at steps back, (2n + 1, rungs, outputs)
@@ -185,7 +185,7 @@ def _evaluated(derivation: Derivation, state, steps: np.ndarray, offsets: np.nda
     )
     damping = columns_of(q + 0 * offsets[:, :n], v + offsets[:, n:], t, numbers)
     terms = derivation.evaluate(("dissipation_by_qdot",), damping)["dissipation_by_qdot"] * (v + offsets[:, n:])
-    names = ("lagrangian_by_q", "force", "given_force", "dissipation_by_qdot", "target")
+    names = ("lagrangian_by_q", "force", "given_force", "dissipation_by_qdot", "gamma")
     one = columns_of(q[None], v[None], t, numbers)
     here = {name: value[0] for name, value in derivation.evaluate(names, one).items()}
 
@@ -204,8 +204,8 @@ def _evaluated(derivation: Derivation, state, steps: np.ndarray, offsets: np.nda
         force=here["force"],
         extra=here["given_force"],
         by_v_of_dissipation=here["dissipation_by_qdot"],
-        rows=near["jacobian"],
-        targets=here["target"],
+        jacobian=near["jacobian"],
+        gamma=here["gamma"],
         velocity=v + offsets[:, n:],
         power=np.stack([terms.sum(axis=1), np.abs(terms).sum(axis=1)], axis=1),
         minus=sides[:, 0],
@@ -228,7 +228,7 @@ def _program_variation(derivation: Derivation, state, acceleration, multipliers)
     cotangents = [unit[i] * acceleration[j] for i in range(n) for j in range(n)]
     cotangents += [unit[n + k] * acceleration[i] - unit[i] * multipliers[k] for k in range(m) for i in range(n)]
     cotangents += [-unit[i] for i in range(n + m)]
-    program = derivation.program("mass_matrix", "jacobian", "force", "target")
+    program = derivation.program("mass_matrix", "jacobian", "force", "gamma")
     found = program.pull_back_many([*q, *v, t, *numbers], cotangents)[: 2 * n]
     return np.stack([np.zeros(n + m) if bar is None else np.broadcast_to(bar, n + m) for bar in found], axis=1)
 
@@ -244,9 +244,8 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
 
     def nearby(offset):
         at = q + offset[:n], v + offset[n:], t, numbers
-        none = jnp.zeros((0, n), q.dtype), jnp.zeros(0, q.dtype)
-        rows, targets = motion.rows_and_targets(*at) if motion.constrained else none
-        return motion.momentum(*at), *motion.mass_matrix_and_force(*at), rows, targets, at[1]
+        equations = motion.constraints.jacobian_and_gamma(*at)
+        return motion.momentum(*at), *motion.mass_matrix_and_force(*at), *equations, at[1]
 
     def dissipated(offset):
         at = q, v + offset[n:], t, numbers
@@ -257,7 +256,7 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
         at = y[:n], y[n:-1], y[-1], numbers
         parts = [motion.lagrangian(*at)[None], motion.momentum(*at)]
         parts += [] if motion.dissipation is None else [motion.dissipation(*at)[None]]
-        return jnp.concatenate(parts + ([motion.residual(*at)] if motion.constrained else []))
+        return jnp.concatenate([*parts, motion.residual(*at)])
 
     def along(direction, h):
         return jax.vmap(lambda h: everything(y + h * direction))(jnp.concatenate([-h, h])).reshape(2, len(h), -1)
@@ -266,7 +265,7 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
     directions = jnp.eye(2 * n + 1, dtype=y.dtype).at[-1, :n].set(v)
     small = n <= _LARGEST_AT_ONCE
     sides = jax.vmap(along)(directions, steps.T) if small else jax.lax.map(lambda x: along(*x), (directions, steps.T))
-    momentum, mass, force, rows, targets, velocity = jax.vmap(nearby)(offsets)
+    momentum, mass, force, jacobian, gamma, velocity = jax.vmap(nearby)(offsets)
     by_q = Motion(motion.lagrangian, None, None).generalized_force(*state)
     extra = jnp.zeros_like(q) if motion.forces is None else motion.forces(*state)
     dragged = -damped.nonconservative_force(*state)
@@ -278,8 +277,8 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
         force=force[0],
         extra=extra,
         by_v_of_dissipation=dragged,
-        rows=rows,
-        targets=targets[0],
+        jacobian=jacobian,
+        gamma=gamma[0],
         velocity=velocity,
         power=jax.vmap(dissipated)(offsets),
         minus=sides[:, 0],
@@ -288,7 +287,7 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
         noise=jnp.zeros_like(everything(y)),
         round_off=(
             *map(_rounding, (by_q, momentum[0], mass[0])), _rounding(by_q, extra, dragged, force[0]),
-            *map(_rounding, (dragged, rows[0])),
+            *map(_rounding, (dragged, jacobian[0])),
         ),
     )  # fmt: skip
 
@@ -308,10 +307,8 @@ def _variation(system: System, q, qdot, t, params, acceleration, multipliers):
     def balance(y):
         q, qdot = jnp.split(y, 2)
         matrix, force = motion.mass_matrix_and_force(q, qdot, t, numbers)
-        if not motion.constrained:
-            return matrix @ acceleration - force
-        rows, targets = motion.rows_and_targets(q, qdot, t, numbers)
-        left = matrix @ acceleration - rows.T @ multipliers - force
-        return jnp.concatenate([left, rows @ acceleration - targets])
+        jacobian, gamma = motion.constraints.jacobian_and_gamma(q, qdot, t, numbers)
+        left = matrix @ acceleration - jacobian.T @ multipliers - force
+        return jnp.concatenate([left, jacobian @ acceleration - gamma])
 
     return jax.jacfwd(balance)(jnp.concatenate([layout.flatten(q), layout.flatten(qdot)]))

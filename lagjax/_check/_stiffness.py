@@ -13,7 +13,7 @@ def findings(scene: Scene) -> list[Finding]:
     """Advice where one part of the motion is much faster than another."""
     n, m = scene.layout.size, scene.measured
     # Constraints leave the velocities in the kernel of G free.
-    free = kernel(m.rows[0].astype(float))
+    free = kernel(m.jacobian[0].astype(float))
     jacobian = scene.jacobian()
     by_q, by_v = free.T @ jacobian[:, :n] @ free, free.T @ jacobian[:, n:] @ free
     if not (np.isfinite(by_q).all() and np.isfinite(by_v).all()) or not free.shape[1]:

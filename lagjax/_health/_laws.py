@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._constraints import distances
 from lagjax._derivation import Derivation, columns_of, derivation_of
 from lagjax._layout import Layout
 from lagjax._linear import saddle_many
@@ -101,15 +102,13 @@ class Law(NamedTuple):
             sizes[:, 0] += np.einsum("si,si->s", np.abs(of["momentum"]), fast) + np.abs(of["lagrangian"])
             slopes = np.einsum("ski,si->sk", by_q, rtol * far + atol)
             slopes += np.einsum("ski,si->sk", by_qdot, rtol * fast + atol)
-            lengths = np.linalg.norm(of["jacobian"], axis=2)
-            held = np.where(np.arange(lengths.shape[1]) < derivation.position_count, of["residual"], 0)
-            distances, rates = (np.where(x == 0, 0.0, np.abs(x) / lengths) for x in (held, of["rates"]))
+            off_q, off_qdot = distances(of["residual"], of["rates"], of["jacobian"], derivation.position_count)
             power, acceleration = np.zeros(len(q), q.dtype), np.zeros_like(q)
             if self.works:
                 acceleration, multipliers = _solved(of)
                 power = _power_of(of, qdot, multipliers)
             return Sample(
-                kept, slopes, sizes, power, acceleration, distances, rates,
+                kept, slopes, sizes, power, acceleration, off_q, off_qdot,
                 _conditions_of(of["mass_matrix"]), self._finite(columns),
             )  # fmt: skip
 
@@ -164,7 +163,7 @@ class Law(NamedTuple):
         )
 
 
-_SYSTEM = ("mass_matrix", "force", "jacobian", "target")
+_SYSTEM = ("mass_matrix", "force", "jacobian", "gamma")
 _SOURCES = ("lagrangian_by_t", "nonconservative_force", "driving")
 _QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *_SYSTEM, *_SOURCES)
 
@@ -235,15 +234,15 @@ def sample_at(law: Law, momenta: tuple[int, ...], tolerances, q, qdot, t, params
     by_q, by_qdot = map(jnp.abs, jax.jacrev(motion.energy_and_momenta, argnums=(1, 2))(momenta, *state))
     (rtol, atol), far, fast = tolerances, jnp.abs(q), jnp.abs(qdot)
     terms = jnp.abs(motion.momentum(*state)) @ fast + jnp.abs(motion.lagrangian(*state))
-    distances, rates = _off(motion, *state) if motion.constrained else [jnp.zeros(0, q.dtype)] * 2
+    off_q, off_qdot = motion.constraints.distances(*state)
     return Sample(
         kept=kept,
         slopes=by_q @ (rtol * far + atol) + by_qdot @ (rtol * fast + atol),
         sizes=(by_q @ far + by_qdot @ fast).at[0].add(terms),
         power=power_at(law, *state),
         acceleration=motion.acceleration(*state) if law.works else jnp.zeros_like(q),
-        distances=distances,
-        rates=rates,
+        distances=off_q,
+        rates=off_qdot,
         mass=_conditions(motion.mass_matrix(*state)),
         finite=jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in _slopes_of_all(motion, *state)])),
     )
@@ -255,19 +254,7 @@ def power_at(law: Law, q, qdot, t, params) -> jax.Array:
     if not law.works:
         return jnp.zeros((), q.dtype)
     power = motion.nonconservative_force(*state) @ qdot - jax.grad(motion.lagrangian, argnums=2)(*state)
-    return power - motion.multipliers(*state) @ motion.driving(*state) if motion.constrained else power
-
-
-def _off(motion: Motion, q, qdot, t, params) -> tuple[jax.Array, jax.Array]:
-    """How far q and q̇ are from the constraints, in their own units."""
-    rows = motion.rows_and_targets(q, qdot, t, params)[0]
-    rates = motion.rates(q, qdot, t, params)
-    values, lengths = jnp.zeros_like(rates), jnp.sqrt(jnp.sum(rows**2, axis=1))
-    if motion.constraints is not None:
-        held = motion.constraints(q, t, params)
-        values = values.at[: len(held)].set(held)
-    distances, speeds = (jnp.where(off == 0, 0.0, jnp.abs(off) / lengths) for off in (values, rates))
-    return distances, speeds
+    return power - motion.multipliers(*state) @ motion.constraints.driving(*state) if motion.constrained else power
 
 
 def _conditions(matrix: jax.Array) -> jax.Array:
@@ -298,7 +285,7 @@ def _slopes_of_all(motion: Motion, q, qdot, t, params) -> list[jax.Array]:
     def total(q, qdot, t, varied):
         state = q, qdot, t, eqx.combine(varied, fixed)
         parts = motion.mass_matrix_and_force(*state)
-        parts += motion.rows_and_targets(*state) if motion.constrained else ()
+        parts += motion.constraints.jacobian_and_gamma(*state)
         return sum(jnp.sum(part) for part in parts)
 
     return jax.tree.leaves(jax.grad(total, argnums=(0, 1, 2, 3))(q, qdot, t, varied))

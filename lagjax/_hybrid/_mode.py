@@ -20,12 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function, accept
-from lagjax._consistent import TOLERANCE
 from lagjax._custom import differentiated_as
 from lagjax._derivation import Derivation
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode, flow_of
-from lagjax._motion import Motion
 from lagjax._native import Guards
 from lagjax._problem import Problem, Solution
 from lagjax._program import Program, Unlowerable, lower
@@ -172,7 +170,7 @@ class Mode(NamedTuple):
             return jnp.asarray(False)
         motion = system.motion(self.layout, self.params)
         t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(self.params, eqx.is_array_like)))
-        return ~(_distance(motion, *halves(y), t, numbers) <= TOLERANCE[self.layout.dtype])
+        return motion.constraints.inconsistent(*halves(y), t, numbers)
 
 
 @functools.lru_cache(maxsize=64)
@@ -240,15 +238,3 @@ def state_after(transition: Transition, layout: Layout, t, y, params) -> jax.Arr
     if not same:
         raise TypeError(f"{where} must return q and qdot in the structure and the shapes of the initial state.")
     return jnp.concatenate([layout.flatten(part) for part in result])
-
-
-def _distance(motion: Motion, q, v, t, numbers):
-    """From the constraints to the state, over its size, the longest of all (see `_consistent`)."""
-    rows, _ = motion.rows_and_targets(q, v, t, numbers)
-    lengths = jnp.sqrt(jnp.sum(rows**2, axis=1))
-    rates = motion.velocity_saddle(q, v, t, numbers)[2] / (1 + jnp.max(jnp.abs(v)))
-    off = jnp.max(jnp.abs(rates) / lengths)
-    if motion.constraints is not None:
-        held = motion.constraints(q, t, numbers) / (1 + jnp.max(jnp.abs(q)))
-        off = jnp.maximum(off, jnp.max(jnp.abs(held) / lengths[: len(held)]))
-    return off

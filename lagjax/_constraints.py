@@ -1,0 +1,298 @@
+"""Constraints in flat coordinates: their equations, the distance of a state from them, and the way back to them.
+
+A scene has k constraints on positions and m − k on velocities, of n coordinates:
+
+    f(q, t) = 0,  shape (k,)        a(q, q̇, t) = 0,  shape (m − k,)
+
+Both are differentiated by the time until the acceleration appears linearly, f twice and a once:
+
+    J q̇ + ∂f/∂t = 0,  J = ∂f/∂q                      the rate of f
+    G q̈ = γ,          G = (J; ∂a/∂q̇), shape (m, n)   the constraint Jacobian and the acceleration-level right-hand side
+
+A scene without constraints has m = 0 rows here, not another kind of object. Nothing here knows a Lagrangian: the mass
+matrix M, by which distances between states are measured, is an argument.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from lagjax import _linear
+
+PyTree = Any
+Vector = Float[Array, " n"]  # one number for each coordinate
+Row = Float[Array, " m"]  # one number for each constraint
+Time = Float[Array, ""]
+
+
+class Constraints(eqx.Module):
+    """The constraint functions of a scene: f(q, t, params) → (k,) and a(q, qdot, t, params) → (m − k,), or None.
+
+    q and qdot have shape (n,). Every result lists the constraints on positions first.
+    """
+
+    on_positions: Callable | None = None
+    on_velocities: Callable | None = None
+
+    @property
+    def exist(self) -> bool:
+        """Whether there are any constraints."""
+        return self.on_positions is not None or self.on_velocities is not None
+
+    def f(self, q: Vector, t: Time, params: PyTree) -> Float[Array, " k"]:
+        """The values of the constraints on positions."""
+        return jnp.zeros(0, q.dtype) if self.on_positions is None else self.on_positions(q, t, params)
+
+    def a(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, " m-k"]:
+        """The values of the constraints on velocities."""
+        return jnp.zeros(0, q.dtype) if self.on_velocities is None else self.on_velocities(q, qdot, t, params)
+
+    def residual(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
+        """f, then a: zero where the constraints hold."""
+        return jnp.concatenate([self.f(q, t, params), self.a(q, qdot, t, params)])
+
+    def rates(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
+        """J q̇ + ∂f/∂t, then a: zero where the velocities are consistent."""
+        rate = jax.jvp(lambda q, t: self.f(q, t, params), (q, t), (qdot, jnp.ones_like(t)))[1]
+        return jnp.concatenate([rate, self.a(q, qdot, t, params)])
+
+    def driving(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
+        """∂f/∂t, then a(q, 0, t): a constraint does no work where its driving is zero."""
+        by_t = jax.jvp(lambda t: self.f(q, t, params), (t,), (jnp.ones_like(t),))[1]
+        return jnp.concatenate([by_t, self.a(q, jnp.zeros_like(qdot), t, params)])
+
+    def jacobian_and_gamma(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Float[Array, "m n"], Row]:
+        """G and γ of G q̈ = γ. γ is minus all that the time derivatives of f and a contain besides G q̈."""
+        forward = qdot, jnp.ones_like(t)
+
+        def rate(q, t):
+            return jax.jvp(lambda q, t: self.f(q, t, params), (q, t), forward)[1]
+
+        jacobian = [jax.jacfwd(self.f)(q, t, params), jax.jacfwd(self.a, argnums=1)(q, qdot, t, params)]
+        second_rate = jax.jvp(rate, (q, t), forward)[1]
+        rate_of_a = jax.jvp(lambda q, t: self.a(q, qdot, t, params), (q, t), forward)[1]
+        return jnp.concatenate(jacobian), -jnp.concatenate([second_rate, rate_of_a])
+
+    def distances(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Row, Row]:
+        """The `distances` of one state."""
+        state = q, qdot, t, params
+        positions = self.f(q, t, params).size
+        return distances(self.residual(*state), self.rates(*state), self.jacobian_and_gamma(*state)[0], positions)
+
+    def inconsistent(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Bool[Array, ""]:
+        """Whether no motion may start from a state: `TOLERANCE` off a constraint, or one of them has no gradient.
+
+        A state that is not a number is inconsistent.
+        """
+        of_q, of_qdot = self.distances(q, qdot, t, params)
+        size_q, size_qdot = 1 + jnp.max(jnp.abs(q)), 1 + jnp.max(jnp.abs(qdot))
+        near = jnp.maximum(of_q / size_q, of_qdot / size_qdot) <= TOLERANCE[np.dtype(q.dtype)]
+        return ~jnp.all(near & self.jacobian_and_gamma(q, qdot, t, params)[0].any(axis=1))
+
+    # ---- one Newton step back to the constraints ----
+
+    def position_step(self, matrix: Float[Array, "n n"], q: Vector, t: Time, params: PyTree) -> Vector:
+        """δq of one Newton step to f = 0, the shortest in the metric of M: M δq = Jᵀμ, J δq = −f."""
+        jacobian = jax.jacfwd(self.f)(q, t, params)
+        return _linear.saddle(matrix, jnp.zeros_like(q), jacobian, -self.f(q, t, params))[0]
+
+    def velocity_step(self, matrix: Float[Array, "n n"], q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """δq̇ to velocities that are consistent, the shortest in the metric of M: M δq̇ = Gᵀμ, G δq̇ = −rates.
+
+        One step arrives, as the rates are affine in q̇ for every f, and for every a that d'Alembert's principle is for.
+        """
+        jacobian, _ = self.jacobian_and_gamma(q, qdot, t, params)
+        return _linear.saddle(matrix, jnp.zeros_like(q), jacobian, -self.rates(q, qdot, t, params))[0]
+
+
+# ---- how far a state is from its constraints -------------------------------------------------------------------------
+
+# The distance from a constraint, over 1 + max|q| or 1 + max|q̇|, up to which a motion may start: an initial state that
+# was computed or typed with six (three) digits. The first projection takes care of it. It would also take care of more,
+# but by moving the start to where nobody asked it to be.
+TOLERANCE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
+
+
+def distances(residual, rates, jacobian, positions: int):
+    """How far positions and velocities are from each constraint, two arrays (..., m).
+
+    |fₖ|/|∂fₖ/∂q| has the units of a coordinate, which fₖ has not: it is, to first order, how far q has to move. The
+    rates divided by the lengths of the same rows are, likewise, velocities. Constraints on velocities ask nothing of q.
+    Takes `residual` and `rates` (..., m) and `jacobian` (..., m, n), of NumPy or JAX; the first `positions` of the m
+    are f. A constraint that holds is at distance zero, also where it has no gradient; otherwise that is infinitely far.
+    """
+    xp = jacobian.__array_namespace__()
+    lengths = xp.sqrt(xp.sum(jacobian**2, axis=-1))
+    of_positions = xp.where(xp.arange(residual.shape[-1]) < positions, residual, 0)
+    of_q, of_qdot = (xp.where(x == 0, 0, xp.abs(x) / xp.where(x == 0, 1, lengths)) for x in (of_positions, rates))
+    return of_q, of_qdot
+
+
+def velocity_scales(matrix: Float[Array, "n n"], jacobian: Float[Array, "m n"], qdot: Vector) -> Vector:
+    """The velocity scale of every coordinate for an error norm: how fast the others make it move through G.
+
+    In constraint k, coordinate j contributes Gₖⱼ q̇ⱼ, which is as large as the velocity |Gₖⱼ q̇ⱼ / Gₖᵢ| of coordinate i;
+    the largest over j is the scale that k gives to i, and the smallest over k counts. So a coupler that does not turn
+    is as exact as the cranks that carry it, and not relative to its own velocity, which is rounding. Where Gₖᵢ happens
+    to pass through zero that grows without bound; it is therefore limited by maxⱼ √(Mⱼⱼ/Mᵢᵢ) |q̇ⱼ|, the velocity of
+    equal kinetic energy. Zero for coordinates in no constraint.
+    """
+    by_constraints = jnp.min(_largest_term(jacobian * qdot, jacobian), axis=0)
+    root = jnp.sqrt(jnp.abs(jnp.diagonal(matrix)))[None]
+    by_energy = _largest_term(root * qdot, root)[0]
+    return jnp.where(by_constraints < jnp.inf, jnp.minimum(by_constraints, by_energy), 0.0)
+
+
+def _largest_term(terms, weights):
+    """max over j of |termsₖⱼ| divided by |weightsₖᵢ|, shape (m, n); infinite where a weight is zero."""
+    nonzero = weights != 0
+    largest = jnp.max(jnp.abs(terms), axis=1, keepdims=True)
+    return jnp.where(nonzero, largest / jnp.abs(jnp.where(nonzero, weights, 1.0)), jnp.inf)
+
+
+def rank_lost(schur_complement: Callable, start: tuple, end: tuple) -> Bool[Array, ""]:
+    """Whether fewer constraints are independent at `end` than at `start`, both (q, q̇, t, params).
+
+    Counted are the independent rows of S = `schur_complement`(state), with every row of G in units of its length at the
+    start: a gradient that fades away on the way is lost as well.
+    """
+    first, last = (schur_complement(*jax.lax.stop_gradient(state)) for state in (start, end))
+    diagonal = jnp.diagonal(first)
+    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+    before, after = (_linear.rank(scale[:, None] * schur * scale) for schur in (first, last))
+    return jnp.isfinite(last).all() & (after < before)
+
+
+# ---- the way back ----------------------------------------------------------------------------------------------------
+
+
+def projected(
+    mass_matrix: Callable, constraints: Constraints, q: Vector, qdot: Vector, t: Time, params: PyTree
+) -> tuple[Vector, Vector]:
+    """(q, q̇) after one Newton step for the positions and one for the velocities, shape (n,) each.
+
+    That is enough after a step of an integration: close to the constraints Newton's method squares the distance.
+    `mass_matrix` takes (q, qdot, t, params).
+    """
+    if constraints.on_positions is not None:
+        q = q + constraints.position_step(mass_matrix(q, qdot, t, params), q, t, params)
+    return q, qdot + constraints.velocity_step(mass_matrix(q, qdot, t, params), q, qdot, t, params)
+
+
+# Newton's method doubles its digits from where it converges, and needs 4 to 8 steps from anywhere near; 300 times the
+# size of a circle away it takes 16. Doubled, this changes nothing but the time that is lost where there is no solution.
+_NEWTON_STEPS = 50
+
+
+def nearest_consistent(
+    mass_matrix: Callable, constraints: Constraints, q: Vector, qdot: Vector, t: Time, params: PyTree
+) -> tuple[Vector, Vector]:
+    """The consistent state nearest to (q, q̇), shape (n,) each; NaN where it is not found.
+
+    q̂ minimises (q̂ − q)ᵀM(q̂ − q) with M = M(q, q̇) among all with f = 0, and then the velocities minimise the same form
+    with M = M(q̂, q̇) among all that are consistent at q̂. The derivatives are those of that function, to every order:
+    q̂ is a root of `_stationary`, and differentiated implicitly. A state that is not found has NaN for derivatives.
+    """
+    if constraints.on_positions is not None:
+        q = _nearest_positions(mass_matrix, constraints, q, qdot, t, params)
+    state = q, qdot, t, params
+    qdot = qdot + constraints.velocity_step(mass_matrix(*state), *state)
+    jacobian, _ = constraints.jacobian_and_gamma(q, qdot, t, params)
+    reached = _holds(constraints.rates(q, qdot, t, params), jacobian, qdot)
+    return q, qdot * jnp.where(reached, 1.0, jnp.nan)  # a product, so that derivatives are NaN as well
+
+
+def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, params) -> Vector:
+    """q with f = 0, nearest to q0 in the metric of M(q0, q̇), by Newton's method for M (q − q0) + Jᵀν = 0, f = 0.
+
+    These are the conditions of the constrained minimum (sequential quadratic programming: Nocedal & Wright, *Numerical
+    Optimization*, §18.1). The method starts where shortest steps to f = 0 alone arrive, for far away its own steps lead
+    anywhere. NaN where either does not arrive, or where the second arrives farther away: at another stationary point.
+
+    The loop is written here and its derivative is `jax.lax.custom_root`'s. `optimistix.root_find` with its `Newton`, an
+    own solver for `lineax` (theirs call LAPACK, see `_linear`) and `ImplicitAdjoint` was measured instead. Its
+    derivatives are right to every order, but it loses three things. A member of a batch that has no nearest state makes
+    the derivative of the whole batch raise, from a call back to the host: lineax solves for tangents with
+    `throw=True`. Its test of convergence compares f and M (q − q0) with the tolerance for q: masses of 1e6 do not
+    converge. And from 30 radii beside a circle it does not arrive, without the first loop.
+    """
+    matrix = mass_matrix(q0, qdot, t, params)
+
+    def stationary(place):
+        q, nu = place
+        f, pull_back = jax.vjp(lambda q: constraints.f(q, t, params), q)
+        return matrix @ (q - q0) + pull_back(nu)[0], f
+
+    def shortest_step(place):
+        q, nu = place
+        return q + constraints.position_step(mass_matrix(q, qdot, t, params), q, t, params), nu
+
+    def newton_step(place):
+        value, linear = jax.linearize(stationary, place)
+        return jax.tree.map(jnp.subtract, place, _solve_symmetric_saddle(linear, value))
+
+    def find(_, start):
+        nearby = _until_at_rest(shortest_step, start)
+        q, nu = _until_at_rest(newton_step, (nearby[0], start[1]))
+
+        def distance(q):
+            return jnp.sqrt((q - q0) @ matrix @ (q - q0))
+
+        # For a q0 that is consistent both distances are round-off.
+        farther = distance(q) > 1.001 * distance(nearby[0]) + distance(q0 + _rounding(q0))
+        holds = _holds(constraints.f(q, t, params), jax.jacfwd(constraints.f)(q, t, params), q)
+        return jnp.where(holds & ~farther, q, jnp.nan), nu
+
+    start = q0, jnp.zeros_like(constraints.f(q0, t, params))
+    return jax.lax.custom_root(stationary, start, find, _solve_symmetric_saddle)[0]
+
+
+def _solve_symmetric_saddle(linear: Callable, right: tuple[Vector, Row]) -> tuple[Vector, Row]:
+    """(x, ν) with H x + Jᵀν = b, J x = c, where `linear` maps (x, ν) to the left-hand sides and `right` is (b, c)."""
+    b, c = right
+    columns = jax.vmap(lambda x: linear((x, jnp.zeros_like(c))), out_axes=1)
+    matrix, jacobian = columns(jnp.eye(b.size, dtype=b.dtype))
+    x, multipliers, _ = _linear.saddle(matrix, b, jacobian, c)
+    return x, -multipliers
+
+
+def _until_at_rest(step: Callable, start: tuple[Vector, Row]) -> tuple[Vector, Row]:
+    """(q, ν) after as many steps as it takes until q moves no more than rounding; NaN if it always does."""
+
+    def moves(carry):
+        (q, _), moved, count = carry
+        return (moved > _rounding(q)) & (count < _NEWTON_STEPS)
+
+    def once(carry):
+        place, _, count = carry
+        new = step(place)
+        return new, jnp.max(jnp.abs(new[0] - place[0])), count + 1
+
+    (q, nu), moved, _ = jax.lax.while_loop(moves, once, (start, jnp.asarray(jnp.inf, start[0].dtype), 0))
+    return jnp.where(moved <= _rounding(q), q, jnp.nan), nu
+
+
+def _holds(residual: Row, jacobian: Float[Array, "m n"], state: Vector) -> Bool[Array, ""]:
+    """Whether constraints hold, in which case the steps did not just become small between some that contradict.
+
+    A distance of √eps of the state is allowed: the last step of Newton's method was at the level of rounding, so that
+    constraints which can hold do so far better, and those that contradict each other are off by far more. The second
+    term is for a gradient that vanishes, where rounding of the others' size is all that can be asked for.
+    """
+    lengths, eps = jnp.sqrt(jnp.sum(jacobian**2, axis=1)), jnp.finfo(residual.dtype).eps
+    allowed = jnp.sqrt(eps) * lengths + 100 * eps * jnp.max(lengths)
+    return jnp.all(jnp.abs(residual) <= allowed * (1 + jnp.max(jnp.abs(state))))
+
+
+def _rounding(q: Vector) -> Float[Array, ""]:
+    """Steps of q at which Newton's method is at rest: 16 units of round-off of the largest coordinate, or of 1.
+
+    The steps of a converged method are some eps times the condition of the scaled saddle point; below 16 an occasional
+    one would not come to rest and count as not found, and twice that still leaves all but one digit.
+    """
+    return 16 * jnp.finfo(q.dtype).eps * (1 + jnp.max(jnp.abs(q)))
