@@ -13,6 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from lagjax._results import ENDED_WELL, name_of
 
@@ -93,7 +94,7 @@ def _verdict(trajectory) -> str:
 
 def _known(x: Any) -> bool:
     """Whether the values of an array can be read here: it is neither traced, nor a shape alone, nor given away."""
-    if isinstance(x, jax.core.Tracer):
+    if isinstance(x, Tracer):
         return False
     if isinstance(x, jax.Array):
         return x.is_fully_addressable and not x.is_deleted()

@@ -1,7 +1,7 @@
 """The two doors between the user's pytree of coordinates and the flat vector that everything inside works on.
 
 A `Layout` is read off one state (q, qdot): the tree, the shape of every leaf, one floating dtype, and a name for each
-scalar coordinate, such as `q['theta']` or `q.r` or `q[1]`, which is what error messages speak of.
+scalar coordinate, such as `q['theta']` or `q.r` or `q[1]`, by which error messages call it.
 """
 
 import math
@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 PyTree = Any
 
@@ -18,7 +19,7 @@ PyTree = Any
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Layout:
-    """The structure of one state; flattens it to a vector of `size` coordinates and restores it."""
+    """The structure of a state's coordinates: `flatten` makes a vector of them, `restore` undoes it."""
 
     tree: Any
     shapes: tuple[tuple[int, ...], ...]
@@ -27,7 +28,7 @@ class Layout:
 
     @classmethod
     def of(cls, q: PyTree, qdot: PyTree) -> "Layout":
-        """Read the layout of a state, or raise a sentence that says why (q, qdot) is not one."""
+        """Read the layout of a state; raise `TypeError` or `ValueError`, with a sentence, where (q, qdot) is none."""
         paths, tree, shapes = _structure(q, "q")
         _, qdot_tree, qdot_shapes = _structure(qdot, "qdot")
         if tree != qdot_tree:
@@ -49,20 +50,20 @@ class Layout:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """One name per scalar coordinate, in flat order."""
+        """The name of each of the n coordinates, in the order of the flat vector."""
         return tuple(
             path + (f"[{', '.join(map(str, index))}]" if shape else "")
             for path, shape in zip(self.paths, self.shapes, strict=True)
             for index in np.ndindex(shape)
         )
 
-    def flatten(self, tree: PyTree) -> jax.Array:
-        """The leaves of one state's q or qdot, end to end, as a vector of shape (size,)."""
+    def flatten(self, tree: PyTree) -> Float[Array, " n"]:
+        """The leaves of one state's q or qdot end to end, n = `size`."""
         leaves = [jnp.ravel(jnp.asarray(leaf, self.dtype)) for leaf in jax.tree.leaves(tree)]
         return jnp.concatenate(leaves)
 
-    def restore(self, flat: jax.Array) -> PyTree:
-        """The user's pytree, from a vector of shape (size,), or from an array of them, shape (..., size)."""
+    def restore(self, flat: Float[Array, "... n"] | np.ndarray) -> PyTree:
+        """The user's pytree of one vector (n,), or of many: leaves of shape (..., *the shape of the leaf)."""
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
         leaves = [
             flat[..., end - math.prod(shape) : end].reshape(flat.shape[:-1] + shape)
@@ -77,14 +78,14 @@ def halves(y):
     return y[..., :n], y[..., n:]
 
 
-def as_vector(numbers: PyTree, dtype) -> jax.Array:
-    """All numbers of a pytree end to end, shape (P,), in the order of its leaves."""
+def as_vector(numbers: PyTree, dtype) -> Float[Array, " P"]:
+    """All numbers of a pytree end to end, in the order of its leaves."""
     leaves = [jnp.ravel(jnp.asarray(leaf)).astype(dtype) for leaf in jax.tree.leaves(numbers)]
     return jnp.concatenate(leaves) if leaves else jnp.zeros(0, dtype)
 
 
 def _structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tuple[int, ...], ...]]:
-    """Paths, tree and shapes of `tree`, after checking that every leaf is an array of real floats."""
+    """The paths, the tree and the shapes of a pytree, every leaf of which is checked to hold real floats."""
     paths, leaves, structure = taken_apart(tree, name)
     for path, leaf in zip(paths, leaves, strict=True):
         try:

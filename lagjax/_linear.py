@@ -1,12 +1,16 @@
-"""The symmetric linear solve M x = b behind every acceleration, for arrays and for scalars.
+"""The symmetric linear solves behind every acceleration, on arrays and on scalars.
 
-M = ∂²L/∂q̇² is symmetric and, for an unusual L, indefinite; it must be regular. A matrix that is singular to working
-precision gives NaN, never a number: no pseudo-inverse, no regularisation. The caller reports it.
+    M x = b                                    without constraints
+    M x − Gᵀλ = b,  G x = c                    with constraints: a saddle point
 
-`factorize` is for arrays: M is scaled to a unit diagonal (Jacobi scaling: within a factor n of the best diagonal
-scaling for positive definite M, van der Sluis 1969), so that masses of very different size cost no accuracy, and then
-inverted by Gauss-Jordan elimination with partial pivoting. `Elimination` is for scalar programs: the same solution,
-written out entry by entry.
+M = ∂²L/∂q̇² is symmetric and, for an unusual L, indefinite. A matrix that is singular to working precision gives NaN,
+never a number: no pseudo-inverse, no regularisation. The caller reports it.
+
+There are three forms of each. `factorize` and `saddle` are for arrays in JAX: M is scaled to a unit diagonal (Jacobi
+scaling: within a factor n of the best diagonal scaling for positive definite M, van der Sluis 1969), so that masses of
+very different size cost no accuracy, and then inverted by Gauss-Jordan elimination with partial pivoting.
+`Elimination` and `SaddleElimination` are for scalar programs: the same solution, written out entry by entry.
+`solve_many` and `saddle_many` are for many small systems side by side in NumPy.
 
 No array function here calls LAPACK through JAX. Each of jaxlib's LAPACK kernels (LU, triangular solve, Cholesky,
 eigenvalues) divides a batch among the threads of XLA and blocks its own thread until they are done; as many kernels as
@@ -22,181 +26,233 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+# The numbers of one state, as arrays of JAX or NumPy, and those of S states, as arrays of NumPy.
+Matrix = Float[Array, "n n"]
+Vector = Float[Array, " n"]
+Rows = Float[Array, "m n"]
+Matrices = Float[np.ndarray, "S n n"]
 
 
 class Factorization(eqx.Module):
     """An inverted symmetric matrix, and whether it is singular to working precision (a NaN in it is not that)."""
 
-    matrix: jax.Array
-    scale: jax.Array
-    inverse: tuple[jax.Array, jax.Array]  # of the scaled matrix, and the order in which it takes its rows
-    singular: jax.Array
+    matrix: Matrix
+    scale: Vector
+    inverse: Matrix  # B of the scaled matrix A, with A⁻¹ b = B b[order]
+    order: Int[Array, " n"]
+    singular: Bool[Array, ""]
 
-    def solve(self, b: jax.Array) -> jax.Array:
+    def solve(self, b: Vector) -> Vector:
         """x with M x = b; NaN where M is singular. Differentiated implicitly: one more solve with the same inverse."""
 
         def times_matrix(y):
             return _scaled(self.matrix, self.scale) @ y
 
         def by_inverse(_, scaled):
-            inverse, order = self.inverse
-            x = inverse @ _rows(scaled, order)
+            x = self.inverse @ _in_order(scaled, self.order)
             # One step of refinement: the residual of an inverse is larger than that of LU by the condition of M.
-            return x + inverse @ _rows(scaled - times_matrix(x), order)
+            return x + self.inverse @ _in_order(scaled - times_matrix(x), self.order)
 
         # `b` scaled, solved, scaled back; M is symmetric, so the transpose solve is the solve.
         x = self.scale * jax.lax.custom_linear_solve(times_matrix, self.scale * b, by_inverse, symmetric=True)
         return jnp.where(self.singular, jnp.nan, x)
 
+    def solve_columns(self, b: Float[Array, "n k"]) -> Float[Array, "n k"]:
+        """X with M X = B, shape (n, k)."""
+        return jax.vmap(self.solve, in_axes=1, out_axes=1)(b)
 
-def factorize(matrix: jax.Array) -> Factorization:
-    """Scale and invert a symmetric matrix of shape (n, n)."""
+
+def factorize(matrix: Matrix) -> Factorization:
+    """Scale and invert a symmetric matrix."""
     matrix = 0.5 * (matrix + matrix.T)
-    scale = jax.lax.stop_gradient(_diagonal_scale(matrix))
+    scale = jax.lax.stop_gradient(diagonal_scale(matrix))
     inverse, order, pivots = _inverted(jax.lax.stop_gradient(_scaled(matrix, scale)))
     pivots, threshold = jnp.abs(pivots), singular_threshold(matrix.shape[0], matrix.dtype)
-    return Factorization(matrix, scale, (inverse, order), jnp.min(pivots) <= threshold * jnp.max(pivots))
+    return Factorization(matrix, scale, inverse, order, jnp.min(pivots) <= threshold * jnp.max(pivots))
+
+
+def diagonal_scale(matrix):
+    """1/√|Mᵢᵢ| of symmetric matrices (..., n, n), shape (..., n), by which both sides are scaled to a unit diagonal.
+
+    Where the diagonal is zero it is the row's largest entry that counts, and 1 where the whole row is. For arrays of
+    NumPy or JAX.
+    """
+    xp = matrix.__array_namespace__()
+    diagonal = xp.abs(xp.diagonal(matrix, axis1=-2, axis2=-1))
+    size = xp.where(diagonal > 0, diagonal, xp.max(xp.abs(matrix), axis=-1))
+    return 1 / xp.sqrt(xp.where(size > 0, size, 1))
+
+
+def _scaled(matrix, scale):
+    """Symmetric matrices (..., n, n) with both sides scaled by (..., n)."""
+    return scale[..., :, None] * matrix * scale[..., None, :]
+
+
+def singular_threshold(n: int, dtype) -> float:
+    """The ratio of the smallest to the largest pivot at which a scaled n × n matrix counts as singular: n eps.
+
+    About so much is left of a pivot that is zero after n subtractions, and a solution has no digit left there. Twice as
+    large, it would refuse matrices whose solution has one binary digit.
+    """
+    return n * float(jnp.finfo(dtype).eps)
+
+
+def null_directions(matrix: np.ndarray, threshold: float | None = None) -> np.ndarray:
+    """Unit vectors, one a row (k, n), that a symmetric matrix (n, n) sends to zero after scaling to a unit diagonal.
+
+    An eigenvalue counts as zero up to `threshold`, by default `singular_threshold`, of the largest.
+    """
+    threshold = singular_threshold(len(matrix), matrix.dtype) if threshold is None else threshold
+    scale = diagonal_scale(matrix)
+    values, vectors = np.linalg.eigh(_scaled(matrix, scale))
+    null = np.abs(values) <= threshold * max(np.abs(values).max(), np.finfo(matrix.dtype).tiny)
+    directions = (scale[:, None] * vectors[:, null]).T
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 # ---- elimination on whole arrays -------------------------------------------------------------------------------------
 #
 # In place: where A x = y is solved for x, column k of A gives way, once it has been eliminated with row p as its pivot,
-# to the column of the inverse that belongs to y_p. Rows stay where they are; `order` remembers p for every k.
+# to the column of the inverse that belongs to y_p. Rows stay where they are; `order` holds p for every k.
 
-_PANEL = 16  # columns eliminated by themselves before a matrix product takes them to the others; 8 to 32 are as fast
+# Columns that are eliminated by themselves before a matrix product applies them to the others. 8 to 32 were measured
+# to be equally fast.
+_PANEL = 16
 
 
-def _inverted(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(B, order, pivots), each by column, with A⁻¹ b = B b[order]: Gauss-Jordan elimination with partial pivoting.
+def _inverted(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
+    """B, `order` and the pivots of A with A⁻¹ b = B b[order], by Gauss-Jordan elimination with partial pivoting.
 
-    Golub & Van Loan, Matrix Computations, §3.2 and §3.4; the pivots are those of LU. Where a pivot is zero, B is
-    anything.
+    The pivots are those of LU. Where one of them is zero, B is meaningless. Source: Golub & Van Loan, *Matrix
+    Computations*, §3.2 and §3.4.
     """
     n = len(matrix)
     width = min(n, _PANEL)
     count = -(-n // width)
-    size = count * width  # made up with the unit matrix
+    size = count * width  # the matrix is padded with the unit matrix
     a = jnp.pad(matrix, (0, size - n)) + jnp.diag((np.arange(size) >= n).astype(matrix.dtype))
 
     def one_panel(index, carry):
         a, free, order, pivots = carry
-        panel, left, some, these = _eliminated(jax.lax.dynamic_slice_in_dim(a, index * width, width, 1), free)
+        panel, left, panel_order, panel_pivots = _eliminated(
+            jax.lax.dynamic_slice_in_dim(a, index * width, width, 1), free
+        )
         if count > 1:
-            a = jnp.where((free & ~left)[:, None], 0, a) + panel @ _rows(a, some)
+            a = jnp.where((free & ~left)[:, None], 0, a) + panel @ _in_order(a, panel_order)
             panel = jax.lax.dynamic_update_slice_in_dim(a, panel, index * width, 1)
-        order = jax.lax.dynamic_update_slice_in_dim(order, some, index * width, 0)
-        return panel, left, order, jax.lax.dynamic_update_slice_in_dim(pivots, these, index * width, 0)
+        order = jax.lax.dynamic_update_slice_in_dim(order, panel_order, index * width, 0)
+        return panel, left, order, jax.lax.dynamic_update_slice_in_dim(pivots, panel_pivots, index * width, 0)
 
     start = a, jnp.ones(size, bool), jnp.zeros(size, np.int32), jnp.zeros(size, a.dtype)
     a, _, order, pivots = jax.lax.fori_loop(0, count, one_panel, start) if count > 1 else one_panel(0, start)
-    return _rows(a, order[:n])[:, :n], order[:n], pivots[:n]
+    return _in_order(a, order[:n])[:, :n], order[:n], pivots[:n]
 
 
-def _eliminated(panel: jax.Array, free: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """A panel of columns after their elimination, the rows that are free still, the pivots' rows, and the pivots."""
+def _eliminated(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
+    """A panel of columns (size, width) after elimination, which rows are still free, the pivots' rows, the pivots."""
 
     def one_column(k, carry):
         panel, free, order, pivots = carry
-        now = np.arange(panel.shape[1]) == k
-        column = jnp.sum(jnp.where(now, panel, 0), axis=1)
+        this_column = np.arange(panel.shape[1]) == k
+        column = jnp.sum(jnp.where(this_column, panel, 0), axis=1)
         row = jnp.argmax(jnp.where(free, jnp.abs(column), -1)).astype(np.int32)  # the first NaN, if there is one
-        panel, pivot = _exchanged(panel, np.arange(len(panel)) == row, now)
-        return panel, free & (np.arange(len(panel)) != row), jnp.where(now, row, order), jnp.where(now, pivot, pivots)
+        this_row = np.arange(len(panel)) == row
+        panel, pivot = _exchanged(panel, this_row, this_column)
+        order, pivots = jnp.where(this_column, row, order), jnp.where(this_column, pivot, pivots)
+        return panel, free & ~this_row, order, pivots
 
     width = panel.shape[1]
     start = panel, free, jnp.zeros(width, np.int32), jnp.zeros(width, panel.dtype)
     return jax.lax.fori_loop(0, width, one_column, start)
 
 
-def _exchanged(a: jax.Array, here: jax.Array, now: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A after one column was eliminated by one row, both marked, and its pivot; masks are faster than places here."""
-    row, column = jnp.sum(jnp.where(here[:, None], a, 0), axis=0), jnp.sum(jnp.where(now, a, 0), axis=1)
-    pivot = jnp.sum(jnp.where(now, row, 0))
-    row = jnp.where(now, 1, row) / jnp.where(pivot == 0, 1, pivot)  # a zero is left to be reported
-    return jnp.where(here[:, None] | now, 0, a) - jnp.where(here, -1, column)[:, None] * row, pivot
+def _exchanged(a: Array, this_row: Array, this_column: Array) -> tuple[Array, Array]:
+    """The array A after one column was eliminated by one row, each given as a mask, and the pivot between them.
+
+    Masks and not indices, which become gathers and scatters under `vmap`: masks were measured to be faster on the CPU.
+    """
+    row = jnp.sum(jnp.where(this_row[:, None], a, 0), axis=0)
+    column = jnp.sum(jnp.where(this_column, a, 0), axis=1)
+    pivot = jnp.sum(jnp.where(this_column, row, 0))
+    row = jnp.where(this_column, 1, row) / jnp.where(pivot == 0, 1, pivot)  # a zero is left to be reported
+    return jnp.where(this_row[:, None] | this_column, 0, a) - jnp.where(this_row, -1, column)[:, None] * row, pivot
 
 
-def _rows(a: jax.Array, order: jax.Array) -> jax.Array:
+def _in_order(a: Array, order: Int[Array, " n"]) -> Array:
+    """The rows of `a` in this order."""
     return a.at[order].get(mode="promise_in_bounds")
 
 
-def singular_threshold(n: int, dtype) -> float:
-    """The ratio of pivots at which a scaled n × n matrix counts as singular: n units of round-off."""
-    return n * float(jnp.finfo(dtype).eps)
-
-
-def null_directions(matrix: np.ndarray) -> np.ndarray:
-    """Unit vectors, one a row, that a symmetric matrix sends to zero (to working precision, after scaling)."""
-    scale = np.asarray(_diagonal_scale(jnp.asarray(matrix)))
-    values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale)
-    null = np.abs(values) <= singular_threshold(len(matrix), matrix.dtype) * max(np.abs(values).max(), 1e-300)
-    directions = (scale[:, None] * vectors[:, null]).T
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+# ---- elimination on scalars ------------------------------------------------------------------------------------------
 
 
 class Elimination:
     """M x = b as straight-line arithmetic on scalars, for one pattern of zeros.
 
-    `zeros` marks the entries of M that are zero whatever the state; whatever they would contribute is left out. Two
-    coordinates are solved by Cramer's rule, which needs no pivoting. More are solved by M = L D Lᵀ without pivoting,
-    which is stable for positive definite M, and no diagonal scaling would change it. A pivot that cancels to round-off
-    is singularity; it is replaced by NaN.
+    `zeros` (n, n) marks the entries of M that are zero whatever the state; whatever they would contribute is left out.
+    Two coordinates are solved by Cramer's rule, which needs no pivoting. More are solved by M = L D Lᵀ without
+    pivoting, which is stable for positive definite M, and no diagonal scaling would change it. A pivot that cancels to
+    round-off is singularity; it is replaced by NaN.
     """
 
     def __init__(self, zeros: np.ndarray, dtype):
-        self.zeros, self.small = zeros, singular_threshold(len(zeros), dtype)
+        self.zeros, self.threshold = zeros, singular_threshold(len(zeros), dtype)
 
-    def factors(self, matrix: list[list], rows: list[list] = ()) -> tuple[Any, jax.Array]:
-        """What `solve` needs of M, a tree of scalars, and whether M is singular. There are no rows of constraints."""
+    def factors(self, matrix: list[list], jacobian: list[list] | None = None) -> tuple[Any, jax.Array]:
+        """What `solve` needs of M, a tree of scalars, and whether M is singular. There is no constraint Jacobian."""
         if len(matrix) == 2:
-            return _cramer_factors(matrix, self.zeros, self.small)
-        return _ldl_factors(matrix, ~self.zeros, self.small)
+            return _cramer_factors(matrix, self.zeros, self.threshold)
+        return _ldl_factors(matrix, ~self.zeros, self.threshold)
 
     def solve(self, factors, b: list) -> list:
-        """x, linear in b."""
+        """x of M x = b, n scalars, linear in b."""
         return _cramer_solve(factors, b) if len(b) == 2 else _ldl_solve(factors, b)
 
 
-def _cramer_factors(matrix, zeros, small):
+def _cramer_factors(matrix, zeros, threshold):
+    """The entries and the inverse determinant of a 2 × 2 matrix, or its diagonal, and whether it is singular."""
     (a, c), (_, d) = matrix
     if zeros[0, 1]:
         return (a, d), (a == 0) | (d == 0)
     product, square = a * d, c * c
     determinant = product - square
-    singular = jnp.abs(determinant) <= small * jnp.maximum(jnp.abs(product), square)
+    singular = jnp.abs(determinant) <= threshold * jnp.maximum(jnp.abs(product), square)
     return (a, c, d, 1 / jnp.where(singular, jnp.nan, determinant)), singular
 
 
 def _cramer_solve(factors, b):
+    """x of the 2 × 2 system, from `_cramer_factors`."""
     if len(factors) == 2:
         return [b[0] / factors[0], b[1] / factors[1]]
     a, c, d, inverse = factors
     return [(d * b[0] - c * b[1]) * inverse, (a * b[1] - c * b[0]) * inverse]
 
 
-def _ldl_factors(matrix, filled, small, drop: bool = False):
-    """L, where it has entries, and D⁻¹, and whether a pivot was lost to round-off.
+def _ldl_factors(matrix, nonzero, threshold, drop: bool = False):
+    """L, where it has entries, D⁻¹, and whether a pivot was lost: cancelled to `threshold` of its diagonal entry.
 
     A lost pivot becomes NaN; with `drop` its row is left out instead, which for a consistent system changes nothing.
     """
-    n, singular, filled = len(matrix), jnp.zeros((), bool), filled.copy()
-    lower, scaled, inverse = {}, {}, [None] * n  # L, L D and D⁻¹, column by column
+    n, singular, nonzero = len(matrix), jnp.zeros((), bool), nonzero.copy()
+    lower, scaled, inverse = {}, {}, []  # L, L D and D⁻¹, column by column
     for j in range(n):
-        before = [k for k in range(j) if filled[j, k]]
+        before = [k for k in range(j) if nonzero[j, k]]
         pivot = matrix[j][j]
         for k in before:
             pivot = pivot - lower[j, k] * scaled[j, k]
-        lost = pivot <= small * matrix[j][j] if before or not filled[j, j] else pivot == 0
+        cancels = before or not nonzero[j, j]
+        lost = pivot <= threshold * matrix[j][j] if cancels else pivot == 0
         singular = singular | lost
         if drop:
-            inverse[j] = jnp.where(lost, 0.0, 1 / jnp.where(lost, 1.0, pivot))
+            inverse.append(jnp.where(lost, 0.0, 1 / jnp.where(lost, 1.0, pivot)))
         else:
-            guarded = before or not filled[j, j]
-            inverse[j] = 1 / (jnp.where(lost, jnp.nan, pivot) if guarded else pivot)
+            inverse.append(1 / (jnp.where(lost, jnp.nan, pivot) if cancels else pivot))
         for i in range(j + 1, n):
-            shared = [k for k in before if filled[i, k]]
-            if filled[i, j] or shared:
-                filled[i, j] = True
+            shared = [k for k in before if nonzero[i, k]]
+            if nonzero[i, j] or shared:
+                nonzero[i, j] = True
                 entry = matrix[i][j]
                 for k in shared:
                     entry = entry - lower[i, k] * scaled[j, k]
@@ -206,6 +262,7 @@ def _ldl_factors(matrix, filled, small, drop: bool = False):
 
 
 def _ldl_solve(factors, b) -> list:
+    """x of L D Lᵀ x = b, n scalars: forward substitution, division by D, back substitution."""
     lower, inverse = factors
     x, n = list(b), len(b)
     for i in range(n):
@@ -225,59 +282,79 @@ def _ldl_solve(factors, b) -> list:
 #     M x − Gᵀλ = b,   G x = c
 #
 # M may be singular where the constraints hold what it does not: adding GᵀW G x = GᵀW c to the first line, W diagonal,
-# changes neither x nor λ and makes the matrix K = M + GᵀW G regular whenever the saddle point is.
+# changes neither x nor λ and makes the augmented matrix K = M + GᵀW G regular whenever the saddle point is. Then
+#
+#     S = G K⁻¹ Gᵀ,   S λ = c − G K⁻¹ (b + GᵀW c),   x = K⁻¹ (b + GᵀW c + Gᵀλ)
+#
+# S is the Schur complement, G M⁻¹ Gᵀ where W = 0 (multibody dynamics: the Delassus matrix). Its rank is the number of
+# independent constraints. The alternative, an elimination of the whole saddle point with pivoting, needs no W, but
+# mixes rows of M with rows of G, and with them two thresholds for what counts as zero.
 
 
-def saddle(matrix: jax.Array, b: jax.Array, rows: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """x, λ of least norm, and whether the saddle point is singular, for arrays."""
-    weight = jax.lax.stop_gradient(_weights(matrix, rows))
-    held = factorize(matrix + rows.T @ (weight[:, None] * rows))
-    solve = jax.vmap(held.solve, in_axes=1, out_axes=1)
-    free, responses = held.solve(b + rows.T @ (weight * c)), solve(rows.T)
-    multipliers = least_norm(rows @ responses, c - rows @ free)
-    return free + responses @ multipliers, multipliers, held.singular
+def saddle(matrix: Matrix, b: Vector, jacobian: Rows, c: Float[Array, " m"]) -> tuple[Vector, Array, Bool[Array, ""]]:
+    """x (n,), λ (m,) of least norm, and whether the saddle point is singular; `jacobian` is G (m, n)."""
+    augmented, weighted = augment(matrix, jacobian)
+    factorization = factorize(augmented)
+    free, responses = factorization.solve(b + weighted.T @ c), factorization.solve_columns(jacobian.T)
+    multipliers = least_norm(jacobian @ responses, c - jacobian @ free)
+    return free + responses @ multipliers, multipliers, factorization.singular
 
 
-def schur_complement(matrix: jax.Array, rows: jax.Array) -> jax.Array:
+def schur_complement(matrix: Matrix, jacobian: Rows) -> Float[Array, "m m"]:
     """S = G K⁻¹ Gᵀ of `saddle`, whose rank is the number of independent constraints."""
-    held = factorize(matrix + rows.T @ (_weights(matrix, rows)[:, None] * rows))
-    return rows @ jax.vmap(held.solve, in_axes=1, out_axes=1)(rows.T)
+    return jacobian @ factorize(augment(matrix, jacobian)[0]).solve_columns(jacobian.T)
+
+
+def augment(matrix, jacobian):
+    """K = M + GᵀW G (..., n, n) and W G (..., m, n), with weights that make every row of G as heavy as M.
+
+    Wₖ = max|Mᵢᵢ|/|Gₖ|² gives both terms of K the same size, in whatever units a constraint is written: neither drowns
+    the other in rounding. 10ᵈ times larger or smaller, they would cost up to d digits. W has no derivative, as nothing
+    depends on it. For arrays of NumPy or JAX.
+    """
+    xp = matrix.__array_namespace__()
+    size = xp.sum(jacobian**2, axis=-1)
+    weights = xp.max(xp.abs(xp.diagonal(matrix, axis1=-2, axis2=-1)), axis=-1)[..., None] / xp.where(size > 0, size, 1)
+    weights = weights if xp is np else jax.lax.stop_gradient(weights)
+    weighted = weights[..., None] * jacobian
+    return matrix + xp.swapaxes(jacobian, -1, -2) @ weighted, weighted
 
 
 def dependent_rows(matrix: np.ndarray) -> dict[int, np.ndarray]:
-    """The rows of G that are combinations of rows before them, with the factors, from S = G K⁻¹ Gᵀ.
+    """The rows of G that are combinations of rows before them, from the Schur complement S (m, m).
 
-    A row is one where its part outside of those before it is below `rank_tolerance` of its own size, squared as S is.
+    For each its index, and by which factors (m,) it is made of the others. A row is dependent where its part outside of
+    those before it is below `rank_tolerance` of its own size, squared as S is.
     """
-    independent, found = [], {}
+    independent, dependent = [], {}
     for row in range(len(matrix)):
         among = matrix[np.ix_(independent, independent)]
         scale = 1 / np.sqrt(np.diagonal(among))
         factors = scale * np.linalg.solve(scale[:, None] * among * scale, scale * matrix[independent, row])
         outside = matrix[row, row] - factors @ matrix[independent, row]
         if outside <= rank_tolerance(matrix.dtype) * matrix[row, row]:
-            weight = factors / scale  # how much of the row each of them makes up
-            factors = np.where(np.abs(weight) > 1e-6 * np.sqrt(matrix[row, row]), factors, 0)
-            found[row] = np.zeros(len(matrix))
-            found[row][independent] = factors
+            # A row that makes up less than a millionth of the combination is not worth a name in a message.
+            part = np.abs(factors / scale) > 1e-6 * np.sqrt(matrix[row, row])
+            dependent[row] = np.zeros(len(matrix))
+            dependent[row][independent] = np.where(part, factors, 0)
         else:
             independent.append(row)
-    return found
-
-
-def _weights(matrix, rows):
-    """Weights that make every row of G as heavy as M."""
-    size = jnp.sum(rows**2, axis=1)
-    return jnp.max(jnp.abs(jnp.diagonal(matrix))) / jnp.where(size > 0, size, 1)
+    return dependent
 
 
 def rank_tolerance(dtype) -> float:
-    """The part of a constraint, scaled to 1, below which it counts as a combination of the others: eps^(2/3)."""
+    """The part of a constraint, scaled to 1, below which it counts as a combination of the others: eps^(2/3).
+
+    It is compared with pivots of S. One of eps^(2/3) = 4e-11 is 2e5 units of round-off, so that redundant constraints,
+    whose pivots are some units, never count as independent, which would give multipliers of any size. A constraint that
+    differs from the others by less than eps^(1/3) = 6e-6 of its length counts as redundant; with twice the tolerance
+    that is 9e-6.
+    """
     return float(jnp.finfo(dtype).eps) ** (2 / 3)
 
 
-def least_norm(matrix: jax.Array, b: jax.Array) -> jax.Array:
-    """The shortest x with S x = b for a symmetric S of any rank and b in its range.
+def least_norm(matrix: Matrix, b: Vector) -> Vector:
+    """The shortest x with S x = b for a symmetric S (m, m) of any rank and b in its range.
 
     The rank is that of S scaled to a unit diagonal, where pivots below `rank_tolerance` count as zero.
     """
@@ -285,15 +362,20 @@ def least_norm(matrix: jax.Array, b: jax.Array) -> jax.Array:
 
 
 @jax.custom_jvp
-def _inverse_on_range(matrix: jax.Array) -> jax.Array:
-    scale = _diagonal_scale(matrix)
+def _inverse_on_range(matrix: Matrix) -> Matrix:
+    """The pseudo-inverse of a symmetric matrix whose rank is decided by `rank_tolerance`.
+
+    It is applied to right-hand sides in the range alone: what dependent constraints ask for is tested to be consistent
+    before a motion starts. So it chooses among multipliers that all give the same motion, and hides no contradiction.
+    """
+    scale = diagonal_scale(matrix)
     inverse, basis, pairs = _independent(_scaled(matrix, scale), scale)
     some = scale[:, None] * inverse * scale  # solves S x = b, but its x need not be the shortest
-    # The part of x in the range of S is the shortest one: P x with P = W (WᵀW)⁻¹ Wᵀ, where W is the basis of the range
-    # scaled back. WᵀW is at least the unit matrix; where W has no column, that of the unit matrix takes its place.
+    # The part of x in the range of S is the shortest one: P x with P = B (BᵀB)⁻¹ Bᵀ, where B is the basis of the range
+    # scaled back. BᵀB is at least the unit matrix; where B has no column, that of the unit matrix takes its place.
     basis = basis / scale[:, None] * (scale @ pairs)
     gram = basis.T @ basis + jnp.diag(1 - jnp.sum(pairs, axis=0))
-    projector = basis @ jax.vmap(factorize(gram).solve, in_axes=1, out_axes=1)(basis.T)
+    projector = basis @ factorize(gram).solve_columns(basis.T)
     return projector @ some @ projector
 
 
@@ -301,25 +383,26 @@ def _inverse_on_range(matrix: jax.Array) -> jax.Array:
 def _inverse_on_range_jvp(primals, tangents):
     # Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973) 413, eq. (4.12), for a symmetric matrix of constant rank. Not by
     # way of the eigenvectors, which have no derivative where eigenvalues meet.
-    (matrix,), (moving,) = primals, tangents
+    (matrix,), (tangent,) = primals, tangents
     inverse = _inverse_on_range(matrix)
     outside = jnp.eye(len(matrix), dtype=matrix.dtype) - inverse @ matrix
-    turned = outside @ moving @ inverse @ inverse
-    return inverse, turned + turned.T - inverse @ moving @ inverse
+    of_range = outside @ tangent @ inverse @ inverse
+    return inverse, of_range + of_range.T - inverse @ tangent @ inverse
 
 
-def rank(matrix: jax.Array) -> jax.Array:
-    """How many rows of a symmetric matrix are independent, where entries below `rank_tolerance` count as zero."""
+def rank(matrix: Matrix) -> Int[Array, ""]:
+    """How many rows of a symmetric matrix (m, m) are independent: `rank_tolerance` decides what counts as zero."""
     return jnp.sum(_independent(matrix, jnp.ones(len(matrix), matrix.dtype))[2]).astype(int)
 
 
-def _independent(matrix: jax.Array, scale: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(X, W, Q) of a symmetric A: A X A = A; W, a basis of its range; Q, 1 where a row was the pivot of a column.
+def _independent(matrix: Matrix, scale: Vector) -> tuple[Matrix, Matrix, Matrix]:
+    """X, B and Q of a symmetric A, (m, m) each, by elimination with complete pivoting.
 
-    Elimination with complete pivoting, which ends where all that is left is below `rank_tolerance`. W has a column for
-    every column that had a pivot, and is Q in the rows of the pivots; other columns are zero. A is positive
-    semi-definite where M is, but need not be. Of pivots that are nearly as good as the largest the one is taken that
-    is largest before `scale` was applied, which keeps W well-conditioned.
+    A X A = A; B is a basis of the range of A; Q is 1 where a row was the pivot of a column. The elimination ends where
+    all that remains is below `rank_tolerance`. B has a column for every column that had a pivot, and is Q in the rows
+    of the pivots; its other columns are zero. A is positive semi-definite where M is, but need not be. Of pivots within
+    a factor of ten of the largest, the one is taken that is largest before `scale` was applied, which keeps B
+    well-conditioned; the factor bounds what that costs X, one digit.
     """
     m = len(matrix)
 
@@ -327,13 +410,13 @@ def _independent(matrix: jax.Array, scale: jax.Array) -> tuple[jax.Array, jax.Ar
         a, pairs = carry
         free = (jnp.sum(pairs, axis=1) == 0)[:, None] & (jnp.sum(pairs, axis=0) == 0)
         size = jnp.where(free, jnp.abs(a), -1)
-        largest = jnp.max(size)  # NaN, if there is one: comparisons are such that it gets into the result
+        largest = jnp.max(size)  # NaN, if there is one: the comparisons are written so that it reaches the result
         good = free & ~(size < 0.1 * largest)
-        place = jnp.argmax(jnp.where(good, size / (scale[:, None] * scale), -1))
-        here, now = np.arange(m) == place // m, np.arange(m) == place % m
+        index = jnp.argmax(jnp.where(good, size / (scale[:, None] * scale), -1))
+        row, column = np.arange(m) == index // m, np.arange(m) == index % m
         counts = ~(largest <= rank_tolerance(a.dtype))
-        a = jnp.where(counts, _exchanged(a, here, now)[0], a)
-        return a, pairs + (here[:, None] & now & counts)
+        a = jnp.where(counts, _exchanged(a, row, column)[0], a)
+        return a, pairs + (row[:, None] & column & counts)
 
     a, pairs = jax.lax.fori_loop(0, m, one_pivot, (matrix, jnp.zeros_like(matrix)))
     rows, columns = jnp.sum(pairs, axis=1) > 0, jnp.sum(pairs, axis=0) > 0
@@ -344,149 +427,141 @@ def _independent(matrix: jax.Array, scale: jax.Array) -> tuple[jax.Array, jax.Ar
 # ---- many small systems side by side, in NumPy -----------------------------------------------------------------------
 
 
-def solve_many(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """x with M x = b for symmetric M (S, n, n) and b (S, n, k); NaN where M is singular, as `Factorization.solve`."""
+def solve_many(matrix: Matrices, b: np.ndarray) -> np.ndarray:
+    """X (S, n, k) with M X = b for S symmetric matrices M, as `Factorization.solve`: NaN where M is singular."""
     if matrix.shape[1] == 1:
         return b / np.where(matrix == 0, np.nan, matrix)
     matrix = 0.5 * (matrix + np.swapaxes(matrix, 1, 2))
-    scale = _scales(matrix)
-    scaled = scale[:, :, None] * matrix * scale[:, None, :]
-    usable = np.isfinite(scaled).all(axis=(1, 2))
-    scaled = np.where(usable[:, None, None], scaled, np.eye(matrix.shape[1], dtype=matrix.dtype))
+    scale = diagonal_scale(matrix)
+    scaled, finite = _or_unit(_scaled(matrix, scale))
     sizes = np.abs(np.linalg.eigvalsh(scaled))
-    usable &= sizes.min(axis=1) > singular_threshold(matrix.shape[1], matrix.dtype) * sizes.max(axis=1)
-    scaled = np.where(usable[:, None, None], scaled, np.eye(matrix.shape[1], dtype=matrix.dtype))
+    regular = sizes.min(axis=1) > singular_threshold(matrix.shape[1], matrix.dtype) * sizes.max(axis=1)
+    scaled = np.where(regular[:, None, None], scaled, np.eye(matrix.shape[1], dtype=matrix.dtype))
     x = scale[:, :, None] * np.linalg.solve(scaled, scale[:, :, None] * b)
-    return np.where(usable[:, None, None], x, np.nan)
+    return np.where((finite & regular)[:, None, None], x, np.nan)
 
 
-def saddle_many(matrix, b, rows, c) -> tuple[np.ndarray, np.ndarray]:
-    """x (S, n) and λ (S, m), of least norm, of S saddle points, as `saddle`; `rows` (S, m, n) may be empty."""
-    if not rows.shape[1]:
+def saddle_many(matrix: Matrices, b, jacobian, c) -> tuple[np.ndarray, np.ndarray]:
+    """x (S, n) and λ (S, m), of least norm, of S saddle points, as `saddle`; `jacobian` (S, m, n) may have no rows."""
+    if not jacobian.shape[1]:
         return solve_many(matrix, b[:, :, None])[:, :, 0], np.zeros((len(b), 0), b.dtype)
-    augmented, weighted = _augmented(matrix, rows)
-    turned = np.swapaxes(rows, 1, 2)
-    solved = solve_many(augmented, np.concatenate([(b + np.einsum("skn,sk->sn", weighted, c))[:, :, None], turned], 2))
-    free, responses = solved[:, :, 0], solved[:, :, 1:]
-    left = c - np.einsum("skn,sn->sk", rows, free)
-    multipliers = _solved_on_range(rows @ responses, left[:, :, None])[:, :, 0]
+    augmented, weighted = augment(matrix, jacobian)
+    transposed = np.swapaxes(jacobian, 1, 2)
+    right = b + np.einsum("skn,sk->sn", weighted, c)
+    solutions = solve_many(augmented, np.concatenate([right[:, :, None], transposed], axis=2))
+    free, responses = solutions[:, :, 0], solutions[:, :, 1:]
+    missing = c - np.einsum("skn,sn->sk", jacobian, free)
+    multipliers = _least_norm_many(jacobian @ responses, missing[:, :, None])[:, :, 0]
     return free + np.einsum("snk,sk->sn", responses, multipliers), multipliers
 
 
-def schur_complements(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """S = G K⁻¹ Gᵀ of `schur_complement`, for S matrices at once."""
-    return rows @ solve_many(_augmented(matrix, rows)[0], np.swapaxes(rows, 1, 2))
+def schur_complements(matrix: Matrices, jacobian: np.ndarray) -> np.ndarray:
+    """S = G K⁻¹ Gᵀ (S, m, m), as `schur_complement`, of S states."""
+    return jacobian @ solve_many(augment(matrix, jacobian)[0], np.swapaxes(jacobian, 1, 2))
 
 
-def _augmented(matrix: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """K = M + GᵀW G and W G."""
-    size, heavy = np.sum(rows**2, axis=2), np.abs(np.diagonal(matrix, axis1=1, axis2=2)).max(axis=1)
-    weighted = (heavy[:, None] / np.where(size > 0, size, 1))[:, :, None] * rows
-    return matrix + np.swapaxes(rows, 1, 2) @ weighted, weighted
-
-
-def _solved_on_range(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The shortest x with S x = b, as `least_norm`, for symmetric S of any rank (S, m, m)."""
-    usable = np.isfinite(matrix).all(axis=(1, 2))
-    matrix = np.where(usable[:, None, None], matrix, np.eye(matrix.shape[1], dtype=matrix.dtype))
-    scale = _scales(matrix)
-    values, vectors = np.linalg.eigh(scale[:, :, None] * matrix * scale[:, None, :])
-    kept = np.abs(values) > rank_tolerance(matrix.dtype)
-    inverse = np.where(kept, 1 / np.where(kept, values, 1), 0)[:, :, None]
+def _least_norm_many(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The shortest X (S, m, k) with S X = b, as `least_norm`, for S symmetric matrices (S, m, m) of any rank."""
+    scale = diagonal_scale(matrix)
+    scaled, finite = _or_unit(_scaled(matrix, scale))
+    values, vectors = np.linalg.eigh(scaled)
+    in_range = np.abs(values) > rank_tolerance(matrix.dtype)
+    inverse = np.where(in_range, 1 / np.where(in_range, values, 1), 0)[:, :, None]
     x = scale[:, :, None] * (vectors @ (inverse * (np.swapaxes(vectors, 1, 2) @ (scale[:, :, None] * b))))
-    if not kept.all():  # what of x lies in the kernel of S is taken out: the kernel of the scaled matrix, scaled back
-        kernel = np.where(kept[:, None, :], 0, scale[:, :, None] * vectors)
-        turned = np.swapaxes(kernel, 1, 2)
-        gram = turned @ kernel + kept[:, :, None] * np.eye(matrix.shape[1], dtype=matrix.dtype)
-        x = x - kernel @ np.linalg.solve(gram, turned @ x)
-    return np.where(usable[:, None, None], x, np.nan)
+    if not in_range.all():  # the part of x in the kernel of S is removed: the kernel of the scaled matrix, scaled back
+        kernel = np.where(in_range[:, None, :], 0, scale[:, :, None] * vectors)
+        transposed = np.swapaxes(kernel, 1, 2)
+        gram = transposed @ kernel + in_range[:, :, None] * np.eye(matrix.shape[1], dtype=matrix.dtype)
+        x = x - kernel @ np.linalg.solve(gram, transposed @ x)
+    return np.where(finite[:, None, None], x, np.nan)
 
 
-def _scales(matrix: np.ndarray) -> np.ndarray:
-    """`_diagonal_scale` of many matrices."""
-    diagonal = np.abs(np.diagonal(matrix, axis1=1, axis2=2))
-    size = np.where(diagonal > 0, diagonal, np.abs(matrix).max(axis=2))
-    return 1 / np.sqrt(np.where(size > 0, size, 1))
+def _or_unit(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Matrices (S, n, n) with the unit matrix for those that hold a NaN, at which LAPACK raises; which are finite."""
+    finite = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
+    return np.where(finite[:, None, None], matrix, np.eye(matrix.shape[1], dtype=matrix.dtype)), finite
+
+
+# ---- the saddle point on scalars -------------------------------------------------------------------------------------
 
 
 class SaddleElimination:
-    """The same as `saddle` on scalars, without pivoting: M positive (semi)definite, G a list of rows.
+    """`saddle` on scalars, without pivoting: M positive (semi)definite, G a list of m rows.
 
-    `zeros` marks what is zero in (M, G) whatever the state. With `helped` M may be singular; without, it must be
-    regular. Redundant rows are left out of λ: the motion is the same, the multipliers are a solution but not the
-    shortest. A `wary` elimination calls a saddle point singular as soon as it loses digits: where M, or what the
-    constraints make of it, is not far from singular (`WARY`).
+    `zeros` marks what is zero in M (n, n) and in G (m, n) whatever the state. M is `augmented` by GᵀW G unless it is
+    known to be regular. Redundant rows are left out of λ: the motion is the same, the multipliers are a solution but
+    not the shortest. With `regular_only` the saddle point is called singular as soon as it loses digits: where M, or
+    what the constraints make of it, is within `REGULAR` of singular. That is the regular-M variant, which takes a third
+    of the arithmetic and leaves the rest of the states to the general one.
     """
 
-    def __init__(self, zeros: tuple[np.ndarray, np.ndarray], dtype, helped: bool, wary: bool):
+    def __init__(self, zeros: tuple[np.ndarray, np.ndarray], dtype, augmented: bool, regular_only: bool):
         self.mass_zeros, self.row_zeros = zeros
-        self.dtype, self.helped, self.wary = dtype, helped, wary
+        self.dtype, self.augmented, self.regular_only = dtype, augmented, regular_only
 
-    def factors(self, matrix: list[list], rows: list[list]) -> tuple[Any, jax.Array]:
+    def factors(self, matrix: list[list], jacobian: list[list]) -> tuple[Any, jax.Array]:
         """What `solve` needs of M and G, a tree of scalars, and whether the saddle point is singular."""
-        n, m, wary = len(matrix), len(rows), self.wary
-        zeros, pulled, singular = self.mass_zeros, None, jnp.zeros((), bool)
-        if self.helped:
-            matrix, pulled, zeros = _helped(matrix, rows, zeros, self.row_zeros)
-        if wary:
+        n, m, regular_only = len(matrix), len(jacobian), self.regular_only
+        zeros, weighted = self.mass_zeros, None
+        if self.augmented:
+            matrix, weighted, zeros = _augmented_entries(matrix, jacobian, zeros, self.row_zeros)
+        mass, singular = _ldl_factors(matrix, ~zeros, REGULAR if regular_only else singular_threshold(n, self.dtype))
+        responses = [_ldl_solve(mass, row) for row in jacobian]
+        schur = [[self._row_times(i, jacobian, responses[j]) for j in range(m)] for i in range(m)]
+        threshold = REGULAR if regular_only else rank_tolerance(self.dtype)
+        schur, redundant = _ldl_factors(schur, np.ones((m, m), bool), threshold, drop=not regular_only)
+        if regular_only:
             least, most = (functools.reduce(of, (matrix[i][i] for i in range(n))) for of in (jnp.minimum, jnp.maximum))
-            singular = (
-                least <= WARY * most
-            )  # the constraints would have to hold a light coordinate against large forces
-        free, lost = _ldl_factors(matrix, ~zeros, WARY if wary else singular_threshold(n, self.dtype))
-        responses = [_ldl_solve(free, row) for row in rows]
-        schur = [[self._along(i, rows, responses[j]) for j in range(m)] for i in range(m)]
-        small = WARY if wary else rank_tolerance(self.dtype)
-        held, redundant = _ldl_factors(schur, np.ones((m, m), bool), small, drop=not wary)
-        return (rows, pulled, free, responses, held), singular | lost | redundant if wary else lost
+            # The constraints would have to hold a light coordinate against forces on heavy ones.
+            uneven = least <= REGULAR * most
+            singular = uneven | singular | redundant
+        return (jacobian, weighted, mass, responses, schur), singular
 
     def solve(self, factors, right: list) -> list:
-        """x and then −λ, linear in b and then c."""
-        rows, pulled, free, responses, held = factors
+        """x and then −λ, n + m scalars, linear in `right`: b and then c."""
+        jacobian, weighted, mass, responses, schur = factors
         m, n = self.row_zeros.shape
         b, c = right[:n], right[n:]
-        if pulled is not None:
-            b = [b[i] + _dot((pulled[k][i], c[k]) for k in range(m) if not self.row_zeros[k, i]) for i in range(n)]
-        x = _ldl_solve(free, b)
-        pulls = _ldl_solve(held, [self._along(i, rows, x) - c[i] for i in range(m)])
+        if weighted is not None:
+            b = [b[i] + _dot((weighted[k][i], c[k]) for k in range(m) if not self.row_zeros[k, i]) for i in range(n)]
+        x = _ldl_solve(mass, b)
+        pulls = _ldl_solve(schur, [self._row_times(i, jacobian, x) - c[i] for i in range(m)])
         return [x[k] - _dot((responses[i][k], pulls[i]) for i in range(m)) for k in range(n)] + pulls
 
-    def _along(self, i: int, rows, x):
-        return _dot((rows[i][k], x[k]) for k in range(len(x)) if not self.row_zeros[i, k])
+    def _row_times(self, i: int, jacobian, x):
+        """Row i of G times x, without the entries that are always zero."""
+        return _dot((jacobian[i][k], x[k]) for k in range(len(x)) if not self.row_zeros[i, k])
 
 
-WARY = 1e-4  # the part of a pivot that has to be left: four digits of an acceleration may be lost, and no more
+# The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
+# digits of an acceleration may be lost, and twelve remain. Twice as large, a few more states take the general variant,
+# three times as expensive; much smaller, the error of an acceleration would exceed the tolerances.
+REGULAR = 1e-4
 
 
-def _helped(matrix, rows, mass_zeros, row_zeros):
-    """M + GᵀW G, W G, and where the first is zero whatever the state."""
-    n, m = len(matrix), len(rows)
-    touched = ~row_zeros
-    total = _dot((matrix[i][i], 1.0) for i in range(n))
-    sizes = [_dot((rows[k][i], rows[k][i]) for i in range(n) if touched[k, i]) for k in range(m)]
-    # Weights that make every row of G as heavy as M.
-    heavy = [total / jnp.where(size > 0, size, 1.0) for size in sizes]
-    pulled = [[heavy[k] * rows[k][i] for i in range(n)] for k in range(m)]
-    matrix = [
-        [matrix[i][j] + _dot((pulled[k][i], rows[k][j]) for k in range(m) if touched[k, i] and touched[k, j])
-         for j in range(n)] for i in range(n)
-    ]  # fmt: skip
-    return matrix, pulled, mass_zeros & ~((touched.T.astype(int) @ touched.astype(int)) > 0)
+def _augmented_entries(matrix, jacobian, mass_zeros, row_zeros):
+    """M + GᵀW G and W G, entry by entry, and where the first is zero whatever the state.
+
+    The weights are the trace of M over |Gₖ|², within a factor n of those of `augment`. They are differentiated here
+    like everything else, and a trace is smooth where a maximum is not.
+    """
+    n, m = len(matrix), len(jacobian)
+    present = ~row_zeros
+    trace = _dot((matrix[i][i], 1.0) for i in range(n))
+    sizes = [_dot((jacobian[k][i], jacobian[k][i]) for i in range(n) if present[k, i]) for k in range(m)]
+    weights = [trace / jnp.where(size > 0, size, 1.0) for size in sizes]
+    weighted = [[weights[k] * jacobian[k][i] for i in range(n)] for k in range(m)]
+
+    def added(i, j):
+        return _dot((weighted[k][i], jacobian[k][j]) for k in range(m) if present[k, i] and present[k, j])
+
+    matrix = [[matrix[i][j] + added(i, j) for j in range(n)] for i in range(n)]
+    return matrix, weighted, mass_zeros & ~((present.T.astype(int) @ present.astype(int)) > 0)
 
 
 def _dot(pairs):
+    """Σ a b over pairs of scalars."""
     total = 0.0
     for a, b in pairs:
         total = total + a * b
     return total
-
-
-def _diagonal_scale(matrix: jax.Array) -> jax.Array:
-    """1/√|Mii|, or the row's largest entry where the diagonal is zero, or 1 where the whole row is."""
-    diagonal = jnp.abs(jnp.diagonal(matrix))
-    size = jnp.where(diagonal > 0, diagonal, jnp.max(jnp.abs(matrix), axis=1))
-    return jax.lax.rsqrt(jnp.where(size > 0, size, 1))
-
-
-def _scaled(matrix: jax.Array, scale: jax.Array) -> jax.Array:
-    return scale[:, None] * matrix * scale

@@ -51,7 +51,9 @@ class FineOutput(diffrax.AbstractAdaptiveSolver):
     interpolation_cls: ClassVar[Callable]
 
     def __check_init__(self):
-        if not isinstance(self.solver, diffrax.AbstractERK) or not self.solver.tableau.fsal:
+        explicit = isinstance(self.solver, diffrax.AbstractERK)
+        tableau = self.solver.tableau if explicit else None
+        if not isinstance(tableau, diffrax.ButcherTableau) or not tableau.fsal:
             raise TypeError(f"FineOutput takes an explicit FSAL Runge-Kutta solver of diffrax; got {self.solver!r}.")
 
     @property
@@ -59,7 +61,7 @@ class FineOutput(diffrax.AbstractAdaptiveSolver):
         """One term, of an ordinary differential equation."""
         return diffrax.ODETerm
 
-    def order(self, terms) -> int:
+    def order(self, terms) -> int | None:
         """The order of the solver."""
         return self.solver.order(terms)
 
@@ -176,7 +178,7 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         """That of the solver."""
         return self.solver.interpolation_cls
 
-    def order(self, terms) -> int:
+    def order(self, terms) -> int | None:
         """The order of the solver."""
         return self.solver.order(terms)
 

@@ -1,7 +1,7 @@
 """`System`: the scene as its author describes it, and the physics one can ask of a single state.
 
 A `System` holds the user's functions, checked for their signatures when it is built and for what they return when they
-first meet a state. `System.motion(layout)` hands the same scene on, in flat coordinates, to whoever integrates it.
+first meet a state. `System.motion(layout)` is the same scene in flat coordinates, as an integration takes it.
 """
 
 import math
@@ -12,6 +12,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from lagjax._arguments import Function, accept
 from lagjax._constraints import Constraints
@@ -26,6 +28,7 @@ from lagjax._program import Unlowerable
 from lagjax._validate import as_arrays, is_concrete, require_number
 
 PyTree = Any
+Time = Float[ArrayLike, ""]  # a number, or an array of shape ()
 
 
 class System(eqx.Module):
@@ -106,63 +109,98 @@ class System(eqx.Module):
     def __repr__(self) -> str:
         """One line: the functions of the scene and what each asks for. `equinox.tree_pprint` prints the fields."""
         roles = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
-        given = [(role, getattr(self, role)) for role in roles]
+        functions = [(role, getattr(self, role)) for role in roles]
         # Mapped to another pytree (axes, filters), a scene is no longer made of functions.
-        shown = [f"{role}={getattr(f, 'name', f)}" for role, f in given if f is not None]
+        shown = [f"{role}={getattr(f, 'name', f)}" for role, f in functions if f is not None]
         return f"System({', '.join(shown)}, path={self.path!r})"
 
-    def acceleration(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
-        """q̈ from Lagrange's equations, in the structure of `q`; NaN where the mass matrix is singular."""
+    # ---- the physics of one state: q and qdot in the user's pytree, the time t, the parameters params ----
+
+    def acceleration(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """q̈ from Lagrange's equations, in the structure of `q`; NaN where no acceleration is determined.
+
+        That is where M is singular, or, with constraints, where M and the constraints together leave something free.
+        """
         return self._at(Motion.acceleration, q, qdot, t, params, restore=True)
 
-    def mass_matrix(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> jax.Array:
-        """M = ∂²L/∂q̇², shape (n, n), in the order in which the leaves of `q` lie end to end."""
+    def mass_matrix(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Float[Array, "n n"]:
+        """M = ∂²L/∂q̇², in the order in which the leaves of `q` lie end to end.
+
+        The entry of two coordinates a and b has units energy·time²/({a}{b}).
+        """
         return self._at(Motion.mass_matrix, q, qdot, t, params)
 
-    def momentum(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
-        """The conjugate momentum p = ∂L/∂q̇, in the structure of `q`."""
+    def momentum(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """The conjugate momentum p = ∂L/∂q̇, in the structure of `q`, in units energy·time/{q}."""
         return self._at(Motion.momentum, q, qdot, t, params, restore=True)
 
-    def generalized_force(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
-        """∂L/∂q + Q − ∂D/∂q̇, in the structure of `q`: what dp/dt equals along the motion."""
+    def generalized_force(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """∂L/∂q + Q − ∂D/∂q̇, in the structure of `q`, in units energy/{q}.
+
+        Without constraints dp/dt equals it along the motion; with them, together with `constraint_force`.
+        """
         return self._at(Motion.generalized_force, q, qdot, t, params, restore=True)
 
-    def energy(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> jax.Array:
-        """h = p·q̇ − L. It changes by dh/dt = −∂L/∂t + (Q − ∂D/∂q̇)·q̇, and need not equal T + U."""
+    def energy(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Float[Array, ""]:
+        """h = p·q̇ − L, a scalar. It changes by dh/dt = −∂L/∂t + (Q − ∂D/∂q̇)·q̇, and need not equal T + U.
+
+        Constraints that depend on the time do work as well: −λ ∂f/∂t.
+        """
         return self._at(Motion.energy, q, qdot, t, params)
 
-    def multipliers(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
+    def multipliers(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
         """λ, in the structure that the constraint functions return: a dict by name if they return dicts.
 
-        With both kinds of constraints: one dict if both return dicts, else the pair (λ, μ).
+        With both kinds of constraints: one dict if both return dicts, else the pair (λ, μ). Where constraints are
+        redundant, their forces are shared by the multipliers of least norm. λ has units energy/{f}.
+
+        **Raises** `ValueError` for a system without constraints.
         """
         return self._of_constraints(Motion.multipliers, q, qdot, t, params)
 
-    def constraint_residual(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
-        """f and a, in the structure of `multipliers`: zero where the constraints hold."""
+    def constraint_residual(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """f and a, in the structure of `multipliers`: zero where the constraints hold.
+
+        **Raises** `ValueError` for a system without constraints.
+        """
         return self._of_constraints(Motion.residual, q, qdot, t, params)
 
-    def constraint_force(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> PyTree:
-        """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ, in the structure of `q`."""
+    def constraint_force(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ, in the structure of `q`, in units energy/{q}.
+
+        **Raises** `ValueError` for a system without constraints.
+        """
         self._require_constraints()
         return self._at(Motion.constraint_force, q, qdot, t, params, restore=True)
 
-    def project(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> tuple[PyTree, PyTree]:
-        """The nearest consistent state.
+    def project(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> tuple[PyTree, PyTree]:
+        """The consistent state (q̂, v̂) nearest to (q, q̇), in the structure of `q`.
 
-        Of all q with f = 0 the one nearest in the metric of M(q, q̇), then of all velocities with J q̇ + ∂f/∂t = 0 and
-        a = 0 those nearest in that of M there. Differentiable as that function of the state and of the parameters. NaN
-        where Newton's method does not find it; contradictory constraints have none.
+            q̂ minimises (q̂ − q)ᵀ M(q, q̇) (q̂ − q)    among all with f(q̂, t) = 0
+            v̂ minimises (v̂ − q̇)ᵀ M(q̂, q̇) (v̂ − q̇)   among all with J v̂ + ∂f/∂t = 0 and a(q̂, v̂, t) = 0
+
+        It has the derivatives of that function, of every order, by the state, the time and the parameters. Values and
+        derivatives are NaN where Newton's method does not find it; constraints that contradict each other have none.
+
+        **Raises** `ValueError` for a system without constraints.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        circle = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q @ q - 1.0)
+        q0, qdot0 = circle.project(jnp.array([3.0, 4.0]), jnp.array([0.0, 1.0]))  # (0.6, 0.8), (-0.48, 0.36)
+        ```
         """
         self._require_constraints()
         layout = Layout.of(q, qdot)
         q, qdot = self._at(Motion.nearest_consistent, q, qdot, t, params)
         return layout.restore(q), layout.restore(qdot)
 
-    def explain(self, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> Explanation:
+    def explain(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Explanation:
         """What this scene contains and what was left out of its equations; print it, or read its fields.
 
-        All of it holds for every state and time, except which constraints depend on which.
+        Read from the scene's programs, so that all of it holds for every state and time, except which constraints
+        depend on which. Raises what `System` raises for coordinates and functions that cannot be.
 
         ```python
         import lagjax
@@ -188,27 +226,25 @@ class System(eqx.Module):
 
         code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
 
-        def of_vectors(function, result):
-            """The user's `function` of (q, qdot), with its pytree turned into the array that `result` makes of it."""
-            if function is None:
-                return None
+        def of_vectors(function: Function, to_array: Callable) -> Callable:
+            """The user's function in flat coordinates, the last of which are (t, params); `to_array` flattens it."""
 
-            def of_state(q, qdot, t, numbers):
-                extras = {"t": t, "params": eqx.combine(numbers, code)}
-                return result(function(layout.restore(q), layout.restore(qdot), **extras))
+            def flat(*arguments):
+                *vectors, t, numbers = arguments
+                trees = map(layout.restore, vectors)
+                return to_array(function(*trees, t=t, params=eqx.combine(numbers, code)))
 
-            return of_state
+            return flat
 
-        def positions(q, t, numbers):
-            return _end_to_end(constraints(layout.restore(q), t=t, params=eqx.combine(numbers, code)))
+        def optional(function: Function | None, to_array: Callable) -> Callable | None:
+            return None if function is None else of_vectors(function, to_array)
 
-        constraints = self.constraints
         return Motion(
             lagrangian=of_vectors(self.lagrangian, lambda value: value),
-            forces=of_vectors(self.forces, layout.flatten),
-            dissipation=of_vectors(self.dissipation, lambda value: value),
+            forces=optional(self.forces, layout.flatten),
+            dissipation=optional(self.dissipation, lambda value: value),
             constraints=Constraints(
-                None if constraints is None else positions, of_vectors(self.velocity_constraints, _end_to_end)
+                optional(self.constraints, _end_to_end), optional(self.velocity_constraints, _end_to_end)
             ),
         )
 
@@ -221,17 +257,17 @@ class System(eqx.Module):
         return self.by_constraint(self._at(quantity, q, qdot, t, params), Layout.of(q, qdot), params)
 
     def by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
-        """A number for each constraint, end to end, in the structure of `multipliers`."""
+        """`flat` (m,), a number for each constraint, in the structure of `multipliers`."""
         structure = self.constraint_structure(layout, params)
         ends = np.cumsum([0, *(math.prod(leaf.shape) for leaf in jax.tree.leaves(structure))]).tolist()
         pieces = [
             flat[start:end].reshape(leaf.shape)
             for start, end, leaf in zip(ends[:-1], ends[1:], jax.tree.leaves(structure), strict=True)
         ]
-        held = jax.tree.unflatten(jax.tree.structure(structure), pieces)
-        if len(held) == 1:
-            return held[0]
-        return {**held[0], **held[1]} if all(isinstance(part, dict) for part in held) else held
+        parts = jax.tree.unflatten(jax.tree.structure(structure), pieces)
+        if len(parts) == 1:
+            return parts[0]
+        return {**parts[0], **parts[1]} if all(isinstance(part, dict) for part in parts) else parts
 
     def constraint_structure(self, layout: Layout, params: PyTree) -> tuple:
         """The shapes that the constraint functions return, a tuple of one or two pytrees."""
@@ -239,15 +275,15 @@ class System(eqx.Module):
 
         def returned(q, t, p):
             extras = {"t": t, "params": eqx.combine(p, code)}
-            held = [] if self.constraints is None else [self.constraints(q, **extras)]
-            held += [] if self.velocity_constraints is None else [self.velocity_constraints(q, q, **extras)]
-            return tuple(held)
+            positions = () if self.constraints is None else (self.constraints(q, **extras),)
+            velocities = () if self.velocity_constraints is None else (self.velocity_constraints(q, q, **extras),)
+            return positions + velocities
 
         state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
         return jax.eval_shape(returned, state, t, numbers)
 
     def constraint_names(self, layout: Layout, params: PyTree) -> list[str]:
-        """One for every number that is to be zero: constraints['rod'], velocity_constraints[1]."""
+        """A name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
         roles = [role for role in ("constraints", "velocity_constraints") if getattr(self, role) is not None]
         names = []
         for role, part in zip(roles, self.constraint_structure(layout, params), strict=True):
@@ -257,7 +293,7 @@ class System(eqx.Module):
         return names
 
     def _at(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
-        """Evaluate one of `Motion`'s functions at a state given in the user's pytree."""
+        """One of `Motion`'s functions at a state in the user's pytree, back in that pytree where `restore` says so."""
         layout = Layout.of(q, qdot)
         require_number(t, "t")
         q, qdot, t = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state")
@@ -271,8 +307,8 @@ class System(eqx.Module):
 
         None where something is being traced, or the scene has no programs.
         """
-        known = all(is_concrete(leaf) for leaf in jax.tree.leaves((self, q, qdot, t, params)))
-        if self.path == "array" or quantity not in _OF_QUANTITIES or not known:
+        concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves((self, q, qdot, t, params)))
+        if self.path == "array" or quantity not in _OF_QUANTITIES or not concrete:
             return None
         names, function = _OF_QUANTITIES[quantity]
         q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)])[None] for x in (q, qdot))
@@ -315,7 +351,7 @@ def _solved(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return saddle_many(*(of[name] for name in _SADDLE))
 
 
-# What the functions of `Motion` are in terms of `Motion.quantities` and q̇, at S states: names, and how to go on.
+# The functions of `Motion` in terms of `Motion.quantities` and q̇ (S, n) at S states: which of them, and the formula.
 _OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
     Motion.acceleration: (_SADDLE, lambda of, v: _solved(of)[0]),
     Motion.multipliers: (_SADDLE, lambda of, v: _solved(of)[1]),
@@ -337,7 +373,7 @@ _OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
 
 @eqx.filter_jit
 def _evaluate(system: System, quantity: Callable, q, qdot, t, params):
-    """One of `Motion`'s functions, compiled: one by one, its operations would take seconds to prepare."""
+    """One of `Motion`'s functions, compiled whole: XLA would take seconds to prepare its operations one by one."""
     layout = Layout.of(q, qdot)
     numbers, state = eqx.filter(params, eqx.is_array), (layout.flatten(q), layout.flatten(qdot))
     if quantity is Motion.acceleration:  # in the form in which diffrax integrates it

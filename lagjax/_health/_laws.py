@@ -219,7 +219,7 @@ def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int,
     except Unlowerable:
         motion, asked = derivation.motion, (system.lagrangian, system.constraints, system.velocity_constraints)
         could_work = any("t" in function.extras for function in asked if function is not None) or any(
-            part is not None for part in (motion.forces, motion.dissipation, motion.velocity_constraints)
+            part is not None for part in (motion.forces, motion.dissipation, motion.constraints.on_velocities)
         )
         return could_work, None
 
