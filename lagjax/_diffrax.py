@@ -17,7 +17,7 @@ from lagjax._failures import differentiable_where, lost_unless
 from lagjax._integrate import Method, integrate
 from lagjax._layout import Layout, halves
 from lagjax._problem import LEAST_RTOL_OF_DIFFRAX, AbstractEngine, Batch, Problem, PyTree, Solution, too_tight
-from lagjax._results import ENDED_WELL, RESULTS, code_of, result_from
+from lagjax._results import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, result_from
 from lagjax._solvers import FineOutput, Projected
 from lagjax._stopped import End, what_stopped
 from lagjax._validate import is_concrete, require_number
@@ -139,8 +139,8 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
 def _state_result(y, acceleration, singular) -> RESULTS:
     """Whether a motion can go on from a state with this acceleration, and if not, why."""
     finite = jax.tree.reduce(lambda all_, leaf: all_ & jnp.isfinite(leaf).all(), (y, acceleration), jnp.array(True))
-    failed = RESULTS.where(singular, RESULTS.mass_matrix_singular, RESULTS.nonfinite_state)
-    return RESULTS.where(finite, RESULTS.successful, failed)
+    failed = jnp.where(singular, code_of(RESULTS.mass_matrix_singular), code_of(RESULTS.nonfinite_state))
+    return result_from(jnp.where(finite, SUCCESSFUL, failed))
 
 
 def _explained(solution: Solution, form: Equations, start: RESULTS, ts, numbers) -> RESULTS:

@@ -4,7 +4,7 @@ Where nothing was asked for, it is machine code where the scene has it, else dif
 fixed steps, an adjoint or a progress meter ask for diffrax; `solver=lagjax.MachineCode()` insists on machine code.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from lagjax._diffrax import Diffrax
 from lagjax._machine_code import MachineCode
@@ -18,7 +18,7 @@ class Choice(NamedTuple):
     refusal: str | None
 
 
-def asked_for(solver=None, dt=None, adjoint=None, progress=False, rtol=None, atol=None) -> AbstractEngine | None:
+def asked_for(solver=None, dt=None, adjoint=None, progress: Any = False, rtol=None, atol=None) -> AbstractEngine | None:
     """The engine that these arguments of `simulate` ask for; None where they leave it open.
 
     Raises `TypeError` or `ValueError` where they cannot be right, or contradict each other.

@@ -99,7 +99,7 @@ class ScalarEquations(Equations):
         return jnp.stack(acceleration), singular
 
 
-def form_of(derivation: Derivation, path: str = "auto") -> Equations:
+def form_of(derivation: Derivation, path: str = "auto") -> "ScalarEquations | ArrayEquations":
     """The form that suits a scene; `path` "scalar" or "array" insists on one.
 
     Raises `ValueError` when "scalar" is asked for and impossible, with the reason.

@@ -6,11 +6,12 @@ a(q, q̇) is zero at rest. Only which constraints depend on which is asked of on
 """
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from lagjax._engine import choose
-from lagjax._equations import ScalarEquations, form_of
+from lagjax._equations import ArrayEquations, form_of
 from lagjax._linear import dependent_rows
 from lagjax._problem import Problem
 from lagjax._program import Program, Unlowerable
@@ -114,21 +115,20 @@ def explain(problem: Problem) -> Explanation:
     )
 
 
-def _engine(problem: Problem) -> dict:
+def _engine(problem: Problem) -> dict[str, Any]:
     """What integrates a motion by default, in what form the equations are evaluated there, and what that costs."""
     derivation, refusal = problem.derivation, choose(problem).refusal
     if refusal is None:
-        facts = {"solver": "Taylor series in machine code", "path": "scalar", "reason": ""}
-        program, projected = derivation.acceleration, derivation.projected
+        solver, reason = "Taylor series in machine code", ""
+        programs = derivation.acceleration, derivation.projected
     else:
-        form = form_of(derivation, problem.system.path)
-        scalar = isinstance(form, ScalarEquations)
-        facts = {"solver": f"diffrax.Dopri8, because {refusal}", "path": "scalar" if scalar else "array"}
-        facts["reason"] = "" if scalar else form.reason
-        program, projected = (form.program, form.projection) if scalar else (None, None)
-    facts["operations"] = None if program is None else program.operations
-    facts["projection_operations"] = None if projected is None else projected.operations
-    return facts
+        solver, form = f"diffrax.Dopri8, because {refusal}", form_of(derivation, problem.system.path)
+        if isinstance(form, ArrayEquations):
+            return {"solver": solver, "path": "array", "reason": form.reason}
+        reason, programs = "", (form.program, form.projection)
+    operations, of_projection = (None if program is None else program.operations for program in programs)
+    costs = {"operations": operations, "projection_operations": of_projection}
+    return {"solver": solver, "path": "scalar", "reason": reason, **costs}
 
 
 def _pattern(parts: Program, n: int) -> str:

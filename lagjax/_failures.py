@@ -11,6 +11,7 @@ branch is a constant; `nan_unless` makes it NaN wherever its cotangent is not ze
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 from jax.experimental.buffer_callback import buffer_callback
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -64,7 +65,7 @@ def _raise(result, t_end, t_last, y_end, *, names) -> None:
 
 
 check_p = Primitive("lagjax_check")
-check_p.def_abstract_eval(lambda result, t_end, t_last, y_end, **_: jax.core.ShapedArray(result.shape, t_end.dtype))
+check_p.def_abstract_eval(lambda result, t_end, t_last, y_end, **_: ShapedArray(result.shape, t_end.dtype))
 
 
 @check_p.def_impl
@@ -149,7 +150,7 @@ def _nan_unless_jvp(primals, tangents):
 
 
 nan_unless_p = Primitive("lagjax_nan_unless")
-nan_unless_p.def_abstract_eval(lambda reached, x: jax.core.ShapedArray(x.shape, x.dtype))
+nan_unless_p.def_abstract_eval(lambda reached, x: ShapedArray(x.shape, x.dtype))
 nan_unless_p.def_impl(_nan_unless)
 mlir.register_lowering(nan_unless_p, mlir.lower_fun(_nan_unless, multiple_results=False))
 ad.primitive_jvps[nan_unless_p] = _nan_unless_jvp

@@ -70,14 +70,17 @@ def _differentiable(moving, method: Method, adjoint, event) -> Solution:
     return _over_recorded_steps(moving, frozen)
 
 
-def _solve(moving, method: Method, adjoint, event=None, record: bool = False):
-    """Call diffrax; `moving` is all that can be differentiated. With `record`, the accepted times come along."""
+def _solve(moving, method: Method, adjoint, event=None) -> Solution:
+    """One integration by diffrax; `moving` is all that can be differentiated."""
+    return _call(moving, method, adjoint, event)[0]
+
+
+def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any]:
+    """Call diffrax: the solution, and what else it is to save."""
     field, project, ts, y0, params = moving
     solver = method.solver if project is None else Projected(method.solver, project)
-    saved = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]
-    if record:
-        saved.append(diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t))
-    done = diffrax.diffeqsolve(
+    saved = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True), *more]
+    done: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
         _looping(solver, adjoint),
         t0=ts[0],
@@ -94,9 +97,9 @@ def _solve(moving, method: Method, adjoint, event=None, record: bool = False):
         progress_meter=method.progress,
     )
     path, end = jnp.concatenate(done.ys[0], axis=-1), jnp.concatenate([leaf[0] for leaf in done.ys[1]])
-    counts = (done.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
-    solution = Solution(path, end, done.ts[1][0], RESULTS.promote(done.result)._value, *counts)
-    return (solution, done.ys[2]) if record else solution
+    accepted, rejected = (done.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
+    result = RESULTS.promote(done.result)._value
+    return Solution(path, end, done.ts[1][0], result, accepted, rejected), done.ys[2:]
 
 
 def _looping(solver, adjoint):
@@ -123,7 +126,8 @@ def _over_recorded_steps(moving, method):
 @_over_recorded_steps.def_fwd
 def _forward(perturbed, moving, method):
     del perturbed
-    solution, times = _solve(moving, method, diffrax.ForwardMode(), record=True)
+    record = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t)
+    solution, (times,) = _call(moving, method, diffrax.ForwardMode(), None, record)
     return solution, (times, solution.t_end, solution.result)
 
 

@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.typing import ArrayLike
 
 from lagjax._arguments import accept
 from lagjax._derivation import Derivation, derivation_of
@@ -35,6 +34,7 @@ from lagjax._validate import (
 )
 
 PyTree = Any
+Number = jax.Array | np.ndarray
 
 # Defaults by dtype. The absolute tolerance is far below the relative one, so that states in small units keep their
 # digits; it is there for components that pass through zero.
@@ -63,7 +63,7 @@ class Problem(eqx.Module):
     params: PyTree
     ts: jax.Array | np.ndarray
     y0: jax.Array | np.ndarray
-    tolerances: tuple[ArrayLike, ArrayLike]
+    tolerances: tuple[Number, Number]
     max_steps: int = eqx.field(static=True)
     event: diffrax.Event | None = None
     guards: Hashable = eqx.field(static=True, default=None)
@@ -177,7 +177,7 @@ class Batch(eqx.Module):
         numbers = [(leaf, axis) for leaf, axis in zip(leaves, self.axes, strict=True) if eqx.is_array_like(leaf)]
         if all(axis is None for _, axis in numbers):
             return end_to_end([leaf for leaf, _ in numbers], self.member.layout.dtype)[None]
-        return rows(*zip(*numbers, strict=True), len(self), self.member.layout.dtype)
+        return rows([leaf for leaf, _ in numbers], [axis for _, axis in numbers], len(self), self.member.layout.dtype)
 
 
 class Solution(NamedTuple):
@@ -238,7 +238,7 @@ def end_to_end(leaves: list, dtype) -> jax.Array | np.ndarray:
 
 def rows(leaves, axes, size: int, dtype) -> jax.Array | np.ndarray:
     """The numbers of every member end to end, shape (size, numbers); `axes` are those of the members, leaf by leaf."""
-    library = np if all(map(_is_on_host, leaves)) else jnp
+    library: Any = np if all(map(_is_on_host, leaves)) else jnp
     columns = [library.zeros((size, 0), dtype)]
     for leaf, axis in zip(leaves, axes, strict=True):
         array = library.asarray(leaf, dtype)
@@ -250,7 +250,7 @@ def rows(leaves, axes, size: int, dtype) -> jax.Array | np.ndarray:
 
 
 def _in_front(leaf, axis: int):
-    library = np if _is_on_host(leaf) else jnp
+    library: Any = np if _is_on_host(leaf) else jnp
     return library.moveaxis(library.asarray(leaf), axis, 0)
 
 
@@ -293,7 +293,7 @@ def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTr
 # ---- what can be wrong -----------------------------------------------------------------------------------------------
 
 
-def _tolerances(dtype, rtol, atol) -> tuple[ArrayLike, ArrayLike]:
+def _tolerances(dtype, rtol, atol) -> tuple[Number, Number]:
     """rtol and atol as arrays, the missing ones by default. Raises where no engine meets them."""
     rtol = DEFAULT_RTOL[dtype] if rtol is None else require_tolerance(rtol, "rtol")
     atol = rtol * _ATOL_OVER_RTOL if atol is None else require_tolerance(atol, "atol")

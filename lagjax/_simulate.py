@@ -177,14 +177,17 @@ def _trajectory(problem: Problem, engine: AbstractEngine, solution: Solution, pa
     if solution.idle is not None:
         stats["num_wasted_lane_steps"] = solution.idle
     fixed_steps = isinstance(engine, Diffrax) and engine.dt is not None
+    ts, q, qdot, result = sent
     return Trajectory(
-        *sent[:3],
-        result_from(sent[3]),
-        State(solution.t_end, restore(q_end), restore(qdot_end)),
-        stats,
-        problem.system,
-        params,
-        params_axes,
+        ts=ts,
+        q=q,
+        qdot=qdot,
+        result=result_from(result),
+        end=State(solution.t_end, restore(q_end), restore(qdot_end)),
+        stats=stats,
+        system=problem.system,
+        params=params,
+        params_axes=params_axes,
         tolerances=None if fixed_steps else problem.tolerances,
     )
 
@@ -212,25 +215,25 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
         states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)
         return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
     y_end = np.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
-    message = sentence(code, end.t, t_last, y_end, layout.names)
-    if trajectory.result == RESULTS.mass_matrix_singular:
-        mass = np.asarray(trajectory.system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
+    message, system = sentence(code, end.t, t_last, y_end, layout.names) or "", trajectory.system
+    if trajectory.result == RESULTS.mass_matrix_singular and isinstance(system, System):
+        mass = np.asarray(system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
         message += f"\n{_describe_null(mass, layout.names)}"
-    if trajectory.result == RESULTS.nonfinite_state and isinstance(trajectory.system, System):
-        message += _describe_undefined(trajectory, layout)
+    if trajectory.result == RESULTS.nonfinite_state and isinstance(system, System):
+        message += _describe_undefined(system, trajectory, layout)
     raise SimulationError(message, trajectory)
 
 
-def _describe_undefined(trajectory: Trajectory, layout: Layout) -> str:
+def _describe_undefined(system: System, trajectory: Trajectory, layout: Layout) -> str:
     """A sentence about the forces, or else the accelerations, that are not finite at the end or just ahead of it."""
-    system, end, params = trajectory.system, trajectory.end, trajectory.params
+    end, params = trajectory.end, trajectory.params
     rate = end.qdot, system.acceleration(end.q, end.qdot, end.t, params)
     first, last = (float(trajectory.ts[place]) for place in (0, -1))
     smallest = float(np.copysign(4 * jnp.finfo(layout.dtype).eps * max(abs(first), abs(last)), last - first))
     for steps in (0.0, *AHEAD):
-        moved = jax.tree.map(lambda x, dx, s=steps * smallest: x + s * dx if s else x, (end.q, end.qdot), rate)
+        q, qdot = jax.tree.map(lambda x, dx, s=steps * smallest: x + s * dx if s else x, (end.q, end.qdot), rate)
         for what, function in (("force on", system.generalized_force), ("acceleration of", system.acceleration)):
-            values = np.asarray(layout.flatten(function(*moved, end.t + steps * smallest, params)))
+            values = np.asarray(layout.flatten(function(q, qdot, end.t + steps * smallest, params)))
             bad = [f"{name} ({x})" for name, x in zip(layout.names, values, strict=True) if not np.isfinite(x)]
             if bad:
                 return f"\nNot finite {'just ahead' if steps else 'there'}: the {what} {', '.join(bad[:8])}."

@@ -19,6 +19,7 @@ from lagjax._results import RESULTS
 from lagjax._system import System
 
 PyTree = Any
+Number = jax.Array | np.ndarray
 
 
 class State(NamedTuple):
@@ -72,7 +73,7 @@ class Trajectory(eqx.Module):
     mode: jax.Array | None = None
     transitions: "Transitions | None" = None
     mode_names: tuple[str, ...] = eqx.field(static=True, default=())
-    tolerances: tuple[jax.Array, jax.Array] | None = None
+    tolerances: tuple[Number, Number] | None = None
 
     def __repr__(self) -> str:
         """Three lines; `equinox.tree_pprint` prints the fields."""
@@ -135,7 +136,7 @@ class Trajectory(eqx.Module):
         except ImportError:
             raise ImportError("to_xarray() needs the package xarray: pip install xarray.") from None
         members = ("member",) * jnp.ndim(self.result._value)
-        variables = {"ok": (members, np.asarray(self.ok))}
+        variables: dict[str, tuple] = {"ok": (members, np.asarray(self.ok))}
         for name, tree in (("q", self.q), ("qdot", self.qdot)):
             for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
                 label = ".".join([name, *(_key_text(key) for key in path)])

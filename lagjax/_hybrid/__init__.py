@@ -94,7 +94,7 @@ def simulate_hybrid(
     plan = Plan(modes, tuple(transitions), start, max_transitions, rtol, atol, max_steps)
     ending, record = hybrid_motion(plan, layout, problem.ts, problem.y0, problem.params)
     trajectory = _trajectory(modes, problem, ending, record)
-    return _raise_unless_ok(trajectory, layout, ending.mode) if throw else trajectory
+    return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory
 
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: Record) -> Trajectory:
@@ -125,13 +125,14 @@ def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, reco
     )
 
 
-def _raise_unless_ok(trajectory: Trajectory, layout: Layout, last) -> Trajectory:
+def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: Layout, last) -> Trajectory:
     """The trajectory where it ended well; else `SimulationError`, which names the mode `last` in which it ended."""
     if not is_concrete(trajectory.ok) or trajectory.ok:
         return raise_unless_ok(trajectory, layout)
     name = trajectory.mode_names[int(last)]
+    system = modes[name]
     try:
-        return raise_unless_ok(dataclasses.replace(trajectory, system=trajectory.system[name]), layout)
+        return raise_unless_ok(dataclasses.replace(trajectory, system=system), layout)
     except SimulationError as error:
         raise SimulationError(f"{error}\nIt was in the mode {name!r}.", trajectory) from None
 

@@ -115,6 +115,11 @@ class Mode(NamedTuple):
         """The structure of the coordinates."""
         return self.problem.layout
 
+    @property
+    def _surfaces(self) -> Surfaces:
+        assert self.surfaces is not None, "no transition leaves this mode"
+        return self.surfaces
+
     # ---- along the mode ----
 
     def solve(self, ts, y0) -> Solution:
@@ -132,7 +137,7 @@ class Mode(NamedTuple):
     def guards_at(self, t, y) -> tuple:
         """The guards, their rates along the motion and their sizes at a state, without derivatives."""
         t, y, numbers = jax.lax.stop_gradient((t, y, self.vector))
-        out, count = self.surfaces.complete(*y, t, *numbers), len(self.leaving)
+        out, count = self._surfaces.complete(*y, t, *numbers), len(self.leaving)
         return out[:count], out[count : 2 * count], out[2 * count : 3 * count]
 
     def crossing(self, k: int) -> Callable:
@@ -146,14 +151,14 @@ class Mode(NamedTuple):
         up to third order in δg, which is zero itself: first and second derivatives are right.
         """
         n, still, count = self.layout.size, jax.lax.stop_gradient, len(self.leaving)
-        program = flow_of(self.problem).anywhere
+        program, surfaces = flow_of(self.problem).anywhere, self._surfaces
 
         def rates(t, y, numbers):
             acceleration = jnp.stack(program(*y, t, *numbers)[:n])
-            return self.surfaces.complete(*y, t, *numbers)[count + k], jnp.concatenate([y[n:], acceleration])
+            return surfaces.complete(*y, t, *numbers)[count + k], jnp.concatenate([y[n:], acceleration])
 
         def moved(taken, t, y, numbers):
-            value, (rate, slope) = self.surfaces.values(*y, t, *numbers)[k], rates(t, y, numbers)
+            value, (rate, slope) = surfaces.values(*y, t, *numbers)[k], rates(t, y, numbers)
             direction = jnp.ones_like(t), slope
             bend, turn = map(still, jax.jvp(lambda t, y: rates(t, y, numbers), (t, y), direction)[1])
             rate = jnp.where(taken & (rate != 0), rate, 1.0)

@@ -61,18 +61,19 @@ class MachineCode(AbstractEngine):
 
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
-        flow, tolerances = _flow_of(problem), _tolerances(problem)
+        flow, tolerances = flow_of(problem), _tolerances(problem)
         if problem.is_known:
-            solution = flow.run(*(np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector)), tolerances)
-            return Solution(*(x[0] for x in solution[:-1]))
-        return _transforms.run(flow, tolerances, *map(jnp.asarray, (problem.ts, problem.y0, problem.vector)))
+            ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
+            return Solution._make([*(x[0] for x in flow.run(ts, y0, params, tolerances)[:-1]), None])
+        ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
+        return _transforms.run(flow, tolerances, ts, y0, params)
 
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, in the lanes of vectors and on all cores."""
         if not batch.is_known:
             return batch.over_members(self.solve)
-        ts, tolerances = np.asarray(batch.member.ts)[None], _tolerances(batch.member)
-        return _flow_of(batch.member).run(ts, *map(np.asarray, (batch.y0, batch.vectors)), tolerances)
+        ts, y0, params = np.asarray(batch.member.ts)[None], np.asarray(batch.y0), np.asarray(batch.vectors)
+        return flow_of(batch.member).run(ts, y0, params, _tolerances(batch.member))
 
 
 def flow_of(problem: Problem) -> Flow:
@@ -103,4 +104,5 @@ def _made(derivation: Derivation, path: str, guards: Guards | None) -> Flow | st
 
 
 def _tolerances(problem: Problem) -> Tolerances:
-    return Tolerances(*map(float, problem.tolerances), problem.max_steps)
+    rtol, atol = (float(np.asarray(x)) for x in problem.tolerances)
+    return Tolerances(rtol, atol, problem.max_steps)

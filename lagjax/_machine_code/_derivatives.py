@@ -122,8 +122,8 @@ def _vjp_by_jacobian(flow: Flow, ts, y0, params, path_ct, end_ct, tolerances) ->
     path, end = jvp(flow, ts, y0, params, unit[..., : flow.states], unit[..., flow.states :], tolerances)
     used = np.einsum("nmts,nrts->nmr", path_ct, np.where(np.isfinite(path), path, 0.0))
     used += np.einsum("nms,nrs->nmr", end_ct, np.where(np.isfinite(end), end, 0.0))
-    lost = ((path_ct != 0) & ~np.isfinite(path).all(axis=1)[:, None]).any(axis=(2, 3))
-    lost |= ((end_ct != 0) & ~np.isfinite(end).all(axis=1)[:, None]).any(axis=2)
+    path_lost, end_lost = (~np.all(np.isfinite(x), axis=1, keepdims=True) for x in (path, end))
+    lost = ((path_ct != 0) & path_lost).any(axis=(2, 3)) | ((end_ct != 0) & end_lost).any(axis=2)
     used[lost] = np.nan
     return used[..., : flow.states], used[..., flow.states :]
 

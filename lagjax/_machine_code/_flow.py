@@ -163,8 +163,8 @@ class Flow:
         again, flow, tolerances = self._second_chance(result, tolerances)
         if not again.any():
             return solution
-        some = members(again, ts, y0, params)
-        better = flow.follow(*some, tolerances, store, None if room is None else room[again])
+        some_ts, some_y0, some_params = members(again, ts, y0, params)
+        better = flow.follow(some_ts, some_y0, some_params, tolerances, store, None if room is None else room[again])
         for values, new in zip(solution[:-1], better[:-1], strict=True):
             values[again] = new
         return solution._replace(idle=done.idle + better.idle)
@@ -181,8 +181,8 @@ class Flow:
             values = self.anywhere.evaluate(*y.T, t, *numbers.T)[: self.size]
             return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
 
-        counts = solution.accepted[some], solution.rejected[some]
-        end = End(solution.t_end[some], solution.y_end[some], times[:, 0], times[:, -1], *counts)
+        y_end, t_end, _, accepted, rejected = (x[some] for x in solution[1:6])
+        end = End(t_end, y_end, times[:, 0], times[:, -1], accepted, rejected)
         not_finite, jumps = what_stopped(acceleration, end, shrank[some], spent[some])
         solution.result[some[jumps]] = _JUMPS
         solution.result[some[not_finite]] = _NOT_FINITE

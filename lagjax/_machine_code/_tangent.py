@@ -8,6 +8,8 @@ Together with the motion they are a program like any other: a derivative is as a
 Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §I.14.
 """
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -66,11 +68,13 @@ def tangent_programs(
     if projection is None:
         return larger, None
 
+    state, scale = cast(Program, projection.state), cast(Program, projection.velocity_scale)
+
     def projected(q, v, t, p):
-        both = with_tangents(lambda q, v, t, p: jnp.stack(projection.state(*q, *v, t, *p)), q, v, t, p)
+        both = with_tangents(lambda q, v, t, p: jnp.stack(state(*q, *v, t, *p)), q, v, t, p)
         return both[:, :n], both[:, n:]
 
     def velocity_scale(q, v, t, p):
-        return projection.velocity_scale(*q[0], *v[0], t, *p[0])
+        return scale(*q[0], *v[0], t, *p[0])
 
     return larger, Projection(*(lower(of, *shapes, budget=_BUDGET) for of in (projected, velocity_scale)))

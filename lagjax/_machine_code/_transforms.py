@@ -27,6 +27,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 from jax.experimental.buffer_callback import buffer_callback
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -82,14 +83,14 @@ def _run_on_host(ts, y0, params, *, flow, tolerances, keep):
 
 def _jvp_on_host(ts, y0, params, path, result, accepted, ticket, dy0, dparams, *, flow, tolerances):
     del path, result, accepted, ticket  # what the transpose needs
-    rows, batch = _rows((ts, y0, params, dy0, dparams), (1, 1, 1, 2, 2), shared=(0, 2))
-    return _in_batch(_derivatives.jvp(flow, *rows, tolerances), batch)
+    (ts, y0, params, *direction), batch = _rows((ts, y0, params, dy0, dparams), (1, 1, 1, 2, 2), shared=(0, 2))
+    return _in_batch(_derivatives.jvp(flow, ts, y0, params, *direction, tolerances=tolerances), batch)
 
 
 def _vjp_on_host(ts, y0, params, path, result, accepted, ticket, path_ct, end_ct, *, flow, tolerances):
     arrays = ts, y0, params, path, result, accepted, ticket, path_ct, end_ct
-    rows, batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2))
-    return _in_batch(_derivatives.vjp(flow, *rows[:3], rows[3:7], *rows[7:], tolerances), batch)
+    (ts, y0, params, *rest), batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2))
+    return _in_batch(_derivatives.vjp(flow, ts, y0, params, rest[:4], *rest[4:], tolerances=tolerances), batch)
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
@@ -109,12 +110,12 @@ def _batch_of(args, inner):
 
 
 def _floats(*shapes):
-    return [jax.core.ShapedArray(shape, np.dtype(float)) for shape in shapes]
+    return [ShapedArray(shape, np.dtype(float)) for shape in shapes]
 
 
 def _run_shapes(ts, y0, params, *, flow, **_):
     batch = _batch_of((ts, y0, params), (1, 1, 1))
-    counts = [jax.core.ShapedArray(batch, np.dtype(int))] * (_OUTPUTS - 3)
+    counts = [ShapedArray(batch, np.dtype(int))] * (_OUTPUTS - 3)
     floats = _floats((*batch, ts.shape[-1], flow.states), (*batch, flow.states), batch)
     return [*floats, *counts]
 
@@ -236,8 +237,8 @@ def _derivative_of_jvp(primals, tangents, **settings):
         dy0, dparams = primals[_GIVEN:]
 
         def along(*moving):
-            lifted = [x[..., None, :] for x in moving]
-            return _jvp_composed(*lifted, dy0, dparams, **settings)
+            ts, y0, params = (x[..., None, :] for x in moving)
+            return _jvp_composed(ts, y0, params, dy0, dparams, **settings)
 
         more = list(jax.jvp(along, primals[:3], tuple(map(_value, tangents[:3])))[1])
         total = more if total is None else _add(total, more)
@@ -252,13 +253,14 @@ def _derivative_of_vjp(primals, tangents, **settings):
     outs = vjp_p.bind(*primals, **settings)
     total = _linear_part(vjp_p, primals, tangents, 2, settings)
     if not all(map(_zero, tangents[:3])):
-        more = _vjp_moved(primals, *tangents[:3], outs, settings)
+        more = _vjp_moved(primals, tangents[:3], outs, settings)
         total = more if total is None else _add(total, more)
     return outs, _or_zeros(total, outs)
 
 
-def _vjp_moved(primals, dts, dy0, dparams, outs, settings):
+def _vjp_moved(primals, tangents, outs, settings):
     """How `vjp` changes with ts, y0 and params: each of its m cotangents for itself."""
+    dts, dy0, dparams = tangents
     (ts, y0, params), cts, total = primals[:3], primals[_GIVEN:], None
     dy0, dparams = _value(dy0), _value(dparams)
     if not _zero(dts):
