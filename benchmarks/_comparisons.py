@@ -24,7 +24,7 @@ from benchmarks._cases import CASES, Case, chain, double_pendulum
 from benchmarks._contenders import Contender, autodiff_acceleration, named
 from benchmarks._measure import Comparison, compare, seconds
 from lagjax._derivation import derivation_of
-from lagjax._equations import Equations, form_of
+from lagjax._diffrax._equations import Equations, form_of
 from lagjax._layout import Layout
 from lagjax._machine_code import MachineCode
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, compiled, lanes

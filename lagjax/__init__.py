@@ -5,6 +5,7 @@ System(L)  →  simulate(system, q0, qdot0, ts, params)  →  Trajectory
 
 from lagjax import plot, scenes
 from lagjax._check import Finding, Findings, check
+from lagjax._diffrax._solvers import FineOutput
 from lagjax._explain import Explanation
 from lagjax._health import Health
 from lagjax._hybrid import Transition, simulate_hybrid
@@ -12,7 +13,6 @@ from lagjax._machine_code import MachineCode
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._simulate import simulate, simulate_batch
-from lagjax._solvers import FineOutput
 from lagjax._system import System
 from lagjax._trajectory import State, Trajectory, Transitions
 

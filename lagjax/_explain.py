@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from lagjax._diffrax._equations import ArrayEquations, form_of
 from lagjax._engine import choose
-from lagjax._equations import ArrayEquations, form_of
 from lagjax._linear import dependent_rows
 from lagjax._problem import Problem
 from lagjax._program import Program, Unlowerable

@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._diffrax._solvers import FineOutput
 from lagjax._engine import choose
 from lagjax._layout import Layout
 from lagjax._machine_code import MachineCode
 from lagjax._problem import LEAST_RTOL, LEAST_RTOL_OF_DIFFRAX, Batch, Problem, axes_per_leaf
 from lagjax._simulate import simulate, simulate_batch
-from lagjax._solvers import FineOutput
 from lagjax._system import System, require_system
 from lagjax._trajectory import Trajectory
 from lagjax._validate import as_arrays

@@ -16,7 +16,7 @@ from sweeps import sweep
 import lagjax
 from lagjax import scenes
 from lagjax._derivation import Derivation, derivation_of
-from lagjax._equations import form_of
+from lagjax._diffrax._equations import form_of
 from lagjax._layout import Layout
 from lagjax._linear import rank_tolerance
 

@@ -8,7 +8,7 @@ import pytest
 from jax import lax
 
 import lagjax
-from lagjax import _diffrax, _equations, _machine_code, scenes
+from lagjax import _diffrax, _machine_code, scenes
 from lagjax._check import _measure as of_check
 from lagjax._derivation import columns_of, derivation_of, numbers_of
 from lagjax._health import _measure as of_health
@@ -212,7 +212,7 @@ def test_explain_names_the_engine_that_runs(name, monkeypatch):
     system, q, engine, words = SCENES[name]
     # Scenes of some thousands of operations take seconds to derive: smaller ones stand for them.
     monkeypatch.setattr(_machine_code._flow, "LARGEST_PROGRAM", 150)
-    monkeypatch.setattr(_equations, "LARGEST_XLA_PROGRAM", 30)
+    monkeypatch.setattr(_diffrax._equations, "LARGEST_XLA_PROGRAM", 30)
     facts = system.explain(q, np.zeros_like(q))
 
     class Ran(Exception):

@@ -10,7 +10,7 @@ from sweeps import KINDS, sweep
 import lagjax
 from lagjax import scenes
 from lagjax._derivation import Derivation
-from lagjax._equations import ArrayEquations, ScalarEquations, form_of
+from lagjax._diffrax._equations import ArrayEquations, ScalarEquations, form_of
 from lagjax._layout import Layout
 
 

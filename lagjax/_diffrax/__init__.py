@@ -12,13 +12,13 @@ import numpy as np
 import optimistix as optx
 
 from lagjax._constraints import rank_lost
-from lagjax._equations import Equations, form_of
+from lagjax._diffrax._equations import Equations, form_of
+from lagjax._diffrax._integrate import Method, integrate
+from lagjax._diffrax._solvers import FineOutput, Projected
 from lagjax._failures import differentiable_where, lost_unless
-from lagjax._integrate import Method, integrate
 from lagjax._layout import Layout, halves
 from lagjax._problem import LEAST_RTOL_OF_DIFFRAX, AbstractEngine, Batch, Problem, PyTree, Solution, too_tight
 from lagjax._results import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, result_from
-from lagjax._solvers import FineOutput, Projected
 from lagjax._stopped import End, what_stopped
 from lagjax._validate import is_concrete, require_number
 

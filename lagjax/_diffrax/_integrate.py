@@ -18,11 +18,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from lagjax._equations import Equations
+from lagjax._diffrax._equations import Equations
+from lagjax._diffrax._solvers import Projected
 from lagjax._layout import halves
 from lagjax._problem import Solution
 from lagjax._results import RESULTS, SUCCESSFUL
-from lagjax._solvers import Projected
 
 PyTree = Any
 
