@@ -7,7 +7,7 @@ for the time and the parameters by writing `t` and `params` in its signature:
     def driven(q, qdot, t, params): ...
 
 `accept` reads the signature once, when the scene is built, and refuses any other one with a sentence. A function that
-does not ask for `t` is never given it: such a Lagrangian is autonomous by construction, not by inspection.
+does not ask for `t` never receives it: such a Lagrangian is autonomous by construction, not by inspection.
 """
 
 import functools
@@ -24,8 +24,8 @@ _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_O
 class Function(eqx.Module):
     """A user's function together with the extras it asks for; called with all of them.
 
-    The function is part of the program, its arrays (the weights of a neural Lagrangian) are data: they are kept apart,
-    so that a scene is a valid argument and result of every JAX transformation.
+    The function is part of the program, its arrays (the weights of a neural Lagrangian) are data: they are separate
+    fields, so that a scene is a valid argument and result of every JAX transformation.
     """
 
     arrays: Any
@@ -41,7 +41,7 @@ class Function(eqx.Module):
         return getattr(code, "__name__", type(code).__name__)
 
     def __call__(self, *roles: Any, **extras: Any) -> Any:
-        """Pass on the roles, and of the extras those that the function asks for."""
+        """The function's result for the roles, by position, and for those of the extras that it asks for, by name."""
         function = eqx.combine(self.arrays, self.code)
         return function(*roles, **{name: extras[name] for name in self.extras})
 
@@ -52,7 +52,7 @@ def accept(
     roles: tuple[str, ...] = ("q", "qdot"),
     extras: tuple[str, ...] = ("t", "params"),
 ) -> Function:
-    """Check that `function` has the signature of its `role` in a scene, and remember which extras it wants.
+    """Check that `function` has the signature of its `role` in a scene; the result passes the extras it asks for.
 
     Raises `TypeError` when it is not callable, when its leading positional parameters are not the `roles`, or when it
     asks by name for anything that is not among the `extras`. Keywords bound with `functools.partial` are left alone.

@@ -93,7 +93,7 @@ def _verdict(trajectory) -> str:
 
 
 def _known(x: Any) -> bool:
-    """Whether the values of an array can be read here: it is neither traced, nor a shape alone, nor given away."""
+    """Whether the values of an array can be read here: it is neither traced, nor a shape alone, nor deleted."""
     if isinstance(x, Tracer):
         return False
     if isinstance(x, jax.Array):

@@ -1,6 +1,6 @@
 """Figures of motions and of what they cost. Needs matplotlib: `pip install lagjax[examples]`.
 
-Every function draws into the `ax` it is given, or into a new figure, and returns the Axes: titles, units, limits and
+Every function draws into its argument `ax`, or into a new figure, and returns the Axes: titles, units, limits and
 saving are matplotlib's business, `ax.figure.savefig(...)`. The line colours are those of Okabe & Ito (2008) and the
 colour maps are perceptually uniform, so that all of them can be told apart with any colour vision and in grey.
 

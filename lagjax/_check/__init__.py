@@ -27,7 +27,7 @@ __all__ = ["Finding", "Findings", "check"]
 
 PyTree = Any
 
-# Of atol: in a motion that is smaller, the errors that atol allows add up to a hundredth within a hundred steps.
+# Units of atol: in a motion that is smaller, the errors that atol allows add up to a hundredth within a hundred steps.
 _SMALLEST = 1e4
 
 
@@ -35,8 +35,8 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree 
     r"""What is wrong with `system` at the state (q, qdot), or worth knowing before it is integrated.
 
     Derivatives are compared with finite differences, L̇ᵢ = [L(x + hᵢ) − L(x − hᵢ)]/2hᵢ and of higher order, on steps
-    over many scales, from both sides and from each. A mass matrix M = ∂²L/∂q̇² that is singular is looked at in the
-    neighbourhood as well, which tells why. The arguments are those of `System.acceleration`: numbers, not batches.
+    over many scales, from both sides and from each. A mass matrix M = ∂²L/∂q̇² that is singular is examined in
+    the neighbourhood as well, which tells why. The arguments are those of `System.acceleration`: numbers, not batches.
 
     **Kinds** of findings, by level (`Finding.level` may be lower for a mild case):
 
@@ -71,29 +71,29 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree 
         raise ValueError(f"t must be one number; got shape {jnp.shape(t)}.")
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((q, qdot, t, params))):
         raise ValueError("check looks at numbers: call it outside of jit, vmap and grad, on one state.")
-    found = _inputs(layout, q, qdot, t, params)
-    if any(finding.level == "error" for finding in found):
-        return Findings.of(found)
+    reported = _inputs(layout, q, qdot, t, params)
+    if any(finding.level == "error" for finding in reported):
+        return Findings.of(reported)
     scene = Scene.of(system, layout, q, qdot, t, params)
-    found += _derivatives.findings(scene)
-    found += _dissipation(scene)
-    found += _constraints.findings(scene)
-    found += _mass.findings(scene)
-    if not any(finding.level == "error" for finding in found):
-        found += [*_acceleration(scene), *_borders.findings(scene), *_stiffness.findings(scene)]
-    return Findings.of([*found, *_time(scene)])
+    reported += _derivatives.findings(scene)
+    reported += _dissipation(scene)
+    reported += _constraints.findings(scene)
+    reported += _mass.findings(scene)
+    if not any(finding.level == "error" for finding in reported):
+        reported += [*_acceleration(scene), *_borders.findings(scene), *_stiffness.findings(scene)]
+    return Findings.of([*reported, *_time(scene)])
 
 
-# ---- what was given --------------------------------------------------------------------------------------------------
+# ---- the arguments ---------------------------------------------------------------------------------------------------
 
 
 def _inputs(layout: Layout, q, qdot, t, params) -> list[Finding]:
-    found = []
+    reported = []
     for name, tree in (("q", q), ("qdot", qdot), ("t", t), ("params", params)):
         for where, value in not_finite(tree, name):
             message = f"{where} is {value}: every number must be finite."
-            found.append(Finding("not_finite", "error", (where,), message))
-    found += _precision(layout, q, qdot, params)
+            reported.append(Finding("not_finite", "error", (where,), message))
+    reported += _precision(layout, q, qdot, params)
     state = np.abs([float(x) for leaf in jax.tree.leaves((q, qdot)) for x in np.ravel(leaf)])
     atol = 1e-3 * DEFAULT_RTOL[layout.dtype]
     if state.any() and state.max() < _SMALLEST * atol:
@@ -102,12 +102,12 @@ def _inputs(layout: Layout, q, qdot, t, params) -> list[Finding]:
             "the units of the state: errors of that size are allowed in every step. Use units in which the motion is "
             f"of order one, or pass atol={1e-3 * DEFAULT_RTOL[layout.dtype] * state.max():.0e}."
         )
-        found.append(Finding("small_state", "advice", layout.names, message))
-    return found
+        reported.append(Finding("small_state", "advice", layout.names, message))
+    return reported
 
 
 def _precision(layout: Layout, q, qdot, params) -> list[Finding]:
-    found = []
+    reported = []
     if layout.dtype == np.float32:
         wide = any(getattr(leaf, "dtype", None) == np.float64 for leaf in jax.tree.leaves((q, qdot, params)))
         what = "float64 was given, but JAX makes float32 of it" if wide else "The state is in float32"
@@ -116,33 +116,33 @@ def _precision(layout: Layout, q, qdot, params) -> list[Finding]:
             f"{what}: a run keeps about {DEFAULT_RTOL[layout.dtype]:.0e} per step, and machine code is for float64. "
             f"For more, {do}pass float64."
         )
-        found.append(Finding("single_precision", "advice", layout.names, message))
-    whole = [
+        reported.append(Finding("single_precision", "advice", layout.names, message))
+    integers = [
         "params" + jax.tree_util.keystr(path)
         for path, leaf in jax.tree_util.tree_leaves_with_path(params)
         if eqx.is_array_like(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.integer)
     ]
-    if whole:
+    if integers:
         message = (
-            f"{listed(whole)}: integers. Their products wrap around when they overflow, and nothing can be "
+            f"{listed(integers)}: integers. Their products wrap around when they overflow, and nothing can be "
             "differentiated by them. Write 1.0 for 1 unless it counts something."
         )
-        found.append(Finding("integer_parameter", "advice", tuple(whole), message))
-    return found
+        reported.append(Finding("integer_parameter", "advice", tuple(integers), message))
+    return reported
 
 
 # ---- what the forces do ----------------------------------------------------------------------------------------------
 
 
 def _dissipation(scene: Scene) -> list[Finding]:
-    """A dissipation function takes energy out at every velocity."""
+    """A warning where the dissipation function puts energy into the motion at some velocity."""
     power, size = scene.measured.power.T
     usable = np.isfinite(power)
-    gained = power < -np.sqrt(np.finfo(scene.layout.dtype).eps) * size
-    if not (usable & gained).any():
+    gains = power < -np.sqrt(np.finfo(scene.layout.dtype).eps) * size
+    if not (usable & gains).any():
         return []
-    kept = (usable & (power > 0)).any()
-    when = "at some velocities, and takes it out at others" if kept else "at every velocity that was tried"
+    loses = (usable & (power > 0)).any()
+    when = "at some velocities, and takes it out at others" if loses else "at every velocity that was tried"
     message = (
         f"The dissipation function puts energy in {when}: its force is -dD/dqdot, so that friction has D = + c/2 "
         "qdot**2 with c > 0. Turn its sign; a force that is meant to drive belongs into forces=..."

@@ -1,8 +1,8 @@
 """Borders nearby: where a piecewise function changes its piece, and something jumps there.
 
-Only a scene with comparisons in it (|x|, max, where, sign, floor, ...) is looked at. From the state one goes along
-every coordinate and velocity, along the time, and along the motion, until a comparison changes its result; the border
-is found by bisection, and L, p, M and the forces are compared on both sides of it.
+Only scenes with comparisons in them (|x|, max, where, sign, floor, ...) have borders. The search goes from the state
+along every coordinate and velocity, and along the motion, until a comparison changes its result; the border is located
+by bisection, and L, p, M and the forces are compared on both sides of it.
 """
 
 from collections.abc import Callable
@@ -18,11 +18,11 @@ from lagjax._check._operations import borders, pieces_of
 from lagjax._derivation import numbers_of
 from lagjax._program import Unlowerable, lower
 
-_REACH = 10  # looked at are 2⁻⁹ … 1 sizes of a coordinate
+_REACH = 10  # the steps of the search: 2⁻⁹, 2⁻⁸ … 1 sizes of a coordinate
 
 
 class Jump(NamedTuple):
-    """How far along which direction, in sizes of it and in its units, at which operation, and what jumps there."""
+    """A jump: its distance in sizes of a direction, the direction, the distance in units, the operation, what jumps."""
 
     sizes: float
     direction: str
@@ -32,7 +32,7 @@ class Jump(NamedTuple):
 
 
 def findings(scene: Scene) -> list[Finding]:
-    """The nearest jump, if there is one."""
+    """A finding about the nearest jump, if there is one."""
     motion = scene.motion
     functions = [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
     pieces = [piece for function in functions for piece in pieces_of(function, *scene.state)]
@@ -40,23 +40,27 @@ def findings(scene: Scene) -> list[Finding]:
         return []
     *y, _ = scene.state
     start = np.concatenate([np.ravel(x) for x in y])
-    sides, look = _followed(scene, functions)
+    sides, evaluate = _functions_of_states(scene, functions)
     labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
-    jumps = [jump for name, size, vector in _directions(scene) for sign in (1, -1)
-             if (jump := _first_jump(sides, look, start, sign * vector, (name, size), labels)) is not None]  # fmt: skip
-    return [_finding(min(jumps))] if jumps else []
+    jumps = [
+        _first_jump(sides, evaluate, start, sign * vector, (name, size), labels)
+        for name, size, vector in _directions(scene)
+        for sign in (1, -1)
+    ]
+    nearest = min((jump for jump in jumps if jump is not None), default=None)
+    return [] if nearest is None else [_finding(nearest)]
 
 
-def _followed(scene: Scene, functions: list[Callable]) -> tuple[Callable, Callable]:
-    """Two functions of states (S, 2n + 1): on which sides of the borders they are, and L, p, M and the force there.
+def _functions_of_states(scene: Scene, functions: list[Callable]) -> tuple[Callable, Callable]:
+    """Two functions of states (S, 2n + 1): on which sides of the borders they are, and (L, p, M, F) at them.
 
-    By programs where the scene has them, else compiled by XLA.
+    They are programs where the scene has them, else compiled by XLA.
     """
     n, derivation, params = scene.layout.size, scene.derivation, scene.state[3]
 
     def sides_at(q, v, t, params):
-        found = [piece for function in functions for piece in borders(function, q, v, t, params)]
-        return jnp.concatenate([jnp.ravel(side) for _, _, side in found])
+        of_functions = [border for function in functions for border in borders(function, q, v, t, params)]
+        return jnp.concatenate([jnp.ravel(side) for _, _, side in of_functions])
 
     names = ("lagrangian", "momentum", "mass_matrix", "force")
     try:
@@ -66,33 +70,33 @@ def _followed(scene: Scene, functions: list[Callable]) -> tuple[Callable, Callab
         def sides(points):
             return program.evaluate_many([*points.T, *numbers]).T
 
-        def look(points):
+        def evaluate(points):
             values = derivation.evaluate(names, [*points.T, *numbers])
             return [values[name] for name in names]
 
-        return sides, look
+        return sides, evaluate
     except Unlowerable:
         motion = scene.motion
 
         def at(point):
             return point[:n], point[n:-1], point[-1], params
 
-        def looked(point):
+        def evaluate_one(point):
             mass, force = motion.mass_matrix_and_force(*at(point))
             return motion.lagrangian(*at(point)), motion.momentum(*at(point)), mass, force
 
-        return jax.jit(jax.vmap(lambda point: sides_at(*at(point)))), jax.jit(jax.vmap(looked))
+        return jax.jit(jax.vmap(lambda point: sides_at(*at(point)))), jax.jit(jax.vmap(evaluate_one))
 
 
 def _directions(scene: Scene) -> list[tuple[str, float, np.ndarray]]:
-    """Every coordinate and velocity by its size, and the motion by the time in which it moves by that."""
+    """(name, size, vector (2n + 1,)) of every direction: a coordinate or a velocity by its size, or the motion."""
     m, n = scene.measured, scene.layout.size
     axes = np.diag(scene.sizes)
     axes[-1, :n], axes[-1, n:-1] = scene.sizes[-1] * m.velocity[0], scene.sizes[-1] * scene.solved()[0]
     return list(zip(scene.names, scene.sizes, axes, strict=True))
 
 
-def _first_jump(sides: Callable, look: Callable, start, vector, axis, labels: list[str]) -> Jump | None:
+def _first_jump(sides: Callable, evaluate: Callable, start, vector, axis, labels: list[str]) -> Jump | None:
     """The nearest border along `vector`, if something jumps there."""
     eps, vector = float(np.finfo(start.dtype).eps), np.asarray(vector, start.dtype)
 
@@ -113,9 +117,10 @@ def _first_jump(sides: Callable, look: Callable, start, vector, axis, labels: li
         inside, beyond = (between[first - 1] if first else inside), between[first]
     there = np.asarray(sides(at([beyond])))[0]
     place = int(np.argmax(there != here))
-    # What changes, against its size here, there, and on a little: a force that sets in at zero does not jump.
-    seen = look(at([inside if past else -beyond, beyond, 0.0, beyond + 0.1]))
-    for what, values in zip(("L", "the momentum", "the mass matrix", "the force"), seen, strict=True):
+    # The change is compared with the size at the state, at the border and a little beyond: a force that sets in at zero
+    # does not jump.
+    on_both_sides = evaluate(at([inside if past else -beyond, beyond, 0.0, beyond + 0.1]))
+    for what, values in zip(("L", "the momentum", "the mass matrix", "the force"), on_both_sides, strict=True):
         one, other, *_ = values = np.asarray(values)
         if np.isfinite(one).all() and np.isfinite(other).all():
             if np.abs(one - other).max() > np.sqrt(eps) * np.nanmax(np.abs(values)):
@@ -128,12 +133,12 @@ def _finding(jump: Jump) -> Finding:
     here = jump.sizes == 0
     where = "at this state" if here else f"{jump.distance:.3g} away along {jump.direction}"
     serious = here or jump.what in ("L", "the momentum")
-    seen = {
+    consequence = {
         "L": "No force shows a jump of L itself: the motion goes through it as if it were not there.",
         "the momentum": "The kick that a jump of the momentum gives to the velocity is not seen.",
     }.get(jump.what, "Steps shrink there; a motion that comes to rest on it (dry friction) does not get on.")
     return Finding(
         "discontinuity", "warning" if serious else "advice", (jump.direction,),
-        f"{jump.what[0].upper()}{jump.what[1:]} jumps {where}, at {jump.operation}. {seen} Smooth it (tanh(v/w) for "
-        "sign(v)), or make two modes of it with a Transition for lagjax.simulate_hybrid.",
+        f"{jump.what[0].upper()}{jump.what[1:]} jumps {where}, at {jump.operation}. {consequence} Smooth it (tanh(v/w) "
+        "for sign(v)), or make two modes of it with a Transition for lagjax.simulate_hybrid.",
     )  # fmt: skip

@@ -1,10 +1,10 @@
-"""Constraints: do they hold, do they hold anything, and does one of them say what others say already."""
+"""Constraints: whether they are satisfied, whether they have a gradient, and whether one follows from others."""
 
 import numpy as np
 
 from lagjax._check._derivatives import position_count
 from lagjax._check._findings import Finding, listed
-from lagjax._check._mass import null_directions
+from lagjax._check._mass import null_velocities
 from lagjax._check._measure import Scene
 from lagjax._consistent import require_consistent
 from lagjax._layout import Layout
@@ -15,27 +15,27 @@ def findings(scene: Scene) -> list[Finding]:
     """All there is to say about constraints on positions and on velocities."""
     if not scene.motion.constrained:
         return []
-    residual, rows = scene.residual, scene.measured.jacobian
-    names = scene.system.constraint_names(scene.layout, scene.given[3])
-    bad = [k for k in range(len(names)) if not (np.isfinite(residual[k]) and np.isfinite(rows[0, k]).all())]
+    residual, jacobian = scene.residual, scene.measured.jacobian
+    names = scene.system.constraint_names(scene.layout, scene.arguments[3])
+    bad = [k for k in range(len(names)) if not (np.isfinite(residual[k]) and np.isfinite(jacobian[0, k]).all())]
     if bad:
         return [_not_finite(names[k], residual[k]) for k in bad]
     positions = position_count(scene)
-    idle = [k for k in range(len(names)) if not rows[0, k].any()]
-    found = [_idle(names[k], k >= positions, residual[k], rows[:, k]) for k in idle]
-    found += _not_affine(names, rows, positions, scene.layout)
+    idle = [k for k in range(len(names)) if not jacobian[0, k].any()]
+    reported = [_idle(names[k], k >= positions, residual[k], jacobian[:, k]) for k in idle]
+    reported += _not_affine(names, jacobian, positions, scene.layout)
     if idle:
-        return found
-    q, qdot, t, params = scene.given
+        return reported
+    q, qdot, t, params = scene.arguments
     try:
         require_consistent(scene.system, scene.layout, np.asarray([t], scene.layout.dtype), q, qdot, params)
     except ValueError as error:
         where = tuple(name for name in names if name in str(error))
-        return [*found, Finding("inconsistent_start", "error", where, str(error))]
-    held = scene.held[0]
-    if not np.isfinite(held).all() or len(null_directions(held)):
-        return found
-    return [*found, *_dependent(rows[0] @ np.linalg.solve(held, rows[0].T), names)]
+        return [*reported, Finding("inconsistent_start", "error", where, str(error))]
+    augmented = scene.augmented[0]
+    if not np.isfinite(augmented).all() or len(null_velocities(augmented)):
+        return reported
+    return [*reported, *_dependent(jacobian[0] @ np.linalg.solve(augmented, jacobian[0].T), names)]
 
 
 def _not_finite(name: str, value) -> Finding:
@@ -66,29 +66,30 @@ def _idle(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
     return Finding("constraint_zero_gradient", "error", (name,), message)
 
 
-def _not_affine(names, rows, positions: int, layout: Layout) -> list[Finding]:
-    """da/dqdot must not change with q̇; the last half of the states differs from the first in q̇ alone."""
-    found = []
+def _not_affine(names, jacobian, positions: int, layout: Layout) -> list[Finding]:
+    """Warnings where ∂a/∂q̇ changes with q̇; the last half of the states differs from the state itself in q̇ alone."""
+    reported = []
     for k in range(positions, len(names)):
-        others = rows[(len(rows) + 1) // 2 :, k]
+        others = jacobian[(len(jacobian) + 1) // 2 :, k]
         others = others[np.isfinite(others).all(axis=1)]
-        size = max(np.abs(rows[0, k]).max(), np.abs(others).max(initial=0))
-        if np.abs(others - rows[0, k]).max(initial=0) > np.sqrt(np.finfo(layout.dtype).eps) * size:
+        size = max(np.abs(jacobian[0, k]).max(), np.abs(others).max(initial=0))
+        if np.abs(others - jacobian[0, k]).max(initial=0) > np.sqrt(np.finfo(layout.dtype).eps) * size:
             message = (
                 f"{names[k]} is not affine in qdot: its derivative by qdot changes with qdot. The principle of "
                 "d'Alembert and Lagrange is for a(q, qdot) = A(q) qdot + b(q); write it so, or take it out."
             )
-            found.append(Finding("velocity_constraint_not_affine", "warning", (names[k],), message))
-    return found
+            reported.append(Finding("velocity_constraint_not_affine", "warning", (names[k],), message))
+    return reported
 
 
-def _dependent(coupling: np.ndarray, names: list[str]) -> list[Finding]:
-    found = []
-    for row, factors in dependent_rows(coupling).items():
+def _dependent(schur: np.ndarray, names: list[str]) -> list[Finding]:
+    """Advice for each constraint that is a combination of others, from the Schur complement (m, m)."""
+    reported = []
+    for row, factors in dependent_rows(schur).items():
         others = tuple(name for name, factor in zip(names, factors, strict=True) if factor)
         message = (
             f"{names[row]} follows from {listed(others)} here. The motion is right, but how their forces are shared "
             "is not determined; the shortest multipliers are given. Drop it if its force is wanted."
         )
-        found.append(Finding("dependent_constraints", "advice", (names[row], *others), message))
-    return found
+        reported.append(Finding("dependent_constraints", "advice", (names[row], *others), message))
+    return reported

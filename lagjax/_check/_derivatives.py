@@ -12,12 +12,12 @@ _SHOWN = 3  # findings of one kind about one function
 
 def findings(scene: Scene) -> list[Finding]:
     """All there is to say about L, the forces and D, one after the other."""
-    found = _values(scene)
-    if found:
-        return found
-    found = _not_finite(scene)
-    if found:
-        return found
+    reported = _values(scene)
+    if reported:
+        return reported
+    reported = _not_finite(scene)
+    if reported:
+        return reported
     return [finding for block in _blocks(scene) for finding in _compared(scene, *block)]
 
 
@@ -25,14 +25,14 @@ def findings(scene: Scene) -> list[Finding]:
 
 
 def _values(scene: Scene) -> list[Finding]:
-    m, found = scene.measured, []
+    m, reported = scene.measured, []
     for role, name, value in (("lagrangian", "L", scene.lagrangian), ("forces", "The force", m.extra),
                               ("dissipation", "D", scene.dissipation)):  # fmt: skip
         if not np.isfinite(value).all():
             where = () if value.ndim == 0 else _named(scene.layout.names, ~np.isfinite(value))
             message = f"{name}{' of ' + listed(where) if where else ''} is {_first_bad(value)} at this state"
-            found.append(Finding("value_not_finite", "error", where, message + _blame(scene, role, "value")))
-    return found
+            reported.append(Finding("value_not_finite", "error", where, message + _blame(scene, role, "value")))
+    return reported
 
 
 def _first_bad(value: np.ndarray) -> str:
@@ -42,18 +42,20 @@ def _first_bad(value: np.ndarray) -> str:
 def _not_finite(scene: Scene) -> list[Finding]:
     m, n, names = scene.measured, scene.layout.size, scene.names
     first = ~np.isfinite(np.concatenate([m.by_q, m.momentum[0]]))
-    dragged = ~np.isfinite(m.by_v_of_dissipation)
-    second = ~np.isfinite(m.mass[0]).all(axis=0) | ~np.isfinite(scene.drift) & ~dragged
-    found = []
+    drag = ~np.isfinite(m.by_v_of_dissipation)
+    second = ~np.isfinite(m.mass[0]).all(axis=0) | ~np.isfinite(scene.drift) & ~drag
+    reported = []
     if first.any():
-        found.append(_no_derivative(scene, "lagrangian", "The derivative of L by", _named(names[:-1], first), "first"))
+        reported.append(
+            _no_derivative(scene, "lagrangian", "The derivative of L by", _named(names[:-1], first), "first")
+        )
     elif second.any():
         where = _named(names[n:-1], second)
-        found.append(_no_derivative(scene, "lagrangian", "The second derivative of L by", where, "second"))
-    if dragged.any():
-        where = _named(names[n:-1], dragged)
-        found.append(_no_derivative(scene, "dissipation", "The derivative of D by", where, "first"))
-    return found
+        reported.append(_no_derivative(scene, "lagrangian", "The second derivative of L by", where, "second"))
+    if drag.any():
+        where = _named(names[n:-1], drag)
+        reported.append(_no_derivative(scene, "dissipation", "The derivative of D by", where, "first"))
+    return reported
 
 
 def _no_derivative(scene: Scene, role: str, what: str, where: tuple[str, ...], order: str) -> Finding:
@@ -84,10 +86,10 @@ _BRANCH = (
 def _blame(scene: Scene, role: str, order: str) -> str:
     """The end of a sentence: which operation, with which operands, in which line, and what to write instead."""
     wanted = {"value": ("value",), "first": ("value", "first derivative")}.get(order)
-    found = [o for o in offenders(getattr(scene.motion, role), *scene.state) if not wanted or o.fault in wanted]
-    if not found:
+    offending = [o for o in offenders(getattr(scene.motion, role), *scene.state) if not wanted or o.fault in wanted]
+    if not offending:
         return ". No single operation is to blame: large numbers may overflow together; look at the units."
-    first = found[0]
+    first = offending[0]
     hidden = first.fault == "value" and order != "value"
     return f": {first}. {_BRANCH if hidden else _remedy(first)}".rstrip()
 
@@ -106,29 +108,33 @@ def _blame_for_kink(scene: Scene, role: str) -> str:
 
 
 def _blocks(scene: Scene):
-    """What is compared: name, function, derivatives (directions, outputs), and where these lie among all."""
+    """What is compared, in blocks: a name, the role of the function, its derivatives, and which those are.
+
+    The derivatives have the shape (directions, outputs); the last two entries are these directions, of the 2n + 1, and
+    these outputs, of `Measured.here`.
+    """
     m, n = scene.measured, scene.layout.size
-    first, dragged = 1 + n, scene.motion.dissipation is not None
-    held = first + dragged
+    first, dissipates = 1 + n, scene.motion.dissipation is not None
+    constraint = first + dissipates
     # Derivatives by automatic differentiation have the rounding of their terms, which may cancel.
     of_q, of_v, of_mass, of_drift, of_drag, of_rows = m.round_off
     by_y = Slopes(*(np.concatenate(parts)[:, None] for parts in ((m.by_q, m.momentum[0]), (of_q, of_v))))
-    along = Slopes(np.concatenate([m.mass[0], scene.drift[None]]), np.concatenate([of_mass, of_drift[None]]))
+    of_momentum = Slopes(np.concatenate([m.mass[0], scene.drift[None]]), np.concatenate([of_mass, of_drift[None]]))
     blocks = [
         ("L", "lagrangian", by_y, range(2 * n), range(1)),
-        ("p = dL/dqdot", "lagrangian", along, range(n, 2 * n + 1), range(1, first)),
+        ("p = dL/dqdot", "lagrangian", of_momentum, range(n, 2 * n + 1), range(1, first)),
     ]
-    if dragged:
+    if dissipates:
         by_v = Slopes(m.by_v_of_dissipation[:, None], of_drag[:, None])
-        blocks.append(("D", "dissipation", by_v, range(n, 2 * n), range(first, held)))
+        blocks.append(("D", "dissipation", by_v, range(n, 2 * n), range(first, constraint)))
     count = len(scene.residual)
     if np.isfinite(scene.residual).all() and np.isfinite(m.jacobian[0]).all():
         positions = position_count(scene)
         by_q, by_v = (Slopes(m.jacobian[0, k].T, of_rows[k].T) for k in (slice(positions), slice(positions, None)))
         blocks += [
-            ("a constraint", "constraints", by_q, range(n), range(held, held + positions)),
+            ("a constraint", "constraints", by_q, range(n), range(constraint, constraint + positions)),
             ("a velocity constraint", "velocity_constraints", by_v, range(n, 2 * n),
-             range(held + positions, held + count)),
+             range(constraint + positions, constraint + count)),
         ]  # fmt: skip
     return [block for block in blocks if len(block[-1])]
 
@@ -148,7 +154,7 @@ def _compared(scene: Scene, name, role, derivative, directions, outputs) -> list
     )  # fmt: skip
     kinks = differ(ahead, behind, dtype)
     derivative, wrong = derivative.value, differ(derivative, both, dtype) & ~kinks
-    names, found = [scene.names[i] for i in directions], []
+    names, reported = [scene.names[i] for i in directions], []
     for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
         message = (
             f"The slope of {name} along {names[i]} is {behind.value[i, k]:.6g} below this state and "
@@ -156,19 +162,19 @@ def _compared(scene: Scene, name, role, derivative, directions, outputs) -> list
             f"{_blame_for_kink(scene, role) if role in ('lagrangian', 'dissipation') else ''}. Smooth it (sqrt(x**2 + "
             "w**2) for abs(x)), or start beside it; a motion across it is one of two modes of simulate_hybrid."
         )
-        found.append(Finding("kink", "error", (names[i],), message))
+        reported.append(Finding("kink", "error", (names[i],), message))
     for i, k in list(zip(*np.nonzero(wrong), strict=True))[:_SHOWN]:
         message = (
             f"The derivative of {name} along {names[i]} is {derivative[i, k]:.6g} by automatic differentiation, and "
             f"{both.value[i, k]:.6g} ± {both.error[i, k]:.0e} by finite differences: a custom derivative is wrong, or "
             "stop_gradient, a round or a cast to integers hides a dependence."
         )
-        found.append(Finding("wrong_derivative", "error", (names[i],), message))
-    return found
+        reported.append(Finding("wrong_derivative", "error", (names[i],), message))
+    return reported
 
 
 def _places(scene: Scene) -> np.ndarray:
-    """The coordinates themselves, whose rounding moves what is computed from them, in the units of the directions."""
+    """|q|, |q̇| and the time, (2n + 1,): the numbers of the state whose rounding moves what is computed from them."""
     q, v, t = (np.abs(np.asarray(x, float)) for x in scene.state[:3])
     speed = v.max()
     return np.concatenate([q, v, [max(t, q.max() / speed if speed > 0 else 0)]])

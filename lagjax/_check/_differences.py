@@ -15,7 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-_SAFETY = 8.0  # an error is trusted within this factor
+# The factor within which an estimated error is trusted. Slopes that differ by less count as equal: doubled, derivatives
+# that are wrong by less than 16 errors pass.
+_SAFETY = 8.0
 
 
 class Slopes(NamedTuple):
@@ -32,14 +34,14 @@ def ladder(size: np.ndarray, dtype) -> np.ndarray:
 
 
 def slopes(minus, here, plus, steps, place, eps: float, noise=0.0) -> tuple[Slopes, Slopes, Slopes]:
-    """Two-sided, forward and backward, from f(x − h e), f(x) and f(x + h e).
+    """Two-sided, forward and backward slopes from f(x − h e), f(x) and f(x + h e), each (directions, outputs).
 
     `minus` and `plus` have the shape (directions, rungs, outputs), `here` (outputs,), `steps` (rungs, directions),
     `place` (directions,): the coordinate itself, whose rounding moves f. `noise` (outputs,): how far the rounding of
     terms that cancel may move f beyond that of its value.
     """
     h, here = steps.T[:, 1:, None], np.asarray(here, float)
-    least = float(np.finfo(steps.dtype).tiny)  # what is smaller underflows
+    least = float(np.finfo(steps.dtype).tiny)  # smaller numbers underflow
     minus, plus = np.asarray(minus, float), np.asarray(plus, float)
     near, far = (plus[:, 1:], minus[:, 1:]), (plus[:, :-1], minus[:, :-1])
     size = np.maximum(np.maximum(np.abs(near[0]), np.abs(near[1])), np.abs(here))
@@ -51,13 +53,14 @@ def slopes(minus, here, plus, steps, place, eps: float, noise=0.0) -> tuple[Slop
         def best(x):
             # f has the rounding of its value, and of every coordinate in it.
             terms = np.abs(place)[:, None, None] * np.abs(x)
-            moved = eps * (size + np.sum(np.where(np.isfinite(terms), terms, 0), axis=0)) + noise
-            return _best(x, (moved + least) / h)
+            rounding = eps * (size + np.sum(np.where(np.isfinite(terms), terms, 0), axis=0)) + noise
+            return _best(x, (rounding + least) / h)
 
         return best(both), best(ahead), best(behind)
 
 
 def _best(estimates: np.ndarray, rounding: np.ndarray) -> Slopes:
+    """The estimate of the rung with the least error, from (directions, rungs, outputs)."""
     changes = np.abs(np.diff(estimates, axis=1))
     # The largest of the changes to two rungs on either side.
     padded = np.pad(changes, ((0, 0), (2, 2), (0, 0)), mode="edge")

@@ -1,4 +1,4 @@
-"""What `check` hands back: findings, each with what to change, the worst first."""
+"""The result of `check`: findings, each with what to change, errors first."""
 
 import textwrap
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Findings:
-    """What `lagjax.check` found, the worst first: iterate over it, or print it.
+    """What `lagjax.check` found, errors first: iterate over it, or print it.
 
     `ok` is True without an error; `kinds` are the kinds that were found.
     """
@@ -69,5 +69,5 @@ class Findings:
 
 
 def listed(names: tuple[str, ...] | list[str], longest: int = 8) -> str:
-    """Names in a sentence."""
+    """Names separated by commas, the `longest` first of them and how many more."""
     return ", ".join(names[:longest]) + (f" and {len(names) - longest} more" if len(names) > longest else "")

@@ -1,7 +1,7 @@
 """The mass matrix: velocities that carry no kinetic energy, and why; its signs and its condition.
 
-With constraints it may be singular where they hold what L does not. Then K = M + GᵀW G is looked at, which is regular
-when the saddle point is (`_linear`). A direction u with K u = 0 is told apart by what happens at states nearby:
+With constraints it may be singular where they hold what L does not. Then the augmented matrix K = M + GᵀW G is
+examined, which is regular when the saddle point is (`_linear`). States nearby tell what a direction u with K u = 0 is:
 
     the row of M is zero everywhere, and p too             a velocity that L does not contain
     the row of M is zero everywhere, p is not              L is linear in it
@@ -16,61 +16,58 @@ import numpy as np
 
 from lagjax._check._findings import Finding, listed
 from lagjax._check._measure import Scene
+from lagjax._linear import diagonal_scale, null_directions, singular_threshold
 from lagjax._problem import DEFAULT_RTOL
 
 
 def findings(scene: Scene) -> list[Finding]:
     """All that there is to say about the mass matrix."""
     m, names = scene.measured, scene.layout.names
-    held = scene.held
-    usable = [k for k in range(1, len(held)) if np.isfinite(held[k]).all()]
-    if not np.isfinite(held[0]).all():
+    augmented = scene.augmented
+    usable = [k for k in range(1, len(augmented)) if np.isfinite(augmented[k]).all()]
+    if not np.isfinite(augmented[0]).all():
         return []  # a derivative is not finite, which was said already
-    if len(null_directions(held[0])):
-        return _singular(scene, held, usable)
-    others = [held[k] for k in usable]
-    condition = _condition(held[0], names, DEFAULT_RTOL[scene.layout.dtype])
-    return [*_nearly_singular(held[0], others, names), *_signs(m.mass[0], m.jacobian[0], names), *condition]
+    if len(null_velocities(augmented[0])):
+        return _singular(scene, augmented, usable)
+    others = [augmented[k] for k in usable]
+    condition = _condition(augmented[0], names, DEFAULT_RTOL[scene.layout.dtype])
+    return [*_nearly_singular(augmented[0], others, names), *_signs(m.mass[0], m.jacobian[0], names), *condition]
 
 
-def _scale(matrix: np.ndarray) -> np.ndarray:
-    diagonal = np.abs(np.diagonal(matrix))
-    size = np.where(diagonal > 0, diagonal, np.abs(matrix).max(axis=1))
-    return 1 / np.sqrt(np.where(size > 0, size, 1))
+def null_velocities(matrix: np.ndarray) -> np.ndarray:
+    """Unit vectors (k, n), one a row, along which a symmetric matrix (n, n) is zero up to the rounding of its entries.
 
-
-def null_directions(matrix: np.ndarray) -> np.ndarray:
-    """Directions in which a symmetric matrix, scaled to a unit diagonal, is zero up to rounding; one a row."""
-    scale = _scale(matrix)
-    values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale)
-    null = np.abs(values) <= _rounding(matrix) * max(np.abs(values).max(), np.finfo(matrix.dtype).tiny)
-    directions = (scale[:, None] * vectors[:, null]).T
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    The entries are derivatives with some units of round-off each: more is allowed for here than in `_linear`, where a
+    matrix is solved with that is taken to be exact.
+    """
+    return null_directions(matrix, _rounding(matrix))
 
 
 def _rounding(matrix: np.ndarray) -> float:
-    return 32 * len(matrix) * float(np.finfo(matrix.dtype).eps)
+    """The part of the largest eigenvalue that rounding may make of a zero: 32 units for each row."""
+    return 32 * singular_threshold(len(matrix), matrix.dtype)
 
 
 # ---- singular --------------------------------------------------------------------------------------------------------
 
 
-def _singular(scene: Scene, held: np.ndarray, usable: list[int]) -> list[Finding]:
+def _singular(scene: Scene, augmented: np.ndarray, usable: list[int]) -> list[Finding]:
+    """Findings for K (states, n, n) that is singular at the state; `usable` are the states nearby where K is finite."""
     names, constrained = scene.layout.names, scene.motion.constrained
-    empty = [i for i in range(len(names)) if all(not held[k][i].any() for k in [0, *usable])]
-    found = [_empty(i, scene.measured.momentum[[0, *usable], i], names[i], constrained) for i in empty]
+    empty = [i for i in range(len(names)) if all(not augmented[k][i].any() for k in [0, *usable])]
+    empty_rows = [_empty(i, scene.measured.momentum[[0, *usable], i], names[i], constrained) for i in empty]
     rest = [i for i in range(len(names)) if i not in empty]
 
     def among_rest(k):
-        return null_directions(held[k][np.ix_(rest, rest)])
+        return null_velocities(augmented[k][np.ix_(rest, rest)])
 
     if not rest or not len(here := among_rest(0)):
-        return found
+        return empty_rows
     where = tuple(names[rest[i]] for i in np.flatnonzero(np.abs(here).max(axis=0) > 1e-6))
-    along = "; ".join(_combination(u, [names[i] for i in rest]) for u in here)
+    combinations = "; ".join(_combination(u, [names[i] for i in rest]) for u in here)
     what = "The saddle point of M and the constraints" if constrained else "The mass matrix d2L/dqdot2"
     kind, why = _classified(scene, here, {k: among_rest(k) for k in usable})
-    return [*found, Finding(kind, "error", where, f"{what} is singular along {along}, {why}")]
+    return [*empty_rows, Finding(kind, "error", where, f"{what} is singular along {combinations}, {why}")]
 
 
 def _empty(i: int, momenta: np.ndarray, name: str, constrained: bool) -> Finding:
@@ -89,13 +86,13 @@ def _empty(i: int, momenta: np.ndarray, name: str, constrained: bool) -> Finding
 def _classified(scene: Scene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
     """The kind of a singularity with these null directions, and the rest of the sentence about it."""
     m = scene.measured
-    if any(not len(found) for k, found in nearby.items() if not (m.velocity[k] != m.velocity[0]).any()):
+    if any(not len(directions) for k, directions in nearby.items() if not (m.velocity[k] != m.velocity[0]).any()):
         return "coordinate_singularity", (
             "but regular at positions nearby: these coordinates are singular here (polar ones at r = 0, spherical ones "
             "and Euler angles at a pole, a slack variable s² at s = 0). Use others that are regular where the motion "
             "goes, such as Cartesian ones with a constraint, or start elsewhere."
         )
-    if any(not len(found) for found in nearby.values()):
+    if any(not len(directions) for directions in nearby.values()):
         return "singular_at_velocity", (
             "but regular at other velocities: L has no second order in them here. Start with another velocity, or "
             "write a kinetic energy that is quadratic in small velocities."
@@ -110,7 +107,7 @@ def _classified(scene: Scene, here: np.ndarray, nearby: dict[int, np.ndarray]) -
             "the velocity itself: L is of degree one in the velocities, and every parametrisation of the path is as "
             "good as another. Take one of the coordinates as t, or, where L is a length alone, integrate its square."
         )
-    if nearby and all(_same_space(here, found) for found in nearby.values()):
+    if nearby and all(_same_space(here, directions) for directions in nearby.values()):
         return "velocity_combination", (
             "here and nearby: L has no kinetic energy along this combination of velocities. Add it (a missing mass?), "
             "or use fewer coordinates."
@@ -122,17 +119,18 @@ def _classified(scene: Scene, here: np.ndarray, nearby: dict[int, np.ndarray]) -
 
 
 def _homogeneous(scene: Scene, states: list[int]) -> bool:
-    """Whether M q̇ = 0 wherever it was looked at: L is of degree one in the velocities."""
+    """Whether M q̇ = 0 at all of these states: L is of degree one in the velocities."""
     m = scene.measured
 
-    def turned(mass, v):
+    def annihilates(mass, v):
         return np.abs(mass @ v).max() <= np.sqrt(np.finfo(mass.dtype).eps) * np.abs(mass).max() * np.abs(v).max()
 
-    moving = [k for k in states if m.velocity[k].any()]
-    return bool(moving) and all(turned(m.mass[k], m.velocity[k]) for k in moving)
+    in_motion = [k for k in states if m.velocity[k].any()]
+    return bool(in_motion) and all(annihilates(m.mass[k], m.velocity[k]) for k in in_motion)
 
 
 def _same_space(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether the rows of two arrays (k, n) span the same space, up to √eps."""
     if one.shape != other.shape:
         return False
     basis = np.linalg.qr(other.T)[0]
@@ -148,11 +146,13 @@ def _combination(direction: np.ndarray, names: list[str]) -> str:
 
 # ---- regular ---------------------------------------------------------------------------------------------------------
 
-_NEARLY = 1e-6  # of the smallest eigenvalue that is usual nearby
+# The smallest eigenvalue of K over that at states nearby, below which the state is called next to a singularity. The
+# states are a tenth of a size away, and eigenvalues vanish like r²: 1e-6 is a ten-thousandth of a size from the pole.
+_NEARLY = 1e-6
 
 
 def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[Finding]:
-    """Next to a pole K is regular in its own scale, but far from it in that of its neighbourhood."""
+    """A warning next to a pole, where K is regular in its own scale but nearly singular in that of states nearby."""
     if not others:
         return []
     usual = 1 / np.sqrt(np.maximum(np.median([np.abs(np.diagonal(k)) for k in others], axis=0), 1e-300))
@@ -177,7 +177,7 @@ def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[
 
 def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
     """Negative kinetic energy along velocities that the constraints allow."""
-    scale = _scale(mass)
+    scale = diagonal_scale(mass)
     free = kernel(rows * scale)
     if not free.shape[1]:
         return []
@@ -186,18 +186,18 @@ def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
     if not negative.any():
         return []
     direction = scale * (free @ vectors[:, 0])
-    along = _combination(direction, list(names))
+    combination = _combination(direction, list(names))
     where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 1e-6 * np.abs(direction).max())
     whole = "negative definite" if negative.all() else "indefinite"
     return [Finding(
         "indefinite_mass_matrix", "warning", where,
-        f"The mass matrix is {whole}: d2L is negative along {along}. The motion is that of L all the same, but "
+        f"The mass matrix is {whole}: d2L is negative along {combination}. The motion is that of L all the same, but "
         "if L is meant to be T - U, a sign is wrong, or a mass is negative.",
     )]  # fmt: skip
 
 
 def kernel(rows: np.ndarray) -> np.ndarray:
-    """Columns that span what the rows leave free."""
+    """The columns (n, n − rank) that span the kernel of some rows (m, n): the velocities that they leave free."""
     if not len(rows):
         return np.eye(rows.shape[1], dtype=rows.dtype)
     _, values, vectors = np.linalg.svd(rows)
@@ -206,7 +206,7 @@ def kernel(rows: np.ndarray) -> np.ndarray:
 
 
 def _condition(matrix: np.ndarray, names, default_rtol: float) -> list[Finding]:
-    scale = _scale(matrix)
+    scale = diagonal_scale(matrix)
     condition, raw = np.linalg.cond(scale[:, None] * matrix * scale), np.linalg.cond(matrix)
     lost = condition * np.finfo(matrix.dtype).eps
     if lost <= default_rtol:

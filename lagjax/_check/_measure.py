@@ -1,7 +1,7 @@
-"""Everything `check` has to compute: of a scene, at a state and around it.
+"""Everything that `check` computes: the values and derivatives of a scene at a state and at states around it.
 
-By the scene's programs, in NumPy, which compiles nothing. A scene that has none (arrays in its functions, operations
-without a scalar form, far too many of them) is compiled by XLA.
+The scene's programs are evaluated in NumPy, which compiles nothing. A scene without programs (arrays in its functions,
+operations without a scalar form, far too many of them) is compiled by XLA.
 """
 
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ import numpy as np
 from lagjax._check._differences import ladder
 from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._layout import Layout
+from lagjax._linear import augment
 from lagjax._motion import Motion
 from lagjax._program import Unlowerable
 from lagjax._system import System
@@ -21,7 +22,8 @@ from lagjax._validate import as_arrays
 
 PyTree = Any
 
-_LARGEST_AT_ONCE = 16  # coordinates up to which all differences are taken side by side
+# Coordinates up to which XLA takes all differences side by side; with more, memory grows like their square.
+_LARGEST_AT_ONCE = 16
 _NEARBY = 4  # states with other positions, and as many with other velocities
 
 
@@ -32,7 +34,7 @@ class Scene(NamedTuple):
     layout: Layout
     derivation: Derivation
     motion: Motion
-    given: tuple  # q, qdot, t, params in the user's pytrees
+    arguments: tuple  # q, qdot, t, params in the user's pytrees
     state: tuple  # q, q̇, t and the numbers in params
     sizes: np.ndarray  # of q, then of q̇, and of the time along the motion
     steps: np.ndarray  # of the differences, (rungs, 2n + 1), along the same directions
@@ -53,7 +55,7 @@ class Scene(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the directions: coordinates, velocities, and along the motion."""
+        """The names of the 2n + 1 directions of differences: coordinates, velocities, and along the motion."""
         names = self.layout.names
         return (*names, *(f"d{name}" for name in names), "the motion")
 
@@ -69,45 +71,45 @@ class Scene(NamedTuple):
 
     @property
     def residual(self) -> np.ndarray:
-        """The constraints at the state."""
+        """f, then a, at the state, (m,)."""
         count = self.measured.jacobian.shape[1]
         return self.measured.here[len(self.measured.here) - count :]
 
     @property
     def drift(self) -> np.ndarray:
-        """(∂p/∂q) q̇ + ∂p/∂t at the state."""
+        """(∂p/∂q) q̇ + ∂p/∂t at the state, (n,)."""
         m = self.measured
         return m.by_q + m.extra - m.by_v_of_dissipation - m.force
 
     @property
-    def held(self) -> np.ndarray:
-        """K = M + GᵀW G of every state (see `_mass`), every row of G as heavy as M."""
-        m = self.measured
-        size = np.sum(m.jacobian**2, axis=2, keepdims=True)
-        heavy = np.abs(np.diagonal(m.mass, axis1=1, axis2=2)).max(axis=1)[:, None, None]
-        weight = np.where(heavy > 0, heavy, 1) / np.where(size > 0, size, 1)
-        return m.mass + np.swapaxes(m.jacobian, 1, 2) @ (weight * m.jacobian)
+    def augmented(self) -> np.ndarray:
+        """The augmented matrix K = M + GᵀW G (see `_linear`) of every state, (states, n, n); M without constraints."""
+        return augment(self.measured.mass, self.measured.jacobian)[0]
 
     def solved(self) -> tuple[np.ndarray, np.ndarray]:
-        """q̈ and λ."""
+        """q̈ (n,) and λ (m,) at the state."""
         m, n = self.measured, self.layout.size
         x = self._solve(np.concatenate([m.force, m.gamma])[:, None])[:, 0]
         return x[:n], x[n:]
 
     def jacobian(self) -> np.ndarray:
-        """∂q̈/∂(q, q̇), (n, 2n): by the implicit function."""
+        """∂q̈/∂(q, q̇) at the state, (n, 2n), by the implicit function theorem."""
         acceleration, multipliers = self.solved()
         try:
             varied = _program_variation(self.derivation, self.state, acceleration, multipliers)
         except Unlowerable:
-            q, qdot, t, params = self.given
+            q, qdot, t, params = self.arguments
             varied = np.asarray(_variation(self.system, q, qdot, t, params, acceleration, multipliers))
         return self._solve(-varied)[: self.layout.size]
 
     def _solve(self, b: np.ndarray) -> np.ndarray:
-        """(q̈, λ) of the saddle point M q̈ − Gᵀλ = b₁, G q̈ = b₂, scaled; of the λ some that are right."""
+        """(q̈, λ) of the saddle point M q̈ − Gᵀλ = b₁, G q̈ = b₂ for columns b (n + m, k), by least squares.
+
+        The matrix is scaled to K with a unit diagonal and rows of unit length. Where constraints are redundant λ is one
+        of many.
+        """
         mass, rows = self.measured.mass[0], self.measured.jacobian[0]
-        diagonal = np.sqrt(np.abs(np.diagonal(self.held[0])))
+        diagonal = np.sqrt(np.abs(np.diagonal(self.augmented[0])))
         units = np.concatenate([1 / np.where(diagonal > 0, diagonal, 1), np.ones(len(rows))])
         units[len(mass) :] = 1 / np.maximum(np.linalg.norm(rows * units[: len(mass)], axis=1), 1e-300)
         matrix = np.block([[mass, -rows.T], [rows, np.zeros((len(rows), len(rows)))]])
@@ -121,29 +123,31 @@ class Scene(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """Where there is a first axis of states: at the state itself, at others in q, at others in q̇."""
+    """What is measured. A first axis of states stands for the state itself, then others in q, then others in q̇."""
 
-    by_q: Any  # ∂L/∂q
+    by_q: Any  # ∂L/∂q, (n,)
     momentum: Any  # (states, n)
     mass: Any  # (states, n, n)
-    force: Any  # M q̈ − Gᵀλ, (n,)
-    extra: Any  # Q as the user gives it
-    by_v_of_dissipation: Any
+    force: Any  # F = M q̈ − Gᵀλ, (n,)
+    extra: Any  # the user's forces, (n,)
+    by_v_of_dissipation: Any  # ∂D/∂q̇, (n,)
     jacobian: Any  # G, (states, m, n)
     gamma: Any  # γ of G q̈ = γ, (m,)
     velocity: Any  # (states, n)
-    power: Any  # that D takes, Σ q̇ ∂D/∂q̇, and the sum of its parts without their signs, (states, 2)
-    minus: Any  # L, p, D if there is one, and the constraints at steps back, (2n + 1, rungs, outputs)
-    here: Any  # the same at the state, (outputs,)
-    plus: Any  # and ahead
+    power: Any  # Σ q̇ᵢ ∂D/∂q̇ᵢ, which D takes out of the motion, and Σ |q̇ᵢ ∂D/∂q̇ᵢ|, (states, 2)
+    minus: Any  # the outputs L, p, D (if there is one), f and a at steps back, (2n + 1, rungs, outputs)
+    here: Any  # these outputs at the state, (outputs,)
+    plus: Any  # these outputs at steps ahead, (2n + 1, rungs, outputs)
     noise: Any  # how far rounding may move `here`, (outputs,)
-    round_off: Any  # and the derivatives by_q (n,), momentum (n,), mass (n, n), drift (n,), by_v_of_dissipation, rows
+    round_off: Any  # how far it may move by_q, momentum, mass, drift, by_v_of_dissipation and the rows of G, each alike
 
 
 def _sizes(layout: Layout, q: PyTree, qdot: PyTree) -> np.ndarray:
-    """Of every coordinate its own size, or that of others in its array, or 1; in time what moves q by its size.
+    """The size of every coordinate, of every velocity, and of the time along the motion, (2n + 1,).
 
-    One that is next to nothing beside the others (an angle that was projected to 1e-20) has a thousandth of theirs.
+    A coordinate has its absolute value as its size; where that is zero, the largest in its array, or 1. One that is
+    tiny beside the others (an angle that was projected to 1e-20) counts as a thousandth of the largest. The size of the
+    time is what the fastest coordinate takes to move by its size.
     """
 
     def of(tree):
@@ -160,9 +164,10 @@ def _sizes(layout: Layout, q: PyTree, qdot: PyTree) -> np.ndarray:
 
 
 def _offsets(layout: Layout, q: PyTree, sizes: np.ndarray) -> np.ndarray:
-    """From the state to others: none, then in q alone, then in q̇ alone; a tenth of the sizes.
+    """Offsets (1 + 2 · _NEARBY, 2n) from the state: zero, then random ones of q alone, then of q̇ alone.
 
-    A coordinate that is small beside the others moves farther: it may be next to where the chart is singular.
+    Their deviation is a tenth of the sizes. A coordinate that is small beside the others moves by a tenth of theirs: it
+    may be next to where the chart is singular, and has to leave that.
     """
     n, whole = layout.size, np.abs(layout.flatten(q)).max()
     sizes = np.concatenate([np.maximum(sizes[:n], min(1.0, whole)), sizes[n:-1]])
@@ -177,7 +182,7 @@ _DRIFT = ("lagrangian_by_q", "given_force", "dissipation_by_qdot", "force")
 
 
 def _evaluated(derivation: Derivation, state, steps: np.ndarray, offsets: np.ndarray) -> Measured:
-    """Everything by the programs of a derivation; raises `Unlowerable`."""
+    """What is measured, by the programs of a derivation; raises `Unlowerable` where it has none."""
     q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
     n = len(q)
     near = derivation.evaluate(
@@ -221,7 +226,10 @@ def _evaluated(derivation: Derivation, state, steps: np.ndarray, offsets: np.nda
 
 
 def _program_variation(derivation: Derivation, state, acceleration, multipliers) -> np.ndarray:
-    """`_variation` by one transposed derivative of the program of M, F, G and γ, all equations side by side."""
+    """How M q̈ − Gᵀλ − F and G q̈ − γ vary with (q, q̇), (n + m, 2n), for constant q̈ and λ: by the programs.
+
+    It is one transposed derivative of the program of M, F, G and γ, for all n + m equations side by side.
+    """
     q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
     n, m = len(q), len(multipliers)
     unit = np.eye(n + m, dtype=q.dtype)
@@ -229,8 +237,8 @@ def _program_variation(derivation: Derivation, state, acceleration, multipliers)
     cotangents += [unit[n + k] * acceleration[i] - unit[i] * multipliers[k] for k in range(m) for i in range(n)]
     cotangents += [-unit[i] for i in range(n + m)]
     program = derivation.program("mass_matrix", "jacobian", "force", "gamma")
-    found = program.pull_back_many([*q, *v, t, *numbers], cotangents)[: 2 * n]
-    return np.stack([np.zeros(n + m) if bar is None else np.broadcast_to(bar, n + m) for bar in found], axis=1)
+    derivatives = program.pull_back_many([*q, *v, t, *numbers], cotangents)[: 2 * n]
+    return np.stack([np.zeros(n + m) if bar is None else np.broadcast_to(bar, n + m) for bar in derivatives], axis=1)
 
 
 @eqx.filter_jit
@@ -268,7 +276,7 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
     momentum, mass, force, jacobian, gamma, velocity = jax.vmap(nearby)(offsets)
     by_q = Motion(motion.lagrangian, None, None).generalized_force(*state)
     extra = jnp.zeros_like(q) if motion.forces is None else motion.forces(*state)
-    dragged = -damped.nonconservative_force(*state)
+    dragging = -damped.nonconservative_force(*state)
 
     return Measured(
         by_q=by_q,
@@ -276,7 +284,7 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
         mass=mass,
         force=force[0],
         extra=extra,
-        by_v_of_dissipation=dragged,
+        by_v_of_dissipation=dragging,
         jacobian=jacobian,
         gamma=gamma[0],
         velocity=velocity,
@@ -286,21 +294,24 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
         plus=sides[:, 1],
         noise=jnp.zeros_like(everything(y)),
         round_off=(
-            *map(_rounding, (by_q, momentum[0], mass[0])), _rounding(by_q, extra, dragged, force[0]),
-            *map(_rounding, (dragged, jacobian[0])),
+            *map(_rounding, (by_q, momentum[0], mass[0])), _rounding(by_q, extra, dragging, force[0]),
+            *map(_rounding, (dragging, jacobian[0])),
         ),
     )  # fmt: skip
 
 
 def _rounding(*terms):
-    """What rounding may be of derivatives whose own terms are not known, in the shape of the first of `terms`."""
+    """The rounding of derivatives whose terms are not known one by one, in the shape of the first of `terms`.
+
+    Four units of round-off of the sum of the largest terms.
+    """
     size = sum(jnp.max(jnp.abs(term), initial=0.0) for term in terms)
     return jnp.full(terms[0].shape, 4 * jnp.finfo(terms[0].dtype).eps * size)
 
 
 @eqx.filter_jit
 def _variation(system: System, q, qdot, t, params, acceleration, multipliers):
-    """How M q̈ − Gᵀλ − F and G q̈ − c vary with (q, q̇) while q̈ and λ do not, (n + m, 2n)."""
+    """How M q̈ − Gᵀλ − F and G q̈ − γ vary with (q, q̇), (n + m, 2n), for constant q̈ and λ: compiled by XLA."""
     layout = Layout.of(q, qdot)
     motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
 

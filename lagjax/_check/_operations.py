@@ -1,6 +1,6 @@
 """Which operation of a user's function is to blame: its jaxpr, followed one equation at a time.
 
-Every equation is evaluated as it stands. One whose result is not finite although its operands are, or whose own first
+Every equation is evaluated by itself. One whose result is not finite although its operands are, or whose own first
 or second derivative is not finite, is an `Offender`; comparisons and their like (|x|, max, sign, floor) are `borders`,
 where a function may have a kink or a jump. Both know the line of the user's code that they come from.
 """
@@ -32,11 +32,11 @@ class Offender(NamedTuple):
 
 
 def offenders(function: Callable, *arguments) -> list[Offender]:
-    """The operations of `function(q, qdot, t, params)` that are not finite, or whose derivatives are not, by (q, q̇, t).
+    """The operations of `function(q, qdot, t, params)` that are not finite, or whose derivatives by (q, q̇, t) are not.
 
-    In the order in which they are evaluated.
+    They are listed in the order in which they are evaluated.
     """
-    found = []
+    collected = []
 
     def visit(equation, operands, moves, results, place):
         chosen = [i for i, x in enumerate(operands) if moves[i] and _floating(x)]
@@ -44,47 +44,47 @@ def offenders(function: Callable, *arguments) -> list[Offender]:
             return
         name = _name(equation)
         if not all(_finite(x) for x in results):
-            found.append(Offender(name, _operands(operands, results), place, "value"))
+            collected.append(Offender(name, _operands(operands, results), place, "value"))
         elif any(_floating(x) for x in results):
             first, second = _derivatives(equation, operands, chosen)
             for fault, values in (("first derivative", first), ("second derivative", second)):
                 if not all(_finite(x) for x in values):
-                    found.append(Offender(name, _operands(operands, values), place, fault))
+                    collected.append(Offender(name, _operands(operands, values), place, fault))
                     break
 
     _follow(function, arguments, visit, into_rules=False)
-    return found
+    return collected
 
 
 def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
-    """The operations of `function` at which it is pieced together: name, place, and on which side of it we are.
+    """The operations of `function` at which it is pieced together: name, place, and the side on which the state is.
 
-    Works on values that are being traced, so that the sides can be had for many states at once.
+    Values may be traced, so that the sides can be computed for many states at once.
     """
-    found = []
+    collected = []
 
     def visit(equation, operands, moves, results, place):
         side = _side_of(equation.primitive.name)
         if side is not None and any(m and _floating(x) for m, x in zip(moves, operands, strict=True)):
-            found.append((_name(equation), place, jnp.asarray(side(results[0], *operands), float)))
+            collected.append((_name(equation), place, jnp.asarray(side(results[0], *operands), float)))
 
     _follow(function, arguments, visit, into_rules=True)
-    return found
+    return collected
 
 
 def pieces_of(function: Callable, *arguments) -> list[tuple[str, str, int]]:
     """The name and place of every border of `function`, and how many numbers it compares; nothing is evaluated."""
-    found = []
+    collected = []
 
     def traced(*arguments):
-        found.extend((name, place, np.size(side)) for name, place, side in borders(function, *arguments))
+        collected.extend((name, place, np.size(side)) for name, place, side in borders(function, *arguments))
         return 0.0
 
     jax.eval_shape(traced, *arguments)
-    return found
+    return collected
 
 
-# Of primitives that compute with several operations; the other borders stand in the table of operations.
+# The sides of primitives that are several operations; those of single ones stand in the table of operations.
 _SIDES = {
     "argmax": lambda result, x: result,
     "argmin": lambda result, x: result,
@@ -112,7 +112,7 @@ _RULES = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 def _follow(function: Callable, arguments: tuple, visit: Callable, into_rules: bool) -> None:
     """Evaluate `function(q, qdot, t, params)`, and show every equation that q, q̇ or t moves to `visit`.
 
-    What has a rule of its own for its derivative is one operation, unless `into_rules`.
+    A function with a custom rule for its derivative counts as one operation, unless `into_rules`.
     """
     closed = jax.make_jaxpr(function)(*arguments)
     *state, params = arguments
@@ -123,19 +123,19 @@ def _follow(function: Callable, arguments: tuple, visit: Callable, into_rules: b
 
 
 def _run(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside: tuple[str, ...]) -> tuple[list, list]:
-    """The results of a jaxpr, and which of them move."""
+    """The results of a jaxpr, and which of them depend on q, q̇ or t."""
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
-    moving = {v for v, m in zip(jaxpr.invars, moves, strict=True) if m}
+    depends = {v for v, m in zip(jaxpr.invars, moves, strict=True) if m}
 
     def read(atom):
         return atom.val if isinstance(atom, core.Literal) else values[atom]
 
-    def is_moving(atom):
-        return not isinstance(atom, core.Literal) and atom in moving
+    def is_dependent(atom):
+        return not isinstance(atom, core.Literal) and atom in depends
 
     for equation in jaxpr.eqns:
-        operands, moved = [read(x) for x in equation.invars], [is_moving(x) for x in equation.invars]
-        # A library function is traced once and remembers who asked first: the line is that of the outermost call.
+        operands, moved = [read(x) for x in equation.invars], [is_dependent(x) for x in equation.invars]
+        # A jitted library function keeps the source line of its first caller: the line is that of the outermost call.
         place = outer or _place(equation)
         body = _body(equation) if equation.primitive.name in inside else None
         if body is not None:
@@ -146,8 +146,8 @@ def _run(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside
             if any(moved):
                 visit(equation, operands, moved, results, place)
         values |= zip(equation.outvars, results, strict=True)
-        moving |= {v for v, m in zip(equation.outvars, out_moved, strict=True) if m}
-    return [read(x) for x in jaxpr.outvars], [is_moving(x) for x in jaxpr.outvars]
+        depends |= {v for v, m in zip(equation.outvars, out_moved, strict=True) if m}
+    return [read(x) for x in jaxpr.outvars], [is_dependent(x) for x in jaxpr.outvars]
 
 
 def _body(equation) -> tuple | None:
@@ -166,7 +166,10 @@ def _bind(equation, operands) -> list:
 
 
 def _derivatives(equation, operands, chosen: list[int]) -> tuple[list, list]:
-    """Sums over its results of the first derivatives of one operation, and of the second: in reverse, then forward."""
+    """The first and the second derivatives of one operation, each summed over its results, by the `chosen` operands.
+
+    Reverse mode, then forward over reverse, as the derivation of the equations takes them.
+    """
 
     def local(*xs):
         filled = list(operands)

@@ -6,7 +6,8 @@ from lagjax._check._findings import Finding
 from lagjax._check._mass import kernel
 from lagjax._check._measure import Scene
 
-_RATIO = 1e4  # of time scales, from which on an explicit solver spends nearly all of its steps on the fastest
+# The ratio of the time scales from which an explicit solver spends nearly all of its steps on the fastest.
+_RATIO = 1e4
 
 
 def findings(scene: Scene) -> list[Finding]:
@@ -40,12 +41,15 @@ def findings(scene: Scene) -> list[Finding]:
 
 
 def _trusted(linear: np.ndarray, eps: float) -> np.ndarray:
-    """The eigenvalues that rounding does not move by a tenth; a defective zero is not one of them."""
+    """The eigenvalues of ẏ = A y that a perturbation of the size of rounding moves by less than a tenth.
+
+    A defective zero, as of a free coordinate, is not one of them: rounding makes eigenvalues of √eps of it.
+    """
     speed = np.sqrt(np.abs(linear[len(linear) // 2 :]).max()) or 1.0
     scale = np.repeat([1.0, speed], len(linear) // 2)  # the time in units in which both halves are alike
     linear = linear * scale / scale[:, None]
     values = np.linalg.eigvals(linear)
     noise = 64 * eps * np.abs(linear).max() * np.random.default_rng(0).standard_normal(linear.shape)
-    moved = np.linalg.eigvals(linear + noise)
-    nearest = np.abs(values[:, None] - moved).min(axis=1)
+    perturbed = np.linalg.eigvals(linear + noise)
+    nearest = np.abs(values[:, None] - perturbed).min(axis=1)
     return values[(np.abs(values) > 0) & (nearest < 0.1 * np.abs(values))]

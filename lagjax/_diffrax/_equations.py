@@ -20,42 +20,42 @@ from lagjax._program import Program, Unlowerable
 PyTree = Any
 State = tuple[jax.Array, jax.Array]
 
-# Beyond this XLA takes longer to compile a program than it saves, and batched Cholesky or LU overtakes written-out
-# elimination (measured on chains of pendulums, where it lies at 12 links).
+# Operations of a program beyond which XLA takes longer to compile it than it saves, and batched elimination on arrays
+# overtakes written-out elimination: measured on chains of pendulums, where it lies at 12 links.
 LARGEST_XLA_PROGRAM = 2_000
 
 
 class Equations(eqx.Module):
-    """ẏ = f(t, y, params) with y = (q, qdot), two vectors."""
+    """ẏ = f(t, y, params) with y = (q, q̇), two vectors of shape (n,); params holds numbers alone."""
 
     @abc.abstractmethod
     def acceleration(self, t: jax.Array, y: State, params: PyTree) -> tuple[jax.Array, jax.Array]:
-        """q̈, and whether the mass matrix is singular there (q̈ is then not finite)."""
+        """q̈ (n,), and whether the matrix that it was solved with is singular: then q̈ is NaN."""
 
     def vector_field(self, t: jax.Array, y: State, params: PyTree) -> State:
-        """(q̇, q̈)."""
+        """ẏ = (q̇, q̈)."""
         return y[1], self.acceleration(t, y, params)[0]
 
     @property
     @abc.abstractmethod
     def constrained(self) -> bool:
-        """Whether there is anything to project to."""
+        """Whether the scene has constraints to project to."""
 
     @abc.abstractmethod
     def projected(self, t: jax.Array, y: State, params: PyTree) -> State:
-        """y after one Newton step back to the constraints."""
+        """y after one Newton step of positions and of velocities back to the constraints."""
 
 
 class ArrayEquations(Equations):
-    """Derivatives as JAX arrays; `reason` says why."""
+    """The equations with M, F, G and γ as JAX arrays; `reason` says why the scene has no scalar program in use."""
 
     motion: Motion = eqx.field(static=True)
-    derived: Any = eqx.field(static=True)
+    accelerate: Any = eqx.field(static=True)
     reason: str = eqx.field(static=True)
 
     def __init__(self, motion: Motion, reason: str):
         self.motion, self.reason = motion, reason
-        self.derived = jax.jit(motion.solved_acceleration)  # traced once, however often it is called
+        self.accelerate = jax.jit(motion.solved_acceleration)  # traced once, however often it is called
 
     @property
     def constrained(self) -> bool:
@@ -63,25 +63,28 @@ class ArrayEquations(Equations):
         return self.motion.constrained
 
     def projected(self, t, y, params):
-        """By `Motion.projected`."""
+        """y after `Motion.projected`."""
         return self.motion.projected(*y, t, params)
 
     def acceleration(self, t, y, params):
-        """By `Motion.solved_acceleration`."""
-        return _compiled_once(self.derived, *y, t, params)
+        """q̈ and whether it is singular, from `Motion.solved_acceleration`."""
+        return _compiled_once(self.accelerate, *y, t, params)
 
 
 class ScalarEquations(Equations):
-    """A scalar program for q̈: inputs q, q̇, t and every number in params; outputs q̈ and whether M is singular."""
+    """The equations as scalar programs, whose inputs are q, q̇, t and every number in params.
+
+    `program` gives q̈ and whether its matrix is singular, `projection` (q, q̇) after a step back to the constraints.
+    """
 
     program: Program = eqx.field(static=True)
     projection: Program | None = eqx.field(static=True)
-    called: Any = eqx.field(static=True)
-    projected_by: Any = eqx.field(static=True)
+    accelerate: Any = eqx.field(static=True)
+    project: Any = eqx.field(static=True)
 
     def __init__(self, program: Program, projection: Program | None = None):
-        self.program, self.projection, self.called = program, projection, jax.jit(program.__call__)
-        self.projected_by = None if projection is None else jax.jit(projection.__call__)
+        self.program, self.projection, self.accelerate = program, projection, jax.jit(program.__call__)
+        self.project = None if projection is None else jax.jit(projection.__call__)
 
     @property
     def constrained(self) -> bool:
@@ -89,18 +92,18 @@ class ScalarEquations(Equations):
         return self.projection is not None
 
     def projected(self, t, y, params):
-        """By the second program."""
-        state = _compiled_once(self.projected_by, *y[0], *y[1], t, *_scalars(params))
+        """y after the program `projection`."""
+        state = _compiled_once(self.project, *y[0], *y[1], t, *_scalars(params))
         return jnp.stack(state[: len(state) // 2]), jnp.stack(state[len(state) // 2 :])
 
     def acceleration(self, t, y, params):
-        """By the program."""
-        *acceleration, singular = _compiled_once(self.called, *y[0], *y[1], t, *_scalars(params))
+        """q̈ and whether it is singular, from `program`."""
+        *acceleration, singular = _compiled_once(self.accelerate, *y[0], *y[1], t, *_scalars(params))
         return jnp.stack(acceleration), singular
 
 
 def form_of(derivation: Derivation, path: str = "auto") -> "ScalarEquations | ArrayEquations":
-    """The form that suits a scene; `path` "scalar" or "array" insists on one.
+    """The form of its equations that suits a scene; `path` "scalar" or "array" insists on one.
 
     Raises `ValueError` when "scalar" is asked for and impossible, with the reason.
     """
@@ -120,11 +123,11 @@ def form_of(derivation: Derivation, path: str = "auto") -> "ScalarEquations | Ar
 
 
 def _scalars(params: PyTree) -> list[jax.Array]:
-    """Every number in the parameters, one by one."""
+    """Every number in the parameters, as a list of scalars."""
     return [x for leaf in jax.tree.leaves(params) for x in ([leaf] if jnp.ndim(leaf) == 0 else jnp.ravel(leaf))]
 
 
 def _compiled_once(function, *arguments):
-    """Call a jitted function without XLA inlining it: one compiled body, however many places call it."""
+    """Call a jitted function without XLA inlining it: it is compiled once, however many places call it."""
     with set_xla_metadata(inlineable="false"):
         return function(*arguments)

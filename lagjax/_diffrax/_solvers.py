@@ -1,9 +1,10 @@
-"""Wrappers around the solvers of diffrax. Neither changes the size of the steps that are taken.
+"""Two wrappers around the solvers of diffrax: a better dense output, and steps that end on the constraints.
 
-`FineOutput` makes the states *between* steps better. The interpolant that comes with `diffrax.Dopri8` is of order five
-or six, the method of order eight: at tight tolerances it loses a factor of 30 to 1000 against the ends of the steps.
+`FineOutput` makes the states *between* steps better and leaves the steps as they are. The interpolant that comes with
+`diffrax.Dopri8` is of order five or six, the method of order eight: at tight tolerances it loses a factor of 30 to 1000
+against the ends of the steps.
 
-`Projected` puts the state back on its constraints after each step.
+`Projected` projects the state onto its constraints after each step.
 """
 
 from collections.abc import Callable
@@ -70,22 +71,22 @@ class FineOutput(diffrax.AbstractAdaptiveSolver):
         return self.solver.init(terms, t0, t1, y0, args)
 
     def func(self, terms, t0, y0, args):
-        """The slope."""
+        """The right-hand side ẏ at (t0, y0)."""
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """The solver's step, and the slopes inside it."""
+        """The solver's step, and the polynomial through it and through the slopes at four points inside it."""
         y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        rough, span = self.solver.interpolation_cls(t0=t0, t1=t1, **dense), terms.contr(t0, t1)
+        interpolant, span = self.solver.interpolation_cls(t0=t0, t1=t1, **dense), terms.contr(t0, t1)
 
         def increment(place):
             t = t0 + place * (t1 - t0)
-            return _in_dtype_of(y0, terms.vf_prod(t, rough.evaluate(t), args, span))
+            return _in_dtype_of(y0, terms.vf_prod(t, interpolant.evaluate(t), args, span))
 
         def correction(y0, y1, k, *inside):
             cubic = (_hermite_slope(place, y1 - y0, k[0], k[-1]) for place in _INSIDE)
-            missing = [slope - guess for slope, guess in zip(inside, cubic, strict=True)]
-            return jnp.tensordot(jnp.asarray(_CORRECTION, y0.dtype), jnp.stack(missing), axes=1)
+            residuals = [slope - of_cubic for slope, of_cubic in zip(inside, cubic, strict=True)]
+            return jnp.tensordot(jnp.asarray(_CORRECTION, y0.dtype), jnp.stack(residuals), axes=1)
 
         increments = dense["k"]
         ends = {"first": _pick(increments, 0), "last": _pick(increments, -1)}
@@ -93,12 +94,16 @@ class FineOutput(diffrax.AbstractAdaptiveSolver):
         return y1, error, {"y0": y0, "y1": y1, **ends, "correction": polynomial}, state, result
 
 
-# Equal parts: with the nodes of Lobatto the slopes alone would fix yₙ₊₁, and no polynomial would meet it as well.
+# The points inside a step, in equal parts. At Lobatto's nodes the slopes alone would fix yₙ₊₁, and a polynomial through
+# them could not take the solver's yₙ₊₁ as well.
 _INSIDE = (0.2, 0.4, 0.6, 0.8)
 
 
 def _correction_weights() -> np.ndarray:
-    """Weights that turn missing slopes at `_INSIDE` into the coefficients of C in θ²(1−θ)² C(θ), C of degree three."""
+    """The (4, 4) weights that turn residual slopes at `_INSIDE` into the coefficients of C, of degree three.
+
+    θ²(1−θ)² C(θ) has these slopes there, and neither value nor slope at the ends.
+    """
     places = np.array(_INSIDE)[:, None]
     powers = np.arange(4)
     bump, bump_slope = (places * (1 - places)) ** 2, 2 * places * (1 - places) * (1 - 2 * places)
@@ -109,7 +114,7 @@ _CORRECTION = _correction_weights()
 
 
 def _hermite_slope(place, rise, first, last):
-    """The slope at `place` of the cubic that rises from 0 to `rise` with the slopes `first` and `last` at its ends."""
+    """The slope at `place` in [0, 1] of the cubic from 0 to `rise` whose slopes at the ends are `first` and `last`."""
     return (
         6 * place * (1 - place) * rise
         + (1 - place) * (1 - 3 * place) * first
@@ -118,9 +123,9 @@ def _hermite_slope(place, rise, first, last):
 
 
 class _Polynomial(diffrax.AbstractLocalInterpolation):
-    """Hermite's cubic through both ends of a step, and θ²(1−θ)² C(θ), which leaves the ends alone.
+    """Hermite's cubic through both ends of a step plus θ²(1−θ)² C(θ), which does not change the ends.
 
-    Written as a sum of single powers the polynomial would lose three digits to cancellation.
+    It is not written as a sum of powers of θ, which would lose three digits to cancellation.
     """
 
     t0: jax.Array
@@ -150,32 +155,33 @@ FineOutput.interpolation_cls = _Polynomial
 
 
 def _pick(stacked: PyTree, index: int) -> PyTree:
+    """The pytree at one index of the first axis of all leaves."""
     return jax.tree.map(lambda leaf: leaf[index], stacked)
 
 
 class Projected(diffrax.AbstractAdaptiveSolver):
     """The steps of a solver, each followed by a projection of the state: `project(t, y, args)` → y, one Newton step.
 
-    It is taken twice: the second says whether Newton's method arrives. Where it does not the state is NaN, which makes
-    the step one to reject; if that cannot be (fixed steps), the run ends with `Projected.FAILED`. How far the state was
-    moved is a part of the error of the step, so that a constraint that jumps is not followed by a jump. The states
-    inside a step are those of the solver.
+    Two Newton steps are taken, the second of which says whether the method converges. Where it does not, the state is
+    NaN, so that the step is rejected; where no step can be rejected (fixed steps), the run ends with
+    `Projected.FAILED`. The distance between the solver's state and the projected one is added to the error of the step:
+    a constraint that jumps is then refused and not followed. The states inside a step are those of the solver.
     """
 
     solver: diffrax.AbstractSolver
     project: Callable
 
-    # The one of diffrax's codes that none of its solvers gives.
+    # The only code of diffrax that none of its own solvers returns.
     FAILED: ClassVar[Any] = diffrax.RESULTS.breakdown
 
     @property
     def term_structure(self):
-        """That of the solver."""
+        """The terms that the solver takes."""
         return self.solver.term_structure
 
     @property
     def interpolation_cls(self) -> Callable:
-        """That of the solver."""
+        """The interpolant of the solver."""
         return self.solver.interpolation_cls
 
     def order(self, terms) -> int | None:
@@ -187,11 +193,11 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         return self.solver.init(terms, t0, t1, y0, args)
 
     def func(self, terms, t0, y0, args):
-        """The slope."""
+        """The right-hand side ẏ at (t0, y0)."""
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """The solver's step, then the projection. A slope kept from the step before belongs to another state."""
+        """The solver's step, then two Newton steps. No FSAL: the last slope is not that of the new state."""
         y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, True)
         near = self.project(t1, y1, args)
         nearer = self.project(t1, near, args)
@@ -199,14 +205,16 @@ class Projected(diffrax.AbstractAdaptiveSolver):
         if error is not None:
             error = jax.tree.map(lambda e, a, b: jnp.abs(e) + jnp.abs(b - a), error, y1, near)
         y1, error, dense = _nan_where(failed, (nearer, error, dense))
-        lost = diffrax.RESULTS.where(failed, self.FAILED, diffrax.RESULTS.successful)
-        return y1, error, dense, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, lost, result)
+        projection = diffrax.RESULTS.where(failed, self.FAILED, diffrax.RESULTS.successful)
+        return y1, error, dense, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, projection, result)
 
 
 def _contracts(start: PyTree, near: PyTree, nearer: PyTree) -> jax.Array:
-    """Whether the second of two steps is far shorter than the first, or round-off: a third would be nothing.
+    """Whether Newton's method converges: its second step is a hundredth of its first, or rounding.
 
-    Newton's method squares a distance that is small enough; from too far away it goes half the way at best.
+    Near a solution the method squares the distance; from too far away a step covers half of it at best, which a
+    hundredth tells apart with room on both sides. A step of a thousand units of round-off counts as converged: so much
+    the condition of the saddle point may leave.
     """
     first, second = (
         jnp.max(jnp.stack([jnp.max(jnp.abs(b - a)) for a, b in zip(*map(jax.tree.leaves, pair), strict=True)]))

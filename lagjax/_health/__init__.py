@@ -9,7 +9,7 @@ A motion has laws that the numbers must obey whatever integrated them. At every 
     ∂(M, F, G)           by the state, the time and every parameter: whether it is finite
 
 The first two are compared with what the tolerances allow. A step may put the error rtol|yᵢ| + atol into each component
-of the state y = (q, q̇), and what is conserved keeps what it is given: after N steps c may be off by
+of the state y = (q, q̇), and a conserved quantity c does not forget it: after N steps c may be off by
 
     N maxₜ Σᵢ |∂c/∂yᵢ| (rtol|yᵢ| + atol),
 
@@ -39,11 +39,12 @@ from lagjax._validate import is_concrete
 
 __all__ = ["Extreme", "Health", "examine"]
 
-UNSTEADY = 0.5  # the part of steps rejected beyond which they are fighting something
+# The part of steps rejected beyond which the motion meets something that the step control does not get over.
+UNSTEADY = 0.5
 
 
 def examine(trajectory, reference=None) -> "Health":
-    """`Trajectory.health`."""
+    """The `Health` of a trajectory, with its global error if there is a reference; see `Trajectory.health`."""
     fields, names = measured(trajectory)
     return Health(
         result=trajectory.result,
@@ -137,7 +138,7 @@ class Health(eqx.Module):
         energy = of.energy_allowed + SLACK * of.work_error
         tries = of.accepted_steps + of.rejected_steps
         with np.errstate(invalid="ignore"):
-            found = {
+            flags = {
                 "result": ~of.ok,
                 "energy": _exceeds(xp, of.energy, energy) & ~(of.outputs_needed > of.outputs),
                 "amplitude": of.amplitude < of.amplitude_needed,
@@ -149,37 +150,37 @@ class Health(eqx.Module):
                 "steps": of.rejected_steps > xp.maximum(UNSTEADY * tries, 20),
             }
             if of.global_error is not None:
-                found["global_error"] = _exceeds(xp, of.global_error, VISIBLE)
-        return found, xp
+                flags["global_error"] = _exceeds(xp, of.global_error, VISIBLE)
+        return flags, xp
 
     def findings(self) -> tuple[str, ...]:
         """What is suspicious or cannot be told, as sentences that say what to do; none where all is well."""
         flags = self._flags()[0]
-        found = {name: np.asarray(flags[name]) for name in _SENTENCES if name in flags and np.any(flags[name])}
-        sentences = {name: _SENTENCES[name].format(_who(flags)) for name, flags in found.items()}
-        if "result" in found:
+        raised = {name: np.asarray(flags[name]) for name in _SENTENCES if name in flags and np.any(flags[name])}
+        sentences = {name: _SENTENCES[name].format(_who(members)) for name, members in raised.items()}
+        if "result" in raised:
             sentences["result"] += " " + self._advice()
-        if "amplitude" in found:
-            # Beside the motion what the atol that was given is beside one of order one.
-            wanted = np.where(found["amplitude"], np.asarray(self.amplitude * self.amplitude_needed), np.inf)
+        if "amplitude" in raised:
+            # The atol whose ratio to this motion is that of the present atol to a motion of order one.
+            wanted = np.where(raised["amplitude"], np.asarray(self.amplitude * self.amplitude_needed), np.inf)
             sentences["amplitude"] += f"{np.min(wanted) / SMALLEST:.0e}."
-        return (*sentences.values(), *self._untold())
+        return (*sentences.values(), *self._undecided())
 
-    def _untold(self) -> tuple[str, ...]:
-        """A sentence where the power balance cannot be told."""
-        given, needed = np.asarray(self.outputs), np.asarray(self.outputs_needed)
-        untold = needed > given
-        if not untold.any():
+    def _undecided(self) -> tuple[str, ...]:
+        """A sentence where the outputs are too few to tell whether the power is balanced."""
+        outputs, needed = np.asarray(self.outputs), np.asarray(self.outputs_needed)
+        undecided = needed > outputs
+        if not undecided.any():
             return ()
-        most = needed[untold].max()
+        most = needed[undecided].max()
         advice = (
             f"Ask for at least about {most:.0f} outputs over the same time, evenly spread."
             if np.isfinite(most)
             else "The power is not finite or not smooth somewhere: give it in modes of simulate_hybrid."
         )
         return (
-            f"Power balance: cannot be told{_who(untold)} from {given} outputs, between which the work is not known to "
-            f"a hundredth of the energy. {advice}",
+            f"Power balance: cannot be told{_who(undecided)} from {outputs} outputs, between which the work is not "
+            f"known to a hundredth of the energy. {advice}",
         )
 
     def __str__(self) -> str:
@@ -215,7 +216,7 @@ class Health(eqx.Module):
         return f"of {self.ok.size} members " + ", ".join(listed)
 
     def _advice(self) -> str:
-        """For what befell most members."""
+        """The advice for the result of most of the members that failed."""
         codes, counts = np.unique(np.asarray(self.result._value)[~np.asarray(self.ok)], return_counts=True)
         name = _RESULT_NAMES[int(codes[np.argmax(counts)])]
         return f"{name}: {advice(getattr(RESULTS, name))}"
@@ -236,7 +237,7 @@ def _exceeds(xp, extreme: Extreme, allowed):
 
 
 def _worst(extreme: Extreme, allowed=None, sign: int = 1) -> str:
-    """The largest of all members, where and when; `sign` gives a value back its own."""
+    """The largest value of all members, where and when; `sign` undoes a change of sign made to rank them."""
     values, times = np.asarray(extreme.value, float), np.asarray(extreme.t, float)
     if np.isnan(times).all():
         return "nan: no output was reached"
@@ -248,7 +249,7 @@ def _worst(extreme: Extreme, allowed=None, sign: int = 1) -> str:
 
 
 def _by_name(label: str, names: tuple[str, ...], extreme: Extreme, allowed) -> list[tuple[str, str]]:
-    """A row for the one that comes nearest to what is allowed, or exceeds it most."""
+    """A row for the quantity, of several with names, that comes nearest to its limit or exceeds it most."""
     if not names:
         return []
     allowed = np.asarray(allowed)

@@ -8,12 +8,14 @@ import numpy as np
 from lagjax._health._measure import Extreme
 from lagjax._validate import is_concrete
 
-TIGHTER = 0.1  # the tolerance of a reference, in those of what it is to judge
-_FLOOR = 1e-3  # atol/rtol, where steps had no tolerances
+# The largest rtol of a reference, over that of the trajectory: its error is then a tenth of what it measures. With a
+# fifth, an error estimate could be off by a quarter.
+TIGHTER = 0.1
+_FLOOR = 1e-3  # atol/rtol for fixed steps, which have no tolerances: the default ratio
 
 
 def global_error(trajectory, reference) -> Extreme:
-    """The largest |yᵢ − reference| over the size of yᵢ, at the outputs that both have reached."""
+    """The largest |yᵢ − reference| over the size of yᵢ along the path, (…), at the outputs that both have reached."""
     require_comparable(trajectory, reference)
     floor = _FLOOR
     if trajectory.tolerances is not None:
@@ -50,7 +52,7 @@ def require_comparable(trajectory, reference) -> None:
 
 
 def _agree(ours, theirs, eps: float) -> bool:
-    """Up to the rounding of the coarser of them; values that are being traced cannot be told apart."""
+    """Whether two arrays agree to 4 eps; values that are being traced cannot be compared, and count as equal."""
     if not (is_concrete(ours) and is_concrete(theirs)):
         return True
     ours, theirs = np.asarray(ours), np.asarray(theirs)
@@ -58,7 +60,7 @@ def _agree(ours, theirs, eps: float) -> bool:
 
 
 def _states(trajectory) -> jax.Array:
-    """(..., T, 2n)."""
+    """The states (q, q̇) at all outputs, (..., T, 2n)."""
     axes = jnp.ndim(trajectory.ok) + 1
     leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves((trajectory.q, trajectory.qdot))]
     return jnp.concatenate([leaf.reshape(*leaf.shape[:axes], -1) for leaf in leaves], axis=-1)
@@ -71,5 +73,5 @@ def _global_error(states, reference, ts, floor) -> Extreme:
     error = jnp.max(jnp.where(both[..., None], jnp.abs(states - reference), -jnp.inf) / size, axis=-1)
     place = jnp.argmax(error, axis=-1, keepdims=True)
     value, t = (jnp.take_along_axis(x, place, axis=-1)[..., 0] for x in (error, jnp.broadcast_to(ts, error.shape)))
-    found = both.any(axis=-1)
-    return Extreme(jnp.where(found, value, jnp.nan), jnp.where(found, t, jnp.nan))
+    reached = both.any(axis=-1)
+    return Extreme(jnp.where(reached, value, jnp.nan), jnp.where(reached, t, jnp.nan))

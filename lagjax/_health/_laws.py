@@ -20,32 +20,32 @@ from lagjax._motion import Motion
 from lagjax._program import Program, Unlowerable, lower
 from lagjax._system import System
 
-_CHUNK = 2**21  # numbers that programs give out together, 16 MB
-_KEPT = 2**20  # values that a transposed derivative keeps in between, 8 MB
-_DERIVATIVE_BUDGET = 20_000  # operations of the program by which a doubtful derivative is looked at once more
+_CHUNK = 2**21  # numbers that programs return together, 16 MB
+_STORED = 2**20  # values that a transposed derivative stores between its two passes, 8 MB
+_DERIVATIVE_BUDGET = 20_000  # operations of the program that computes a doubtful derivative a second time
 
 
 class Sample(NamedTuple):
-    """What is measured at one state; with a leading axis (S, …) at S of them."""
+    """What is measured at one state; at S states every field has a first axis (S, …)."""
 
-    kept: Any  # h, then momenta, (k,)
-    slopes: Any  # of these: Σ |∂c/∂yᵢ| (rtol|yᵢ| + atol), (k,)
-    sizes: Any  # Σ |∂c/∂yᵢ yᵢ|, with the terms of c, (k,)
+    conserved: Any  # c: h, then k − 1 momenta, (k,)
+    slopes: Any  # Σ |∂c/∂yᵢ| (rtol|yᵢ| + atol), the error that one step may put into c, (k,)
+    sizes: Any  # Σ |∂c/∂yᵢ yᵢ| and the terms of c, whose rounding c has, (k,)
     power: Any  # dh/dt, ()
     acceleration: Any  # q̈, (n,); zero where nothing does work
-    distances: Any  # from the constraints, (m,)
-    rates: Any  # (m,)
-    mass: Any  # smallest eigenvalue of M, condition, scaled condition, (3,)
-    finite: Any  # whether the derivatives of the acceleration are, ()
+    distances: Any  # of q from the constraints, (m,)
+    rates: Any  # the distances of q̇ from consistent ones, (m,)
+    mass: Any  # smallest eigenvalue of M, its condition, its condition after scaling, (3,)
+    finite: Any  # whether the derivatives of the acceleration are finite, ()
 
 
 class Law(NamedTuple):
     """The equations of one mode, and which of its quantities are constant."""
 
     derivation: Derivation
-    works: bool  # whether anything does: h is not constant
+    works: bool  # whether anything does work, so that h is not constant
     conserved: tuple[int, ...] | None  # the coordinates on which nothing acts; None where that is not known
-    names: tuple[str, ...]  # of its constraints
+    names: tuple[str, ...]  # the names of its constraints
 
     @property
     def motion(self) -> Motion:
@@ -94,7 +94,7 @@ class Law(NamedTuple):
         (rtol, atol), far, fast = (np.reshape(x, (-1, 1)) for x in tolerances), np.abs(q), np.abs(qdot)
         with np.errstate(all="ignore"):
             energy = np.einsum("si,si->s", of["momentum"], qdot) - of["lagrangian"]
-            kept = np.concatenate([energy[:, None], of["momentum"][:, list(momenta)]], axis=1)
+            conserved = np.concatenate([energy[:, None], of["momentum"][:, list(momenta)]], axis=1)
             by_q = np.abs(np.concatenate([of["energy_by_q"][:, None], self._momenta_by_q(momenta, columns)], axis=1))
             of_energy = np.einsum("sij,sj->si", of["mass_matrix"], qdot)[:, None]
             by_qdot = np.abs(np.concatenate([of_energy, of["mass_matrix"][:, list(momenta)]], axis=1))
@@ -108,12 +108,12 @@ class Law(NamedTuple):
                 acceleration, multipliers = _solved(of)
                 power = _power_of(of, qdot, multipliers)
             return Sample(
-                kept, slopes, sizes, power, acceleration, off_q, off_qdot,
+                conserved, slopes, sizes, power, acceleration, off_q, off_qdot,
                 _conditions_of(of["mass_matrix"]), self._finite(columns),
             )  # fmt: skip
 
     def _momenta_by_q(self, momenta, columns) -> np.ndarray:
-        """∂pᵢ/∂q of some momenta at S states, (S, len(momenta), n)."""
+        """∂pᵢ/∂q of the coordinates i in `momenta` at S states, (S, len(momenta), n)."""
         n, count = self.derivation.layout.size, max(np.size(x) for x in columns)
         if not momenta:
             return np.zeros((count, 0, n), columns[0].dtype)
@@ -130,20 +130,21 @@ class Law(NamedTuple):
             return _power_of(of, qdot, _solved(of)[1] if driven else np.zeros_like(of["driving"]))
 
     def _finite(self, columns) -> np.ndarray:
-        """Whether M, F, G and γ have finite derivatives by all inputs: one transposed derivative, which a NaN spoils.
+        """Whether M, F, G and γ have finite derivatives by all inputs at S states, (S,).
 
-        The program's own operations answer first. Where they say no, a power may only have been written as a root, or
-        the user's rule for a derivative may know better: there the derivative of the functions themselves decides.
+        One transposed derivative of the sum of them all is taken, which a single NaN makes NaN. The program's own
+        operations answer first. Where they say no, the program may have written a power as a root, or the user may have
+        given a rule for a derivative: there the derivative of the functions themselves decides.
         """
         program = self.derivation.program(*_SYSTEM)
         count = max(np.size(x) for x in columns)
 
-        def look(*part):
+        def finite_at(*part):
             bars = [bar for bar in program.pull_back_many(part, [1.0] * len(program.outputs)) if bar is not None]
             finite = np.all([np.isfinite(np.broadcast_to(bar, part[0].shape)) for bar in bars], axis=0)
             return np.broadcast_to(finite, part[0].shape)
 
-        finite = _in_parts(look, max(1, _KEPT // len(program.nodes)), count, *columns)
+        finite = _in_parts(finite_at, max(1, _STORED // len(program.nodes)), count, *columns)
         if finite.all():
             return finite
         doubtful = [x if np.ndim(x) == 0 else x[~finite] for x in columns]
@@ -169,7 +170,7 @@ _QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *_S
 
 
 def _in_parts(function: Callable, size: int, count: int, *arguments):
-    """`function` on parts of at most `size` of `count` states, put together; single numbers are shared."""
+    """`function` of `count` states, evaluated on at most `size` of them at a time; single numbers go to every part."""
 
     def cut(x, start):
         return x if np.ndim(x) == 0 else x[start : start + size]
@@ -192,7 +193,7 @@ def _power_of(of: dict[str, np.ndarray], qdot, multipliers) -> np.ndarray:
 
 
 def _conditions_of(matrix: np.ndarray) -> np.ndarray:
-    """`_conditions` of S matrices, shape (S, 3)."""
+    """The smallest eigenvalue of S matrices M, max|λ| / min|λ|, and that ratio after scaling, shape (S, 3)."""
     diagonal = np.abs(np.diagonal(matrix, axis1=1, axis2=2))
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
     values, scaled = (_eigenvalues_of(m) for m in (matrix, scale[:, :, None] * matrix * scale[:, None, :]))
@@ -213,12 +214,12 @@ def _eigenvalues_of(matrix: np.ndarray) -> np.ndarray:
 
 
 def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int, ...] | None]:
-    """Whether anything does work, and the coordinates on which no force of any kind acts."""
+    """Whether anything does work, and the coordinates on which no force of any kind acts (None: not known)."""
     try:
         return derivation.works, derivation.conserved
     except Unlowerable:
-        motion, asked = derivation.motion, (system.lagrangian, system.constraints, system.velocity_constraints)
-        could_work = any("t" in function.extras for function in asked if function is not None) or any(
+        motion, functions = derivation.motion, (system.lagrangian, system.constraints, system.velocity_constraints)
+        could_work = any("t" in function.extras for function in functions if function is not None) or any(
             part is not None for part in (motion.forces, motion.dissipation, motion.constraints.on_velocities)
         )
         return could_work, None
@@ -228,15 +229,15 @@ def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int,
 
 
 def sample_at(law: Law, momenta: tuple[int, ...], tolerances, q, qdot, t, params) -> Sample:
-    """A `Sample` of one state; `momenta` says of which coordinates."""
+    """A `Sample` of one state, with the momenta of the coordinates in `momenta`."""
     motion, state = law.motion, (q, qdot, t, params)
-    kept = motion.energy_and_momenta(momenta, *state)
+    conserved = motion.energy_and_momenta(momenta, *state)
     by_q, by_qdot = map(jnp.abs, jax.jacrev(motion.energy_and_momenta, argnums=(1, 2))(momenta, *state))
     (rtol, atol), far, fast = tolerances, jnp.abs(q), jnp.abs(qdot)
     terms = jnp.abs(motion.momentum(*state)) @ fast + jnp.abs(motion.lagrangian(*state))
     off_q, off_qdot = motion.constraints.distances(*state)
     return Sample(
-        kept=kept,
+        conserved=conserved,
         slopes=by_q @ (rtol * far + atol) + by_qdot @ (rtol * fast + atol),
         sizes=(by_q @ far + by_qdot @ fast).at[0].add(terms),
         power=power_at(law, *state),
@@ -258,10 +259,10 @@ def power_at(law: Law, q, qdot, t, params) -> jax.Array:
 
 
 def _conditions(matrix: jax.Array) -> jax.Array:
-    """The smallest eigenvalue, max|λ| / min|λ|, and the same after scaling to a unit diagonal."""
+    """The smallest eigenvalue of a matrix M, max|λ| / min|λ|, and that ratio after scaling to a unit diagonal, (3,)."""
     diagonal = jnp.abs(jnp.diagonal(matrix))
     scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
-    # One call for both: LAPACK's kernels side by side in one program wait for each other for ever (`_linear`).
+    # One call for both: LAPACK's kernels side by side in one program deadlock (`_linear`).
     values, scaled = jax.vmap(_eigenvalues)(jnp.stack([matrix, scale[:, None] * matrix * scale]))
     spread = (jnp.max(jnp.abs(x)) / jnp.min(jnp.abs(x)) for x in (values, scaled))
     return jnp.stack([jnp.min(values), *spread])
@@ -279,16 +280,16 @@ def _eigenvalues(matrix: jax.Array) -> jax.Array:
 
 
 def _slopes_of_all(motion: Motion, q, qdot, t, params) -> list[jax.Array]:
-    """The derivatives of the sum of all that the acceleration is solved from, by everything it depends on."""
-    varied, fixed = eqx.partition(params, _is_inexact)
+    """The derivatives of the sum of M, F, G and γ by q, q̇, t and every parameter."""
+    floats, others = eqx.partition(params, _is_inexact)
 
-    def total(q, qdot, t, varied):
-        state = q, qdot, t, eqx.combine(varied, fixed)
+    def total(q, qdot, t, floats):
+        state = q, qdot, t, eqx.combine(floats, others)
         parts = motion.mass_matrix_and_force(*state)
         parts += motion.constraints.jacobian_and_gamma(*state)
         return sum(jnp.sum(part) for part in parts)
 
-    return jax.tree.leaves(jax.grad(total, argnums=(0, 1, 2, 3))(q, qdot, t, varied))
+    return jax.tree.leaves(jax.grad(total, argnums=(0, 1, 2, 3))(q, qdot, t, floats))
 
 
 def _is_inexact(leaf) -> bool:

@@ -1,8 +1,8 @@
 """From the states of a trajectory to the arrays of a report.
 
-The arrays have the axes (…, state, component): in NumPy all members of a batch are looked at together, by the programs
-of the scene; where values are being traced, or the scene has no programs, one member is written down in JAX, under
-`jit` and `vmap`. What follows from the measured states is one and the same text for both.
+The arrays have the axes (…, state, component). In NumPy the programs of the scene evaluate all members of a batch
+together; where values are being traced, or the scene has no programs, the functions of one member are evaluated in JAX,
+under `jit` and `vmap`. What follows from the measured states is written once, for arrays of either library.
 """
 
 import dataclasses
@@ -22,23 +22,28 @@ from lagjax._validate import is_concrete
 
 PyTree = Any
 
-SLACK = 10.0  # on top of √(2n), by which one component may exceed a root mean square
-VISIBLE = 1e-2  # of its own size: no tolerance makes a conserved quantity right that is off by more
-ROUND_OFF = 100.0  # units of it, in one evaluation
-# Of atol: in a motion that is smaller, the errors that atol allows add up to `VISIBLE` within a hundred steps.
+# The factor on the bound of what N steps may add up to, besides √(2n) for solvers that measure a root mean square: an
+# error estimate may be off by as much. Twice as large, drifts of 10 to 20 times the bound would go unreported.
+SLACK = 10.0
+# The part of its own size by which a conserved quantity is always wrong, whatever the tolerances were.
+VISIBLE = 1e-2
+# Units of round-off that are allowed for one evaluation of a conserved quantity.
+ROUND_OFF = 100.0
+# Units of atol: in a motion that is smaller, the errors that atol allows add up to `VISIBLE` within a hundred steps.
 SMALLEST = 1e4
-_CHUNK = 2**18  # numbers of mass matrices looked at together: what is made of them stays in the caches
+# Numbers of mass matrices that are evaluated together: intermediate results then stay in the caches.
+_CHUNK = 2**18
 
 
 class Extreme(NamedTuple):
-    """The worst value along each path and the time of the output where it is found; NaN where nothing was reached."""
+    """The most extreme value along each path and the time of its output, (…) each; NaN where nothing was reached."""
 
     value: jax.Array | np.ndarray
     t: jax.Array | np.ndarray
 
 
 class Names(eqx.Module):
-    """Text that leaves a compiled function."""
+    """The text of a report, which a compiled function returns as static data."""
 
     works: bool = eqx.field(static=True)
     momenta: tuple[str, ...] | None = eqx.field(static=True)
@@ -46,7 +51,7 @@ class Names(eqx.Module):
 
 
 class Path(NamedTuple):
-    """The states of one member, or of N in NumPy with a first axis more, and what is promised of them.
+    """The S states of one member, or of N members with a first axis (N, …) in NumPy, and the tolerances of the run.
 
     The T outputs come first, then the states just before each transition.
     """
@@ -58,7 +63,7 @@ class Path(NamedTuple):
     ts: Any  # (…, T)
     ends: Any  # (…, T − 1): where the law of each output ends, at the next output or at a transition before it
     steps: Any  # (…)
-    promised: Any  # rtol and atol, (…) each; None for fixed steps
+    tolerances: Any  # rtol and atol, (…) each; None for fixed steps
 
     @property
     def library(self):
@@ -80,8 +85,8 @@ def measured(trajectory) -> tuple[dict[str, Any], Names]:
         if all(law.lowered() for law in laws):
             return members.report(laws), _names(laws, members.layout)
     axes, tree = jax.tree.flatten(trajectory.params_axes, is_leaf=lambda axis: axis is None)  # hashable
-    lean = dataclasses.replace(trajectory, stats={}, params_axes=None)
-    return _measured(lean, tuple(axes), tree, jnp.asarray(steps))
+    arrays = dataclasses.replace(trajectory, stats={}, params_axes=None)
+    return _measured(arrays, tuple(axes), tree, jnp.asarray(steps))
 
 
 def _laws(trajectory, layout: Layout, params) -> list[Law]:
@@ -110,7 +115,7 @@ def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
 # ---- in NumPy, all members at once -----------------------------------------------------------------------------------
 
 
-_SHARED = "shared"  # in the place of a batch axis
+_SHARED = "shared"  # stands for the batch axis of what all members share
 
 
 class _Members:
@@ -127,70 +132,71 @@ class _Members:
 
     def _parameters(self) -> tuple[list[np.ndarray], PyTree]:
         """Every number in params, () where all members share it, else (N,); and the params of one member."""
-        given, axes = self._trajectory.params, self._trajectory.params_axes
-        numbers, code = eqx.partition(given, eqx.is_array_like)
-        spread = jax.tree.map(
+        axes = self._trajectory.params_axes
+        numbers, code = eqx.partition(self._trajectory.params, eqx.is_array_like)
+        axis_of_leaf = jax.tree.map(
             lambda axis, part: jax.tree.map(lambda _: _SHARED if axis is None else axis, part),
             axes, numbers, is_leaf=lambda axis: axis is None,
         )  # fmt: skip
         leaves, structure = jax.tree.flatten(numbers)
-        columns, ones = [], []
-        for leaf, axis in zip(leaves, jax.tree.leaves(spread), strict=True):
+        columns, of_one = [], []
+        for leaf, axis in zip(leaves, jax.tree.leaves(axis_of_leaf), strict=True):
             each = np.asarray(leaf)
             if self._outer < len(self.batch) and axis is _SHARED:
                 each = np.expand_dims(each, self._outer)
             elif self._outer < len(self.batch):
                 each = np.moveaxis(each, axis + self._outer if axis >= 0 else axis, self._outer)
-            leading, own = each.shape[: len(self.batch)], each.shape[len(self.batch) :]
-            ones.append(each[(0,) * len(self.batch)])
+            leading, shape = each.shape[: len(self.batch)], each.shape[len(self.batch) :]
+            of_one.append(each[(0,) * len(self.batch)])
             if math.prod(leading) == 1:
                 columns += list(each.reshape(-1))
             else:
-                columns += list(np.broadcast_to(each, self.batch + own).reshape(self.count, -1).T)
-        return columns, eqx.combine(jax.tree.unflatten(structure, ones), code)
+                columns += list(np.broadcast_to(each, self.batch + shape).reshape(self.count, -1).T)
+        return columns, eqx.combine(jax.tree.unflatten(structure, of_one), code)
 
     def _flat(self, tree: PyTree, axes: int = 1) -> np.ndarray:
-        """The leaves of coordinates end to end, (N, states, n)."""
+        """The leaves of q or qdot end to end, (N, S, n)."""
         lead = len(self.batch) + axes
         parts = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
         parts = [x.reshape(self.count, *x.shape[len(self.batch) : lead], -1) for x in parts]
         return np.concatenate(parts, axis=-1)
 
-    def _shared(self, x, own: int) -> np.ndarray:
-        """What times and tolerances are, with `own` axes of their own, for every member."""
+    def _shared(self, x, dimensions: int) -> np.ndarray:
+        """Times or tolerances, arrays of so many dimensions, for every member: (N, …), also where all share them."""
         x = np.asarray(x)
-        if x.ndim < len(self.batch) + own:
-            x = np.expand_dims(x, x.ndim - own)
+        if x.ndim < len(self.batch) + dimensions:
+            x = np.expand_dims(x, x.ndim - dimensions)
         return np.broadcast_to(x, self.batch + x.shape[len(self.batch) :]).reshape(
             self.count, *x.shape[len(self.batch) :]
         )
 
     def path(self) -> Path:
         """The states of all members."""
-        given = self._trajectory
-        ts = self._shared(given.ts, 1)
-        q, qdot = self._flat(given.q), self._flat(given.qdot)
-        mode = np.zeros(ts.shape, int) if given.mode is None else np.asarray(given.mode).reshape(ts.shape)
+        run = self._trajectory
+        ts = self._shared(run.ts, 1)
+        q, qdot = self._flat(run.q), self._flat(run.qdot)
+        mode = np.zeros(ts.shape, int) if run.mode is None else np.asarray(run.mode).reshape(ts.shape)
         t, ends = ts, np.broadcast_to(np.arange(1, ts.shape[1]), (self.count, ts.shape[1] - 1))
-        if given.transitions is not None:
-            over = given.transitions
-            times = np.asarray(over.t).reshape(self.count, -1)
-            source = np.asarray(over.source).reshape(times.shape)
+        if run.transitions is not None:
+            transitions = run.transitions
+            times = np.asarray(transitions.t).reshape(self.count, -1)
+            source = np.asarray(transitions.source).reshape(times.shape)
             ends = _ends(np, ts, times)
-            more = (self._flat(over.q), self._flat(over.qdot), times, source)
+            more = (self._flat(transitions.q), self._flat(transitions.qdot), times, source)
             q, qdot, t, mode = (np.concatenate(pair, axis=1) for pair in zip((q, qdot, t, mode), more, strict=True))
-        promised = given.tolerances
-        tolerances = None if promised is None else tuple(self._shared(x, 0).astype(q.dtype) for x in promised)
-        steps = np.asarray(given.stats["num_accepted_steps"], q.dtype).reshape(self.count)
+        tolerances = run.tolerances
+        if tolerances is not None:
+            tolerances = tuple(self._shared(x, 0).astype(q.dtype) for x in tolerances)
+        steps = np.asarray(run.stats["num_accepted_steps"], q.dtype).reshape(self.count)
         return Path(q, qdot, t, mode, ts, ends, steps, tolerances)
 
     def report(self, laws: list[Law]) -> dict[str, Any]:
-        """The fields, with the batch axes of the trajectory."""
+        """The fields of `Health` that are measured, with the batch axes of the trajectory."""
         path, momenta = self.path(), _conserved(laws) or ()
         starts = np.cumsum([0, *(len(law.names) for law in laws)])
 
         def by_mode(function: Callable, q, qdot, t, mode):
-            """`function(law, index, states…)` on the states of each mode, put together, (N, S, …)."""
+            """`function(law, index, states…)` on the states of each mode, in the order of all states, (N, S, …)."""
             shape, total = t.shape, None
             q, qdot = (np.ascontiguousarray(x.reshape(-1, x.shape[-1])) for x in (q, qdot))
             t, mode = t.reshape(-1), mode.reshape(-1)
@@ -200,22 +206,22 @@ class _Members:
                 if not len(here):
                     continue
                 numbers = [x if np.ndim(x) == 0 else x[member[here]] for x in self.numbers]
-                some = function(law, index, member[here], q[here], qdot[here], t[here], numbers)
+                values = function(law, index, member[here], q[here], qdot[here], t[here], numbers)
                 if len(here) == len(mode):
-                    total = some
+                    total = values
                     break
                 if total is None:
-                    total = jax.tree.map(lambda x: np.zeros((len(mode), *x.shape[1:]), x.dtype), some)
-                for whole, part in zip(jax.tree.leaves(total), jax.tree.leaves(some), strict=True):
-                    whole[here] = part
+                    total = jax.tree.map(lambda x: np.zeros((len(mode), *x.shape[1:]), x.dtype), values)
+                for all_states, part in zip(jax.tree.leaves(total), jax.tree.leaves(values), strict=True):
+                    all_states[here] = part
             return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), total)
 
         def sampled(law, index, member, q, qdot, t, numbers) -> Sample:
-            promised = (0.0, 0.0) if path.promised is None else (x[member] for x in path.promised)
-            sample = law.samples(momenta, tuple(promised), q, qdot, t, numbers)
+            tolerances = (0.0, 0.0) if path.tolerances is None else (x[member] for x in path.tolerances)
+            sample = law.samples(momenta, tuple(tolerances), q, qdot, t, numbers)
             before, after = int(starts[index]), int(starts[-1] - starts[index + 1])
-            held = (np.pad(off, ((0, 0), (before, after))) for off in (sample.distances, sample.rates))
-            return sample._replace(**dict(zip(("distances", "rates"), held, strict=True)))
+            distances, rates = (np.pad(x, ((0, 0), (before, after))) for x in (sample.distances, sample.rates))
+            return sample._replace(distances=distances, rates=rates)
 
         def powers(law, index, member, q, qdot, t, numbers):
             return law.powers(q, qdot, t, numbers)
@@ -233,53 +239,53 @@ def _measured(trajectory, axes, tree, steps):
     trajectory = dataclasses.replace(trajectory, params_axes=jax.tree.unflatten(tree, axes))
     names, members = {}, max(1, jnp.size(trajectory.result._value))
 
-    def one(q, qdot, given, params, mode, steps, transitions):
+    def one(q, qdot, times_and_tolerances, params, mode, steps, transitions):
         layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
         laws = _laws(trajectory, layout, params)
         names["all"] = _names(laws, layout)
-        path = _path_of_one(layout, q, qdot, given, mode, steps, transitions)
+        path = _path_of_one(layout, q, qdot, times_and_tolerances, mode, steps, transitions)
         momenta, numbers = _conserved(laws) or (), eqx.filter(params, eqx.is_array)
-        promised = (0.0, 0.0) if path.promised is None else path.promised
+        tolerances = (0.0, 0.0) if path.tolerances is None else path.tolerances
         size = _CHUNK // (members * layout.size**2)
 
         def chunked(function):
             return lambda *states: _in_chunks(partial(_in_its_mode, laws, function), states, size)
 
-        look = chunked(lambda law, q, v, t: sample_at(law, momenta, promised, q, v, t, numbers))
-        return _report(path, laws, momenta, look, chunked(lambda law, q, v, t: power_at(law, q, v, t, numbers)))
+        sample = chunked(lambda law, q, v, t: sample_at(law, momenta, tolerances, q, v, t, numbers))
+        return _report(path, laws, momenta, sample, chunked(lambda law, q, v, t: power_at(law, q, v, t, numbers)))
 
-    found = trajectory.over_members(one, steps, trajectory.transitions)
-    return found, names["all"]
+    fields = trajectory.over_members(one, steps, trajectory.transitions)
+    return fields, names["all"]
 
 
-def _path_of_one(layout: Layout, q, qdot, given, mode, steps, transitions) -> Path:
+def _path_of_one(layout: Layout, q, qdot, times_and_tolerances, mode, steps, transitions) -> Path:
     def flat(tree):
         return jax.vmap(layout.flatten)(tree)
 
-    ts, tolerances = given
+    ts, tolerances = times_and_tolerances
     mode = jnp.zeros(ts.size, int) if mode is None else mode
     q, v, t, ends = flat(q), flat(qdot), ts, jnp.arange(1, ts.size)
     if transitions is not None:
         q, v = jnp.concatenate([q, flat(transitions.q)]), jnp.concatenate([v, flat(transitions.qdot)])
         t, mode = jnp.concatenate([t, transitions.t]), jnp.concatenate([mode, transitions.source])
         ends = _ends(jnp, ts, transitions.t)
-    promised = None if tolerances is None else tuple(jnp.asarray(x, layout.dtype) for x in tolerances)
-    return Path(q, v, t, mode, ts, ends, steps.astype(layout.dtype), promised)
+    tolerances = None if tolerances is None else tuple(jnp.asarray(x, layout.dtype) for x in tolerances)
+    return Path(q, v, t, mode, ts, ends, steps.astype(layout.dtype), tolerances)
 
 
 def _in_its_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
-    """What the law of the mode of one state says; constraints of the others are zero."""
+    """`function(law, q, qdot, t)` by the law of the state's own mode; distances from constraints of others are zero."""
     starts = np.cumsum([0, *(len(law.names) for law in laws)])
     total = None
     for index, law in enumerate(laws):
-        found = function(law, q, qdot, t)
-        if isinstance(found, Sample):
-            held = [
-                jnp.zeros(starts[-1], q.dtype).at[starts[index] : starts[index + 1]].set(off)
-                for off in (found.distances, found.rates)
-            ]
-            found = found._replace(distances=held[0], rates=held[1])
-        total = found if total is None else _where(mode == index, found, total)
+        value = function(law, q, qdot, t)
+        if isinstance(value, Sample):
+            distances, rates = (
+                jnp.zeros(starts[-1], q.dtype).at[starts[index] : starts[index + 1]].set(of_law)
+                for of_law in (value.distances, value.rates)
+            )
+            value = value._replace(distances=distances, rates=rates)
+        total = value if total is None else _where(mode == index, value, total)
     return total
 
 
@@ -288,59 +294,59 @@ def _where(which, new, old):
 
 
 def _in_chunks(function, arrays, size: int):
-    """`jax.vmap`, so many at a time."""
+    """`function` of each of the states in `arrays`, at most `size` of them at a time."""
     count = len(arrays[0])
     size = max(1, min(size, count))
     missing = -count % size
     padded = [jnp.concatenate([x, jnp.broadcast_to(x[-1:], (missing, *x.shape[1:]))]) for x in arrays]
     chunks = [x.reshape(-1, size, *x.shape[1:]) for x in padded]
-    found = jax.lax.map(lambda some: jax.vmap(function)(*some), chunks)
-    return jax.tree.map(lambda x: x.reshape(x.shape[0] * size, *x.shape[2:])[:count], found)
+    values = jax.lax.map(lambda chunk: jax.vmap(function)(*chunk), chunks)
+    return jax.tree.map(lambda x: x.reshape(x.shape[0] * size, *x.shape[2:])[:count], values)
 
 
 # ---- what the path shows: arrays of either library -------------------------------------------------------------------
 
 
-def _report(path: Path, laws: list[Law], momenta: tuple[int, ...], look: Callable, power: Callable) -> dict:
-    """All fields; `look(q, qdot, t, mode)` gives `Sample`s of states, `power` dh/dt at states."""
+def _report(path: Path, laws: list[Law], momenta: tuple[int, ...], sample: Callable, power: Callable) -> dict:
+    """All measured fields; `sample(q, qdot, t, mode)` gives `Sample`s of states, `power` dh/dt at states."""
     xp, axis, T, dtype = path.library, path.time, path.ts.shape[-1], path.q.dtype
     q, qdot, t, mode = path[:4]
     reached = xp.isfinite(q).all(axis=-1) & xp.isfinite(qdot).all(axis=-1) & (mode >= 0)
-    # What was not reached is looked at as if it were the start, and then not counted.
+    # States that were not reached are evaluated as if they were the start, and then not counted.
     q, qdot = (xp.where(reached[..., None], x, x[..., :1, :]) for x in (q, qdot))
     path = path._replace(q=q, qdot=qdot, t=xp.where(reached, t, t[..., :1]))
-    found = look(q, qdot, path.t, xp.maximum(mode, 0))
-    drifts, work_error = _drifts(path, laws, momenta, found, reached, power)
-    here = jax.tree.map(lambda leaf: leaf[(slice(None),) * axis + (slice(T),)], found)
-    on_path, worst = reached[..., :T], partial(_extreme, xp, axis, path.ts)
+    samples = sample(q, qdot, path.t, xp.maximum(mode, 0))
+    drifts, work_error = _drifts(path, laws, momenta, samples, reached, power)
+    here = jax.tree.map(lambda leaf: leaf[(slice(None),) * axis + (slice(T),)], samples)
+    on_path, extreme = reached[..., :T], partial(_extreme, xp, axis, path.ts)
     limits, size = _limits(path, here, on_path)
     owner = np.repeat(np.arange(len(laws)), [len(law.names) for law in laws])
-    held = on_path[..., None] & (mode[..., :T, None] == owner)
+    in_force = on_path[..., None] & (mode[..., :T, None] == owner)
     spans = [xp.max(xp.where(on_path[..., None], xp.abs(x[..., :T, :]), 0.0), axis=(-2, -1)) for x in (q, qdot)]
     eps = float(np.finfo(dtype).eps)
-    fixed = path.promised is None
-    near = math.sqrt(eps) if fixed else xp.maximum(path.promised[0], ROUND_OFF * eps)[..., None]
-    singular = any(law.motion.constrained for law in laws)  # M may be, where constraints hold what it does not
-    finest = max(math.sqrt(eps), SLACK * eps) if fixed else SLACK * path.promised[0]
+    fixed = path.tolerances is None
+    near = math.sqrt(eps) if fixed else xp.maximum(path.tolerances[0], ROUND_OFF * eps)[..., None]
+    may_be_singular = any(law.motion.constrained for law in laws)  # the constraints may hold what M does not
+    finest = max(math.sqrt(eps), SLACK * eps) if fixed else SLACK * path.tolerances[0]
     fine, none = here.finite | ~on_path, xp.zeros(path.ts.shape[:-1], dtype)
     all_fine, first = xp.all(fine, axis=axis), xp.argmin(fine, axis=axis)
-    energy = worst(drifts[..., 0], on_path)
+    energy = extreme(drifts[..., 0], on_path)
     return {
         "energy": energy,
         "energy_allowed": limits[..., 0],
         "work_error": work_error,
         "outputs_needed": _outputs_needed(xp, T, energy.value, work_error, size[..., 0]),
         "amplitude": _amplitude(xp, q[..., :T, :], on_path),
-        "amplitude_needed": none if fixed else SMALLEST * path.promised[1] + none,
-        "momentum": worst(drifts[..., 1:], on_path),
+        "amplitude_needed": none if fixed else SMALLEST * path.tolerances[1] + none,
+        "momentum": extreme(drifts[..., 1:], on_path),
         "momentum_allowed": limits[..., 1:],
-        "constraint_distance": worst(here.distances, held),
-        "constraint_rate": worst(here.rates, held),
+        "constraint_distance": extreme(here.distances, in_force),
+        "constraint_rate": extreme(here.rates, in_force),
         "constraint_allowed": near * (1 + xp.stack(spans, axis=-1)),
-        "smallest_eigenvalue": worst(here.mass[..., 0], on_path, largest=False),
-        "condition": worst(here.mass[..., 1], on_path),
-        "scaled_condition": worst(here.mass[..., 2], on_path),
-        "scaled_condition_allowed": none + (math.inf if singular else finest / eps),
+        "smallest_eigenvalue": extreme(here.mass[..., 0], on_path, largest=False),
+        "condition": extreme(here.mass[..., 1], on_path),
+        "scaled_condition": extreme(here.mass[..., 2], on_path),
+        "scaled_condition_allowed": none + (math.inf if may_be_singular else finest / eps),
         "gradients_finite": all_fine,
         "gradients_time": xp.where(all_fine, math.nan, _at(xp, path.ts, first)),
     }
@@ -351,7 +357,7 @@ def _at(xp, ts, place):
 
 
 def _ends(xp, ts, transitions):
-    """Where the law of each output ends: the place of the next output, or of a transition before it; (…, T − 1)."""
+    """The index (…, T − 1) of the state where the law of each output ends: the next output or a transition before."""
     T = ts.shape[-1]
     times = xp.where(xp.isnan(transitions), math.inf, transitions)
     before = xp.sum(times[..., None, :] < ts[..., :-1, None], axis=-1)
@@ -361,27 +367,27 @@ def _ends(xp, ts, transitions):
     return xp.where(between, T + first, xp.arange(1, T))
 
 
-def _drifts(path: Path, laws, momenta, found: Sample, reached, power: Callable) -> tuple[Any, Any]:
-    """|h − h₀ − W| and |p − p₀| at every output, a column each; and how far W may be off.
+def _drifts(path: Path, laws, momenta, samples: Sample, reached, power: Callable) -> tuple[Any, Any]:
+    """|h − h₀ − W| and |pᵢ − pᵢ₀| at every output, a column each, and how far W may be off, (…).
 
-    A piece of the path from an output to `ends` is measured if its mode has the law; what else happens before the next
-    output is left out.
+    A piece of the path, from an output to its entry in `ends`, counts for a quantity that its mode conserves; whatever
+    changes the quantity between there and the next output, such as a transition, is left out.
     """
     xp, axis, ends = path.library, path.time, path.ends
     T = path.ts.shape[-1]
     until = partial(_at_ends, xp, axis, ends)
-    values = found.kept
+    values = samples.conserved
     start = values[..., : T - 1, :]
     measurable = until(reached) & reached[..., : T - 1]
     work, work_error = xp.zeros_like(start[..., 0]), xp.zeros_like(start[..., 0, 0])
     if any(law.works for law in laws):
-        work, work_error = _work(path, found, measurable, power)
+        work, work_error = _work(path, samples, measurable, power)
     expected = xp.concatenate([work[..., None], xp.zeros_like(start[..., 1:])], axis=-1)
-    keeps = xp.asarray(np.array([[True, *(i in (law.conserved or ()) for i in momenta)] for law in laws]))
-    counted = keeps[xp.maximum(until(path.mode), 0)] & measurable[..., None]
+    conserves = xp.asarray(np.array([[True, *(i in (law.conserved or ()) for i in momenta)] for law in laws]))
+    counted = conserves[xp.maximum(until(path.mode), 0)] & measurable[..., None]
     rise = values[..., 1:T, :] - start
     excused = rise - xp.where(counted, until(values) - start - expected, 0.0)
-    # The same without the rounding of a sum of differences, where the piece goes on to the next output.
+    # Where the piece goes on to the next output this is what is expected, without the rounding of three differences.
     excused = xp.where(counted & (ends < T)[..., None], expected, excused)
     before = xp.concatenate([xp.zeros_like(values[..., :1, :]), xp.cumsum(excused, axis=axis)], axis=axis)
     return xp.abs(values[..., :T, :] - values[..., :1, :] - before), work_error
@@ -397,16 +403,16 @@ _POINTS, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(4))
 _POINTS = _POINTS + 0.5
 
 
-def _work(path: Path, found: Sample, measurable, power: Callable) -> tuple[Any, Any]:
-    """∫ P dt over every piece, and how far the sum may be off.
+def _work(path: Path, samples: Sample, measurable, power: Callable) -> tuple[Any, Any]:
+    """∫ P dt over every piece, (…, T − 1), and how far the sum of them may be off, (…).
 
-    Between its ends the motion is taken for the polynomial of degree five that has their q, q̇ and q̈: its error of
-    order six in q integrates to an error of order six in W. The cubic through q and q̇, and the trapezoidal rule, are of
-    order four and two, and tell the error.
+    Between its ends the motion is replaced by the polynomial of degree five that has their q, q̇ and q̈: its error of
+    order six in q integrates to an error of order six in W. The cubic through q and q̇ is of order four and the
+    trapezoidal rule of order two; the differences between the three estimate the error.
     """
     xp, axis, T, n = path.library, path.time, path.ts.shape[-1], path.q.shape[-1]
     until = partial(_at_ends, xp, axis, path.ends)
-    (q, v, t, a, p), last = (path.q, path.qdot, path.t, found.acceleration, found.power), T - 1
+    (q, v, t, a, p), last = (path.q, path.qdot, path.t, samples.acceleration, samples.power), T - 1
     points, weights = (x.astype(q.dtype) for x in (_POINTS, _WEIGHTS))
     h, zero = until(t) - t[..., :last], xp.zeros((), q.dtype)
     a0, a1 = a[..., :last, :], until(a)
@@ -419,10 +425,10 @@ def _work(path: Path, found: Sample, measurable, power: Callable) -> tuple[Any, 
             return sum((c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=False)), start=zero)
 
         at = summed([points**k for k in range(6)])
-        along = summed([k * points ** max(k - 1, 0) for k in range(6)])
+        slope = summed([k * points ** max(k - 1, 0) for k in range(6)])
         shape = at.shape[:-3] + (-1,)
         times = t[..., :last, None] + h[..., None] * points
-        velocities = along / h[..., None, None]
+        velocities = slope / h[..., None, None]
         modes = xp.broadcast_to(mode[..., None], times.shape)
         values = power(at.reshape(*shape, n), velocities.reshape(*shape, n), times.reshape(shape), modes.reshape(shape))
         return h * xp.sum(values.reshape(times.shape) * weights, axis=-1)
@@ -432,14 +438,14 @@ def _work(path: Path, found: Sample, measurable, power: Callable) -> tuple[Any, 
     rise = q1 - q0
     cubic = [q0, v0, 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise]
     # The three conditions at s = 1 on the coefficients of s³, s⁴ and s⁵.
-    left, slope, bend = rise - v0 - a0, v1 - v0 - 2 * a0, a1 - 2 * a0
+    missing, slope, bend = rise - v0 - a0, v1 - v0 - 2 * a0, a1 - 2 * a0
     quintic = [
         q0, v0, a0,
-        10 * left - 4 * slope + bend / 2, -15 * left + 7 * slope - bend, 6 * left - 3 * slope + bend / 2,
+        10 * missing - 4 * slope + bend / 2, -15 * missing + 7 * slope - bend, 6 * missing - 3 * slope + bend / 2,
     ]  # fmt: skip
     second = h / 2 * (p[..., :last] + until(p))
     fourth, sixth = integrated(cubic), integrated(quintic)
-    smooth = xp.isfinite(fourth) & xp.isfinite(sixth) & xp.isfinite(second)  # elsewhere nothing tells the error
+    smooth = xp.isfinite(fourth) & xp.isfinite(sixth) & xp.isfinite(second)  # elsewhere the error is not known
     rough, fine = xp.abs(fourth - second), xp.abs(sixth - fourth)
     # Once pieces are short enough, errors fall from order to order by the same factor, or a larger one. Where they do
     # not fall by four, the pieces are longer than what they should show, and a small difference is an accident.
@@ -449,15 +455,15 @@ def _work(path: Path, found: Sample, measurable, power: Callable) -> tuple[Any, 
 
 
 def _outputs_needed(xp, T: int, imbalance, work_error, size):
-    """About how many outputs tell whether the power is balanced; T where these outputs do.
+    """About how many outputs it takes to tell whether the power is balanced; T where the present ones do.
 
-    They do not where the balance is off visibly, and the work may be off as much. The rule for the work is of order
-    six.
+    They do not where the balance is off by more than `VISIBLE` of the energy and the error of the work may be as large.
+    That error is of order six, so that a sixth root gives the number.
     """
     visible = VISIBLE * size
     excess = SLACK * work_error / xp.where(visible > 0, visible, 1.0)
-    untold = (excess > 1) & (imbalance > visible)
-    return T * xp.where(untold, xp.maximum(2.0, xp.ceil(xp.abs(excess) ** (1 / 6))), 1.0)
+    undecided = (excess > 1) & (imbalance > visible)
+    return T * xp.where(undecided, xp.maximum(2.0, xp.ceil(xp.abs(excess) ** (1 / 6))), 1.0)
 
 
 def _amplitude(xp, q, on_path):
@@ -470,25 +476,25 @@ def _amplitude(xp, q, on_path):
 
 
 def _limits(path: Path, here: Sample, on_path) -> tuple[Any, Any]:
-    """What steps and round-off may add up to, for h and the momenta, and the sizes of these, (…, k) each.
+    """What the errors of steps and round-off may add up to in h and the momenta, and their sizes, (…, k) each.
 
-    Of fixed steps nothing is promised.
+    Fixed steps have no tolerances: there `VISIBLE` of the size is the limit.
     """
     xp, n = path.library, path.q.shape[-1]
     slope, size = (xp.max(xp.where(on_path[..., None], x, 0.0), axis=-2) for x in (here.slopes, here.sizes))
     allowed, steps = VISIBLE * size, path.steps[..., None]
-    if path.promised is not None:
+    if path.tolerances is not None:
         allowed = xp.minimum(allowed, SLACK * math.sqrt(2 * n) * (steps + 1) * slope)
     return allowed + ROUND_OFF * float(np.finfo(size.dtype).eps) * (1 + xp.sqrt(steps)) * size, size
 
 
 def _extreme(xp, axis: int, ts, values, at, largest: bool = True) -> Extreme:
-    """Along the axis of time, where `at` says so; a NaN there is the most extreme of all."""
+    """The extreme of `values` along the axis of time where `at` holds; a NaN there is more extreme than any number."""
     extra = (1,) * (values.ndim - ts.ndim)
     at = xp.broadcast_to(at.reshape(at.shape + (1,) * (values.ndim - at.ndim)), values.shape)
     ranked = xp.where(at, values if largest else -values, -math.inf)
     place = xp.expand_dims(xp.argmax(ranked, axis=axis), axis)  # the first NaN, if there is one
     times = xp.broadcast_to(ts.reshape(ts.shape + extra), values.shape)
     value, when = (xp.squeeze(xp.take_along_axis(x, place, axis=axis), axis) for x in (values, times))
-    found = xp.any(at, axis=axis)
-    return Extreme(xp.where(found, value, math.nan), xp.where(found, when, math.nan))
+    any_at = xp.any(at, axis=axis)
+    return Extreme(xp.where(any_at, value, math.nan), xp.where(any_at, when, math.nan))
