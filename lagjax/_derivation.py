@@ -26,6 +26,7 @@ from lagjax._layout import Layout
 from lagjax._motion import Motion
 from lagjax._native import Projection
 from lagjax._program import Program, Unlowerable, lower, lower_solution
+from lagjax._saddle import SaddleElimination
 
 PyTree = Any
 
@@ -303,7 +304,7 @@ class Derivation:
         mass_zeros, row_zeros = self.absent("mass_matrix"), self.absent("jacobian")[:m]
         augmented = not (regular_only or (self._constant_mass and regular))
         if self.motion.constrained:
-            elimination = _linear.SaddleElimination((mass_zeros, row_zeros), self.layout.dtype, augmented, regular_only)
+            elimination = SaddleElimination((mass_zeros, row_zeros), self.layout.dtype, augmented, regular_only)
         else:
             elimination = _linear.Elimination(mass_zeros, self.layout.dtype)
 

@@ -9,7 +9,7 @@ never a number: no pseudo-inverse, no regularisation. The caller reports it.
 There are three forms of each. `factorize` and `saddle` are for arrays in JAX: M is scaled to a unit diagonal (Jacobi
 scaling: within a factor n of the best diagonal scaling for positive definite M, van der Sluis 1969), so that masses of
 very different size cost no accuracy, and then inverted by Gauss-Jordan elimination with partial pivoting.
-`Elimination` and `SaddleElimination` are for scalar programs: the same solution, written out entry by entry.
+`Elimination` is for scalar programs, the same solution written out entry by entry; that of a saddle point is in `_saddle`.
 `solve_many` and `saddle_many` are for many small systems side by side in NumPy.
 
 No array function here calls LAPACK through JAX. Each of jaxlib's LAPACK kernels (LU, triangular solve, Cholesky,
@@ -19,7 +19,6 @@ is `vmap`ped is for the caller to decide, so all of it is written in array opera
 fast as LAPACK in a batch of up to about 12 coordinates; a single matrix of 128 takes four times as long, under 1 ms.
 """
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -230,10 +229,10 @@ def _cramer_solve(factors, b):
     return [(d * b[0] - c * b[1]) * inverse, (a * b[1] - c * b[0]) * inverse]
 
 
-def _ldl_factors(matrix, nonzero, threshold, drop: bool = False):
+def _ldl_factors(matrix, nonzero, threshold):
     """L, where it has entries, D⁻¹, and whether a pivot was lost: cancelled to `threshold` of its diagonal entry.
 
-    A lost pivot becomes NaN; with `drop` its row is left out instead, which for a consistent system changes nothing.
+    A lost pivot becomes NaN.
     """
     n, singular, nonzero = len(matrix), jnp.zeros((), bool), nonzero.copy()
     lower, scaled, inverse = {}, {}, []  # L, L D and D⁻¹, column by column
@@ -245,10 +244,7 @@ def _ldl_factors(matrix, nonzero, threshold, drop: bool = False):
         cancels = before or not nonzero[j, j]
         lost = pivot <= threshold * matrix[j][j] if cancels else pivot == 0
         singular = singular | lost
-        if drop:
-            inverse.append(jnp.where(lost, 0.0, 1 / jnp.where(lost, 1.0, pivot)))
-        else:
-            inverse.append(1 / (jnp.where(lost, jnp.nan, pivot) if cancels else pivot))
+        inverse.append(1 / (jnp.where(lost, jnp.nan, pivot) if cancels else pivot))
         for i in range(j + 1, n):
             shared = [k for k in before if nonzero[i, k]]
             if nonzero[i, j] or shared:
@@ -480,88 +476,3 @@ def _or_unit(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Matrices (S, n, n) with the unit matrix for those that hold a NaN, at which LAPACK raises; which are finite."""
     finite = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
     return np.where(finite[:, None, None], matrix, np.eye(matrix.shape[1], dtype=matrix.dtype)), finite
-
-
-# ---- the saddle point on scalars -------------------------------------------------------------------------------------
-
-
-class SaddleElimination:
-    """`saddle` on scalars, without pivoting: M positive (semi)definite, G a list of m rows.
-
-    `zeros` marks what is zero in M (n, n) and in G (m, n) whatever the state. M is `augmented` by GᵀW G unless it is
-    known to be regular. Redundant rows are left out of λ: the motion is the same, the multipliers are a solution but
-    not the shortest. With `regular_only` the saddle point is called singular as soon as it loses digits: where M, or
-    what the constraints make of it, is within `REGULAR` of singular. That is the regular-M variant, which takes a third
-    of the arithmetic and leaves the rest of the states to the general one.
-    """
-
-    def __init__(self, zeros: tuple[np.ndarray, np.ndarray], dtype, augmented: bool, regular_only: bool):
-        self.mass_zeros, self.row_zeros = zeros
-        self.dtype, self.augmented, self.regular_only = dtype, augmented, regular_only
-
-    def factors(self, matrix: list[list], jacobian: list[list]) -> tuple[Any, jax.Array]:
-        """What `solve` needs of M and G, a tree of scalars, and whether the saddle point is singular."""
-        n, m, regular_only = len(matrix), len(jacobian), self.regular_only
-        zeros, weighted = self.mass_zeros, None
-        if self.augmented:
-            matrix, weighted, zeros = _augmented_entries(matrix, jacobian, zeros, self.row_zeros)
-        mass, singular = _ldl_factors(matrix, ~zeros, REGULAR if regular_only else singular_threshold(n, self.dtype))
-        responses = [_ldl_solve(mass, row) for row in jacobian]
-        schur = [[self._row_times(i, jacobian, responses[j]) for j in range(m)] for i in range(m)]
-        threshold = REGULAR if regular_only else rank_tolerance(self.dtype)
-        schur, redundant = _ldl_factors(schur, np.ones((m, m), bool), threshold, drop=not regular_only)
-        if regular_only:
-            least, most = (functools.reduce(of, (matrix[i][i] for i in range(n))) for of in (jnp.minimum, jnp.maximum))
-            # The constraints would have to hold a light coordinate against forces on heavy ones.
-            uneven = least <= REGULAR * most
-            singular = uneven | singular | redundant
-        return (jacobian, weighted, mass, responses, schur), singular
-
-    def solve(self, factors, right: list) -> list:
-        """x and then −λ, n + m scalars, linear in `right`: b and then c."""
-        jacobian, weighted, mass, responses, schur = factors
-        m, n = self.row_zeros.shape
-        b, c = right[:n], right[n:]
-        if weighted is not None:
-            b = [b[i] + _dot((weighted[k][i], c[k]) for k in range(m) if not self.row_zeros[k, i]) for i in range(n)]
-        x = _ldl_solve(mass, b)
-        pulls = _ldl_solve(schur, [self._row_times(i, jacobian, x) - c[i] for i in range(m)])
-        return [x[k] - _dot((responses[i][k], pulls[i]) for i in range(m)) for k in range(n)] + pulls
-
-    def _row_times(self, i: int, jacobian, x):
-        """Row i of G times x, without the entries that are always zero."""
-        return _dot((jacobian[i][k], x[k]) for k in range(len(x)) if not self.row_zeros[i, k])
-
-
-# The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
-# digits of an acceleration may be lost, and twelve remain. Twice as large, a few more states take the general variant,
-# three times as expensive; much smaller, the error of an acceleration would exceed the tolerances.
-REGULAR = 1e-4
-
-
-def _augmented_entries(matrix, jacobian, mass_zeros, row_zeros):
-    """M + GᵀW G and W G, entry by entry, and where the first is zero whatever the state.
-
-    The weights are the trace of M over |Gₖ|², within a factor n of those of `augment`. They are differentiated here
-    like everything else, and a trace is smooth where a maximum is not.
-    """
-    n, m = len(matrix), len(jacobian)
-    present = ~row_zeros
-    trace = _dot((matrix[i][i], 1.0) for i in range(n))
-    sizes = [_dot((jacobian[k][i], jacobian[k][i]) for i in range(n) if present[k, i]) for k in range(m)]
-    weights = [trace / jnp.where(size > 0, size, 1.0) for size in sizes]
-    weighted = [[weights[k] * jacobian[k][i] for i in range(n)] for k in range(m)]
-
-    def added(i, j):
-        return _dot((weighted[k][i], jacobian[k][j]) for k in range(m) if present[k, i] and present[k, j])
-
-    matrix = [[matrix[i][j] + added(i, j) for j in range(n)] for i in range(n)]
-    return matrix, weighted, mass_zeros & ~((present.T.astype(int) @ present.astype(int)) > 0)
-
-
-def _dot(pairs):
-    """Σ a b over pairs of scalars."""
-    total = 0.0
-    for a, b in pairs:
-        total = total + a * b
-    return total
