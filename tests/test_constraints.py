@@ -388,6 +388,17 @@ def test_derivatives_through_steps_that_are_taken_again():
         np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-6)
 
 
+def test_reverse_mode_through_constraints_needs_no_parameters():
+    system, ts, angle, step = lagjax.System(weight, constraints=rod), np.linspace(0, 1, 3), 1.0, 1e-4
+
+    def inside(angle):
+        return lagjax.simulate(system, *hung(angle, 0.5), ts, rtol=1e-12).q[1, 0]
+
+    # Central differences are off by step²/6 times the third derivative, some tens here.
+    difference = (inside(angle + step) - inside(angle - step)) / (2 * step)
+    np.testing.assert_allclose(jax.grad(inside)(angle), difference, atol=1e-6)
+
+
 def bars_in_a_row(loops):
     """So many parallelograms side by side, of uniform bars of unit mass and length, by their upper joints."""
 

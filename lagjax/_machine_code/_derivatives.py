@@ -139,7 +139,8 @@ def _through_projection(flow: Flow, projection: Projection, ts, path, params, pa
                             (members, m, times - 2, flow.states))  # fmt: skip
     t = np.broadcast_to(ts[:, None, 1:-1], place.shape[:-1])
     numbers = np.broadcast_to(params[:, None, None], (*place.shape[:-1], flow.numbers))
-    columns = [x.reshape(-1, x.shape[-1]).T for x in (place, t[..., None], numbers, path_ct[:, :, 1:-1])]
+    parts = place, t[..., None], numbers, path_ct[:, :, 1:-1]
+    columns = [x.reshape(place[..., 0].size, x.shape[-1]).T for x in parts]  # a scene may have no numbers
     back = evaluate(_transposed(projection.state, flow.states), list(np.concatenate(columns))).T
     back = back.reshape(*place.shape[:-1], -1)
     path_ct[:, :, 1:-1] = back[..., : flow.states]
