@@ -9,7 +9,7 @@ never a number: no pseudo-inverse, no regularisation. The caller reports it.
 There are three forms of each. `factorize` and `saddle` are for arrays in JAX: M is scaled to a unit diagonal (Jacobi
 scaling: within a factor n of the best diagonal scaling for positive definite M, van der Sluis 1969), so that masses of
 very different size cost no accuracy, and then inverted by Gauss-Jordan elimination with partial pivoting.
-`Elimination` is for scalar programs, the same solution written out entry by entry; that of a saddle point is in `_saddle`.
+`Elimination` is for scalar programs: the same solution, written out (that of a saddle point is in `_saddle`).
 `solve_many` and `saddle_many` are for many small systems side by side in NumPy.
 
 No array function here calls LAPACK through JAX. Each of jaxlib's LAPACK kernels (LU, triangular solve, Cholesky,

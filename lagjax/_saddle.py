@@ -148,7 +148,7 @@ def elimination_order(mass: np.ndarray, rows: np.ndarray) -> tuple[list[int], np
     return order, filled
 
 
-def _entry(matrix, rows, i: int, j: int):
+def _entry(matrix, jacobian, i: int, j: int):
     """That of A at (i, j), i ≠ j."""
     i, j, n = max(i, j), min(i, j), len(matrix)
     return matrix[i][j] if i < n else jacobian[i - n][j] if j < n else 0.0

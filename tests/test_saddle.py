@@ -24,21 +24,21 @@ def chain(links, rng):
 
 def solved(matrix, rows, b, c, zeros=None, **kind):
     zeros = (matrix == 0, rows == 0) if zeros is None else zeros
-    elimination = SaddleElimination(zeros, np.float64, **{"helped": False, "wary": False} | kind)
+    elimination = SaddleElimination(zeros, np.float64, **{"augmented": False, "regular_only": False} | kind)
     factors, singular = elimination.factors(matrix.tolist(), rows.tolist())
     z = np.array(elimination.solve(factors, [*b, *c]), float)
     return z[: len(b)], -z[len(b) :], bool(singular)
 
 
-@pytest.mark.parametrize("helped", [False, True])
-def test_a_chain_is_solved_as_by_dense_algebra(helped):
+@pytest.mark.parametrize("augmented", [False, True])
+def test_a_chain_is_solved_as_by_dense_algebra(augmented):
     rng = np.random.default_rng(0)
     matrix, rows = chain(6, rng)
     n, m = len(matrix), len(rows)
     b, c = rng.normal(size=n), rng.normal(size=m)
     full = np.block([[matrix, -rows.T], [rows, np.zeros((m, m))]])
     expected = np.linalg.solve(full, np.concatenate([b, c]))
-    x, multipliers, singular = solved(matrix, rows, b, c, helped=helped)
+    x, multipliers, singular = solved(matrix, rows, b, c, augmented=augmented)
     found = np.concatenate([x, multipliers])
     assert not singular
     assert np.abs(found - expected).max() < 4 * n * np.finfo(float).eps * np.linalg.cond(full) * np.abs(expected).max()
@@ -58,7 +58,7 @@ def test_constraints_that_depend_on_others_leave_the_solution():
     assert not singular and np.sum(multipliers == 0) == 3
     np.testing.assert_allclose(x, once, rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(matrix @ x - more.T @ multipliers, b, atol=1e-10)
-    assert solved(matrix, more, b, right, wary=True)[2]
+    assert solved(matrix, more, b, right, regular_only=True)[2]
 
 
 def test_coordinates_without_mass_are_held_by_constraints_or_reported():
@@ -68,13 +68,13 @@ def test_coordinates_without_mass_are_held_by_constraints_or_reported():
     b, c = rng.normal(size=len(matrix)), rng.normal(size=len(rows))
     full = np.block([[matrix, -rows.T], [rows, np.zeros((len(rows),) * 2)]])
     expected = np.linalg.solve(full, np.concatenate([b, c]))
-    x, multipliers, singular = solved(matrix, rows, b, c, helped=True)
+    x, multipliers, singular = solved(matrix, rows, b, c, augmented=True)
     assert not singular
     np.testing.assert_allclose(np.concatenate([x, multipliers]), expected, rtol=1e-9, atol=1e-10)
     dense = np.zeros_like(matrix, bool), np.zeros_like(rows, bool)  # zero in this state only
-    assert solved(matrix, rows, b, c, dense, wary=True)[2]
+    assert solved(matrix, rows, b, c, dense, regular_only=True)[2]
     rows[:, 2] = 0.0  # nothing holds it any more
-    assert solved(matrix, rows, b, c, dense, helped=True)[2]
+    assert solved(matrix, rows, b, c, dense, augmented=True)[2]
 
 
 def test_a_chain_costs_in_proportion_to_its_length():
