@@ -64,7 +64,9 @@ class SaddleElimination:
     def _eliminated(self, matrix, jacobian) -> tuple[dict, list, Any, Any]:
         """L by (row, column), D⁻¹, and whether a pivot of M, or one of a constraint, was lost to round-off."""
         lost = redundant = jnp.zeros((), bool)
-        lower, scaled, inverse = {}, {}, [None] * len(self.order)  # L, L D and D⁻¹
+        lower: dict[tuple[int, int], Any] = {}  # L by (row, column)
+        scaled: dict[tuple[int, int], Any] = {}  # L D
+        inverse: list[Any] = [None] * len(self.order)  # D⁻¹
         for place, j in enumerate(self.order):
             before = [k for k in self.order[:place] if self.filled[j, k]]
             of_coordinates, of_constraints = (
