@@ -197,7 +197,7 @@ def _require_solver(solver, adaptive: bool) -> None:
     if not (isinstance(structure, type) and issubclass(diffrax.ODETerm, structure)):
         raise ValueError(
             f"{name} splits the equations into several terms, which those of a general Lagrangian do not allow; "
-            "use a solver of ordinary differential equations, such as diffrax.Dopri8() or diffrax.ImplicitMidpoint()."
+            "use a solver of ordinary differential equations, such as diffrax.Dopri8() or diffrax.Kvaerno5()."
         )
     if adaptive and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
         raise ValueError(f"{name} has no error estimate to adapt its steps to: give a fixed step with dt=...")
