@@ -41,10 +41,12 @@ def test_readme_commands_and_links():
 
 
 PUBLIC = [getattr(lagjax, name) for name in lagjax.__all__ if callable(getattr(lagjax, name))]
+PUBLIC += [lagjax.System.explain, lagjax.System.project]
+COSTLY = (lagjax.work_precision, lagjax.System.project)
 
 
 @pytest.mark.parametrize(
-    "thing", sweep(PUBLIC, kept=lambda thing: thing is not lagjax.work_precision), ids=lambda thing: thing.__name__
+    "thing", sweep(PUBLIC, kept=lambda thing: thing not in COSTLY), ids=lambda thing: thing.__name__
 )
 def test_docstrings(thing):
     assert inspect.getdoc(thing), f"{thing.__name__} has no docstring"

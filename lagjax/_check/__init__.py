@@ -14,6 +14,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
 
 from lagjax._check import _borders, _constraints, _derivatives, _mass, _stiffness
 from lagjax._check._findings import Finding, Findings, listed
@@ -31,7 +33,7 @@ PyTree = Any
 _SMALLEST = 1e4
 
 
-def check(system: System, q: PyTree, qdot: PyTree, t: Any = 0.0, params: PyTree = None) -> Findings:
+def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0, params: PyTree = None) -> Findings:
     r"""What is wrong with `system` at the state (q, qdot), or worth knowing before it is integrated.
 
     Derivatives are compared with finite differences, L̇ᵢ = [L(x + hᵢ) − L(x − hᵢ)]/2hᵢ and of higher order, on steps

@@ -12,13 +12,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import Array, Bool, Float
 
 from lagjax._derivation import Derivation
 from lagjax._motion import Motion
 from lagjax._program import Program, Unlowerable
 
 PyTree = Any
-State = tuple[jax.Array, jax.Array]
+Vector = Float[Array, " n"]
+State = tuple[Vector, Vector]  # q and q̇
 
 # Operations of a program beyond which XLA takes longer to compile it than it saves, and batched elimination on arrays
 # overtakes written-out elimination: measured on chains of pendulums, where it lies at 12 links.
@@ -29,10 +31,10 @@ class Equations(eqx.Module):
     """ẏ = f(t, y, params) with y = (q, q̇), two vectors of shape (n,); params holds numbers alone."""
 
     @abc.abstractmethod
-    def acceleration(self, t: jax.Array, y: State, params: PyTree) -> tuple[jax.Array, jax.Array]:
+    def acceleration(self, t: Float[Array, ""], y: State, params: PyTree) -> tuple[Vector, Bool[Array, ""]]:
         """q̈ (n,), and whether the matrix that it was solved with is singular: then q̈ is NaN."""
 
-    def vector_field(self, t: jax.Array, y: State, params: PyTree) -> State:
+    def vector_field(self, t: Float[Array, ""], y: State, params: PyTree) -> State:
         """ẏ = (q̇, q̈)."""
         return y[1], self.acceleration(t, y, params)[0]
 
@@ -42,7 +44,7 @@ class Equations(eqx.Module):
         """Whether the scene has constraints to project to."""
 
     @abc.abstractmethod
-    def projected(self, t: jax.Array, y: State, params: PyTree) -> State:
+    def projected(self, t: Float[Array, ""], y: State, params: PyTree) -> State:
         """y after one Newton step of positions and of velocities back to the constraints."""
 
 

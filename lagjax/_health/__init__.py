@@ -31,6 +31,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from lagjax._health._compare import global_error
 from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measured
@@ -65,7 +66,7 @@ class Health(eqx.Module):
     """How far a trajectory can be trusted; made by `Trajectory.health`. Print it, or read its fields.
 
     Every field has the batch axes of the trajectory, and is measured over the outputs that were reached. An `Extreme`
-    is a pair of a `value` and the time `t` where it is found, NaN where nothing was reached.
+    is a pair of a `value` and the time `t` of the output that has it, NaN where nothing was reached.
 
     - `result`, `ok`, `accepted_steps`, `rejected_steps`: as in the trajectory.
     - `energy`: the largest |h − h₀ − W|, in units of energy, W the work done by forces, by an explicit time and by
@@ -93,27 +94,27 @@ class Health(eqx.Module):
     """
 
     result: RESULTS
-    ok: jax.Array
-    t_end: jax.Array
-    accepted_steps: jax.Array
-    rejected_steps: jax.Array
+    ok: Bool[Array, "*batch"]
+    t_end: Float[Array, "*batch"]
+    accepted_steps: Int[Array, "*batch"]
+    rejected_steps: Int[Array, "*batch"]
     energy: Extreme
-    energy_allowed: jax.Array
-    work_error: jax.Array
-    outputs_needed: jax.Array
-    amplitude: jax.Array
-    amplitude_needed: jax.Array
-    momentum: Extreme
-    momentum_allowed: jax.Array
-    constraint_distance: Extreme
-    constraint_rate: Extreme
-    constraint_allowed: jax.Array
+    energy_allowed: Float[Array, "*batch"]
+    work_error: Float[Array, "*batch"]
+    outputs_needed: Float[Array, "*batch"]
+    amplitude: Float[Array, "*batch"]
+    amplitude_needed: Float[Array, "*batch"]
+    momentum: Extreme  # each field (*batch, momenta)
+    momentum_allowed: Float[Array, "*batch momenta"]
+    constraint_distance: Extreme  # each field (*batch, m)
+    constraint_rate: Extreme  # each field (*batch, m)
+    constraint_allowed: Float[Array, "*batch 2"]
     smallest_eigenvalue: Extreme
     condition: Extreme
     scaled_condition: Extreme
-    scaled_condition_allowed: jax.Array
-    gradients_finite: jax.Array
-    gradients_time: jax.Array
+    scaled_condition_allowed: Float[Array, "*batch"]
+    gradients_finite: Bool[Array, "*batch"]
+    gradients_time: Float[Array, "*batch"]
     global_error: Extreme | None
     outputs: int = eqx.field(static=True)
     works: bool = eqx.field(static=True)
@@ -121,12 +122,12 @@ class Health(eqx.Module):
     constraint_names: tuple[str, ...] = eqx.field(static=True)
 
     @property
-    def suspicious(self) -> jax.Array:
-        """Whether anything is, for each member."""
+    def suspicious(self) -> Bool[Array, "*batch"]:
+        """Whether any of the `checks` is, for each member."""
         flags, xp = self._flags()
         return jnp.asarray(xp.any(xp.stack(list(flags.values())), axis=0))
 
-    def checks(self) -> dict[str, jax.Array]:
+    def checks(self) -> dict[str, Bool[Array, "*batch"]]:
         """What is suspicious, by name: a Boolean for each member. A NaN at a state that was reached is."""
         return {name: jnp.asarray(flag) for name, flag in self._flags()[0].items()}
 

@@ -109,7 +109,7 @@ class Law(NamedTuple):
                 power = _power_of(of, qdot, multipliers)
             return Sample(
                 conserved, slopes, sizes, power, acceleration, off_q, off_qdot,
-                _conditions_of(of["mass_matrix"]), self._finite(columns),
+                _conditions(of["mass_matrix"]), self._finite(columns),
             )  # fmt: skip
 
     def _momenta_by_q(self, momenta, columns) -> np.ndarray:
@@ -192,25 +192,35 @@ def _power_of(of: dict[str, np.ndarray], qdot, multipliers) -> np.ndarray:
     return power - np.einsum("sk,sk->s", multipliers, of["driving"])
 
 
-def _conditions_of(matrix: np.ndarray) -> np.ndarray:
-    """The smallest eigenvalue of S matrices M, max|λ| / min|λ|, and that ratio after scaling, shape (S, 3)."""
-    diagonal = np.abs(np.diagonal(matrix, axis1=1, axis2=2))
-    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
-    values, scaled = (_eigenvalues_of(m) for m in (matrix, scale[:, :, None] * matrix * scale[:, None, :]))
-    spread = (np.abs(x).max(axis=1) / np.abs(x).min(axis=1) for x in (values, scaled))
-    return np.stack([values.min(axis=1), *spread], axis=1)
+def _conditions(matrix):
+    """The smallest eigenvalue of symmetric matrices (…, n, n), max|λ| / min|λ|, and that ratio after scaling, (…, 3).
+
+    For arrays of NumPy or JAX. The matrix and the one scaled to a unit diagonal go into one call: LAPACK's kernels side
+    by side in one program of JAX deadlock (`_linear`).
+    """
+    xp = matrix.__array_namespace__()
+    diagonal = xp.abs(xp.diagonal(matrix, axis1=-2, axis2=-1))
+    scale = 1 / xp.sqrt(xp.where(diagonal > 0, diagonal, 1))
+    values, scaled = _eigenvalues(xp, xp.stack([matrix, scale[..., :, None] * matrix * scale[..., None, :]]))
+    spread = (xp.max(xp.abs(x), axis=-1) / xp.min(xp.abs(x), axis=-1) for x in (values, scaled))
+    return xp.stack([xp.min(values, axis=-1), *spread], axis=-1)
 
 
-def _eigenvalues_of(matrix: np.ndarray) -> np.ndarray:
-    """Eigenvalues of S symmetric matrices, (S, n); NaN where a matrix is not finite."""
-    if matrix.shape[1] == 2:  # a closed form keeps the digits of the smaller one
-        a, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
-        middle, radius = 0.5 * (a + d), np.hypot(0.5 * (a - d), c)
-        larger = np.where(middle < 0, middle - radius, middle + radius)
-        return np.stack([larger, np.where(larger == 0, 0.0, (a * d - c * c) / larger)], axis=1)
-    usable, unit = np.asarray(np.isfinite(matrix).all(axis=(1, 2))), np.eye(matrix.shape[1], dtype=matrix.dtype)
-    symmetric = np.where(usable[:, None, None], 0.5 * (matrix + np.swapaxes(matrix, 1, 2)), unit)
-    return np.where(usable[:, None], np.linalg.eigvalsh(symmetric), np.nan)
+def _eigenvalues(xp, matrix):
+    """The eigenvalues (…, n) of symmetric matrices (…, n, n); NaN where a matrix is not finite."""
+    n = matrix.shape[-1]
+    if n == 1:
+        return matrix[..., 0]
+    if n == 2:  # a closed form keeps the digits of the smaller one, and LAPACK is called for one matrix after the other
+        a, c, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
+        middle, radius = 0.5 * (a + d), xp.hypot(0.5 * (a - d), c)
+        larger = xp.where(middle < 0, middle - radius, middle + radius)
+        smaller = xp.where(larger == 0, 0.0, (a * d - c * c) / xp.where(larger == 0, 1.0, larger))
+        return xp.stack([larger, smaller], axis=-1)
+    finite = xp.isfinite(matrix).all(axis=(-2, -1))  # NumPy's LAPACK raises where one is not
+    symmetric = 0.5 * (matrix + xp.swapaxes(matrix, -1, -2))
+    usable = xp.where(finite[..., None, None], symmetric, xp.eye(n, dtype=matrix.dtype))
+    return xp.where(finite[..., None], xp.linalg.eigvalsh(usable), np.nan)
 
 
 def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int, ...] | None]:
@@ -256,27 +266,6 @@ def power_at(law: Law, q, qdot, t, params) -> jax.Array:
         return jnp.zeros((), q.dtype)
     power = motion.nonconservative_force(*state) @ qdot - jax.grad(motion.lagrangian, argnums=2)(*state)
     return power - motion.multipliers(*state) @ motion.constraints.driving(*state) if motion.constrained else power
-
-
-def _conditions(matrix: jax.Array) -> jax.Array:
-    """The smallest eigenvalue of a matrix M, max|λ| / min|λ|, and that ratio after scaling to a unit diagonal, (3,)."""
-    diagonal = jnp.abs(jnp.diagonal(matrix))
-    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
-    # One call for both: LAPACK's kernels side by side in one program deadlock (`_linear`).
-    values, scaled = jax.vmap(_eigenvalues)(jnp.stack([matrix, scale[:, None] * matrix * scale]))
-    spread = (jnp.max(jnp.abs(x)) / jnp.min(jnp.abs(x)) for x in (values, scaled))
-    return jnp.stack([jnp.min(values), *spread])
-
-
-def _eigenvalues(matrix: jax.Array) -> jax.Array:
-    if matrix.shape == (1, 1):
-        return matrix[0]
-    if matrix.shape == (2, 2):  # LAPACK is called for one matrix after the other
-        (a, c), (_, d) = matrix
-        middle, radius = 0.5 * (a + d), jnp.hypot(0.5 * (a - d), c)
-        larger = jnp.where(middle < 0, middle - radius, middle + radius)
-        return jnp.stack([larger, jnp.where(larger == 0, 0.0, (a * d - c * c) / larger)])
-    return jnp.linalg.eigvalsh(0.5 * (matrix + matrix.T))
 
 
 def _slopes_of_all(motion: Motion, q, qdot, t, params) -> list[jax.Array]:

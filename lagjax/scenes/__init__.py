@@ -6,7 +6,7 @@
     ts = jnp.linspace(0.0, scene.duration, 101)
     trajectory = lagjax.simulate(scene.system, scene.q0, scene.qdot0, ts, scene.params)
 
-Every function in `ALL` takes no argument that it must be given, and returns a `Scene`.
+Every function in `ALL` can be called without arguments, and returns a `Scene`.
 """
 
 from lagjax.scenes import _de421 as de421

@@ -22,7 +22,7 @@ from lagjax.scenes._scene import Scene
 
 
 class Rolling(NamedTuple):
-    """r: between the axes; theta1: of the line of centres from the upward vertical; theta2: turned by the cylinder."""
+    """The distance r of the axes, the angle theta1 of their line from the vertical, the turn theta2 of the cylinder."""
 
     r: ArrayLike
     theta1: ArrayLike
@@ -98,8 +98,8 @@ def _masses_lagrangian(q, qdot, params):
 
 
 def _rods(q, params):
-    along = jnp.diff(q, axis=0, prepend=0.0)
-    return (params["l"] ** 2 - jnp.sum(along**2, axis=-1)) / (2 * params["l"])
+    rods = jnp.diff(q, axis=0, prepend=0.0)
+    return (params["l"] ** 2 - jnp.sum(rods**2, axis=-1)) / (2 * params["l"])
 
 
 def _rod(q, params):
@@ -133,7 +133,7 @@ def cartesian_pendulum() -> Scene:
     """A mass on a rod, L = ½ m (ẋ² + ẏ²) − m g y, (l² − x² − y²)/(2l) = 0; q is the array (x, y), y upwards.
 
     λ of "rod" is the tension. The start is that of the benchmark A01 of the IFToMM library of computational dynamics
-    (González, Dopico, Lugrís & Cuadrado, Multibody System Dynamics 16 (2006) 23): at rest, held out sideways.
+    (González, Dopico, Lugrís & Cuadrado, Multibody System Dynamics 16 (2006) 23): at rest, horizontal.
 
     >>> scene = lagjax.scenes.cartesian_pendulum(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
@@ -197,7 +197,7 @@ class _Wire(eqx.Module):
 
 
 def wire_multiplier(q, qdot, params, shape=parabola):
-    """λ = m (g + y″ ẋ²)/(1 + y′²), what a wire y(x) exerts on a bead upwards; its whole push is λ √(1 + y′²).
+    """λ = m (g + y″ ẋ²)/(1 + y′²), the vertical force of a wire y(x) on a bead; the whole force is λ √(1 + y′²).
 
     >>> scene = bead_on_wire(); wire_multiplier(scene.q0, scene.qdot0, scene.params)
     """
@@ -270,7 +270,7 @@ def particle_on_sphere() -> Scene:
 
 
 class Disc(NamedTuple):
-    """x (down the slope), y: point of contact; phi: heading from the x axis; psi: angle rolled."""
+    """The point of contact x (down the slope), y; the heading phi from the x axis; the angle psi that was rolled."""
 
     x: ArrayLike
     y: ArrayLike
@@ -279,7 +279,7 @@ class Disc(NamedTuple):
 
 
 class Blade(NamedTuple):
-    """x (down the slope), y: point of contact; phi: heading from the x axis."""
+    """The point of contact x (down the slope), y; the heading phi from the x axis."""
 
     x: ArrayLike
     y: ArrayLike
@@ -287,7 +287,10 @@ class Blade(NamedTuple):
 
 
 def _turning(t, speed, push, phi, rate):
-    """What moves along a heading that turns at `rate`, pushed by `push` cos φ: way, its components, and speed."""
+    """The way of a body, its components x and y, its speed and its heading φ after t, φ turning at `rate`.
+
+    A force of `push` cos φ per unit mass acts along the heading.
+    """
     # u̇ = k cos φ with φ = φ0 + ω t, so u = c + (k/ω) sin φ, and ẋ = u cos φ, ẏ = u sin φ are integrated by parts.
     end, k = phi + rate * t, push / rate
     c = speed - k * jnp.sin(phi)
@@ -397,16 +400,16 @@ def _sleigh_exact(t, q0, qdot0, params):
     c = jnp.arctanh(u0 / U)
     turned = jnp.sign(w0) * jnp.sqrt(inertia / m) / a  # heading per angle of Gudermann
 
-    def moving(t):
+    def speed_rate_heading(t):
         s = k * U * t + c
         phi = q0.phi + turned * 2 * (jnp.arctan(jnp.tanh(s / 2)) - jnp.arctan(jnp.tanh(c / 2)))
         return U * jnp.tanh(s), turned * k * U / jnp.cosh(s), phi
 
-    # Speed and heading are closed; the place is their integral, by quadrature over the whole time.
+    # Speed and heading have closed forms; the position is their integral from 0 to t, by quadrature.
     nodes, weights = np.polynomial.legendre.leggauss(100)
-    speeds, _, headings = moving(t / 2 * (1 + nodes))
+    speeds, _, headings = speed_rate_heading(t / 2 * (1 + nodes))
     x, y = (t / 2 * jnp.sum(weights * speeds * turn(headings)) for turn in (jnp.cos, jnp.sin))
-    u, w, phi = moving(t)
+    u, w, phi = speed_rate_heading(t)
     return Blade(q0.x + x, q0.y + y, phi), Blade(u * jnp.cos(phi), u * jnp.sin(phi), w)
 
 
@@ -437,7 +440,7 @@ def chaplygin_sleigh() -> Scene:
 
 
 class SliderCrank(NamedTuple):
-    """crank, rod: angles of both from the x axis, along which the slider moves; x: the place of the slider."""
+    """The angles of crank and rod from the x axis, along which the slider moves; the position x of the slider."""
 
     crank: ArrayLike
     rod: ArrayLike

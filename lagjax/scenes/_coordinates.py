@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 
 
 class Cartesian(NamedTuple):
-    """x, y, z."""
+    """Cartesian coordinates (x, y, z) of a particle."""
 
     x: ArrayLike
     y: ArrayLike
@@ -34,7 +34,7 @@ class Cartesian(NamedTuple):
 
 
 class Polar(NamedTuple):
-    """rho, phi in the plane z = 0: x = ρ cos φ, y = ρ sin φ."""
+    """Polar coordinates (rho, phi) in the plane z = 0: x = ρ cos φ, y = ρ sin φ."""
 
     rho: ArrayLike
     phi: ArrayLike
@@ -55,7 +55,7 @@ class Polar(NamedTuple):
 
 
 class Cylindrical(NamedTuple):
-    """rho, phi, z: x = ρ cos φ, y = ρ sin φ."""
+    """Cylindrical coordinates (rho, phi, z): x = ρ cos φ, y = ρ sin φ."""
 
     rho: ArrayLike
     phi: ArrayLike
@@ -77,7 +77,7 @@ class Cylindrical(NamedTuple):
 
 
 class Spherical(NamedTuple):
-    """r, theta (from the z axis), phi: x = r sin θ cos φ, y = r sin θ sin φ, z = r cos θ."""
+    """Spherical coordinates (r, theta, phi), θ from the z axis: x = r sin θ cos φ, y = r sin θ sin φ, z = r cos θ."""
 
     r: ArrayLike
     theta: ArrayLike
@@ -101,7 +101,7 @@ class Spherical(NamedTuple):
 
 
 def convert(q, qdot, coordinates):
-    """The state (q, qdot) in other `coordinates`, one of the classes above; angles come back as principal values.
+    """The state (q, qdot) in other `coordinates`, one of these classes; angles are principal values.
 
     Into `Polar` the state is projected on the plane z = 0. On the z axis the curvilinear charts are singular: nan.
 
@@ -111,6 +111,6 @@ def convert(q, qdot, coordinates):
 
 
 def angular_momentum_z(q, qdot):
-    """x ẏ − y ẋ, from any of the coordinates above, per unit mass."""
+    """The angular momentum per unit mass x ẏ − y ẋ of a state in any of these coordinates."""
     (x, y, _), (vx, vy, _) = convert(q, qdot, Cartesian)
     return x * vy - y * vx

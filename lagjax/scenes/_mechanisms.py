@@ -12,7 +12,7 @@ from lagjax.scenes._scene import Scene
 
 
 class WedgeAndMass(NamedTuple):
-    """X: position of the wedge on the ground; x: horizontal position of the mass along the wedge."""
+    """The position X of the wedge on the ground; the horizontal position x of the mass along the wedge."""
 
     X: ArrayLike
     x: ArrayLike
@@ -155,7 +155,7 @@ def chain(n=3) -> Scene:
 
     L = Σ ½ m_i (ẋ_i² + ẏ_i²) − m_i g y_i with x_i = Σ_{j≤i} l_j sin θ_j, y_i = −Σ_{j≤i} l_j cos θ_j.
 
-    Total length and mass 1, held out sideways; n = 2 is the double pendulum. Landau & Lifshitz, Mechanics, §5.
+    Total length and mass 1, horizontal at the start; n = 2 is the double pendulum. Landau & Lifshitz, Mechanics, §5.
 
     >>> scene = lagjax.scenes.chain(10); scene.system.energy(scene.q0, scene.qdot0, params=scene.params)
     """
@@ -171,7 +171,7 @@ def chain(n=3) -> Scene:
 
 
 class Direction(NamedTuple):
-    """theta: angle from the downward vertical; phi: azimuth."""
+    """A direction: the angle theta from the downward vertical, and the azimuth phi."""
 
     theta: ArrayLike
     phi: ArrayLike
@@ -279,7 +279,7 @@ def damped_driven_oscillator() -> Scene:
 
 
 class Swing(NamedTuple):
-    """r: length of string to the swinging mass; theta: its angle from the downward vertical."""
+    """The length r of the string to the swinging mass, and its angle theta from the downward vertical."""
 
     r: ArrayLike
     theta: ArrayLike
@@ -316,7 +316,7 @@ def swinging_atwood() -> Scene:
 
 
 class SlowAndFast(NamedTuple):
-    """Of each stiff spring the scaled centre, `slow`, and the scaled stretch, `fast`: arrays of equal length."""
+    """The scaled centre `slow` and the scaled stretch `fast` of each stiff spring: arrays of equal length."""
 
     slow: ArrayLike
     fast: ArrayLike

@@ -44,7 +44,7 @@ def free_particle() -> Scene:
 
 
 def _linear_momenta(*axes):
-    """m ẋ and its like, for `Cartesian` coordinates."""
+    """m ẋ, m ẏ and m ż by name, for `Cartesian` coordinates."""
     return {f"p_{axis}": _LinearMomentum(axis) for axis in axes}
 
 

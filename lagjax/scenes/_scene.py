@@ -1,4 +1,4 @@
-"""What every scene hands over."""
+"""`Scene`: a system with parameters, a start, and what is known about its motion."""
 
 from collections.abc import Callable
 from typing import Any, final
