@@ -680,6 +680,7 @@ def test_jit_and_vmap_change_nothing():
     np.testing.assert_allclose(run(q0[1], qdot0[1])[0], mapped[0][1], rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_single_precision():
     system = lagjax.System(weight, constraints=rod)
     q0, qdot0 = (np.float32(x) for x in hung(1.0, 0.5))

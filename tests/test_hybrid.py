@@ -109,7 +109,7 @@ def test_rolling_cylinder_leaves_where_it_must_and_then_flies():
         _ = runs.multipliers
     which, when = np.nonzero(modes == 0)
     at = q[which, when], v[which, when], 0.0, {"alpha": alpha[which]}
-    given = jax.vmap(runs.system["rolling"].multipliers, (0, 0, None, 0))(*at)
+    given = jax.jit(jax.vmap(runs.system["rolling"].multipliers, (0, 0, None, 0)))(*at)
     expected = M * G / (1 + alpha) * ((3 + alpha) * np.cos(q[..., 1].T) - 2 * np.cos(theta))
     np.testing.assert_allclose(given["contact"], expected.T[which, when], atol=1e-10)
 
@@ -177,7 +177,7 @@ def test_bounces_that_pile_up_are_reported_and_never_fall_through(direction):
         {"flight": BALL}, [bounce], 1.0 + floor, 0.0, ts, {"e": e, "g": G, "floor": floor},
         max_transitions=200, throw=False,
     )  # fmt: skip
-    runs = jax.vmap(run)(floor, e)
+    runs = jax.jit(jax.vmap(run))(floor, e)
     assert (runs.result._value == lagjax.RESULTS.zeno._value).all() and not runs.ok.any()
     still = np.sqrt(2 / G) * (1 + 2 * e / (1 - e))
     np.testing.assert_allclose(runs.end.t, still, atol=1e-6)
@@ -408,7 +408,7 @@ def test_a_surface_crossed_twice_within_a_step(direction):
     run = lambda half, middle: hybrid(
         {"a": FREE, "b": FREE}, [lagjax.Transition("a", "b", band, direction)], params={"half": half, "middle": middle}
     )
-    found = jax.vmap(run)(half, middle).transitions
+    found = jax.jit(jax.vmap(run))(half, middle).transitions
     np.testing.assert_allclose(found.t[:, 0], middle + (half if direction > 0 else -half), rtol=1e-12)
     assert (found.count == 1).all()
 
@@ -432,7 +432,7 @@ def test_a_start_on_the_surface_does_not_fire(direction):
     q = jnp.array([0.0, 0.0, 1e-17, 1e-17, -1e-17, -1e-17, 0.0, 0.3, -0.3])
     v = jnp.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 0.0, 0.0])
     x = jnp.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1e-10, 0.3, -0.3])
-    found = jax.vmap(run)(q, v, x).transitions
+    found = jax.jit(jax.vmap(run))(q, v, x).transitions
     falls = v[:6] > 0  # at π
     fires = (direction == 0) | (falls == (direction < 0))
     assert found.count[:6].tolist() == fires.astype(int).tolist()
@@ -502,6 +502,7 @@ def test_every_member_switches_at_its_own_time_in_its_own_order():
     assert data["mode"].dims == ("member", "time") and (data["mode"].values == modes).all()
 
 
+@pytest.mark.slow
 def test_derivatives_through_different_modes_in_a_batch():
     x = jnp.array([[1.0, 4.0, 1.0], [9.0, 0.3, 0.7], [0.2, 25.0, 1.3]])
 

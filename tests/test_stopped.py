@@ -37,7 +37,10 @@ def names(result):
     return [next(n for n in NAMES if bool(r == getattr(lagjax.RESULTS, n)._value)) for r in np.asarray(result._value)]
 
 
-@pytest.mark.parametrize("solver", [None, diffrax.Tsit5()], ids=["machine code", "diffrax"])
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(None, id="machine code"), pytest.param(diffrax.Tsit5(), id="diffrax", marks=pytest.mark.slow)],
+)
 def test_members_are_named_by_what_stopped_them(solver):
     batch = lagjax.simulate_batch(SCENE, Q0, 0 * Q0, TS, PARAMS, batch_axes=(0, 0, 0), solver=solver, **BUDGET)
     assert names(batch.result) == list(NAMES)

@@ -45,11 +45,8 @@ def test_first_derivatives_by_the_state_parameters_and_times(mode):
     )
 
 
-SECOND = [pytest.param(*two, marks=() if two == ("forward", "reverse") else pytest.mark.slow)
-          for two in itertools.product(MODES, MODES)]  # fmt: skip
-
-
-@pytest.mark.parametrize("outer, inner", SECOND)
+@pytest.mark.slow  # by default, a hessian on a constraint, and `test_simulate` of a free motion
+@pytest.mark.parametrize("outer, inner", list(itertools.product(MODES, MODES)))
 def test_second_derivatives_in_every_order_of_modes(outer, inner):
     found = jax.jit(MODES[outer](MODES[inner](loss(followed))))(X)
     np.testing.assert_allclose(found, jax.hessian(loss(exact))(X), rtol=1e-9, atol=1e-9)
