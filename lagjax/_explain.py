@@ -53,13 +53,13 @@ class Explanation:
     dependent_constraints: dict[str, tuple[str, ...]] | None = field(default_factory=dict)
     projection_operations: int | None = None
 
-    def with_constraints(self, names: list[str], coupling: np.ndarray | None) -> "Explanation":
-        """The same with the names of constraints, and what depends on what where their `coupling` is known."""
+    def with_constraints(self, names: list[str], schur_complement: np.ndarray | None) -> "Explanation":
+        """This explanation with the names of constraints; where G M⁻¹ Gᵀ is known, with what depends on what."""
         dependent = None
-        if coupling is not None:
+        if schur_complement is not None:
             dependent = {
                 names[row]: tuple(name for name, factor in zip(names, factors, strict=True) if factor)
-                for row, factors in dependent_rows(coupling).items()
+                for row, factors in dependent_rows(schur_complement).items()
             }
         return replace(self, constraints=tuple(names), dependent_constraints=dependent)
 
