@@ -17,11 +17,15 @@ from lagjax._native._constants import (
     BISECTIONS,
     GOLDEN,
     GUARD_NOISE,
+    INSTANT,
     INTERVALS,
     JUMP,
     LITTLE,
+    NEAR_LEAST,
+    NOTICEABLE,
     SAMPLES,
     SECTIONS,
+    SMOOTH,
     TOUCHING,
 )
 from lagjax._native._frame import Frame
@@ -89,7 +93,7 @@ class Events:
         fresh = code.compare("==", frame["steps"], 0.0)
         with code.only_if(code.any_lane(fresh)):
             frame.call(self.guard, order, LITTLE * frame["h"])
-            instant = 16.0 * frame["smallest"]
+            instant = INSTANT * frame["smallest"]
             out = self.motion.evaluate_now(frame, self.line)
             for i in range(count):
                 value, rate, size, rate_size = out[i::count]
@@ -175,8 +179,8 @@ class Events:
                 for y in four[1:]:
                     highest, lowest = code.select(highest > y, highest, y), code.select(lowest < y, lowest, y)
                 far = code.intrinsic("fabs", between - cubic)
-                matters = (far > 0.01 * code.intrinsic("fabs", between)) & (far > frame["noise", i])
-                unseen = unseen | (matters & (far > 0.05 * (highest - lowest)))
+                matters = (far > NOTICEABLE * code.intrinsic("fabs", between)) & (far > frame["noise", i])
+                unseen = unseen | (matters & (far > SMOOTH * (highest - lowest)))
         return unseen
 
     # ---- the first change of one guard ----
@@ -234,7 +238,7 @@ class Events:
         before, here, after = sizes
         bend, tilt = before - 2.0 * here + after, after - before
         # The parabola through them comes down to half of the least, or so near that its error matters.
-        deep = (4.0 * bend * here < tilt * tilt) | (here < 0.02 * bend)
+        deep = (4.0 * bend * here < tilt * tilt) | (here < NEAR_LEAST * bend)
         return deep & (here > frame["noise", i]) & (here < before) & (here <= after)
 
     def _look_into_dip(self, frame: Frame, order, i: int, note, place, spacing, above, least, sizes) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._adjoint import Adjoint
-from lagjax._native._constants import DONE, LEAST_ORDER, MAX_ORDER
+from lagjax._native._constants import DONE, LEAST_ORDER, MAX_ORDER, VECTORS_PER_THREAD
 from lagjax._native._frame import LANE, Layout
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled
@@ -150,7 +150,7 @@ class Kernel:
         )  # fmt: skip
 
     def _threads(self, members: int) -> int:
-        return min(cores(), max(1, members // (4 * self.width)))
+        return min(cores(), max(1, members // (VECTORS_PER_THREAD * self.width)))
 
 
 class _Compiled:

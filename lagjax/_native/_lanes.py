@@ -5,13 +5,11 @@ from collections.abc import Callable
 from llvmlite import ir
 
 from lagjax._digits import COS, PI_2, PI_2_ROUNDED, SIN
+from lagjax._native._constants import LARGEST_ANGLE
 from lagjax._native._ir import BIT, Code, Value
 from lagjax._program._graph import Unlowerable
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._series import StraightLine
-
-# Beyond this an angle is left to the C library, which knows enough digits of π.
-LARGEST_ANGLE = 2.0**20
 
 
 def emit(code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos: Code | None) -> list[Value]:
