@@ -49,14 +49,14 @@ def test_every_operation_for_many_states_at_once_and_its_transpose():
     )
 
     weights = np.linspace(-1.0, 1.0, len(values))
-    pulled = program.pull_back_many(x, weights)
+    pulled = program.vjp_many(x, weights)
     exact = jax.jit(jax.vmap(jax.grad(lambda x, y: weights @ everything(x, y), argnums=(0, 1))))(*x)
     np.testing.assert_allclose(pulled, exact, rtol=1e-12, atol=1e-13)
     # As a straight line of its own.
     transposed = pullback(program.line, program.dtypes, [0, 1], range(len(weights)))
     np.testing.assert_allclose(evaluate(transposed, [*x, *weights]), exact, rtol=1e-12, atol=1e-13)
     # Of many outputs at one state: cotangents side by side.
-    rows = program.pull_back_many(x[:, 3], np.eye(len(weights)))
+    rows = program.vjp_many(x[:, 3], np.eye(len(weights)))
     np.testing.assert_allclose(np.stack(rows) @ weights, [column[3] for column in pulled], rtol=1e-12, atol=1e-13)
 
 

@@ -237,7 +237,7 @@ def _program_variation(derivation: Derivation, state, acceleration, multipliers)
     cotangents += [unit[n + k] * acceleration[i] - unit[i] * multipliers[k] for k in range(m) for i in range(n)]
     cotangents += [-unit[i] for i in range(n + m)]
     program = derivation.program("mass_matrix", "jacobian", "force", "gamma")
-    derivatives = program.pull_back_many([*q, *v, t, *numbers], cotangents)[: 2 * n]
+    derivatives = program.vjp_many([*q, *v, t, *numbers], cotangents)[: 2 * n]
     return np.stack([np.zeros(n + m) if bar is None else np.broadcast_to(bar, n + m) for bar in derivatives], axis=1)
 
 

@@ -140,7 +140,7 @@ class Law(NamedTuple):
         count = max(np.size(x) for x in columns)
 
         def finite_at(*part):
-            bars = [bar for bar in program.pull_back_many(part, [1.0] * len(program.outputs)) if bar is not None]
+            bars = [bar for bar in program.vjp_many(part, [1.0] * len(program.outputs)) if bar is not None]
             finite = np.all([np.isfinite(np.broadcast_to(bar, part[0].shape)) for bar in bars], axis=0)
             return np.broadcast_to(finite, part[0].shape)
 

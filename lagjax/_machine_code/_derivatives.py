@@ -99,7 +99,7 @@ def _vjp_over_steps(
     def back(store: StepStore, tickets, places):
         for steps, some, members in store.runs(tickets):
             rows = places[some]
-            y_ct[rows], params_ct[rows] = steps.kernel.pull(
+            y_ct[rows], params_ct[rows] = steps.kernel.vjp(
                 ts if len(ts) == 1 else ts[rows], params[rows], steps.table, steps.first[members],
                 steps.counts[members], path_ct[rows], end_ct[rows], steps.order,
             )  # fmt: skip

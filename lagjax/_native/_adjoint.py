@@ -1,12 +1,12 @@
 """The reverse-mode derivative of a batch of motions: the transpose of every step, from the last to the first.
 
-A step y(t + h) = Σ yₖ hᵏ is a straight line of arithmetic from the state y₀ and the parameters: the series of `start`,
-the sums of `products` and the `sweep` of each order. Its transpose takes a cotangent λ of the state at the end of the
+A step y(t + h) = Σ yₖ hᵏ is a straight line of arithmetic from the state y₀ and the parameters: the zeroth order, and
+the Cauchy products and the recursion of each order. Its transpose takes a cotangent λ of the state at the end of the
 step to one at its beginning, and adds to the cotangents of the parameters:
 
     seed           ȳₖ = hᵏ λ, and sᵏ times the cotangent of every output within the step, at t + s
-    orders         from the last to the first: the transposes of the sums, then of the sweep
-    start          the transpose of the acceleration and of what the sweep reads off it
+    orders         from the last to the first: the transposes of the Cauchy products, then of the recursion
+    zeroth order   the transpose of the acceleration and of what the recursion reads off it
     λ              is ȳ₀ then
 
 Every number it takes is one of the step itself, so the series is made once more from the recorded state. The cost is
@@ -24,10 +24,10 @@ from lagjax._native._series import Motion, double
 from lagjax._program._series import Recurrent, Series
 from lagjax._program._transpose import pullback
 
-# `y_bar` is the cotangent of the end, and becomes that of the start.
+# `y_ct` is the cotangent of the end, and becomes that of the start.
 JOB = job(
     "AdjointJob",
-    ("next_member", "ts", "params", "record", "first_step", "steps", "path_bar", "y_bar", "params_bar"),
+    ("next_member", "ts", "params", "record", "first_step", "steps", "path_ct", "y_ct", "params_ct"),
     ("ts_stride", "params_stride", "members", "times", "order"),
 )
 
@@ -40,20 +40,20 @@ class Adjoint:
     def __init__(self, program: Recurrent, series: Series, projection=None):
         n, states = series.size, 2 * series.size
         fields = {
-            "bar": states,  # the cotangent of the state
-            "y_bar": (states, MAX_ORDER + 1),  # those of its coefficients
-            "rows_bar": series.rows,
-            "values_bar": series.values,
-            "params_bar": program.size - states - 1,
+            "state_ct": states,  # the cotangent of the state
+            "y_ct": (states, MAX_ORDER + 1),  # those of its coefficients
+            "rows_ct": series.rows,
+            "values_ct": series.values,
+            "params_ct": program.size - states - 1,
             "active": 1,
         }
         self.motion = Motion("adjoint", program, series, JOB, fields, keep_sums=True)
         self.n, self.states, self.series = n, states, series
         dtypes = program.dtypes
         self.varied = [i for i, dtype in enumerate(dtypes) if dtype.kind == "f" and i != states]  # all but the time
-        self.start_line, self.sweep_line = self._transposed(dtypes)
+        self.zeroth_order, self.order_recursion = self._transposed(dtypes)
         self.start_next = self._start_next()
-        steps = [self._seed(), self._back_orders(self._back_sums(), self._back_sweep()), self._back_start()]
+        steps = [self._seed(), self._back_orders(self._back_sums(), self._back_recursion()), self._back_start()]
         if projection is not None:
             self.projection_line = pullback(projection.state.line, dtypes, self.varied, range(states))
             steps.insert(0, self._back_projection())
@@ -61,13 +61,13 @@ class Adjoint:
         self._run(steps)
 
     def _transposed(self, dtypes):
-        """The transposes of `start` and of the sweep."""
+        """The transposes of the zeroth order and of the order recursion."""
         series, n = self.series, self.n
         outputs = [*range(n), *range(n + 1, n + 1 + series.values)]
-        start = pullback(series.start, dtypes, self.varied, outputs)
-        first, read = self.states + 3, series.values + len(series.products)
+        zeroth = pullback(series.zeroth_order, dtypes, self.varied, outputs)
+        first, read = self.states + 3, series.values + len(series.cauchy_products)
         by, rows = [*range(self.states), *range(first, first + read)], range(n, n + series.rows)
-        return start, pullback(series.sweep, [dtypes[0]] * (first + read), by, range(n + series.rows), rows)
+        return zeroth, pullback(series.order_recursion, [dtypes[0]] * (first + read), by, range(n + series.rows), rows)
 
     # ---- rounds ----
 
@@ -115,10 +115,10 @@ class Adjoint:
         lane["output"] = frame.job("times") - 2
         with code.only_if(there):
             for i in range(self.states):
-                lane["bar", i] = frame.read("y_bar", member * self.states + i)
+                lane["state_ct", i] = frame.read("y_ct", member * self.states + i)
             with code.loop(self.motion.numbers) as i:
                 lane["params", i] = frame.read("params", member * frame.job("params_stride") + i)
-                lane["params_bar", i] = 0.0
+                lane["params_ct", i] = 0.0
         return frame.finish()
 
     def _recall(self, frame: Frame, lane: Lane) -> None:
@@ -139,9 +139,9 @@ class Adjoint:
             lane["step"] = left
             with code.only_if(left < 0):
                 for i in range(self.states):
-                    frame.write("y_bar", member * self.states + i, lane["bar", i])
+                    frame.write("y_ct", member * self.states + i, lane["state_ct", i])
                 with code.loop(self.motion.numbers) as i:
-                    frame.write("params_bar", member * self.motion.numbers + i, lane["params_bar", i])
+                    frame.write("params_ct", member * self.motion.numbers + i, lane["params_ct", i])
                 frame.call(self.start_next, index)
 
     # ---- the transpose of a step ----
@@ -151,11 +151,11 @@ class Adjoint:
         frame = self.motion.function("seed")
         code, h, power = frame.code, frame["h"], frame.code.variable(frame.constant(1.0))
         for i in range(self.series.values):
-            frame["values_bar", i] = 0.0
+            frame["values_ct", i] = 0.0
         with code.loop(frame.job("order") + 1) as k:
             now = code.load(power, frame.vector)
             for i in range(self.states):
-                frame["y_bar", i, k] = frame["bar", i] * now
+                frame["y_ct", i, k] = frame["state_ct", i] * now
             code.store(now * h, power)
         with code.loop(self.motion.width) as j:
             self._seed_outputs(frame, frame.lane(j))
@@ -175,21 +175,21 @@ class Adjoint:
             index = lane["output"]
             s, power = frame.time(member, index) - t, code.variable(double(code, 1.0))
             row = (member * frame.job("times") + index) * self.states
-            bars = [frame.read("path_bar", row + i) for i in range(self.states)]
+            cotangents = [frame.read("path_ct", row + i) for i in range(self.states)]
             with code.loop(frame.job("order") + 1) as k:
                 now = code.load(power, DOUBLE)
-                for i, bar in enumerate(bars):
-                    lane["y_bar", i, k] = lane["y_bar", i, k] + bar * now
+                for i, cotangent in enumerate(cotangents):
+                    lane["y_ct", i, k] = lane["y_ct", i, k] + cotangent * now
                 code.store(now * s, power)
             lane["output"] = index - 1
 
-    def _back_orders(self, back_sums: Code, back_sweep: Code) -> Code:
-        """From the last order to the first: the transposes of the sums, then of the sweep."""
+    def _back_orders(self, back_sums: Code, back_recursion: Code) -> Code:
+        """From the last order to the first: the transposes of the Cauchy products, then of the recursion."""
         frame = self.motion.function("back_orders")
         order = frame.job("order")
         with frame.code.loop(order, start=1) as i:
             frame.call(back_sums, order - i, order)
-            frame.call(back_sweep, order - i)
+            frame.call(back_recursion, order - i)
         return frame.finish()
 
     def _back_sums(self) -> Code:
@@ -197,8 +197,8 @@ class Adjoint:
         frame = self.motion.function("back_sums", INTEGER, INTEGER)
         code, (k, order) = frame.code, frame.arguments
         for i in range(self.series.rows):
-            frame["rows_bar", i] = 0.0
-        kinds = [[p for p in self.series.products if (p[0] == p[1]) == square] for square in (False, True)]
+            frame["rows_ct", i] = 0.0
+        kinds = [[p for p in self.series.cauchy_products if (p[0] == p[1]) == square] for square in (False, True)]
         tables = [self.motion.table(f"back{len(pairs)}_{square}", pairs) for square, pairs in enumerate(kinds)]
         end = code.function.append_basic_block("end")
         switch = code.builder.switch((order - 1 - k).it, end)
@@ -216,65 +216,65 @@ class Adjoint:
 
     def _back_sum(self, frame: Frame, table, i: Value, first: int, k: Value, terms: int) -> None:
         """s = Σ' aⱼ bₖ₋ⱼ at orders k + 1, …: its cotangent times b is one of a, and times a one of b."""
-        code, width, products = frame.code, self.motion.width, len(self.series.products)
+        code, width, products = frame.code, self.motion.width, len(self.series.cauchy_products)
         # The cotangents of higher orders lie where the sums themselves were.
-        bars = frame.address("sums", *self.motion.sum_indices(i + first, k))
+        cotangents = frame.address("sums", *self.motion.sum_indices(i + first, k))
         offsets = [code.load(code.element(Value(code, table), i * 2 + which, INTEGER), INTEGER) for which in range(2)]
         rows = [code.element(frame.address("rows"), offset) for offset in offsets]
         totals: list = [None, None]
         for j in range(1, terms + 1):
-            bar = code.load(code.element(bars, j * products * width), frame.vector)
+            cotangent = code.load(code.element(cotangents, j * products * width), frame.vector)
             for which in range(2):
-                term = bar * code.load(code.element(rows[1 - which], j * width), frame.vector)
+                term = cotangent * code.load(code.element(rows[1 - which], j * width), frame.vector)
                 totals[which] = term if totals[which] is None else term + totals[which]
         for offset, total in zip(offsets, totals, strict=True):  # a square gets the same twice
-            address = code.element(frame.address("rows_bar"), offset / MAX_ORDER)
+            address = code.element(frame.address("rows_ct"), offset / MAX_ORDER)
             code.store(code.load(address, frame.vector) + total, address)
 
-    def _back_sweep(self) -> Code:
+    def _back_recursion(self) -> Code:
         """`(k)`: from the cotangents of order k + 1, and of the rows, to those of order k and of the sums.
 
         Those of the sums take the place of the sums, which nobody reads again: all of it fits into the first cache.
         """
-        frame = self.motion.function("back_sweep", INTEGER)
+        frame = self.motion.function("back_recursion", INTEGER)
         code, (k,), n, series = frame.code, frame.arguments, self.n, self.series
         inverse = 1.0 / code.as_double(k + 1)
         for i in range(n):  # q̇ₖ = (k+1) qₖ₊₁
-            _add(frame, frame["y_bar", i, k + 1] * inverse, "y_bar", n + i, k)
-        forward, read = self.states + 3 + series.values + len(series.products), self.motion.at_order(frame, k)
+            _add(frame, frame["y_ct", i, k + 1] * inverse, "y_ct", n + i, k)
+        forward, read = self.states + 3 + series.values + len(series.cauchy_products), self.motion.at_order(frame, k)
 
         def inputs(i):
             if i < forward:
                 return read(i)
             if i < forward + n:
-                return frame["y_bar", n + (i - forward), k + 1] * inverse
+                return frame["y_ct", n + (i - forward), k + 1] * inverse
             i -= forward + n
-            return frame["rows_bar", i] if i < series.rows else frame["rows", i - series.rows, k]
+            return frame["rows_ct", i] if i < series.rows else frame["rows", i - series.rows, k]
 
-        out = emit(code, self.sweep_line, inputs, None)
+        out = emit(code, self.order_recursion, inputs, None)
         for i, x in enumerate(out[: self.states]):
-            _add(frame, x, "y_bar", i, k)
+            _add(frame, x, "y_ct", i, k)
         for i, x in enumerate(out[self.states :][: series.values]):
-            _add(frame, x, "values_bar", i)
+            _add(frame, x, "values_ct", i)
         for i, x in enumerate(out[self.states + series.values :]):
             frame["sums", *self.motion.sum_indices(i, k)] = x
         return frame.finish()
 
     def _back_start(self) -> Code:
-        """From the cotangents of the first orders, and of what the sweep read, to that of the state."""
+        """From the cotangents of the first orders, and of what the recursion read, to that of the state."""
         frame = self.motion.function("back_start")
         n, now, size = self.n, self.motion.now(frame), self.motion.program.size
         for i in range(n):
-            _add(frame, frame["y_bar", i, 1], "y_bar", n + i, 0)
+            _add(frame, frame["y_ct", i, 1], "y_ct", n + i, 0)
 
         def inputs(i):
             if i < size:
                 return now(i)
             i -= size
-            return frame["y_bar", n + i, 1] if i < n else frame["values_bar", i - n]
+            return frame["y_ct", n + i, 1] if i < n else frame["values_ct", i - n]
 
-        out = emit(frame.code, self.start_line, inputs, self.motion.sincos)
-        self._store(frame, [frame["y_bar", i, 0] + x if i < self.states else x for i, x in self._by_input(out)])
+        out = emit(frame.code, self.zeroth_order, inputs, self.motion.sincos)
+        self._store(frame, [frame["y_ct", i, 0] + x if i < self.states else x for i, x in self._by_input(out)])
         return frame.finish()
 
     def _back_projection(self) -> Code:
@@ -288,7 +288,7 @@ class Adjoint:
                 return moved[i]
             if i < size:
                 return now(i) + h if i == self.states else now(i)
-            return frame["bar", i - size]
+            return frame["state_ct", i - size]
 
         self._store(frame, emit(frame.code, self.projection_line, inputs, self.motion.sincos))
         return frame.finish()
@@ -300,9 +300,9 @@ class Adjoint:
         """The cotangent of the state takes the place of the one before; those of the parameters add up."""
         for i, x in self._by_input(cotangents):
             if i < self.states:
-                frame["bar", i] = x
+                frame["state_ct", i] = x
             else:
-                _add(frame, x, "params_bar", i - self.states - 1)
+                _add(frame, x, "params_ct", i - self.states - 1)
 
 
 def _add(frame: Frame, x: Value, name: str, *indices: Index) -> None:

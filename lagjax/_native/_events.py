@@ -194,30 +194,30 @@ class Events:
         code, h = frame.code, frame["h"]
         moving, spacing = code.compare("!=", h, 0.0), h * (1.0 / INTERVALS)
         begin, zero = frame["side", i], frame.constant(0.0)
-        found = _Change(*(code.variable(x) for x in (begin, zero, zero, zero)))
-        note = self._noter(frame, found, moving, direction)
+        first = _Change(*(code.variable(x) for x in (begin, zero, zero, zero)))
+        note = self._noter(frame, first, moving, direction)
         with code.loop(INTERVALS + 1) as k:
             place = code.lanes_of(code.as_double(k))
             before, here, after = (frame["samples", i, k + j] for j in range(3))
-            sign = code.load(found.side, frame.vector)
+            sign = code.load(first.side, frame.vector)
             above = sign > 0.0
             sizes = [code.select(above, x, 0.0 - x) for x in (before, here, after)]
             sided = above | (sign < 0.0)
-            least = sided & self._dips(frame, i, sizes) & moving & (code.load(found.kind, frame.vector) <= 0.0)
+            least = sided & self._dips(frame, i, sizes) & moving & (code.load(first.kind, frame.vector) <= 0.0)
             self._look_into_dip(frame, order, i, note, place, spacing, above, least, sizes)
             inside = place < float(INTERVALS)
             crosses = inside & ((above & (after < 0.0)) | (sided & ~above & (after > 0.0)))
             note(crosses, above, place * spacing, (place + 1.0) * spacing)
             passed = inside & (code.intrinsic("fabs", after) > 0.0)  # a zero, or a NaN, is on no side
-            code.store(code.select(passed, after, sign), found.side)
-        frame["side", i] = code.load(found.side, frame.vector)
-        kind = code.load(found.kind, frame.vector)
+            code.store(code.select(passed, after, sign), first.side)
+        frame["side", i] = code.load(first.side, frame.vector)
+        kind = code.load(first.kind, frame.vector)
         frame["change", i] = kind
         with code.only_if(code.any_lane(kind > 0.0)):
-            low, high = code.load(found.low, frame.vector), code.load(found.high, frame.vector)
+            low, high = code.load(first.low, frame.vector), code.load(first.high, frame.vector)
             frame["root", i] = self._root(frame, order, i, low, high, kind)
 
-    def _noter(self, frame: Frame, found: _Change, moving: Value, direction: int) -> Callable:
+    def _noter(self, frame: Frame, first: _Change, moving: Value, direction: int) -> Callable:
         """`(where, falls, start, end)`: note a change between two times, if it is the first and of that direction.
 
         `falls` where the sign before is positive.
@@ -226,9 +226,9 @@ class Events:
 
         def note(where: Value, falls: Value, start: Value, end: Value) -> None:
             allowed = falls if direction < 0 else ~falls if direction > 0 else frame.constant(0.0) <= 0.0
-            new = where & allowed & (code.load(found.kind, frame.vector) <= 0.0) & moving
+            new = where & allowed & (code.load(first.kind, frame.vector) <= 0.0) & moving
             kind = code.select(falls, frame.constant(1), 2.0)
-            for variable, value in ((found.low, start), (found.high, end), (found.kind, kind)):
+            for variable, value in ((first.low, start), (first.high, end), (first.kind, kind)):
                 code.store(code.select(new, value, code.load(variable, frame.vector)), variable)
 
         return note

@@ -78,11 +78,11 @@ class Frame:
         self.code.store(self.code.lanes_of(value), self.address(*_parts(key)))
 
     def address(self, name: str, *indices: Index) -> Value:
-        """Where a vector begins."""
+        """The address of a vector."""
         return self.code.element(self._memory, self.layout.place(name, *indices))
 
     def constant(self, x: float) -> Value:
-        """The same number in every lane."""
+        """A vector with one number in every lane."""
         return self.code.lanes_of(x)
 
     def lane(self, index: Value) -> "Lane":
@@ -141,7 +141,7 @@ class Lane:
         self._frame.code.store(value, self.address(name, *indices))
 
     def address(self, name: str, *indices: Index) -> Value:
-        """Where a number of the lane lies."""
+        """The address of a number of the lane."""
         frame = self._frame
         if name in LANE:
             return frame.code.element(frame._integers, self._index + LANE.index(name) * frame.width, INTEGER)

@@ -55,7 +55,7 @@ _LARGE = 2**20
 
 
 def _machine(level: int) -> llvm.TargetMachine:
-    """This processor. Not kept: the engine that is given it owns it, and frees it in the end."""
+    """This processor, anew for each engine: an engine owns its target machine, and frees it in the end."""
     return _target().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=level
     )
@@ -184,7 +184,7 @@ class Code:
         return ir.Constant(like, int(x) if isinstance(like, ir.IntType) else float(x))
 
     def lanes_of(self, x) -> Value:
-        """The same double in every lane."""
+        """A vector with one double in every lane."""
         return self.as_value(x, self.vector)
 
     def arithmetic(self, op: str, a, b) -> Value:
@@ -248,11 +248,11 @@ class Code:
         return Value(self, self.builder.gep(base.it, [index.it], source_etype=kind))
 
     def load(self, address: Value, kind: ir.Type) -> Value:
-        """What lies there."""
+        """The number or vector at an address."""
         return Value(self, self.builder.load(address.it, typ=kind, align=self._alignment(kind)))
 
     def store(self, x: Value, address: Value) -> None:
-        """Put it there."""
+        """Write a number or vector to an address."""
         self.builder.store(x.it, address.it, align=self._alignment(x.it.type))
 
     def variable(self, start: Value) -> Value:

@@ -92,7 +92,7 @@ class Kernel:
         """The motions from the states `y0` (N, 2n), all arrays of float64.
 
         `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. With `room` (N,)
-        up to so many steps of each member are written down, for `pull`.
+        up to so many steps of each member are written down, for `vjp`.
         """
         ts, y0, params = _contiguous(ts, y0, params)
         members, times = len(y0), ts.shape[1]
@@ -119,24 +119,24 @@ class Kernel:
         code, steps, rejected = (counts.astype(int) for counts in (code, steps, rejected))
         return Outcome(path, y_end, t_end, code, steps, rejected, idle, table)
 
-    def pull(self, ts, params, table, first, counts, path_bar, y_bar, order: int) -> tuple[np.ndarray, np.ndarray]:
+    def vjp(self, ts, params, table, first, counts, path_ct, y_ct, order: int) -> tuple[np.ndarray, np.ndarray]:
         """The transposed derivative of a run, over the steps it wrote down.
 
         The steps of member k are `counts[k]` rows of `table` from `first[k]` on. From the cotangents of the outputs,
-        `path_bar` (N, T, 2n), of which the first and the last are not looked at, and of the states at the end, `y_bar`
+        `path_ct` (N, T, 2n), of which the first and the last are not looked at, and of the states at the end, `y_ct`
         (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P).
         """
-        ts, params, path_bar, table = _contiguous(ts, params, path_bar, table)
+        ts, params, path_ct, table = _contiguous(ts, params, path_ct, table)
         first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
-        y_bar, params_bar = np.array(y_bar, np.float64, order="C"), np.zeros((len(y_bar), self.numbers))
+        y_ct, params_ct = np.array(y_ct, np.float64, order="C"), np.zeros((len(y_ct), self.numbers))
         arrays = dict(
             next_member=np.zeros(1, np.int64), ts=ts, params=params, record=table, first_step=first, steps=counts,
-            path_bar=path_bar, y_bar=y_bar, params_bar=params_bar,
+            path_ct=path_ct, y_ct=y_ct, params_ct=params_ct,
         )  # fmt: skip
-        members, times = path_bar.shape[:2]
+        members, times = path_ct.shape[:2]
         numbers = dict(**self._strides(ts, params), members=members, times=times, order=order)
         self._backward(arrays, numbers, self._threads(members))
-        return y_bar, params_bar
+        return y_ct, params_ct
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":

@@ -41,12 +41,12 @@ class Motion:
         self.coefficients = self._coefficients_function()
 
     def _fields(self) -> dict:
-        series, products = self.series, len(self.series.products)
+        series, products = self.series, len(self.series.cauchy_products)
         return {
             "y": (self.states, MAX_ORDER + 1),  # the series of the state, component by component
             "rows": (series.rows, MAX_ORDER),  # the series that the Cauchy products are made of
             "sums": (MAX_ORDER if self.keep_sums else 1, products),
-            "values": series.values,  # what the sweep reads of the zeroth order
+            "values": series.values,  # what the order recursion reads of the zeroth order
             "params": self.numbers,
             **dict.fromkeys(("t", "h", "singular"), 1),
         }
@@ -65,8 +65,8 @@ class Motion:
         """`(k)`: Σ' aⱼ bₖ₋ⱼ for every product, 0 < j < k."""
         frame = self.function("sums", INTEGER)
         code, (k,) = frame.code, frame.arguments
-        mixed = [pair for pair in self.series.products if pair[0] != pair[1]]
-        squares = [(a,) for a, b in self.series.products if a == b]
+        mixed = [pair for pair in self.series.cauchy_products if pair[0] != pair[1]]
+        squares = [(a,) for a, b in self.series.cauchy_products if a == b]
         kinds = [("mixed", mixed, 0, _mixed_sum), ("squares", squares, len(mixed), _square_sum)]
         tables = {name: self.table(name, pairs) for name, pairs, _, _ in kinds}
         end = code.function.append_basic_block("end")
@@ -107,21 +107,21 @@ class Motion:
         """`(order)`: the series of the state, to that order, from its values."""
         frame = self.function("coefficients", INTEGER)
         code, (order,), series, n = frame.code, frame.arguments, self.series, self.n
-        *acceleration, singular = (out := emit(code, series.start, self.now(frame), self.sincos))[: n + 1]
+        *acceleration, singular = (out := emit(code, series.zeroth_order, self.now(frame), self.sincos))[: n + 1]
         frame["singular"] = code.as_double(singular)
         for i in range(n):
             frame["y", i, 1] = frame["y", n + i]
             frame["y", n + i, 1] = acceleration[i]
         for i, value in enumerate(out[n + 1 :]):
             frame["values", i] = value
-        for i in range(len(series.products)):
+        for i in range(len(series.cauchy_products)):
             frame["sums", *self.sum_indices(i, integer(code, 1))] = 0.0
 
         with code.loop(order, start=1) as k:
             with code.only_if(k > 1):
                 frame.call(self._sums, k)
             inverse = 1.0 / code.as_double(k + 1)
-            out = emit(code, series.sweep, self.at_order(frame, k), None)
+            out = emit(code, series.order_recursion, self.at_order(frame, k), None)
             for row, value in enumerate(out[n:]):
                 frame["rows", row, k] = value
             for i in range(n):
@@ -140,7 +140,7 @@ class Motion:
         return read
 
     def at_order(self, frame: Frame, k: Value) -> Callable[[int], Value]:
-        """The inputs of the sweep: the coefficients of order k, k, 1/k, the values and the sums."""
+        """The inputs of the order recursion: the coefficients of order k, k, 1/k, the values and the sums."""
         code = frame.code
         time, order, inverse, first = range(self.states, self.states + 4)
 

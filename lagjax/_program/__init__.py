@@ -36,10 +36,10 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from lagjax._program._emit import emit, in_jax, plain_elementary
-from lagjax._program._evaluate import evaluate, pull_back, round_off, steps_of
+from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import Node, Unlowerable
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._passes import finish, live, regroup
+from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
 from lagjax._program._rules import Expansion, kind_of
 from lagjax._program._series import Series, StraightLine, series
 from lagjax._program._transpose import pullback
@@ -84,7 +84,7 @@ def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], 
     with np.errstate(all="ignore"):
         results = expansion.run_closed(traced, arguments)
     outputs = [i for result in results for i in result.ravel().tolist()]
-    nodes, kinds, outputs = finish(*regroup(expansion.graph, outputs))
+    nodes, kinds, outputs = eliminate_dead_code(*sink_negations(*factor(expansion.graph, outputs)))
     return Program(nodes, kinds, outputs, expansion.traced_operations, function, shapes, budget)
 
 
@@ -212,13 +212,13 @@ class Program:
         """How far rounding may move every output at S states, shape (outputs, S), to first order."""
         return round_off(self.line, columns)
 
-    def pull_back_many(self, columns, cotangents) -> list:
+    def vjp_many(self, columns, cotangents) -> list:
         """Σₖ cotangentₖ ∂outputₖ/∂input for every input, in NumPy; None where nothing flows to an input.
 
         Of the operations as they stand here, without the user's own rules for derivatives. All of the values are kept
         in between: some hundred states at once are enough.
         """
-        return pull_back(self.line, columns, cotangents)
+        return vjp(self.line, columns, cotangents)
 
     def only(self, positions: Sequence[int], function: Callable) -> "Program":
         """The program of some of the outputs; `function` is the JAX function that gives just these, leaf by leaf."""

@@ -118,7 +118,7 @@ def round_off(line, columns: Sequence) -> np.ndarray:
 # ---- the transposed derivative ---------------------------------------------------------------------------------------
 
 
-def pull_back(line, columns: Sequence, cotangents: Sequence) -> list:
+def vjp(line, columns: Sequence, cotangents: Sequence) -> list:
     """Σ cotangentₖ ∂outputₖ/∂input for every input, each a number or of shape (S,); None where nothing flows there.
 
     It is the derivative of this straight line of operations, in reverse as JAX would take it: NaN where a branch that
@@ -128,20 +128,25 @@ def pull_back(line, columns: Sequence, cotangents: Sequence) -> list:
     (nodes, kinds, outputs), (columns, precision, _) = line, _prepared(line, columns)
     with np.errstate(all="ignore"):
         values = _values(steps_of((nodes, kinds, range(len(nodes))), precision), columns)
-        bars: list = [None] * len(nodes)
-        for i, bar in zip(outputs, cotangents, strict=True):
-            _flow(bars, kinds, i, bar)
+        of_nodes: list = [None] * len(nodes)
+        for i, part in zip(outputs, cotangents, strict=True):
+            _add(of_nodes, kinds, i, part)
         inputs: list = [None] * len(columns)
         for k in range(len(nodes) - 1, -1, -1):
             op, operands, attribute = nodes[k]
-            if bars[k] is None:
+            if of_nodes[k] is None:
                 continue
             if op == "input":
-                inputs[attribute] = bars[k]
+                inputs[attribute] = of_nodes[k]
             for i, partial in zip(operands, _transpose(op), strict=False):
                 if partial is not None and kinds[i] == "float" and nodes[i][0] != "constant":
-                    _flow(bars, kinds, i, partial(in_numpy, float, bars[k], values[k], *(values[j] for j in operands)))
-            bars[k] = None
+                    _add(
+                        of_nodes,
+                        kinds,
+                        i,
+                        partial(in_numpy, float, of_nodes[k], values[k], *(values[j] for j in operands)),
+                    )
+            of_nodes[k] = None
     return inputs
 
 
@@ -149,6 +154,7 @@ def _transpose(op: str) -> tuple:
     return () if op in ("input", "constant") else OPERATIONS[op].transpose()
 
 
-def _flow(bars: list, kinds, i: int, bar) -> None:
-    if bar is not None and kinds[i] == "float":
-        bars[i] = bar if bars[i] is None else bars[i] + bar
+def _add(cotangents: list, kinds, i: int, part) -> None:
+    """Add to the cotangent of node i, which is None as long as nothing flows there."""
+    if part is not None and kinds[i] == "float":
+        cotangents[i] = part if cotangents[i] is None else cotangents[i] + part

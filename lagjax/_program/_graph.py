@@ -10,7 +10,7 @@ Constants are folded in float64.
 What may change in the last digits: constants multiply out (`2*(3*x)` is `6*x`); products of the same factors are one
 product, and sums of the same terms one sum, in whatever order they were written; like terms are collected where that
 shortens a sum (`x + x` is `2*x`, `x - x` is 0); `sin(x)**2 + cos(x)**2` is 1; half-integer powers become roots. Nothing
-is multiplied out (but `_passes.regroup` draws out common factors), and a quotient stays one unless its divisor is a
+is multiplied out (but `_passes.factor` draws out common factors), and a quotient stays one unless its divisor is a
 power of two.
 
 A zero found here is *structural*: `0*x` is 0 whatever `x` will be, so an infinity or NaN it would have met is not seen;
@@ -67,8 +67,8 @@ class Graph:
         if OPERATIONS[op].commutative and operands[0] > operands[1]:
             operands = operands[::-1]
         key = (op, operands, attribute)
-        if (found := self._ids.get(key)) is not None:
-            return found
+        if (node := self._ids.get(key)) is not None:
+            return node
         self._operations += 1
         if self._operations > self.budget:
             raise Unlowerable(f"the function takes more than the {self.budget} scalar operations allowed by `budget`")
@@ -83,8 +83,8 @@ class Graph:
         if value != value:
             value = math.nan  # one object, so that the key below equals itself
         key = (kind, value, math.copysign(1.0, value))  # 0.0 and -0.0 are equal but not the same
-        if (found := self._ids.get(key)) is not None:
-            return found
+        if (node := self._ids.get(key)) is not None:
+            return node
         return self._append(key, ("constant", (), value), kind)
 
     def find(self, op: str, *operands: int) -> int | None:
@@ -149,10 +149,10 @@ class Graph:
         factors = tuple(sorted(self._factors.get(a, (a,)) + self._factors.get(b, (b,))))
         if len(factors) > LONGEST:
             return self.node("mul", a, b)
-        if (found := self._products.get(factors)) is None:
-            found = self._products[factors] = self.node("mul", a, b)
-            self._factors[found] = factors
-        return found
+        if (product := self._products.get(factors)) is None:
+            product = self._products[factors] = self.node("mul", a, b)
+            self._factors[product] = factors
+        return product
 
     def terms(self, i: int) -> dict[int, float]:
         """A sum as {base: coefficient}; a number is a multiple of 1."""
@@ -190,10 +190,10 @@ class Graph:
 
     def _known_sum(self, terms: dict[int, float], a: int, b: int, sign: int) -> int:
         """`a + sign*b`, which is the sum of `terms`: an earlier node, or its negative, if there is one."""
-        if (found := self._sums.get(frozenset(terms.items()))) is not None:
-            return found
-        if (found := self._sums.get(frozenset((x, -c) for x, c in terms.items()))) is not None:
-            return self.apply("neg", found)
+        if (total := self._sums.get(frozenset(terms.items()))) is not None:
+            return total
+        if (negative := self._sums.get(frozenset((x, -c) for x, c in terms.items()))) is not None:
+            return self.apply("neg", negative)
         coefficient, base = self.term(self._signed_sum(a, b, sign))
         self._terms[base] = {x: coefficient * c for x, c in terms.items()}
         self._sums[frozenset(self._terms[base].items())] = base

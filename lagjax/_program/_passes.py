@@ -6,28 +6,25 @@ from collections.abc import Callable
 
 from lagjax._program._graph import LONGEST, Graph, Node
 
-
-def finish(graph: Graph, outputs: list[int]) -> tuple[tuple[Node, ...], tuple[str, ...], tuple[int, ...]]:
-    """Nodes, kinds and outputs of what the outputs depend on, in its final form and order."""
-    return _compact(*_turn_signs(graph, outputs))
+Line = tuple[tuple[Node, ...], tuple[str, ...], tuple[int, ...]]  # nodes, kinds and outputs
 
 
-def regroup(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
-    """The same with squares formed first, and with the common factor of a sum drawn out of it.
+def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
+    """The graph with squares formed first in every product, and with the common factor of a sum drawn out of it.
 
-    Both only where the products that they replace have no other use, so that no operation is added: x(x y) becomes
-    x² y, and x y + x z becomes x (y + z). What has become equal by that is shared, sin² + cos² too.
+    Both happen only where the products that they replace have no other use, so that no operation is added: x(x y)
+    becomes x² y, and x y + x z becomes x (y + z). What has become equal by that is shared, sin² + cos² too.
     """
     uses = _uses(graph, outputs)
 
     def node_of(new, i, moved):
         op, operands, attribute = graph.nodes[i]
-        given, found = [moved[x] for x in operands], None
+        xs, simpler = [moved[x] for x in operands], None
         if graph.kinds[i] == "float" and op == "mul":
-            found = _square_first(new, [moved[x] for x in _factors(graph, uses, i)])
+            simpler = _square_first(new, [moved[x] for x in _factors(graph, uses, i)])
         elif graph.kinds[i] == "float" and op in ("add", "sub") and 1 in (uses[x] for x in operands):
-            found = _common_factor(new, op, *given)
-        return new.apply(op, *given, attribute=attribute) if found is None else found
+            simpler = _common_factor(new, op, *xs)
+        return new.apply(op, *xs, attribute=attribute) if simpler is None else simpler
 
     return _rebuilt(graph, outputs, uses, node_of)
 
@@ -83,8 +80,8 @@ def _common_factor(graph, op, a, b) -> int | None:
     return graph.apply("mul", common, graph.apply(op, graph.scale(m, y), graph.scale(n, z)))
 
 
-def _turn_signs(graph, outputs):
-    """A sign that nothing absorbed moves into the difference or the constant below it, if nothing else uses that."""
+def sink_negations(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
+    """The graph with every negation moved into the difference or the constant below it, if nothing else uses that."""
     uses = _uses(graph, outputs)
 
     def node_of(new, i, moved):
@@ -108,27 +105,27 @@ def _negative(graph, i) -> int | None:
     return None
 
 
-def _compact(graph, outputs):
-    """Only what is used, renumbered."""
+def eliminate_dead_code(graph: Graph, outputs: list[int]) -> Line:
+    """The nodes that the outputs depend on, renumbered."""
     position = {i: k for k, i in enumerate(sorted(_uses(graph, outputs)))}
     nodes = (graph.nodes[i] for i in position)
     renumbered = tuple((op, tuple(position[i] for i in operands), attribute) for op, operands, attribute in nodes)
     return renumbered, tuple(graph.kinds[i] for i in position), tuple(position[i] for i in outputs)
 
 
-def live(nodes, kinds, outputs):
-    """Nodes, kinds and outputs of what these outputs depend on."""
+def live(nodes, kinds, outputs) -> Line:
+    """The nodes that some outputs of a straight line depend on, renumbered."""
     graph = Graph(len(nodes) + 1)
     graph.nodes, graph.kinds = list(nodes), list(kinds)
-    return _compact(graph, list(outputs))
+    return eliminate_dead_code(graph, list(outputs))
 
 
-def with_given(nodes, kinds, outputs, given: dict[int, int]):
-    """The same where some nodes, whose values are known, are inputs at the positions given."""
+def replace_by_inputs(nodes, kinds, outputs, positions: dict[int, int]) -> Line:
+    """A straight line in which some nodes, whose values are known, are inputs at these positions instead."""
     graph = Graph(len(nodes) + 1)
-    graph.nodes = [("input", (), given[i]) if i in given else node for i, node in enumerate(nodes)]
+    graph.nodes = [("input", (), positions[i]) if i in positions else node for i, node in enumerate(nodes)]
     graph.kinds = list(kinds)
-    return _compact(graph, list(outputs))
+    return eliminate_dead_code(graph, list(outputs))
 
 
 def _uses(graph, outputs) -> Counter:

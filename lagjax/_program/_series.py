@@ -10,11 +10,11 @@ result follows from the coefficients of its operands by a recurrence, one for ea
     w = f(u)     wₖ = uₖ g₀ + 1/k Σ' j uⱼ gₖ₋ⱼ       with g = f′(u), itself a program: cos u for sin u
     A z = r      A₀ zₖ = rₖ − Aₖ z₀ − Σ' Aⱼ zₖ₋ⱼ     with the factors of A₀: no series of an elimination
 
-where Σ' runs over 0 < j < k. Two kinds of work come out of this. The sums Σ' need lower orders only, so all of them can
-be taken at once, product after product; nearly all the arithmetic is there, and it is the same for every scene. What is
-left is *linear* in the coefficients of order k: a straight line of about as many operations as the program itself,
-the same for every k. So the coefficients of a motion to any order take one run of `start`, and for each order the
-`products` and one run of `sweep`.
+where Σ' runs over 0 < j < k. Two kinds of work come out of this. The sums Σ', Cauchy products without their outer
+terms, need lower orders only, so that all of them can be taken at once, one after the other; nearly all the arithmetic
+is there, and its code is the same for every scene. What is left is *linear* in the coefficients of order k: a straight
+line of about as many operations as the program itself, the same for every k. So the coefficients of a motion to any
+order take one run of `zeroth_order`, and for each order the `cauchy_products` and one run of `order_recursion`.
 
 The circle is closed by whoever knows what the outputs are the rates of: by yₖ₊₁ = fₖ / (k+1) for ẏ = f(t, y), by
 qₖ₊₁ = q̇ₖ / (k+1) and q̇ₖ₊₁ = q̈ₖ / (k+1) for q̈(q, q̇, t).
@@ -34,7 +34,7 @@ import numpy as np
 
 from lagjax._program._graph import Graph, Node, Unlowerable
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._passes import finish
+from lagjax._program._passes import eliminate_dead_code, sink_negations
 from lagjax._program._recurrences import finite
 
 
@@ -68,17 +68,18 @@ class Recurrent(Protocol):
 class Series(NamedTuple):
     """The recurrences of the first `size` outputs of a program, along a motion of its first `moving` inputs.
 
-    `start` takes the inputs of the program and gives all its outputs, and `values` numbers. `sweep` takes the
-    coefficients of order k of the moving inputs, then k and 1/k, these values, and one sum for each pair in `products`;
-    it gives the coefficients of order k of the outputs, and of each of the `rows` that the products are made of.
+    `zeroth_order` takes the inputs of the program and gives all its outputs, and `values` numbers more.
+    `order_recursion` takes the coefficients of order k of the moving inputs, then k and 1/k, these values, and one sum
+    Σ' aⱼ bₖ₋ⱼ for each pair of rows (a, b) in `cauchy_products`; it gives the coefficients of order k of the outputs,
+    and of each of the `rows` that the Cauchy products are made of.
     """
 
     size: int
     moving: int
-    start: StraightLine
-    sweep: StraightLine
+    zeroth_order: StraightLine
+    order_recursion: StraightLine
     values: int
-    products: tuple[tuple[int, int], ...]
+    cauchy_products: tuple[tuple[int, int], ...]
     rows: int
 
 
@@ -93,36 +94,40 @@ def series(program: Recurrent, size: int, moving: int) -> Series:
 
 
 class _Recurrences:
-    """Two graphs grow side by side: `start`, the program and the derivatives g; and `sweep`, linear in order k."""
+    """Two graphs grow side by side.
+
+    `zeroth_order` holds the program and the derivatives g, `order_recursion` what is linear in the coefficients of
+    order k.
+    """
 
     def __init__(self, program: Recurrent, size: int, moving: int):
         self.size, self.moving = size, moving
-        self.start, self.sweep = Graph(10 * program.budget), Graph(20 * program.budget)
+        self.zeroth_order, self.order_recursion = Graph(10 * program.budget), Graph(20 * program.budget)
         for (op, operands, attribute), kind in zip(program.line.nodes, program.line.kinds, strict=True):
             if op == "input":
-                self.start.input(attribute, kind)
+                self.zeroth_order.input(attribute, kind)
             elif op == "constant":
-                self.start.constant(attribute, kind)
+                self.zeroth_order.constant(attribute, kind)
             else:
-                self.start.node(op, *operands, attribute=attribute)
+                self.zeroth_order.node(op, *operands, attribute=attribute)
         self.outputs = list(program.line.outputs)
-        self.order_k = [self.sweep.input(i, "float") for i in range(self.moving)]
-        self.k, self.inverse_k = (self.sweep.input(self.moving + i, "float") for i in range(2))
-        self._given: dict[tuple, int] = {}  # what else the sweep reads: ("value", node) or ("product", row, row)
+        self.order_k = [self.order_recursion.input(i, "float") for i in range(self.moving)]
+        self.k, self.inverse_k = (self.order_recursion.input(self.moving + i, "float") for i in range(2))
+        self._given: dict[tuple, int] = {}  # what else is read: ("value", node) or ("product", row, row)
         self._rows: dict[tuple[int | _Component, bool], int] = {}
         self.coefficients: list[int | _Unknown | None] = []  # None: constant along the motion
-        while len(self.coefficients) < len(self.start.nodes):  # the rules add derivatives at the end
+        while len(self.coefficients) < len(self.zeroth_order.nodes):  # the rules add derivatives at the end
             self.coefficients.append(self._coefficient(len(self.coefficients)))
         self.solution = [] if program.linear is None else self._solution(program.linear)
 
-    # ---- what the sweep reads ----
+    # ---- what the order recursion reads ----
 
     def value(self, node: int) -> int:
         """The value of a node at order zero."""
-        number = self.start.value(node)
-        return self._input("value", node) if number is None else self.sweep.constant(number, "float")
+        number = self.zeroth_order.value(node)
+        return self._input("value", node) if number is None else self.order_recursion.constant(number, "float")
 
-    def product(self, a: int, b: "int | _Component", by_order: bool = False) -> int:
+    def cauchy_product(self, a: int, b: "int | _Component", by_order: bool = False) -> int:
         """Σ' aⱼ bₖ₋ⱼ, or Σ' j aⱼ bₖ₋ⱼ."""
         first, second = self._row(a, by_order), self._row(b, False)
         return self._input("product", min(first, second), max(first, second))
@@ -132,16 +137,16 @@ class _Recurrences:
 
     def _input(self, *key) -> int:
         if key not in self._given:
-            self._given[key] = self.sweep.input(self.moving + 2 + len(self._given), "float")
+            self._given[key] = self.order_recursion.input(self.moving + 2 + len(self._given), "float")
         return self._given[key]
 
     # ---- the recurrences ----
 
     def _coefficient(self, i: int) -> "int | _Unknown | None":
-        op, operands, attribute = self.start.nodes[i]
+        op, operands, attribute = self.zeroth_order.nodes[i]
         if op == "input":
             return self.order_k[attribute] if attribute < self.moving else None
-        if op == "constant" or self.start.kinds[i] != "float" or OPERATIONS[op].is_step:
+        if op == "constant" or self.zeroth_order.kinds[i] != "float" or OPERATIONS[op].is_step:
             return None
         of = [self.coefficients[operand] for operand in operands]
         used = of[1:] if op == "select" else of
@@ -156,19 +161,19 @@ class _Recurrences:
 
     def _by_slopes(self, i, operands, of):
         """w = f(u, …) by its partial derivatives."""
-        row = OPERATIONS[self.start.nodes[i][0]]
-        total, apply = None, self.sweep.apply
+        row = OPERATIONS[self.zeroth_order.nodes[i][0]]
+        total, apply = None, self.order_recursion.apply
         for u, c, slope in zip(operands, of, row.slopes, strict=True):
             if c is None:
                 continue
-            g = slope(self.start.apply, self.number, i, *operands)
-            inner = self.start.operand_of("neg", g)
+            g = slope(self.zeroth_order.apply, self.number, i, *operands)
+            inner = self.zeroth_order.operand_of("neg", g)
             sign, g = ("sub", inner) if inner is not None else ("add", g)
             if row.steep:
-                g = finite(self.start.apply, self.number, g)
+                g = finite(self.zeroth_order.apply, self.number, g)
             term = apply("mul", c, self.value(g))
-            if self.start.value(g) is None:
-                term = apply("add", term, apply("mul", self.inverse_k, self.product(u, g, by_order=True)))
+            if self.zeroth_order.value(g) is None:
+                term = apply("add", term, apply("mul", self.inverse_k, self.cauchy_product(u, g, by_order=True)))
             if total is None:
                 total = term if sign == "add" else apply("neg", term)
             else:
@@ -176,45 +181,45 @@ class _Recurrences:
         return total
 
     def number(self, x: float) -> int:
-        return self.start.constant(x, "float")
+        return self.zeroth_order.constant(x, "float")
 
     # ---- a linear system: the coefficients of its solution, without those of its elimination ----
 
     def _solution(self, system) -> list[int]:
-        """Of z in A z = r: A₀ zₖ = rₖ − Aₖ z₀ − Σ' Aⱼ zₖ₋ⱼ, solved with the factors of A₀."""
-        apply = self.sweep.apply
+        """The coefficients zₖ where A z = r: A₀ zₖ = rₖ − Aₖ z₀ − Σ' Aⱼ zₖ₋ⱼ, solved with the factors of A₀."""
+        apply = self.order_recursion.apply
         residual = [self._of_output(node) for node in system.right]
         for (i, j), node in system.entries.items():
             if self.coefficients[node] is not None:
                 c = self._of_output(node)
                 for row, column in dict.fromkeys([(i, j), (j, i)]):
                     taken = apply("mul", c, self.value(system.z[column]))
-                    taken = apply("add", taken, self.product(node, _Component(column)))
+                    taken = apply("add", taken, self.cauchy_product(node, _Component(column)))
                     residual[row] = apply("sub", residual[row], taken)
         return self._inlined(system.solve(), system.factors, residual)
 
-    def _inlined(self, program, known, given: list[int]) -> list[int]:
-        """Its outputs in the sweep, from nodes of `start`, which are taken at order zero, and nodes of the sweep."""
-        places: list[tuple[bool, int]] = []  # whether in `start`, and which node
+    def _inlined(self, program, factors, right: list[int]) -> list[int]:
+        """The outputs of a program of factors (order zero) and a right-hand side (order k), as recursion nodes."""
+        places: list[tuple[bool, int]] = []  # whether of the zeroth order, and which node
 
-        def in_sweep(place):
+        def in_recursion(place):
             return self.value(place[1]) if place[0] else place[1]
 
         for (op, operands, attribute), kind in zip(program.nodes, program.kinds, strict=True):
             of = [places[i] for i in operands]
             if op == "input":
-                i = attribute - len(known)
-                places.append((True, known[attribute]) if i < 0 else (False, given[i]))
+                i = attribute - len(factors)
+                places.append((True, factors[attribute]) if i < 0 else (False, right[i]))
             elif op == "constant":
-                places.append((True, self.start.constant(attribute, kind)))
+                places.append((True, self.zeroth_order.constant(attribute, kind)))
             elif all(at_start for at_start, _ in of):
-                places.append((True, self.start.apply(op, *(node for _, node in of), attribute=attribute)))
+                places.append((True, self.zeroth_order.apply(op, *(node for _, node in of), attribute=attribute)))
             elif op == "div":
-                inverse = self.start.apply("div", self.number(1.0), of[1][1])
-                places.append((False, self.sweep.apply("mul", in_sweep(of[0]), self.value(inverse))))
+                inverse = self.zeroth_order.apply("div", self.number(1.0), of[1][1])
+                places.append((False, self.order_recursion.apply("mul", in_recursion(of[0]), self.value(inverse))))
             else:
-                places.append((False, self.sweep.apply(op, *map(in_sweep, of), attribute=attribute)))
-        return [in_sweep(places[i]) for i in program.outputs]
+                places.append((False, self.order_recursion.apply(op, *map(in_recursion, of), attribute=attribute)))
+        return [in_recursion(places[i]) for i in program.outputs]
 
     # ---- the end: only what the outputs need ----
 
@@ -225,21 +230,22 @@ class _Recurrences:
         needed: set[int] = set()
         while True:
             wanted = self._reached([*rates, *(self._of_row(*rows[r]) for r in needed)])
-            found = {row for kind, *which in wanted if kind == "product" for row in which}
-            if found == needed:
+            read = {row for kind, *which in wanted if kind == "product" for row in which}
+            if read == needed:
                 break
-            needed = found
+            needed = read
         values = [key[1] for key in wanted if key[0] == "value"]
         # Distinct factors first, squares last: a square needs half the work.
         products = sorted((key for key in wanted if key[0] == "product"), key=lambda key: (key[1] == key[2], key[1:]))
         place = {row: k for k, row in enumerate(sorted(needed))}
         order = [("value", node) for node in values] + products
         self._renumber({self._given[key]: self.moving + 2 + k for k, key in enumerate(order)})
+        kept = [self._of_row(*rows[r]) for r in sorted(needed)]
         return Series(
             self.size,
             self.moving,
-            StraightLine(*finish(self.start, self.outputs + values)),
-            StraightLine(*finish(self.sweep, rates + [self._of_row(*rows[r]) for r in sorted(needed)])),
+            StraightLine(*eliminate_dead_code(*sink_negations(self.zeroth_order, self.outputs + values))),
+            StraightLine(*eliminate_dead_code(*sink_negations(self.order_recursion, rates + kept))),
             len(values),
             tuple((place[a], place[b]) for _, a, b in products),
             len(needed),
@@ -249,29 +255,29 @@ class _Recurrences:
         c = self.coefficients[node]
         if isinstance(c, _Unknown):
             raise Unlowerable(f"`{c.op}` has no Taylor series here")
-        return self.sweep.constant(0.0, "float") if c is None else c
+        return self.order_recursion.constant(0.0, "float") if c is None else c
 
     def _of_row(self, node: "int | _Component", by_order: bool) -> int:
         c = self.solution[node.i] if isinstance(node, _Component) else self._of_output(node)
-        return self.sweep.apply("mul", self.k, c) if by_order else c
+        return self.order_recursion.apply("mul", self.k, c) if by_order else c
 
     def _reached(self, roots: list[int]) -> list[tuple]:
-        """The keys of `_given` that these nodes of the sweep depend on, in the order they were first asked for."""
+        """The keys of `_given` that these nodes of the recursion depend on, in the order they were first asked for."""
         seen, stack = set(), list(roots)
         while stack:
             node = stack.pop()
             if node not in seen:
                 seen.add(node)
-                stack.extend(self.sweep.nodes[node][1])
+                stack.extend(self.order_recursion.nodes[node][1])
         return [key for key, node in self._given.items() if node in seen]
 
     def _renumber(self, positions: dict[int, int]) -> None:
         for node, position in positions.items():
-            self.sweep.nodes[node] = ("input", (), position)
+            self.order_recursion.nodes[node] = ("input", (), position)
 
 
 class _Component(NamedTuple):
-    """Of the solution of the linear system."""
+    """Component i of the solution of the linear system, as the owner of a row."""
 
     i: int
 

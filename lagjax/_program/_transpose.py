@@ -10,7 +10,7 @@ import numpy as np
 
 from lagjax._program._graph import Graph
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._passes import finish, regroup, with_given
+from lagjax._program._passes import eliminate_dead_code, factor, replace_by_inputs, sink_negations
 from lagjax._program._series import StraightLine
 
 _LARGEST = 100  # operations that one may become: a bound for errors, three are usual
@@ -30,11 +30,12 @@ def pullback(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequen
         for k, output in enumerate(of):
             _add(graph, cotangents, line.outputs[output], graph.input(len(dtypes) + k, "float"))
         results = _back(graph, line, nodes, cotangents, by)
-        done = finish(*regroup(graph, results + [nodes[line.outputs[i]] for i in known]))
-    results, values = done[2][: len(by)], done[2][len(by) :]
+        results += [nodes[line.outputs[i]] for i in known]
+        done = StraightLine(*eliminate_dead_code(*sink_negations(*factor(graph, results))))
+    results, values = done.outputs[: len(by)], done.outputs[len(by) :]
     first = len(dtypes) + len(of)
-    given = {node: first + k for k, node in enumerate(values) if done[0][node][1]}
-    return StraightLine(*with_given(*done[:2], results, given))
+    positions = {node: first + k for k, node in enumerate(values) if done.nodes[node][1]}
+    return StraightLine(*replace_by_inputs(done.nodes, done.kinds, results, positions))
 
 
 def _kind(dtype) -> str:
