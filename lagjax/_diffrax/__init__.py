@@ -59,7 +59,7 @@ class Diffrax(AbstractEngine):
         if not (is_concrete(self.dt) and is_concrete(problem.ts)):
             return None
         ts = np.asarray(problem.ts)
-        needed = abs(ts[-1] - ts[0]) / float(self.dt)
+        needed = float(abs(ts[-1] - ts[0])) / float(self.dt)
         if needed <= problem.max_steps + 0.5:
             return None
         return f"dt={self.dt} needs {needed:.0f} steps, more than max_steps={problem.max_steps}: raise one of them"
