@@ -36,10 +36,10 @@ def step(t, y):
 @pytest.mark.parametrize("scan", sweep([False, True], kept=[True]))
 def test_derivatives_are_those_of_the_expression_in_every_order_of_modes(scan):
     x = jnp.array([0.7, 1.1])
-    exact = jax.jacfwd(jax.jacfwd(lambda x: repeated(x, False, moved)))(x)
+    exact = jax.jit(jax.jacfwd(jax.jacfwd(lambda x: repeated(x, False, moved))))(x)
     for outer in (jax.jacfwd, jax.jacrev):
         for inner in (jax.jacfwd, jax.jacrev):
-            found = outer(inner(lambda x: repeated(x, scan, step)))(x)
+            found = jax.jit(outer(inner(lambda x: repeated(x, scan, step))))(x)
             np.testing.assert_allclose(found, exact, rtol=1e-12)
     batch = jnp.stack([x, 2 * x])
     found = jax.jit(jax.vmap(jax.hessian(lambda x: repeated(x, scan, step))))(batch)
