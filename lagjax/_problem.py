@@ -5,7 +5,7 @@
 
 An engine is a value. It says which problems it refuses, and solves the others, one or a batch, under every
 transformation of JAX. Pytrees of the user exist on both sides of this module, but not behind it: the state is one
-vector (q, q̇), and the programs of a scene take the parameters as one vector too (`Problem.numbers`).
+vector (q, q̇), and the programs of a scene take the parameters as one vector too (`Problem.vector`).
 """
 
 import abc
@@ -183,7 +183,7 @@ class Batch(eqx.Module):
 class Solution(NamedTuple):
     """The motion that answers a problem; of a batch, with the members as first axis of everything.
 
-    - `path` (T, 2n): the states at the output times, NaN (with diffrax perhaps infinite) where not reached.
+    - `path` (T, 2n): the states at the output times, NaN where not reached.
     - `y_end` (2n,), `t_end` (): the state and the time at which the motion ended.
     - `result` (): how it ended, as the integer of a `lagjax.RESULTS`.
     - `accepted`, `rejected` (): counts of steps.
