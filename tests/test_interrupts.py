@@ -35,6 +35,8 @@ def single(ts=LONG):
 
 def interrupted(run, count):
     """Ctrl-C at `count` random moments of a long run; the next run is complete, and on no thread of the one before."""
+    # A shell's background jobs inherit a Ctrl-C that is ignored, and Python then leaves it so.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     draw, expected, threads = random.Random(0), batch(SHORT), _thread._count()
     for _ in range(count):
         delay, caught = draw.choice([0.003, 0.03, 0.3]) * draw.random(), threading.Event()
