@@ -219,7 +219,7 @@ def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, param
     derivatives are right to every order, but it loses three things. A member of a batch that has no nearest state makes
     the derivative of the whole batch raise, from a call back to the host: lineax solves for tangents with
     `throw=True`. Its test of convergence compares f and M (q − q0) with the tolerance for q: masses of 1e6 do not
-    converge. And from 30 radii beside a circle it does not arrive, without the first loop.
+    converge. And from some 44 radii beside a circle it does not arrive, without the first loop.
     """
     matrix = mass_matrix(q0, qdot, t, params)
 
