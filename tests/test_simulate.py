@@ -337,6 +337,7 @@ def run_with_budget(q0):
         ({"solver": "rk4"}, TypeError, "instance of a diffrax solver"),
         ({"solver": diffrax.Euler()}, ValueError, "no error estimate"),
         ({"solver": diffrax.SemiImplicitEuler(), "dt": 0.1}, ValueError, "several terms"),
+        ({"solver": diffrax.ImplicitEuler(), "dt": 0.1}, ValueError, "nothing says how well"),
         ({"event": lambda q: q}, TypeError, "event must have the form"),
         ({"q0": jnp.float32(1), "qdot0": jnp.float32(1), "rtol": 1e-12}, ValueError, "float32 cannot meet"),
     ],

@@ -201,3 +201,12 @@ def _require_solver(solver, adaptive: bool) -> None:
         )
     if adaptive and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
         raise ValueError(f"{name} has no error estimate to adapt its steps to: give a fixed step with dt=...")
+    # Left to their default, they are those of adaptive steps.
+    if not adaptive and isinstance(solver, diffrax.AbstractImplicitSolver):
+        finder = solver.root_finder
+        if not all(eqx.is_array_like(getattr(finder, tolerance, 0.0)) for tolerance in ("rtol", "atol")):
+            raise ValueError(
+                f"{name} solves an equation in every step, and with a fixed step nothing says how well: give it "
+                f"tolerances, as in diffrax.{name}(root_finder=diffrax.VeryChord(rtol=1e-10, atol=1e-10)), or leave "
+                "dt out."
+            )

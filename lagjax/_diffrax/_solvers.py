@@ -19,7 +19,25 @@ import numpy as np
 PyTree = Any
 
 
-class FineOutput(diffrax.AbstractAdaptiveSolver):
+class _Around(diffrax.AbstractAdaptiveSolver):
+    """What a wrapper leaves to the `solver` inside it: all but the step, its terms and its dense output."""
+
+    solver: eqx.AbstractVar[diffrax.AbstractSolver]
+
+    def order(self, terms) -> int | None:
+        """The order of the solver."""
+        return self.solver.order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        """The state of the solver."""
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def func(self, terms, t0, y0, args):
+        """The right-hand side ẏ at (t0, y0)."""
+        return self.solver.func(terms, t0, y0, args)
+
+
+class FineOutput(_Around):
     r"""The steps of an explicit Runge–Kutta solver of diffrax, with better states between them.
 
     The solver's own interpolant gives states at four points inside the step, the equations give the slopes there, and
@@ -61,18 +79,6 @@ class FineOutput(diffrax.AbstractAdaptiveSolver):
     def term_structure(self):
         """One term, of an ordinary differential equation."""
         return diffrax.ODETerm
-
-    def order(self, terms) -> int | None:
-        """The order of the solver."""
-        return self.solver.order(terms)
-
-    def init(self, terms, t0, t1, y0, args):
-        """The state of the solver."""
-        return self.solver.init(terms, t0, t1, y0, args)
-
-    def func(self, terms, t0, y0, args):
-        """The right-hand side ẏ at (t0, y0)."""
-        return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """The solver's step, and the polynomial through it and through the slopes at four points inside it."""
@@ -159,7 +165,7 @@ def _pick(stacked: PyTree, index: int) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[index], stacked)
 
 
-class Projected(diffrax.AbstractAdaptiveSolver):
+class Projected(_Around):
     """The steps of a solver, each followed by a projection of the state: `project(t, y, args)` → y, one Newton step.
 
     Two Newton steps are taken, the second of which says whether the method converges. Where it does not, the state is
@@ -183,18 +189,6 @@ class Projected(diffrax.AbstractAdaptiveSolver):
     def interpolation_cls(self) -> Callable:
         """The interpolant of the solver."""
         return self.solver.interpolation_cls
-
-    def order(self, terms) -> int | None:
-        """The order of the solver."""
-        return self.solver.order(terms)
-
-    def init(self, terms, t0, t1, y0, args):
-        """The state of the solver."""
-        return self.solver.init(terms, t0, t1, y0, args)
-
-    def func(self, terms, t0, y0, args):
-        """The right-hand side ẏ at (t0, y0)."""
-        return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """The solver's step, then two Newton steps. No FSAL: the last slope is not that of the new state."""
