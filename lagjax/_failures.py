@@ -78,8 +78,8 @@ def _compiled(on_host):
     """One comparison where all is well; the host is asked only where something failed."""
 
     def check(result, *values, names):
-        def host(*given):
-            _raise(*map(np.asarray, given), names=names)
+        def host(*arrays):
+            _raise(*map(np.asarray, arrays), names=names)
 
         shape = jax.ShapeDtypeStruct(result.shape, values[0].dtype)
         well = jnp.isin(result, jnp.asarray(ENDED_WELL, result.dtype)).all()
@@ -89,11 +89,11 @@ def _compiled(on_host):
 
 
 def _in_place(host, shape):
-    return buffer_callback(lambda _, place, *given: host(*given), shape)
+    return buffer_callback(lambda _, place, *arrays: host(*arrays), shape)
 
 
 def _by_copies(host, shape):
-    return lambda *given: jax.pure_callback(lambda *x: host(*x), shape, *given)
+    return lambda *arrays: jax.pure_callback(lambda *x: host(*x), shape, *arrays)
 
 
 mlir.register_lowering(check_p, _compiled(_by_copies))
@@ -106,8 +106,8 @@ def _without_derivative(primals, tangents, **settings):
 
 
 ad.primitive_jvps[check_p] = _without_derivative
-batching.primitive_batchers[check_p] = lambda args, axes, **given: (
-    check_p.bind(*batch_in_front(args, axes), **given),
+batching.primitive_batchers[check_p] = lambda args, axes, **settings: (
+    check_p.bind(*batch_in_front(args, axes), **settings),
     0,
 )
 

@@ -165,14 +165,14 @@ def work_precision(
 
     if solvers is None:
         measured = _with_default_named(_problem(system, q0, qdot0, ts, params, batch_axes))
-    given = as_arrays((q0, qdot0, jnp.asarray(ts), params), dtype)
-    precise = as_arrays(given, jnp.result_type(float))
+    scene = as_arrays((q0, qdot0, jnp.asarray(ts), params), dtype)
+    precise = as_arrays(scene, jnp.result_type(float))
 
     def run(solver, rtol, reference=False) -> Trajectory:
-        scene, options = precise if reference else given, {"solver": solver, "rtol": rtol, "max_steps": max_steps}
+        arguments, options = precise if reference else scene, {"solver": solver, "rtol": rtol, "max_steps": max_steps}
         if batch_axes is None:
-            return simulate(system, *scene, throw=reference, **options)
-        return simulate_batch(system, *scene, batch_axes=batch_axes, **options)
+            return simulate(system, *arguments, throw=reference, **options)
+        return simulate_batch(system, *arguments, batch_axes=batch_axes, **options)
 
     truth, resolution = _reference(partial(run, None, reference=True), jnp.result_type(float))
     rows = []

@@ -161,9 +161,10 @@ class Trajectory(eqx.Module):
     def _at_every_time(self, name: str) -> PyTree:
         """Map a method (q, qdot, t, params) of the system over the time axis, and over the batch axes before it."""
 
-        def of_member(q, qdot, given, params, mode):
+        def of_member(q, qdot, times_and_tolerances, params, mode):
+            ts, _ = times_and_tolerances
             at_one_time = partial(self._at_one_time, name)
-            return jax.vmap(at_one_time, in_axes=(0, 0, 0, None, 0))(q, qdot, given[0], params, mode)
+            return jax.vmap(at_one_time, in_axes=(0, 0, 0, None, 0))(q, qdot, ts, params, mode)
 
         return self.over_members(of_member)
 
@@ -175,8 +176,8 @@ class Trajectory(eqx.Module):
         total = None
         for index, which in enumerate(self.mode_names):
             # Laws of another mode may be singular here: their NaN must not reach a derivative.
-            given = jax.tree.map(lambda x, here=mode == index: _varied_where(here, x), (q, qdot, t, params))
-            value = getattr(self.system[which], name)(*given)
+            state = jax.tree.map(lambda x, here=mode == index: _varied_where(here, x), (q, qdot, t, params))
+            value = getattr(self.system[which], name)(*state)
             total = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), value) if total is None else total
             total = jax.tree.map(lambda new, old, here=mode == index: jnp.where(here, new, old), value, total)
         return total
@@ -184,10 +185,12 @@ class Trajectory(eqx.Module):
 
 def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, params) -> None:
     """Raise where modes do not have the same constraints, so that there is no one structure to return."""
-    held = [which for which, s in modes.items() if s.constraints is not None or s.velocity_constraints is not None]
-    structures = [modes[which].constraint_structure(Layout.of(q, qdot), params) for which in held]
-    if len(held) < len(modes) or any(structure != structures[0] for structure in structures):
-        one = held[0] if held else next(iter(modes))
+    constrained = [
+        which for which, s in modes.items() if s.constraints is not None or s.velocity_constraints is not None
+    ]
+    structures = [modes[which].constraint_structure(Layout.of(q, qdot), params) for which in constrained]
+    if len(constrained) < len(modes) or any(structure != structures[0] for structure in structures):
+        one = constrained[0] if constrained else next(iter(modes))
         raise ValueError(
             f"The modes differ in their constraints, so there is no {name} of the whole motion: take the times of one "
             f"mode and jax.vmap(trajectory.system[{one!r}].{name}, (0, 0, 0, None))(q, qdot, t, params)."

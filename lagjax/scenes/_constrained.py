@@ -286,13 +286,13 @@ class Blade(NamedTuple):
     phi: ArrayLike
 
 
-def _turning(t, speed, push, phi, rate):
+def _turning(t, speed, acceleration, phi, rate):
     """The way of a body, its components x and y, its speed and its heading φ after t, φ turning at `rate`.
 
-    A force of `push` cos φ per unit mass acts along the heading.
+    A force along the heading accelerates the body by `acceleration` cos φ.
     """
     # u̇ = k cos φ with φ = φ0 + ω t, so u = c + (k/ω) sin φ, and ẋ = u cos φ, ẏ = u sin φ are integrated by parts.
-    end, k = phi + rate * t, push / rate
+    end, k = phi + rate * t, acceleration / rate
     c = speed - k * jnp.sin(phi)
     d_sin, d_cos = jnp.sin(end) - jnp.sin(phi), jnp.cos(end) - jnp.cos(phi)
     x = (c * d_sin + 0.5 * k * (jnp.sin(end) ** 2 - jnp.sin(phi) ** 2)) / rate
@@ -313,8 +313,8 @@ def _rolling_without_slipping(q, qdot, params):
 
 def _rolling_disc_exact(t, q0, qdot0, params):
     m, R = params["m"], params["R"]
-    push = m * params["g"] * jnp.sin(params["slope"]) * R / (m * R**2 + params["I"])
-    rolled, x, y, spin, phi = _turning(t, qdot0.psi, push, q0.phi, qdot0.phi)
+    acceleration = m * params["g"] * jnp.sin(params["slope"]) * R / (m * R**2 + params["I"])
+    rolled, x, y, spin, phi = _turning(t, qdot0.psi, acceleration, q0.phi, qdot0.phi)
     q = Disc(q0.x + R * x, q0.y + R * y, phi, q0.psi + rolled)
     return q, Disc(R * spin * jnp.cos(phi), R * spin * jnp.sin(phi), qdot0.phi, spin)
 
@@ -359,8 +359,8 @@ def _knife_edge_lagrangian(q, qdot, params):
 
 def _knife_edge_exact(t, q0, qdot0, params):
     speed = qdot0.x * jnp.cos(q0.phi) + qdot0.y * jnp.sin(q0.phi)
-    push = params["g"] * jnp.sin(params["slope"])
-    _, x, y, speed, phi = _turning(t, speed, push, q0.phi, qdot0.phi)
+    acceleration = params["g"] * jnp.sin(params["slope"])
+    _, x, y, speed, phi = _turning(t, speed, acceleration, q0.phi, qdot0.phi)
     return Blade(q0.x + x, q0.y + y, phi), Blade(speed * jnp.cos(phi), speed * jnp.sin(phi), qdot0.phi)
 
 

@@ -62,12 +62,12 @@ def _uniform_fields_exact(t, q0, qdot0, params):
     strength = jnp.sqrt(B @ B)
     b, w = B / strength, e * strength / m
     drift = jnp.cross(E, B) / strength**2
-    parallel, push = b * (b @ qdot0), b * (b @ E) * e / m
+    parallel, acceleration = b * (b @ qdot0), b * (b @ E) * e / m
     u = qdot0 - parallel - drift  # turns about b in the drifting frame
     turned = u * jnp.cos(w * t) + jnp.cross(u, b) * jnp.sin(w * t)
-    q = q0 + (parallel + drift) * t + push * t**2 / 2
+    q = q0 + (parallel + drift) * t + acceleration * t**2 / 2
     q = q + (u * jnp.sin(w * t) + jnp.cross(u, b) * (1 - jnp.cos(w * t))) / w
-    return q, parallel + drift + push * t + turned
+    return q, parallel + drift + acceleration * t + turned
 
 
 class _Pseudomomentum(eqx.Module):

@@ -30,8 +30,8 @@ def wedge_accelerations(params):
     >>> lagjax.scenes.wedge_accelerations({"M": 3.0, "m": 1.0, "g": 9.81, "alpha": 0.6})
     """
     M, m, g, sin, cos = params["M"], params["m"], params["g"], jnp.sin(params["alpha"]), jnp.cos(params["alpha"])
-    push = g * sin * cos / (M + m * sin**2)
-    return WedgeAndMass(X=m * push, x=-(M + m) * push)
+    acceleration = g * sin * cos / (M + m * sin**2)
+    return WedgeAndMass(X=m * acceleration, x=-(M + m) * acceleration)
 
 
 def _wedge_exact(t, q0, qdot0, params):
