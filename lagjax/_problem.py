@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import Array, Float, Int
 
 from lagjax._arguments import accept
 from lagjax._derivation import Derivation, derivation_of
@@ -34,7 +35,7 @@ from lagjax._validate import (
 )
 
 PyTree = Any
-Number = jax.Array | np.ndarray
+Numbers = Array | np.ndarray
 
 # Defaults by dtype. The absolute tolerance is far below the relative one, so that states in small units keep their
 # digits; it is there for components that pass through zero.
@@ -61,9 +62,9 @@ class Problem(eqx.Module):
     system: Any
     layout: Layout
     params: PyTree
-    ts: jax.Array | np.ndarray
-    y0: jax.Array | np.ndarray
-    tolerances: tuple[Number, Number]
+    ts: Float[Numbers, " T"]
+    y0: Float[Numbers, " states"]
+    tolerances: tuple[Float[Numbers, ""], Float[Numbers, ""]]
     max_steps: int = eqx.field(static=True)
     event: diffrax.Event | None = None
     guards: Hashable = eqx.field(static=True, default=None)
@@ -105,7 +106,7 @@ class Problem(eqx.Module):
         return eqx.filter(self.params, eqx.is_array_like)
 
     @property
-    def vector(self) -> jax.Array | np.ndarray:
+    def vector(self) -> Float[Numbers, " P"]:
         """Every number in the parameters, shape (P,), in the dtype of the state."""
         return end_to_end(jax.tree.leaves(self.numbers), self.layout.dtype)
 
@@ -124,7 +125,7 @@ class Batch(eqx.Module):
     """
 
     member: Problem
-    y0: jax.Array | np.ndarray
+    y0: Float[Numbers, "N states"]
     params: PyTree
     axes: tuple[int | None, ...] = eqx.field(static=True)
 
@@ -171,7 +172,7 @@ class Batch(eqx.Module):
         return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.member.ts, self.y0, numbers)))
 
     @property
-    def vectors(self) -> jax.Array | np.ndarray:
+    def vectors(self) -> Float[Numbers, "members P"]:
         """The numbers in the parameters of each member, shape (N, P), or (1, P) where all share them."""
         leaves = jax.tree.leaves(self.params)
         numbers = [(leaf, axis) for leaf, axis in zip(leaves, self.axes, strict=True) if eqx.is_array_like(leaf)]
@@ -192,15 +193,15 @@ class Solution(NamedTuple):
     - `idle`: of a batch as a whole, the steps for which a lane stood empty; None for one motion.
     """
 
-    path: Any
-    y_end: Any
-    t_end: Any
-    result: Any
-    accepted: Any
-    rejected: Any
-    event: Any = None
-    ticket: Any = None
-    idle: Any = None
+    path: Float[Any, "*N T states"]
+    y_end: Float[Any, "*N states"]
+    t_end: Float[Any, "*N"]
+    result: Int[Any, "*N"]
+    accepted: Int[Any, "*N"]
+    rejected: Int[Any, "*N"]
+    event: Int[Any, "*N"] = None
+    ticket: Int[Any, "*N"] = None
+    idle: Int[Any, ""] = None
 
 
 class AbstractEngine(eqx.Module):
@@ -229,14 +230,14 @@ def _is_on_host(leaf) -> bool:
     return is_concrete(leaf) and [device.platform for device in leaf.devices()] == ["cpu"]
 
 
-def end_to_end(leaves: list, dtype) -> jax.Array | np.ndarray:
+def end_to_end(leaves: list, dtype) -> Float[Numbers, " count"]:
     """All numbers of the leaves as one vector; by NumPy where it can read them, at a tenth of the cost of JAX."""
     if not all(map(_is_on_host, leaves)):
         return as_vector(leaves, dtype)
     return np.concatenate([np.zeros(0, dtype), *(np.asarray(leaf, dtype).ravel() for leaf in leaves)])
 
 
-def rows(leaves, axes, size: int, dtype) -> jax.Array | np.ndarray:
+def rows(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
     """The numbers of every member end to end, shape (size, numbers); `axes` are those of the members, leaf by leaf."""
     library: Any = np if all(map(_is_on_host, leaves)) else jnp
     columns = [library.zeros((size, 0), dtype)]
@@ -293,7 +294,7 @@ def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTr
 # ---- what can be wrong -----------------------------------------------------------------------------------------------
 
 
-def _tolerances(dtype, rtol, atol) -> tuple[Number, Number]:
+def _tolerances(dtype, rtol, atol) -> tuple[Float[Numbers, ""], Float[Numbers, ""]]:
     """rtol and atol as arrays, the missing ones by default. Raises where no engine meets them."""
     rtol = DEFAULT_RTOL[dtype] if rtol is None else require_tolerance(rtol, "rtol")
     atol = rtol * _ATOL_OVER_RTOL if atol is None else require_tolerance(atol, "atol")
