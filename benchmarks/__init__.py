@@ -8,11 +8,12 @@ A speed without its error is not a result, so the main comparison sweeps the tol
 error of each run against an independent reference, and compares times *at equal error*. The parts:
 
 - `_cases`: the scenes, each with a batch of initial states and its Lagrangian in a form that every peer can read;
-- `_contenders`: lagjax and its peers, each as `prepare(case) -> solve(tol) -> final states`; `_mujoco`, `_numba`: two
-  of them;
+  `_large`: machines and many bodies;
+- `_contenders`: lagjax and its peers, each as `prepare(case) -> solve(tol) -> final states`; `_mujoco`, `_numba`,
+  `_rebound`: three of them;
 - `_measure`: warm-up, interleaved repeats, medians, errors;
-- `_comparisons`: right-hand sides, sizes of scenes and of batches, cores; `_derivation`: the time to the first result;
-  `_gradient`: derivatives; `_mixed`: batches whose members need different numbers of steps; `_constraints`: what they
+- `_comparisons`: right-hand sides, sizes of batches, cores; `_sizes`: many coordinates; `_latency`: one call;
+  `_derivation`: the time to the first result; `_gradient`: derivatives; `_mixed`: batches whose members need different numbers of steps; `_constraints`: what they
   cost;
 - `_goals`: what is to be reached, from the stored numbers;
 - `hard_cases` and `_hard/`: errors against references from elsewhere; `soak`: random scenes for an hour. Both are

@@ -10,7 +10,18 @@ from typing import Any
 
 import jax
 
-from benchmarks import _comparisons, _constraints, _derivation, _figures, _goals, _gradient, _mixed, _report
+from benchmarks import (
+    _comparisons,
+    _constraints,
+    _derivation,
+    _figures,
+    _goals,
+    _gradient,
+    _latency,
+    _mixed,
+    _report,
+    _sizes,
+)
 from benchmarks._cases import CASES
 from benchmarks._contenders import BATCHED, SINGLE
 from benchmarks._measure import Comparison, compare
@@ -134,7 +145,9 @@ COMPARISONS: dict[str, Callable] = {
 TABLES: dict[str, Callable] = {
     "right_hand_sides": _comparisons.right_hand_sides,
     "derivation": _derivation.derivation,
-    "sizes": _comparisons.sizes,
+    "sizes": _sizes.sizes,
+    "first_results": _sizes.first_results,
+    "latency": _latency.latency,
     "batches": _comparisons.batches,
     "cores": _comparisons.cores,
     "gradient": _gradient.gradient,

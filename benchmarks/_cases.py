@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import _large
 from lagjax import scenes
 
 GRAVITY = 9.81
@@ -33,8 +34,9 @@ class Case:
     q0: np.ndarray
     qdot0: np.ndarray
     duration: float
-    symbolic: Callable
+    symbolic: Callable | None
     acceleration: Callable | None = None
+    equations: Callable | None = None  # q̈ by hand in the expressions of heyoka, where a Lagrangian takes it too long
     long_formulas: bool = False  # heyoka then runs its loops instead of writing them out: here faster, and it compiles
 
     @property
@@ -258,6 +260,41 @@ def spherical_pendulum(batch: int = 1024) -> Case:
         duration=5.0,
         symbolic=lambda ops, q, v: 0.5 * (v[0] ** 2 + ops.sin(q[0]) ** 2 * v[1] ** 2) + GRAVITY * ops.cos(q[0]),
         acceleration=acceleration,
+    )
+
+
+def bodies(count: int, batch: int = 8) -> Case:
+    """The cluster of `_large.bodies`; members differ by 1e-3 in their velocities."""
+    system, x, v, params = _large.bodies(count)
+    m, rng = params["m"], np.random.default_rng(6)
+
+    def acceleration(q, qdot):
+        x = jnp.asarray(q).reshape(count, 3)
+        r = x[None, :] - x[:, None]
+        squared = jnp.sum(r**2, axis=-1) + _large.SOFTENING**2
+        return jnp.einsum("ab,abk->ak", m / (squared * jnp.sqrt(squared)), r).ravel()
+
+    def equations(hy, q, v):
+        parts: list[list] = [[] for _ in q]
+        for a in range(count):
+            for b in range(a):
+                r = [q[3 * b + axis] - q[3 * a + axis] for axis in range(3)]
+                inverse = hy.sum([*(d**2 for d in r), hy.expression(_large.SOFTENING**2)]) ** -1.5
+                for axis, d in enumerate(r):
+                    parts[3 * a + axis].append(float(m[b]) * d * inverse)
+                    parts[3 * b + axis].append(-float(m[a]) * d * inverse)
+        return [hy.sum(part) for part in parts]
+
+    return Case(
+        name=f"bodies_{count}",
+        scene=scenes.Scene(system, params, x, v, 2.0, {}),
+        q0=np.tile(x.ravel(), (batch, 1)),
+        qdot0=v.ravel() * (1 + 1e-3 * rng.uniform(-1, 1, (batch, v.size))),
+        duration=2.0,
+        symbolic=None,
+        acceleration=acceleration,
+        equations=equations,
+        long_formulas=True,
     )
 
 

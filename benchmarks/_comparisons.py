@@ -1,7 +1,7 @@
 """Questions other than error against time, one after the other. Each takes the options and returns rows.
 
 - `right_hand_sides`: is the derived right-hand side as fast as the best one written by hand?
-- `sizes`, `batches`: the cost against the number of coordinates and of members;
+- `batches`: the cost against the number of members;
 - `cores`: what a second core is worth.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 from llvmlite import ir
 
 from benchmarks import _contenders
-from benchmarks._cases import CASES, Case, chain, double_pendulum
+from benchmarks._cases import CASES, Case, double_pendulum
 from benchmarks._contenders import Contender, autodiff_acceleration, named
 from benchmarks._measure import Comparison, compare, seconds
 from lagjax._derivation import derivation_of
@@ -159,21 +159,9 @@ def _hand_on_arrays(case: Case):
     return (lambda y: (y[1], acceleration(*y))), (jnp.asarray(case.q0), jnp.asarray(case.qdot0))
 
 
-# ---- coordinates, members, cores -------------------------------------------------------------------------------------
+# ---- members, cores --------------------------------------------------------------------------------------------------
 
-LINKS = (2, 4, 8, 16, 32, 64, 128)
 SIZES = tuple(10**k for k in range(7))
-
-
-def sizes(options) -> Rows:
-    """A chain of pendulums, ever longer: 64 members, one second of their motion."""
-    names = ("lagjax", "lagjax, diffrax", "diffrax, by hand", "diffrax, autodiff", "heyoka, SIMD", "heyoka, threads")
-    contenders = list(named(*names))
-    rows = []
-    for n in (n for n in LINKS if n <= options.links):
-        case = replace(chain(n, min(options.batch, 64)), duration=min(1.0, options.duration or 1.0))
-        rows += _rows(_compared(case, contenders, options, grown=lambda s: 4 * max(s)), {"links": n})
-    return rows
 
 
 def batches(options) -> Rows:
@@ -183,7 +171,7 @@ def batches(options) -> Rows:
     rows = []
     for size in (size for size in SIZES if size <= 250 * options.batch):
         case = _shortened(double_pendulum(size), options)
-        rows += _rows(_compared(case, contenders, options, grown=lambda s: 10 * s[1]), {"batch": size})
+        rows += _rows(compared(case, contenders, options, grown=lambda s: 10 * s[1]), {"batch": size})
     return rows
 
 
@@ -238,12 +226,16 @@ def _on(allowed: list[int], contender: Contender) -> Contender:
     return replace(contender, name=f"{contender.name} on {len(allowed)}", prepare=prepare)
 
 
-def _compared(case: Case, contenders: list[Contender], options, grown: Callable) -> Comparison:
+def compared(
+    case: Case, contenders: list[Contender], options, grown: Callable, tolerances=(TOLERANCE,), truth=None
+) -> Comparison:
     """One point of a series. `grown` says from (compile, run) seconds what the next one takes; if that is more than the
     budget, the contender is removed.
     """
-    comparison = compare(case, contenders, [TOLERANCE], options.repeats, options.budget)
+    comparison = compare(case, contenders, tolerances, options.repeats, options.budget, truth=truth)
     for row in comparison.rows:
+        if row.contender not in [contender.name for contender in contenders]:
+            continue
         spent = row.compile_seconds, row.seconds * row.members
         if grown(spent) > options.budget:
             contenders[:] = [contender for contender in contenders if contender.name != row.contender]

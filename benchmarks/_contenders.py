@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lagjax
-from benchmarks import _mujoco, _numba
+from benchmarks import _mujoco, _numba, _rebound
 from benchmarks._cases import Case
 from lagjax._native import cores
 
@@ -186,6 +186,9 @@ def heyoka_system(case: Case) -> list:
     if hasattr(hy.llvm_state, "set_diskcache_enabled"):  # or compile times would be those of reading a file
         hy.llvm_state.set_diskcache_enabled(False)
     q, v = ([hy.expression(f"{letter}{i}") for i in range(case.coordinates)] for letter in "qv")
+    if case.equations is not None:
+        rates = [*v, *case.equations(hy, q, v)]
+        return list(zip([*q, *v], rates, strict=True))
     return hy.lagrangian(case.symbolic(hy, q, v), q, v)
 
 
@@ -291,7 +294,7 @@ def reference(case: Case) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _heyoka_compiles(case: Case) -> str | None:
-    long = case.long_formulas and case.coordinates > 16
+    long = case.equations is None and case.long_formulas and case.coordinates > 16
     return "heyoka takes minutes to compile formulas this long" if long else None
 
 
@@ -362,6 +365,7 @@ BATCHED = (
     Contender("heyoka, threads", _heyoka_threads, **HEYOKA),
     Contender("heyoka, single", _heyoka_single, **HEYOKA, members=128),
     Contender("numba", _numba.prepare, ("numba", "scipy"), suits=_numba.why_not),
+    Contender("REBOUND", _rebound.prepare, ("rebound",), suits=_rebound.why_not),
     Contender("MuJoCo", _mujoco.prepare, ("mujoco",), suits=_mujoco.why_not, members=32),
     Contender("SciPy + SymPy", _scipy, ("scipy", "sympy"), suits=_sympy_copes, members=4),
 )

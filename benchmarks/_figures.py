@@ -20,6 +20,7 @@ COLOURS = {
     "heyoka, threads": "#14532d",
     "heyoka, single": "#9bc995",
     "numba": "#e09f3e",
+    "REBOUND": "#17a2b8",
     "MuJoCo": "#7b4fa3",
     "SciPy + SymPy": "#7a6c5d",
 }
@@ -118,16 +119,43 @@ def _curves(axes, row: dict) -> None:
 
 
 def _sizes(figure, rows: list[dict]) -> None:
+    families = {"chain": ("links of the chain", "Chains of pendulums"), "bodies": ("bodies", "Softened gravity")}
     left, right = figure.subplots(1, 2)
-    for axes, column in ((left, "µs/trajectory"), (right, "µs/step")):
-        _series(axes, rows, "links", column)
-        axes.set_xlabel("links of the chain")
-        _ticks_at(axes, rows, "links")
+    for axes, (family, (label, title)) in zip((left, right), families.items(), strict=True):
+        some = [row for row in rows if row["family"] == family and row["tol"] == 1e-9]
+        _series(axes, some, "size", "µs/trajectory")
+        axes.set(xlabel=label, title=f"{title}, T = 2, tolerance 1e-9", ylabel="µs per trajectory")
+        _ticks_at(axes, some, "size")
         _log(axes.yaxis)
-    left.set(title="One second of a chain of pendulums", ylabel="µs per trajectory")
-    right.set(title="One step of it", ylabel="µs per trajectory and step")
-    _name_the_lines(left)
-    _name_the_lines(right)
+        _name_the_lines(axes)
+
+
+def _first_results(figure, rows: list[dict]) -> None:
+    """Three marks for each scene: its first result, its first gradient, and `check`."""
+    axes = figure.add_subplot()
+    names = [row["scene"] for row in rows]
+    kinds = (("first result s", "o", "#c1121f"), ("first gradient s", "D", "#1d4e89"), ("check s", "|", GREY))
+    for kind, marker, colour in kinds:
+        points = [(row[kind], place) for place, row in enumerate(rows) if row[kind] is not None]
+        axes.plot(*zip(*points, strict=True), marker, color=colour, label=kind.removesuffix(" s"), linestyle="none")
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set(xscale="log", xlabel="seconds", title="What one waits for, once")
+    axes.legend(frameon=False)
+
+
+def _latency(figure, rows: list[dict]) -> None:
+    axes = figure.add_subplot()
+    names = [row["way"] for row in rows]
+    axes.barh(
+        names, [row["µs"] for row in rows], color=[COLOURS.get(name.partition(", jit")[0], GREY) for name in names]
+    )
+    for place, row in enumerate(rows):
+        axes.annotate(
+            f"{row['µs']:.3g}", (row["µs"], place), (4, 0), textcoords="offset points", va="center", fontsize=9
+        )
+    axes.invert_yaxis()
+    axes.set(xscale="log", xlabel="µs a call", title="One double pendulum over T = 5, tolerance 1e-9")
 
 
 def _batches(figure, rows: list[dict]) -> None:
@@ -307,6 +335,8 @@ def _title(case: str) -> str:
 
 PLOTS: dict[str, tuple[Callable, Any]] = {
     "sizes": (_sizes, (13, 5)),
+    "first_results": (_first_results, (8, 6)),
+    "latency": (_latency, (8, 3)),
     "batches": (_batches, (8, 5)),
     "gpu": (_batches, (8, 5)),
     "derivation": (_derivation, (8, 5)),

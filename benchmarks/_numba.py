@@ -1,6 +1,6 @@
 """What a careful person writes for one scene: its formulas and DOP853 in loops, compiled by numba, members in threads.
 
-Only where the formulas are short enough to be written out by hand: the double pendulum and Kepler's problem. The step
+Only where the formulas are short enough to be written out by hand: pendulums, Kepler's problem, bodies. The step
 control is SciPy's, with its coefficients, and a member allocates its work space once.
 """
 
@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from benchmarks._cases import GRAVITY, Case
+from benchmarks._large import SOFTENING
 from lagjax._native import cores
 
 
@@ -27,17 +28,49 @@ def _kepler(y, slope):
     slope[0], slope[1], slope[2], slope[3] = y[2], y[3], factor * y[0], factor * y[1]
 
 
-FIELDS = {"double_pendulum": _double_pendulum, "kepler": _kepler}
+def _chain(y, slope):
+    n = len(y) // 2
+    mass, force = np.empty((n, n)), np.zeros(n)
+    for i in range(n):
+        for j in range(n):
+            below, difference = n - max(i, j), y[i] - y[j]
+            mass[i, j] = below * math.cos(difference)
+            force[i] -= below * math.sin(difference) * y[n + j] ** 2
+        force[i] -= GRAVITY * (n - i) * math.sin(y[i])
+    slope[:n], slope[n:] = y[n:], np.linalg.solve(mass, force)
+
+
+def _bodies(y, slope):
+    n = len(y) // 2
+    slope[:n], slope[n:] = y[n:], 0.0
+    for a in range(0, n, 3):
+        for b in range(0, a, 3):
+            x, y_, z = y[b] - y[a], y[b + 1] - y[a + 1], y[b + 2] - y[a + 2]
+            squared = x * x + y_ * y_ + z * z + SOFTENING**2
+            pull = 3.0 / n / (squared * math.sqrt(squared))  # equal masses, together 1
+            slope[n + a] += pull * x
+            slope[n + a + 1] += pull * y_
+            slope[n + a + 2] += pull * z
+            slope[n + b] -= pull * x
+            slope[n + b + 1] -= pull * y_
+            slope[n + b + 2] -= pull * z
+
+
+FIELDS = {"double_pendulum": _double_pendulum, "kepler": _kepler, "chain": _chain, "bodies": _bodies}
+
+
+def _field_of(case: Case) -> str:
+    return case.name if case.name in FIELDS else case.name.partition("_")[0]
 
 
 def why_not(case: Case) -> str | None:
-    return None if case.name in FIELDS else "nobody writes this scene out for numba"
+    return None if _field_of(case) in FIELDS else "nobody writes this scene out for numba"
 
 
 def prepare(case: Case):
     import numba
 
-    run, states = _compiled(case.name), np.ascontiguousarray(case.states)
+    run, states = _compiled(_field_of(case)), np.ascontiguousarray(case.states)
 
     def solve(tol):
         numba.set_num_threads(cores())

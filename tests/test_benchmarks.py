@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from sweeps import sweep
 
+import lagjax
+
 TOLERANCES = (1e-4, 1e-8)
 
 
@@ -100,11 +102,45 @@ def lagjax_alone(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("part", "key", "values"), [("sizes", "links", [2]), ("batches", "batch", [1, 10, 100, 1000])])
-def test_series(lagjax_alone, part, key, values):
-    rows = getattr(lagjax_alone, part)(OPTIONS)
-    assert [row[key] for row in rows] == values
+def test_batches(lagjax_alone):
+    rows = lagjax_alone.batches(OPTIONS)
+    assert [row["batch"] for row in rows] == [1, 10, 100, 1000]
     assert all(row["median error"] < 1e-7 and row["µs/step"] < row["µs/trajectory"] for row in rows)
+
+
+@pytest.mark.slow
+def test_sizes():
+    """Two links, three and five bodies: all peers that are here agree with DOP853 on equations of another hand."""
+    pytest.importorskip("scipy", reason="the reference needs SciPy")
+    rows = of_benchmarks("_sizes").sizes(OPTIONS)
+    assert {(row["family"], row["size"]) for row in rows} == {("chain", 2), ("bodies", 3), ("bodies", 5)}
+    assert {"lagjax", "diffrax, by hand"} <= {row["contender"] for row in rows}
+    assert all(row["median error"] < 100 * row["tol"] + 1e-10 for row in rows)
+
+
+@pytest.mark.slow
+def test_first_results():
+    done = of_benchmarks("_sizes")._in_new_process("bodies 4", 200.0)
+    assert all(done[f"{what} s"] > 0 for what in of_benchmarks("_sizes").WHAT)
+    late = of_benchmarks("_sizes")._in_new_process("bodies 4", 1e-3)
+    assert late["first result s"] is None
+
+
+@pytest.mark.slow
+def test_latency(monkeypatch):
+    latency = of_benchmarks("_latency")
+    monkeypatch.setattr(latency, "CALLS", 1)
+    rows = {row["way"]: row["µs"] for row in latency.latency(OPTIONS)}
+    assert min(rows.values()) > 0 and {"machine code", "lagjax, jit", "lagjax, no jit"} <= rows.keys()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["arm", "bicycle", "bricard", "charges"])
+def test_machines_move_as_their_laws_say(name):
+    """Energy and constraints over half a unit of time; the beam and the families are checked by their peers."""
+    system, q, qdot, params = of_benchmarks("_large").scene_of(name)
+    health = lagjax.simulate(system, q, qdot, np.linspace(0.0, 0.5, 21), params).health()
+    assert not health.findings(), health
 
 
 @pytest.mark.slow
@@ -221,7 +257,13 @@ def test_parts_that_were_not_run_again_are_kept(tmp_path):
 
 SERIES = [{"contender": name, "x": x, "y": x} for name in ("lagjax", "numba") for x in (1, 10)]
 RECORD = {
-    "sizes": [{"links": r["x"], "µs/trajectory": r["y"], "µs/step": r["y"], **r} for r in SERIES],
+    "sizes": [
+        {"family": family, "size": r["x"], "tol": 1e-9, "µs/trajectory": r["y"], **r}
+        for r in SERIES
+        for family in ("chain", "bodies")
+    ],
+    "first_results": [{"scene": "arm", "first result s": 2.0, "first gradient s": None, "check s": 0.1}],
+    "latency": [{"way": "machine code", "µs": 50.0}, {"way": "lagjax, jit", "µs": 80.0}],
     "batches": [{"batch": r["x"], "µs/trajectory": r["y"], **r} for r in SERIES],
     "derivation": [{"links": r["x"], "first result s": r["y"], **r} for r in SERIES],
     "cores": [{"case": "chain_8", "cores": r["x"], "times faster than one": r["y"], **r} for r in SERIES],
