@@ -22,7 +22,7 @@ import numpy as np
 
 from lagjax import _linear
 from lagjax._constraints import velocity_scales
-from lagjax._layout import Layout
+from lagjax._layout import Layout, dtype_of
 from lagjax._motion import Motion
 from lagjax._native import Projection
 from lagjax._program import Program, Unlowerable, lower, lower_solution
@@ -374,13 +374,27 @@ def numbers_of(params: PyTree) -> list:
 # ---- made once ---------------------------------------------------------------------------------------------------
 
 
+class _Number(NamedTuple):
+    """What decides about a number, or an array of them, among the parameters."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
 class _Structure(NamedTuple):
-    """All that decides how a scene is derived. The scene and its layout are structure alone."""
+    """All that decides how a scene is derived, which is structure alone, as its layout is.
+
+    `leaves` are those of the parameters: a `_Number`, or what is part of the program.
+    """
 
     system: Any
-    layout: Any
-    code: tuple
-    shapes: tuple
+    layout: Layout
+    params: Any
+    leaves: tuple
+
+
+def _structure_of(leaf):
+    return _Number(jnp.shape(leaf), np.dtype(dtype_of(leaf))) if eqx.is_array_like(leaf) else leaf
 
 
 def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
@@ -389,15 +403,14 @@ def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
     It is made once for scenes, layouts and structures that are equal. Scenes whose functions hold arrays of their own
     have no programs, as these arrays could change; those whose code cannot be hashed are derived anew each time.
     """
-    numbers, code = eqx.partition(params, eqx.is_array_like)
-    if jax.tree.leaves(system):
+    arrays, scene = jax.tree.flatten(system)
+    if arrays:
+        numbers = eqx.filter(params, eqx.is_array_like)
         return Derivation(
             system.motion(layout, params), layout, numbers, "the functions of the scene hold arrays of their own"
         )
-    leaves, structure = jax.tree.flatten(numbers)
-    shapes = tuple((np.shape(leaf), np.dtype(jnp.result_type(leaf))) for leaf in leaves)
-    others, tree = jax.tree.flatten(code)
-    key = _Structure(jax.tree.structure(system), jax.tree.structure(layout), (tuple(others), tree, structure), shapes)
+    leaves, tree = jax.tree.flatten(params)
+    key = _Structure(scene, layout, tree, tuple(map(_structure_of, leaves)))
     try:
         hash(key)
     except TypeError as reason:
@@ -406,11 +419,10 @@ def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
 
 
 def _derived(key: _Structure, unhashable: str | None = None) -> Derivation:
-    others, tree, structure = key.code
-    numbers = jax.tree.unflatten(structure, [np.zeros(*shape) for shape in key.shapes])
-    params = eqx.combine(numbers, jax.tree.unflatten(tree, others))
-    system, layout = jax.tree.unflatten(key.system, []), jax.tree.unflatten(key.layout, [])
-    return Derivation(system.motion(layout, params), layout, numbers, unhashable=unhashable)
+    leaves = [np.zeros(*leaf) if isinstance(leaf, _Number) else leaf for leaf in key.leaves]
+    params, system = jax.tree.unflatten(key.params, leaves), jax.tree.unflatten(key.system, [])
+    numbers = eqx.filter(params, eqx.is_array_like)
+    return Derivation(system.motion(key.layout, params), key.layout, numbers, unhashable=unhashable)
 
 
 _derived_once = functools.lru_cache(maxsize=64)(_derived)

@@ -38,14 +38,17 @@ def asked_for(solver=None, dt=None, adjoint=None, progress: Any = False, rtol=No
     return Diffrax.of(solver, dt, adjoint, progress) if solver is not None or any(others.values()) else None
 
 
+_MACHINE_CODE = MachineCode()
+
+
 def choose(problem: Problem, asked: AbstractEngine | None = None) -> Choice:
     """The engine for a problem. Raises `ValueError` where the one that was asked for, or else every one, refuses it."""
     if isinstance(asked, Diffrax):
         choice = Choice(asked, "diffrax was asked for")
     else:
-        refusal = MachineCode().refuses(problem)
+        refusal = _MACHINE_CODE.refuses(problem)
         if refusal is None:
-            return Choice(MachineCode(), None)
+            return Choice(_MACHINE_CODE, None)
         if asked is not None:
             raise ValueError(_refused(refusal))
         choice = Choice(Diffrax(), refusal)

@@ -9,8 +9,9 @@ vector (q, q̇), and the programs of a scene take the parameters as one vector t
 """
 
 import abc
+import functools
 from collections.abc import Callable, Hashable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import diffrax
@@ -47,7 +48,9 @@ _ATOL_OVER_RTOL = 1e-3
 LEAST_RTOL, LEAST_RTOL_OF_DIFFRAX = {np.dtype("float64"): 0.25, np.dtype("float32"): 10}, 10
 
 
-class Problem(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Problem:
     """How does the motion of a scene go on from one state?
 
     - `system`, `layout`, `params`: the scene, the structure of its coordinates, and its parameters as the user gave
@@ -65,9 +68,9 @@ class Problem(eqx.Module):
     ts: Float[Numbers, " T"]
     y0: Float[Numbers, " states"]
     tolerances: tuple[Float[Numbers, ""], Float[Numbers, ""]]
-    max_steps: int = eqx.field(static=True)
+    max_steps: int = field(metadata={"static": True})
     event: diffrax.Event | None = None
-    guards: Hashable = eqx.field(static=True, default=None)
+    guards: Hashable = field(metadata={"static": True}, default=None)
 
     @classmethod
     def of(
@@ -77,25 +80,23 @@ class Problem(eqx.Module):
 
         Raises `TypeError` or `ValueError` with the name of the argument that cannot be right.
         """
-        problem = cls.about(system, layout, params, ts, rtol, atol, max_steps, event)
-        state = as_arrays((q0, qdot0), layout.dtype, "state")
-        for name, value in (("q0", q0), ("qdot0", qdot0), ("params", problem.params)):
+        dtype, given = layout.dtype, _checked(layout.dtype, params, ts, rtol, atol, max_steps, event)
+        y0 = end_to_end(jax.tree.leaves(as_arrays((q0, qdot0), dtype, "state")), dtype)
+        for name, value in (("q0", q0), ("qdot0", qdot0), ("params", given["params"])):
             require_finite(value, name)
-        return replace(problem, y0=end_to_end(jax.tree.leaves(state), layout.dtype))
+        return cls(system=system, layout=layout, y0=y0, **given)
 
     @classmethod
     def about(
         cls, system, layout: Layout, params, ts=(0.0, 1.0), rtol=None, atol=None, max_steps=65_536, event=None
     ) -> "Problem":
         """A problem about this scene from a state of zeros: enough to ask which engine it is for."""
-        dtype, ts = layout.dtype, output_times(ts, layout.dtype)
-        require_budget(max_steps, "max_steps")
-        tolerances, event = _tolerances(dtype, rtol, atol), _event(event, dtype)
-        return cls(
-            system, layout, as_arrays(params, dtype), ts, np.zeros(2 * layout.size, dtype), tolerances, max_steps, event
-        )
+        given = _checked(layout.dtype, params, ts, rtol, atol, max_steps, event)
+        return cls(system=system, layout=layout, y0=np.zeros(2 * layout.size, layout.dtype), **given)
 
-    @property
+    # What follows from the fields is looked up once: an engine is chosen and then solves the same problem.
+
+    @functools.cached_property
     def derivation(self) -> Derivation:
         """What is derived from the scene: made once for all problems whose scene and structure are equal."""
         return derivation_of(self.system, self.layout, self.params)
@@ -105,15 +106,15 @@ class Problem(eqx.Module):
         """The numbers among the parameters: what can be traced. The rest is part of the program."""
         return eqx.filter(self.params, eqx.is_array_like)
 
-    @property
+    @functools.cached_property
     def vector(self) -> Float[Numbers, " P"]:
         """Every number in the parameters, shape (P,), in the dtype of the state."""
-        return end_to_end(jax.tree.leaves(self.numbers), self.layout.dtype)
+        return end_to_end(list(filter(eqx.is_array_like, jax.tree.leaves(self.params))), self.layout.dtype)
 
     @property
     def is_known(self) -> bool:
         """Whether nothing in it is being traced, so that it can be solved at once."""
-        return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.ts, self.y0, self.numbers)))
+        return all(map(is_concrete, (self.ts, self.y0, self.vector)))
 
 
 class Batch(eqx.Module):
@@ -204,7 +205,7 @@ class Solution(NamedTuple):
     idle: Int[Any, ""] = None
 
 
-class AbstractEngine(eqx.Module):
+class AbstractEngine(abc.ABC):
     """What integrates: `MachineCode` or `Diffrax`."""
 
     @abc.abstractmethod
@@ -294,13 +295,38 @@ def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTr
 # ---- what can be wrong -----------------------------------------------------------------------------------------------
 
 
+<<<<<<< HEAD
 def _tolerances(dtype, rtol, atol) -> tuple[Float[Numbers, ""], Float[Numbers, ""]]:
+=======
+def _checked(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, Any]:
+    """The fields of a problem that depend neither on its scene nor on its state. Raises where they cannot be right."""
+    ts = output_times(ts, dtype)
+    require_budget(max_steps, "max_steps")
+    tolerances = DEFAULT_TOLERANCES[dtype] if rtol is None and atol is None else _tolerances(dtype, rtol, atol)
+    event = _event(event, dtype)
+    return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
+
+
+def _tolerances(dtype, rtol, atol) -> tuple[Number, Number]:
+>>>>>>> 7d4ee5c (An eager call looks its scene up once, names leaves only in errors, and sends arrays to JAX in one compiled call)
     """rtol and atol as arrays, the missing ones by default. Raises where no engine meets them."""
     rtol = DEFAULT_RTOL[dtype] if rtol is None else require_tolerance(rtol, "rtol")
     atol = rtol * _ATOL_OVER_RTOL if atol is None else require_tolerance(atol, "atol")
     if reason := too_tight(rtol, dtype, LEAST_RTOL[dtype]):
         raise ValueError(f"{reason}.")
     return as_arrays((1.0 * rtol, 1.0 * atol), dtype)
+
+
+def _read_only(number: float, dtype) -> np.ndarray:
+    array = np.array(number, dtype)
+    array.flags.writeable = False
+    return array
+
+
+# For all problems: nobody may write to them.
+DEFAULT_TOLERANCES = {
+    dtype: (_read_only(rtol, dtype), _read_only(rtol * _ATOL_OVER_RTOL, dtype)) for dtype, rtol in DEFAULT_RTOL.items()
+}
 
 
 def too_tight(rtol, dtype, least: float) -> str | None:

@@ -63,7 +63,7 @@ _STRUCTURE = jax.tree.structure(RESULTS.successful)
 
 def result_from(codes) -> RESULTS:
     """The results with these codes, integers of any shape."""
-    return jax.tree.unflatten(_STRUCTURE, [jnp.asarray(codes)])
+    return jax.tree.unflatten(_STRUCTURE, [codes if isinstance(codes, jax.Array) else jnp.asarray(codes)])
 
 
 _NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from lagjax._layout import taken_apart
+from lagjax._layout import dtype_of, taken_apart
 
 PyTree = Any
 
@@ -23,8 +23,25 @@ def as_arrays(tree: PyTree, dtype, name: str = "params") -> PyTree:
     Raises `TypeError` or `ValueError`, with the name of the leaf, for what is neither a number nor can be a part of the
     program.
     """
-    labels, leaves, structure = taken_apart(tree, name)
-    return structure.unflatten(_leaf_as_array(*of, dtype) for of in zip(leaves, labels, strict=True))
+    leaves, structure = _flattened(tree, name)
+    if not all(_is_plain(leaf, dtype) for leaf in leaves):
+        labels, leaves, structure = taken_apart(tree, name)
+        return structure.unflatten(_leaf_as_array(*of, dtype) for of in zip(leaves, labels, strict=True))
+    return structure.unflatten([np.asarray(leaf, dtype) if type(leaf) is float else leaf for leaf in leaves])
+
+
+def _flattened(tree: PyTree, name: str) -> tuple[list, Any]:
+    """The leaves of a pytree, whose names cost more than all else, and its structure."""
+    try:
+        return jax.tree.flatten(tree)
+    except ValueError:
+        _, leaves, structure = taken_apart(tree, name)  # which raises a sentence
+        return leaves, structure
+
+
+def _is_plain(leaf, dtype) -> bool:
+    """Whether nothing can be wrong with a leaf: a Python float, or an array that has the dtype of the state."""
+    return type(leaf) is float or ((type(leaf) is np.ndarray or isinstance(leaf, jax.Array)) and leaf.dtype == dtype)
 
 
 def _leaf_as_array(leaf, label: str, dtype):
@@ -43,7 +60,7 @@ def _leaf_as_array(leaf, label: str, dtype):
 def _dtype_of(value):
     """The dtype of a number or an array of numbers; None for all else, of which NumPy has many kinds."""
     try:
-        kind = jnp.result_type(value)
+        kind = dtype_of(value)
     except (TypeError, ValueError):
         return None
     return kind if jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.bool_) else None
@@ -80,6 +97,8 @@ def is_concrete(value) -> bool:
 def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
     """Every number that is NaN or infinite, with its name; values that are being traced have none yet."""
     found = []
+    if all(_is_finite(leaf) for leaf in jax.tree.leaves(tree)):  # the names of leaves cost more than all else
+        return found
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if eqx.is_array_like(leaf) and is_concrete(leaf) and _dtype_of(leaf) is not None:
             values = np.asarray(leaf)
@@ -90,6 +109,19 @@ def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
             for index in np.argwhere(~finite):
                 found.append((label + (str(index.tolist()) if values.ndim else ""), values[tuple(index)]))
     return found
+
+
+def _is_finite(leaf) -> bool:
+    """Whether a leaf is an array of floats without NaN and infinity; false where that takes a closer look."""
+    return isinstance(leaf, np.ndarray | jax.Array) and is_concrete(leaf) and leaf.dtype in _FLOATS and all_finite(leaf)
+
+
+_FLOATS = (np.dtype("float64"), np.dtype("float32"))
+
+
+def all_finite(array) -> bool:
+    """Whether no number of a concrete array is NaN or infinite."""
+    return bool(np.isfinite(np.asarray(array)).all())
 
 
 def require_budget(value, name: str) -> None:
@@ -127,7 +159,7 @@ def require_number(value, name: str) -> None:
 def output_times(ts, dtype) -> jax.Array | np.ndarray:
     """The output times as an array (T,) of this dtype. Raises for what is not strictly monotonic, or not two times."""
     try:
-        kind = jnp.result_type(ts if isinstance(ts, jax.Array) else np.asarray(ts))
+        kind = dtype_of(ts if isinstance(ts, jax.Array) else np.asarray(ts))
     except (TypeError, ValueError):
         raise TypeError(f"ts must be an array of output times; got {type(ts).__name__}.") from None
     if np.ndim(ts) != 1 or np.size(ts) < 2:
@@ -135,10 +167,11 @@ def output_times(ts, dtype) -> jax.Array | np.ndarray:
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"ts must hold real numbers; got {kind}.")
     whole = ts if isinstance(ts, jax.Array) else np.asanyarray(ts)
-    times = _as_array(_leaf_as_array(whole, "ts", dtype), dtype)
+    times = whole if _is_plain(whole, dtype) else _as_array(_leaf_as_array(whole, "ts", dtype), dtype)
     require_finite(times, "ts")
     if is_concrete(times):
-        gaps = np.diff(np.asarray(times))
+        values = np.asarray(times)
+        gaps = values[1:] - values[:-1]
         if not (np.all(gaps > 0) or np.all(gaps < 0)):
             raise ValueError(
                 f"ts must be strictly increasing or strictly decreasing, in {np.dtype(dtype).name}; it is not between "

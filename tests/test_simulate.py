@@ -8,6 +8,7 @@ import pytest
 from sweeps import sweep
 
 import lagjax
+from lagjax import _problem
 
 
 def oscillator(q, qdot, params):
@@ -360,3 +361,21 @@ def test_sensitivities_of_second_order():
     exact = jax.grad(jax.grad(lambda k: jnp.cos(3.0 * jnp.sqrt(k))))(2.0)
     np.testing.assert_allclose(jax.grad(jax.grad(end))(2.0), exact, rtol=1e-8)
     np.testing.assert_allclose(jax.jacfwd(jax.jacrev(end))(2.0), exact, rtol=1e-8)
+
+
+def test_a_call_looks_its_scene_up_once_and_never_remembers_a_number(monkeypatch):
+    scene, asked = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2), []
+    kept, derivation_of = [], _problem.derivation_of
+    monkeypatch.setattr(_problem, "derivation_of", lambda *args: asked.append(1) or derivation_of(*args))
+    ts, start, params = np.linspace(0.0, 2.0, 5), np.array(1.0), {"k": np.array(1.0)}
+    for k, q, last in ((1.0, 1.0, 2.0), (4.0, 1.0, 2.0), (4.0, 0.5, 2.0), (4.0, 0.5, 3.0)):
+        params["k"][()], start[()], ts[-1] = k, q, last  # arrays of the user, changed in place
+        asked.clear()
+        trajectory = lagjax.simulate(scene, start, 0.0, ts, params)
+        assert len(asked) == 1
+        assert isinstance(trajectory.q, jax.Array) and isinstance(trajectory.ts, jax.Array)
+        np.testing.assert_allclose(trajectory.q, q * np.cos(np.sqrt(k) * ts), atol=1e-8)
+        kept.append((trajectory, *(np.array(x) for x in (trajectory.ts, trajectory.q, trajectory.end.t))))
+    for trajectory, ts, q, t_end in kept:
+        for later, then in zip((trajectory.ts, trajectory.q, trajectory.end.t), (ts, q, t_end), strict=True):
+            np.testing.assert_array_equal(later, then)

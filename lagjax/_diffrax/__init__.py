@@ -23,7 +23,7 @@ from lagjax._stopped import End, what_stopped
 from lagjax._validate import is_concrete, require_number
 
 
-class Diffrax(AbstractEngine):
+class Diffrax(AbstractEngine, eqx.Module):
     """A solver of diffrax, with adaptive steps or with fixed ones of size `dt`.
 
     `solver` None is Dopri8, with better states between its steps where they are wanted; `adjoint` None goes back over

@@ -5,7 +5,9 @@ of JAX, where something is.
 """
 
 import functools
+from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,6 +20,10 @@ from lagjax._program import Unlowerable
 from lagjax._validate import is_concrete
 
 
+@jax.tree_util.register_static
+@dataclass(
+    frozen=True
+)  # methods of an equinox.Module are pytrees of their own, whose making takes as long as ten steps
 class MachineCode(AbstractEngine):
     r"""Taylor series in machine code made for the scene: `simulate(..., solver=lagjax.MachineCode())`.
 

@@ -144,9 +144,12 @@ class Flow:
         With a `store` the steps are kept there, up to `room` (N,) of each member: by default to equal parts of what may
         be kept. Results tell what stopped a member, and not only that its steps became too small, or too many.
         """
-        solution = self._explained(self.follow(ts, y0, params, tolerances, store, room), ts, params)
-        overflowed = ~np.isfinite(solution.y_end).all(axis=1)  # even where it came to the last time
-        solution.result[overflowed] = _NOT_FINITE
+        solution = self.follow(ts, y0, params, tolerances, store, room)
+        if (solution.result != SUCCESSFUL).any():
+            solution = self._explained(solution, ts, params)
+        finite = np.isfinite(solution.y_end)
+        if not finite.all():  # even where it came to the last time
+            solution.result[~finite.all(axis=1)] = _NOT_FINITE
         return solution
 
     def follow(self, ts, y0, params, tolerances, store=None, room=None) -> Solution:
