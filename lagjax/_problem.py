@@ -26,6 +26,7 @@ from lagjax._arguments import accept
 from lagjax._derivation import Derivation, derivation_of
 from lagjax._layout import Layout, as_vector, taken_apart
 from lagjax._validate import (
+    all_finite,
     as_arrays,
     is_concrete,
     output_times,
@@ -82,9 +83,12 @@ class Problem:
         """
         dtype, given = layout.dtype, _checked(layout.dtype, params, ts, rtol, atol, max_steps, event)
         y0 = end_to_end(jax.tree.leaves(as_arrays((q0, qdot0), dtype, "state")), dtype)
-        for name, value in (("q0", q0), ("qdot0", qdot0), ("params", given["params"])):
-            require_finite(value, name)
-        return cls(system=system, layout=layout, y0=y0, **given)
+        problem = cls(system=system, layout=layout, y0=y0, **given)
+        vectors = y0, problem.vector
+        if not all(isinstance(x, np.ndarray) and all_finite(x) for x in vectors):  # leaf by leaf, with their names
+            for name, value in (("q0", q0), ("qdot0", qdot0), ("params", problem.params)):
+                require_finite(value, name)
+        return problem
 
     @classmethod
     def about(
