@@ -5,6 +5,7 @@ the engine; let it solve the problem; and dress the solution in the user's pytre
 trajectory fails.
 """
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -170,7 +171,7 @@ def _trajectory(problem: Problem, engine: AbstractEngine, solution: Solution, pa
     if not isinstance(solution.y_end, np.ndarray):
         ts, q, qdot, result = jax.tree.map(jnp.asarray, arrays)
     else:
-        ts, q, qdot, result = jax.device_put(arrays) if np.ndim(solution.result) else _sent(*arrays)
+        ts, q, qdot, result = _sent(arrays)
     stats = {
         "num_steps": solution.accepted + solution.rejected,
         "num_accepted_steps": solution.accepted,
@@ -196,9 +197,18 @@ def _trajectory(problem: Problem, engine: AbstractEngine, solution: Solution, pa
     )
 
 
-# NumPy arrays as arrays of JAX. `jax.device_put` takes as long as a short motion, where a compiled function of this
-# signature, once there is one, takes a tenth of that.
-_sent = jax.jit(lambda *arrays: arrays)
+def _sent(arrays: tuple) -> tuple:
+    """NumPy arrays as arrays of JAX.
+
+    `jax.device_put` takes as long as a short motion, a compiled function of arrays of these shapes a tenth of that. In
+    a process that was forked nothing can be compiled: XLA's threads did not come along.
+    """
+    is_batch = np.ndim(arrays[-1]) > 0
+    return jax.device_put(arrays) if is_batch or os.getpid() != _PROCESS else _as_they_are(*arrays)
+
+
+_PROCESS = os.getpid()
+_as_they_are = jax.jit(lambda *arrays: arrays)
 
 
 def _refused(trajectory: Trajectory, astray: jax.Array) -> Trajectory:

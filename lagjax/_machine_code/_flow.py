@@ -137,14 +137,22 @@ class Flow:
     # ---- forward ----
 
     def run(
-        self, ts, y0, params, tolerances: Tolerances, store: StepStore | None = None, room: np.ndarray | None = None
+        self,
+        ts,
+        y0,
+        params,
+        tolerances: Tolerances,
+        store: StepStore | None = None,
+        room: np.ndarray | None = None,
+        begun: _native.Begun | None = None,
     ) -> Solution:
         """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the motions of N members.
 
         With a `store` the steps are kept there, up to `room` (N,) of each member: by default to equal parts of what may
         be kept. Results tell what stopped a member, and not only that its steps became too small, or too many.
+        A run that a handler has `begun` is gone on with.
         """
-        solution = self.follow(ts, y0, params, tolerances, store, room)
+        solution = self.follow(ts, y0, params, tolerances, store, room, begun)
         if (solution.result != SUCCESSFUL).any():
             solution = self._explained(solution, ts, params)
         finite = np.isfinite(solution.y_end)
@@ -152,12 +160,12 @@ class Flow:
             solution.result[~finite.all(axis=1)] = _NOT_FINITE
         return solution
 
-    def follow(self, ts, y0, params, tolerances, store=None, room=None) -> Solution:
+    def follow(self, ts, y0, params, tolerances, store=None, room=None, begun=None) -> Solution:
         """`run` without a look at what stopped a member: for another try, and for derivatives."""
         rtol, atol, max_steps, _ = tolerances
         if store is not None and room is None:
             room = np.full(len(y0), min(max_steps, LARGEST_KEPT // ((self.states + 2) * max(1, len(y0)))))
-        done = self.kernel(ts, y0, params, rtol, atol, max_steps, room)
+        done = self.kernel(ts, y0, params, rtol, atol, max_steps, room, begun)
         result, event = _RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:

@@ -23,19 +23,21 @@ shared; under `jax.vmap` it is still one call of machine code. Outside of `jit` 
 
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.experimental.buffer_callback import buffer_callback
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from lagjax._machine_code import _derivatives
+from lagjax._machine_code._call import has_handler, on_host, run_by_handler
 from lagjax._machine_code._flow import Flow, Tolerances
 from lagjax._machine_code._steps import KEPT
 from lagjax._machine_code._tangent import from_rows, to_rows
+from lagjax._native import Begun
 from lagjax._problem import Solution
 from lagjax._results import SUCCESSFUL
 
@@ -57,9 +59,8 @@ def _compiled(flow: Flow, tolerances: Tolerances):
 # ---- on the host: NumPy arrays with any batch axes in front ----------------------------------------------------------
 
 
-def _rows(arrays, inner, shared=()):
+def _rows(arrays, inner, shared=(), library: Any = np):
     """Each array with one row a member, or one row where that is all there is to a `shared` one; and the batch axes."""
-    arrays = [np.asarray(x) for x in arrays]
     leading = [x.shape[: x.ndim - k] for x, k in zip(arrays, inner, strict=True)]
     batch = np.broadcast_shapes(*leading)
 
@@ -67,7 +68,7 @@ def _rows(arrays, inner, shared=()):
         own = x.shape[x.ndim - k :]
         if place in shared and x.size == math.prod(own):
             return x.reshape(1, *own)
-        return np.broadcast_to(x, batch + own).reshape(math.prod(batch), *own)
+        return library.broadcast_to(x, batch + own).reshape(math.prod(batch), *own)
 
     return [rows(place, x, k) for place, (x, k) in enumerate(zip(arrays, inner, strict=True))], batch
 
@@ -79,6 +80,11 @@ def _in_batch(results, batch):
 def _run_on_host(ts, y0, params, *, flow, tolerances, keep):
     rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2))
     return _in_batch(flow.run(*rows, tolerances, KEPT if keep else None)[:_OUTPUTS], batch)
+
+
+def _run_gone_on_with(ts, y0, params, *begun, flow, tolerances, **_):
+    """The results of a run of rows of members, of which a handler has done what it could."""
+    return flow.run(ts, y0, params, tolerances, begun=Begun(*begun))[:_OUTPUTS]
 
 
 def _jvp_on_host(ts, y0, params, path, result, accepted, ticket, dy0, dparams, *, flow, tolerances):
@@ -405,25 +411,30 @@ def _on_host(primitive, host, shapes) -> None:
             return jax.device_put([np.asarray(x) for x in host(*map(np.asarray, args), **settings)])
 
     def compiled(*args, **settings):
-        avals = shapes(*args, **settings)
-
-        # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
-        # the callbacks themselves may occupy.
-        def callback(_, places, *arrays):
-            with jax.enable_x64(True):  # another thread; a program may be made here
-                results = host(*map(np.asarray, arrays), **settings)
-            for place, values in zip(places, results, strict=True):
-                np.asarray(place)[...] = values
-
-        return buffer_callback(callback, tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in avals))(*args)
+        return on_host(functools.partial(host, **settings), shapes(*args, **settings), *args)
 
     primitive.def_impl(at_once)
     mlir.register_lowering(primitive, mlir.lower_fun(compiled, multiple_results=True), platform="cpu")
 
 
+def _run_compiled(ts, y0, params, *, flow, tolerances, keep):
+    """`run` of what XLA compiles: by the handler where that may be, else on the host."""
+    settings = dict(flow=flow, tolerances=tolerances, keep=keep)
+    shapes = _run_shapes(ts, y0, params, **settings)
+    rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2), library=jnp)
+    with jax.enable_x64(True):  # where the kernel is made, and whatever was set where this is lowered
+        if keep or not has_handler(flow, math.prod(batch)):
+            return on_host(functools.partial(_run_on_host, **settings), shapes, ts, y0, params)
+        of_rows = [jax.ShapeDtypeStruct((len(rows[1]), *x.shape[len(batch) :]), x.dtype) for x in shapes]
+        return _in_batch(
+            run_by_handler(flow, tolerances, functools.partial(_run_gone_on_with, **settings), of_rows, *rows), batch
+        )
+
+
 _on_host(run_p, _run_on_host, _run_shapes)
 _on_host(jvp_p, _jvp_on_host, _jvp_shapes)
 _on_host(vjp_p, _vjp_on_host, _vjp_shapes)
+mlir.register_lowering(run_p, mlir.lower_fun(_run_compiled, multiple_results=True), platform="cpu")
 curvature_p.multiple_results = True
 curvature_p.def_abstract_eval(_curvature_shapes)
 curvature_p.def_impl(_curvature_composed)

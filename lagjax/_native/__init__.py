@@ -16,7 +16,7 @@ one Taylor series, of the order that the tolerance asks for.
     _events      where guards change sign
     _output      what is written down
     _integrator  all of these, round by round;  _adjoint: its transpose
-    _kernel      both as functions of arrays;  _threads: on several cores, interruptible
+    _kernel      both as functions of arrays;  _threads: on several cores, interruptible;  _handler: as a call of XLA
 
 Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).
 """
@@ -31,9 +31,11 @@ from lagjax._native._constants import (
     SINGULAR,
     STEP_TOO_SMALL,
 )
-from lagjax._native._kernel import Guards, Kernel, Outcome, Projection, cores, order_for, recurrences
+from lagjax._native._handler import Handler, Plan, unavailable
+from lagjax._native._kernel import Begun, Guards, Kernel, Outcome, Projection, cores, order_for, recurrences
 
 __all__ = [
     "DISCONTINUOUS", "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "STEP_TOO_SMALL",
-    "Guards", "Kernel", "Outcome", "Projection", "cores", "order_for", "recurrences",
+    "Begun", "Guards", "Handler", "Kernel", "Outcome", "Plan", "Projection", "cores", "order_for", "recurrences",
+    "unavailable",
 ]  # fmt: skip

@@ -13,11 +13,16 @@ from llvmlite import ir
 from lagjax._native._adjoint import Adjoint
 from lagjax._native._constants import DONE, LEAST_ORDER, MAX_ORDER, VECTORS_PER_THREAD
 from lagjax._native._frame import LANE, Layout
+from lagjax._native._handler import Plan, Rest, aligned
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled
-from lagjax._native._threads import in_slices, together
+from lagjax._native._threads import FIRST_ROUNDS, SLICE, in_slices, together
 from lagjax._program._graph import Unlowerable
 from lagjax._program._series import Recurrent, Series, series
+
+# A round of the largest programs takes 0.5 ms, one of small ones less than this would have it: how long a handler runs,
+# which nobody can interrupt, need not be known better than that.
+_SECONDS_AN_OPERATION = 1e-7
 
 
 class Outcome(NamedTuple):
@@ -38,6 +43,18 @@ class Outcome(NamedTuple):
     rejected: np.ndarray
     idle: int
     table: np.ndarray | None
+
+
+class Begun(NamedTuple):
+    """A run as a handler left it: its results (`_handler.Handler`), some of which may not be written yet."""
+
+    path: np.ndarray
+    y_end: np.ndarray
+    t_end: np.ndarray
+    code: np.ndarray
+    steps: np.ndarray
+    rejected: np.ndarray
+    rest: np.ndarray
 
 
 class Guards(NamedTuple):
@@ -88,30 +105,37 @@ class Kernel:
         self.states, self.numbers, self.width = motion.states, motion.numbers, motion.width
         self._forward = _Compiled(motion.module, motion.layout, integrator.job, pointers=4)
 
-    def __call__(self, ts, y0, params, rtol: float, atol: float, max_steps: int, room=None) -> Outcome:
+    def __call__(
+        self, ts, y0, params, rtol: float, atol: float, max_steps: int, room=None, begun: Begun | None = None
+    ) -> Outcome:
         """The motions from the states `y0` (N, 2n), all arrays of float64.
 
         `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. With `room` (N,)
-        up to so many steps of each member are written down, for `vjp`.
+        up to so many steps of each member are written down, for `vjp`. What a handler has `begun` is gone on with.
         """
         ts, y0, params = _contiguous(ts, y0, params)
         members, times = len(y0), ts.shape[1]
-        path = np.full((members, times, self.states), np.nan)
-        y_end, t_end = np.empty((members, self.states)), np.empty(members)
-        code, steps, rejected = (np.empty(members) for _ in range(3))
+        if begun is None:
+            rest, path = None, np.full((members, times, self.states), np.nan)
+            y_end, t_end = np.empty((members, self.states)), np.empty(members)
+            code, steps, rejected = (np.empty(members) for _ in range(3))
+        else:
+            rest = Rest.of(begun.rest, self._forward.layout)
+            path, y_end, t_end, code, steps, rejected = (np.array(x, np.float64) for x in begun[:-1])
         table = first_step = None
         if room is not None:
             first_step = np.concatenate([[0], np.cumsum(room)]).astype(np.int64)
             table = np.empty((first_step[-1], self.states + 2))  # the system provides pages when they are written to
         arrays = dict(
-            next_member=np.zeros(1, np.int64), ts=ts, y0=y0, params=params, path=path, y_end=y_end, t_end=t_end,
-            code=code, steps=steps, rejected=rejected, record=table, first_step=first_step,
+            next_member=np.zeros(1, np.int64) if rest is None else rest.next_member, ts=ts, y0=y0, params=params,
+            path=path, y_end=y_end, t_end=t_end, code=code, steps=steps, rejected=rejected, record=table,
+            first_step=first_step,
         )  # fmt: skip
         numbers = dict(
             **self._strides(ts, params), members=members, times=times, order=order_for(rtol), max_steps=max_steps,
             recording=table is not None, rtol=rtol, atol=atol,
         )  # fmt: skip
-        idle = self._forward(arrays, numbers, self._threads(members))
+        idle = self._forward(arrays, numbers, self.threads(members) if rest is None else 1, rest)
         ended_badly = code != DONE
         if ended_badly.any():  # a start that is infinite was not reached either
             reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
@@ -135,8 +159,23 @@ class Kernel:
         )  # fmt: skip
         members, times = path_ct.shape[:2]
         numbers = dict(**self._strides(ts, params), members=members, times=times, order=order)
-        self._backward(arrays, numbers, self._threads(members))
+        self._backward(arrays, numbers, self.threads(members))
         return y_ct, params_ct
+
+    def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
+        """What a handler needs to begin a run; for as long as this kernel lives."""
+        operations = len(self._parts[0].line.nodes)
+        rounds = max(FIRST_ROUNDS, int(SLICE / (_SECONDS_AN_OPERATION * operations)))
+        begin, run = self._forward.places
+        return Plan(
+            begin, run, self._forward.layout.size, self.states, self.numbers, order_for(rtol), max_steps, rounds, rtol,
+            atol,
+        )  # fmt: skip
+
+    @property
+    def rest_size(self) -> int:
+        """The doubles of the `rest` that a handler leaves behind."""
+        return Rest.size(self._forward.layout)
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
@@ -149,7 +188,8 @@ class Kernel:
             ts_stride=ts.shape[1] if len(ts) > 1 else 0, params_stride=self.numbers if len(params) > 1 else 0
         )  # fmt: skip
 
-    def _threads(self, members: int) -> int:
+    def threads(self, members: int) -> int:
+        """On how many threads so many members are worked on."""
         return min(cores(), max(1, members // (VECTORS_PER_THREAD * self.width)))
 
 
@@ -157,22 +197,29 @@ class _Compiled:
     """The functions `begin` and `run` of a module: all members of a job, on several threads."""
 
     def __init__(self, module: ir.Module, layout: Layout, job: Callable, pointers: int):
-        self._layout, self._job, self._counts_idle = layout, job, pointers == 4
-        # The engine holds the code that the other points to.
+        self.layout, self._job, self._counts_idle = layout, job, pointers == 4
+        # The engine holds the code that the others point to.
         self._engine, at = compiled(module, ("begin", "run"))
+        self.places = at["begin"], at["run"]
         self._begin = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(at["begin"])
         self._run = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * pointers, ctypes.c_int64)(at["run"])
 
-    def __call__(self, arrays: Mapping[str, np.ndarray | None], numbers: Mapping[str, float], threads: int) -> int:
-        """Work on the arrays; how many steps lanes stood empty for."""
+    def __call__(
+        self, arrays: Mapping[str, np.ndarray | None], numbers: Mapping[str, float], threads: int, rest=None
+    ) -> int:
+        """Work on the arrays, from the beginning or from what is left to do; how many steps lanes stood empty for."""
         addresses = {name: None if array is None else array.ctypes.data for name, array in arrays.items()}
         job = self._job(**addresses, **numbers)
 
         def work(stopped, _arrays=arrays) -> int:  # whose memory must live as long as somebody works on it
-            memory = aligned(self._layout.size)
-            lanes, idle = np.zeros(len(LANE) * self._layout.width, np.int64), np.zeros(1, np.int64)
+            if rest is None:
+                memory = aligned(self.layout.size)
+                lanes, idle = np.zeros(len(LANE) * self.layout.width, np.int64), np.zeros(1, np.int64)
+            else:
+                memory, lanes, idle, _ = rest
             mine = [ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data]
-            self._begin(*mine)
+            if rest is None:
+                self._begin(*mine)
             if self._counts_idle:
                 mine.append(idle.ctypes.data)
             in_slices(functools.partial(self._run, *mine), stopped)
@@ -202,9 +249,3 @@ def order_for(rtol: float) -> int:
 def cores() -> int:
     """The cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def aligned(size: int) -> np.ndarray:
-    """Zeros on the boundary of a cache line, which vectors need."""
-    memory = np.zeros(size + 8)
-    return memory[(-memory.ctypes.data // 8) % 8 :]

@@ -1,0 +1,100 @@
+"""A run of machine code as XLA calls it: by a handler in machine code, and by Python for all that is rare.
+
+    members that one thread works on ─► handler ─► all ended well? ─► yes: results, without Python
+                                                        └─ no: `Flow.run` goes on in a callback
+    more members, steps to be kept   ─► `Flow.run` in a callback
+
+Long runs, second chances, failures and what stopped them are Python's, as are threads and Ctrl-C. The handler is for
+the version of XLA's interface that it knows; where `NO_HANDLER` says why that is another one, every run is a callback.
+"""
+
+import ctypes
+import functools
+import threading
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+from lagjax import _native
+from lagjax._machine_code._flow import Flow, Tolerances
+from lagjax._results import EVENT_OCCURRED, SUCCESSFUL
+
+NO_HANDLER = _native.unavailable(jax.ffi.include_dir())
+_TARGET = "lagjax_integrate"
+_lock = threading.Lock()
+
+
+def on_host(host: Callable, shapes, *arrays) -> tuple:
+    """What `host` computes from NumPy arrays, in a callback of what XLA compiles; `shapes` are those of its results."""
+
+    # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
+    # the callbacks themselves may occupy.
+    def callback(_, places, *arrays):
+        with jax.enable_x64(True):  # another thread; a program may be made here
+            results = host(*map(np.asarray, arrays))
+        for place, values in zip(places, results, strict=True):
+            np.asarray(place)[...] = values
+
+    return tuple(buffer_callback(callback, tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in shapes))(*arrays))
+
+
+def has_handler(flow: Flow, members: int) -> bool:
+    """Whether a run of so many members begins in the handler."""
+    return NO_HANDLER is None and flow.kernel.threads(members) == 1
+
+
+def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, ts, y0, params) -> tuple:
+    """The run of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), N not too many for one thread.
+
+    `host(ts, y0, params, *begun)` goes on with what the handler leaves undone (`_native.Begun`); its results, of these
+    `shapes`, are those of the whole.
+    """
+    _register()
+    kernel, (members, states) = flow.kernel, y0.shape
+    plan = kernel.plan(tolerances.rtol, tolerances.atol, tolerances.max_steps)
+    rows, size = (members,), (kernel.rest_size,)
+    of_handler = [(members, ts.shape[1], states), (members, states), *[rows] * 4, size]
+    call = jax.ffi.ffi_call(_TARGET, [jax.ShapeDtypeStruct(shape, np.float64) for shape in of_handler])
+    begun = _native.Begun(*call(ts, y0, params, plan=np.int64(ctypes.addressof(plan))))
+
+    def finished(ts, y0, params, path, y_end, t_end, code, steps, rejected, rest):
+        happened = code >= _native.EVENT
+        result = jnp.where(happened, EVENT_OCCURRED, SUCCESSFUL)
+        event = jnp.where(happened, code - _native.EVENT, 0.0)
+        counts = result, steps, rejected, event, jnp.full(rows, -1)
+        return path, y_end, t_end, *(x.astype(int) for x in counts)
+
+    def unfinished(*arrays):
+        # The callback lives as long as the compiled program, and with it what the handler needs.
+        return on_host(functools.partial(host, needed=(plan, kernel)), shapes, *arrays)
+
+    well = _ended_well(begun)
+    return tuple(jax.lax.cond(well, finished, unfinished, ts, y0, params, *begun))
+
+
+def _ended_well(begun: _native.Begun):
+    """Whether nothing is left to do, and no member failed."""
+    more = jax.lax.bitcast_convert_type(begun.rest[-1], np.int64)
+    codes = (begun.code == _native.DONE) | (begun.code >= _native.EVENT)
+    return (more == 0) & jnp.all(codes) & jnp.all(jnp.isfinite(begun.y_end))
+
+
+def _register() -> None:
+    """Make the handler, and tell XLA about it; once."""
+    with _lock:
+        _handler()
+
+
+@functools.cache
+def _handler() -> _native.Handler:
+    handler = _native.Handler()
+    jax.ffi.register_ffi_target(_TARGET, _capsule(handler.address), platform="cpu", api_version=1)
+    return handler
+
+
+def _capsule(address: int):
+    new = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
+    return new(("PyCapsule_New", ctypes.pythonapi))(address, None, None)

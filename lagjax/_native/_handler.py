@@ -1,0 +1,249 @@
+"""The integration of a few members as a call of XLA's typed foreign-function interface: no Python, no lock, no thread.
+
+XLA calls a handler with a frame, in which are the addresses of the arguments, of the results and of one attribute: that
+of a `Plan`, which says whose machine code is to run, how and how far. One handler serves all kernels. It never waits:
+it begins a run, does as many rounds as take a slice of time, and leaves behind what is needed to go on (`REST`). Who
+asked for it looks at that, and at how members ended; all that is rare stays in Python.
+
+Layouts of structures are those of `xla/ffi/api/c_api.h`, on 64 bits. `unavailable` compares them with the header that
+came with the XLA at hand.
+"""
+
+import ctypes
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+
+from lagjax._native._frame import LANE, Layout
+from lagjax._native._integrator import JOB
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compiled, lanes
+
+MAJOR, MINOR = 0, 3
+# The structures that a handler reads, field by field, as the header declares them.
+_HEAD = "size_t struct_size; XLA_FFI_Extension_Base* extension_start; "
+_STRUCTURES = {
+    "CallFrame": _HEAD + "const XLA_FFI_Api* api; XLA_FFI_ExecutionContext* ctx; XLA_FFI_ExecutionStage stage; "
+    "XLA_FFI_Args args; XLA_FFI_Rets rets; XLA_FFI_Attrs attrs; XLA_FFI_Future* future;",
+    "Args": _HEAD + "int64_t size; XLA_FFI_ArgType* types; void** args;",
+    "Rets": _HEAD + "int64_t size; XLA_FFI_RetType* types; void** rets;",
+    "Attrs": _HEAD + "int64_t size; XLA_FFI_AttrType* types; XLA_FFI_ByteSpan** names; void** attrs;",
+    "Buffer": _HEAD + "XLA_FFI_DataType dtype; void* data; int64_t rank; int64_t* dims;",
+    "Scalar": "XLA_FFI_DataType dtype; void* value;",
+    "Metadata": "size_t struct_size; XLA_FFI_Api_Version api_version; XLA_FFI_Handler_Traits traits; "
+    "XLA_FFI_TypeId state_type_id;",
+    "Metadata_Extension": "XLA_FFI_Extension_Base extension_base; XLA_FFI_Metadata* metadata;",
+    "Extension_Base": "size_t struct_size; XLA_FFI_Extension_Type type; struct XLA_FFI_Extension_Base* next;",
+    "Api_Version": _HEAD + "int major_version; int minor_version;",
+    "TypeId": "int64_t type_id;",
+}
+# Offsets in bytes that follow from them.
+_EXTENSION, _ARGS, _RETS, _ATTRS = 8, 72, 112, 160
+_METADATA, _MAJOR, _MINOR, _TRAITS, _STATE_TYPE = 24, 24, 28, 32, 40
+_DATA, _DIMS, _SCALAR_VALUE = 24, 40, 8
+
+
+def unavailable(include: str) -> str | None:
+    """Why handlers cannot be made for the XLA whose headers are in this folder; None where they can."""
+    header = Path(include) / "xla" / "ffi" / "api" / "c_api.h"
+    if ctypes.sizeof(ctypes.c_void_p) != 8:
+        return "pointers do not have 64 bits"
+    try:
+        text = re.sub(r"//[^\n]*", "", header.read_text())
+    except OSError:
+        return f"there is no {header}"
+    major = re.search(r"#define XLA_FFI_API_MAJOR (\d+)", text)
+    if major is None or int(major[1]) != MAJOR:
+        return f"the version of the interface is {major and major[1]}, not {MAJOR}"
+    for name, fields in _STRUCTURES.items():
+        body = re.search(rf"struct XLA_FFI_{name} {{(.*?)\n}}", text, flags=re.DOTALL)
+        declared = body and " ".join(body[1].split())
+        if declared != fields:
+            return f"the structure {name} is another one: {declared}"
+    return None
+
+
+class Plan(ctypes.Structure):
+    """What a handler is told of a kernel: where its functions are, how large its memory is, and how to run it.
+
+    `memory` counts the doubles of a thread, `rounds` the rounds until the handler returns.
+    """
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("begin", "run")),
+        *((name, ctypes.c_int64) for name in ("memory", "states", "numbers", "order", "max_steps", "rounds")),
+        *((name, ctypes.c_double) for name in ("rtol", "atol")),
+    ]
+
+
+class Rest(NamedTuple):
+    """What a handler leaves behind of a run, for whoever goes on with it: the memory of the thread and its integers.
+
+    As an array of doubles, `size` of them, it begins with the memory, after as many doubles as are left before the next
+    boundary of a cache line. At the end stand integers of 64 bits: those of the lanes, how many doubles were left, the
+    steps that lanes stood empty for, the next member, and 1 if there is more to do.
+    """
+
+    memory: np.ndarray
+    lanes: np.ndarray
+    idle: np.ndarray
+    next_member: np.ndarray
+
+    @staticmethod
+    def size(layout: Layout) -> int:
+        """How many doubles it takes."""
+        return layout.size + _CACHE_LINE + _integers(layout.width)
+
+    @classmethod
+    def of(cls, array: np.ndarray, layout: Layout) -> "Rest":
+        """From what a handler wrote: a copy."""
+        integers = array[-_integers(layout.width) :].view(np.int64).copy()
+        lanes, (skipped, *_) = np.split(integers, [-_OTHERS])
+        memory = aligned(layout.size)
+        memory[: layout.size] = array[skipped : skipped + layout.size]
+        return cls(memory, lanes, integers[-3:-2], integers[-2:-1])
+
+
+_CACHE_LINE = 8  # doubles, with which a vector is to begin
+_OTHERS = 4  # integers after those of the lanes
+
+
+def _integers(width: int) -> int:
+    return len(LANE) * width + _OTHERS
+
+
+def aligned(size: int) -> np.ndarray:
+    """Zeros on the boundary of a cache line, which vectors need."""
+    memory = np.zeros(size + _CACHE_LINE)
+    return memory[(-memory.ctypes.data // 8) % _CACHE_LINE :]
+
+
+ARGUMENTS = ("ts", "y0", "params")
+RESULTS = ("path", "y_end", "t_end", "code", "steps", "rejected", "rest")
+
+
+class Handler:
+    """The handler in machine code; `address` is where, as long as this object lives.
+
+    Its arguments are `ts` (1 or N, T), `y0` (N, 2n) and `params` (1 or N, P), its results `path` (N, T, 2n), `y_end`
+    (N, 2n), then `t_end`, `code`, `steps` and `rejected`, each (N,), and the `rest` of the run (`Rest.size`), all of
+    doubles. `path` is NaN where a member did not come.
+    """
+
+    def __init__(self):
+        module = ir.Module("handler")
+        module.triple = ""
+        _Builder(module).build()
+        self._engine, places = compiled(module, ("handler",))
+        self.address = places["handler"]
+
+
+class _Builder:
+    """Writes the handler down: `XLA_FFI_Error* handler(XLA_FFI_CallFrame*)`."""
+
+    def __init__(self, module: ir.Module):
+        self.code = Code(module, "handler", [POINTER], lanes(), result=POINTER, public=True)
+        self.null = ir.Constant(POINTER, None)
+
+    def build(self) -> None:
+        code, (frame,) = self.code, self.code.arguments
+        extension = self._at(frame, _EXTENSION, POINTER)
+        with code.builder.if_then(code.builder.icmp_unsigned("!=", extension.it, self.null)):
+            self._tell_version(extension)
+            code.builder.ret(self.null)
+        self._integrate(frame)
+        code.builder.ret(self.null)
+
+    # ---- memory ----
+
+    def _address(self, base: Value, offset: int) -> Value:
+        """A place so many bytes behind another."""
+        return self.code.element(base, offset, ir.IntType(8))
+
+    def _at(self, base: Value, offset: int, kind: ir.Type) -> Value:
+        """The value there."""
+        return self.code.load(self._address(base, offset), kind)
+
+    def _element(self, array: Value, index: int) -> Value:
+        """An element of an array of pointers."""
+        return self.code.load(self.code.element(array, index, POINTER), POINTER)
+
+    def _plan(self, plan: Value, name: str, kind: ir.Type = INTEGER) -> Value:
+        return self._at(plan, getattr(Plan, name).offset, kind)
+
+    # ---- what XLA asks for ----
+
+    def _tell_version(self, extension: Value) -> None:
+        """XLA asks once, when the handler is registered, for which version of the interface it was written."""
+        code, metadata, short = self.code, self._at(extension, _METADATA, POINTER), ir.IntType(32)
+        for offset, number in ((_MAJOR, MAJOR), (_MINOR, MINOR), (_TRAITS, 0)):
+            code.builder.store(ir.Constant(short, number), self._address(metadata, offset).it)
+        code.store(code.as_value(0, INTEGER), self._address(metadata, _STATE_TYPE))  # a handler without state
+
+    def _integrate(self, frame: Value) -> None:
+        code = self.code
+        args, rets, attrs = (self._at(frame, offset, POINTER) for offset in (_ARGS, _RETS, _ATTRS))
+        plan = self._at(self._at(self._element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
+        buffers = {name: self._element(args, i) for i, name in enumerate(ARGUMENTS)}
+        buffers |= {name: self._element(rets, i) for i, name in enumerate(RESULTS)}
+        data = {name: self._at(buffer, _DATA, POINTER) for name, buffer in buffers.items()}
+        dims = {name: self._at(buffers[name], _DIMS, POINTER) for name in (*ARGUMENTS, "rest")}
+        members, times = self._at(dims["y0"], 0, INTEGER), self._at(dims["ts"], 8, INTEGER)
+        states, numbers = self._plan(plan, "states"), self._plan(plan, "numbers")
+
+        def stride(name: str, count: Value) -> Value:
+            return code.select(self._at(dims[name], 0, INTEGER) > 1, count, 0)
+
+        with code.loop(members * times * states) as i:
+            code.store(code.as_value(float("nan"), DOUBLE), code.element(data["path"], i))
+        memory, integers = self._rest(data.pop("rest"), self._at(dims["rest"], 0, INTEGER), plan)
+        width = len(LANE) * code.lanes
+        idle, next_member, more = (code.element(integers, width + i, INTEGER) for i in (1, 2, 3))
+        fields: dict[str, Any] = dict.fromkeys((name for name, _ in JOB._fields_), 0) | data
+        fields |= {name: self._plan(plan, name) for name in ("order", "max_steps")}
+        fields |= {name: self._plan(plan, name, DOUBLE) for name in ("rtol", "atol")}
+        fields |= dict(members=members, times=times, next_member=next_member)
+        fields |= dict(ts_stride=stride("ts", times), params_stride=stride("params", numbers))
+        job = self._job(fields)
+        begin, run = (self._plan(plan, name) for name in ("begin", "run"))
+        self._call(begin, ir.VoidType(), job, memory, integers)
+        code.store(self._call(run, INTEGER, job, memory, integers, idle, self._plan(plan, "rounds")), more)
+
+    def _rest(self, rest: Value, size: Value, plan: Value) -> tuple[Value, Value]:
+        """The memory of the thread, of zeros and on the boundary of a cache line, and the integers, of zeros."""
+        code, size_of_memory = self.code, self._plan(plan, "memory")
+        address = Value(code, code.builder.ptrtoint(rest.it, INTEGER))
+        bytes_left = Value(code, code.builder.and_((0 - address).it, ir.Constant(INTEGER, 8 * _CACHE_LINE - 1)))
+        skipped = bytes_left / 8
+        memory, integers = code.element(rest, skipped), code.element(rest, size - _integers(code.lanes))
+        with code.loop(size_of_memory / code.lanes) as i:
+            code.store(code.lanes_of(0.0), code.element(memory, i * code.lanes))
+        with code.loop(code.as_value(_integers(code.lanes), INTEGER)) as i:
+            code.store(code.as_value(0, INTEGER), code.element(integers, i, INTEGER))
+        code.store(skipped, code.element(integers, len(LANE) * code.lanes, INTEGER))
+        return memory, integers
+
+    def _job(self, fields: dict[str, Any]) -> Value:
+        """The job of one run, on the stack."""
+        code = self.code
+        kinds = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
+        with code.builder.goto_entry_block():
+            place = code.builder.alloca(ir.ArrayType(INTEGER, len(JOB._fields_)))
+        place.align = 8
+        # A pointer of no kind, which llvmlite has no other way to make of one to an array.
+        job = Value(code, code.builder.inttoptr(code.builder.ptrtoint(place, INTEGER), POINTER))
+        for i, (name, kind) in enumerate(JOB._fields_):
+            value = fields[name]
+            if not isinstance(value, Value):
+                kind = ir.Constant(POINTER, None) if kind is ctypes.c_void_p else ir.Constant(kinds[kind], value)
+                value = Value(code, kind)
+            code.store(value, code.element(job, i, INTEGER))
+        return job
+
+    def _call(self, function: Value, result: ir.Type, *arguments: Value) -> Value:
+        """A function of the kernel, by its address."""
+        kind = ir.FunctionType(result, [argument.it.type for argument in arguments])
+        pointer = self.code.builder.inttoptr(function.it, kind.as_pointer())
+        return Value(self.code, self.code.builder.call(pointer, [argument.it for argument in arguments]))

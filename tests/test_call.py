@@ -1,0 +1,229 @@
+"""A run inside compiled functions: what the handler does without Python is what a run outside of them does, to the bit.
+
+The handler serves few members and short runs; what it leaves undone is gone on with. Both under every transformation,
+on several threads and devices, after a fork, and with what fails.
+"""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import _native
+from lagjax._machine_code import _call, _transforms
+
+SCENE = lagjax.scenes.double_pendulum()
+TS = np.linspace(0.0, 1.0, 4)
+Q = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 2))
+
+
+@pytest.fixture
+def on_host(monkeypatch):
+    """The arguments of every run, or of what is left of one, that Python is asked for."""
+    asked = []
+    for name in ("_run_on_host", "_run_gone_on_with"):
+        function = getattr(_transforms, name)
+
+        def counted(*args, function=function, **settings):
+            asked.append(args)
+            return function(*args, **settings)
+
+        monkeypatch.setattr(_transforms, name, counted)
+    return asked
+
+
+def run(q, ts=TS, params=SCENE.params, **options):
+    found = lagjax.simulate(SCENE.system, q, np.zeros(2), ts, params, **options)
+    return found.q, found.end, found.result._value, found.stats
+
+
+def assert_equal(one, other):
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_compiled_run_is_the_run_itself_and_takes_no_python(on_host):
+    assert _call.NO_HANDLER is None
+    compiled = jax.jit(run)
+    for q in Q[:3]:
+        assert_equal(compiled(q), run(q))
+    masses = SCENE.params | {"m1": 1.0 + np.arange(6.0)}
+    sets = {**dict.fromkeys(SCENE.params), "m1": 0}
+
+    def of_each(q, params):
+        return jax.vmap(lambda q, params: run(q, params=params), in_axes=(0, sets))(q, params)
+
+    assert_equal(jax.jit(of_each)(Q, masses), of_each(Q, masses))
+    times = TS * (1.0 + np.arange(3.0))[:, None]
+
+    def at_all(q, ts):  # members with times of their own, and an axis that shares them
+        return jax.vmap(lambda q: jax.vmap(lambda ts: run(q, ts))(ts))(q)
+
+    eager = at_all(Q[:2], times)
+    assert eager[0].shape == (2, 3, 4, 2)
+    on_host.clear()
+    assert_equal(jax.jit(at_all)(Q[:2], times), eager)
+    assert not on_host
+
+
+def test_a_loop_of_short_runs_takes_no_python_and_has_derivatives(on_host):
+    ts = jnp.linspace(0.0, 0.1, 2)
+
+    def walk(q, params):
+        def step(state, _):
+            found = jax.checkpoint(lambda s: lagjax.simulate(SCENE.system, *s, ts, params))(state)
+            return (found.q[-1], found.qdot[-1]), found.q[-1]
+
+        return jax.lax.scan(step, (q, jnp.zeros(2)), None, length=10)[1]
+
+    whole = lagjax.simulate(SCENE.system, Q[0], np.zeros(2), np.linspace(0.0, 1.0, 11), SCENE.params, rtol=1e-12)
+    on_host.clear()
+    np.testing.assert_allclose(jax.jit(walk)(Q[0], SCENE.params), whole.q[1:], atol=1e-8)
+    assert not on_host
+    slope = jax.jit(jax.grad(lambda m: walk(Q[0], SCENE.params | {"m1": m})[-1, 0]))(1.0)
+    h = 1e-4
+    low, high = (walk(Q[0], SCENE.params | {"m1": 1.0 + s})[-1, 0] for s in (-h, h))
+    np.testing.assert_allclose(slope, (high - low) / (2 * h), atol=1e-6)
+
+
+def test_a_long_run_is_gone_on_with(on_host, monkeypatch):
+    plan = _native.Kernel.plan
+    monkeypatch.setattr(_native.Kernel, "plan", lambda *args: short(plan(*args)))
+
+    def short(plan):
+        plan.rounds = 3
+        return plan
+
+    found = jax.jit(lambda q: run(q))(Q[0])
+    (begun,) = on_host
+    assert np.array(begun[-1])[-1:].view(np.int64) == 1  # there was more to do
+    assert_equal(found, run(Q[0]))
+    many = jax.jit(jax.vmap(lambda q: run(q)))
+    assert_equal(many(np.tile(Q, (2, 1))), jax.vmap(run)(np.tile(Q, (2, 1))))
+
+
+def test_without_a_handler_python_does_all(on_host, monkeypatch):
+    monkeypatch.setattr(_call, "NO_HANDLER", "this test says so")
+    assert_equal(jax.jit(lambda q: run(q))(Q[1]), run(Q[1]))
+    assert len(on_host) == 1 and len(on_host[0]) == 3
+
+
+def fall(q, qdot):  # towards the centre, which it reaches at t = 1.11
+    return 0.5 * jnp.sum(qdot**2) + 1.0 / jnp.sqrt(jnp.sum(q**2))
+
+
+def test_what_fails_is_explained_and_costs_the_others_nothing():
+    scene, ts, starts = (
+        lagjax.System(fall),
+        np.array([0.0, 0.5, 2.0]),
+        np.array([[1.0, 0.0], [3.0, 0.0], [np.nan, 0.0]]),
+    )
+
+    def path(q):
+        found = lagjax.simulate(scene, q, jnp.zeros(2), ts, throw=False)
+        return found.q, found.result._value, found.end
+
+    compiled, eager = jax.jit(jax.vmap(path))(starts), lagjax.simulate_batch(scene, starts, np.zeros((3, 2)), ts)
+    assert_equal(compiled, (eager.q, eager.result._value, eager.end))
+    assert list(eager.ok) == [False, True, False]
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"could not be followed beyond t = 1\.11"):
+        jax.block_until_ready(jax.jit(lambda q: lagjax.simulate(scene, q, jnp.zeros(2), ts).q)(starts[0]))
+
+
+def test_the_interface_is_compared_with_the_header(tmp_path):
+    header = tmp_path / "xla" / "ffi" / "api" / "c_api.h"
+    assert "there is no" in _native.unavailable(str(tmp_path))
+    header.parent.mkdir(parents=True)
+    text = (tmp_path.__class__(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
+    for old, new, reason in (
+        ("API_MAJOR 0", "API_MAJOR 1", "version of the interface is 1"),
+        ("  XLA_FFI_Args args;\n", "", "structure CallFrame is another"),
+        ("  int64_t rank;\n", "  int64_t offset;\n  int64_t rank;\n", "structure Buffer is another"),
+        ("  XLA_FFI_DataType dtype;\n  void* value;", "  void* value;\n  XLA_FFI_DataType dtype;", "structure Scalar"),
+        ("  int major_version;  // out\n", "  long major_version;  // out\n", "structure Api_Version is another"),
+    ):
+        assert old in text
+        header.write_text(text.replace(old, new))
+        assert reason in _native.unavailable(str(tmp_path))
+    header.write_text(text)
+    assert _native.unavailable(str(tmp_path)) is None
+
+
+# ---- processes -------------------------------------------------------------------------------------------------------
+
+
+def on_two_devices():
+    from jax.sharding import PartitionSpec as P
+
+    assert len(jax.devices()) == 2
+    mesh = jax.make_mesh((2,), ("members",), axis_types=(jax.sharding.AxisType.Auto,))
+    function = jax.vmap(lambda q: run(q)[0])
+    sharded = jax.shard_map(function, mesh=mesh, in_specs=P("members"), out_specs=P("members"), check_vma=False)
+    assert_equal(jax.jit(sharded)(Q), function(Q))
+
+
+def on_many_threads():
+    compiled, found = jax.jit(lambda q: run(q)[0]), [None] * 8
+    expected = [run(q)[0] for q in Q]
+
+    def work(place):
+        found[place] = [compiled(q) for _ in range(20) for q in Q]
+
+    threads = [threading.Thread(target=work, args=(place,)) for place in range(8)]
+    for step in (threading.Thread.start, threading.Thread.join):
+        for thread in threads:
+            step(thread)
+    for results in found:
+        assert_equal(results, expected * 20)
+
+
+def after_a_fork():
+    """A child has none of JAX's threads, which take up most programs; a run by itself needs none."""
+    compiled = jax.jit(lambda q: run(q)[0])
+    expected = np.asarray(compiled(Q[0]))
+    child = os.fork()
+    if child == 0:
+        signal.alarm(30)
+        assert_equal((compiled(Q[0]), run(Q[0])[0]), (expected, expected))
+        run(Q[0], np.linspace(0.0, 1.0, 7))  # of a shape that was never sent before
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def in_many_programs():
+    """A program that is gone takes its kernel with it; one that is compiled and kept does not need its function."""
+    kept = jax.jit(lambda q: run(q)[0]).lower(Q[0]).compile()
+    expected = np.asarray(run(Q[0])[0])
+    jax.clear_caches()
+    from lagjax import _derivation, _machine_code
+
+    _machine_code._made.cache_clear()
+    _derivation._derived_once.cache_clear()
+    _transforms._compiled.cache_clear()
+    import gc
+
+    gc.collect()
+    np.testing.assert_array_equal(kept(Q[0]), expected)
+
+
+def test_on_devices_threads_and_after_a_fork():
+    start = "import jax; jax.config.update('jax_enable_x64', True); import test_call as t; "
+    call = "t.on_two_devices(); t.on_many_threads(); t.in_many_programs(); t.after_a_fork()"
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", start + call], cwd=os.path.dirname(__file__), timeout=200,
+        env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_plan_has_eight_bytes_a_field():
+    assert ctypes.sizeof(_native.Plan) == 8 * len(_native.Plan._fields_)
