@@ -299,9 +299,6 @@ def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTr
 # ---- what can be wrong -----------------------------------------------------------------------------------------------
 
 
-<<<<<<< HEAD
-def _tolerances(dtype, rtol, atol) -> tuple[Float[Numbers, ""], Float[Numbers, ""]]:
-=======
 def _checked(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, Any]:
     """The fields of a problem that depend neither on its scene nor on its state. Raises where they cannot be right."""
     ts = output_times(ts, dtype)
@@ -311,8 +308,7 @@ def _checked(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, Any]:
     return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
 
 
-def _tolerances(dtype, rtol, atol) -> tuple[Number, Number]:
->>>>>>> 7d4ee5c (An eager call looks its scene up once, names leaves only in errors, and sends arrays to JAX in one compiled call)
+def _tolerances(dtype, rtol, atol) -> tuple[Float[Numbers, ""], Float[Numbers, ""]]:
     """rtol and atol as arrays, the missing ones by default. Raises where no engine meets them."""
     rtol = DEFAULT_RTOL[dtype] if rtol is None else require_tolerance(rtol, "rtol")
     atol = rtol * _ATOL_OVER_RTOL if atol is None else require_tolerance(atol, "atol")
