@@ -17,10 +17,9 @@ diffrax, their sizes are not differentiated. Source: Griewank & Walther, *Evalua
 from llvmlite import ir
 
 from lagjax._native._constants import MAX_ORDER
-from lagjax._native._frame import Frame, Index, Lane, job
+from lagjax._native._frame import Frame, Index, Lane, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
-from lagjax._native._lanes import emit
-from lagjax._native._series import Motion, double
+from lagjax._native._series import Motion, Numbers, double, is_large
 from lagjax._program._series import Recurrent, Series
 from lagjax._program._transpose import pullback
 
@@ -47,7 +46,8 @@ class Adjoint:
             "params_ct": program.size - states - 1,
             "active": 1,
         }
-        self.motion = Motion("adjoint", program, series, JOB, fields, keep_sums=True)
+        large = is_large(program, projection)
+        self.motion = Motion("adjoint", program, series, JOB, fields, large, keep_sums=True)
         self.n, self.states, self.series = n, states, series
         dtypes = program.dtypes
         self.varied = [i for i, dtype in enumerate(dtypes) if dtype.kind == "f" and i != states]  # all but the time
@@ -57,8 +57,9 @@ class Adjoint:
         if projection is not None:
             self.projection_line = pullback(projection.state.line, dtypes, self.varied, range(states))
             steps.insert(0, self._back_projection())
-        self._begin()
         self._run(steps)
+        self._begin()
+        self.motion.form.finish()
 
     def _transposed(self, dtypes):
         """The transposes of the zeroth order and of the order recursion."""
@@ -74,6 +75,7 @@ class Adjoint:
     def _begin(self) -> None:
         """`begin(job, memory, lanes)`: every lane takes a member."""
         frame = self.motion.function("begin", public=True)
+        self.motion.form.prepare(frame)
         with frame.code.loop(self.motion.width) as lane:
             frame.call(self.start_next, lane)
         frame.finish()
@@ -114,7 +116,7 @@ class Adjoint:
         lane["step"] = lane["step"] - 1
         lane["output"] = frame.job("times") - 2
         with code.only_if(there):
-            for i in range(self.states):
+            for i in self.motion.form.each(code, self.states):
                 lane["state_ct", i] = frame.read("y_ct", member * self.states + i)
             with code.loop(self.motion.numbers) as i:
                 lane["params", i] = frame.read("params", member * frame.job("params_stride") + i)
@@ -128,7 +130,7 @@ class Adjoint:
             row = (frame.read("first_step", member, INTEGER) + lane["step"]) * (self.states + 2)
             lane["t"] = frame.read("record", row)
             lane["h"] = frame.read("record", row + 1)
-            for i in range(self.states):
+            for i in self.motion.form.each(frame.code, self.states):
                 lane["y", i] = frame.read("record", row + (i + 2))
 
     def _end_or_go_on(self, frame: Frame, lane: Lane, index: Value) -> None:
@@ -138,7 +140,7 @@ class Adjoint:
             left = lane["step"] - 1
             lane["step"] = left
             with code.only_if(left < 0):
-                for i in range(self.states):
+                for i in self.motion.form.each(code, self.states):
                     frame.write("y_ct", member * self.states + i, lane["state_ct", i])
                 with code.loop(self.motion.numbers) as i:
                     frame.write("params_ct", member * self.motion.numbers + i, lane["params_ct", i])
@@ -150,11 +152,12 @@ class Adjoint:
         """The cotangents of all coefficients, by the polynomials that they are used in."""
         frame = self.motion.function("seed")
         code, h, power = frame.code, frame["h"], frame.code.variable(frame.constant(1.0))
-        for i in range(self.series.values):
+        form = self.motion.form
+        for i in form.each(code, self.series.values):
             frame["values_ct", i] = 0.0
         with code.loop(frame.job("order") + 1) as k:
             now = code.load(power, frame.vector)
-            for i in range(self.states):
+            for i in form.each(code, self.states):
                 frame["y_ct", i, k] = frame["state_ct", i] * now
             code.store(now * h, power)
         with code.loop(self.motion.width) as j:
@@ -175,10 +178,11 @@ class Adjoint:
             index = lane["output"]
             s, power = frame.time(member, index) - t, code.variable(double(code, 1.0))
             row = (member * frame.job("times") + index) * self.states
-            cotangents = [frame.read("path_ct", row + i) for i in range(self.states)]
+            cotangents = code.element(frame.job("path_ct"), row)
             with code.loop(frame.job("order") + 1) as k:
                 now = code.load(power, DOUBLE)
-                for i, cotangent in enumerate(cotangents):
+                for i in self.motion.form.each(code, self.states):
+                    cotangent = code.load(code.element(cotangents, i), DOUBLE)
                     lane["y_ct", i, k] = lane["y_ct", i, k] + cotangent * now
                 code.store(now * s, power)
             lane["output"] = index - 1
@@ -196,10 +200,10 @@ class Adjoint:
         """`(k, order)`: the cotangents of the rows at order k, from those of the sums of higher orders."""
         frame = self.motion.function("back_sums", INTEGER, INTEGER)
         code, (k, order) = frame.code, frame.arguments
-        for i in range(self.series.rows):
+        for i in self.motion.form.each(code, self.series.rows):
             frame["rows_ct", i] = 0.0
         kinds = [[p for p in self.series.cauchy_products if (p[0] == p[1]) == square] for square in (False, True)]
-        tables = [self.motion.table(f"back{len(pairs)}_{square}", pairs) for square, pairs in enumerate(kinds)]
+        tables = [self.motion.table(pairs) for pairs in kinds]
         end = code.function.append_basic_block("end")
         switch = code.builder.switch((order - 1 - k).it, end)
         for terms in range(1, MAX_ORDER - 1):
@@ -237,72 +241,50 @@ class Adjoint:
         Those of the sums take the place of the sums, which nobody reads again: all of it fits into the first cache.
         """
         frame = self.motion.function("back_recursion", INTEGER)
-        code, (k,), n, series = frame.code, frame.arguments, self.n, self.series
+        code, (k,), n, series, form = frame.code, frame.arguments, self.n, self.series, self.motion.form
         inverse = 1.0 / code.as_double(k + 1)
-        for i in range(n):  # q̇ₖ = (k+1) qₖ₊₁
-            _add(frame, frame["y_ct", i, k + 1] * inverse, "y_ct", n + i, k)
-        forward, read = self.states + 3 + series.values + len(series.cauchy_products), self.motion.at_order(frame, k)
-
-        def inputs(i):
-            if i < forward:
-                return read(i)
-            if i < forward + n:
-                return frame["y_ct", n + (i - forward), k + 1] * inverse
-            i -= forward + n
-            return frame["rows_ct", i] if i < series.rows else frame["rows", i - series.rows, k]
-
-        out = emit(code, self.order_recursion, inputs, None)
-        for i, x in enumerate(out[: self.states]):
-            _add(frame, x, "y_ct", i, k)
-        for i, x in enumerate(out[self.states :][: series.values]):
-            _add(frame, x, "values_ct", i)
-        for i, x in enumerate(out[self.states + series.values :]):
-            frame["sums", *self.motion.sum_indices(i, k)] = x
+        for i in form.each(code, n):  # q̇ₖ = (k+1) qₖ₊₁
+            _add(frame, frame["y_ct", i, k + 1] * inverse, "y_ct", i + n, k)
+        accelerations_ct = Vectors(n, lambda i: frame["y_ct", i + n, k + 1] * inverse)
+        rows_ct, rows = frame.vectors("rows_ct", series.rows), Vectors(series.rows, lambda i: frame["rows", i, k])
+        inputs = self.motion.at_order(frame, k)
+        out = form.run(frame, self.order_recursion, *inputs, accelerations_ct, rows_ct, rows)
+        for i in form.each(code, self.states):
+            _add(frame, out[i], "y_ct", i, k)
+        for i in form.each(code, series.values):
+            _add(frame, out[i + self.states], "values_ct", i)
+        for i in form.each(code, len(series.cauchy_products)):
+            frame["sums", *self.motion.sum_indices(i, k)] = out[i + (self.states + series.values)]
         return frame.finish()
 
     def _back_start(self) -> Code:
         """From the cotangents of the first orders, and of what the recursion read, to that of the state."""
-        frame = self.motion.function("back_start")
-        n, now, size = self.n, self.motion.now(frame), self.motion.program.size
-        for i in range(n):
-            _add(frame, frame["y_ct", i, 1], "y_ct", n + i, 0)
-
-        def inputs(i):
-            if i < size:
-                return now(i)
-            i -= size
-            return frame["y_ct", n + i, 1] if i < n else frame["values_ct", i - n]
-
-        out = emit(frame.code, self.zeroth_order, inputs, self.motion.sincos)
-        self._store(frame, [frame["y_ct", i, 0] + x if i < self.states else x for i, x in self._by_input(out)])
+        frame, form = self.motion.function("back_start"), self.motion.form
+        for i in form.each(frame.code, self.n):
+            _add(frame, frame["y_ct", i, 1], "y_ct", i + self.n, 0)
+        accelerations_ct = Vectors(self.n, lambda i: frame["y_ct", i + self.n, 1])
+        values_ct = frame.vectors("values_ct", self.series.values)
+        out = form.run(frame, self.zeroth_order, *self.motion.now(frame), accelerations_ct, values_ct)
+        self._store(frame, out, frame.vectors("y_ct", self.states, lambda i: (i, 0)))
         return frame.finish()
 
     def _back_projection(self) -> Code:
         """From the state on the constraints to the end of the series before it was put there."""
         frame = self.motion.function("back_projection")
-        h, now, size = frame["h"], self.motion.now(frame), self.motion.program.size
-        moved = self.motion.moved(frame, frame.job("order"), h)
-
-        def inputs(i):
-            if i < self.states:
-                return moved[i]
-            if i < size:
-                return now(i) + h if i == self.states else now(i)
-            return frame["state_ct", i - size]
-
-        self._store(frame, emit(frame.code, self.projection_line, inputs, self.motion.sincos))
+        h, motion = frame["h"], self.motion
+        moved = motion.moved(frame, motion.increments(frame, frame.job("order"), h)[0])
+        _, _, params = motion.now(frame)
+        state_ct = frame.vectors("state_ct", self.states)
+        self._store(frame, motion.form.run(frame, self.projection_line, moved, [frame["t"] + h], params, state_ct))
         return frame.finish()
 
-    def _by_input(self, cotangents: list[Value]):
-        return zip(self.varied, cotangents, strict=True)
-
-    def _store(self, frame: Frame, cotangents: list[Value]) -> None:
-        """The cotangent of the state takes the place of the one before; those of the parameters add up."""
-        for i, x in self._by_input(cotangents):
-            if i < self.states:
-                frame["state_ct", i] = x
-            else:
-                _add(frame, x, "params_ct", i - self.states - 1)
+    def _store(self, frame: Frame, cotangents: Numbers, more: "Vectors | None" = None) -> None:
+        """The cotangent of the state takes the place of the one before, with `more`; those of the parameters add up."""
+        form, states = self.motion.form, self.states
+        for i in form.each(frame.code, states):
+            frame["state_ct", i] = cotangents[i] if more is None else more[i] + cotangents[i]
+        for k, i in enumerate(self.varied[states:]):
+            _add(frame, cotangents[states + k], "params_ct", i - states - 1)
 
 
 def _add(frame: Frame, x: Value, name: str, *indices: Index) -> None:

@@ -25,6 +25,11 @@ LEAST_ORDER, MAX_ORDER = 7, 20
 # reduction with parts of 32 bits is exact for quotients of 21 bits, angles up to 2²⁰ π: doubled it still would be.
 LARGEST_ANGLE = 2.0**20
 
+# ---- the form of a kernel --------------------------------------------------------------------------------------------
+
+# Nodes of the programs of a kernel beyond which they are tables, and not written down one by one (`_tables`). TODO
+LARGEST_LINE = 1200
+
 # ---- step control ----------------------------------------------------------------------------------------------------
 
 # Of the step at which the last terms of the series equal the tolerance (Jorba & Zou: e^(−0.7/(p−1)), about the same).

@@ -72,8 +72,10 @@ class Events:
         frame = self.motion.function("guard", INTEGER, self.motion.vector)
         order, s = frame.arguments
         line = self.line._replace(outputs=self.line.outputs[: len(self.directions)])
-        for i, value in enumerate(self.motion.evaluate(frame, line, self.motion.moved(frame, order, s), s)):
-            frame["guard", i] = value
+        moved = self.motion.moved(frame, self.motion.increments(frame, order, s)[0])
+        guards = self.motion.evaluate(frame, line, moved, s)
+        for i in range(len(self.directions)):
+            frame["guard", i] = guards[i]
         return frame.finish()
 
     def _at(self, frame: Frame, order: Value, i: int, s: Value) -> Value:
@@ -96,7 +98,7 @@ class Events:
             instant = INSTANT * frame["smallest"]
             out = self.motion.evaluate_now(frame, self.line)
             for i in range(count):
-                value, rate, size, rate_size = out[i::count]
+                value, rate, size, rate_size = (out[i + k * count] for k in range(4))
                 moved = code.intrinsic("fabs", rate)
                 on_it = code.intrinsic("fabs", value) <= GUARD_NOISE * size + moved * instant
                 going = code.select(moved > GUARD_NOISE * rate_size, rate, frame["guard", i])

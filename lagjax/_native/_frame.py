@@ -15,8 +15,11 @@ with.
 """
 
 import ctypes
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 from llvmlite import ir
 
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
@@ -37,10 +40,20 @@ def job(name: str, pointers: tuple[str, ...], integers: tuple[str, ...], doubles
     return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 
+def integers(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
+    """A constant array of integers, as its bytes: their text is short, and read fast."""
+    data = bytearray(numbers.tobytes())
+    kind = ir.ArrayType(ir.IntType(8), len(data))
+    table: Any = ir.GlobalVariable(module, kind, module.get_unique_name("integers"))
+    table.global_constant, table.linkage, table.align = True, "internal", 8
+    table.initializer = ir.Constant(kind, data)
+    return table
+
+
 class Layout:
     """Where the vectors of a thread lie: `fields` gives each name a number of vectors, or rows and columns of them.
 
-    `size` is the memory that a thread needs, in doubles; `width` the lanes of a vector.
+    `width` is the lanes of a vector.
     """
 
     def __init__(self, width: int, fields: Mapping[str, int | tuple[int, int]]):
@@ -50,7 +63,17 @@ class Layout:
             rows, self._columns[name] = shape if isinstance(shape, tuple) else (shape, 1)
             self._offsets[name] = total
             total += rows * self._columns[name]
-        self.size = total * width
+        self._vectors = total
+
+    @property
+    def size(self) -> int:
+        """The memory that a thread needs, in doubles."""
+        return self._vectors * self.width
+
+    def extend(self, name: str, rows: int) -> None:
+        """One field more, of so many vectors, behind all others."""
+        self._offsets[name], self._columns[name] = self._vectors, 1
+        self._vectors += rows
 
     def place(self, name: str, *indices: Index) -> Index:
         """The first element of a vector, counted in doubles: `name`, `name[i]` or `name[i, k]`."""
@@ -58,6 +81,29 @@ class Layout:
         columns = self._columns[name]
         index = row if columns == 1 else column if isinstance(row, int) and row == 0 else column + row * columns
         return (index + self._offsets[name]) * self.width
+
+
+@dataclass(frozen=True, eq=False)
+class Vectors:
+    """So many vectors in a row, as a list of them would be: `read(i)` gives one, and `write(i, x)` sets it.
+
+    `place(i)` tells where vector i lies, counted in doubles from the beginning of the thread's memory, if it is known.
+    """
+
+    count: int
+    read: Callable[[Index], Value]
+    write: "Callable[[Index, Value], None] | None" = None
+    place: "Callable[[int], int] | None" = None
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, i: Index) -> Value:
+        return self.read(i)
+
+    def __setitem__(self, i: Index, x: Value) -> None:
+        assert self.write is not None
+        self.write(i, x)
 
 
 class Frame:
@@ -80,6 +126,19 @@ class Frame:
     def address(self, name: str, *indices: Index) -> Value:
         """The address of a vector."""
         return self.code.element(self._memory, self.layout.place(name, *indices))
+
+    def vectors(self, name: str, count: int, place: Callable[[Index], tuple] = lambda i: (i,)) -> Vectors:
+        """Vectors of a field: number i is `name[place(i)]`, whose place does not change."""
+
+        def where(i):
+            address = self.layout.place(name, *place(i))
+            assert isinstance(address, int)
+            return address
+
+        def write(i, x):
+            self[name, *place(i)] = x
+
+        return Vectors(count, lambda i: self[name, *place(i)], write, where)
 
     def constant(self, x: float) -> Value:
         """A vector with one number in every lane."""
@@ -114,6 +173,10 @@ class Frame:
         return self.read("ts", member * self.job("ts_stride") + index)
 
     # ---- functions ----
+
+    def at(self, offset: Value) -> Value:
+        """The address that lies so many doubles behind the beginning of the memory."""
+        return self.code.element(self._memory, offset)
 
     def call(self, function: Code, *arguments: Value) -> None:
         """Another function of the kernel, on the same job, memory and lanes."""

@@ -21,7 +21,7 @@ from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._ir import INTEGER, POINTER, Code, Value
 from lagjax._native._output import Output
 from lagjax._native._projection import Projector
-from lagjax._native._series import Motion, double, integer
+from lagjax._native._series import Motion, double, integer, is_large
 from lagjax._native._step import StepControl
 from lagjax._program._series import Recurrent, Series
 
@@ -59,7 +59,7 @@ class Integrator:
         fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards) | {"active": 1}
         if projection is not None:
             fields |= Projector.fields(n, self.base_size) | _rank_drops.fields(n, self.guards)
-        self.motion = motion = Motion("motion", program, series, JOB, fields)
+        self.motion = motion = Motion("motion", program, series, JOB, fields, is_large(program, projection, guards))
         self.projector = projection and Projector(
             motion, projection.state, projection.velocity_scale, self.base_size
         )  # fmt: skip
@@ -67,8 +67,9 @@ class Integrator:
         self.events = guards and Events(motion, self.step, guards.program.line, guards.directions)
         self.output = Output(motion, self.projector)
         self.start_next = self._start_next()
-        self._begin()
         self._run()
+        self._begin()
+        motion.form.finish()
 
     # ---- members ----
 
@@ -97,9 +98,9 @@ class Integrator:
         lane["smallest"] = SMALLEST_STEP * largest
         lane["longest"] = code.intrinsic("fabs", end - begin) * FIRST_STEP
         self.output.await_next(frame, lane, integer(code, 1))
-        for i in range(self.base_size if self.projector else 0):
+        for i in motion.form.each(code, self.base_size if self.projector else 0):
             lane["velocity_scale", i] = 0.0
-        for i in range(motion.states):
+        for i in motion.form.each(code, motion.states):
             x = frame.read("y0", member * motion.states + i)
             lane["y", i] = x
             frame.write("path", self.output.place(frame, member, 0, i), x)
@@ -110,6 +111,7 @@ class Integrator:
     def _begin(self) -> None:
         """`begin(job, memory, lanes)`: every lane takes a member."""
         frame = self.motion.function("begin", public=True)
+        self.motion.form.prepare(frame)
         with frame.code.loop(self.motion.width) as lane:
             frame.call(self.start_next, lane)
         frame.finish()
@@ -129,7 +131,7 @@ class Integrator:
             self.step.choose(frame, order)
             self.step.halve_until_sound(frame, order)
             if self.projector is not None:
-                _rank_drops.return_or_remember(frame, self.motion.states, self.guards)
+                _rank_drops.return_or_remember(frame, self.motion.form, self.motion.states, self.guards)
             if self.events is not None:
                 self.events.stop(frame, order)
             with code.only_if(frame.job("recording") > 0), code.loop(self.motion.width) as lane:

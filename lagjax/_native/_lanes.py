@@ -1,15 +1,71 @@
 """The operations of a scalar program on vectors, one lane for each member of a batch."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterator, Sequence
 
 from llvmlite import ir
 
 from lagjax._digits import COS, PI_2, PI_2_ROUNDED, SIN
 from lagjax._native._constants import LARGEST_ANGLE
+from lagjax._native._frame import Frame, Vectors
 from lagjax._native._ir import BIT, Code, Value
 from lagjax._program._graph import Unlowerable
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._series import StraightLine
+
+
+class Lines:
+    """The form of small kernels: every operation is written down, and so is every component of the state.
+
+    `Tables` is that of large ones, with the same methods.
+    """
+
+    def __init__(self, sincos: Code):
+        self._sincos = sincos
+
+    def run(self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors") -> list[Value]:
+        """The outputs of a program, of which these are the inputs, one after the other; a bool is 1 or 0."""
+        parts = [(values, i) for values in inputs for i in range(len(values))]
+
+        def read(position):
+            values, i = parts[position]
+            return values[i]
+
+        out = emit(frame.code, line, read, self._sincos)
+        kinds = (line.kinds[i] for i in line.outputs)
+        return [frame.code.as_double(x) if kind == "bool" else x for x, kind in zip(out, kinds, strict=True)]
+
+    def each(self, code: Code, count: int) -> Iterator[int]:
+        """The numbers from 0 to `count`, for a body that is written down for each of them."""
+        return iter(range(count))
+
+    def strands(self, code: Code, n: int) -> Iterator[tuple[list, dict]]:
+        """The components of a state of n coordinates, four at a time; and which of these are velocities: of what."""
+        for first in range(0, 2 * n, 4):
+            some = list(range(first, min(first + 4, 2 * n)))
+            yield some, {k: i - n for k, i in enumerate(some) if i >= n}
+
+    def room(self, frame: Frame, count: int) -> list:
+        """Room for so many vectors."""
+        return [None] * count
+
+    def largest(self, code: Code, numbers: Callable[[int], Value], count: int) -> Value:
+        """The largest of so many numbers, which are not negative; NaN where the last one is."""
+        return functools.reduce(code.maximum, map(numbers, range(count)))
+
+    def largest_by_group(self, frame: Frame, numbers: Callable[[int], Value], groups: Sequence[int]) -> list[Value]:
+        """For each of the numbers the largest one of its group: of those with the same number in `groups`."""
+        largest: dict[int, Value] = {}
+        for i, group in enumerate(groups):
+            value = numbers(i)
+            largest[group] = frame.code.maximum(largest[group], value) if group in largest else value
+        return [largest[group] for group in groups]
+
+    def prepare(self, frame: Frame) -> None:
+        """What has to be done once for the memory of a thread."""
+
+    def finish(self) -> None:
+        """After all programs of the kernel."""
 
 
 def emit(code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos: Code | None) -> list[Value]:
@@ -26,18 +82,21 @@ def emit(code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos:
             value = code.as_value(attribute, code.vector if kind != "bool" else ir.VectorType(BIT, code.lanes))
         elif op in ("sin", "cos") and sincos is not None:
             if operands[0] not in turns:
-                turns[operands[0]] = _both(code, sincos, xs[0])
+                turns[operands[0]] = sines_and_cosines(code, sincos, xs[0])
             value = turns[operands[0]][op == "cos"]
-        elif op == "convert":
-            value = _convert(code, xs[0], line.kinds[operands[0]], kind)
         else:
-            value = _apply(code, op, xs, attribute)
+            value = apply(code, op, xs, attribute, [line.kinds[i] for i in operands], kind)
         values.append(value)
     return [values[i] for i in line.outputs]
 
 
-def _apply(code: Code, op: str, xs: list[Value], attribute) -> Value:
-    """An operation by its row: of the C library, lane by lane, or written with vectors."""
+def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str], kind: str) -> Value:
+    """An operation by its row: of the C library, lane by lane, or written with vectors.
+
+    `kinds` and `kind` are those of the operands and of the result.
+    """
+    if op == "convert":
+        return _convert(code, xs[0], kinds[0], kind)
     how = OPERATIONS[op].llvm
     if how is None:
         raise Unlowerable(f"`{op}` has no machine code here")
@@ -103,7 +162,8 @@ def _horner(z, coefficients):
     return total
 
 
-def _both(code: Code, sincos: Code, x: Value) -> tuple[Value, Value]:
+def sines_and_cosines(code: Code, sincos: Code, x: Value) -> tuple[Value, Value]:
+    """Sine and cosine of the angles x."""
     with code.builder.goto_entry_block():
         place = code.builder.alloca(ir.ArrayType(code.vector, 2))
     place.align = 8 * code.lanes

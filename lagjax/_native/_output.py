@@ -2,7 +2,7 @@
 
 from lagjax._native._constants import DONE
 from lagjax._native._frame import Frame, Index, Lane
-from lagjax._native._ir import DOUBLE, INTEGER, Value
+from lagjax._native._ir import INTEGER, Value
 from lagjax._native._projection import Projector
 from lagjax._native._series import Motion
 
@@ -23,7 +23,7 @@ class Output:
 
     # ---- states at output times ----
 
-    def place(self, frame: Frame, member: Value, time_index: Index, i: int) -> Value:
+    def place(self, frame: Frame, member: Value, time_index: Index, i: Index) -> Value:
         """Where in `path` component i of the state at an output time belongs."""
         return (member * frame.job("times") + time_index) * self.motion.states + i
 
@@ -47,25 +47,30 @@ class Output:
         with code.repeat_while(lambda: code.any_lane(due())):
             there = due()
             s = code.select(there, (frame["due"] * forward - t) - low, 0.0)
-            for i, value in enumerate(self._states(frame, order, s)):
-                frame["between", i] = value
+            self._interpolate(frame, order, s)
             frame["is_due"] = code.select(there, frame.constant(1.0), 0.0)
             with code.loop(self.motion.width) as j:
                 lane = frame.lane(j)
                 with code.only_if(lane["is_due"] > 0.0):
                     member, index = lane["member"], lane["output"]
-                    for i in range(self.motion.states):
+                    for i in self.motion.form.each(code, self.motion.states):
                         frame.write("path", self.place(frame, member, index, i), lane["between", i])
                     self.await_next(frame, lane, index + 1)
 
-    def _states(self, frame: Frame, order: Value, s: Value) -> list[Value]:
+    def _interpolate(self, frame: Frame, order: Value, s: Value) -> None:
         """The state a time s after the present one: that of the series, on the constraints if that is near."""
+        states, form = self.motion.states, self.motion.form
         increments, _ = self.motion.increments(frame, order, s)
-        values = [frame["y", i] + (dy + frame["low", i]) for i, dy in enumerate(increments)]
+        values = form.room(frame, states)
+        for i in form.each(frame.code, states):
+            values[i] = frame["y", i] + (increments[i] + frame["low", i])
         if self.projector is None:
-            return values
+            for i in form.each(frame.code, states):
+                frame["between", i] = values[i]
+            return
         projected, off = self.projector.projected(frame, values, increments, s)
-        return [frame.code.select(off <= 1.0, on, value) for on, value in zip(projected, values, strict=True)]
+        for i in form.each(frame.code, states):
+            frame["between", i] = frame.code.select(off <= 1.0, projected[i], values[i])
 
     # ---- steps, for their transposes ----
 
@@ -76,10 +81,11 @@ class Output:
             steps = code.as_integer(lane["steps"])
             first, after = (frame.read("first_step", member + k, INTEGER) for k in range(2))
             with code.only_if(first + steps < after):
-                places = [lane.address(name) for name in ("t", "h")]
-                places += [lane.address("y", i) for i in range(self.motion.states)]
-                for k, place in enumerate(places):
-                    frame.write("record", (first + steps) * len(places) + k, code.load(place, DOUBLE))
+                row = (first + steps) * (self.motion.states + 2)
+                for k, name in enumerate(("t", "h")):
+                    frame.write("record", row + k, lane[name])
+                for i in self.motion.form.each(code, self.motion.states):
+                    frame.write("record", row + 2 + i, lane["y", i])
 
     # ---- the end of a member ----
 
@@ -90,7 +96,7 @@ class Output:
         for name in ("code", "steps", "rejected"):
             frame.write(name, member, lane[name])
         done = code.compare("==", lane["code"], float(DONE))
-        for i in range(self.motion.states):
+        for i in self.motion.form.each(code, self.motion.states):
             x = lane["y", i]
             frame.write("y_end", member * self.motion.states + i, x)
             with code.only_if(done):

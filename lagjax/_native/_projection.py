@@ -6,9 +6,9 @@ then the projection has failed, and the step is halved.
 """
 
 from lagjax._native._constants import PROJECTION_TOLERANCES, ROUND_OFF, START
-from lagjax._native._frame import Frame
+from lagjax._native._frame import Frame, Index
 from lagjax._native._ir import Code, Value
-from lagjax._native._series import Motion
+from lagjax._native._series import Motion, Numbers
 from lagjax._program._series import Recurrent
 
 
@@ -25,12 +25,17 @@ class Projector:
 
     @staticmethod
     def fields(n: int, base_size: int) -> dict:
-        """What a thread remembers for it: the projected state at the end of the step, and velocity scales."""
-        return {"projected": 2 * n, "velocity_scale": base_size}
+        """What a thread remembers for it: the projected state at the end of the step, and velocity scales.
 
-    def projected(
-        self, frame: Frame, values: list[Value], increments: list[Value], s: Value
-    ) -> tuple[list[Value], Value]:
+        Those of derivatives stay zero.
+        """
+        return {"projected": 2 * n, "velocity_scale": n}
+
+    def scales(self, i: Index) -> bool:
+        """Whether coordinate i may have a velocity scale; where i is not known, it may."""
+        return not isinstance(i, int) or i < self.base_size
+
+    def projected(self, frame: Frame, values: Numbers, increments: Numbers, s: Value) -> tuple[Numbers, Value]:
         """The projection of a state of the series at t + s, and its distance in `PROJECTION_TOLERANCES`.
 
         The series ends within the tolerance of the constraints. If it is much farther to the state that the projection
@@ -38,33 +43,37 @@ class Projector:
         several branches close together, and rounding of q decides on q̇.
         """
         code, n = frame.code, self.motion.n
-        projected, off = self.motion.evaluate(frame, self.state, values, s), frame.constant(0.0)
+        projected, farthest = self.motion.evaluate(frame, self.state, values, s), code.variable(frame.constant(0.0))
         first = code.compare("==", frame["steps"], 0.0)
-        for i in (*range(self.base_size), *range(n, n + self.base_size)):
+        for i in (i + half for half in (0, n) for i in self.motion.form.each(code, self.base_size)):
             far = code.intrinsic("fabs", projected[i] - values[i])
             size = code.intrinsic("fabs", projected[i]) + code.intrinsic("fabs", increments[i])
             error = (far - ROUND_OFF * size) * frame["scale", i] * (1 / PROJECTION_TOLERANCES)
             # A start may be off by more, as much as is taken for consistent.
             error = code.select(first, far / (START * (1.0 + size)), error)
-            off = code.select(error <= off, off, error)  # NaN goes through
-        return projected, off
+            off = code.load(farthest, frame.vector)
+            code.store(code.select(error <= off, off, error), farthest)  # NaN goes through
+        return projected, code.load(farthest, frame.vector)
 
     def _project(self) -> Code:
         """`()`: the end of the step back on the constraints, into `projected`; how far it was, into `defect`."""
         frame = self.motion.function("project")
-        code, states, h = frame.code, self.motion.states, frame["h"]
-        sums = [end_of_step(frame, i)[0] for i in range(states)]
-        projected, off = self.projected(frame, sums, [frame["increment", i] for i in range(states)], h)
-        for i, value in enumerate(projected):
-            frame["projected", i] = value
-        for i, value in enumerate(self.motion.evaluate(frame, self.velocity_scale, projected, h)):
-            frame["velocity_scale", i] = value
+        code, states, form, h = frame.code, self.motion.states, self.motion.form, frame["h"]
+        sums = form.room(frame, states)
+        for i in form.each(code, states):
+            sums[i] = end_of_step(frame, i)[0]
+        projected, off = self.projected(frame, sums, frame.vectors("increment", states), h)
+        for i in form.each(code, states):
+            frame["projected", i] = projected[i]
+        scales = self.motion.evaluate(frame, self.velocity_scale, projected, h)
+        for i in form.each(code, self.base_size):
+            frame["velocity_scale", i] = scales[i]
         defect = frame["defect"]
         frame["defect"] = code.select(off <= defect, defect, off)
         return frame.finish()
 
 
-def end_of_step(frame: Frame, i: int) -> tuple[Value, Value]:
+def end_of_step(frame: Frame, i: Index) -> tuple[Value, Value]:
     """Component i of the state at the end of the step, by the series, and what rounding takes from it."""
     y = frame["y", i]
     increment = frame["increment", i] + frame["low", i]

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from lagjax._native._constants import MOST_RETURNS, RETAKEN, RUNNING, SHORTER
 from lagjax._native._frame import Frame
 from lagjax._native._ir import Value
+from lagjax._native._lanes import Lines
+from lagjax._native._tables import Tables
 
 
 def fields(n: int, guards: int) -> dict:
@@ -20,7 +22,7 @@ def fields(n: int, guards: int) -> dict:
 AT_FIRST_ZERO = ("h_before", "returns", "returned")  # for every new member
 
 
-def return_or_remember(frame: Frame, states: int, guards: int) -> None:
+def return_or_remember(frame: Frame, form: Lines | Tables, states: int, guards: int) -> None:
     """Back to where the last long step began, if steps have become too short since; or remember this beginning."""
     code = frame.code
     size, long = (code.intrinsic("fabs", frame[name]) for name in ("h", "h_before"))
@@ -37,18 +39,18 @@ def return_or_remember(frame: Frame, states: int, guards: int) -> None:
     frame["rejected"] = frame["rejected"] + code.select(back, undone + 1.0, 0.0)
     frame["code"] = code.select(back, float(RUNNING), frame["code"])
     frame["h"] = code.select(back, 0.0, frame["h"])
-    for now, then in _beginnings(frame, states, guards):
+    for now, then in _beginnings(frame, form, states, guards):
         here, there = code.load(now, frame.vector), code.load(then, frame.vector)
         code.store(code.select(back, there, here), now)
         code.store(code.select(new, here, there), then)
 
 
-def _beginnings(frame: Frame, states: int, guards: int) -> Iterator[tuple[Value, Value]]:
+def _beginnings(frame: Frame, form: Lines | Tables, states: int, guards: int) -> Iterator[tuple[Value, Value]]:
     """The addresses of what a step begins with, and of what the last long one began with."""
-    for i in range(states):
+    for i in form.each(frame.code, states):
         yield frame.address("y", i), frame.address("y_before", i)
     for name, count in {"low": states, "side": guards, **dict.fromkeys(("t", "t_low", "steps"), 1)}.items():
-        for i in range(count):
+        for i in form.each(frame.code, count):
             yield frame.address(name, i), frame.address(name + "_before", i)
 
 

@@ -9,26 +9,39 @@
 import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
+import numpy as np
 from llvmlite import ir
 
-from lagjax._native._constants import MAX_ORDER
-from lagjax._native._frame import Frame, Index, Layout
+from lagjax._native._constants import LARGEST_LINE, MAX_ORDER
+from lagjax._native._frame import Frame, Index, Layout, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value, lanes
-from lagjax._native._lanes import emit, sincos_function
+from lagjax._native._lanes import Lines, sincos_function
+from lagjax._native._tables import Tables
 from lagjax._program._series import Recurrent, Series, StraightLine
+
+Numbers = list[Value] | Vectors
 
 
 class Motion:
     """A module with the functions `sums` and `coefficients` of a motion, for others to be built on.
 
     The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n. `fields`
-    names what else a thread remembers (see `Layout`), `job` the structure that all threads share. With `keep_sums` the
-    sums of every order stay in memory, not only those of the last.
+    names what else a thread remembers (see `Layout`), `job` the structure that all threads share. `large` kernels are
+    written as tables (see `is_large`). With `keep_sums` the sums of every order stay in memory, not only those of the
+    last.
     """
 
-    def __init__(self, name: str, program: Recurrent, series: Series, job: type, fields: dict, keep_sums: bool = False):
+    def __init__(
+        self,
+        name: str,
+        program: Recurrent,
+        series: Series,
+        job: type,
+        fields: dict,
+        large: bool,
+        keep_sums: bool = False,
+    ):
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
         self.numbers = program.size - self.states - 1  # parameters
         self.keep_sums, self.job = keep_sums, job
@@ -36,7 +49,8 @@ class Motion:
         self.module.triple = ""
         self.layout = Layout(lanes(), self._fields() | fields)
         self.width, self.vector = self.layout.width, ir.VectorType(DOUBLE, self.layout.width)
-        self.sincos = sincos_function(self.module, self.width)
+        sincos = sincos_function(self.module, self.width)
+        self.form = Tables(self.function, sincos) if large else Lines(sincos)
         self._sums = self._sums_function()
         self.coefficients = self._coefficients_function()
 
@@ -68,7 +82,7 @@ class Motion:
         mixed = [pair for pair in self.series.cauchy_products if pair[0] != pair[1]]
         squares = [(a,) for a, b in self.series.cauchy_products if a == b]
         kinds = [("mixed", mixed, 0, _mixed_sum), ("squares", squares, len(mixed), _square_sum)]
-        tables = {name: self.table(name, pairs) for name, pairs, _, _ in kinds}
+        tables = {name: self.table(pairs) for name, pairs, _, _ in kinds}
         end = code.function.append_basic_block("end")
         switch = code.builder.switch(k.it, end)
         for order in range(2, MAX_ORDER):
@@ -84,14 +98,10 @@ class Motion:
         code.builder.position_at_end(end)
         return frame.finish()
 
-    def table(self, name: str, pairs) -> ir.GlobalVariable:
+    def table(self, pairs) -> ir.GlobalVariable:
         """The rows of each product, as distances in memory from the first row."""
         flat = [row * MAX_ORDER * self.width for pair in pairs for row in pair]
-        kind = ir.ArrayType(INTEGER, max(1, len(flat)))
-        table: Any = ir.GlobalVariable(self.module, kind, name)
-        table.global_constant, table.linkage = True, "internal"
-        table.initializer = ir.Constant(kind, [ir.Constant(INTEGER, x) for x in flat or [0]])
-        return table
+        return integers(self.module, np.array(flat or [0], np.int64))
 
     def _row(self, frame: Frame, table, index: Value) -> Value:
         code = frame.code
@@ -106,101 +116,88 @@ class Motion:
     def _coefficients_function(self) -> Code:
         """`(order)`: the series of the state, to that order, from its values."""
         frame = self.function("coefficients", INTEGER)
-        code, (order,), series, n = frame.code, frame.arguments, self.series, self.n
-        *acceleration, singular = (out := emit(code, series.zeroth_order, self.now(frame), self.sincos))[: n + 1]
-        frame["singular"] = code.as_double(singular)
-        for i in range(n):
-            frame["y", i, 1] = frame["y", n + i]
-            frame["y", n + i, 1] = acceleration[i]
-        for i, value in enumerate(out[n + 1 :]):
-            frame["values", i] = value
-        for i in range(len(series.cauchy_products)):
+        code, (order,), series, n, form = frame.code, frame.arguments, self.series, self.n, self.form
+        out = form.run(frame, series.zeroth_order, *self.now(frame))
+        frame["singular"] = out[n]
+        for i in form.each(code, n):
+            frame["y", i, 1] = frame["y", i + n]
+            frame["y", i + n, 1] = out[i]
+        for i in form.each(code, series.values):
+            frame["values", i] = out[i + (n + 1)]
+        for i in form.each(code, len(series.cauchy_products)):
             frame["sums", *self.sum_indices(i, integer(code, 1))] = 0.0
 
         with code.loop(order, start=1) as k:
             with code.only_if(k > 1):
                 frame.call(self._sums, k)
             inverse = 1.0 / code.as_double(k + 1)
-            out = emit(code, series.order_recursion, self.at_order(frame, k), None)
-            for row, value in enumerate(out[n:]):
-                frame["rows", row, k] = value
-            for i in range(n):
-                frame["y", i, k + 1] = frame["y", n + i, k] * inverse
-                frame["y", n + i, k + 1] = out[i] * inverse
+            out = form.run(frame, series.order_recursion, *self.at_order(frame, k))
+            for row in form.each(code, series.rows):
+                frame["rows", row, k] = out[row + n]
+            for i in form.each(code, n):
+                frame["y", i, k + 1] = frame["y", i + n, k] * inverse
+                frame["y", i + n, k + 1] = out[i] * inverse
         return frame.finish()
 
-    def now(self, frame: Frame) -> Callable[[int], Value]:
+    def now(self, frame: Frame) -> list[Vectors]:
         """The inputs of the program at the present time: q, q̇, t, parameters."""
+        state = frame.vectors("y", self.states, lambda i: (i, 0))
+        return [state, frame.vectors("t", 1), frame.vectors("params", self.numbers)]
 
-        def read(i):
-            if i < self.states:
-                return frame["y", i]
-            return frame["t"] if i == self.states else frame["params", i - self.states - 1]
-
-        return read
-
-    def at_order(self, frame: Frame, k: Value) -> Callable[[int], Value]:
+    def at_order(self, frame: Frame, k: Value) -> list:
         """The inputs of the order recursion: the coefficients of order k, k, 1/k, the values and the sums."""
-        code = frame.code
-        time, order, inverse, first = range(self.states, self.states + 4)
-
-        def read(i):
-            if i < time:
-                return frame["y", i, k]
-            if i == time:
-                return code.lanes_of(code.select(code.compare("==", k, 1), code.as_double(k), 0.0))
-            if i in (order, inverse):
-                number = code.as_double(k)
-                return code.lanes_of(number if i == order else 1.0 / number)
-            i -= first
-            if i < self.series.values:
-                return frame["values", i]
-            return frame["sums", *self.sum_indices(i - self.series.values, k)]
-
-        return read
+        code, number, products = frame.code, frame.code.as_double(k), len(self.series.cauchy_products)
+        time = code.select(code.compare("==", k, 1), number, 0.0)
+        sums = frame.vectors("sums", products, lambda i: (0, i))
+        if self.keep_sums:
+            sums = Vectors(products, lambda i: frame["sums", k, i])
+        return [
+            Vectors(self.states, lambda i: frame["y", i, k]),
+            [code.lanes_of(x) for x in (time, number, 1.0 / number)],
+            frame.vectors("values", self.series.values),
+            sums,
+        ]
 
     # ---- along the step ----
 
-    def increments(self, frame: Frame, order: Value, s: Value) -> tuple[list[Value], list[Value]]:
+    def increments(self, frame: Frame, order: Value, s: Value) -> tuple[Numbers, Numbers]:
         """P(s) − y for every component, and P′(s) for the velocities, by Horner's scheme.
 
         A few components at a time, so that none waits for the other.
         """
-        code, increments, slopes = frame.code, [], []
-        for first in range(0, self.states, 4):
-            some = range(first, min(first + 4, self.states))
-            fast = [i for i in some if i >= self.n]
-            highest = {i: frame["y", i, order] for i in some}
-            value = {i: code.variable(highest[i]) for i in some}
-            slope = {i: code.variable(code.as_double(order) * highest[i]) for i in fast}
-            with code.loop(order, start=1) as j:
-                k = order - j
+        code, increments, slopes = frame.code, self.form.room(frame, self.states), self.form.room(frame, self.n)
+        for some, velocities in self.form.strands(code, self.n):
+            highest = [frame["y", i, order] for i in some]
+            value = [code.variable(c) for c in highest]
+            slope = {j: code.variable(code.as_double(order) * highest[j]) for j in velocities}
+            with code.loop(order, start=1) as at:
+                k = order - at
                 weight = code.lanes_of(code.as_double(k))
-                for i in some:
+                for j, i in enumerate(some):
                     c = frame["y", i, k]
-                    code.store(code.load(value[i], frame.vector) * s + c, value[i])
-                    if i in slope:
-                        code.store(code.load(slope[i], frame.vector) * s + c * weight, slope[i])
-            increments += [code.load(value[i], frame.vector) * s for i in some]
-            slopes += [code.load(slope[i], frame.vector) for i in fast]
+                    code.store(code.load(value[j], frame.vector) * s + c, value[j])
+                    if j in slope:
+                        code.store(code.load(slope[j], frame.vector) * s + c * weight, slope[j])
+            for j, i in enumerate(some):
+                increments[i] = code.load(value[j], frame.vector) * s
+            for j, i in velocities.items():
+                slopes[i] = code.load(slope[j], frame.vector)
         return increments, slopes
 
-    def evaluate_now(self, frame: Frame, line: StraightLine) -> list[Value]:
+    def evaluate_now(self, frame: Frame, line: StraightLine) -> Numbers:
         """The outputs of a program of (q, q̇, t, parameters) at the present state."""
-        return emit(frame.code, line, self.now(frame), self.sincos)
+        return self.form.run(frame, line, *self.now(frame))
 
-    def moved(self, frame: Frame, order: Value, s: Value) -> list[Value]:
-        """The state P(s), a time s after the present one."""
-        return [frame["y", i] + increment for i, increment in enumerate(self.increments(frame, order, s)[0])]
+    def moved(self, frame: Frame, increments: Numbers) -> Numbers:
+        """The state at the end of these increments."""
+        moved = self.form.room(frame, self.states)
+        for i in self.form.each(frame.code, self.states):
+            moved[i] = frame["y", i] + increments[i]
+        return moved
 
-    def evaluate(self, frame: Frame, line: StraightLine, state: list[Value], s: Value) -> list[Value]:
+    def evaluate(self, frame: Frame, line: StraightLine, state: Numbers, s: Value) -> Numbers:
         """The outputs of a program of (q, q̇, t, parameters) at a state, a time s after the present one."""
-        now = self.now(frame)
-
-        def then(i):
-            return state[i] if i < self.states else now(i) + s if i == self.states else now(i)
-
-        return emit(frame.code, line, then, self.sincos)
+        return self.form.run(frame, line, state, [frame["t"] + s], frame.vectors("params", self.numbers))
 
     # ---- rounds ----
 
@@ -218,6 +215,16 @@ class Motion:
 
     def _any_active(self, frame: Frame) -> Value:
         return frame.code.any_lane(frame["active"] > 0.0)
+
+
+def is_large(program: Recurrent, projection=None, guards=None) -> bool:
+    """Whether a kernel is written as tables, and not operation by operation."""
+    lines = [program.line]
+    if projection is not None:
+        lines += [projection.state.line, projection.velocity_scale.line]
+    if guards is not None:
+        lines.append(guards.program.line)
+    return sum(len(line.nodes) for line in lines) > LARGEST_LINE
 
 
 def integer(code: Code, x: int) -> Value:

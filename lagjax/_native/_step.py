@@ -10,7 +10,7 @@ h ‖d‖ / (p+1) ≤ 1. It costs two accelerations, and sees what no coefficien
 narrow feature ahead.
 """
 
-import functools
+from collections.abc import Callable
 
 from lagjax._native._constants import (
     CHECKS,
@@ -27,10 +27,10 @@ from lagjax._native._constants import (
     SINGULAR,
     STEP_TOO_SMALL,
 )
-from lagjax._native._frame import Frame
+from lagjax._native._frame import Frame, Index
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._projection import Projector, end_of_step
-from lagjax._native._series import Motion, double, integer
+from lagjax._native._series import Motion, Numbers, double, integer
 
 
 class StepControl:
@@ -79,40 +79,36 @@ class StepControl:
         """The scaled norms of the last two coefficients; `scale` keeps 1 / (atol + rtol·size)."""
         code = frame.code
         rtol, atol = (code.lanes_of(frame.job(name)) for name in ("rtol", "atol"))
-        errors = [frame.constant(0.0), frame.constant(0.0)]
-        for i, size in enumerate(self._sizes(frame)):
-            rate = code.intrinsic("fabs", frame["y", i, 1])
-            scale = 1.0 / (atol + rtol * size)
-            frame["scale", i] = scale
-            for k in range(2):
-                error = code.intrinsic("fabs", frame["y", i, order - k]) * scale
-                errors[k] = code.select(error <= errors[k], errors[k], error)  # NaN goes through
-            # An infinite slope may leave no trace in the last coefficients.
-            errors[0] = code.select(rate < float("inf"), errors[0], float("nan"))
-        return errors[0], errors[1]
+        errors = [code.variable(frame.constant(0.0)) for _ in range(2)]
+        for half in range(2):
+            sizes, first = self._sizes(frame, half), half * self.motion.n
+            for i in self.motion.form.each(code, self.motion.n):
+                rate = code.intrinsic("fabs", frame["y", i + first, 1])
+                scale = 1.0 / (atol + rtol * sizes[i])
+                frame["scale", i + first] = scale
+                for k in range(2):
+                    error = code.intrinsic("fabs", frame["y", i + first, order - k]) * scale
+                    before = code.load(errors[k], frame.vector)
+                    code.store(code.select(error <= before, before, error), errors[k])  # NaN goes through
+                # An infinite slope may leave no trace in the last coefficients.
+                sound = code.select(rate < float("inf"), code.load(errors[0], frame.vector), float("nan"))
+                code.store(sound, errors[0])
+        return code.load(errors[0], frame.vector), code.load(errors[1], frame.vector)
 
-    def _sizes(self, frame: Frame) -> list[Value]:
-        """How large every component of the state is over the step, or the largest one of its group."""
-        code, n = frame.code, self.motion.n
+    def _sizes(self, frame: Frame, half: int) -> Numbers:
+        """How large every coordinate, or every velocity (half 1), is over the step, or the largest one of its group."""
+        code, first = frame.code, half * self.motion.n
         before = code.intrinsic("fabs", frame["h"])
 
         def largest(i):
             # A component that passes through zero is as large as it will be a step away.
-            y, rate = (code.intrinsic("fabs", frame["y", i, k]) for k in range(2))
-            if self.projector is not None and i % n < self.projector.base_size:
-                scale = frame["velocity_scale", i % n]
-                y, rate = (y, code.maximum(rate, scale)) if i < n else (code.maximum(y, scale), rate)
+            y, rate = (code.intrinsic("fabs", frame["y", i + first, k]) for k in range(2))
+            if self.projector is not None and self.projector.scales(i):
+                scale = frame["velocity_scale", i]
+                y, rate = (code.maximum(y, scale), rate) if half else (y, code.maximum(rate, scale))
             return code.maximum(y, rate * before)
 
-        halves = ([largest(i) for i in half] for half in (range(n), range(n, 2 * n)))
-        return [size for half in halves for size in self._by_group(code, half)]
-
-    def _by_group(self, code: Code, values: list[Value]) -> list[Value]:
-        """For every coordinate the largest value in its group."""
-        largest: dict[int, Value] = {}
-        for group, value in zip(self.error_groups, values, strict=True):
-            largest[group] = code.maximum(largest[group], value) if group in largest else value
-        return [largest[group] for group in self.error_groups]
+        return self.motion.form.largest_by_group(frame, largest, self.error_groups)
 
     # ---- whether its series holds ----
 
@@ -126,32 +122,38 @@ class StepControl:
         code, (order, place), h = frame.code, frame.arguments, frame["h"]
         s = code.lanes_of(place) * h
         increments, slopes = motion.increments(frame, order, s)
-        for i, increment in enumerate(increments):
-            frame["increment", i] = increment
-        moved = [frame["y", i] + increment for i, increment in enumerate(increments)]
-        line = motion.program.line
+        for i in motion.form.each(code, motion.states):
+            frame["increment", i] = increments[i]
+        moved, line = motion.moved(frame, increments), motion.program.line
         acceleration = motion.evaluate(frame, line._replace(outputs=line.outputs[:n]), moved, s)
         noise = self._noise(frame, acceleration, increments, moved)
-        defect, weight = frame["defect"], code.intrinsic("fabs", h) / code.as_double(order + 1)
-        for i in range(n):
+        defect, weight = code.variable(frame["defect"]), code.intrinsic("fabs", h) / code.as_double(order + 1)
+        for i in motion.form.each(code, n):
             # What rounding leaves of an acceleration is not a defect of the series.
-            excess = code.intrinsic("fabs", acceleration[i] - slopes[i]) - noise[i]
-            error = weight * excess * frame["scale", n + i]
-            defect = code.select(error <= defect, defect, error)  # NaN goes through
-        frame["defect"] = defect
+            excess = code.intrinsic("fabs", acceleration[i] - slopes[i]) - noise(i)
+            error, before = weight * excess * frame["scale", i + n], code.load(defect, frame.vector)
+            code.store(code.select(error <= before, before, error), defect)  # NaN goes through
+        frame["defect"] = code.load(defect, frame.vector)
         return frame.finish()
 
-    def _noise(self, frame: Frame, acceleration, increments, moved) -> list[Value]:
-        """What rounding may leave of every component of an acceleration at a place of the step."""
-        code, n = frame.code, self.motion.n
-        size = self._by_group(code, [code.intrinsic("fabs", a) for a in acceleration])
+    def _noise(self, frame: Frame, acceleration, increments, moved) -> Callable[[Index], Value]:
+        """What rounding may leave of component i of an acceleration at a place of the step."""
+        code, n, form = frame.code, self.motion.n, self.motion.form
+
+        def size_of(numbers):
+            return lambda i: code.intrinsic("fabs", numbers[i])
+
+        size = form.largest_by_group(frame, size_of(acceleration), self.error_groups)
         # Half a unit in the last place of q moves an acceleration by what it varies along the step, in proportion.
-        place = functools.reduce(code.maximum, (code.intrinsic("fabs", q) for q in moved[:n]))
-        moves = functools.reduce(code.maximum, (code.intrinsic("fabs", dq) for dq in increments[:n]))
+        place, moves = (form.largest(code, size_of(numbers), n) for numbers in (moved, increments))
         unit = (PLACES * EPS) * place / moves
         unit = code.select(unit < LARGEST_UNIT, unit, 0.0)  # what hardly moves is not what makes it vary
-        changes = (code.intrinsic("fabs", acceleration[i] - frame["y", n + i, 1]) for i in range(n))
-        return [ROUND_OFF * size[i] + unit * change for i, change in enumerate(changes)]
+
+        def noise(i):
+            change = code.intrinsic("fabs", acceleration[i] - frame["y", i + n, 1])
+            return ROUND_OFF * size[i] + unit * change
+
+        return noise
 
     def halve_until_sound(self, frame: Frame, order: Value) -> None:
         """Check the steps of all lanes, and halve those that fail, until none does."""
@@ -202,7 +204,7 @@ class StepControl:
         frame["t"] = code.select(moving, after, frame["t"])
         frame["t_low"] = code.select(moving, rest, frame["t_low"])
         frame["longest"] = code.intrinsic("fabs", h) * frame["growth"]
-        for i in range(self.motion.states):
+        for i in self.motion.form.each(code, self.motion.states):
             total, rest = end_of_step(frame, i)
             if self.projector is not None:
                 total = frame["projected", i]

@@ -1,0 +1,212 @@
+"""Large programs as tables: what is computed is data, and one loop of machine code runs all of it.
+
+LLVM's time for a straight line grows faster than its length. Here a program is a row of integers,
+
+    kind, then for each of `times` operations where its operands and its result lie;  kind, …;  0
+
+and `execute` walks along it: a switch over the kinds of operations (some twenty) leads to their code, for `_schedule`
+puts alike operations side by side. Every number lies in the memory of the thread, so that what has been computed is
+read from the first or second cache instead of a register. The operations, and the order in which a sum adds up, are
+those of the straight line.
+"""
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from llvmlite import ir
+
+from lagjax._native._frame import Frame, Vectors, integers
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
+from lagjax._native._lanes import apply, sines_and_cosines
+from lagjax._native._schedule import TIMES, Kind, Operation, schedule
+from lagjax._program._series import StraightLine
+
+_WORD = ir.IntType(32)  # an entry of a table: a kind, or a distance in the memory, in doubles
+
+
+class Tables:
+    """The form of large kernels; `Lines` is that of small ones, with the same methods.
+
+    `function(name, *kinds)` makes a function of the kernel, with its frame.
+    """
+
+    def __init__(self, function, sincos: Code):
+        self._sincos = sincos
+        self._kinds: dict[tuple[Kind, int], int] = {}
+        self._constants: dict[bytes, int] = {}
+        self._fields: list[str] = []
+        self._execute: Frame = function("execute", POINTER)
+        self._prepare: Frame = function("prepare")
+        self._module, self._layout = self._execute.code.module, self._execute.layout
+        self._nowhere = self._layout.place(self._field(1), 0)  # for results that nobody reads
+
+    # ---- what a kernel is written with ----
+
+    def run(self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors") -> Vectors:
+        """The outputs of a program, of which these are the inputs, one after the other; a bool is 1 or 0.
+
+        They stay until this place of the kernel is passed again.
+        """
+        plan = schedule(line)
+        name, lying = self._field(plan.size), self._places(frame, inputs)
+        places = {node: self._layout.place(name, slot) for node, slot in plan.slots.items()}
+        places |= {node: self._constant(number) for node, number in plan.constants.items()}
+        places |= {node: lying[position] for node, position in plan.inputs.items()}
+        words = [word for group in plan.groups for word in self._words(group, places)]
+        frame.call(self._execute.code, Value(frame.code, integers(self._module, np.array([*words, 0], np.int32))))
+        return frame.vectors(name, len(line.outputs))
+
+    def each(self, code: Code, count: int) -> Iterator[Value]:
+        """The numbers from 0 to `count`, for a body that is written down once, in a loop."""
+        if count:
+            with code.loop(count) as i:
+                yield i
+
+    def strands(self, code: Code, n: int) -> Iterator[tuple[list, dict]]:
+        """The components of a state of n coordinates: one coordinate and its velocity at a time; and which is that."""
+        for i in self.each(code, n):
+            yield [i, i + n], {1: i}
+
+    def room(self, frame: Frame, count: int) -> Vectors:
+        """Room for so many vectors."""
+        return frame.vectors(self._field(count), count)
+
+    def largest(self, code: Code, numbers: Callable[[Value], Value], count: int) -> Value:
+        """The largest of so many numbers, which are not negative; NaN where the last one is."""
+        largest = code.variable(code.lanes_of(0.0))
+        for i in self.each(code, count):
+            code.store(code.maximum(code.load(largest, code.vector), numbers(i)), largest)
+        return code.load(largest, code.vector)
+
+    def largest_by_group(self, frame: Frame, numbers: Callable[[Value], Value], groups: Sequence[int]) -> Vectors:
+        """For each of the numbers the largest one of its group: of those with the same number in `groups`."""
+        code, count, names = frame.code, len(groups), sorted(set(groups))
+        values = self.room(frame, count)
+        if len(names) == count:
+            for i in self.each(code, count):
+                values[i] = numbers(i)
+            return values
+        largest = self.room(frame, len(names))
+        table = integers(self._module, np.array([names.index(group) for group in groups], np.int64))
+        for group in self.each(code, len(names)):
+            largest[group] = code.lanes_of(0.0)
+        for i in self.each(code, count):
+            group = code.load(code.element(Value(code, table), i, INTEGER), INTEGER)
+            largest[group] = code.maximum(largest[group], numbers(i))
+        for i in self.each(code, count):
+            values[i] = largest[code.load(code.element(Value(code, table), i, INTEGER), INTEGER)]
+        return values
+
+    def prepare(self, frame: Frame) -> None:
+        """What has to be done once for the memory of a thread: constants are numbers like all others."""
+        frame.call(self._prepare.code)
+
+    def finish(self) -> None:
+        """After all programs of the kernel: the loop with all kinds of operations that these have."""
+        self._write_execute()
+        self._write_prepare()
+
+    # ---- where numbers lie ----
+
+    def _field(self, count: int) -> str:
+        """A new field of the memory, of so many vectors."""
+        name = f"field{len(self._fields)}"
+        self._fields.append(name)
+        self._layout.extend(name, count)
+        return name
+
+    def _constant(self, number: float) -> int:
+        """Where a constant lies."""
+        key = struct.pack("d", number)  # 0.0 and -0.0 are equal but not the same
+        if key not in self._constants:
+            self._constants[key] = self._layout.place(self._field(1), 0)
+        return self._constants[key]
+
+    def _places(self, frame: Frame, inputs) -> list[int]:
+        """Where every input lies; those without a place of their own are given one."""
+        places: list[int] = []
+        for values in inputs:
+            if getattr(values, "place", None) is None:
+                room = self.room(frame, len(values))
+                for i in self.each(frame.code, len(values)) if isinstance(values, Vectors) else range(len(values)):
+                    room[i] = values[i]
+                values = room
+            places += map(values.place, range(len(values)))
+        return places
+
+    # ---- the table of a program ----
+
+    def _words(self, group: list[Operation], places: dict[int, int]) -> Iterator[int]:
+        """The operations of a group, so many at a time as there is code for."""
+        start = 0
+        while start < len(group):
+            times = TIMES if len(group) - start >= TIMES else 1
+            yield self._kinds.setdefault((group[start].kind, times), len(self._kinds) + 1)
+            for operation in group[start : start + times]:
+                yield from map(places.__getitem__, operation.operands)
+                yield from (places[x] if x >= 0 else self._nowhere for x in operation.results)
+            start += times
+
+    # ---- the code ----
+
+    def _write_execute(self) -> None:
+        """`(table)`: run a program."""
+        frame, code = self._execute, self._execute.code
+        (table,) = frame.arguments
+        at = code.variable(table)
+        head, end = (code.function.append_basic_block(name) for name in ("next", "end"))
+        code.builder.branch(head)
+        code.builder.position_at_end(head)
+        switch = code.builder.switch(_word(code, code.load(at, POINTER), 0).it, end)
+        for (kind, times), number in self._kinds.items():
+            block = code.function.append_basic_block(kind.op)
+            switch.add_case(ir.Constant(INTEGER, number), block)
+            code.builder.position_at_end(block)
+            words, size = code.load(at, POINTER), len(kind.operands) + kind.results
+            for k in range(times):
+                where = [frame.at(_word(code, words, 1 + k * size + i)) for i in range(size)]
+                operands = [code.load(address, frame.vector) for address in where[: len(kind.operands)]]
+                for result, address in zip(self._results(kind, operands), where[len(kind.operands) :], strict=True):
+                    code.store(result, address)
+            code.store(code.element(words, 1 + times * size, _WORD), at)
+            code.builder.branch(head)
+        code.builder.position_at_end(end)
+        frame.finish()
+
+    def _results(self, kind: Kind, operands: list[Value]) -> tuple[Value, ...]:
+        """The results of an operation; a bool is 1 or 0."""
+        code = self._execute.code
+        if kind.op == "copy":
+            return (operands[0],)
+        if kind.op == "sincos":
+            return sines_and_cosines(code, self._sincos, operands[0])
+        if merged := _MERGED.get(kind.op):
+            return (merged(*operands),)
+        xs = [code.compare("!=", x, 0.0) if of == "bool" else x for x, of in zip(operands, kind.operands, strict=True)]
+        result = apply(code, kind.op, xs, kind.attribute, kind.operands, kind.result)
+        return (code.as_double(result) if kind.result == "bool" else result,)
+
+    def _write_prepare(self) -> None:
+        """`()`: every constant in its place, in all lanes."""
+        frame, code = self._prepare, self._prepare.code
+        if self._constants:
+            places = Value(code, integers(self._module, np.array([*self._constants.values()], np.int64)))
+            numbers = Value(code, integers(self._module, np.frombuffer(b"".join(self._constants), np.int64)))
+            with code.loop(len(self._constants)) as i:
+                number = code.load(code.element(numbers, i), DOUBLE)
+                code.store(code.lanes_of(number), frame.at(code.load(code.element(places, i, INTEGER), INTEGER)))
+        frame.finish()
+
+
+_MERGED = {
+    "multiply_add": lambda a, b, c: a * b + c,
+    "multiply_subtract": lambda a, b, c: a * b - c,
+    "subtract_product": lambda a, b, c: c - a * b,
+}
+
+
+def _word(code: Code, words: Value, index: int) -> Value:
+    """An entry of a table."""
+    address = code.builder.gep(words.it, [ir.Constant(INTEGER, index)], source_etype=_WORD)
+    return Value(code, code.builder.zext(code.builder.load(address, typ=_WORD, align=4), INTEGER))
