@@ -8,26 +8,39 @@
 Nothing here knows LLVM.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from typing import NamedTuple
 
 from lagjax._program._series import StraightLine
 
-# Alike operations that run as one step of the loop, written out. Measured on chains of 8 to 24 pendulums and 6 to 20
-# bodies in space: TODO
-TIMES = 8
-# Alike operations taken together at most, so that results are read while they are in the first caches.
-MOST = 64
+TIMES = 4, 1
+MOST = 4
+WINDOW = 1024
+ROUNDS, OFTEN, LARGEST = 12, 12, 10
+JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))
 
 
 class Kind(NamedTuple):
-    """What an operation does: its name and attribute, and the kinds ("float", "bool", …) of operands and result."""
+    """What an operation does: its name and attribute, and the kinds ("float", "bool", …) of operands and result.
+
+    `parts` has an entry for each operand: the operation that it is the result of, if that belongs to this one, or None.
+    """
 
     op: str
     attribute: object
-    operands: tuple[str, ...]
+    kinds: tuple[str, ...]
     result: str
-    results: int = 1
+    parts: "tuple[Kind | None, ...]" = (None,)
+
+    @property
+    def operands(self) -> int:
+        """How many numbers it reads."""
+        return sum(1 if part is None else part.operands for part in self.parts)
+
+    @property
+    def results(self) -> int:
+        """How many numbers it makes."""
+        return 2 if self.op == "sincos" else 1
 
 
 class Operation(NamedTuple):
@@ -55,7 +68,7 @@ class Schedule(NamedTuple):
 def schedule(line: StraightLine) -> Schedule:
     """The order of the operations that the outputs of a program need, and the slots of their results."""
     nodes, uses = line.nodes, _uses(line)
-    operations = _operations(line, uses)
+    operations = _joined(_operations(line, uses), uses)
     outputs, copies = _outputs(line, operations)
     groups = _grouped(operations + copies)
     slots, size = _slots(groups, outputs, len(line.outputs))
@@ -66,44 +79,6 @@ def schedule(line: StraightLine) -> Schedule:
 
 
 # ---- operations ------------------------------------------------------------------------------------------------------
-
-
-def _operations(line: StraightLine, uses: list[int]) -> list[Operation]:
-    """The operations that the outputs need, each after those that it reads."""
-    nodes, kinds = line.nodes, line.kinds
-    merged, pairs, operations = _merged(line, uses), _angles(line, uses), []
-    gone = {product for product, _, _ in merged.values()}
-    for i, (op, operands, attribute) in enumerate(nodes):
-        if not uses[i] or i in gone or op in ("input", "constant"):
-            continue
-        if i in merged:
-            _, name, operands = merged[i]
-            operations.append(Operation(Kind(name, None, ("float",) * 3, "float"), operands, (i,)))
-        elif op in ("sin", "cos"):
-            pair = pairs[operands[0]]
-            if i == min(x for x in pair if x >= 0):
-                operations.append(Operation(Kind("sincos", None, ("float",), "float", 2), operands, tuple(pair)))
-        else:
-            kind = Kind(op, attribute, tuple(kinds[x] for x in operands), kinds[i])
-            operations.append(Operation(kind, operands, (i,)))
-    return operations
-
-
-def _outputs(line: StraightLine, operations: list[Operation]) -> tuple[dict[int, int], list[Operation]]:
-    """Which output every node is, and the copies for outputs that no operation makes, or that are an earlier one too.
-
-    Of a program of N nodes, a copy for output k is node N + k.
-    """
-    made = {x for operation in operations for x in operation.results}
-    outputs: dict[int, int] = {}
-    copies = []
-    for k, i in enumerate(line.outputs):
-        if i in made and i not in outputs:
-            outputs[i] = k
-        else:
-            outputs[len(line.nodes) + k] = k
-            copies.append(Operation(Kind("copy", None, ("float",), "float"), (i,), (len(line.nodes) + k,)))
-    return outputs, copies
 
 
 def _uses(line: StraightLine) -> list[int]:
@@ -118,22 +93,22 @@ def _uses(line: StraightLine) -> list[int]:
     return uses
 
 
-_MERGED = {("add", 0): "multiply_add", ("add", 1): "multiply_add",
-           ("sub", 0): "multiply_subtract", ("sub", 1): "subtract_product"}  # fmt: skip
-
-
-def _merged(line: StraightLine, uses: list[int]) -> dict[int, tuple[int, str, tuple[int, ...]]]:
-    """The sums with a product that nothing else reads: the product, the operation of both, and what that reads."""
-    merged, taken = {}, set()
-    for i, (op, operands, _) in enumerate(line.nodes):
-        if not uses[i] or op not in ("add", "sub") or line.kinds[i] != "float":
+def _operations(line: StraightLine, uses: list[int]) -> list[Operation]:
+    """The operations that the outputs need, each after those that it reads."""
+    angles, operations = _angles(line, uses), []
+    interned: dict[Kind, Kind] = {}
+    for i, (op, operands, attribute) in enumerate(line.nodes):
+        if not uses[i] or op in ("input", "constant"):
             continue
-        for place, x in enumerate(operands):
-            if line.nodes[x][0] == "mul" and uses[x] == 1 and x not in taken:
-                taken.add(x)
-                merged[i] = x, _MERGED[op, place], (*line.nodes[x][1], operands[1 - place])
-                break
-    return merged
+        results = (i,)
+        if op in ("sin", "cos"):
+            op, results = "sincos", tuple(angles[operands[0]])
+            if i != min(x for x in results if x >= 0):
+                continue
+        kinds = tuple(line.kinds[x] for x in operands)
+        kind = Kind(op, attribute, kinds, line.kinds[i], (None,) * len(operands))
+        operations.append(Operation(interned.setdefault(kind, kind), operands, results))
+    return operations
 
 
 def _angles(line: StraightLine, uses: list[int]) -> dict[int, list[int]]:
@@ -145,34 +120,146 @@ def _angles(line: StraightLine, uses: list[int]) -> dict[int, list[int]]:
     return pairs
 
 
+def _outputs(line: StraightLine, operations: list[Operation]) -> tuple[dict[int, int], list[Operation]]:
+    """Which output every node is, and the copies for outputs that no operation makes, or that are an earlier one too.
+
+    Of a program of N nodes, a copy for output k is node N + k.
+    """
+    made = {x for operation in operations for x in operation.results}
+    outputs: dict[int, int] = {}
+    copies, copy = [], Kind("copy", None, ("float",), "float")
+    for k, i in enumerate(line.outputs):
+        if i in made and i not in outputs:
+            outputs[i] = k
+        else:
+            outputs[len(line.nodes) + k] = k
+            copies.append(Operation(copy, (i,), (len(line.nodes) + k,)))
+    return outputs, copies
+
+
+# ---- what comes often together ---------------------------------------------------------------------------------------
+
+
+def _joined(operations: list[Operation], uses: list[int]) -> list[Operation]:
+    """The operations, with a result that only one other reads computed inside that one, where such a pair comes often.
+
+    Pairs of pairs come often too, and so on: as in byte-pair encoding, with trees for strings.
+    """
+    work = _Work({operation.results[0]: operation for operation in operations}, uses)
+    work.join_products()
+    for _ in range(ROUNDS):
+        if not work.join(work.often()):
+            break
+    return [*work.operations.values()]
+
+
+class _Work:
+    """Operations by the node that they make, in order, some of which are joined to others."""
+
+    def __init__(self, operations: dict[int, Operation], uses: list[int]):
+        self.operations, self._uses = operations, uses
+        self._joined: dict[tuple[Kind, int, Kind], Kind] = {}
+
+    def _inner(self, x: int) -> Operation | None:
+        """The operation that makes node x, if only one other reads it and it can be a part of that."""
+        operation = self.operations.get(x) if self._uses[x] == 1 else None
+        return operation if operation is not None and operation.kind.op in JOINED else None
+
+    def join_products(self) -> None:
+        """A product that only one sum reads is computed with that sum, as the processor has it, and rounded with it."""
+        for i, operation in list(self.operations.items()):
+            kind, operands, _ = operation
+            if kind.op not in ("add", "sub") or kind.result != "float":
+                continue
+            place = next((k for k, x in enumerate(operands) if (inner := self._inner(x)) and inner.kind.op == "mul"), None)
+            if place is not None:
+                if kind.op == "add" and place == 1:
+                    self.operations[i], place = operation._replace(operands=operands[::-1]), 0
+                self._put(i, place)
+
+    def often(self) -> dict[Kind, tuple[int, Kind]]:
+        """The pairs that come most often: for kinds of operations the operand that is joined, and its kind."""
+        pairs: Counter = Counter()
+        for operation in self.operations.values():
+            if operation.kind.op in JOINED:
+                for place, x in enumerate(operation.operands):
+                    if inner := self._inner(x):
+                        pairs[operation.kind, place, inner.kind] += 1
+        chosen: dict[Kind, tuple[int, Kind]] = {}
+        inside: set[Kind] = set()
+        for (kind, place, part), count in pairs.most_common():
+            free = kind not in chosen and kind not in inside and (part not in chosen or part == kind)
+            if count >= OFTEN and kind.operands + part.operands <= LARGEST and free:
+                chosen[kind] = place, part
+                inside.add(part)
+        return chosen
+
+    def join(self, chosen: dict[Kind, tuple[int, Kind]]) -> bool:
+        """Join the operations that are such pairs; whether there are any."""
+        for i, operation in list(self.operations.items()):
+            if i in self.operations and operation.kind in chosen:
+                place, part = chosen[operation.kind]
+                inner = self._inner(operation.operands[place])
+                if inner is not None and inner.kind == part:
+                    self._put(i, place)
+        return bool(chosen)
+
+    def _put(self, i: int, place: int) -> None:
+        """Compute the operand of operation i at this place inside it."""
+        kind, operands, results = self.operations[i]
+        inner = self.operations.pop(operands[place])
+        key = kind, place, inner.kind
+        if key not in self._joined:
+            self._joined[key] = _with_part(*key)
+        operands = operands[:place] + inner.operands + operands[place + 1 :]
+        self.operations[i] = Operation(self._joined[key], operands, results)
+
+
+def _with_part(kind: Kind, place: int, part: Kind) -> Kind:
+    """The kind whose operand at this place, counted over all that it reads, is made by another."""
+    parts = list(kind.parts)
+    for k, inner in enumerate(parts):
+        width = 1 if inner is None else inner.operands
+        if place < width:
+            parts[k] = part if inner is None else _with_part(inner, place, part)
+            break
+        place -= width
+    return kind._replace(parts=tuple(parts))
+
+
 # ---- order -----------------------------------------------------------------------------------------------------------
 
 
 def _grouped(operations: list[Operation]) -> list[list[Operation]]:
-    """Operations of one kind that do not wait for each other, `MOST` at most, in an order that respects all others.
+    """Operations of one kind that do not wait for each other, in an order that respects all others.
 
-    The kind that became ready last goes first where it fills a step of the loop, for its operands are near; among kinds
-    that do not, the one that comes nearest.
+    Of the next `WINDOW` operations, in the order in which the program has them, the kind goes first that fills a step
+    of the loop and became ready last, for its operands are near; among kinds that do not, the one that comes nearest.
     """
     users, waiting = _edges(operations)
     ready: dict[Kind, list[int]] = defaultdict(list)
-    for k in range(len(operations) - 1, -1, -1):
-        if not waiting[k]:
-            ready[operations[k].kind].append(k)
-    groups, since, moment, left = [], dict.fromkeys(ready, 0), 0, len(operations)
-    while left:
-        full = [kind for kind, some in ready.items() if len(some) >= TIMES]
+    since: dict[Kind, int] = defaultdict(int)
+    groups, done, first, seen = [], [False] * len(operations), 0, 0
+    while first < len(operations):
+        while seen < min(len(operations), first + WINDOW):
+            if not waiting[seen]:
+                ready[operations[seen].kind].append(seen)
+            seen += 1
+        full = [kind for kind, some in ready.items() if len(some) >= TIMES[0]]
         kind = max(full, key=since.__getitem__) if full else max(ready, key=lambda kind: len(ready[kind]))
-        group = ready[kind][-MOST:]
-        del ready[kind][-MOST:]
-        moment, left = moment + 1, left - len(group)
+        count = min(MOST, len(ready[kind]) // TIMES[0] * TIMES[0]) or len(ready[kind])
+        group = ready[kind][-count:]
+        del ready[kind][-count:]
         groups.append([operations[k] for k in group])
         for k in group:
+            done[k] = True
             for user in users[k]:
                 waiting[user] -= 1
-                if not waiting[user]:
+                if not waiting[user] and user < seen:
                     ready[operations[user].kind].append(user)
-                    since[operations[user].kind] = moment
+                    since[operations[user].kind] = len(groups)
+        while first < len(operations) and done[first]:
+            first += 1
     return groups
 
 

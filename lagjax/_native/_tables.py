@@ -141,7 +141,7 @@ class Tables:
         """The operations of a group, so many at a time as there is code for."""
         start = 0
         while start < len(group):
-            times = TIMES if len(group) - start >= TIMES else 1
+            times = next(times for times in TIMES if times <= len(group) - start)
             yield self._kinds.setdefault((group[start].kind, times), len(self._kinds) + 1)
             for operation in group[start : start + times]:
                 yield from map(places.__getitem__, operation.operands)
@@ -163,28 +163,27 @@ class Tables:
             block = code.function.append_basic_block(kind.op)
             switch.add_case(ir.Constant(INTEGER, number), block)
             code.builder.position_at_end(block)
-            words, size = code.load(at, POINTER), len(kind.operands) + kind.results
+            words, size = code.load(at, POINTER), kind.operands + kind.results
             for k in range(times):
                 where = [frame.at(_word(code, words, 1 + k * size + i)) for i in range(size)]
-                operands = [code.load(address, frame.vector) for address in where[: len(kind.operands)]]
-                for result, address in zip(self._results(kind, operands), where[len(kind.operands) :], strict=True):
+                operands = (code.load(address, frame.vector) for address in where[: kind.operands])
+                for result, address in zip(self._results(kind, operands), where[kind.operands :], strict=True):
                     code.store(result, address)
             code.store(code.element(words, 1 + times * size, _WORD), at)
             code.builder.branch(head)
         code.builder.position_at_end(end)
         frame.finish()
 
-    def _results(self, kind: Kind, operands: list[Value]) -> tuple[Value, ...]:
-        """The results of an operation; a bool is 1 or 0."""
+    def _results(self, kind: Kind, operands: Iterator[Value]) -> tuple[Value, ...]:
+        """The results of an operation, from those of the numbers that it reads; a bool is 1 or 0."""
         code = self._execute.code
+        xs = [next(operands) if part is None else self._results(part, operands)[0] for part in kind.parts]
         if kind.op == "copy":
-            return (operands[0],)
+            return (xs[0],)
         if kind.op == "sincos":
-            return sines_and_cosines(code, self._sincos, operands[0])
-        if merged := _MERGED.get(kind.op):
-            return (merged(*operands),)
-        xs = [code.compare("!=", x, 0.0) if of == "bool" else x for x, of in zip(operands, kind.operands, strict=True)]
-        result = apply(code, kind.op, xs, kind.attribute, kind.operands, kind.result)
+            return sines_and_cosines(code, self._sincos, xs[0])
+        xs = [code.compare("!=", x, 0.0) if of == "bool" else x for x, of in zip(xs, kind.kinds, strict=True)]
+        result = apply(code, kind.op, xs, kind.attribute, kind.kinds, kind.result)
         return (code.as_double(result) if kind.result == "bool" else result,)
 
     def _write_prepare(self) -> None:
@@ -197,13 +196,6 @@ class Tables:
                 number = code.load(code.element(numbers, i), DOUBLE)
                 code.store(code.lanes_of(number), frame.at(code.load(code.element(places, i, INTEGER), INTEGER)))
         frame.finish()
-
-
-_MERGED = {
-    "multiply_add": lambda a, b, c: a * b + c,
-    "multiply_subtract": lambda a, b, c: a * b - c,
-    "subtract_product": lambda a, b, c: c - a * b,
-}
 
 
 def _word(code: Code, words: Value, index: int) -> Value:
