@@ -59,7 +59,7 @@ def lanewise(body, *columns):
 
 
 def sincos(x):
-    return lanewise(lambda code, sincos, xs: _lanes._both(code, sincos, xs[0]), x)
+    return lanewise(lambda code, sincos, xs: _lanes.sines_and_cosines(code, sincos, xs[0]), x)
 
 
 def ulps(found, exact):

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 from lagjax._program._series import StraightLine
 
-TIMES = 4, 1
-MOST = 4
-WINDOW = 1024
+TIMES = 4, 2, 1
+MOST = 16
+WINDOW = 4096
 ROUNDS, OFTEN, LARGEST = 12, 12, 10
 JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))
 
