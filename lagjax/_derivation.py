@@ -25,14 +25,14 @@ from lagjax._constraints import velocity_scales
 from lagjax._layout import Layout, dtype_of
 from lagjax._motion import Motion
 from lagjax._native import Projection
-from lagjax._program import Program, Unlowerable, lower, lower_solution
+from lagjax._program import Program, Unlowerable, lower, lower_scalars, lower_solution
+from lagjax._quantities import OwnRules, quantities
 from lagjax._saddle import SaddleElimination
 
 PyTree = Any
 
-# A larger scene is not even looked at: most of the work of reducing it would be thrown away.
-LARGEST_SCALAR_SCENE = 64
-OPERATION_BUDGET = 20_000
+# While it is lowered, an operation takes about a kilobyte: this is what some gigabytes of memory hold.
+OPERATION_BUDGET = 4_000_000
 
 
 class _Saddle(NamedTuple):
@@ -102,12 +102,21 @@ class Derivation:
         if self.refusal is not None:
             raise Unlowerable(self.refusal)
 
-        def quantities(*state):
-            values = self._traced_once.quantities(*state)
+        def in_order(values):
             self._shapes = {name: values[name].shape for name in sorted(values)}
             return [values[name] for name in self._shapes]
 
-        return lower(quantities, *self.state_shapes, budget=OPERATION_BUDGET)
+        def on_arrays(*leaves):
+            return in_order(self._traced_once.quantities(*jax.tree.unflatten(structure, leaves)))
+
+        def on_scalars(expansion, leaves):
+            return in_order(quantities(self.motion, expansion, self.state_shapes, leaves))
+
+        leaves, structure = jax.tree.flatten(self.state_shapes)
+        try:
+            return lower_scalars(on_scalars, on_arrays, tuple(leaves), OPERATION_BUDGET)
+        except OwnRules:
+            return lower(on_arrays, *leaves, budget=OPERATION_BUDGET)
 
     def program(self, *names: str) -> Program:
         """The program for these of `Motion.quantities`, end to end, each in C order."""
@@ -175,7 +184,6 @@ class Derivation:
         Machine code changes over where that comes about, with the numbers of the run at hand; XLA, which has to write
         the program down before it knows them, takes the one that always holds (`Program.complete`).
         """
-        self._require_small()
         if not self.motion.constrained or self._constant_mass or not self._regular(_ACCELERATION):
             return self._general_acceleration
         variant = self._solution(_ACCELERATION, regular_only=True)
@@ -190,7 +198,6 @@ class Derivation:
         """λ, those of `constraints` first; redundant ones are zero. None without constraints."""
         if not self.motion.constrained:
             return None
-        self._require_small()
         system, solve = self._system(_ACCELERATION)
 
         def multipliers(*scalars):
@@ -204,7 +211,6 @@ class Derivation:
         """(q, q̇) after one Newton step of each kind back to the constraints, as `Motion.projected`; or None."""
         if not self.motion.constrained:
             return None
-        self._require_small()
         n = self.layout.size
         velocity = self._solution(_VELOCITY_STEP)
         position = None if self.motion.constraints.on_positions is None else self._solution(_POSITION_STEP)
@@ -280,10 +286,6 @@ class Derivation:
         leaves = jax.tree.leaves(self.numbers)
         numbers = [leaf.dtype for leaf in leaves for _ in range(leaf.size)]
         return [jax.ShapeDtypeStruct((), dtype) for dtype in [self.layout.dtype] * (2 * self.layout.size + 1) + numbers]
-
-    def _require_small(self) -> None:
-        if self.layout.size > LARGEST_SCALAR_SCENE:
-            raise Unlowerable(f"it has {self.layout.size} coordinates, more than {LARGEST_SCALAR_SCENE}")
 
     # ---- linear systems ----
 

@@ -4,7 +4,8 @@
 
 Q are the generalised forces that no potential gives, and minus the velocity gradient of the Rayleigh dissipation
 function; Gᵀλ are the forces of the constraints. L may be any smooth function: nothing here assumes T − U. Everything is
-flat: q and q̇ are vectors of n coordinates. This is the only module that differentiates a Lagrangian.
+flat: q and q̇ are vectors of n coordinates. Only this module, on arrays, and `_quantities`, on scalars, differentiate a
+Lagrangian.
 """
 
 from collections.abc import Callable

@@ -34,30 +34,39 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jax.extend import core
 
+from lagjax._program._differentiate import Derivatives, has_own_rules
 from lagjax._program._emit import emit, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
-from lagjax._program._graph import Node, Unlowerable
+from lagjax._program._graph import Graph, Node, Tape, Unlowerable
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
-from lagjax._program._rules import Expansion, kind_of
+from lagjax._program._rules import Expansion, inputs_of
 from lagjax._program._series import Series, StraightLine, series
 from lagjax._program._transpose import pullback
 
 __all__ = [
     "OPERATIONS",
+    "Derivatives",
+    "Expansion",
     "Program",
     "Series",
     "StraightLine",
+    "Tape",
     "Unlowerable",
     "emit",
     "evaluate",
+    "has_own_rules",
     "in_jax",
+    "inputs_of",
     "lower",
+    "lower_scalars",
     "lower_solution",
     "plain_elementary",
     "pullback",
     "series",
+    "traced",
 ]
 
 
@@ -72,17 +81,28 @@ def lower(function: Callable, *examples, budget: int = 20_000) -> "Program":
     return _lower_leaves(lambda *xs: jax.tree.leaves(function(*jax.tree.unflatten(structure, xs))), shapes, budget)
 
 
-def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int) -> "Program":
+def traced(function: Callable, *shapes) -> core.ClosedJaxpr:
+    """The jaxpr of a function, with programs in it as they are to be lowered."""
     with plain_elementary():
-        traced = jax.make_jaxpr(function)(*shapes)
-    expansion, arguments, count = Expansion(budget), [], 0
-    for shape in shapes:
-        expansion.work(shape.size)
-        ids = [expansion.graph.input(count + k, kind_of(shape.dtype)) for k in range(shape.size)]
-        arguments.append(np.array(ids, dtype=np.int64).reshape(shape.shape))
-        count += shape.size
+        return jax.make_jaxpr(function)(*shapes)
+
+
+def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int) -> "Program":
+    jaxpr = traced(function, *shapes)
+    return lower_scalars(lambda expansion, arguments: expansion.run_closed(jaxpr, arguments), function, shapes, budget)
+
+
+def lower_scalars(
+    scalars: Callable, function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int
+) -> "Program":
+    """The program of the id arrays that `scalars(expansion, arguments)` makes of those of its inputs.
+
+    `function` is the function in JAX that it stands for, of arrays of these `shapes`.
+    """
+    expansion = Expansion(Graph(budget))
+    arguments = inputs_of(expansion.graph, shapes)
     with np.errstate(all="ignore"):
-        results = expansion.run_closed(traced, arguments)
+        results = scalars(expansion, arguments)
     outputs = [i for result in results for i in result.ravel().tolist()]
     nodes, kinds, outputs = eliminate_dead_code(*sink_negations(*factor(expansion.graph, outputs)))
     return Program(nodes, kinds, outputs, expansion.traced_operations, function, shapes, budget)

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from lagjax._program._operations import OPERATIONS
+from lagjax._program._simplify import whole_power
 
 
 class Unlowerable(Exception):
@@ -53,6 +54,7 @@ class Graph:
         self._terms: dict[int, dict[int, float]] = {}
         self._products: dict[tuple[int, ...], int] = {}
         self._sums: dict[frozenset, int] = {}
+        self.powers: dict[int, tuple[int, float]] = {}  # what is a power of another node, and which
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
         """The scalar `op(*operands)`, as simple as the rules below make it."""
@@ -61,6 +63,10 @@ class Graph:
         if rule := OPERATIONS[op].simplify:
             return rule(self, op, *operands) if attribute is None else rule(self, op, *operands, attribute)
         return self.node(op, *operands, attribute=attribute)
+
+    def power(self, a: int, exponent: int) -> int:
+        """The scalar `a**exponent`, for any whole exponent."""
+        return whole_power(self, a, exponent)
 
     def node(self, op: str, *operands: int, attribute: Any = None) -> int:
         """The node with exactly these operands: an old one if there is one."""
@@ -228,3 +234,28 @@ class Graph:
         for k, (i, j) in enumerate(itertools.pairwise(factors)):
             if i == j and self.nodes[i][0] == "sin":
                 yield i, factors[:k] + factors[k + 2 :]
+
+
+class Tape(Graph):
+    """Scalars as they are written, one node for each operation: what reverse mode goes through.
+
+    In a graph that shares equal scalars the cotangents of all their uses come together in one sum. That hides what
+    cancels: in ∂L/∂q − (∂p/∂q) q̇ the kinetic part of one use of cos q cancels, and its potential part does not.
+    """
+
+    def apply(self, op: str, *operands: int, attribute=None) -> int:
+        """The scalar `op(*operands)`; a number, where all operands are."""
+        if all(self.nodes[i][0] == "constant" for i in operands):
+            return self._fold(op, operands, attribute)
+        return self._written(op, operands, attribute, self._kind(op, operands, attribute))
+
+    def power(self, a: int, exponent: int) -> int:
+        """The scalar `a**exponent`, as one node."""
+        if self.value(a) is not None or self.kinds[a] != "float":
+            return super().power(a, exponent)
+        return self._written("integer_pow", (a,), exponent, "float")
+
+    def _written(self, op: str, operands: tuple[int, ...], attribute: Any, kind: str) -> int:
+        self.nodes.append((op, operands, attribute))
+        self.kinds.append(kind)
+        return len(self.nodes) - 1

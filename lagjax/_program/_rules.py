@@ -19,16 +19,18 @@ from jax.extend import core
 
 from lagjax._program._graph import Graph, Unlowerable
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._simplify import power
 
-WORK_PER_OPERATION = 50  # scalars looked at for each one the budget allows; most of a derivative folds away
+# Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
+# takes some minutes.
+WORK_PER_OPERATION = 50
+LARGEST_WORK = 20_000_000
 
 
 class Expansion:
     """A jaxpr being turned into a graph, and what that has cost so far."""
 
-    def __init__(self, budget: int):
-        self.graph = Graph(budget)
+    def __init__(self, graph: Graph):
+        self.graph = graph
         self.traced_operations = 0
         self._work = 0
 
@@ -82,7 +84,7 @@ class Expansion:
     def work(self, count: int) -> None:
         """Give up before the work is done, not after."""
         self._work += count
-        if self._work > WORK_PER_OPERATION * self.graph.budget:
+        if self._work > min(WORK_PER_OPERATION * self.graph.budget, LARGEST_WORK):
             raise Unlowerable(
                 f"expanded to scalars, the function takes far more than the {self.graph.budget} operations allowed by "
                 "`budget`"
@@ -111,6 +113,16 @@ def kind_of(dtype) -> str:
     if dtype == np.bool_ or jnp.issubdtype(dtype, jnp.integer):
         return np.dtype(dtype).name
     raise Unlowerable(f"values of type {dtype} have no scalar form here")
+
+
+def inputs_of(graph: Graph, shapes) -> list[np.ndarray]:
+    """The inputs of a graph for arrays of these shapes, as ids."""
+    arguments, count = [], 0
+    for shape in shapes:
+        kind = kind_of(shape.dtype)
+        arguments.append(_ids([graph.input(count + k, kind) for k in range(shape.size)], shape.shape))
+        count += shape.size
+    return arguments
 
 
 def _ids(ids: list[int], shape) -> np.ndarray:
@@ -206,8 +218,7 @@ def _integer_pow(expansion, params, x):
     exponent, graph = params["y"], expansion.graph
     expansion.work(x.size)
     expansion.traced_operations += x.size
-    result = _ids([power(graph, i, abs(exponent)) for i in x.ravel().tolist()], x.shape)
-    return result if exponent >= 0 else expansion.map("div", expansion.constants(1.0), result)
+    return _ids([graph.power(i, exponent) for i in x.ravel().tolist()], x.shape)
 
 
 @_lowers("pow")

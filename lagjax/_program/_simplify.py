@@ -75,14 +75,31 @@ def raise_to_power(graph, op, a, b):
     exponent = graph.value(b)
     if exponent is None or abs(exponent) > 16 or (2 * exponent) % 1:
         return graph.node("pow", a, b)
-    result = power(graph, a, int(abs(exponent)))
+    result = _positive_power(graph, a, int(abs(exponent)))
     if exponent % 1:
         result = graph.apply("mul", result, graph.apply("sqrt", a))
-    return result if exponent >= 0 else graph.apply("div", graph.constant(1, "float"), result)
+    if exponent < 0:
+        result = graph.apply("div", graph.constant(1, "float"), result)
+    return _noted(graph, a, exponent, result)
 
 
-def power(graph, a: int, exponent: int) -> int:
-    """The node `a**exponent` for `exponent >= 0`, by repeated squaring: other powers of `a` share the squares."""
+def whole_power(graph, a: int, exponent: int) -> int:
+    """The node `a**exponent` for a whole exponent of any sign."""
+    result = _positive_power(graph, a, abs(exponent))
+    if exponent < 0:
+        result = graph.apply("div", graph.constant(1.0, graph.kinds[a]), result)
+    return _noted(graph, a, exponent, result)
+
+
+def _noted(graph, a: int, exponent: float, result: int) -> int:
+    """The node of a power, kept in mind as one: its derivative is not that of the products that it consists of."""
+    if exponent not in (0, 0.5, 1) and graph.kinds[a] == "float" and graph.value(result) is None:
+        graph.powers.setdefault(result, (a, exponent))
+    return result
+
+
+def _positive_power(graph, a: int, exponent: int) -> int:
+    """`a**exponent` for a whole `exponent >= 0`, by repeated squaring: other powers of `a` share the squares."""
     result = graph.constant(1, graph.kinds[a])
     while exponent:
         if exponent & 1:
