@@ -20,14 +20,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import _linear
 from lagjax._constraints import velocity_scales
 from lagjax._layout import Layout, dtype_of
 from lagjax._motion import Motion
 from lagjax._native import Projection
-from lagjax._program import Program, Unlowerable, lower, lower_scalars, lower_solution
+from lagjax._program import Program, Unlowerable, lower, lower_formula, lower_scalars, lower_solution
+from lagjax._program._scalars import applied, joined, spread, stacked
 from lagjax._quantities import OwnRules, quantities
-from lagjax._saddle import SaddleElimination
+from lagjax._saddle import SaddleElimination, TwoCoordinates
 
 PyTree = Any
 
@@ -201,10 +201,10 @@ class Derivation:
         system, solve = self._system(_ACCELERATION)
 
         def multipliers(*scalars):
-            _, right, factors, _ = system(*scalars)
-            return [-pull for pull in solve(factors, right)[self.layout.size :]]
+            _, _, right, factors, _ = system(*scalars)
+            return -solve(factors, right)[self.layout.size :]
 
-        return lower(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
+        return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
     @_lowered_once
     def projected(self) -> Program | None:
@@ -216,13 +216,12 @@ class Derivation:
         position = None if self.motion.constraints.on_positions is None else self._solution(_POSITION_STEP)
 
         def projected(*scalars):
-            q, rest = list(scalars[:n]), scalars[n:]
+            q, v, rest = stacked(scalars[:n]), stacked(scalars[n : 2 * n]), scalars[n:]
             if position is not None:
-                q = [x + dx for x, dx in zip(q, position(*scalars), strict=False)]
-            v = [x + dx for x, dx in zip(rest[:n], velocity(*q, *rest), strict=False)]
-            return *q, *v
+                q = q + position.vector(*scalars)[:n]
+            return joined([q, v + velocity.vector(*(q[i] for i in range(n)), *rest)[:n]])
 
-        return lower(projected, *self.scalar_shapes, budget=OPERATION_BUDGET)
+        return lower_formula(projected, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
     @_lowered_once
     def velocity_scales(self) -> Program | None:
@@ -231,13 +230,13 @@ class Derivation:
             return None
         n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
 
-        def scales(*scalars):
-            values = jnp.stack(parts(*scalars))
-            return velocity_scales(
-                values[: n * n].reshape(n, n), values[n * n :].reshape(-1, n), jnp.stack(scalars[n : 2 * n])
-            )
+        def of_arrays(values, qdot):
+            return velocity_scales(values[: n * n].reshape(n, n), values[n * n :].reshape(-1, n), qdot)
 
-        return lower(scales, *self.scalar_shapes, budget=OPERATION_BUDGET)
+        def scales(*scalars):
+            return applied(of_arrays, parts.vector(*scalars), stacked(scalars[n : 2 * n]))
+
+        return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
     @_lowered_once
     def projection(self) -> Projection | None:
@@ -301,29 +300,49 @@ class Derivation:
         r. With constraints M is augmented by GᵀW G, unless it is constant and regular, or `regular_only` is asked for:
         that says where M is not regular enough.
         """
-        n, parts, m = self.layout.size, self._parts(saddle), self._rows(saddle)
-        regular = self._regular(saddle)
-        mass_zeros, row_zeros = self.absent("mass_matrix"), self.absent("jacobian")[:m]
-        augmented = not (regular_only or (self._constant_mass and regular))
-        if self.motion.constrained:
-            elimination = SaddleElimination((mass_zeros, row_zeros), self.layout.dtype, augmented, regular_only)
+        n, m, regular = self.layout.size, self._rows(saddle), self._regular(saddle)
+        zeros = self.absent("mass_matrix"), self.absent("jacobian")[:m]
+        augmented = self.motion.constrained and not (regular_only or (self._constant_mass and regular))
+        if n == 2 and not self.motion.constrained:
+            elimination = TwoCoordinates(zeros[0], self.layout.dtype)
         else:
-            elimination = _linear.Elimination(mass_zeros, self.layout.dtype)
+            elimination = SaddleElimination(zeros, self.layout.dtype, augmented, regular_only)
+        if elimination.operations > OPERATION_BUDGET:
+            raise Unlowerable(
+                f"to solve for the accelerations takes some {elimination.operations} operations, more than the "
+                f"{OPERATION_BUDGET} that are expected to fit in memory"
+            )
+        parts = self._parts(saddle, elimination.entries, m)
+        count, places = len(elimination.entries), elimination.entries
 
         def system(*scalars):
-            values = list(parts(*scalars))
-            table = [values[n * i : n * i + n] for i in range(n + self.shape("jacobian")[0])]
-            matrix, rows, right = table[:n], table[n : n + m], values[n * len(table) :]
-            c = right[:m] if saddle.sign > 0 else [-x for x in right[:m]]
-            b = [jnp.zeros((), self.layout.dtype)] * n if saddle.b is None else right[-n:]
-            factors, singular = elimination.factors(matrix, rows)
-            entries = {(i, j): x for i, row in enumerate(matrix + rows) for j, x in enumerate(row[: i + 1])}
-            return entries, b + c, factors, singular
+            values = parts.vector(*scalars)
+            entries, c, b = values[:count], values[count : count + m], values[count + m :]
+            factors, singular = elimination.factors(entries)
+            c = c if saddle.sign > 0 else -c
+            b = spread(c[:0], np.zeros(0, int), n) if saddle.b is None else b
+            return places, entries, joined([b, c]), factors, singular
 
         return system, elimination.solve
 
-    def _parts(self, saddle: _Saddle) -> Program:
-        return self.program("mass_matrix", "jacobian", saddle.c, *(() if saddle.b is None else (saddle.b,)))
+    def _parts(self, saddle: _Saddle, entries: np.ndarray, constraints: int) -> Program:
+        """The program of these entries of M and G, the `constraints` numbers of c, and b."""
+        n, starts = self.layout.size, self._starts
+        row, column = entries.T
+        of_mass = starts["mass_matrix"] + n * row + column
+        positions = np.where(row < n, of_mass, starts["jacobian"] + n * (row - n) + column).tolist()
+        positions += range(starts[saddle.c], starts[saddle.c] + constraints)
+        if saddle.b is not None:
+            positions += range(starts[saddle.b], starts[saddle.b] + n)
+        structure = jax.tree.structure(tuple(self.state_shapes))
+
+        def chosen(*leaves):
+            values = self._traced_once.quantities(*jax.tree.unflatten(structure, leaves))
+            table = jnp.concatenate([values["mass_matrix"], values["jacobian"]])
+            right = [] if saddle.b is None else [values[saddle.b]]
+            return [table[row, column], values[saddle.c][:constraints], *right]
+
+        return self._whole.only(positions, chosen)
 
     def _rows(self, saddle: _Saddle) -> int:
         """How many constraints belong to this system; those on positions come first."""

@@ -6,11 +6,11 @@
 M = ∂²L/∂q̇² is symmetric and, for an unusual L, indefinite. A matrix that is singular to working precision gives NaN,
 never a number: no pseudo-inverse, no regularisation. The caller reports it.
 
-There are three forms of each. `factorize` and `saddle` are for arrays in JAX: M is scaled to a unit diagonal (Jacobi
+There are two forms of each here. `factorize` and `saddle` are for arrays in JAX: M is scaled to a unit diagonal (Jacobi
 scaling: within a factor n of the best diagonal scaling for positive definite M, van der Sluis 1969), so that masses of
 very different size cost no accuracy, and then inverted by Gauss-Jordan elimination with partial pivoting.
-`Elimination` is for scalar programs: the same solution, written out (that of a saddle point is in `_saddle`).
-`solve_many` and `saddle_many` are for many small systems side by side in NumPy.
+`solve_many` and `saddle_many` are for many small systems side by side in NumPy. A third form, written out for scalar
+programs, is in `_saddle`.
 
 No array function here calls LAPACK through JAX. Each of jaxlib's LAPACK kernels (LU, triangular solve, Cholesky,
 eigenvalues) divides a batch among the threads of XLA and blocks its own thread until they are done; as many kernels as
@@ -18,8 +18,6 @@ there are threads, side by side in one program, wait for each other for ever (ja
 is `vmap`ped is for the caller to decide, so all of it is written in array operations, which never wait. Those are as
 fast as LAPACK in a batch of up to about 12 coordinates; a single matrix of 128 takes four times as long, under 1 ms.
 """
-
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -182,95 +180,6 @@ def _exchanged(a: Array, this_row: Array, this_column: Array) -> tuple[Array, Ar
 def _in_order(a: Array, order: Int[Array, " n"]) -> Array:
     """The rows of `a` in this order."""
     return a.at[order].get(mode="promise_in_bounds")
-
-
-# ---- elimination on scalars ------------------------------------------------------------------------------------------
-
-
-class Elimination:
-    """M x = b as straight-line arithmetic on scalars, for one pattern of zeros.
-
-    `zeros` (n, n) marks the entries of M that are zero whatever the state; whatever they would contribute is left out.
-    Two coordinates are solved by Cramer's rule, which needs no pivoting. More are solved by M = L D Lᵀ without
-    pivoting, which is stable for positive definite M, and no diagonal scaling would change it. A pivot that cancels to
-    round-off is singularity; it is replaced by NaN.
-    """
-
-    def __init__(self, zeros: np.ndarray, dtype):
-        self.zeros, self.threshold = zeros, singular_threshold(len(zeros), dtype)
-
-    def factors(self, matrix: list[list], jacobian: list[list] | None = None) -> tuple[Any, jax.Array]:
-        """What `solve` needs of M, a tree of scalars, and whether M is singular. There is no constraint Jacobian."""
-        if len(matrix) == 2:
-            return _cramer_factors(matrix, self.zeros, self.threshold)
-        return _ldl_factors(matrix, ~self.zeros, self.threshold)
-
-    def solve(self, factors, b: list) -> list:
-        """x of M x = b, n scalars, linear in b."""
-        return _cramer_solve(factors, b) if len(b) == 2 else _ldl_solve(factors, b)
-
-
-def _cramer_factors(matrix, zeros, threshold):
-    """The entries and the inverse determinant of a 2 × 2 matrix, or its diagonal, and whether it is singular."""
-    (a, c), (_, d) = matrix
-    if zeros[0, 1]:
-        return (a, d), (a == 0) | (d == 0)
-    product, square = a * d, c * c
-    determinant = product - square
-    singular = jnp.abs(determinant) <= threshold * jnp.maximum(jnp.abs(product), square)
-    return (a, c, d, 1 / jnp.where(singular, jnp.nan, determinant)), singular
-
-
-def _cramer_solve(factors, b):
-    """x of the 2 × 2 system, from `_cramer_factors`."""
-    if len(factors) == 2:
-        return [b[0] / factors[0], b[1] / factors[1]]
-    a, c, d, inverse = factors
-    return [(d * b[0] - c * b[1]) * inverse, (a * b[1] - c * b[0]) * inverse]
-
-
-def _ldl_factors(matrix, nonzero, threshold):
-    """L, where it has entries, D⁻¹, and whether a pivot was lost: cancelled to `threshold` of its diagonal entry.
-
-    A lost pivot becomes NaN.
-    """
-    n, singular, nonzero = len(matrix), jnp.zeros((), bool), nonzero.copy()
-    lower, scaled, inverse = {}, {}, []  # L, L D and D⁻¹, column by column
-    for j in range(n):
-        before = [k for k in range(j) if nonzero[j, k]]
-        pivot = matrix[j][j]
-        for k in before:
-            pivot = pivot - lower[j, k] * scaled[j, k]
-        cancels = before or not nonzero[j, j]
-        lost = pivot <= threshold * matrix[j][j] if cancels else pivot == 0
-        singular = singular | lost
-        inverse.append(1 / (jnp.where(lost, jnp.nan, pivot) if cancels else pivot))
-        for i in range(j + 1, n):
-            shared = [k for k in before if nonzero[i, k]]
-            if nonzero[i, j] or shared:
-                nonzero[i, j] = True
-                entry = matrix[i][j]
-                for k in shared:
-                    entry = entry - lower[i, k] * scaled[j, k]
-                scaled[i, j] = entry
-                lower[i, j] = entry * inverse[j]
-    return (lower, inverse), singular
-
-
-def _ldl_solve(factors, b) -> list:
-    """x of L D Lᵀ x = b, n scalars: forward substitution, division by D, back substitution."""
-    lower, inverse = factors
-    x, n = list(b), len(b)
-    for i in range(n):
-        for k in range(i):
-            if (i, k) in lower:
-                x[i] = x[i] - lower[i, k] * x[k]
-    x = [x[i] * inverse[i] for i in range(n)]
-    for i in reversed(range(n)):
-        for k in range(i + 1, n):
-            if (k, i) in lower:
-                x[i] = x[i] - lower[k, i] * x[k]
-    return x
 
 
 # ---- with constraints: the saddle point ------------------------------------------------------------------------------

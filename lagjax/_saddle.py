@@ -1,27 +1,31 @@
-"""The saddle point behind every constrained acceleration, on scalars: one elimination that keeps its zeros.
+"""The linear system behind every acceleration on scalars: one elimination that keeps the zeros of its matrix.
 
-    M x − Gᵀλ = b,   G x = c,        for z = (x, −λ):   A z = (b, c),   A = (M Gᵀ; G 0)
+    M x = b                     without constraints
+    M x − Gᵀλ = b,   G x = c    with constraints: for z = (x, −λ),   A z = (b, c),   A = (M Gᵀ; G 0)
 
 A mechanism couples a part to few others, but M⁻¹ and the Schur complement G M⁻¹ Gᵀ have hardly a zero left: to
 eliminate all of M and then all constraints takes operations that grow with the cube of the number of links. Here a
 constraint is eliminated after the last of its own coordinates, and all of them in an order that fills few zeros
-(minimum degree: Tinney & Walker, Proc. IEEE 55 (1967) 1801, scheme 2). A chain of n links then costs n times a link.
+(minimum degree: Tinney & Walker, Proc. IEEE 55 (1967) 1801, scheme 2). A chain of n links then costs n times a link,
+a diagonal M one division for each coordinate, and blocks of M do not meet.
 
 M positive definite needs no pivoting. What is left of M, once coordinates E and constraints C that touch only E are
 eliminated, is the mass matrix of the other coordinates where those of E move freely under C. It lies between that
 without C, which is M's own Schur complement, and that with E at rest, a block of M. The pivots of coordinates are
 therefore positive, those of constraints negative or, where a constraint depends on those before it, zero; no entry
 grows. The rank so found is that of the rows of G that came before: all their coordinates did, too.
+
+The formulas are for vectors of `Scalars` as well as for arrays of JAX: a pivot, its column of L, and what it takes off
+all that is left, at once.
 """
 
-import functools
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lagjax._linear import rank_tolerance, singular_threshold
+from lagjax._program import _scalars as xp
 
 # The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
 # digits of an acceleration may be lost, and twelve remain. Twice as large, a few more states take the general variant,
@@ -29,103 +33,227 @@ from lagjax._linear import rank_tolerance, singular_threshold
 REGULAR = 1e-4
 
 
-class SaddleElimination:
-    """A z = (b, c) as straight-line arithmetic, for one pattern of zeros: M positive (semi)definite, G a list of rows.
+class _Pivot(NamedTuple):
+    """One step of an elimination: the index of the pivot, those it is eliminated from, and places in vectors.
 
-    `zeros` marks what is zero in M (n, n) and in G (m, n) whatever the state. M is `augmented` by GᵀW G, W diagonal,
-    unless it is known to be regular: GᵀW G x = GᵀW c changes neither x nor λ. Redundant rows are left out of λ: the
-    motion is the same, the multipliers are a solution but not the shortest. With `regular_only` the saddle point is
-    called singular as soon as it loses digits: where M, or what the constraints make of it, is within `REGULAR` of
-    singular. That is the regular-M variant, which takes a third of the arithmetic and leaves the rest of the states to
-    the general one.
+    `column` has the places of Lᵢⱼ in L, and of Aᵢⱼ in A; `first`, `second` and `updated` are, for every pair of rows
+    below the pivot, their positions in the column and the place of what is taken off.
+    """
+
+    index: int
+    rows: np.ndarray
+    column: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    updated: np.ndarray
+
+
+class SaddleElimination:
+    """A z = (b, c) as straight-line arithmetic, for one pattern of zeros: M positive (semi)definite.
+
+    `zeros` marks what is zero in M (n, n) and in G (m, n) whatever the state; m may be zero. M is `augmented` by GᵀW G,
+    W diagonal, unless it is known to be regular: GᵀW G x = GᵀW c changes neither x nor λ. Redundant rows are left out
+    of λ: the motion is the same, the multipliers are a solution but not the shortest. With `regular_only` the saddle
+    point is called singular as soon as it loses digits: where M, or what the constraints make of it, is within
+    `REGULAR` of singular. That is the regular-M variant, which takes a third of the arithmetic and leaves the rest of
+    the states to the general one.
+
+    `entries` lists the row and column of what may not be zero in M, on and below its diagonal, and then in G, whose
+    rows are numbered from n: the vectors that `factors` takes are in that order.
     """
 
     def __init__(self, zeros: tuple[np.ndarray, np.ndarray], dtype, augmented: bool, regular_only: bool):
-        mass_zeros, self.row_zeros = zeros
+        mass_zeros, row_zeros = zeros
         self.dtype, self.augmented, self.regular_only = dtype, augmented, regular_only
-        self.constraints, self.size = self.row_zeros.shape
-        touched = ~self.row_zeros
-        mass = ~mass_zeros | ((touched.T.astype(int) @ touched.astype(int)) > 0) if augmented else ~mass_zeros
-        self.order, self.filled = elimination_order(mass, touched)
+        self.constraints, self.size = row_zeros.shape
+        touched = ~row_zeros
+        self.rows = [np.flatnonzero(row) for row in touched]
+        self.entries = np.concatenate(
+            [np.argwhere(np.tril(~mass_zeros | ~mass_zeros.T)), np.argwhere(touched) + [self.size, 0]]
+        )
+        mass = ~mass_zeros
+        if augmented:
+            mass = mass | ((touched.T.astype(float) @ touched.astype(float)) > 0)
+        self.order, filled = elimination_order(mass, touched)
         self.massless = ~np.diagonal(mass)
+        self._place_all(filled)
 
-    def factors(self, matrix: list[list], jacobian: list[list]) -> tuple[Any, jax.Array]:
-        """What `solve` needs of M and G, a tree of scalars, and whether the saddle point is singular."""
-        weighted, singular = None, jnp.zeros((), bool)
+    def _place_all(self, filled: np.ndarray) -> None:
+        """Where the entries of A on and below its diagonal stand in a vector: the diagonal, then L by columns."""
+        total, place = len(self.order), np.argsort(self.order)
+        self.slots = np.full((total, total), -1)
+        self.slots[range(total), range(total)] = range(total)
+        self.below, self.count = {}, total
+        for j in self.order:
+            rows = np.flatnonzero(filled[j] & (place > place[j]))
+            self.below[j] = rows = rows[np.argsort(place[rows])]
+            self.slots[rows, j] = self.slots[j, rows] = np.arange(self.count, self.count + len(rows))
+            self.count += len(rows)
+
+    def _pivots(self) -> Iterator[_Pivot]:
+        """The steps of the elimination, in order."""
+        for j in self.order:
+            rows = self.below[j]
+            first, second = np.tril_indices(len(rows), -1)
+            yield _Pivot(j, rows, self.slots[rows, j], first, second, self.slots[rows[first], rows[second]])
+
+    @property
+    def operations(self) -> int:
+        """About how many operations the elimination and one solution take."""
+        return sum(len(rows) * (len(rows) + 6) + 3 for rows in self.below.values())
+
+    # ---- factors ----
+
+    def factors(self, values) -> tuple[Any, Any]:
+        """What `solve` needs of M and G, a tree of vectors, and whether the saddle point is singular.
+
+        `values` holds what stands at `entries`.
+        """
+        a, weighted, singular = xp.spread(values, self.slots[tuple(self.entries.T)], self.count), None, None
         if self.augmented:
-            matrix, weighted = _augmented_entries(matrix, jacobian, self.row_zeros)
+            a, weighted = self._with_weights(a)
         if self.regular_only:
             # The constraints would have to hold a light coordinate against forces on heavy ones.
-            diagonal = [matrix[i][i] for i in range(self.size)]
-            singular = functools.reduce(jnp.minimum, diagonal) <= REGULAR * functools.reduce(jnp.maximum, diagonal)
-        lower, inverse, lost, redundant = self._eliminated(matrix, jacobian)
-        return (weighted, lower, inverse), singular | lost | redundant if self.regular_only else lost
+            diagonal = a[: self.size]
+            singular = xp.folded("min", diagonal) <= REGULAR * xp.folded("max", diagonal)
+        lower, inverse, lost = self._eliminated(a)
+        return (weighted, lower, inverse), lost if singular is None else singular | lost
 
-    def _eliminated(self, matrix, jacobian) -> tuple[dict, list, Any, Any]:
-        """L by (row, column), D⁻¹, and whether a pivot of M, or one of a constraint, was lost to round-off."""
-        lost = redundant = jnp.zeros((), bool)
-        lower: dict[tuple[int, int], Any] = {}  # L by (row, column)
-        scaled: dict[tuple[int, int], Any] = {}  # L D
-        inverse: list[Any] = [None] * len(self.order)  # D⁻¹
-        for place, j in enumerate(self.order):
-            before = [k for k in self.order[:place] if self.filled[j, k]]
-            of_coordinates, of_constraints = (
-                [lower[j, k] * scaled[j, k] for k in before if (k >= self.size) == later] for later in (False, True)
-            )
-            if j < self.size:
-                gone, inverse[j] = self._mass_pivot(j, matrix[j][j], of_coordinates + of_constraints)
-                lost = lost | gone
-            else:
-                gone, inverse[j] = self._constraint_pivot(of_coordinates, of_constraints)
-                redundant = redundant | gone
-            for i in self.order[place + 1 :]:
-                if self.filled[i, j]:
-                    entry = _entry(matrix, jacobian, i, j)
-                    for k in before:
-                        if self.filled[i, k]:
-                            entry = entry - lower[i, k] * scaled[j, k]
-                    scaled[i, j], lower[i, j] = entry, entry * inverse[j]
-        return lower, inverse, lost, redundant
+    def _eliminated(self, a) -> tuple[Any, Any, Any]:
+        """L in the order of the pivots, D⁻¹, and whether a pivot was lost to round-off."""
+        n, total = self.size, len(self.order)
+        # What is taken off the diagonal: by coordinates, and by constraints, which must be told apart in a constraint.
+        taken: list[list] = [[[], []] for _ in range(total)]
+        inverse, columns, losses = [None] * total, [], []
+        for j, rows, column, first, second, updated in self._pivots():
+            lost, inverse[j] = self._pivot(j, a[j], *taken[j])
+            if lost is not None:
+                losses.append(lost)
+            if not len(rows):
+                continue
+            scaled = a[column]  # L D
+            lower = scaled * inverse[j]
+            columns.append(lower)
+            squares = lower * scaled
+            for k, i in enumerate(rows.tolist()):
+                taken[i][j >= n].append(squares[k])
+            if len(updated):
+                a = xp.replaced(a, updated, a[updated] - lower[first] * scaled[second])
+        lost = xp.folded("or", xp.stacked(losses)) if losses else False
+        return xp.joined(columns) if columns else a[:0], xp.stacked(inverse), lost
 
-    def _mass_pivot(self, j: int, diagonal, terms):
+    def _pivot(self, j: int, diagonal, of_coordinates: list, of_constraints: list) -> tuple[Any, Any]:
+        """Whether a pivot was lost, None where that does not count, and its inverse."""
+        if j < self.size:
+            return self._mass_pivot(j, diagonal, of_coordinates + of_constraints)
+        lost, inverse = self._constraint_pivot(of_coordinates, of_constraints)
+        return (lost if self.regular_only else None), inverse
+
+    def _mass_pivot(self, j: int, diagonal, terms: list) -> tuple[Any, Any]:
         """Whether what is left of Mⱼⱼ is round-off, and its inverse; NaN where it is."""
         if not terms and not self.massless[j]:
-            return diagonal == 0, 1 / diagonal
-        pivot = functools.reduce(lambda a, b: a - b, terms, diagonal)
+            return diagonal == 0.0, 1.0 / diagonal
+        pivot = diagonal
+        for term in terms:
+            pivot = pivot - term
         lost = pivot <= (REGULAR if self.regular_only else singular_threshold(self.size, self.dtype)) * diagonal
-        return lost, 1 / jnp.where(lost, jnp.nan, pivot)
+        return lost, 1.0 / xp.where(lost, np.nan, pivot)
 
-    def _constraint_pivot(self, of_coordinates, of_constraints):
+    def _constraint_pivot(self, of_coordinates: list, of_constraints: list) -> tuple[Any, Any]:
         """Whether a constraint depends on those before it, and its D⁻¹: it is left out then, or NaN if `regular_only`.
 
         The pivot is −G M⁻¹ Gᵀ of this constraint, and what those before it take off that. A row that is left out
         changes nothing where the constraints are consistent.
         """
-        own = functools.reduce(lambda a, b: a + b, of_coordinates, jnp.zeros((), self.dtype))
-        left = functools.reduce(lambda a, b: a + b, of_constraints, own)
+        own: Any = 0.0
+        for term in of_coordinates:
+            own = own + term
+        left = own
+        for term in of_constraints:
+            left = left + term
         lost = left <= (REGULAR if self.regular_only else rank_tolerance(self.dtype)) * own
         if self.regular_only:
-            return lost, -1 / jnp.where(lost, jnp.nan, left)
-        return lost, jnp.where(lost, 0.0, -1 / jnp.where(lost, 1.0, left))
+            return lost, -1.0 / xp.where(lost, np.nan, left)
+        return lost, xp.where(lost, 0.0, -1.0 / xp.where(lost, 1.0, left))
 
-    def solve(self, factors, right: list) -> list:
-        """x and then −λ, n + m scalars, linear in `right`: b and then c."""
+    def _with_weights(self, a) -> tuple[Any, Any]:
+        """The entries of M + GᵀW G and of G, and W G, entry by entry in the order of the rows of G.
+
+        The weights are the trace of M over |Gₖ|², within a factor n of those of `augment`. They are differentiated here
+        like everything else, and a trace is smooth where a maximum is not.
+        """
+        trace, weighted, added = xp.folded("add", a[: self.size]), [], xp.spread(a[:0], np.zeros(0, int), self.count)
+        for k, touching in enumerate(self.rows):
+            if not len(touching):
+                continue
+            row = a[self.slots[self.size + k, touching]]
+            size = xp.folded("add", row * row)
+            weighted.append(trace / xp.where(size > 0.0, size, 1.0) * row)
+            first, second = np.tril_indices(len(touching))
+            places = self.slots[touching[first], touching[second]]
+            added = xp.replaced(added, places, added[places] + weighted[-1][first] * row[second])
+        return a + added, xp.joined(weighted) if weighted else a[:0]
+
+    # ---- solution ----
+
+    def solve(self, factors, right):
+        """x and then −λ, n + m numbers, linear in `right`: b and then c."""
         weighted, lower, inverse = factors
-        z, order = list(right), self.order
-        if weighted is not None:
-            for i in range(self.size):
-                touching = [k for k in range(self.constraints) if not self.row_zeros[k, i]]
-                z[i] = z[i] + _dot((weighted[k][i], right[self.size + k]) for k in touching)
-        for place, i in enumerate(order):
-            for k in order[:place]:
-                if self.filled[i, k]:
-                    z[i] = z[i] - lower[i, k] * z[k]
-        z = [x * d for x, d in zip(z, inverse, strict=True)]
-        for place, i in reversed(list(enumerate(order))):
-            for k in order[place + 1 :]:
-                if self.filled[k, i]:
-                    z[i] = z[i] - lower[k, i] * z[k]
+        z, n = right, self.size
+        start = 0
+        for k, touching in enumerate(self.rows if weighted is not None else ()):
+            row = weighted[start : start + len(touching)]
+            z = xp.replaced(z, touching, z[touching] + row * z[n + k]) if len(touching) else z
+            start += len(touching)
+        start = 0
+        for j in self.order:
+            rows = self.below[j]
+            if len(rows):
+                z = xp.replaced(z, rows, z[rows] - lower[start : start + len(rows)] * z[j])
+            start += len(rows)
+        z = z * inverse
+        for i, (columns, places) in reversed(list(zip(self.order, self._rows_of_lower(), strict=True))):
+            if len(columns):
+                z = xp.replaced(z, columns, z[columns] - lower[places] * z[i])
         return z
+
+    def _rows_of_lower(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """For every index, in the order of elimination: the columns in which L has an entry in its row, and where."""
+        total, columns = len(self.order), {i: [] for i in self.order}
+        for j in self.order:
+            for i in self.below[j].tolist():
+                columns[i].append(j)
+        for i in self.order:
+            yield (before := np.array(columns[i], int)), self.slots[i, before] - total
+
+
+class TwoCoordinates:
+    """M x = b for two coordinates, by Cramer's rule: it needs no pivoting, and takes the fewest operations.
+
+    `zeros` (2, 2) marks what is zero in M whatever the state; the rest is as in `SaddleElimination`. A determinant that
+    cancels to round-off is singularity; it is replaced by NaN.
+    """
+
+    def __init__(self, zeros: np.ndarray, dtype):
+        self.threshold, self.diagonal, self.operations = singular_threshold(2, dtype), bool(zeros[1, 0]), 16
+        self.entries = np.array([[0, 0], [1, 1]] if self.diagonal else [[0, 0], [1, 0], [1, 1]])
+
+    def factors(self, values) -> tuple[Any, Any]:
+        """The entries and the inverse determinant, or the diagonal, and whether M is singular."""
+        if self.diagonal:
+            return values, (values[0] == 0.0) | (values[1] == 0.0)
+        a, c, d = (values[k] for k in range(3))
+        product, square = a * d, c * c
+        determinant = product - square
+        singular = xp.absolute(determinant) <= self.threshold * xp.maximum(xp.absolute(product), square)
+        return xp.stacked([a, c, d, 1.0 / xp.where(singular, np.nan, determinant)]), singular
+
+    def solve(self, factors, right):
+        """x, two numbers, linear in `right`."""
+        if self.diagonal:
+            return right / factors
+        a, c, d, inverse = (factors[k] for k in range(4))
+        return xp.stacked([(d * right[0] - c * right[1]) * inverse, (a * right[1] - c * right[0]) * inverse])
 
 
 def elimination_order(mass: np.ndarray, rows: np.ndarray) -> tuple[list[int], np.ndarray]:
@@ -138,47 +266,17 @@ def elimination_order(mass: np.ndarray, rows: np.ndarray) -> tuple[list[int], np
     filled = np.block([[mass | mass.T, rows.T], [rows, np.zeros((m, m), bool)]])
     np.fill_diagonal(filled, False)
     left, order = np.ones(n + m, bool), []
+    degree, waiting = filled.sum(axis=1), rows.sum(axis=1)
     while left.any():
-        waiting = np.concatenate([np.zeros(n, bool), (rows & left[:n]).any(axis=1)])
-        degree = np.where(left & ~waiting, (filled & left).sum(axis=1), n + m)
-        j = int(np.argmin(degree))
+        free = left.copy()
+        free[n:] &= waiting == 0
+        j = int(np.argmin(np.where(free, degree, n + m)))
         order.append(j)
         left[j] = False
-        others = filled[j] & left
-        filled |= np.outer(others, others)
-        np.fill_diagonal(filled, False)
+        others = np.flatnonzero(filled[j] & left)
+        filled[np.ix_(others, others)] = True
+        filled[others, others] = False
+        degree[others] = (filled[others] & left).sum(axis=1)
+        if j < n:
+            waiting -= rows[:, j]
     return order, filled
-
-
-def _entry(matrix, jacobian, i: int, j: int):
-    """That of A at (i, j), i ≠ j."""
-    i, j, n = max(i, j), min(i, j), len(matrix)
-    return matrix[i][j] if i < n else jacobian[i - n][j] if j < n else 0.0
-
-
-def _augmented_entries(matrix, jacobian, row_zeros):
-    """M + GᵀW G and W G, entry by entry.
-
-    The weights are the trace of M over |Gₖ|², within a factor n of those of `augment`. They are differentiated here
-    like everything else, and a trace is smooth where a maximum is not.
-    """
-    n, m = len(matrix), len(jacobian)
-    present = ~row_zeros
-    trace = _dot((matrix[i][i], 1.0) for i in range(n))
-    sizes = [_dot((jacobian[k][i], jacobian[k][i]) for i in range(n) if present[k, i]) for k in range(m)]
-    weights = [trace / jnp.where(size > 0, size, 1.0) for size in sizes]
-    weighted = [[weights[k] * jacobian[k][i] for i in range(n)] for k in range(m)]
-
-    def added(i, j):
-        return _dot((weighted[k][i], jacobian[k][j]) for k in range(m) if present[k, i] and present[k, j])
-
-    matrix = [[matrix[i][j] + added(i, j) for j in range(n)] for i in range(n)]
-    return matrix, weighted
-
-
-def _dot(pairs):
-    """Σ a b over pairs of scalars."""
-    total = 0.0
-    for a, b in pairs:
-        total = total + a * b
-    return total

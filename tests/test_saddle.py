@@ -1,5 +1,6 @@
 """The written-out elimination of saddle points: right against dense algebra, and it keeps the zeros of a mechanism."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -25,8 +26,9 @@ def chain(links, rng):
 def solved(matrix, rows, b, c, zeros=None, **kind):
     zeros = (matrix == 0, rows == 0) if zeros is None else zeros
     elimination = SaddleElimination(zeros, np.float64, **{"augmented": False, "regular_only": False} | kind)
-    factors, singular = elimination.factors(matrix.tolist(), rows.tolist())
-    z = np.array(elimination.solve(factors, [*b, *c]), float)
+    entries = np.concatenate([matrix, rows])[tuple(elimination.entries.T)]
+    factors, singular = elimination.factors(jnp.asarray(entries))
+    z = np.array(elimination.solve(factors, jnp.concatenate([b, c])))
     return z[: len(b)], -z[len(b) :], bool(singular)
 
 

@@ -25,6 +25,7 @@ from lagjax._program import (
     pullback,
     series,
 )
+from lagjax._program._scalars import applied, stacked
 
 ORDER = 10
 NAN = float("nan")
@@ -336,22 +337,30 @@ def test_the_solution_of_a_linear_system_without_its_elimination(name):
 
 def test_a_linear_system_of_any_entries():
     # Entries that move, that stay and that are zero; a right-hand side with time; divisions in the solution.
-    def system(q, v, t, k):
-        a, b, c, d, e = 2 + jnp.sin(q[0]), k * v[1], 3.0 + k, q[2] * t, 4 + q[1] ** 2
-        entries = {(0, 0): a, (1, 0): b, (1, 1): c, (2, 1): d, (2, 2): e}
-        determinant = a * c * e - a * d * d - b * b * e
-        return entries, [-k * q[0], v[0] * v[1], jnp.sin(t)], ([a, b, c, d, e], determinant), a > 0
+    def numbers_of(x):
+        q, v, t, k = x[:3], x[3:6], x[6], x[7]
+        entries = 2 + jnp.sin(q[0]), k * v[1], 3.0 + k, q[2] * t, 4 + q[1] ** 2
+        return jnp.stack([*entries, -k * q[0], v[0] * v[1], jnp.sin(t)])
 
-    def solve(factors, r):  # Cramer's rule
-        (a, b, c, d, e), determinant = factors
-        return [
-            (r[0] * (c * e - d * d) - b * (r[1] * e - d * r[2])) / determinant,
-            (a * (r[1] * e - d * r[2]) - b * e * r[0]) / determinant,
-            (a * (c * r[2] - d * r[1]) - b * (b * r[2] - d * r[0])) / determinant,
+    def system(*scalars):
+        x = applied(numbers_of, stacked(scalars))
+        a, b, c, d, e = (x[i] for i in range(5))
+        places = np.array([[0, 0], [1, 0], [1, 1], [2, 1], [2, 2]])
+        return places, x[:5], x[5:], (x[:5], a * c * e - a * d * d - b * b * e), a > 0.0
+
+    def solve(factors, right):  # Cramer's rule
+        entries, determinant = factors
+        (a, b, c, d, e), r = (entries[i] for i in range(5)), [right[i] for i in range(3)]
+        solution = [
+            r[0] * (c * e - d * d) - b * (r[1] * e - d * r[2]),
+            a * (r[1] * e - d * r[2]) - b * e * r[0],
+            a * (c * r[2] - d * r[1]) - b * (b * r[2] - d * r[0]),
         ]
+        return stacked(solution) / determinant
 
     q, v, t, k = [0.3, -0.2, 0.5], [0.4, 0.1, -0.3], 0.2, 1.5
-    program = lower_solution(system, solve, 3, *map(jnp.asarray, (q, v, t, k)))
+    scalar = jax.ShapeDtypeStruct((), float)
+    program = lower_solution(system, solve, 3, *[scalar] * 8, budget=1000)
     found, exact = (series(p, 3, 7) for p in (program, replace(program, linear=None)))
     numbers = [*q, *v, t, k]
     close(coefficients_of(program, found, 10, numbers), coefficients_of(program, exact, 10, numbers))

@@ -43,14 +43,16 @@ from lagjax._program._graph import Graph, Node, Tape, Unlowerable
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
 from lagjax._program._rules import Expansion, inputs_of
+from lagjax._program._scalars import Scalars, stacked
 from lagjax._program._series import Series, StraightLine, series
-from lagjax._program._transpose import pullback
+from lagjax._program._transpose import copied, pullback
 
 __all__ = [
     "OPERATIONS",
     "Derivatives",
     "Expansion",
     "Program",
+    "Scalars",
     "Series",
     "StraightLine",
     "Tape",
@@ -61,6 +63,7 @@ __all__ = [
     "in_jax",
     "inputs_of",
     "lower",
+    "lower_formula",
     "lower_scalars",
     "lower_solution",
     "plain_elementary",
@@ -100,6 +103,7 @@ def lower_scalars(
     `function` is the function in JAX that it stands for, of arrays of these `shapes`.
     """
     expansion = Expansion(Graph(budget))
+    expansion.work(sum(shape.size for shape in shapes))
     arguments = inputs_of(expansion.graph, shapes)
     with np.errstate(all="ignore"):
         results = scalars(expansion, arguments)
@@ -108,37 +112,66 @@ def lower_scalars(
     return Program(nodes, kinds, outputs, expansion.traced_operations, function, shapes, budget)
 
 
-def lower_solution(system: Callable, solve: Callable, size: int, *examples, budget: int = 20_000) -> "Program":
+def lower_formula(formula: Callable, *shapes, budget: int) -> "Program":
+    """The program of a formula: a function of numbers, each a `Scalars` () or a JAX scalar, that gives a vector."""
+
+    def scalars(expansion, arguments):
+        return [formula(*(Scalars(expansion, x) for x in arguments)).ids]
+
+    return lower_scalars(scalars, lambda *xs: list(formula(*xs)), tuple(shapes), budget)
+
+
+def lower_solution(system: Callable, solve: Callable, size: int, *shapes, budget: int) -> "Program":
     """The program of the first `size` components of z with A z = r, A symmetric, and of one more number.
 
-    `system(*examples)` gives the entries of A on and below its diagonal as {(row, column): scalar}, zeros left out or
-    not, r as a list, what `solve` needs of A, and that number; `solve(factors, r)` gives z, and is linear in r.
+    Both functions are formulas (see `lower_formula`) on numbers of these `shapes`. `system(*numbers)` gives the rows
+    and columns (k, 2) of entries of A on and below its diagonal, these entries (k,), r, what `solve` needs of A, a tree
+    of vectors, and that number; `solve(factors, r)` gives z, and is linear in r.
     """
-    trees = []
+    counts: list = []
 
-    def whole(*arguments):
-        entries, right, factors, number = system(*arguments)
+    def whole(expansion, arguments):
+        places, entries, right, factors, number = system(*(Scalars(expansion, x) for x in arguments))
+        leaves = jax.tree.leaves(factors)
         z = solve(factors, right)
-        leaves, tree = jax.tree.flatten((z[:size], number, z[size:], entries, right, factors))
-        trees.append(tree)
-        return leaves
+        counts.append((places, [x.ids.size for x in (z, entries, right)], [x.shape for x in leaves], factors))
+        return [z.ids[:size], _ids_of(expansion, number), z.ids[size:], *(x.ids for x in (entries, right, *leaves))]
 
-    program = lower(whole, *examples, budget=budget)
-    z, _, others, entries, right, factors = jax.tree.unflatten(trees[0], program.outputs)
-    scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
-    shapes = jax.tree.map(lambda _: scalar, (factors, right))
+    def in_jax(*arguments):
+        _, _, right, factors, number = system(*arguments)
+        return [*solve(factors, right)[:size], jnp.asarray(number)]
+
+    program = lower_scalars(whole, in_jax, tuple(shapes), budget)
+    places, (of_z, of_entries, of_right), of_factors, factors = counts[0]
+    ends = np.cumsum([size, 1, of_z - size, of_entries, of_right])
+    z, _, others, entries, right, leaves = np.split(np.array(program.outputs), ends)
+    scalar = jnp.result_type(float)
+    tree = jax.tree.structure(factors)
+    vectors = [jax.ShapeDtypeStruct(shape, scalar) for shape in (*of_factors, (of_right,))]
+
+    def solution(expansion, arguments):
+        *parts, b = (Scalars(expansion, x) for x in arguments)
+        return [solve(jax.tree.unflatten(tree, parts), b).ids]
+
+    def solution_in_jax(*arguments):
+        return [solve(jax.tree.unflatten(tree, arguments[:-1]), arguments[-1])]
+
     return replace(
         program,
         outputs=program.outputs[: size + 1],
-        function=lambda *arguments: whole(*arguments)[: size + 1],
+        function=in_jax,
         linear=LinearSystem(
-            z=(*z, *others),
-            entries=entries,
-            right=tuple(right),
-            factors=tuple(jax.tree.leaves(factors)),
-            solve=functools.cache(lambda: lower(solve, *shapes, budget=budget)),
+            z=(*z.tolist(), *others.tolist()),
+            entries=dict(zip(map(tuple, places.tolist()), entries.tolist(), strict=True)),
+            right=tuple(right.tolist()),
+            factors=tuple(leaves.tolist()),
+            solve=functools.cache(lambda: lower_scalars(solution, solution_in_jax, tuple(vectors), budget)),
         ),
     )
+
+
+def _ids_of(expansion: Expansion, number) -> np.ndarray:
+    return number.ids if isinstance(number, Scalars) else expansion.constants(number)
 
 
 class LinearSystem(NamedTuple):
@@ -190,6 +223,15 @@ class Program:
         if len(scalars) != self.size:
             raise TypeError(f"this program takes {self.size} scalars, not {len(scalars)}")
         return self._differentiable(*scalars)
+
+    def vector(self, *scalars):
+        """The outputs as one vector, in a formula: of JAX, or of `Scalars`, of whose graph the program becomes part."""
+        first = next((x for x in scalars if isinstance(x, Scalars)), None)
+        if first is None:
+            return jnp.stack(self(*scalars))
+        nodes = copied(first.expansion.graph, self.line, stacked(scalars).ids.tolist())
+        first.expansion.traced_operations += self.operations
+        return Scalars(first.expansion, np.array([nodes[i] for i in self.outputs], dtype=np.int64))
 
     @property
     def size(self) -> int:

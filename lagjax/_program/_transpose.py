@@ -25,7 +25,7 @@ def pullback(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequen
     graph = Graph(_LARGEST * len(line.nodes) + 1000)
     inputs = [graph.input(i, _kind(dtype)) for i, dtype in enumerate(dtypes)]
     with np.errstate(all="ignore"):
-        nodes = _copied(graph, line, inputs)
+        nodes = copied(graph, line, inputs)
         cotangents: list[int | None] = [None] * len(line.nodes)
         for k, output in enumerate(of):
             _add(graph, cotangents, line.outputs[output], graph.input(len(dtypes) + k, "float"))
@@ -42,7 +42,7 @@ def _kind(dtype) -> str:
     return "float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name
 
 
-def _copied(graph: Graph, line: StraightLine, inputs: list[int]) -> list[int]:
+def copied(graph: Graph, line: StraightLine, inputs: list[int]) -> list[int]:
     """The nodes of the line in the graph."""
     nodes: list[int] = []
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):

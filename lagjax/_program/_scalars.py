@@ -1,0 +1,150 @@
+"""Formulas on the scalars of a graph, written like those on arrays: `Scalars` is to an id array what `jax.Array` is.
+
+An elimination has more operations than JAX should have to trace one by one. Written with the operators of `Scalars` and
+the functions below, the same formula makes nodes of a graph, where a program is wanted, and is a function of JAX
+arrays, where JAX is to differentiate or batch it.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Scalars:
+    """Nodes of a graph as an array: arithmetic, comparisons of numbers, indexing by numbers."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, expansion: Any, ids: np.ndarray):
+        self.expansion, self.ids = expansion, np.asarray(ids, dtype=np.int64)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of the array."""
+        return self.ids.shape
+
+    def map(self, op: str, *operands) -> "Scalars":
+        """An operation on arrays or numbers that broadcast."""
+        return Scalars(self.expansion, self.expansion.map(op, *map(self._ids, operands)))
+
+    def _ids(self, x) -> np.ndarray:
+        return x.ids if isinstance(x, Scalars) else self.expansion.constants(x)
+
+    def __getitem__(self, index) -> "Scalars":
+        return Scalars(self.expansion, self.ids[index])
+
+    def __neg__(self):
+        return self.map("neg", self)
+
+    def __add__(self, other):
+        return self.map("add", self, other)
+
+    def __radd__(self, other):
+        return self.map("add", other, self)
+
+    def __sub__(self, other):
+        return self.map("sub", self, other)
+
+    def __rsub__(self, other):
+        return self.map("sub", other, self)
+
+    def __mul__(self, other):
+        return self.map("mul", self, other)
+
+    def __rmul__(self, other):
+        return self.map("mul", other, self)
+
+    def __truediv__(self, other):
+        return self.map("div", self, other)
+
+    def __rtruediv__(self, other):
+        return self.map("div", other, self)
+
+    def __le__(self, other):
+        return self.map("le", self, other)
+
+    def __gt__(self, other):
+        return self.map("gt", self, other)
+
+    def __eq__(self, other):  # type: ignore[override]
+        return self.map("eq", self, other)
+
+    def __or__(self, other):
+        return self.map("or", self, other)
+
+
+def _scalars(*xs) -> Scalars | None:
+    return next((x for x in xs if isinstance(x, Scalars)), None)
+
+
+def _function(op: str, in_jax: Callable) -> Callable:
+    def function(*xs):
+        scalars = _scalars(*xs)
+        return in_jax(*xs) if scalars is None else scalars.map(op, *xs)
+
+    return function
+
+
+minimum, maximum, absolute = _function("min", jnp.minimum), _function("max", jnp.maximum), _function("abs", jnp.abs)
+
+
+def where(condition, yes, no):
+    """`yes` where the condition holds, else `no`."""
+    scalars = _scalars(condition, yes, no)
+    return jnp.where(condition, yes, no) if scalars is None else scalars.map("select", condition, no, yes)
+
+
+def folded(op: str, x):
+    """The sum ("add"), smallest ("min"), largest ("max") or disjunction ("or") of a vector that is not empty."""
+    if isinstance(x, Scalars):
+        return Scalars(x.expansion, x.expansion.fold(op, x.ids))
+    return {"add": jnp.sum, "min": jnp.min, "max": jnp.max, "or": jnp.any}[op](x)
+
+
+def joined(parts: Sequence):
+    """Vectors end to end, some of which may be of numbers."""
+    scalars = _scalars(*parts)
+    if scalars is None:
+        return jnp.concatenate([jnp.asarray(part) for part in parts])
+    return Scalars(scalars.expansion, np.concatenate([scalars._ids(part) for part in parts]))
+
+
+def replaced(x, index, values):
+    """A vector with other values at these places."""
+    if not isinstance(x, Scalars):
+        return jnp.asarray(x).at[index].set(values)
+    ids = x.ids.copy()
+    ids[index] = values.ids if isinstance(values, Scalars) else x.expansion.constants(values)
+    return Scalars(x.expansion, ids)
+
+
+def spread(x, index, size: int):
+    """A vector of `size` numbers, zero but for those of x at these places."""
+    zeros = (
+        Scalars(x.expansion, np.full(size, x.expansion.graph.constant(0.0, "float")))
+        if isinstance(x, Scalars)
+        else jnp.zeros(size, x.dtype)
+    )
+    return replaced(zeros, index, x)
+
+
+def stacked(scalars: Sequence):
+    """A vector of scalars."""
+    first = _scalars(*scalars)
+    if first is None:
+        return jnp.stack([jnp.asarray(x) for x in scalars])
+    return Scalars(first.expansion, np.array([int(first._ids(x)) for x in scalars], dtype=np.int64))
+
+
+def applied(function: Callable, *arguments):
+    """A function of JAX arrays on arrays of scalars."""
+    scalars = _scalars(*arguments)
+    if scalars is None:
+        return function(*arguments)
+    expansion = scalars.expansion
+    jaxpr = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(x.shape, jnp.result_type(float)) for x in arguments))
+    (result,) = expansion.run_closed(jaxpr, [x.ids for x in arguments])
+    return Scalars(expansion, result)
