@@ -53,12 +53,17 @@ class Graph:
         self._factors: dict[int, tuple[int, ...]] = {}
         self._terms: dict[int, dict[int, float]] = {}
         self._products: dict[tuple[int, ...], int] = {}
-        self._sums: dict[frozenset, int] = {}
+        self._sums: dict[frozenset, tuple[int, float]] = {}  # and whether it is that sum or its negative
+        self._with_squares: set[int] = set()  # the products that hold a sine twice
         self.powers: dict[int, tuple[int, float]] = {}  # what is a power of another node, and which
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
         """The scalar `op(*operands)`, as simple as the rules below make it."""
-        if all(self.nodes[i][0] == "constant" for i in operands):
+        nodes = self.nodes
+        for i in operands:
+            if nodes[i][0] != "constant":
+                break
+        else:
             return self._fold(op, operands, attribute)
         if rule := OPERATIONS[op].simplify:
             return rule(self, op, *operands) if attribute is None else rule(self, op, *operands, attribute)
@@ -82,7 +87,8 @@ class Graph:
 
     def input(self, index: int, kind: str) -> int:
         node = ("input", (), index)
-        return self._append(node, node, kind)
+        known = self._ids.get(node)
+        return self._append(node, node, kind) if known is None else known
 
     def constant(self, value, kind: str) -> int:
         value = np.dtype(kind).type(value).item()
@@ -158,6 +164,8 @@ class Graph:
         if (product := self._products.get(factors)) is None:
             product = self._products[factors] = self.node("mul", a, b)
             self._factors[product] = factors
+            if any(i == j and self.nodes[i][0] == "sin" for i, j in itertools.pairwise(factors)):
+                self._with_squares.add(product)
         return product
 
     def terms(self, i: int) -> dict[int, float]:
@@ -175,8 +183,10 @@ class Graph:
         terms = dict(left)
         for base, coefficient in right.items():
             terms[base] = terms.get(base, 0.0) + sign * coefficient
-        self._pythagoras(terms)
-        terms = {base: coefficient for base, coefficient in terms.items() if coefficient != 0}
+        if not self._with_squares.isdisjoint(terms):
+            self._pythagoras(terms)
+        if 0.0 in terms.values():
+            terms = {base: coefficient for base, coefficient in terms.items() if coefficient != 0}
         if not terms:
             return self.constant(0, "float")
         if len(terms) > LONGEST:
@@ -196,13 +206,13 @@ class Graph:
 
     def _known_sum(self, terms: dict[int, float], a: int, b: int, sign: int) -> int:
         """`a + sign*b`, which is the sum of `terms`: an earlier node, or its negative, if there is one."""
-        if (total := self._sums.get(frozenset(terms.items()))) is not None:
-            return total
-        if (negative := self._sums.get(frozenset((x, -c) for x, c in terms.items()))) is not None:
-            return self.apply("neg", negative)
+        first = -1.0 if terms[min(terms)] < 0 else 1.0  # a sum and its negative are known by one key
+        key = frozenset(terms.items() if first > 0 else [(x, -c) for x, c in terms.items()])
+        if (known := self._sums.get(key)) is not None:
+            return known[0] if known[1] == first else self.apply("neg", known[0])
         coefficient, base = self.term(self._signed_sum(a, b, sign))
-        self._terms[base] = {x: coefficient * c for x, c in terms.items()}
-        self._sums[frozenset(self._terms[base].items())] = base
+        self._terms[base] = terms if coefficient > 0 else {x: -c for x, c in terms.items()}
+        self._sums[key] = base, first * coefficient
         return self.scale(coefficient, base)
 
     def _signed_sum(self, a: int, b: int, sign: int) -> int:
