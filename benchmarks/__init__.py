@@ -12,9 +12,9 @@ error of each run against an independent reference, and compares times *at equal
 - `_contenders`: lagjax and its peers, each as `prepare(case) -> solve(tol) -> final states`; `_mujoco`, `_numba`,
   `_rebound`: three of them;
 - `_measure`: warm-up, interleaved repeats, medians, errors;
-- `_comparisons`: right-hand sides, sizes of batches, cores; `_sizes`: many coordinates; `_latency`: one call;
-  `_derivation`: the time to the first result; `_gradient`: derivatives; `_mixed`: batches whose members need different numbers of steps; `_constraints`: what they
-  cost;
+- `_comparisons`: right-hand sides, sizes of batches, cores; `_sizes`: many coordinates, first results; `_latency`: one
+  call; `_derivation`: the time to the first result beside peers; `_gradient`: derivatives; `_mixed`: batches whose
+  members need different numbers of steps; `_constraints`: what they cost;
 - `_goals`: what is to be reached, from the stored numbers;
 - `hard_cases` and `_hard/`: errors against references from elsewhere; `soak`: random scenes for an hour. Both are
   commands of their own;
