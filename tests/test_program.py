@@ -9,6 +9,9 @@ import pytest
 from jax import lax
 from sweeps import sweep
 
+import lagjax
+from lagjax._derivation import derivation_of
+from lagjax._layout import Layout
 from lagjax._program import Unlowerable, lower
 
 TOLERANCE = 4e-15
@@ -94,6 +97,7 @@ FAMILIES = {
     "padding": (lambda m: lax.pad(m, 9.0, ((1, -1, 1), (-1, 2, 0))), M),
     "iota": (lambda a: a * jnp.arange(3) + jnp.eye(3)[1] + lax.broadcasted_iota(float, (2, 3), 0), A),
     "products": (lambda m, a: (a @ m, m.T @ m, jnp.outer(a, a), jnp.cross(a, a[::-1]), m.T @ a), M, A),
+    "matrices of two kinds": (lambda m, n: (n @ m, (m > 0).T @ m, jnp.einsum("ij,i->j", m > 0, n)), M, N),
     "einsum": (lambda m: (jnp.einsum("ij,ik->ijk", m, m), jnp.einsum("ij,ij->j", m, m), jnp.trace(m @ m.T)), M),
     "diagonals": (lambda m: (jnp.diagonal(m[:, :3]), jnp.diag(m[0]), jnp.fill_diagonal(m, 2.0, inplace=False)), M),
     "reductions": (lambda m: (m.sum(), m.sum(0), m.prod(1), m.max(1), m.min(), (m > 0).any(0), (m > 0).all()), M),
@@ -162,6 +166,33 @@ def test_all_families_in_jax():
 def test_each_family_in_jax(family):
     function, *arguments = FAMILIES[family]
     assert_same(function, *arguments, in_jax=True)
+
+
+@pytest.mark.parametrize(
+    "family",
+    sweep(sorted(FAMILIES.keys() - {"calls", "while", "integers"}), kept=("matrices of two kinds", "powers", "norms")),
+)
+def test_derivatives_of_each_family(family):
+    """Those of a Lagrangian that consists of its outputs, against forward mode in JAX; `cube` and `while` have none."""
+    function, *arguments = FAMILIES[family]
+    leaves, structure = jax.tree.flatten(arguments)
+    moving = [k for k, leaf in enumerate(leaves) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
+
+    def lagrangian(q, v):
+        put = dict(zip(moving, [x + 0.5 * jnp.sin(u) for x, u in zip(q, v, strict=True)], strict=True))
+        outputs = function(*structure.unflatten([put.get(k, leaf) for k, leaf in enumerate(leaves)]))
+        return sum(jnp.sum(x * jnp.cos(1.0 + jnp.arange(x.size).reshape(x.shape))) for x in jax.tree.leaves(outputs))
+
+    q = [jnp.asarray(leaves[k]) for k in moving]
+    v = [0.1 * jnp.ones_like(x) for x in q]
+    derivation = derivation_of(lagjax.System(lagrangian), Layout.of(q, v), None)
+    values = derivation.evaluate(["momentum", "lagrangian_by_q", "mass_matrix"], [*scalars(*q, *v), 0.0])
+    y, unravel = jax.flatten_util.ravel_pytree((q, v))
+    flat_lagrangian, n = lambda y: lagrangian(*unravel(y)), y.size // 2
+    slopes, bend = jax.jacfwd(flat_lagrangian)(y), jax.jacfwd(jax.jacfwd(flat_lagrangian))(y)
+    for name, expected in (("lagrangian_by_q", slopes[:n]), ("momentum", slopes[n:]), ("mass_matrix", bend[n:, n:])):
+        size = 1 + np.max(np.abs(expected), initial=0.0, where=np.isfinite(expected))
+        np.testing.assert_allclose(values[name][0], expected, rtol=1e-13, atol=1e-13 * size, err_msg=name)
 
 
 # ---- mechanics ------------------------------------------------------------------------------------------------------

@@ -281,6 +281,12 @@ def _platform_index(expansion, params):
 
 @_lowers("dot_general")
 def _dot_general(expansion, params, x, y):
+    if (dtype := params["preferred_element_type"]) is not None:  # JAX multiplies matrices of two dtypes
+        kind, kinds = kind_of(dtype), expansion.graph.kinds
+        x, y = (
+            z if all(kinds[i] == kind for i in z.ravel().tolist()) else expansion.map("convert", z, attribute=kind)
+            for z in (x, y)
+        )
     (contract_x, contract_y), (batch_x, batch_y) = params["dimension_numbers"]
     free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
     free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
