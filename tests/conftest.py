@@ -24,6 +24,7 @@ gc.set_threshold(50_000, 20, 20)
 CPU = llvmlite.binding.get_host_cpu_name() + llvmlite.binding.get_host_cpu_features().flatten()
 COMPILED = Path(__file__).parent.parent / ".cache" / "jax" / hashlib.sha256(CPU.encode()).hexdigest()[:16]
 jax.config.update("jax_compilation_cache_dir", str(COMPILED))
+os.environ["LAGJAX_CACHE"] = str(COMPILED.parent.parent / "objects")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 

@@ -6,7 +6,7 @@ XLA compiles one operation after the other for all members of a batch; here one 
 operations, four or eight side by side in the lanes of vector registers, and nothing leaves the first caches. A step is
 one Taylor series, of the order that the tolerance asks for.
 
-    _ir          LLVM's instructions, written like arithmetic
+    _ir          LLVM's instructions, written like arithmetic;  _objects: machine code kept on disk
     _lanes       the operations of a program on vectors
     _constants   every numerical choice, with its reason
     _frame       what a function of a kernel sees: the memory of its thread, the lanes, the job

@@ -19,8 +19,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import llvmlite
 import llvmlite.binding as llvm
 from llvmlite import ir
+
+from lagjax._native._objects import kept
 
 DOUBLE, INTEGER, BIT, POINTER = ir.DoubleType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
 _CONTRACT = ("contract",)
@@ -76,21 +79,31 @@ _PASSES = ("sroa", "dead_code_elimination")
 def compiled(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
     """Machine code for a module, and where its functions are. It lives as long as the engine."""
     text = str(module)
-    parsed = llvm.parse_assembly(text)
+    level = 1 if len(text) > _LARGE else 2
+    machine = _machine(level)
+    by = llvm.llvm_version_info, llvmlite.__version__, machine.triple, _PASSES, level
+    processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    made = kept(lambda: _object(text, level), text, repr(by), *processor)
+    empty = llvm.parse_assembly("")
+    engine = llvm.create_mcjit_compiler(empty, machine)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(made))
+    engine.finalize_object()
+    return engine, {name: engine.get_function_address(name) for name in functions}
+
+
+def _object(text: str, level: int) -> bytes:
+    """The object file of a module."""
+    parsed, machine = llvm.parse_assembly(text), _machine(level)
     parsed.verify()
-    machine = _machine(1 if len(text) > _LARGE else 2)
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
     manager = llvm.create_new_module_pass_manager()
     for name in _PASSES:
         getattr(manager, f"add_{name}_pass")()
     manager.run(parsed, builder)
-    engine = llvm.create_mcjit_compiler(parsed, machine)
-    engine.finalize_object()
-    places = {name: engine.get_function_address(name) for name in functions}
-    # The code is made: what it was made from takes ten times its memory.
-    engine.remove_module(parsed)
-    parsed.close()
-    return engine, places
+    try:
+        return machine.emit_object(parsed)
+    finally:
+        parsed.close()  # what the code is made from takes ten times its memory
 
 
 @dataclass(frozen=True, eq=False)

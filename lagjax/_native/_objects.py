@@ -1,0 +1,106 @@
+"""Machine code kept on disk, so that a second process need not make it again.
+
+An object file is known by all that it was made from: the text of its module, the processor, what was done with the text
+and by which LLVM. Nothing of a process is in it: functions of the C library are called by name. Files are written under
+another name first and then renamed, so that any number of processes may read and write them at once; one that is cut
+short or damaged is not what its first bytes say, and is made anew. Where files cannot be read or written, nothing is
+kept, and nothing fails.
+
+They lie in the user's folder for caches. The environment variable `LAGJAX_CACHE` names another one; `off` keeps none.
+"""
+
+import contextlib
+import hashlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+# Bytes of all files, beyond which the ones that were not used for longest go until a quarter is free. A double pendulum
+# takes 60 kB, a chain of 16 half a megabyte.
+LARGEST_CACHE = 2**28
+_MAGIC = b"lagjax object 1\n"
+_DIGEST = hashlib.sha256
+
+
+def folder() -> Path | None:
+    """Where objects are kept; None where they are not."""
+    chosen = os.environ.get("LAGJAX_CACHE", "")
+    if chosen:
+        return None if chosen.lower() in ("off", "0", "no", "false") else Path(chosen)
+    try:
+        if sys.platform == "win32":
+            base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+        elif sys.platform == "darwin":
+            base = Path.home() / "Library" / "Caches"
+        else:
+            base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # there is no home
+        return None
+    return base / "lagjax" / "objects"
+
+
+def kept(make: Callable[[], bytes], *made_from: str) -> bytes:
+    """The object that `make` returns, or the one that it returned for the same texts in this or another process."""
+    place = folder()
+    if place is None:
+        return make()
+    digest = _DIGEST()
+    for text in made_from:
+        digest.update(len(text).to_bytes(8, "little") + text.encode())
+    file = place / f"{digest.hexdigest()}.o"
+    found = _read(file)
+    if found is not None:
+        return found
+    made = make()
+    with contextlib.suppress(OSError):
+        _write(file, made)
+        _bound(place)
+    return made
+
+
+def _read(file: Path) -> bytes | None:
+    """What was written to a file; None where there is none, or not what was written."""
+    try:
+        content = file.read_bytes()
+    except OSError:
+        return None
+    begin = len(_MAGIC) + _DIGEST().digest_size
+    body = content[begin:]
+    if content[:begin] != _MAGIC + _DIGEST(body).digest():
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(file)  # it was used now
+    return body
+
+
+def _write(file: Path, body: bytes) -> None:
+    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    number, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
+    try:
+        with os.fdopen(number, "wb") as part:
+            part.write(_MAGIC + _DIGEST(body).digest() + body)
+        os.replace(name, file)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
+        raise
+
+
+def _bound(place: Path) -> None:
+    """Remove the files that were not used for longest where all together are too large."""
+    files = []
+    for file in place.iterdir():
+        with contextlib.suppress(OSError):  # another process removed it
+            status = file.stat()
+            files.append((status.st_mtime, status.st_size, file))
+    total = sum(size for _, size, _ in files)
+    if total <= LARGEST_CACHE:
+        return
+    for _, size, file in sorted(files):
+        if total <= 0.75 * LARGEST_CACHE:
+            break
+        with contextlib.suppress(OSError):
+            file.unlink()
+        total -= size

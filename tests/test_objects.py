@@ -1,0 +1,118 @@
+"""Machine code kept on disk: the same code, made once for all processes, whatever happens to the files."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import _native
+from lagjax._layout import Layout
+from lagjax._machine_code import flow_of
+from lagjax._native import _ir, _objects
+from lagjax._problem import Problem
+
+SCENE = lagjax.scenes.spherical_pendulum()
+TS = np.linspace(0.0, 1.0, 5)
+
+
+def run() -> np.ndarray:
+    """The path of a motion by a kernel of its own."""
+    problem = Problem.of(SCENE.system, Layout.of(SCENE.q0, SCENE.qdot0), SCENE.q0, SCENE.qdot0, TS, SCENE.params)
+    flow = flow_of(problem)
+    kernel = _native.Kernel(flow.program, flow.size, flow.projection, flow.guards, flow.groups, flow.base_size)
+    return kernel(TS[None], np.asarray(problem.y0)[None], np.asarray(problem.vector)[None], 1e-9, 1e-12, 1000).path
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """The texts that LLVM is asked to make objects of."""
+    texts, make = [], _ir._object
+    monkeypatch.setattr(_ir, "_object", lambda text, level: texts.append(text) or make(text, level))
+    return texts
+
+
+@pytest.fixture
+def cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("LAGJAX_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_another_process_finds_what_one_has_made(cache, made, monkeypatch):
+    code = "import jax; jax.config.update('jax_enable_x64', True); import test_objects as t; t.run()"
+    hashes = {"PYTHONHASHSEED": "12345"}  # in whose order sets of names are gone through
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code], cwd=os.path.dirname(__file__), env=os.environ | hashes,
+        timeout=200, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (file,) = cache.iterdir()
+    found = run()
+    assert not made and list(cache.iterdir()) == [file]
+    monkeypatch.setenv("LAGJAX_CACHE", "off")
+    np.testing.assert_array_equal(run(), found)
+    assert len(made) == 1 and list(cache.iterdir()) == [file]
+
+
+def test_files_that_are_damaged_are_made_again(cache, made):
+    expected = run()
+    (file,) = cache.iterdir()
+    whole = file.read_bytes()
+    middle = len(whole) // 2
+    for content in (b"", whole[:middle], whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]):
+        file.write_bytes(content)
+        made.clear()
+        np.testing.assert_array_equal(run(), expected)
+        assert len(made) == 1 and file.read_bytes() == whole
+
+
+def test_a_folder_that_cannot_be_written_is_no_failure(monkeypatch, tmp_path, made):
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("LAGJAX_CACHE", str(tmp_path / "file"))
+    assert np.isfinite(run()).all() and np.isfinite(run()).all()
+    assert len(made) == 2
+
+
+def test_what_was_not_used_for_longest_goes_first(cache, monkeypatch):
+    monkeypatch.setattr(_objects, "LARGEST_CACHE", 10_000)
+    for k in range(9):  # of 1000 bytes and some, of which a tenth does not fit
+        assert _objects.kept(lambda k=k: bytes([k]) * 1000, str(k)) == bytes([k]) * 1000
+        for file in cache.iterdir():  # in order, however coarse the clock of the files is
+            age = time.time() - 1000 + file.read_bytes()[-1]
+            os.utime(file, (age, age))
+    assert _objects.kept(lambda: b"unused", "0") == bytes(1000)  # it is used now
+    _objects.kept(lambda: bytes([9]) * 1000, "9")
+    left = {file.read_bytes()[-1] for file in cache.iterdir()}
+    assert {0, 9} < left and left <= {0, 3, 4, 5, 6, 7, 8, 9}
+
+
+def test_many_may_write_and_read_at_once(cache):
+    def work():
+        for k in range(50):
+            content = bytes([k % 5]) * 10_000
+            assert _objects.kept(lambda content=content: content, str(k % 5)) == content
+            if k % 7 == 0:
+                for file in cache.iterdir():
+                    file.unlink(missing_ok=True)
+        ended.append(1)
+
+    ended = []
+    threads = [threading.Thread(target=work) for _ in range(8)]
+    for step in (threading.Thread.start, threading.Thread.join):
+        for thread in threads:
+            step(thread)
+    assert len(ended) == 8 and not list(cache.glob("*.part"))
+
+
+def test_the_folder_is_where_caches_belong(monkeypatch, tmp_path):
+    monkeypatch.delenv("LAGJAX_CACHE", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert _objects.folder() == tmp_path / "lagjax" / "objects"
+    for word in ("off", "0"):
+        monkeypatch.setenv("LAGJAX_CACHE", word)
+        assert _objects.folder() is None
