@@ -29,6 +29,12 @@ LARGEST_ANGLE = 2.0**20
 
 # Nodes of the programs of a kernel beyond which they are tables, and not written down one by one (`_tables`). TODO
 LARGEST_LINE = 1200
+# Alike operations that are written out for one step of the loop that walks along a table; the last one is 1. TODO
+TIMES = 4, 2, 1
+# Alike operations taken together at most
+MOST = 16
+WINDOW = 4096
+ROUNDS, OFTEN, LARGEST_TREE = 12, 12, 10
 
 # ---- step control ----------------------------------------------------------------------------------------------------
 

@@ -1,8 +1,8 @@
 """The order in which a large program runs, and where its numbers lie: alike operations side by side.
 
-    operations   what the outputs need; a product that only one sum reads becomes one operation with that sum, as the
-                 processor has it; sine and cosine of one angle are one operation with two results
-    groups       the operations in an order that puts alike ones, none of which waits for another, next to each other
+    operations   what the outputs need; sine and cosine of one angle are one operation with two results
+    joined       operations that often come together are one: a product and the sum that reads it, and then larger trees
+    groups       an order that puts alike operations, none of which waits for another, next to each other
     slots        where every result lies, from when it is made until nobody reads it any more
 
 Nothing here knows LLVM.
@@ -11,13 +11,10 @@ Nothing here knows LLVM.
 from collections import Counter, defaultdict
 from typing import NamedTuple
 
+from lagjax._native._constants import LARGEST_TREE, MOST, OFTEN, ROUNDS, TIMES, WINDOW
 from lagjax._program._series import StraightLine
 
-TIMES = 4, 2, 1
-MOST = 16
-WINDOW = 4096
-ROUNDS, OFTEN, LARGEST = 12, 12, 10
-JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))
+_JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))  # what one operation may consist of
 
 
 class Kind(NamedTuple):
@@ -30,7 +27,7 @@ class Kind(NamedTuple):
     attribute: object
     kinds: tuple[str, ...]
     result: str
-    parts: "tuple[Kind | None, ...]" = (None,)
+    parts: "tuple[Kind | None, ...]"
 
     @property
     def operands(self) -> int:
@@ -44,9 +41,9 @@ class Kind(NamedTuple):
 
 
 class Operation(NamedTuple):
-    """An operation of a program: the nodes that it reads, and those that it makes (-1: nobody reads that one)."""
+    """An operation: its kind, as a number, the nodes that it reads, and those that it makes (-1: nobody reads it)."""
 
-    kind: Kind
+    kind: int
     operands: tuple[int, ...]
     results: tuple[int, ...]
 
@@ -54,10 +51,12 @@ class Operation(NamedTuple):
 class Schedule(NamedTuple):
     """A program in the order in which it runs.
 
-    Node i lies in slot `slots[i]`, of which there are `size`; the outputs lie in the first slots, in their order.
-    `inputs` gives the position of every node that is an input, and `constants` the number of one that is a number.
+    Every group holds operations of one of the `kinds`. Node i lies in slot `slots[i]`, of which there are `size`; the
+    outputs lie in the first slots, in their order. `inputs` gives the position of every node that is an input, and
+    `constants` the number of one that is a number.
     """
 
+    kinds: list[Kind]
     groups: list[list[Operation]]
     slots: dict[int, int]
     size: int
@@ -68,17 +67,57 @@ class Schedule(NamedTuple):
 def schedule(line: StraightLine) -> Schedule:
     """The order of the operations that the outputs of a program need, and the slots of their results."""
     nodes, uses = line.nodes, _uses(line)
-    operations = _joined(_operations(line, uses), uses)
-    outputs, copies = _outputs(line, operations)
+    kinds = _Kinds()
+    operations = _joined(_operations(line, uses, kinds), uses, kinds)
+    outputs, copies = _outputs(line, operations, kinds)
     groups = _grouped(operations + copies)
     slots, size = _slots(groups, outputs, len(line.outputs))
     live = [i for i, count in enumerate(uses) if count]
     inputs = {i: nodes[i][2] for i in live if nodes[i][0] == "input"}
     constants = {i: float(nodes[i][2]) for i in live if nodes[i][0] == "constant"}
-    return Schedule(groups, slots, size, inputs, constants)
+    return Schedule(kinds.all, groups, slots, size, inputs, constants)
 
 
 # ---- operations ------------------------------------------------------------------------------------------------------
+
+
+class _Kinds:
+    """The kinds of the operations of a program, numbered as they come."""
+
+    def __init__(self):
+        self.all: list[Kind] = []
+        self.operands: list[int] = []
+        self._numbers: dict[Kind, int] = {}
+        self._joined: dict[tuple[int, int, int], int] = {}
+
+    def number(self, op: str, attribute: object, kinds: tuple[str, ...], result: str) -> int:
+        """The number of a kind that consists of one operation."""
+        return self._number(Kind(op, attribute, kinds, result, (None,) * len(kinds)))
+
+    def joined(self, kind: int, place: int, part: int) -> int:
+        """The kind whose operand at this place, counted over all that it reads, is made by another."""
+        key = kind, place, part
+        if key not in self._joined:
+            self._joined[key] = self._number(_with_part(self.all[kind], place, self.all[part]))
+        return self._joined[key]
+
+    def _number(self, kind: Kind) -> int:
+        number = self._numbers.setdefault(kind, len(self.all))
+        if number == len(self.all):
+            self.all.append(kind)
+            self.operands.append(kind.operands)
+        return number
+
+
+def _with_part(kind: Kind, place: int, part: Kind) -> Kind:
+    parts = list(kind.parts)
+    for k, inner in enumerate(parts):
+        width = 1 if inner is None else inner.operands
+        if place < width:
+            parts[k] = part if inner is None else _with_part(inner, place, part)
+            break
+        place -= width
+    return kind._replace(parts=tuple(parts))
 
 
 def _uses(line: StraightLine) -> list[int]:
@@ -93,10 +132,9 @@ def _uses(line: StraightLine) -> list[int]:
     return uses
 
 
-def _operations(line: StraightLine, uses: list[int]) -> list[Operation]:
+def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Operation]:
     """The operations that the outputs need, each after those that it reads."""
-    angles, operations = _angles(line, uses), []
-    interned: dict[Kind, Kind] = {}
+    angles, operations, numbers = _angles(line, uses), [], {}
     for i, (op, operands, attribute) in enumerate(line.nodes):
         if not uses[i] or op in ("input", "constant"):
             continue
@@ -105,9 +143,10 @@ def _operations(line: StraightLine, uses: list[int]) -> list[Operation]:
             op, results = "sincos", tuple(angles[operands[0]])
             if i != min(x for x in results if x >= 0):
                 continue
-        kinds = tuple(line.kinds[x] for x in operands)
-        kind = Kind(op, attribute, kinds, line.kinds[i], (None,) * len(operands))
-        operations.append(Operation(interned.setdefault(kind, kind), operands, results))
+        key = op, attribute, tuple(line.kinds[x] for x in operands), line.kinds[i]
+        if key not in numbers:
+            numbers[key] = kinds.number(*key)
+        operations.append(Operation(numbers[key], operands, results))
     return operations
 
 
@@ -120,14 +159,14 @@ def _angles(line: StraightLine, uses: list[int]) -> dict[int, list[int]]:
     return pairs
 
 
-def _outputs(line: StraightLine, operations: list[Operation]) -> tuple[dict[int, int], list[Operation]]:
+def _outputs(line: StraightLine, operations: list[Operation], kinds) -> tuple[dict[int, int], list[Operation]]:
     """Which output every node is, and the copies for outputs that no operation makes, or that are an earlier one too.
 
     Of a program of N nodes, a copy for output k is node N + k.
     """
     made = {x for operation in operations for x in operation.results}
     outputs: dict[int, int] = {}
-    copies, copy = [], Kind("copy", None, ("float",), "float")
+    copies, copy = [], kinds.number("copy", None, ("float",), "float")
     for k, i in enumerate(line.outputs):
         if i in made and i not in outputs:
             outputs[i] = k
@@ -137,94 +176,100 @@ def _outputs(line: StraightLine, operations: list[Operation]) -> tuple[dict[int,
     return outputs, copies
 
 
-# ---- what comes often together ---------------------------------------------------------------------------------------
+# ---- what often comes together ---------------------------------------------------------------------------------------
 
 
-def _joined(operations: list[Operation], uses: list[int]) -> list[Operation]:
+def _joined(operations: list[Operation], uses: list[int], kinds: _Kinds) -> list[Operation]:
     """The operations, with a result that only one other reads computed inside that one, where such a pair comes often.
 
-    Pairs of pairs come often too, and so on: as in byte-pair encoding, with trees for strings.
+    Pairs of pairs come often too, and so on: byte-pair encoding, with trees for strings. A product that only one sum
+    reads always belongs to that sum, as the processor has it: in a straight line LLVM does the same.
     """
-    work = _Work({operation.results[0]: operation for operation in operations}, uses)
+    work = _Work(operations, uses, kinds)
     work.join_products()
     for _ in range(ROUNDS):
-        if not work.join(work.often()):
+        chosen = work.often()
+        if not chosen:
             break
-    return [*work.operations.values()]
+        work.join(chosen)
+    return [operation for operation in work.by_node if operation is not None]
 
 
 class _Work:
-    """Operations by the node that they make, in order, some of which are joined to others."""
+    """Operations by the node that they make, in order; those that have become a part of another are None."""
 
-    def __init__(self, operations: dict[int, Operation], uses: list[int]):
-        self.operations, self._uses = operations, uses
-        self._joined: dict[tuple[Kind, int, Kind], Kind] = {}
-
-    def _inner(self, x: int) -> Operation | None:
-        """The operation that makes node x, if only one other reads it and it can be a part of that."""
-        operation = self.operations.get(x) if self._uses[x] == 1 else None
-        return operation if operation is not None and operation.kind.op in JOINED else None
+    def __init__(self, operations: list[Operation], uses: list[int], kinds: _Kinds):
+        self.by_node: list[Operation | None] = [None] * len(uses)
+        self._single, self._kinds = bytearray(len(uses)), kinds
+        for operation in operations:
+            first = max(operation.results) if min(operation.results) < 0 else min(operation.results)
+            self.by_node[first] = operation
+            # Whether only one other reads it, and it can be a part of that.
+            self._single[first] = uses[first] == 1 and kinds.all[operation.kind].op in _JOINED
+        # The nodes whose operation can have parts.
+        self._open = [i for i, x in enumerate(self.by_node) if x and kinds.all[x.kind].op in _JOINED]
 
     def join_products(self) -> None:
-        """A product that only one sum reads is computed with that sum, as the processor has it, and rounded with it."""
-        for i, operation in list(self.operations.items()):
-            kind, operands, _ = operation
-            if kind.op not in ("add", "sub") or kind.result != "float":
-                continue
-            place = next((k for k, x in enumerate(operands) if (inner := self._inner(x)) and inner.kind.op == "mul"), None)
-            if place is not None:
-                if kind.op == "add" and place == 1:
-                    self.operations[i], place = operation._replace(operands=operands[::-1]), 0
-                self._put(i, place)
+        """Every product that only one sum reads is computed with that sum; the first one, of two."""
+        for i in self._open:
+            operation = self.by_node[i]
+            assert operation is not None
+            kind = self._kinds.all[operation.kind]
+            if kind.op in ("add", "sub") and kind.result == "float":
+                for place, x in enumerate(operation.operands):
+                    if self._single[x] and self._kinds.all[self.by_node[x].kind].op == "mul":  # type: ignore[union-attr]
+                        if kind.op == "add" and place == 1:  # one kind less
+                            self.by_node[i], place = operation._replace(operands=operation.operands[::-1]), 0
+                        self._put(i, place)
+                        break
 
-    def often(self) -> dict[Kind, tuple[int, Kind]]:
+    def often(self) -> dict[int, tuple[int, int]]:
         """The pairs that come most often: for kinds of operations the operand that is joined, and its kind."""
         pairs: Counter = Counter()
-        for operation in self.operations.values():
-            if operation.kind.op in JOINED:
+        still = []
+        for i in self._open:
+            if (operation := self.by_node[i]) is not None:
+                found = False
                 for place, x in enumerate(operation.operands):
-                    if inner := self._inner(x):
-                        pairs[operation.kind, place, inner.kind] += 1
-        chosen: dict[Kind, tuple[int, Kind]] = {}
-        inside: set[Kind] = set()
+                    if self._single[x]:
+                        pairs[operation.kind, place, self.by_node[x].kind] += 1  # type: ignore[union-attr]
+                        found = True
+                if found:
+                    still.append(i)
+        self._open = still
+        chosen: dict[int, tuple[int, int]] = {}
+        inside: set[int] = set()
+        size = self._kinds.operands
         for (kind, place, part), count in pairs.most_common():
+            if count < OFTEN:
+                break
             free = kind not in chosen and kind not in inside and (part not in chosen or part == kind)
-            if count >= OFTEN and kind.operands + part.operands <= LARGEST and free:
+            if free and size[kind] + size[part] <= LARGEST_TREE:
                 chosen[kind] = place, part
                 inside.add(part)
         return chosen
 
-    def join(self, chosen: dict[Kind, tuple[int, Kind]]) -> bool:
-        """Join the operations that are such pairs; whether there are any."""
-        for i, operation in list(self.operations.items()):
-            if i in self.operations and operation.kind in chosen:
+    def join(self, chosen: dict[int, tuple[int, int]]) -> None:
+        """Join the operations that are such pairs."""
+        for i in self._open:
+            operation = self.by_node[i]
+            if operation is not None and operation.kind in chosen:
                 place, part = chosen[operation.kind]
-                inner = self._inner(operation.operands[place])
-                if inner is not None and inner.kind == part:
+                x = operation.operands[place]
+                if self._single[x] and self.by_node[x].kind == part:  # type: ignore[union-attr]
                     self._put(i, place)
-        return bool(chosen)
 
     def _put(self, i: int, place: int) -> None:
-        """Compute the operand of operation i at this place inside it."""
-        kind, operands, results = self.operations[i]
-        inner = self.operations.pop(operands[place])
-        key = kind, place, inner.kind
-        if key not in self._joined:
-            self._joined[key] = _with_part(*key)
+        """Compute the operand of the operation of node i at this place inside it."""
+        operation = self.by_node[i]
+        assert operation is not None
+        kind, operands, results = operation
+        x = operands[place]
+        inner = self.by_node[x]
+        assert inner is not None
+        self.by_node[x] = None
         operands = operands[:place] + inner.operands + operands[place + 1 :]
-        self.operations[i] = Operation(self._joined[key], operands, results)
-
-
-def _with_part(kind: Kind, place: int, part: Kind) -> Kind:
-    """The kind whose operand at this place, counted over all that it reads, is made by another."""
-    parts = list(kind.parts)
-    for k, inner in enumerate(parts):
-        width = 1 if inner is None else inner.operands
-        if place < width:
-            parts[k] = part if inner is None else _with_part(inner, place, part)
-            break
-        place -= width
-    return kind._replace(parts=tuple(parts))
+        self.by_node[i] = Operation(self._kinds.joined(kind, place, inner.kind), operands, results)
 
 
 # ---- order -----------------------------------------------------------------------------------------------------------
@@ -237,9 +282,9 @@ def _grouped(operations: list[Operation]) -> list[list[Operation]]:
     of the loop and became ready last, for its operands are near; among kinds that do not, the one that comes nearest.
     """
     users, waiting = _edges(operations)
-    ready: dict[Kind, list[int]] = defaultdict(list)
-    since: dict[Kind, int] = defaultdict(int)
-    groups, done, first, seen = [], [False] * len(operations), 0, 0
+    ready: dict[int, list[int]] = defaultdict(list)
+    since: dict[int, int] = defaultdict(int)
+    groups, done, first, seen = [], bytearray(len(operations)), 0, 0
     while first < len(operations):
         while seen < min(len(operations), first + WINDOW):
             if not waiting[seen]:
@@ -264,14 +309,15 @@ def _grouped(operations: list[Operation]) -> list[list[Operation]]:
 
 
 def _edges(operations: list[Operation]) -> tuple[list[list[int]], list[int]]:
-    """For every operation those that read its results, and how many others it waits for."""
+    """For every operation those that read its results, as often as they do, and how many operands it waits for."""
     maker = {x: k for k, operation in enumerate(operations) for x in operation.results}
     users: list[list[int]] = [[] for _ in operations]
     waiting = [0] * len(operations)
     for k, operation in enumerate(operations):
-        for other in {maker[x] for x in operation.operands if x in maker}:
-            users[other].append(k)
-            waiting[k] += 1
+        for x in operation.operands:
+            if x in maker:
+                users[maker[x]].append(k)
+                waiting[k] += 1
     return users, waiting
 
 

@@ -51,6 +51,9 @@ class Motion:
         self.width, self.vector = self.layout.width, ir.VectorType(DOUBLE, self.layout.width)
         sincos = sincos_function(self.module, self.width)
         self.form = Tables(self.function, sincos) if large else Lines(sincos)
+        # The program whose first outputs are q̈. As a table the zeroth order is there already, and little longer.
+        line = program.line
+        self.acceleration = series.zeroth_order if large else line._replace(outputs=line.outputs[: self.n])
         self._sums = self._sums_function()
         self.coefficients = self._coefficients_function()
 

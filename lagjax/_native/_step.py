@@ -124,8 +124,8 @@ class StepControl:
         increments, slopes = motion.increments(frame, order, s)
         for i in motion.form.each(code, motion.states):
             frame["increment", i] = increments[i]
-        moved, line = motion.moved(frame, increments), motion.program.line
-        acceleration = motion.evaluate(frame, line._replace(outputs=line.outputs[:n]), moved, s)
+        moved = motion.moved(frame, increments)
+        acceleration = motion.evaluate(frame, motion.acceleration, moved, s)
         noise = self._noise(frame, acceleration, increments, moved)
         defect, weight = code.variable(frame["defect"]), code.intrinsic("fabs", h) / code.as_double(order + 1)
         for i in motion.form.each(code, n):

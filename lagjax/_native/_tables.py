@@ -16,10 +16,11 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from llvmlite import ir
 
+from lagjax._native._constants import TIMES
 from lagjax._native._frame import Frame, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
 from lagjax._native._lanes import apply, sines_and_cosines
-from lagjax._native._schedule import TIMES, Kind, Operation, schedule
+from lagjax._native._schedule import Kind, Operation, Schedule, schedule
 from lagjax._program._series import StraightLine
 
 _WORD = ir.IntType(32)  # an entry of a table: a kind, or a distance in the memory, in doubles
@@ -36,6 +37,7 @@ class Tables:
         self._kinds: dict[tuple[Kind, int], int] = {}
         self._constants: dict[bytes, int] = {}
         self._fields: list[str] = []
+        self._schedules: dict[int, tuple[StraightLine, Schedule]] = {}  # by the program, which lives as long
         self._execute: Frame = function("execute", POINTER)
         self._prepare: Frame = function("prepare")
         self._module, self._layout = self._execute.code.module, self._execute.layout
@@ -48,12 +50,14 @@ class Tables:
 
         They stay until this place of the kernel is passed again.
         """
-        plan = schedule(line)
+        if id(line) not in self._schedules:
+            self._schedules[id(line)] = line, schedule(line)
+        _, plan = self._schedules[id(line)]
         name, lying = self._field(plan.size), self._places(frame, inputs)
         places = {node: self._layout.place(name, slot) for node, slot in plan.slots.items()}
         places |= {node: self._constant(number) for node, number in plan.constants.items()}
         places |= {node: lying[position] for node, position in plan.inputs.items()}
-        words = [word for group in plan.groups for word in self._words(group, places)]
+        words = [word for group in plan.groups for word in self._words(plan.kinds[group[0].kind], group, places)]
         frame.call(self._execute.code, Value(frame.code, integers(self._module, np.array([*words, 0], np.int32))))
         return frame.vectors(name, len(line.outputs))
 
@@ -137,16 +141,17 @@ class Tables:
 
     # ---- the table of a program ----
 
-    def _words(self, group: list[Operation], places: dict[int, int]) -> Iterator[int]:
-        """The operations of a group, so many at a time as there is code for."""
-        start = 0
+    def _words(self, kind: Kind, group: list[Operation], places: dict[int, int]) -> list[int]:
+        """The operations of a group, all of one kind, so many at a time as there is code for."""
+        start, words = 0, []
         while start < len(group):
             times = next(times for times in TIMES if times <= len(group) - start)
-            yield self._kinds.setdefault((group[start].kind, times), len(self._kinds) + 1)
+            words.append(self._kinds.setdefault((kind, times), len(self._kinds) + 1))
             for operation in group[start : start + times]:
-                yield from map(places.__getitem__, operation.operands)
-                yield from (places[x] if x >= 0 else self._nowhere for x in operation.results)
+                words += [places[x] for x in operation.operands]
+                words += [places.get(x, self._nowhere) for x in operation.results]
             start += times
+        return words
 
     # ---- the code ----
 
