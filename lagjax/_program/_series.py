@@ -115,10 +115,18 @@ class _Recurrences:
         self.k, self.inverse_k = (self.order_recursion.input(self.moving + i, "float") for i in range(2))
         self._given: dict[tuple, int] = {}  # what else is read: ("value", node) or ("product", row, row)
         self._rows: dict[tuple[int | _Component, bool], int] = {}
-        self.coefficients: list[int | _Unknown | None] = []  # None: constant along the motion
-        while len(self.coefficients) < len(self.zeroth_order.nodes):  # the rules add derivatives at the end
-            self.coefficients.append(self._coefficient(len(self.coefficients)))
+        self._coefficients: dict[int, int | _Unknown | None] = {}  # None: constant along the motion
+        # Of an elimination no coefficient is needed: it is most of a large program.
+        self._find(self._needed(program.linear))
+        i = len(program.line.nodes)
+        while i < len(self.zeroth_order.nodes):  # the rules add derivatives at the end
+            self.coefficient(i)
+            i += 1
         self.solution = [] if program.linear is None else self._solution(program.linear)
+
+    def _needed(self, linear) -> list[int]:
+        """The nodes whose coefficients are asked for: of the linear system, or of the outputs themselves."""
+        return self.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
 
     # ---- what the order recursion reads ----
 
@@ -142,13 +150,30 @@ class _Recurrences:
 
     # ---- the recurrences ----
 
+    def coefficient(self, i: int) -> "int | _Unknown | None":
+        """The coefficient of order k of a node."""
+        if i not in self._coefficients:
+            self._find([i])
+        return self._coefficients[i]
+
+    def _find(self, roots: list[int]) -> None:
+        """The coefficients of these nodes, and before them those of what they depend on."""
+        missing, stack = set(), list(roots)
+        while stack:
+            i = stack.pop()
+            if i not in missing and i not in self._coefficients:
+                missing.add(i)
+                stack.extend(self.zeroth_order.nodes[i][1])
+        for i in sorted(missing):
+            self._coefficients[i] = self._coefficient(i)
+
     def _coefficient(self, i: int) -> "int | _Unknown | None":
         op, operands, attribute = self.zeroth_order.nodes[i]
         if op == "input":
             return self.order_k[attribute] if attribute < self.moving else None
         if op == "constant" or self.zeroth_order.kinds[i] != "float" or OPERATIONS[op].is_step:
             return None
-        of = [self.coefficients[operand] for operand in operands]
+        of = [self.coefficient(operand) for operand in operands]
         used = of[1:] if op == "select" else of
         if all(c is None for c in used):
             return None
@@ -190,7 +215,7 @@ class _Recurrences:
         apply = self.order_recursion.apply
         residual = [self._of_output(node) for node in system.right]
         for (i, j), node in system.entries.items():
-            if self.coefficients[node] is not None:
+            if self.coefficient(node) is not None:
                 c = self._of_output(node)
                 for row, column in dict.fromkeys([(i, j), (j, i)]):
                     taken = apply("mul", c, self.value(system.z[column]))
@@ -252,7 +277,7 @@ class _Recurrences:
         )
 
     def _of_output(self, node: int) -> int:
-        c = self.coefficients[node]
+        c = self.coefficient(node)
         if isinstance(c, _Unknown):
             raise Unlowerable(f"`{c.op}` has no Taylor series here")
         return self.order_recursion.constant(0.0, "float") if c is None else c
