@@ -13,6 +13,7 @@ import numpy as np
 from lagjax._diffrax._equations import ArrayEquations, form_of
 from lagjax._engine import choose
 from lagjax._linear import dependent_rows
+from lagjax._native import is_large
 from lagjax._problem import Problem
 from lagjax._program import Program, Unlowerable
 
@@ -34,7 +35,8 @@ class Explanation:
       gradient). They change nothing but the multipliers.
     - `projection_operations`: scalar operations of one way back to the constraints, taken after every step.
     - `path`: "scalar" or "array"; `reason`: why not "scalar".
-    - `solver`: what integrates the motion by default, and where it is not machine code, why not.
+    - `solver`: what integrates the motion by default, and where it is not machine code, why not; of machine code,
+      whether it is written operation by operation or walks along tables of them.
     """
 
     coordinates: tuple[str, ...]
@@ -120,6 +122,8 @@ def _engine(problem: Problem) -> dict[str, Any]:
     derivation, refusal = problem.derivation, choose(problem).refusal
     if refusal is None:
         solver, reason = "Taylor series in machine code", ""
+        if is_large(derivation.acceleration, derivation.projection):
+            solver += ", whose operations stand in tables: for code operation by operation they are too many"
         programs = derivation.acceleration, derivation.projected
     else:
         solver, form = f"diffrax.Dopri8, because {refusal}", form_of(derivation, problem.system.path)

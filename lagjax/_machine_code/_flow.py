@@ -19,7 +19,8 @@ from lagjax._program import Program, Unlowerable
 from lagjax._results import RESULTS, SUCCESSFUL, code_of
 from lagjax._stopped import End, what_stopped
 
-LARGEST_PROGRAM = 6_000  # operations of an acceleration, beyond which LLVM takes too long
+# Operations of an acceleration: making its kernel takes some 3 KB for each, with the derivatives some 10 KB.
+LARGEST_PROGRAM = 1_000_000
 # The codes of the kernel, in their order, as results. Beyond `EVENT` they say which guards changed sign.
 _RESULT_OF_CODE = np.array([code_of(result) for result in (
     RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,
@@ -55,7 +56,10 @@ def unfit(program: Program, size: int, dtype) -> str | None:
     if dtype != np.float64:
         return f"the coordinates are {np.dtype(dtype).name}, not float64"
     if program.operations > LARGEST_PROGRAM:
-        return f"its acceleration takes {program.operations} operations, more than {LARGEST_PROGRAM}"
+        return (
+            f"its acceleration takes {program.operations} operations, more than the {LARGEST_PROGRAM} whose kernel is "
+            "expected to fit in memory"
+        )  # fmt: skip
     try:
         _native.recurrences(program, size)
     except Unlowerable as reason:

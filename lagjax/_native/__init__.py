@@ -7,7 +7,8 @@ operations, four or eight side by side in the lanes of vector registers, and not
 one Taylor series, of the order that the tolerance asks for.
 
     _ir          LLVM's instructions, written like arithmetic;  _objects: machine code kept on disk
-    _lanes       the operations of a program on vectors
+    _lanes       the operations of a program on vectors, one by one: the form of small kernels
+    _tables      the form of large ones: operations are data that one loop walks along;  _schedule: in which order
     _constants   every numerical choice, with its reason
     _frame       what a function of a kernel sees: the memory of its thread, the lanes, the job
     _series      the coefficients of a motion, and what is read off them along a step
@@ -33,9 +34,10 @@ from lagjax._native._constants import (
 )
 from lagjax._native._handler import Handler, Plan, unavailable
 from lagjax._native._kernel import Begun, Guards, Kernel, Outcome, Projection, cores, order_for, recurrences
+from lagjax._native._series import is_large
 
 __all__ = [
     "DISCONTINUOUS", "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "STEP_TOO_SMALL",
-    "Begun", "Guards", "Handler", "Kernel", "Outcome", "Plan", "Projection", "cores", "order_for", "recurrences",
-    "unavailable",
+    "Begun", "Guards", "Handler", "Kernel", "Outcome", "Plan", "Projection", "cores", "is_large", "order_for",
+    "recurrences", "unavailable",
 ]  # fmt: skip

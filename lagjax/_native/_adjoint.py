@@ -283,8 +283,13 @@ class Adjoint:
         form, states = self.motion.form, self.states
         for i in form.each(frame.code, states):
             frame["state_ct", i] = cotangents[i] if more is None else more[i] + cotangents[i]
-        for k, i in enumerate(self.varied[states:]):
-            _add(frame, cotangents[states + k], "params_ct", i - states - 1)
+        params = [i - states - 1 for i in self.varied[states:]]
+        if params == list(range(self.motion.numbers)):
+            for i in form.each(frame.code, len(params)):
+                _add(frame, cotangents[i + states], "params_ct", i)
+        else:  # some are integers
+            for k, i in enumerate(params):
+                _add(frame, cotangents[states + k], "params_ct", i)
 
 
 def _add(frame: Frame, x: Value, name: str, *indices: Index) -> None:

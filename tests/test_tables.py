@@ -1,0 +1,172 @@
+"""Kernels as tables against kernels that are written down operation by operation: the same numbers by both."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import _native
+from lagjax._derivation import derivation_of, numbers_of
+from lagjax._layout import Layout
+from lagjax._native import _schedule, _series
+from lagjax._program import OPERATIONS, Unlowerable, lower
+
+MEMBERS, RTOL, ROOM = 3, 1e-9, 300
+# Every operation is rounded as often in both forms. But of two products in a sum the processor rounds one with the sum,
+# and which one LLVM takes depends on what stands around them: that is round-off of some hundred operations of a step,
+# which a motion of some hundred steps carries along.
+ROUND_OFF = 1e-11
+
+
+def in_both_forms(*parts, **options):
+    """A kernel written down operation by operation, and one as tables."""
+    for border in (10**9, -1):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(_series, "LARGEST_LINE", border)
+            kernel = _native.Kernel(*parts, **options)
+            kernel._backward  # noqa: B018  (compiled in the same form)
+        yield kernel
+
+
+def run_and_back(kernel, ts, y0, params):
+    """A run, and the cotangents of its start and of the parameters, from those of its outputs and its end."""
+    run = kernel(ts[None], y0, params, RTOL, 1e-3 * RTOL, 10_000, np.full(len(y0), ROOM))
+    first, counts = np.arange(len(y0)) * ROOM, np.minimum(run.steps, ROOM)
+    cotangents = np.random.default_rng(0).normal(size=run.path.shape), np.ones_like(y0)
+    return run, kernel.vjp(ts[None], params, run.table, first, counts, *cotangents, _native.order_for(RTOL))
+
+
+def assert_same(kernels, ts, y0, params):
+    (written, back), (table, back_by_table) = (run_and_back(kernel, ts, y0, params) for kernel in kernels)
+    np.testing.assert_array_equal(table.code, written.code)
+    np.testing.assert_array_equal(table.steps, written.steps)
+    np.testing.assert_allclose(table.path, written.path, rtol=0, atol=ROUND_OFF * np.nanmax(abs(written.path)))
+    for by_table, by_line in zip(back_by_table, back, strict=True):
+        if by_line.size:
+            np.testing.assert_allclose(by_table, by_line, rtol=0, atol=ROUND_OFF * np.nanmax(abs(by_line)))
+
+
+# Constraints with a projection, a motion that depends on time; the others in the slow part.
+QUICK = ("double_pendulum", "slider_crank", "driven_pendulum")
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [pytest.param(scene, id=scene.__name__, marks=() if scene.__name__ in QUICK else pytest.mark.slow)
+     for scene in lagjax.scenes.ALL],
+)  # fmt: skip
+def test_ready_scenes(scene):
+    made = scene()
+    layout = Layout.of(made.q0, made.qdot0)
+    derivation = derivation_of(made.system, layout, made.params)
+    try:
+        parts = derivation.acceleration, layout.size, derivation.projection
+    except Unlowerable as reason:
+        pytest.skip(str(reason))
+    params = np.array([numbers_of(made.params)], float)
+    y0 = np.concatenate([layout.flatten(made.q0), layout.flatten(made.qdot0)])
+    duration = {"solar_system": 10.0}.get(scene.__name__, 1.0)
+    assert_same(in_both_forms(*parts), np.linspace(0.0, duration, 4), np.tile(y0, (MEMBERS, 1)), params)
+
+
+def test_piecewise_operations_parameters_that_are_integers_and_guards():
+    def acceleration(q, v, t, k, n):
+        wall = jnp.maximum(-q[0], 0) ** 1.5 - jnp.minimum(q[0], 1) * jnp.where((q[1] > 0.3) | ~(v[0] < 0), k, 0.5)
+        turned = jnp.sin(jnp.mod(q[1], 2.0)) * jnp.cos(q[1]) / (1 + abs(v[1])) + jnp.tanh(v[0]) + n * jnp.cos(t)
+        return wall, -turned, False
+
+    shapes = jnp.ones(2), jnp.ones(2), 1.0
+    program = lower(acceleration, *shapes, 1.0, 2)
+
+    def guards(q, v, t, k, n):
+        g = q[0] * q[1] - 0.7
+        return g, v[0] * q[1] + q[0] * v[1], abs(g) + 1.4, abs(v[0] * q[1]) + abs(q[0] * v[1])
+
+    events = _native.Guards(lower(guards, *shapes, 1.0, 2), (0,))
+    y0 = np.random.default_rng(1).uniform(-0.5, 0.5, (MEMBERS, 4)) + np.array([0.5, 0.5, 0, 0])
+    kernels = list(in_both_forms(program, 2, guards=events))
+    assert_same(kernels, np.linspace(0.0, 2.0, 5), y0, np.array([[2.0, 1.0]]))
+    codes = kernels[1](np.array([[0.0, 9.0]]), y0, np.array([[2.0, 1.0]]), RTOL, RTOL, 10_000).code
+    assert (codes >= _native.EVENT).any()
+
+
+# ---- the order in which a table runs --------------------------------------------------------------------------------
+
+
+def everything(x, y, s):
+    """Sums and products in long chains, several results of one node, outputs that are inputs, numbers, or alike."""
+    for k in range(12):
+        x, y = x + y * jnp.cos(x) - jnp.roll(y, k) * jnp.roll(x, 1), (x - y / (2.0 + x * x)) * s
+    angle = jnp.sum(x)
+    return x, y, s, jnp.cos(angle), jnp.where(x[0] > 0, x, y), x[0] > y[0], jnp.ones(2), jnp.sqrt(1 + y * y), x[:2]
+
+
+@pytest.mark.parametrize("window", [1, 40, 10**6])
+def test_a_schedule_computes_the_program(window, monkeypatch):
+    monkeypatch.setattr(_schedule, "WINDOW", window)
+    program = lower(everything, jnp.ones(7), jnp.ones(7), 1.0)
+    numbers = np.random.default_rng(0).uniform(0.5, 1.5, 15)
+    plan, memory = _schedule.schedule(program.line), {}
+    node_at = {node: ("slot", slot) for node, slot in plan.slots.items()}
+    for node, position in plan.inputs.items():
+        node_at[node] = "input", position
+        memory[node_at[node]] = numbers[position]
+    for node, number in plan.constants.items():
+        node_at[node] = "constant", node
+        memory[node_at[node]] = number
+
+    def results(kind, operands):
+        xs = [next(operands) if part is None else results(part, operands)[0] for part in kind.parts]
+        if kind.op == "copy":
+            return xs
+        if kind.op == "sincos":
+            return [np.sin(xs[0]), np.cos(xs[0])]
+        return [OPERATIONS[kind.op].value(*xs, *(() if kind.attribute is None else (kind.attribute,)))]
+
+    for group in plan.groups:
+        made = {}  # a group may read all before it writes any
+        for kind, operands, nodes in group:
+            values = results(plan.kinds[kind], iter([memory[node_at[x]] for x in operands]))
+            made |= {node_at[x]: value for x, value in zip(nodes, values, strict=True) if x >= 0}
+        memory |= made
+    found = [memory["slot", k] for k in range(len(program.line.outputs))]
+    np.testing.assert_allclose(np.array(found, float), np.array(program.evaluate(*numbers), float), rtol=1e-14)
+    assert plan.size < len(program.line.nodes) / 2  # slots are used again
+
+
+def test_what_comes_often_is_one_operation():
+    program = lower(everything, jnp.ones(7), jnp.ones(7), 1.0)
+    plan = _schedule.schedule(program.line)
+    done = [operation for group in plan.groups for operation in group]
+    assert len(done) < 0.8 * program.operations
+    assert max(plan.kinds[operation.kind].operands for operation in done) > 3
+    alike = sum(len(group) for group in plan.groups if len(group) >= _schedule.TIMES[0])
+    assert alike > 0.5 * len(done)
+
+
+# ---- size -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_code_of_a_table_does_not_grow_with_the_scene():
+    """Thirty times the pairs of bodies: the tables are longer, and the code is the same but for a few kinds."""
+    from lagjax._native._integrator import Integrator
+
+    def instructions(count):
+        i, j = np.triu_indices(count, 1)
+
+        def acceleration(q, v, t):
+            distance = jnp.sqrt(jnp.sum((q.reshape(count, 2)[i] - q.reshape(count, 2)[j]) ** 2, axis=1) + 0.1)
+            pull = (q.reshape(count, 2)[i] - q.reshape(count, 2)[j]) / distance[:, None] ** 3
+            return jnp.zeros((count, 2)).at[i].add(-pull).at[j].add(pull).ravel(), False
+
+        states = jax.ShapeDtypeStruct((2 * count,), float)
+        program = lower(acceleration, states, states, 1.0)
+        series = _native.recurrences(program, 2 * count)
+        functions = Integrator(program, series).motion.module.functions
+        return sum(len(block.instructions) for function in functions for block in function.blocks)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_series, "LARGEST_LINE", -1)
+        small, large = instructions(4), instructions(20)
+    assert large < 1.5 * small
