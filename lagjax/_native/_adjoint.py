@@ -46,7 +46,7 @@ class Adjoint:
             "params_ct": program.size - states - 1,
             "active": 1,
         }
-        large = is_large(program, projection)
+        large = is_large(program, projection, times=2)
         self.motion = Motion("adjoint", program, series, JOB, fields, large, keep_sums=True)
         self.n, self.states, self.series = n, states, series
         dtypes = program.dtypes

@@ -220,14 +220,14 @@ class Motion:
         return frame.code.any_lane(frame["active"] > 0.0)
 
 
-def is_large(program: Recurrent, projection=None, guards=None) -> bool:
-    """Whether a kernel is written as tables, and not operation by operation."""
+def is_large(program: Recurrent, projection=None, guards=None, times: int = 1) -> bool:
+    """Whether a kernel that has the operations of these programs so many times is written as tables."""
     lines = [program.line]
     if projection is not None:
         lines += [projection.state.line, projection.velocity_scale.line]
     if guards is not None:
         lines.append(guards.program.line)
-    return sum(len(line.nodes) for line in lines) > LARGEST_LINE
+    return times * sum(len(line.nodes) for line in lines) > LARGEST_LINE
 
 
 def integer(code: Code, x: int) -> Value:
