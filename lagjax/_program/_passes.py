@@ -6,6 +6,10 @@ from collections.abc import Callable
 
 from lagjax._program._graph import LONGEST, Graph, Node
 
+# Nodes of a graph beyond which passes change it in place: to compare all of its sums and products once more would take
+# longer than what it saves, less than a hundredth of its operations.
+MANY = 20_000
+
 Line = tuple[tuple[Node, ...], tuple[str, ...], tuple[int, ...]]  # nodes, kinds and outputs
 
 
@@ -18,27 +22,40 @@ def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
     uses = _uses(graph, outputs)
 
     def node_of(new, i, moved):
+        op, operands, _ = graph.nodes[i]
+        if graph.kinds[i] != "float":
+            return None
+        if op == "mul" and any(uses[x] == 1 and graph.nodes[x][0] == "mul" for x in operands):
+            return _square_first(new, [moved(x, x) for x in _factors(graph, uses, i)])
+        if op in ("add", "sub") and 1 in (uses[x] for x in operands):
+            return _common_factor(new, op, *(moved(x, x) for x in operands))
+        return None
+
+    return _rewritten(graph, outputs, uses, node_of, Graph.apply)
+
+
+def _rewritten(graph, outputs, uses, node_of: Callable, make: Callable) -> tuple[Graph, list[int]]:
+    """A graph with `node_of(new, i, moved)` in the place of every node i for which that is not None, and the outputs.
+
+    `moved(x, x)` says where a node before i is. The nodes that use others than before are made anew by `make`. A small
+    graph is made anew as a whole, so that everything in it is compared once more; to a large one nodes are added.
+    """
+    many = len(uses) - uses.count(0) > MANY
+    new, places = graph if many else Graph(2 * graph.budget), {}
+    for i in range(len(uses)):
+        if not uses[i]:
+            continue
         op, operands, attribute = graph.nodes[i]
-        xs, simpler = [moved[x] for x in operands], None
-        if graph.kinds[i] == "float" and op == "mul":
-            simpler = _square_first(new, [moved[x] for x in _factors(graph, uses, i)])
-        elif graph.kinds[i] == "float" and op in ("add", "sub") and 1 in (uses[x] for x in operands):
-            simpler = _common_factor(new, op, *xs)
-        return new.apply(op, *xs, attribute=attribute) if simpler is None else simpler
-
-    return _rebuilt(graph, outputs, uses, node_of)
-
-
-def _rebuilt(graph, outputs, used, node_of: Callable) -> tuple[Graph, list[int]]:
-    """A new graph, node by node; `node_of(new, i, moved)` makes node i, with `moved` to say where the old ones are."""
-    new, moved = Graph(2 * graph.budget), {}
-    for i in sorted(used):
-        op, _, attribute = graph.nodes[i]
         if op in ("input", "constant"):
-            moved[i] = getattr(new, op)(attribute, graph.kinds[i])
-        else:
-            moved[i] = node_of(new, i, moved)
-    return new, [moved[i] for i in outputs]
+            if not many:
+                places[i] = getattr(new, op)(attribute, graph.kinds[i])
+            continue
+        at = node_of(new, i, places.get)
+        if at is None and not (many and places.keys().isdisjoint(operands)):
+            at = make(new, op, *(places.get(x, x) for x in operands), attribute=attribute)
+        if at is not None:
+            places[i] = at
+    return new, [places.get(i, i) for i in outputs]
 
 
 def _factors(graph, uses, i) -> list[int]:
@@ -85,11 +102,10 @@ def sink_negations(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
     uses = _uses(graph, outputs)
 
     def node_of(new, i, moved):
-        op, operands, attribute = graph.nodes[i]
-        turned = _negative(new, moved[operands[0]]) if op == "neg" and uses[operands[0]] == 1 else None
-        return new.node(op, *(moved[x] for x in operands), attribute=attribute) if turned is None else turned
+        op, operands, _ = graph.nodes[i]
+        return _negative(new, moved(*operands * 2)) if op == "neg" and uses[operands[0]] == 1 else None
 
-    return _rebuilt(graph, outputs, uses, node_of)
+    return _rewritten(graph, outputs, uses, node_of, Graph.node)
 
 
 def _negative(graph, i) -> int | None:
@@ -107,10 +123,11 @@ def _negative(graph, i) -> int | None:
 
 def eliminate_dead_code(graph: Graph, outputs: list[int]) -> Line:
     """The nodes that the outputs depend on, renumbered."""
-    position = {i: k for k, i in enumerate(sorted(_uses(graph, outputs)))}
-    nodes = (graph.nodes[i] for i in position)
-    renumbered = tuple((op, tuple(position[i] for i in operands), attribute) for op, operands, attribute in nodes)
-    return renumbered, tuple(graph.kinds[i] for i in position), tuple(position[i] for i in outputs)
+    kept = [i for i, count in enumerate(_uses(graph, outputs)) if count]
+    position = dict(zip(kept, range(len(kept)), strict=True)).__getitem__
+    nodes = (graph.nodes[i] for i in kept)
+    renumbered = tuple((op, tuple(map(position, operands)), attribute) for op, operands, attribute in nodes)
+    return renumbered, tuple(graph.kinds[i] for i in kept), tuple(map(position, outputs))
 
 
 def live(nodes, kinds, outputs) -> Line:
@@ -128,10 +145,13 @@ def replace_by_inputs(nodes, kinds, outputs, positions: dict[int, int]) -> Line:
     return eliminate_dead_code(graph, list(outputs))
 
 
-def _uses(graph, outputs) -> Counter:
-    """How often each live node is used, by a live node or as an output."""
-    uses = Counter(outputs)
+def _uses(graph, outputs) -> list[int]:
+    """How often each node is used, by a node that is needed or as an output."""
+    uses = [0] * len(graph.nodes)
+    for i in outputs:
+        uses[i] += 1
     for i in range(len(graph.nodes) - 1, -1, -1):
-        if i in uses:
-            uses.update(graph.nodes[i][1])
+        if uses[i]:
+            for x in graph.nodes[i][1]:
+                uses[x] += 1
     return uses
