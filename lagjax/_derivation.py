@@ -11,6 +11,7 @@ All programs take the same inputs: q, q̇, t and then every number of params, on
 """
 
 import functools
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from lagjax._constraints import velocity_scales
 from lagjax._layout import Layout, dtype_of
 from lagjax._motion import Motion
 from lagjax._native import Projection
-from lagjax._program import Program, Unlowerable, lower, lower_formula, lower_scalars, lower_solution
+from lagjax._program import Graph, Program, Unlowerable, lower, lower_formula, lower_scalars, lower_solution
 from lagjax._program._scalars import applied, joined, spread, stacked
 from lagjax._quantities import OwnRules, quantities
 from lagjax._saddle import SaddleElimination, TwoCoordinates
@@ -59,10 +60,12 @@ def _lowered_once(make: Callable) -> property:
     @functools.wraps(make)
     def get(self):
         if name not in self._made:
-            try:
-                self._made[name] = make(self)
-            except Unlowerable as reason:
-                self._made[name] = reason
+            with self._lock:  # programs of a large scene share one graph
+                if name not in self._made:
+                    try:
+                        self._made[name] = make(self)
+                    except Unlowerable as reason:
+                        self._made[name] = reason
         made = self._made[name]
         if isinstance(made, Unlowerable):
             raise Unlowerable(str(made)) from None
@@ -88,6 +91,7 @@ class Derivation:
         self.motion, self.layout, self.refusal, self.unhashable = motion, layout, refusal, unhashable
         self.numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
         self._made: dict[str, Any] = {}
+        self._lock = threading.RLock()
         self._programs: dict[tuple[str, ...], Program] = {}
         self._by_q: dict[tuple[int, ...], Program] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
@@ -117,6 +121,12 @@ class Derivation:
             return lower_scalars(on_scalars, on_arrays, tuple(leaves), OPERATION_BUDGET)
         except OwnRules:
             return lower(on_arrays, *leaves, budget=OPERATION_BUDGET)
+
+    @property
+    def _graph(self) -> Graph | None:
+        """The graph of all quantities, to which other programs are added, where it is too large to be copied."""
+        origin = self._whole.origin
+        return None if origin is None else origin.graph
 
     def program(self, *names: str) -> Program:
         """The program for these of `Motion.quantities`, end to end, each in C order."""
@@ -204,7 +214,7 @@ class Derivation:
             _, _, right, factors, _ = system(*scalars)
             return -solve(factors, right)[self.layout.size :]
 
-        return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
+        return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
 
     @_lowered_once
     def projected(self) -> Program | None:
@@ -221,7 +231,7 @@ class Derivation:
                 q = q + position.vector(*scalars)[:n]
             return joined([q, v + velocity.vector(*(q[i] for i in range(n)), *rest)[:n]])
 
-        return lower_formula(projected, *self.scalar_shapes, budget=OPERATION_BUDGET)
+        return lower_formula(projected, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
 
     @_lowered_once
     def velocity_scales(self) -> Program | None:
@@ -236,7 +246,7 @@ class Derivation:
         def scales(*scalars):
             return applied(of_arrays, parts.vector(*scalars), stacked(scalars[n : 2 * n]))
 
-        return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET)
+        return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
 
     @_lowered_once
     def projection(self) -> Projection | None:
@@ -291,7 +301,9 @@ class Derivation:
     def _solution(self, saddle: _Saddle, regular_only: bool = False) -> Program:
         """x of a linear system, and then whether it is singular."""
         system, solve = self._system(saddle, regular_only)
-        return lower_solution(system, solve, self.layout.size, *self.scalar_shapes, budget=OPERATION_BUDGET)
+        return lower_solution(
+            system, solve, self.layout.size, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph
+        )
 
     def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
         """A z = r with z = (x, −λ), as two functions of scalars.

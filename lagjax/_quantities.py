@@ -160,6 +160,7 @@ def _derivatives(state: _State, lagrangian: _Taped, rates: dict) -> tuple[Ids, I
     for together in (True, False) if len(lagrangian.tape.nodes) <= _APART else (True,):
         by_q, momentum, by_t = state.gradient(lagrangian, "q", "qdot", "t", together=together)
         matrix = state.jacobian(momentum, "qdot")
+        matrix = np.where(np.tri(len(matrix), dtype=bool), matrix, matrix.T)
         inertial = state.map("sub", by_q, state.along(momentum, **rates))
         forms.append((by_q, momentum, by_t, matrix, inertial))
     sizes = [state.derivatives.size([*matrix.ravel().tolist(), *inertial.tolist()]) for *_, matrix, inertial in forms]

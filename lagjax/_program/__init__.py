@@ -39,7 +39,7 @@ from jax.extend import core
 from lagjax._program._differentiate import Derivatives, has_own_rules
 from lagjax._program._emit import emit, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
-from lagjax._program._graph import Graph, Node, Tape, Unlowerable
+from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
 from lagjax._program._rules import Expansion, inputs_of
@@ -51,6 +51,7 @@ __all__ = [
     "OPERATIONS",
     "Derivatives",
     "Expansion",
+    "Graph",
     "Program",
     "Scalars",
     "Series",
@@ -96,32 +97,41 @@ def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], 
 
 
 def lower_scalars(
-    scalars: Callable, function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int
+    scalars: Callable,
+    function: Callable,
+    shapes: tuple[jax.ShapeDtypeStruct, ...],
+    budget: int,
+    graph: Graph | None = None,
 ) -> "Program":
     """The program of the id arrays that `scalars(expansion, arguments)` makes of those of its inputs.
 
-    `function` is the function in JAX that it stands for, of arrays of these `shapes`.
+    `function` is the function in JAX that it stands for, of arrays of these `shapes`. Where a `graph` is given, that of
+    a program of the same inputs, the new one is added to it.
     """
-    expansion = Expansion(Graph(budget))
+    expansion = Expansion(Graph(budget) if graph is None else graph)
     expansion.work(sum(shape.size for shape in shapes))
     arguments = inputs_of(expansion.graph, shapes)
     with np.errstate(all="ignore"):
         results = scalars(expansion, arguments)
     outputs = [i for result in results for i in result.ravel().tolist()]
-    nodes, kinds, outputs = eliminate_dead_code(*sink_negations(*factor(expansion.graph, outputs)))
-    return Program(nodes, kinds, outputs, expansion.traced_operations, function, shapes, budget)
+    graph, places = sink_negations(*factor(expansion.graph, outputs))
+    origin = Origin(graph, tuple(places)) if len(graph.nodes) > MANY else None
+    line = eliminate_dead_code(graph, places)
+    return Program(*line, expansion.traced_operations, function, shapes, budget, origin=origin)
 
 
-def lower_formula(formula: Callable, *shapes, budget: int) -> "Program":
+def lower_formula(formula: Callable, *shapes, budget: int, graph: Graph | None = None) -> "Program":
     """The program of a formula: a function of numbers, each a `Scalars` () or a JAX scalar, that gives a vector."""
 
     def scalars(expansion, arguments):
         return [formula(*(Scalars(expansion, x) for x in arguments)).ids]
 
-    return lower_scalars(scalars, lambda *xs: list(formula(*xs)), tuple(shapes), budget)
+    return lower_scalars(scalars, lambda *xs: list(formula(*xs)), tuple(shapes), budget, graph)
 
 
-def lower_solution(system: Callable, solve: Callable, size: int, *shapes, budget: int) -> "Program":
+def lower_solution(
+    system: Callable, solve: Callable, size: int, *shapes, budget: int, graph: Graph | None = None
+) -> "Program":
     """The program of the first `size` components of z with A z = r, A symmetric, and of one more number.
 
     Both functions are formulas (see `lower_formula`) on numbers of these `shapes`. `system(*numbers)` gives the rows
@@ -141,7 +151,7 @@ def lower_solution(system: Callable, solve: Callable, size: int, *shapes, budget
         _, _, right, factors, number = system(*arguments)
         return [*solve(factors, right)[:size], jnp.asarray(number)]
 
-    program = lower_scalars(whole, in_jax, tuple(shapes), budget)
+    program = lower_scalars(whole, in_jax, tuple(shapes), budget, graph)
     places, (of_z, of_entries, of_right), of_factors, factors = counts[0]
     ends = np.cumsum([size, 1, of_z - size, of_entries, of_right])
     z, _, others, entries, right, leaves = np.split(np.array(program.outputs), ends)
@@ -159,6 +169,7 @@ def lower_solution(system: Callable, solve: Callable, size: int, *shapes, budget
     return replace(
         program,
         outputs=program.outputs[: size + 1],
+        origin=None,
         function=in_jax,
         linear=LinearSystem(
             z=(*z.tolist(), *others.tolist()),
@@ -172,6 +183,13 @@ def lower_solution(system: Callable, solve: Callable, size: int, *shapes, budget
 
 def _ids_of(expansion: Expansion, number) -> np.ndarray:
     return number.ids if isinstance(number, Scalars) else expansion.constants(number)
+
+
+class Origin(NamedTuple):
+    """The graph that a large program was cut out of, and where its outputs are: for programs that go on from it."""
+
+    graph: Graph
+    outputs: tuple[int, ...]
 
 
 class LinearSystem(NamedTuple):
@@ -207,6 +225,7 @@ class Program:
     budget: int
     otherwise: "Callable[[], Program] | None" = None
     linear: LinearSystem | None = None
+    origin: Origin | None = None
 
     @property
     def line(self) -> StraightLine:
@@ -229,6 +248,10 @@ class Program:
         first = next((x for x in scalars if isinstance(x, Scalars)), None)
         if first is None:
             return jnp.stack(self(*scalars))
+        if self.origin is not None and self.origin.graph is first.expansion.graph:
+            inputs = inputs_of(self.origin.graph, self.shapes)
+            if stacked(scalars).ids.tolist() == [i for ids in inputs for i in ids.ravel().tolist()]:
+                return Scalars(first.expansion, np.array(self.origin.outputs))
         nodes = copied(first.expansion.graph, self.line, stacked(scalars).ids.tolist())
         first.expansion.traced_operations += self.operations
         return Scalars(first.expansion, np.array([nodes[i] for i in self.outputs], dtype=np.int64))
@@ -285,7 +308,9 @@ class Program:
     def only(self, positions: Sequence[int], function: Callable) -> "Program":
         """The program of some of the outputs; `function` is the JAX function that gives just these, leaf by leaf."""
         nodes, kinds, outputs = live(self.nodes, self.kinds, [self.outputs[i] for i in positions])
-        return replace(self, nodes=nodes, kinds=kinds, outputs=outputs, function=function, otherwise=None, linear=None)
+        origin = self.origin and self.origin._replace(outputs=tuple(self.origin.outputs[i] for i in positions))
+        line = {"nodes": nodes, "kinds": kinds, "outputs": outputs}
+        return replace(self, **line, function=function, otherwise=None, linear=None, origin=origin)
 
     @functools.cached_property
     def operations(self) -> int:

@@ -34,6 +34,9 @@ class Unlowerable(Exception):
 
 
 LONGEST = 16  # terms of a sum, or factors of a product, that are compared with others
+# Nodes of a graph beyond which sums and products are not compared any more, but for equal operands: among so many that
+# takes most of the time and saves less than a hundredth of the operations.
+MANY = 20_000
 
 Node = tuple[str, tuple[int, ...], Any]
 
@@ -47,6 +50,7 @@ class Graph:
     def __init__(self, budget: int):
         self.nodes: list[Node] = []
         self.kinds: list[str] = []
+        self.plain = bytearray()  # whether a node is a float that is no number, negation or multiple of another
         self.budget = budget
         self._operations = 0
         self._ids: dict = {}
@@ -69,6 +73,30 @@ class Graph:
             return rule(self, op, *operands) if attribute is None else rule(self, op, *operands, attribute)
         return self.node(op, *operands, attribute=attribute)
 
+    def apply_all(self, op: str, *columns: list[int], attribute=None) -> list[int]:
+        """`apply` for many operands."""
+        if op not in ("add", "sub", "mul") or len(self.nodes) <= MANY:
+            return [self.apply(op, *operands, attribute=attribute) for operands in zip(*columns, strict=True)]
+        nodes, ids, plain, results = self.nodes, self._ids, self.plain, []
+        for a, b in zip(*columns, strict=True):
+            if not (plain[a] and plain[b]) or a == b:
+                results.append(self.apply(op, a, b))
+                continue
+            node = (op, (b, a) if a > b and op != "sub" else (a, b), None)
+            i = ids.setdefault(node, len(nodes))
+            if i == len(nodes):  # as `node` does, without a look at what is not there
+                nodes.append(node)
+                self.kinds.append("float")
+                plain.append(True)
+                self._operations += 1
+            results.append(i)
+        self._require_room()
+        return results
+
+    def _require_room(self) -> None:
+        if self._operations > self.budget:
+            raise Unlowerable(f"the function takes more than the {self.budget} scalar operations allowed by `budget`")
+
     def power(self, a: int, exponent: int) -> int:
         """The scalar `a**exponent`, for any whole exponent."""
         return whole_power(self, a, exponent)
@@ -81,8 +109,7 @@ class Graph:
         if (node := self._ids.get(key)) is not None:
             return node
         self._operations += 1
-        if self._operations > self.budget:
-            raise Unlowerable(f"the function takes more than the {self.budget} scalar operations allowed by `budget`")
+        self._require_room()
         return self._append(key, key, self._kind(op, operands, attribute))
 
     def input(self, index: int, kind: str) -> int:
@@ -113,6 +140,12 @@ class Graph:
         return self.nodes[i][1][0] if self.nodes[i][0] == op else None
 
     def _append(self, key, node: Node, kind: str) -> int:
+        op, operands, _ = node
+        self.plain.append(
+            kind == "float"
+            and op not in ("constant", "neg")
+            and not (op == "mul" and "constant" in (self.nodes[operands[0]][0], self.nodes[operands[1]][0]))
+        )
         self.nodes.append(node)
         self.kinds.append(kind)
         self._ids[key] = len(self.nodes) - 1
@@ -158,6 +191,8 @@ class Graph:
 
     def product(self, a: int, b: int) -> int:
         """`a * b`, or an earlier product of the same factors."""
+        if len(self.nodes) > MANY:
+            return self.node("mul", a, b)
         factors = tuple(sorted(self._factors.get(a, (a,)) + self._factors.get(b, (b,))))
         if len(factors) > LONGEST:
             return self.node("mul", a, b)
@@ -179,6 +214,9 @@ class Graph:
 
     def sum(self, a: int, b: int, sign: int) -> int:
         """`a + sign*b` with like terms collected, or an earlier sum of the same terms."""
+        if len(self.nodes) > MANY:
+            (m, x), (n, y) = self.term(a), self.term(b)
+            return self.scale(m + sign * n, x) if x == y else self._signed_sum(a, b, sign)
         left, right = self.terms(a), self.terms(b)
         terms = dict(left)
         for base, coefficient in right.items():
@@ -258,6 +296,10 @@ class Tape(Graph):
         if all(self.nodes[i][0] == "constant" for i in operands):
             return self._fold(op, operands, attribute)
         return self._written(op, operands, attribute, self._kind(op, operands, attribute))
+
+    def apply_all(self, op: str, *columns: list[int], attribute=None) -> list[int]:
+        """`apply` for many operands."""
+        return [self.apply(op, *operands, attribute=attribute) for operands in zip(*columns, strict=True)]
 
     def power(self, a: int, exponent: int) -> int:
         """The scalar `a**exponent`, as one node."""

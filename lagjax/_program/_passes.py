@@ -4,11 +4,7 @@ import functools
 from collections import Counter
 from collections.abc import Callable
 
-from lagjax._program._graph import LONGEST, Graph, Node
-
-# Nodes of a graph beyond which passes change it in place: to compare all of its sums and products once more would take
-# longer than what it saves, less than a hundredth of its operations.
-MANY = 20_000
+from lagjax._program._graph import LONGEST, MANY, Graph, Node
 
 Line = tuple[tuple[Node, ...], tuple[str, ...], tuple[int, ...]]  # nodes, kinds and outputs
 
@@ -25,9 +21,9 @@ def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
         op, operands, _ = graph.nodes[i]
         if graph.kinds[i] != "float":
             return None
-        if op == "mul" and any(uses[x] == 1 and graph.nodes[x][0] == "mul" for x in operands):
+        if op == "mul" and any([uses[x] == 1 and graph.nodes[x][0] == "mul" for x in operands]):
             return _square_first(new, [moved(x, x) for x in _factors(graph, uses, i)])
-        if op in ("add", "sub") and 1 in (uses[x] for x in operands):
+        if op in ("add", "sub") and (uses[operands[0]] == 1 or uses[operands[1]] == 1):
             return _common_factor(new, op, *(moved(x, x) for x in operands))
         return None
 
@@ -86,6 +82,8 @@ def _square_first(graph, factors) -> int | None:
 
 def _common_factor(graph, op, a, b) -> int | None:
     """x (y ± z) for x y ± x z."""
+    if graph.nodes[a][0] not in ("mul", "neg") or graph.nodes[b][0] not in ("mul", "neg"):
+        return None
     (m, first), (n, second) = graph.term(a), graph.term(b)
     if graph.nodes[first][0] != "mul" or graph.nodes[second][0] != "mul" or first == second:
         return None

@@ -64,8 +64,8 @@ class Expansion:
         shape, size = arrays[0].shape, arrays[0].size
         self.work(size)
         self.traced_operations += size
-        apply, columns = self.graph.apply, zip(*(array.ravel().tolist() for array in arrays), strict=True)
-        return _ids([apply(op, *operands, attribute=attribute) for operands in columns], shape)
+        columns = (array.ravel().tolist() for array in arrays)
+        return _ids(self.graph.apply_all(op, *columns, attribute=attribute), shape)
 
     def fold(self, op: str, array: np.ndarray) -> np.ndarray:
         """`op` along the first axis, from the left."""
