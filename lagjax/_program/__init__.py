@@ -108,13 +108,16 @@ def lower_scalars(
     `function` is the function in JAX that it stands for, of arrays of these `shapes`. Where a `graph` is given, that of
     a program of the same inputs, the new one is added to it.
     """
-    expansion = Expansion(Graph(budget) if graph is None else graph)
+    added = graph is not None
+    expansion = Expansion(graph if added else Graph(budget))
     expansion.work(sum(shape.size for shape in shapes))
     arguments = inputs_of(expansion.graph, shapes)
     with np.errstate(all="ignore"):
         results = scalars(expansion, arguments)
     outputs = [i for result in results for i in result.ravel().tolist()]
-    graph, places = sink_negations(*factor(expansion.graph, outputs))
+    graph, places = expansion.graph, outputs
+    if not added:  # else what a new program consists of has been through this, and the rest would follow it
+        graph, places = sink_negations(*factor(graph, places))
     origin = Origin(graph, tuple(places)) if len(graph.nodes) > MANY else None
     line = eliminate_dead_code(graph, places)
     return Program(*line, expansion.traced_operations, function, shapes, budget, origin=origin)

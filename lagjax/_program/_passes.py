@@ -37,7 +37,8 @@ def _rewritten(graph, outputs, uses, node_of: Callable, make: Callable) -> tuple
     graph is made anew as a whole, so that everything in it is compared once more; to a large one nodes are added.
     """
     many = len(uses) - uses.count(0) > MANY
-    new, places = graph if many else Graph(2 * graph.budget), {}
+    new, places = graph if many else Graph(graph.budget), {}
+    new.budget += LONGEST * len(uses)  # what a pass writes anew and drops again is not what the budget is for
     for i in range(len(uses)):
         if not uses[i]:
             continue
