@@ -106,9 +106,9 @@ def dtype_of(x):
     An array of JAX has it already, and tells at a tenth of what `jnp.result_type` costs; a weak one does not. One of
     NumPy in double precision has it where JAX has doubles.
     """
-    if isinstance(x, jax.Array) and not x.weak_type:
+    if isinstance(x, jax.Array) and not getattr(x, "weak_type", True):  # arrays of random keys have no such attribute
         return x.dtype
-    if type(x) is np.ndarray and x.dtype == np.float64 and jax.config.jax_enable_x64:
+    if type(x) is np.ndarray and x.dtype == np.float64 == jax.dtypes.canonicalize_dtype(np.float64):
         return x.dtype
     return jnp.result_type(x)
 

@@ -195,6 +195,27 @@ def test_derivatives_of_each_family(family):
         np.testing.assert_allclose(values[name][0], expected, rtol=1e-13, atol=1e-13 * size, err_msg=name)
 
 
+AT_EDGES = {
+    "abs": jnp.abs, "sign": jnp.sign, "sqrt": jnp.sqrt, "relu": jax.nn.relu, "clip": lambda x: jnp.clip(x, -1.0, 1.0),
+    "clamp": lambda x: lax.clamp(0.0, x, 1.0), "max": lambda x: jnp.maximum(x, 0.0), "floor": jnp.floor,
+    "where": lambda x: jnp.where(x > 0, x, x**2), "norm": lambda x: jnp.linalg.norm(jnp.array([x, 0.0])),
+    "hypot": lambda x: jnp.hypot(x, 0.0), "x |x|": lambda x: x * jnp.abs(x), "asin": jnp.asin, "atanh": jnp.atanh,
+    "log": jnp.log, "reciprocal": lambda x: 1 / x, "sinc": jnp.sinc, "logsumexp": lambda x: jnp.logaddexp(x, 0.0),
+    "root of a square": lambda x: jnp.sqrt(x**2), "product": lambda x: jnp.prod(jnp.array([x, x, 0.0])),
+    **{f"x**{p}": lambda x, p=p: x**p for p in (-1, 0, 0.5, 1, 1.5, 2, 2.5, 3)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sweep(AT_EDGES, kept=("abs", "clamp", "max", "x**1.5", "root of a square")))
+def test_derivatives_at_edges_are_those_of_jax(name):
+    """Where a function has a kink, or ends, a derivative is a convention: also there both forms have the same."""
+    function, points = AT_EDGES[name], np.array([0.0, 1.0, -1.0, 0.5])
+    derivation = derivation_of(lagjax.System(lambda q, v: 0.5 * v**2 + function(q)), Layout.of(0.0, 0.0), None)
+    columns = [points, np.zeros(4), np.zeros(4)]
+    derived = derivation.evaluate(["lagrangian_by_q"], columns)["lagrangian_by_q"][:, 0]
+    np.testing.assert_allclose(derived, jax.vmap(jax.grad(function))(points), rtol=1e-15)
+
+
 # ---- mechanics ------------------------------------------------------------------------------------------------------
 
 

@@ -288,7 +288,8 @@ _ROWS = (
     # Pieces
     Operation(
         "abs", 1, np.abs, _intrinsic("fabs"), simplify=_even, exact=True, recurrence=_recurrences.absolute,
-        slopes=(lambda f, c, w, u: f("sign", u),), side=lambda f, c, w, u: f("ge", u, c(0.0)),
+        slopes=(lambda f, c, w, u: f("select", f("ge", u, c(0.0)), c(-1.0), c(1.0)),),  # at zero too, as in JAX
+        side=lambda f, c, w, u: f("ge", u, c(0.0)),
     ),
     Operation(
         "max", 2, np.maximum, _intrinsic("maximum"), simplify=_simplify.extremum, commutative=True, exact=True,

@@ -242,7 +242,9 @@ def _convert_element_type(expansion, params, x):
 
 @_lowers("clamp")
 def _clamp(expansion, params, low, x, high):
-    return expansion.map("min", expansion.map("max", x, low), high)
+    # Not min and max, whose derivatives at the bounds are a half where JAX has none.
+    above = expansion.map("select", expansion.map("le", x, low), x, low)
+    return expansion.map("select", expansion.map("ge", x, high), above, high)
 
 
 @_lowers("select_n")
