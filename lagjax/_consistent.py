@@ -27,7 +27,7 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
     That is: a constraint is not finite, or has no gradient; so many are independent that nothing can move; two of them
     contradict each other; or q0 or qdot0 is farther from one than `TOLERANCE` of its size.
     """
-    if not _has_constraints(system) or not _all_concrete((ts, q0, qdot0, params, system)):
+    if not has_constraints(system) or not _all_concrete((ts, q0, qdot0, params, system)):
         return
     names = system.constraint_names(layout, params)
     start = _start(system, layout, ts, q0, qdot0, params)
@@ -113,7 +113,7 @@ def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -
 
     `values` holds q0, qdot0 and params of the batch, `axes` which axis of each counts the members.
     """
-    if not _has_constraints(system) or not _all_concrete((ts, values, system)):
+    if not has_constraints(system) or not _all_concrete((ts, values, system)):
         return None
 
     t = jnp.asarray(ts[0])
@@ -161,7 +161,8 @@ def _compiled(system, layout: Layout, q, qdot, t, params: PyTree) -> dict[str, j
     return {name: values[name] for name in _ASKED}
 
 
-def _has_constraints(system) -> bool:
+def has_constraints(system) -> bool:
+    """Whether a motion of the scene can start off its constraints."""
     return system.constraints is not None or system.velocity_constraints is not None
 
 

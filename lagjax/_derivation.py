@@ -427,7 +427,9 @@ class _Structure(NamedTuple):
 
 
 def _structure_of(leaf):
-    return _Number(jnp.shape(leaf), np.dtype(dtype_of(leaf))) if eqx.is_array_like(leaf) else leaf
+    if type(leaf) is np.ndarray or eqx.is_array_like(leaf):
+        return _Number(np.shape(leaf), np.dtype(dtype_of(leaf)))
+    return leaf
 
 
 def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:

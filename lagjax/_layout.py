@@ -94,10 +94,13 @@ def _structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tup
             dtype = dtype_of(leaf)
         except (TypeError, ValueError):
             raise TypeError(f"{path} must be a real number or array; got {leaf!r}.") from None
-        if not jnp.issubdtype(dtype, jnp.floating):
+        if dtype != _DOUBLE and not jnp.issubdtype(dtype, jnp.floating):
             raise TypeError(f"{path} must hold real floating-point numbers; got {dtype} (write 1.0 instead of 1).")
         dtypes.append(dtype)
-    return paths, structure, tuple(jnp.shape(leaf) for leaf in leaves), dtypes
+    return paths, structure, tuple(np.shape(leaf) for leaf in leaves), dtypes
+
+
+_DOUBLE = np.dtype("float64")
 
 
 def dtype_of(x):
@@ -108,8 +111,8 @@ def dtype_of(x):
     """
     if isinstance(x, jax.Array) and not getattr(x, "weak_type", True):  # arrays of random keys have no such attribute
         return x.dtype
-    if type(x) is np.ndarray and x.dtype == np.float64 == jax.dtypes.canonicalize_dtype(np.float64):
-        return x.dtype
+    if type(x) is np.ndarray and x.dtype == _DOUBLE == jax.dtypes.canonicalize_dtype(_DOUBLE):
+        return _DOUBLE
     return jnp.result_type(x)
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax import _linear
-from lagjax._consistent import inconsistent_members, require_consistent
+from lagjax._consistent import has_constraints, inconsistent_members, require_consistent
 from lagjax._diffrax import Diffrax
 from lagjax._engine import asked_for, choose
 from lagjax._failures import raise_where_failed, sentence
@@ -108,11 +108,15 @@ def simulate(
     layout = Layout.of(q0, qdot0)
     asked = asked_for(solver, dt, adjoint, progress, rtol, atol)
     problem = Problem.of(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
-    q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
-    require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
+    if has_constraints(system):
+        q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
+        require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
     engine = choose(problem, asked).engine
-    trajectory = _trajectory(problem, engine, engine.solve(problem), problem.params)
-    return raise_unless_ok(trajectory, layout) if throw else trajectory
+    solution = engine.solve(problem)
+    trajectory = _trajectory(problem, engine, solution, problem.params)
+    if not throw or (isinstance(solution.result, np.integer) and solution.result in ENDED_WELL):
+        return trajectory
+    return raise_unless_ok(trajectory, layout)
 
 
 def simulate_batch(

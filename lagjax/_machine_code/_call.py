@@ -83,16 +83,15 @@ def _ended_well(begun: _native.Begun):
 
 
 def _register() -> None:
-    """Make the handler, and tell XLA about it; once."""
+    """Tell XLA about the handler; once."""
     with _lock:
-        _handler()
+        _registered()
 
 
 @functools.cache
-def _handler() -> _native.Handler:
-    handler = _native.Handler()
-    jax.ffi.register_ffi_target(_TARGET, _capsule(handler.address), platform="cpu", api_version=1)
-    return handler
+def _registered() -> None:
+    capsule = _capsule(_native.handler().address)
+    jax.ffi.register_ffi_target(_TARGET, capsule, platform="cpu", api_version=1)
 
 
 def _capsule(address: int):

@@ -175,6 +175,8 @@ class Flow:
         if store is not None:
             ticket = store.keep(self._compact(done.table, room, done.steps, rtol))
         solution = Solution(*done[:3], result, done.steps, done.rejected, event, ticket, done.idle)
+        if (result == SUCCESSFUL).all():
+            return solution
         again, flow, tolerances = self._second_chance(result, tolerances)
         if not again.any():
             return solution
@@ -217,8 +219,6 @@ class Flow:
         dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇, or allow no step from
         there. The kernel takes such steps again; where that does not help, steps of other sizes all along may.
         """
-        if (result == SUCCESSFUL).all():
-            return np.zeros(len(result), bool), self, tolerances
         given_up = np.isin(result, _GIVEN_UP)
         if given_up.any() and (general := self.general()) is not None:
             return given_up, general, tolerances

@@ -32,12 +32,12 @@ from lagjax._native._constants import (
     SINGULAR,
     STEP_TOO_SMALL,
 )
-from lagjax._native._handler import Handler, Plan, unavailable
+from lagjax._native._handler import Plan, handler, unavailable
 from lagjax._native._kernel import Begun, Guards, Kernel, Outcome, Projection, cores, order_for, recurrences
 from lagjax._native._series import is_large
 
 __all__ = [
     "DISCONTINUOUS", "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "STEP_TOO_SMALL",
-    "Begun", "Guards", "Handler", "Kernel", "Outcome", "Plan", "Projection", "cores", "is_large", "order_for",
+    "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "cores", "handler", "is_large", "order_for",
     "recurrences", "unavailable",
 ]  # fmt: skip

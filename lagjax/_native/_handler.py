@@ -2,15 +2,18 @@
 
 XLA calls a handler with a frame, in which are the addresses of the arguments, of the results and of one attribute: that
 of a `Plan`, which says whose machine code is to run, how and how far. One handler serves all kernels. It never waits:
-it begins a run, does as many rounds as take a slice of time, and leaves behind what is needed to go on (`REST`). Who
-asked for it looks at that, and at how members ended; all that is rare stays in Python.
+it begins a run, does as many rounds as take a slice of time, and leaves behind what is needed to go on (`Rest`). Who
+asked for it looks at that, and at how members ended; all that is rare stays in Python. Outside of XLA a `Kernel` begins
+in the same way, with one call.
 
 Layouts of structures are those of `xla/ffi/api/c_api.h`, on 64 bits. `unavailable` compares them with the header that
 came with the XLA at hand.
 """
 
 import ctypes
+import functools
 import re
+import threading
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -105,6 +108,16 @@ class Rest(NamedTuple):
         memory[: layout.size] = array[skipped : skipped + layout.size]
         return cls(memory, lanes, integers[-3:-2], integers[-2:-1])
 
+    @staticmethod
+    def more(array: np.ndarray) -> bool:
+        """Whether more is to be done, from what a handler wrote."""
+        return bool(array[-1:].view(np.int64)[0])
+
+    @staticmethod
+    def idle_of(array: np.ndarray) -> int:
+        """The steps that lanes stood empty for, from what a handler wrote."""
+        return int(array[-3:-2].view(np.int64)[0])
+
 
 _CACHE_LINE = 8  # doubles, with which a vector is to begin
 _OTHERS = 4  # integers after those of the lanes
@@ -125,99 +138,125 @@ RESULTS = ("path", "y_end", "t_end", "code", "steps", "rejected", "rest")
 
 
 class Handler:
-    """The handler in machine code; `address` is where, as long as this object lives.
+    """Two functions in machine code, for as long as this object lives: `address` is where XLA's handler is.
 
     Its arguments are `ts` (1 or N, T), `y0` (N, 2n) and `params` (1 or N, P), its results `path` (N, T, 2n), `y_end`
     (N, 2n), then `t_end`, `code`, `steps` and `rejected`, each (N,), and the `rest` of the run (`Rest.size`), all of
     doubles. `path` is NaN where a member did not come.
+
+    `begin` does the same for Python: it takes the addresses of a plan, of the arguments and of the results, then N, T
+    and how many rows `ts` and `params` have.
     """
 
     def __init__(self):
         module = ir.Module("handler")
         module.triple = ""
-        _Builder(module).build()
-        self._engine, places = compiled(module, ("handler",))
-        self.address = places["handler"]
+        _handler_function(module, _Run(module).code)
+        self._engine, places = compiled(module, ("handler", "begin_run"))
+        self.address, pointers = places["handler"], 1 + len(ARGUMENTS) + len(RESULTS)
+        kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_int64] * 4)
+        self.begin = kind(places["begin_run"])
 
 
-class _Builder:
-    """Writes the handler down: `XLA_FFI_Error* handler(XLA_FFI_CallFrame*)`."""
+_lock = threading.Lock()
+
+
+def handler() -> Handler:
+    """The one of this process."""
+    with _lock:
+        return _made()
+
+
+@functools.cache
+def _made() -> Handler:
+    return Handler()
+
+
+# ---- XLA's side ------------------------------------------------------------------------------------------------------
+
+
+def _handler_function(module: ir.Module, begin_run: Code) -> None:
+    """`XLA_FFI_Error* handler(XLA_FFI_CallFrame*)`, which reads the frame."""
+    code, null = Code(module, "handler", [POINTER], lanes(), result=POINTER, public=True), ir.Constant(POINTER, None)
+    (frame,) = code.arguments
+    extension = _at(frame, _EXTENSION, POINTER)
+    with code.builder.if_then(code.builder.icmp_unsigned("!=", extension.it, null)):
+        _tell_version(code, extension)
+        code.builder.ret(null)
+    args, rets, attrs = (_at(frame, offset, POINTER) for offset in (_ARGS, _RETS, _ATTRS))
+    plan = _at(_at(_element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
+    buffers = [_element(args, i) for i in range(len(ARGUMENTS))] + [_element(rets, i) for i in range(len(RESULTS))]
+    ts, y0, params = (_at(buffer, _DIMS, POINTER) for buffer in buffers[: len(ARGUMENTS)])
+    sizes = _at(y0, 0, INTEGER), _at(ts, 8, INTEGER), _at(ts, 0, INTEGER), _at(params, 0, INTEGER)
+    code.call(begin_run, plan, *(_at(buffer, _DATA, POINTER) for buffer in buffers), *sizes)
+    code.builder.ret(null)
+
+
+def _tell_version(code: Code, extension: Value) -> None:
+    """XLA asks once, when the handler is registered, for which version of the interface it was written."""
+    metadata, short = _at(extension, _METADATA, POINTER), ir.IntType(32)
+    for offset, number in ((_MAJOR, MAJOR), (_MINOR, MINOR), (_TRAITS, 0)):
+        code.builder.store(ir.Constant(short, number), _address(metadata, offset).it)
+    code.store(code.as_value(0, INTEGER), _address(metadata, _STATE_TYPE))  # a handler without state
+
+
+def _address(base: Value, offset: int) -> Value:
+    """A place so many bytes behind another."""
+    return base.code.element(base, offset, ir.IntType(8))
+
+
+def _at(base: Value, offset: int, kind: ir.Type) -> Value:
+    """The value there."""
+    return base.code.load(_address(base, offset), kind)
+
+
+def _element(array: Value, index: int) -> Value:
+    """An element of an array of pointers."""
+    return array.code.load(array.code.element(array, index, POINTER), POINTER)
+
+
+# ---- the run ---------------------------------------------------------------------------------------------------------
+
+
+class _Run:
+    """Writes down `begin_run(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
 
     def __init__(self, module: ir.Module):
-        self.code = Code(module, "handler", [POINTER], lanes(), result=POINTER, public=True)
-        self.null = ir.Constant(POINTER, None)
+        kinds = [POINTER] * (1 + len(ARGUMENTS) + len(RESULTS)) + [INTEGER] * 4
+        self.code = Code(module, "begin_run", kinds, lanes(), public=True)
+        plan, *pointers, members, times, rows_of_ts, rows_of_params = self.code.arguments
+        self.plan, data = plan, dict(zip((*ARGUMENTS, *RESULTS), pointers, strict=True))
+        self._run(data, members, times, rows_of_ts, rows_of_params)
+        self.code.finish()
 
-    def build(self) -> None:
-        code, (frame,) = self.code, self.code.arguments
-        extension = self._at(frame, _EXTENSION, POINTER)
-        with code.builder.if_then(code.builder.icmp_unsigned("!=", extension.it, self.null)):
-            self._tell_version(extension)
-            code.builder.ret(self.null)
-        self._integrate(frame)
-        code.builder.ret(self.null)
-
-    # ---- memory ----
-
-    def _address(self, base: Value, offset: int) -> Value:
-        """A place so many bytes behind another."""
-        return self.code.element(base, offset, ir.IntType(8))
-
-    def _at(self, base: Value, offset: int, kind: ir.Type) -> Value:
-        """The value there."""
-        return self.code.load(self._address(base, offset), kind)
-
-    def _element(self, array: Value, index: int) -> Value:
-        """An element of an array of pointers."""
-        return self.code.load(self.code.element(array, index, POINTER), POINTER)
-
-    def _plan(self, plan: Value, name: str, kind: ir.Type = INTEGER) -> Value:
-        return self._at(plan, getattr(Plan, name).offset, kind)
-
-    # ---- what XLA asks for ----
-
-    def _tell_version(self, extension: Value) -> None:
-        """XLA asks once, when the handler is registered, for which version of the interface it was written."""
-        code, metadata, short = self.code, self._at(extension, _METADATA, POINTER), ir.IntType(32)
-        for offset, number in ((_MAJOR, MAJOR), (_MINOR, MINOR), (_TRAITS, 0)):
-            code.builder.store(ir.Constant(short, number), self._address(metadata, offset).it)
-        code.store(code.as_value(0, INTEGER), self._address(metadata, _STATE_TYPE))  # a handler without state
-
-    def _integrate(self, frame: Value) -> None:
-        code = self.code
-        args, rets, attrs = (self._at(frame, offset, POINTER) for offset in (_ARGS, _RETS, _ATTRS))
-        plan = self._at(self._at(self._element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
-        buffers = {name: self._element(args, i) for i, name in enumerate(ARGUMENTS)}
-        buffers |= {name: self._element(rets, i) for i, name in enumerate(RESULTS)}
-        data = {name: self._at(buffer, _DATA, POINTER) for name, buffer in buffers.items()}
-        dims = {name: self._at(buffers[name], _DIMS, POINTER) for name in (*ARGUMENTS, "rest")}
-        members, times = self._at(dims["y0"], 0, INTEGER), self._at(dims["ts"], 8, INTEGER)
-        states, numbers = self._plan(plan, "states"), self._plan(plan, "numbers")
-
-        def stride(name: str, count: Value) -> Value:
-            return code.select(self._at(dims[name], 0, INTEGER) > 1, count, 0)
-
+    def _run(self, data: dict[str, Value], members: Value, times: Value, rows_of_ts: Value, rows_of_params: Value):
+        code, of_plan = self.code, self._of_plan
+        states, numbers = of_plan("states"), of_plan("numbers")
         with code.loop(members * times * states) as i:
             code.store(code.as_value(float("nan"), DOUBLE), code.element(data["path"], i))
-        memory, integers = self._rest(data.pop("rest"), self._at(dims["rest"], 0, INTEGER), plan)
+        memory, integers = self._rest(data.pop("rest"))
         width = len(LANE) * code.lanes
         idle, next_member, more = (code.element(integers, width + i, INTEGER) for i in (1, 2, 3))
         fields: dict[str, Any] = dict.fromkeys((name for name, _ in JOB._fields_), 0) | data
-        fields |= {name: self._plan(plan, name) for name in ("order", "max_steps")}
-        fields |= {name: self._plan(plan, name, DOUBLE) for name in ("rtol", "atol")}
+        fields |= {name: of_plan(name) for name in ("order", "max_steps")}
+        fields |= {name: of_plan(name, DOUBLE) for name in ("rtol", "atol")}
         fields |= dict(members=members, times=times, next_member=next_member)
-        fields |= dict(ts_stride=stride("ts", times), params_stride=stride("params", numbers))
+        fields |= dict(ts_stride=code.select(rows_of_ts > 1, times, 0))
+        fields |= dict(params_stride=code.select(rows_of_params > 1, numbers, 0))
         job = self._job(fields)
-        begin, run = (self._plan(plan, name) for name in ("begin", "run"))
-        self._call(begin, ir.VoidType(), job, memory, integers)
-        code.store(self._call(run, INTEGER, job, memory, integers, idle, self._plan(plan, "rounds")), more)
+        self._call(of_plan("begin"), ir.VoidType(), job, memory, integers)
+        code.store(self._call(of_plan("run"), INTEGER, job, memory, integers, idle, of_plan("rounds")), more)
 
-    def _rest(self, rest: Value, size: Value, plan: Value) -> tuple[Value, Value]:
+    def _of_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
+        return _at(self.plan, getattr(Plan, name).offset, kind)
+
+    def _rest(self, rest: Value) -> tuple[Value, Value]:
         """The memory of the thread, of zeros and on the boundary of a cache line, and the integers, of zeros."""
-        code, size_of_memory = self.code, self._plan(plan, "memory")
+        code, size_of_memory = self.code, self._of_plan("memory")
         address = Value(code, code.builder.ptrtoint(rest.it, INTEGER))
         bytes_left = Value(code, code.builder.and_((0 - address).it, ir.Constant(INTEGER, 8 * _CACHE_LINE - 1)))
         skipped = bytes_left / 8
-        memory, integers = code.element(rest, skipped), code.element(rest, size - _integers(code.lanes))
+        memory, integers = code.element(rest, skipped), code.element(rest, size_of_memory + _CACHE_LINE)
         with code.loop(size_of_memory / code.lanes) as i:
             code.store(code.lanes_of(0.0), code.element(memory, i * code.lanes))
         with code.loop(code.as_value(_integers(code.lanes), INTEGER)) as i:

@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import itertools
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -13,7 +14,7 @@ from llvmlite import ir
 from lagjax._native._adjoint import Adjoint
 from lagjax._native._constants import DONE, LEAST_ORDER, MAX_ORDER, VECTORS_PER_THREAD
 from lagjax._native._frame import LANE, Layout
-from lagjax._native._handler import Plan, Rest, aligned
+from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled
 from lagjax._native._threads import FIRST_ROUNDS, SLICE, in_slices, together
@@ -104,6 +105,7 @@ class Kernel:
         motion = integrator.motion
         self.states, self.numbers, self.width = motion.states, motion.numbers, motion.width
         self._forward = _Compiled(motion.module, motion.layout, integrator.job, pointers=4)
+        self.rest_size = Rest.size(motion.layout)  # the doubles of the `rest` that a handler leaves behind
 
     def __call__(
         self, ts, y0, params, rtol: float, atol: float, max_steps: int, room=None, begun: Begun | None = None
@@ -115,13 +117,18 @@ class Kernel:
         """
         ts, y0, params = _contiguous(ts, y0, params)
         members, times = len(y0), ts.shape[1]
+        if begun is not None:
+            begun = Begun(*(np.array(x, np.float64) for x in begun))
+        elif room is None and self.threads(members) == 1:
+            begun = self._begun(ts, y0, params, self.plan(rtol, atol, max_steps))
         if begun is None:
-            rest, path = None, np.full((members, times, self.states), np.nan)
-            y_end, t_end = np.empty((members, self.states)), np.empty(members)
-            code, steps, rejected = (np.empty(members) for _ in range(3))
+            path, y_end = np.full((members, times, self.states), np.nan), np.empty((members, self.states))
+            t_end, code, steps, rejected = np.empty((4, members))
         else:
-            rest = Rest.of(begun.rest, self._forward.layout)
-            path, y_end, t_end, code, steps, rejected = (np.array(x, np.float64) for x in begun[:-1])
+            path, y_end, t_end, code, steps, rejected, rest = begun
+            if not Rest.more(rest):
+                return _outcome(path, y_end, t_end, code, steps, rejected, Rest.idle_of(rest), None)
+        rest = None if begun is None else Rest.of(begun.rest, self._forward.layout)
         table = first_step = None
         if room is not None:
             first_step = np.concatenate([[0], np.cumsum(room)]).astype(np.int64)
@@ -136,12 +143,19 @@ class Kernel:
             recording=table is not None, rtol=rtol, atol=atol,
         )  # fmt: skip
         idle = self._forward(arrays, numbers, self.threads(members) if rest is None else 1, rest)
-        ended_badly = code != DONE
-        if ended_badly.any():  # a start that is infinite was not reached either
-            reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
-            path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
-        code, steps, rejected = (counts.astype(int) for counts in (code, steps, rejected))
-        return Outcome(path, y_end, t_end, code, steps, rejected, idle, table)
+        return _outcome(path, y_end, t_end, code, steps, rejected, idle, table)
+
+    def _begun(self, ts, y0, params, plan: Plan) -> Begun:
+        """What few members come to in a slice of time, by one call of machine code."""
+        members, times, states = len(y0), ts.shape[1], self.states
+        block, ends = np.empty(members * (times * states + states + 4) + self.rest_size), [0]
+        for size in (members * times * states, members * states, *[members] * 4, self.rest_size):
+            ends.append(ends[-1] + size)
+        first, arguments = block.ctypes.data, (x.ctypes.data for x in (ts, y0, params))
+        results = (first + 8 * end for end in ends[:-1])
+        handler().begin(ctypes.addressof(plan), *arguments, *results, members, times, len(ts), len(params))
+        path, y_end, *others = (block[begin:end] for begin, end in itertools.pairwise(ends))
+        return Begun(path.reshape(members, times, states), y_end.reshape(members, states), *others)
 
     def vjp(self, ts, params, table, first, counts, path_ct, y_ct, order: int) -> tuple[np.ndarray, np.ndarray]:
         """The transposed derivative of a run, over the steps it wrote down.
@@ -171,11 +185,6 @@ class Kernel:
             begin, run, self._forward.layout.size, self.states, self.numbers, order_for(rtol), max_steps, rounds, rtol,
             atol,
         )  # fmt: skip
-
-    @property
-    def rest_size(self) -> int:
-        """The doubles of the `rest` that a handler leaves behind."""
-        return Rest.size(self._forward.layout)
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
@@ -226,6 +235,16 @@ class _Compiled:
             return int(idle[0])
 
         return together(work, threads)
+
+
+def _outcome(path, y_end, t_end, code, steps, rejected, idle: int, table) -> Outcome:
+    """What is in the arrays when all is done; NaN in the path where a member did not come."""
+    ended_badly = code != DONE
+    if ended_badly.any():  # a start that is infinite was not reached either
+        reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
+        path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
+    counts = (numbers.astype(int) for numbers in (code, steps, rejected))
+    return Outcome(path, y_end, t_end, *counts, idle, table)
 
 
 def _contiguous(*arrays) -> list[np.ndarray]:
