@@ -17,12 +17,12 @@ from lagjax._native._frame import LANE, Layout
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled
-from lagjax._native._threads import FIRST_ROUNDS, SLICE, in_slices, together
+from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._graph import Unlowerable
 from lagjax._program._series import Recurrent, Series, series
 
-# A round of the largest programs takes 0.5 ms, one of small ones less than this would have it: how long a handler runs,
-# which nobody can interrupt, need not be known better than that.
+# What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
+# It decides how long the first slice is, which nobody needs to know well.
 _SECONDS_AN_OPERATION = 1e-7
 
 
@@ -104,7 +104,8 @@ class Kernel:
         integrator = Integrator(*self._parts, guards, error_groups, base_size)
         motion = integrator.motion
         self.states, self.numbers, self.width = motion.states, motion.numbers, motion.width
-        self._forward = _Compiled(motion.module, motion.layout, integrator.job, pointers=4)
+        self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
+        self._forward = _Compiled(motion.module, motion.layout, integrator.job, self._rounds, pointers=4)
         self.rest_size = Rest.size(motion.layout)  # the doubles of the `rest` that a handler leaves behind
 
     def __call__(
@@ -178,19 +179,15 @@ class Kernel:
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
         """What a handler needs to begin a run; for as long as this kernel lives."""
-        operations = len(self._parts[0].line.nodes)
-        rounds = max(FIRST_ROUNDS, int(SLICE / (_SECONDS_AN_OPERATION * operations)))
         begin, run = self._forward.places
-        return Plan(
-            begin, run, self._forward.layout.size, self.states, self.numbers, order_for(rtol), max_steps, rounds, rtol,
-            atol,
-        )  # fmt: skip
+        size, rounds = self._forward.layout.size, self._forward.rounds
+        return Plan(begin, run, size, self.states, self.numbers, order_for(rtol), max_steps, rounds, rtol, atol)
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
         """The transpose, compiled when it is first asked for."""
         adjoint = Adjoint(*self._parts)
-        return _Compiled(adjoint.motion.module, adjoint.motion.layout, adjoint.job, pointers=3)
+        return _Compiled(adjoint.motion.module, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
 
     def _strides(self, ts, params) -> dict[str, int]:
         return dict(
@@ -203,9 +200,13 @@ class Kernel:
 
 
 class _Compiled:
-    """The functions `begin` and `run` of a module: all members of a job, on several threads."""
+    """The functions `begin` and `run` of a module: all members of a job, on several threads.
 
-    def __init__(self, module: ir.Module, layout: Layout, job: Callable, pointers: int):
+    `rounds` is how many of them a slice has at first.
+    """
+
+    def __init__(self, module: ir.Module, layout: Layout, job: Callable, rounds: int, pointers: int):
+        self.rounds = rounds
         self.layout, self._job, self._counts_idle = layout, job, pointers == 4
         # The engine holds the code that the others point to.
         self._engine, at = compiled(module, ("begin", "run"))
@@ -231,7 +232,7 @@ class _Compiled:
                 self._begin(*mine)
             if self._counts_idle:
                 mine.append(idle.ctypes.data)
-            in_slices(functools.partial(self._run, *mine), stopped)
+            in_slices(functools.partial(self._run, *mine), stopped, self.rounds)
             return int(idle[0])
 
         return together(work, threads)

@@ -15,12 +15,13 @@ import time
 from collections.abc import Callable
 
 SLICE = 0.03  # seconds, more or less: a tenth of what a hand at the keyboard notices, a thousand times what it costs
-FIRST_ROUNDS = 256  # of the first slice, the only one of a short run; a round of the largest programs takes 0.5 ms
 
 
-def in_slices(run: Callable[[int], int], stopped: Callable[[], bool]) -> None:
-    """Call `run(rounds)` until it returns 0, or until `stopped()`; with as many rounds as take about a `SLICE`."""
-    rounds = FIRST_ROUNDS
+def in_slices(run: Callable[[int], int], stopped: Callable[[], bool], rounds: int) -> None:
+    """Call `run(rounds)` until it returns 0, or until `stopped()`; with as many rounds as take about a `SLICE`.
+
+    The first time with as many as are given here.
+    """
     while not stopped():
         begin = time.perf_counter()
         if not run(rounds):
