@@ -133,8 +133,8 @@ def aligned(size: int) -> np.ndarray:
     return memory[(-memory.ctypes.data // 8) % _CACHE_LINE :]
 
 
-ARGUMENTS = ("ts", "y0", "params")
-RESULTS = ("path", "y_end", "t_end", "code", "steps", "rejected", "rest")
+ARGUMENTS: tuple[str, ...] = ("ts", "y0", "params")
+RESULTS: tuple[str, ...] = ("path", "y_end", "t_end", "code", "steps", "rejected", "rest")
 
 
 class Handler:

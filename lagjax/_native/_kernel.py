@@ -6,7 +6,7 @@ import itertools
 import math
 import os
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -47,15 +47,18 @@ class Outcome(NamedTuple):
 
 
 class Begun(NamedTuple):
-    """A run as a handler left it: its results (`_handler.Handler`), some of which may not be written yet."""
+    """A run as a handler left it: its results (`_handler.Handler`), some of which may not be written yet.
 
-    path: np.ndarray
-    y_end: np.ndarray
-    t_end: np.ndarray
-    code: np.ndarray
-    steps: np.ndarray
-    rejected: np.ndarray
-    rest: np.ndarray
+    Arrays of NumPy, or of JAX in what XLA compiles.
+    """
+
+    path: Any
+    y_end: Any
+    t_end: Any
+    code: Any
+    steps: Any
+    rejected: Any
+    rest: Any
 
 
 class Guards(NamedTuple):
@@ -244,8 +247,8 @@ def _outcome(path, y_end, t_end, code, steps, rejected, idle: int, table) -> Out
     if ended_badly.any():  # a start that is infinite was not reached either
         reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
         path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
-    counts = (numbers.astype(int) for numbers in (code, steps, rejected))
-    return Outcome(path, y_end, t_end, *counts, idle, table)
+    code, steps, rejected = (numbers.astype(int) for numbers in (code, steps, rejected))
+    return Outcome(path, y_end, t_end, code, steps, rejected, idle, table)
 
 
 def _contiguous(*arrays) -> list[np.ndarray]:
