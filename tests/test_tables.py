@@ -102,13 +102,15 @@ def everything(x, y, s):
     return x, y, s, jnp.cos(angle), jnp.where(x[0] > 0, x, y), x[0] > y[0], jnp.ones(2), jnp.sqrt(1 + y * y), x[:2]
 
 
-@pytest.mark.parametrize("window", [1, 40, 10**6])
-def test_a_schedule_computes_the_program(window, monkeypatch):
+@pytest.mark.parametrize(("window", "stored"), [(1, 0), (40, 9), (10**6, 30)])
+def test_a_schedule_computes_the_program(window, stored, monkeypatch):
     monkeypatch.setattr(_schedule, "WINDOW", window)
     program = lower(everything, jnp.ones(7), jnp.ones(7), 1.0)
     numbers = np.random.default_rng(0).uniform(0.5, 1.5, 15)
-    plan, memory = _schedule.schedule(program.line), {}
-    node_at = {node: ("slot", slot) for node, slot in plan.slots.items()}
+    plan, memory = _schedule.schedule(program.line, stored), {}
+    count, nodes = len(program.line.outputs), len(program.line.nodes)
+    node_at = {nodes + k: ("slot", plan.size + k) for k in range(count)}  # what is stored, behind the slots
+    node_at |= {node: ("slot", slot) for node, slot in plan.slots.items()}
     for node, position in plan.inputs.items():
         node_at[node] = "input", position
         memory[node_at[node]] = numbers[position]
@@ -118,7 +120,7 @@ def test_a_schedule_computes_the_program(window, monkeypatch):
 
     def results(kind, operands):
         xs = [next(operands) if part is None else results(part, operands)[0] for part in kind.parts]
-        if kind.op == "copy":
+        if kind.op in ("copy", "store"):
             return xs
         if kind.op == "sincos":
             return [np.sin(xs[0]), np.cos(xs[0])]
@@ -130,14 +132,15 @@ def test_a_schedule_computes_the_program(window, monkeypatch):
             values = results(plan.kinds[kind], iter([memory[node_at[x]] for x in operands]))
             made |= {node_at[x]: value for x, value in zip(nodes, values, strict=True) if x >= 0}
         memory |= made
-    found = [memory["slot", k] for k in range(len(program.line.outputs))]
+    found = [memory["slot", k if k < plan.staying else plan.size + k] for k in range(count)]
+    assert plan.staying == count - stored
     np.testing.assert_allclose(np.array(found, float), np.array(program.evaluate(*numbers), float), rtol=1e-14)
     assert plan.size < len(program.line.nodes) / 2  # slots are used again
 
 
 def test_what_comes_often_is_one_operation():
     program = lower(everything, jnp.ones(7), jnp.ones(7), 1.0)
-    plan = _schedule.schedule(program.line)
+    plan = _schedule.schedule(program.line, 0)
     done = [operation for group in plan.groups for operation in group]
     assert len(done) < 0.8 * program.operations
     assert max(plan.kinds[operation.kind].operands for operation in done) > 3

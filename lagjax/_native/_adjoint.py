@@ -248,13 +248,12 @@ class Adjoint:
         accelerations_ct = Vectors(n, lambda i: frame["y_ct", i + n, k + 1] * inverse)
         rows_ct, rows = frame.vectors("rows_ct", series.rows), Vectors(series.rows, lambda i: frame["rows", i, k])
         inputs = self.motion.at_order(frame, k)
-        out = form.run(frame, self.order_recursion, *inputs, accelerations_ct, rows_ct, rows)
+        sums_ct = frame.vectors_at("sums", len(series.cauchy_products), k, by_row=True)
+        out = form.run(frame, self.order_recursion, *inputs, accelerations_ct, rows_ct, rows, to=sums_ct)
         for i in form.each(code, self.states):
             _add(frame, out[i], "y_ct", i, k)
         for i in form.each(code, series.values):
             _add(frame, out[i + self.states], "values_ct", i)
-        for i in form.each(code, len(series.cauchy_products)):
-            frame["sums", *self.motion.sum_indices(i, k)] = out[i + (self.states + series.values)]
         return frame.finish()
 
     def _back_start(self) -> Code:

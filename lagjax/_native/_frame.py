@@ -87,13 +87,15 @@ class Layout:
 class Vectors:
     """So many vectors in a row, as a list of them would be: `read(i)` gives one, and `write(i, x)` sets it.
 
-    `place(i)` tells where vector i lies, counted in doubles from the beginning of the thread's memory, if it is known.
+    `place(i)` tells where vector i lies, counted in doubles from the beginning of the thread's memory, if it is known;
+    or where it would lie if `shift` were zero.
     """
 
     count: int
     read: Callable[[Index], Value]
     write: "Callable[[Index, Value], None] | None" = None
     place: "Callable[[int], int] | None" = None
+    shift: "Value | None" = None
 
     def __len__(self) -> int:
         return self.count
@@ -139,6 +141,21 @@ class Frame:
             self[name, *place(i)] = x
 
         return Vectors(count, lambda i: self[name, *place(i)], write, where)
+
+    def vectors_at(self, name: str, count: int, k: Value, by_row: bool = False) -> Vectors:
+        """Column k of a field, from the first row on; or row k, from the first column on."""
+
+        def index(i):
+            return (k, i) if by_row else (i, k)
+
+        def write(i, x):
+            self[name, *index(i)] = x
+
+        first = (0, 1) if not by_row else (1, 0)
+        stride = self.layout.place(name, *first) - self.layout.place(name, 0, 0)
+        assert isinstance(stride, int)
+        place = self.vectors(name, count, (lambda i: (0, i)) if by_row else (lambda i: (i, 0))).place
+        return Vectors(count, lambda i: self[name, *index(i)], write, place, k * stride)
 
     def constant(self, x: float) -> Value:
         """A vector with one number in every lane."""

@@ -23,8 +23,13 @@ class Lines:
     def __init__(self, sincos: Code):
         self._sincos = sincos
 
-    def run(self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors") -> list[Value]:
-        """The outputs of a program, of which these are the inputs, one after the other; a bool is 1 or 0."""
+    def run(
+        self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors", to: "Vectors | None" = None
+    ) -> list[Value]:
+        """The outputs of a program, of which these are the inputs, one after the other; a bool is 1 or 0.
+
+        The last outputs go `to` some other place as well.
+        """
         parts = [(values, i) for values in inputs for i in range(len(values))]
 
         def read(position):
@@ -33,7 +38,10 @@ class Lines:
 
         out = emit(frame.code, line, read, self._sincos)
         kinds = (line.kinds[i] for i in line.outputs)
-        return [frame.code.as_double(x) if kind == "bool" else x for x, kind in zip(out, kinds, strict=True)]
+        out = [frame.code.as_double(x) if kind == "bool" else x for x, kind in zip(out, kinds, strict=True)]
+        for i in range(0 if to is None else len(to)):
+            to[i] = out[len(out) - len(to) + i]
+        return out
 
     def each(self, code: Code, count: int) -> Iterator[int]:
         """The numbers from 0 to `count`, for a body that is written down for each of them."""

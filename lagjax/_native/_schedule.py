@@ -52,30 +52,36 @@ class Schedule(NamedTuple):
     """A program in the order in which it runs.
 
     Every group holds operations of one of the `kinds`. Node i lies in slot `slots[i]`, of which there are `size`; the
-    outputs lie in the first slots, in their order. `inputs` gives the position of every node that is an input, and
+    outputs that are `staying` lie in the first slots, in their order, and the others are stored: of a program of N
+    nodes, output k is node N + k then, and has no slot. `inputs` gives the position of every node that is an input, and
     `constants` the number of one that is a number.
     """
 
     kinds: list[Kind]
     groups: list[list[Operation]]
     slots: dict[int, int]
+    staying: int
     size: int
     inputs: dict[int, int]
     constants: dict[int, float]
 
 
-def schedule(line: StraightLine) -> Schedule:
-    """The order of the operations that the outputs of a program need, and the slots of their results."""
+def schedule(line: StraightLine, stored: int) -> Schedule:
+    """The order of the operations that the outputs of a program need, and the slots of their results.
+
+    The last outputs, so many, are `stored` somewhere else as soon as they are there.
+    """
     nodes, uses = line.nodes, _uses(line)
     kinds = _Kinds()
     operations = _joined(_operations(line, uses, kinds), uses, kinds)
-    outputs, copies = _outputs(line, operations, kinds)
-    groups = _grouped(operations + copies)
-    slots, size = _slots(groups, outputs, len(line.outputs))
+    staying = len(line.outputs) - stored
+    outputs, copies = _outputs(line, operations, kinds, staying)
+    groups = _grouped(_in_order(operations, copies))
+    slots, size = _slots(groups, outputs, staying, len(nodes))
     live = [i for i, count in enumerate(uses) if count]
     inputs = {i: nodes[i][2] for i in live if nodes[i][0] == "input"}
     constants = {i: float(nodes[i][2]) for i in live if nodes[i][0] == "constant"}
-    return Schedule(kinds.all, groups, slots, size, inputs, constants)
+    return Schedule(kinds.all, groups, slots, staying, size, inputs, constants)
 
 
 # ---- operations ------------------------------------------------------------------------------------------------------
@@ -159,21 +165,39 @@ def _angles(line: StraightLine, uses: list[int]) -> dict[int, list[int]]:
     return pairs
 
 
-def _outputs(line: StraightLine, operations: list[Operation], kinds) -> tuple[dict[int, int], list[Operation]]:
-    """Which output every node is, and the copies for outputs that no operation makes, or that are an earlier one too.
+def _outputs(
+    line: StraightLine, operations: list[Operation], kinds: _Kinds, staying: int
+) -> tuple[dict[int, int], list[Operation]]:
+    """Which of the first outputs every node is; and the copies for those that no operation makes, or that are an
+    earlier output too, and for all other outputs.
 
     Of a program of N nodes, a copy for output k is node N + k.
     """
     made = {x for operation in operations for x in operation.results}
     outputs: dict[int, int] = {}
-    copies, copy = [], kinds.number("copy", None, ("float",), "float")
+    copies, copy, store = [], *(kinds.number(op, None, ("float",), "float") for op in ("copy", "store"))
     for k, i in enumerate(line.outputs):
-        if i in made and i not in outputs:
+        if k >= staying:
+            copies.append(Operation(store, (i,), (len(line.nodes) + k,)))
+        elif i in made and i not in outputs:
             outputs[i] = k
         else:
             outputs[len(line.nodes) + k] = k
             copies.append(Operation(copy, (i,), (len(line.nodes) + k,)))
     return outputs, copies
+
+
+def _in_order(operations: list[Operation], copies: list[Operation]) -> list[Operation]:
+    """The operations, each followed by the copies of its results."""
+    of: dict[int, list[Operation]] = {}
+    for copy in copies:
+        of.setdefault(copy.operands[0], []).append(copy)
+    ordered = []
+    for operation in operations:
+        ordered.append(operation)
+        for x in operation.results:
+            ordered += of.pop(x, [])
+    return [copy for some in of.values() for copy in some] + ordered  # those of inputs and numbers first
 
 
 # ---- what often comes together ---------------------------------------------------------------------------------------
@@ -324,16 +348,18 @@ def _edges(operations: list[Operation]) -> tuple[list[list[int]], list[int]]:
 # ---- slots -----------------------------------------------------------------------------------------------------------
 
 
-def _slots(groups: list[list[Operation]], outputs: dict[int, int], count: int) -> tuple[dict[int, int], int]:
+def _slots(
+    groups: list[list[Operation]], outputs: dict[int, int], count: int, nodes: int
+) -> tuple[dict[int, int], int]:
     """A slot for every result, the one that became free last first; inputs and constants have none here.
 
-    The `count` outputs come first and keep theirs. Results of a group get their slots before its operands give theirs
-    back: the group may read and write in any order.
+    The first `count` outputs come first and keep theirs, and what is stored, from node `nodes` on, has none. Results of
+    a group get their slots before its operands give theirs back: the group may read and write in any order.
     """
     slots, free, size = dict(outputs), [], count
     last = {x: g for g, group in enumerate(groups) for operation in group for x in operation.operands}
     for g, group in enumerate(groups):
-        for x in (x for operation in group for x in operation.results if x >= 0 and x not in slots):
+        for x in (x for operation in group for x in operation.results if 0 <= x < nodes and x not in slots):
             if not free:
                 free, size = [size], size + 1
             slots[x] = free.pop()

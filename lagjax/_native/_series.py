@@ -120,13 +120,11 @@ class Motion:
         """`(order)`: the series of the state, to that order, from its values."""
         frame = self.function("coefficients", INTEGER)
         code, (order,), series, n, form = frame.code, frame.arguments, self.series, self.n, self.form
-        out = form.run(frame, series.zeroth_order, *self.now(frame))
+        out = form.run(frame, series.zeroth_order, *self.now(frame), to=frame.vectors("values", series.values))
         frame["singular"] = out[n]
         for i in form.each(code, n):
             frame["y", i, 1] = frame["y", i + n]
             frame["y", i + n, 1] = out[i]
-        for i in form.each(code, series.values):
-            frame["values", i] = out[i + (n + 1)]
         for i in form.each(code, len(series.cauchy_products)):
             frame["sums", *self.sum_indices(i, integer(code, 1))] = 0.0
 
@@ -134,9 +132,8 @@ class Motion:
             with code.only_if(k > 1):
                 frame.call(self._sums, k)
             inverse = 1.0 / code.as_double(k + 1)
-            out = form.run(frame, series.order_recursion, *self.at_order(frame, k))
-            for row in form.each(code, series.rows):
-                frame["rows", row, k] = out[row + n]
+            rows = frame.vectors_at("rows", series.rows, k)
+            out = form.run(frame, series.order_recursion, *self.at_order(frame, k), to=rows)
             for i in form.each(code, n):
                 frame["y", i, k + 1] = frame["y", i + n, k] * inverse
                 frame["y", i + n, k + 1] = out[i] * inverse

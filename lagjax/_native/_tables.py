@@ -38,28 +38,40 @@ class Tables:
         self._constants: dict[bytes, int] = {}
         self._fields: list[str] = []
         self._schedules: dict[int, tuple[StraightLine, Schedule]] = {}  # by the program, which lives as long
-        self._execute: Frame = function("execute", POINTER)
+        self._execute: Frame = function("execute", POINTER, INTEGER)
         self._prepare: Frame = function("prepare")
         self._module, self._layout = self._execute.code.module, self._execute.layout
         self._nowhere = self._layout.place(self._field(1), 0)  # for results that nobody reads
 
     # ---- what a kernel is written with ----
 
-    def run(self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors") -> Vectors:
+    def run(
+        self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors", to: "Vectors | None" = None
+    ) -> Vectors:
         """The outputs of a program, of which these are the inputs, one after the other; a bool is 1 or 0.
 
-        They stay until this place of the kernel is passed again.
+        They stay until this place of the kernel is passed again. The last outputs go `to` some other place instead;
+        where the same program is run without one, nothing becomes of them.
         """
         if id(line) not in self._schedules:
-            self._schedules[id(line)] = line, schedule(line)
+            self._schedules[id(line)] = line, schedule(line, 0 if to is None else len(to))
         _, plan = self._schedules[id(line)]
         name, lying = self._field(plan.size), self._places(frame, inputs)
         places = {node: self._layout.place(name, slot) for node, slot in plan.slots.items()}
         places |= {node: self._constant(number) for node, number in plan.constants.items()}
         places |= {node: lying[position] for node, position in plan.inputs.items()}
-        words = [word for group in plan.groups for word in self._words(plan.kinds[group[0].kind], group, places)]
-        frame.call(self._execute.code, Value(frame.code, integers(self._module, np.array([*words, 0], np.int32))))
-        return frame.vectors(name, len(line.outputs))
+        if to is not None:
+            end = len(line.nodes) + len(line.outputs)
+            places |= {end - len(to) + i: to.place(i) for i in range(len(to))}
+        words: list[int] = []
+        for group in plan.groups:
+            kind = plan.kinds[group[0].kind]
+            if kind.op != "store" or to is not None:
+                words += self._words(kind, group, places)
+        table = Value(frame.code, integers(self._module, np.array([*words, 0], np.int32)))
+        shift = None if to is None else to.shift
+        frame.call(self._execute.code, table, frame.code.as_value(0 if shift is None else shift, INTEGER))
+        return frame.vectors(name, plan.staying)
 
     def each(self, code: Code, count: int) -> Iterator[Value]:
         """The numbers from 0 to `count`, for a body that is written down once, in a loop."""
@@ -131,7 +143,7 @@ class Tables:
         """Where every input lies; those without a place of their own are given one."""
         places: list[int] = []
         for values in inputs:
-            if getattr(values, "place", None) is None:
+            if getattr(values, "place", None) is None or values.shift is not None:
                 room = self.room(frame, len(values))
                 for i in self.each(frame.code, len(values)) if isinstance(values, Vectors) else range(len(values)):
                     room[i] = values[i]
@@ -156,9 +168,9 @@ class Tables:
     # ---- the code ----
 
     def _write_execute(self) -> None:
-        """`(table)`: run a program."""
+        """`(table, shift)`: run a program; what is stored lies so many doubles behind where the table says."""
         frame, code = self._execute, self._execute.code
-        (table,) = frame.arguments
+        table, shift = frame.arguments
         at = code.variable(table)
         head, end = (code.function.append_basic_block(name) for name in ("next", "end"))
         code.builder.branch(head)
@@ -173,7 +185,7 @@ class Tables:
                 where = [frame.at(_word(code, words, 1 + k * size + i)) for i in range(size)]
                 operands = (code.load(address, frame.vector) for address in where[: kind.operands])
                 for result, address in zip(self._results(kind, operands), where[kind.operands :], strict=True):
-                    code.store(result, address)
+                    code.store(result, code.element(address, shift) if kind.op == "store" else address)
             code.store(code.element(words, 1 + times * size, _WORD), at)
             code.builder.branch(head)
         code.builder.position_at_end(end)
@@ -183,7 +195,7 @@ class Tables:
         """The results of an operation, from those of the numbers that it reads; a bool is 1 or 0."""
         code = self._execute.code
         xs = [next(operands) if part is None else self._results(part, operands)[0] for part in kind.parts]
-        if kind.op == "copy":
+        if kind.op in ("copy", "store"):
             return (xs[0],)
         if kind.op == "sincos":
             return sines_and_cosines(code, self._sincos, xs[0])
