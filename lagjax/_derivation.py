@@ -131,15 +131,14 @@ class Derivation:
     def program(self, *names: str) -> Program:
         """The program for these of `Motion.quantities`, end to end, each in C order."""
         if names not in self._programs:
-            whole, starts = self._whole, self._starts
-            positions = [k for name in names for k in range(starts[name], starts[name] + self.count(name))]
+            positions = [k for name in names for k in self._positions(name)]
             structure = jax.tree.structure(tuple(self.state_shapes))
 
             def chosen(*leaves):
                 values = self._traced_once.quantities(*jax.tree.unflatten(structure, leaves))
                 return [values[name] for name in names]
 
-            self._programs[names] = whole.only(positions, chosen)
+            self._programs[names] = self._whole.only(positions, chosen)
         return self._programs[names]
 
     @functools.cached_property
@@ -257,13 +256,17 @@ class Derivation:
 
     def reads(self, name: str) -> frozenset[int]:
         """The positions of the inputs that any number of this quantity depends on."""
-        program = self.program(name)
-        return frozenset().union(*(program.depends(k) for k in range(len(program.outputs))))
+        return self._whole.read_by(self._positions(name))
 
     def absent(self, name: str) -> np.ndarray:
         """Which numbers of this quantity are zero whatever the state, in its shape."""
-        program = self.program(name)
-        return np.array([program.constant(k) == 0 for k in range(len(program.outputs))], bool).reshape(self.shape(name))
+        zeros = [self._whole.constant(k) == 0 for k in self._positions(name)]
+        return np.array(zeros, bool).reshape(self.shape(name))
+
+    def _positions(self, name: str) -> range:
+        """The outputs of the program of all quantities that are this one."""
+        count = self.count(name)  # first of all: it is the trace that says where quantities start
+        return range(self._starts[name], self._starts[name] + count)
 
     @_lowered_once
     def works(self) -> bool:
@@ -328,7 +331,7 @@ class Derivation:
         count, places = len(elimination.entries), elimination.entries
 
         def system(*scalars):
-            values = parts.vector(*scalars)
+            values = parts(*scalars)
             entries, c, b = values[:count], values[count : count + m], values[count + m :]
             factors, singular = elimination.factors(entries)
             c = c if saddle.sign > 0 else -c
@@ -337,8 +340,8 @@ class Derivation:
 
         return system, elimination.solve
 
-    def _parts(self, saddle: _Saddle, entries: np.ndarray, constraints: int) -> Program:
-        """The program of these entries of M and G, the `constraints` numbers of c, and b."""
+    def _parts(self, saddle: _Saddle, entries: np.ndarray, constraints: int) -> Callable:
+        """A formula for these entries of M and G, the `constraints` numbers of c, and b, end to end."""
         n, starts = self.layout.size, self._starts
         row, column = entries.T
         of_mass = starts["mass_matrix"] + n * row + column
@@ -354,7 +357,13 @@ class Derivation:
             right = [] if saddle.b is None else [values[saddle.b]]
             return [table[row, column], values[saddle.c][:constraints], *right]
 
-        return self._whole.only(positions, chosen)
+        cut = functools.cache(lambda: self._whole.only(positions, chosen))
+
+        def parts(*scalars):
+            whole = self._whole.own_outputs(*scalars)
+            return cut().vector(*scalars) if whole is None else whole[positions]
+
+        return parts
 
     def _rows(self, saddle: _Saddle) -> int:
         """How many constraints belong to this system; those on positions come first."""
@@ -386,12 +395,17 @@ class Derivation:
         """
         n, m, regular = self.layout.size, self._rows(saddle), True
         for matrix, jacobian in self._samples:
-            lowest, size, rows = np.linalg.eigvalsh(matrix)[0], np.abs(matrix).max(), jacobian[:m]
+            lowest, size, rows = _lowest_eigenvalue(matrix), np.abs(matrix).max(), jacobian[:m]
             regular = regular and lowest > 1e-10 * size
-            augmented = np.linalg.eigvalsh(matrix + rows.T @ rows)[0] if m else lowest
+            augmented = _lowest_eigenvalue(matrix + rows.T @ rows) if m else lowest
             if (n > 2 or m) and augmented < -1e-12 * size:
                 raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
         return bool(regular)
+
+
+def _lowest_eigenvalue(matrix: np.ndarray) -> float:
+    diagonal = np.diagonal(matrix)
+    return float(diagonal.min() if np.array_equal(matrix, np.diag(diagonal)) else np.linalg.eigvalsh(matrix)[0])
 
 
 def columns_of(q, qdot, t, numbers: Sequence) -> list:

@@ -163,6 +163,8 @@ def _derivatives(state: _State, lagrangian: _Taped, rates: dict) -> tuple[Ids, I
         matrix = np.where(np.tri(len(matrix), dtype=bool), matrix, matrix.T)
         inertial = state.map("sub", by_q, state.along(momentum, **rates))
         forms.append((by_q, momentum, by_t, matrix, inertial))
+    if len(forms) == 1:
+        return forms[0]
     sizes = [state.derivatives.size([*matrix.ravel().tolist(), *inertial.tolist()]) for *_, matrix, inertial in forms]
     return forms[0] if sizes[0] < _SHORTER * sizes[-1] else forms[-1]
 

@@ -233,10 +233,16 @@ def _program_variation(derivation: Derivation, state, acceleration, multipliers)
     q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
     n, m = len(q), len(multipliers)
     unit = np.eye(n + m, dtype=q.dtype)
-    cotangents = [unit[i] * acceleration[j] for i in range(n) for j in range(n)]
-    cotangents += [unit[n + k] * acceleration[i] - unit[i] * multipliers[k] for k in range(m) for i in range(n)]
-    cotangents += [-unit[i] for i in range(n + m)]
     program = derivation.program("mass_matrix", "jacobian", "force", "gamma")
+    # Numbers that do not vary, most of a large mass matrix, have no use for a cotangent of n + m numbers.
+    varies = iter([program.constant(k) is None for k in range(n * n + m * n)])
+    cotangents: list = [unit[i] * acceleration[j] if next(varies) else None for i in range(n) for j in range(n)]
+    cotangents += [
+        unit[n + k] * acceleration[i] - unit[i] * multipliers[k] if next(varies) else None
+        for k in range(m)
+        for i in range(n)
+    ]
+    cotangents += [-unit[i] for i in range(n + m)]
     derivatives = program.vjp_many([*q, *v, t, *numbers], cotangents)[: 2 * n]
     return np.stack([np.zeros(n + m) if bar is None else np.broadcast_to(bar, n + m) for bar in derivatives], axis=1)
 

@@ -251,10 +251,8 @@ class Program:
         first = next((x for x in scalars if isinstance(x, Scalars)), None)
         if first is None:
             return jnp.stack(self(*scalars))
-        if self.origin is not None and self.origin.graph is first.expansion.graph:
-            inputs = inputs_of(self.origin.graph, self.shapes)
-            if stacked(scalars).ids.tolist() == [i for ids in inputs for i in ids.ravel().tolist()]:
-                return Scalars(first.expansion, np.array(self.origin.outputs))
+        if (own := self.own_outputs(*scalars)) is not None:
+            return own
         nodes = copied(first.expansion.graph, self.line, stacked(scalars).ids.tolist())
         first.expansion.traced_operations += self.operations
         return Scalars(first.expansion, np.array([nodes[i] for i in self.outputs], dtype=np.int64))
@@ -308,6 +306,15 @@ class Program:
         """
         return vjp(self.line, columns, cotangents)
 
+    def own_outputs(self, *scalars) -> Scalars | None:
+        """The outputs in the graph that the program was cut out of, where the scalars are its inputs there."""
+        first = next((x for x in scalars if isinstance(x, Scalars)), None)
+        if self.origin is None or first is None or self.origin.graph is not first.expansion.graph:
+            return None
+        inputs = [i for ids in inputs_of(self.origin.graph, self.shapes) for i in ids.ravel().tolist()]
+        same = stacked(scalars).ids.tolist() == inputs
+        return Scalars(first.expansion, np.array(self.origin.outputs, dtype=np.int64)) if same else None
+
     def only(self, positions: Sequence[int], function: Callable) -> "Program":
         """The program of some of the outputs; `function` is the JAX function that gives just these, leaf by leaf."""
         nodes, kinds, outputs = live(self.nodes, self.kinds, [self.outputs[i] for i in positions])
@@ -324,6 +331,16 @@ class Program:
         """The value of an output that does not depend on the inputs, else None."""
         op, _, attribute = self.nodes[self.outputs[output]]
         return attribute if op == "constant" else None
+
+    def read_by(self, outputs: Sequence[int]) -> frozenset[int]:
+        """The positions of the inputs that any of some outputs depends on."""
+        seen, stack = set(), [self.outputs[k] for k in outputs]
+        while stack:
+            i = stack.pop()
+            if i not in seen:
+                seen.add(i)
+                stack.extend(self.nodes[i][1])
+        return frozenset(self.nodes[i][2] for i in seen if self.nodes[i][0] == "input")
 
     def depends(self, output: int) -> frozenset[int]:
         """The positions of the inputs that an output depends on."""

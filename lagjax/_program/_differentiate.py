@@ -101,9 +101,10 @@ class Derivatives:
             for i, tangent in direction.items():
                 if self.graph.value(tangent) != 0:
                     tangents.setdefault(i, {})[k] = tangent
-        for i in self._below(outputs):
-            if self.graph.kinds[i] == "float" and i not in tangents and self.graph.nodes[i][1]:
-                if of_node := self._tangents(i, tangents):
+        for i in self._below(outputs) if tangents else ():
+            if self.graph.kinds[i] == "float" and i not in tangents:
+                moved = not tangents.keys().isdisjoint(self.graph.nodes[i][1])
+                if moved and (of_node := self._tangents(i, tangents)):
                     tangents[i] = of_node
         return [tangents.get(i, {}) for i in outputs]
 
