@@ -8,12 +8,12 @@ import pytest
 from jax import lax
 
 import lagjax
-from lagjax import _diffrax, _machine_code, scenes
+from lagjax import _derivation, _diffrax, _machine_code, _program, scenes
 from lagjax._check import _measure as of_check
-from lagjax._derivation import columns_of, derivation_of, numbers_of
+from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._health import _measure as of_health
 from lagjax._layout import Layout
-from lagjax._program import OPERATIONS, evaluate, lower, pullback
+from lagjax._program import OPERATIONS, Unlowerable, evaluate, lower, pullback
 from lagjax._program._evaluate import CHUNK
 
 # ---- evaluation in NumPy ---------------------------------------------------------------------------------------------
@@ -142,6 +142,50 @@ def test_quantities_are_those_of_the_motion(make):
     program = derivation.acceleration.complete if singular else derivation.acceleration
     expected = jax.jit(motion.acceleration)(*state)
     np.testing.assert_allclose(program.evaluate(*scalars)[:-1], expected, rtol=1e-10, atol=1e-11)
+
+
+@pytest.mark.parametrize("make", [scenes.cartesian_chain, scenes.figure_eight, lambda: scenes.chain(6)])
+def test_large_graphs_are_those_of_small_scenes(make, monkeypatch):
+    # What a graph does beyond so many nodes, as if that were few: it compares less, grows in place and is continued.
+    def programs(derivation):
+        return (
+            derivation.acceleration.complete,
+            derivation.projected,
+            derivation.multipliers,
+            derivation.velocity_scales,
+        )
+
+    scene = make()
+    derivation = of(scene.system, scene.q0, scene.qdot0, scene.params)
+    small = programs(derivation)
+    for module in (_program, _program._graph, _program._passes):
+        monkeypatch.setattr(module, "MANY", 20)
+    large = programs(Derivation(derivation.motion, derivation.layout, scene.params))
+    x = np.random.default_rng(0).uniform(0.4, 0.9, (3, len(derivation.scalar_shapes))).T
+    for a, b in zip(small, large, strict=True):
+        if a is not None:
+            assert b.origin is not None or b.linear is not None
+            exact, found = a.evaluate_many(x), b.evaluate_many(x)
+            np.testing.assert_allclose(found, exact, rtol=1e-11, atol=1e-12 * np.abs(exact).max())
+
+
+def test_a_mass_matrix_in_blocks_costs_what_its_blocks_cost():
+    def lagrangian(q, v):
+        x, u = q.reshape(-1, 3), v.reshape(-1, 3)
+        return 0.5 * jnp.sum(u**2) + jnp.sum(u[:, 0] * u[:, 1] * jnp.cos(x[:, 0] - x[:, 1])) / 4 - jnp.sum(x[:, 2] ** 2)
+
+    one, many = (of(lagjax.System(lagrangian), np.ones(n), np.ones(n)).acceleration.operations for n in (3, 90))
+    assert many <= 30 * one + 29  # disjunctions: whether any block is singular
+
+
+def test_what_does_not_fit_in_memory_is_refused_before_it_is_tried(monkeypatch):
+    scene = scenes.chain(16)
+    small = of(scene.system, scene.q0, scene.qdot0, scene.params)
+    large = Derivation(small.motion, small.layout, scene.params)
+    assert large.program("force").operations > 0
+    monkeypatch.setattr(_derivation, "OPERATION_BUDGET", 1000)
+    with pytest.raises(Unlowerable, match=r"some \d+ operations, more than the 1000 that are expected to fit"):
+        large.acceleration  # noqa: B018
 
 
 def test_check_and_health_compile_nothing_where_there_are_programs(monkeypatch):
