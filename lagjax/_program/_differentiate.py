@@ -149,7 +149,7 @@ class Derivatives:
 
     def _of_power(self, base: int, exponent: float, g: int) -> int:
         """p uᵖ⁻¹ g, which is finite at u = 0 where the products and roots that make up uᵖ have no derivative."""
-        lower = self._apply("pow", base, self._number(exponent - 1))
+        lower = base if exponent == 2 else self._apply("pow", base, self._number(exponent - 1))
         return self._apply("mul", g, self._apply("mul", self._number(exponent), lower))
 
     def _below(self, outputs: Sequence[int]) -> list[int]:

@@ -118,7 +118,7 @@ class Graph:
         return self._append(node, node, kind) if known is None else known
 
     def constant(self, value, kind: str) -> int:
-        value = np.dtype(kind).type(value).item()
+        value = float(value) if kind == "float" else np.dtype(kind).type(value).item()
         if value != value:
             value = math.nan  # one object, so that the key below equals itself
         key = (kind, value, math.copysign(1.0, value))  # 0.0 and -0.0 are equal but not the same
