@@ -17,9 +17,9 @@ diffrax, their sizes are not differentiated. Source: Griewank & Walther, *Evalua
 from llvmlite import ir
 
 from lagjax._native._constants import MAX_ORDER
-from lagjax._native._frame import Frame, Index, Lane, Vectors, job
+from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
-from lagjax._native._series import Motion, Numbers, double, is_large
+from lagjax._native._series import Motion, double, is_large
 from lagjax._program._series import Recurrent, Series
 from lagjax._program._transpose import pullback
 

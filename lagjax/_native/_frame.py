@@ -25,6 +25,7 @@ from llvmlite import ir
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
 
 Index = int | Value
+Numbers = Any  # vectors by their numbers: a list of values whose indices are known, or `Vectors`
 # Integers of a lane: which member it carries (-1: none), which output comes next, and which step.
 LANE = ("member", "output", "step")
 _KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
@@ -75,7 +76,7 @@ class Layout:
         self._offsets[name], self._columns[name] = self._vectors, 1
         self._vectors += rows
 
-    def place(self, name: str, *indices: Index) -> Index:
+    def place(self, name: str, *indices: Index) -> Any:
         """The first element of a vector, counted in doubles: `name`, `name[i]` or `name[i, k]`."""
         row, column = (*indices, 0, 0)[:2]
         columns = self._columns[name]

@@ -7,7 +7,7 @@ from llvmlite import ir
 
 from lagjax._digits import COS, PI_2, PI_2_ROUNDED, SIN
 from lagjax._native._constants import LARGEST_ANGLE
-from lagjax._native._frame import Frame, Vectors
+from lagjax._native._frame import Frame, Numbers, Vectors
 from lagjax._native._ir import BIT, Code, Value
 from lagjax._program._graph import Unlowerable
 from lagjax._program._operations import OPERATIONS
@@ -25,7 +25,7 @@ class Lines:
 
     def run(
         self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors", to: "Vectors | None" = None
-    ) -> list[Value]:
+    ) -> Numbers:
         """The outputs of a program, of which these are the inputs, one after the other; a bool is 1 or 0.
 
         The last outputs go `to` some other place as well.
@@ -39,8 +39,9 @@ class Lines:
         out = emit(frame.code, line, read, self._sincos)
         kinds = (line.kinds[i] for i in line.outputs)
         out = [frame.code.as_double(x) if kind == "bool" else x for x, kind in zip(out, kinds, strict=True)]
-        for i in range(0 if to is None else len(to)):
-            to[i] = out[len(out) - len(to) + i]
+        if to is not None:
+            for i in range(len(to)):
+                to[i] = out[len(out) - len(to) + i]
         return out
 
     def each(self, code: Code, count: int) -> Iterator[int]:
@@ -53,7 +54,7 @@ class Lines:
             some = list(range(first, min(first + 4, 2 * n)))
             yield some, {k: i - n for k, i in enumerate(some) if i >= n}
 
-    def room(self, frame: Frame, count: int) -> list:
+    def room(self, frame: Frame, count: int) -> Numbers:
         """Room for so many vectors."""
         return [None] * count
 
@@ -61,7 +62,7 @@ class Lines:
         """The largest of so many numbers, which are not negative; NaN where the last one is."""
         return functools.reduce(code.maximum, map(numbers, range(count)))
 
-    def largest_by_group(self, frame: Frame, numbers: Callable[[int], Value], groups: Sequence[int]) -> list[Value]:
+    def largest_by_group(self, frame: Frame, numbers: Callable[[int], Value], groups: Sequence[int]) -> Numbers:
         """For each of the numbers the largest one of its group: of those with the same number in `groups`."""
         largest: dict[int, Value] = {}
         for i, group in enumerate(groups):

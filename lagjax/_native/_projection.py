@@ -6,9 +6,9 @@ then the projection has failed, and the step is halved.
 """
 
 from lagjax._native._constants import PROJECTION_TOLERANCES, ROUND_OFF, START
-from lagjax._native._frame import Frame, Index
+from lagjax._native._frame import Frame, Index, Numbers
 from lagjax._native._ir import Code, Value
-from lagjax._native._series import Motion, Numbers
+from lagjax._native._series import Motion
 from lagjax._program._series import Recurrent
 
 

@@ -14,13 +14,11 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._constants import LARGEST_LINE, MAX_ORDER
-from lagjax._native._frame import Frame, Index, Layout, Vectors, integers
+from lagjax._native._frame import Frame, Index, Layout, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value, lanes
 from lagjax._native._lanes import Lines, sincos_function
 from lagjax._native._tables import Tables
 from lagjax._program._series import Recurrent, Series, StraightLine
-
-Numbers = list[Value] | Vectors
 
 
 class Motion:

@@ -27,10 +27,10 @@ from lagjax._native._constants import (
     SINGULAR,
     STEP_TOO_SMALL,
 )
-from lagjax._native._frame import Frame, Index
+from lagjax._native._frame import Frame, Index, Numbers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._projection import Projector, end_of_step
-from lagjax._native._series import Motion, Numbers, double, integer
+from lagjax._native._series import Motion, double, integer
 
 
 class StepControl:

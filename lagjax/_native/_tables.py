@@ -17,7 +17,7 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._constants import TIMES
-from lagjax._native._frame import Frame, Vectors, integers
+from lagjax._native._frame import Frame, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
 from lagjax._native._lanes import apply, sines_and_cosines
 from lagjax._native._schedule import Kind, Operation, Schedule, schedule
@@ -47,7 +47,7 @@ class Tables:
 
     def run(
         self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors", to: "Vectors | None" = None
-    ) -> Vectors:
+    ) -> Numbers:
         """The outputs of a program, of which these are the inputs, one after the other; a bool is 1 or 0.
 
         They stay until this place of the kernel is passed again. The last outputs go `to` some other place instead;
@@ -61,6 +61,7 @@ class Tables:
         places |= {node: self._constant(number) for node, number in plan.constants.items()}
         places |= {node: lying[position] for node, position in plan.inputs.items()}
         if to is not None:
+            assert to.place is not None
             end = len(line.nodes) + len(line.outputs)
             places |= {end - len(to) + i: to.place(i) for i in range(len(to))}
         words: list[int] = []
@@ -84,7 +85,7 @@ class Tables:
         for i in self.each(code, n):
             yield [i, i + n], {1: i}
 
-    def room(self, frame: Frame, count: int) -> Vectors:
+    def room(self, frame: Frame, count: int) -> Numbers:
         """Room for so many vectors."""
         return frame.vectors(self._field(count), count)
 
@@ -95,7 +96,7 @@ class Tables:
             code.store(code.maximum(code.load(largest, code.vector), numbers(i)), largest)
         return code.load(largest, code.vector)
 
-    def largest_by_group(self, frame: Frame, numbers: Callable[[Value], Value], groups: Sequence[int]) -> Vectors:
+    def largest_by_group(self, frame: Frame, numbers: Callable[[Value], Value], groups: Sequence[int]) -> Numbers:
         """For each of the numbers the largest one of its group: of those with the same number in `groups`."""
         code, count, names = frame.code, len(groups), sorted(set(groups))
         values = self.room(frame, count)
