@@ -44,7 +44,8 @@ class _State:
         names = ("q", "qdot", "t", "params")
         state = jax.tree.unflatten(jax.tree.structure(shapes), leaves)
         self.expansion, self.derivatives = expansion, Derivatives(expansion.graph)
-        self.shapes, self.ids = dict(zip(names, shapes, strict=True)), dict(zip(names, state, strict=True))
+        self.shapes: dict[str, Any] = dict(zip(names, shapes, strict=True))
+        self.ids: dict[str, Any] = dict(zip(names, state, strict=True))
 
     def of(self, function: Callable, *arguments: str, at_rest: bool = False) -> Ids:
         """The value of a function of some of q, qdot, t, params; `at_rest` with qdot = 0."""
@@ -55,13 +56,14 @@ class _State:
 
     def taped(self, function: Callable) -> "_Taped":
         """A function of (q, q̇, t, params) with one value, as it is written."""
-        written = Expansion(Tape(self.expansion.graph.budget))
+        tape = Tape(self.expansion.graph.budget)
+        written = Expansion(tape)
         inputs = [i for leaf in jax.tree.leaves(list(self.ids.values())) for i in leaf.ravel().tolist()]
-        arguments = inputs_of(written.graph, jax.tree.leaves(list(self.shapes.values())))
+        arguments = inputs_of(tape, jax.tree.leaves(list(self.shapes.values())))
         (output,) = written.run_closed(self._traced(function, *self.ids), arguments)
         self.expansion.traced_operations += written.traced_operations
-        nodes = self.derivatives.copied(written.graph, inputs)
-        return _Taped(written.graph, nodes, int(output), {i: k for k, i in enumerate(inputs)})
+        nodes = self.derivatives.copied(tape, inputs)
+        return _Taped(tape, nodes, int(output), {i: k for k, i in enumerate(inputs)})
 
     def gradient(self, of: "_Taped", *by: str, together: bool = True) -> list[Ids]:
         """The derivatives of what is on a tape by each of some of q, qdot and t."""

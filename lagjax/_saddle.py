@@ -124,7 +124,8 @@ class SaddleElimination:
         n, total = self.size, len(self.order)
         # What is taken off the diagonal: by coordinates, and by constraints, which must be told apart in a constraint.
         taken: list[list] = [[[], []] for _ in range(total)]
-        inverse, columns, losses = [None] * total, [], []
+        inverse: list[Any] = [None] * total
+        columns, losses = [], []
         for j, rows, column, first, second, updated in self._pivots():
             lost, inverse[j] = self._pivot(j, a[j], *taken[j])
             if lost is not None:
@@ -196,7 +197,7 @@ class SaddleElimination:
 
     # ---- solution ----
 
-    def solve(self, factors, right):
+    def solve(self, factors: tuple[Any, Any, Any], right):
         """x and then −λ, n + m numbers, linear in `right`: b and then c."""
         weighted, lower, inverse = factors
         z, n = right, self.size

@@ -10,6 +10,7 @@ differentiated here: `has_own_rules` finds it.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 from jax.extend import core
@@ -17,6 +18,7 @@ from jax.extend import core
 from lagjax._program._graph import Graph, Tape
 from lagjax._program._operations import OPERATIONS
 
+_Rule = Callable[[int], int]
 Tangents = dict[int, int]  # by the number of the direction; a direction that is not there has none
 
 _OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"))
@@ -83,7 +85,8 @@ class Derivatives:
         if op == "constant":
             return self.graph.constant(attribute, kind)
         if op == "integer_pow":
-            return self.graph.power(*operands, attribute)
+            (base,) = operands
+            return self.graph.power(base, attribute)
         return self.graph.apply(op, *operands, attribute=attribute)
 
     def _varied(self, tape: Tape, nodes: list[int], by: frozenset[int]) -> list[bool]:
@@ -137,7 +140,7 @@ class Derivatives:
             result[k] = apply("sub", tangent, apply("mul", i, of_v[k])) if k in of_v else tangent
         return {k: apply("div", tangent, v) for k, tangent in result.items()}
 
-    def _rules(self, w: int, op: str, operands: Sequence[int], attribute=None) -> list[Callable[[int], int] | None]:
+    def _rules(self, w: int, op: str, operands: Sequence[int], attribute: Any = None) -> Sequence[_Rule | None]:
         """For every operand what takes a cotangent, or a tangent, past w = op(operands); None: there is none."""
         if op == "integer_pow":
             return [lambda g: self._of_power(operands[0], attribute, g)]

@@ -131,7 +131,7 @@ def spread(x, index, size: int):
     return replaced(zeros, index, x)
 
 
-def stacked(scalars: Sequence):
+def stacked(scalars: Sequence) -> Any:
     """A vector of scalars."""
     first = _scalars(*scalars)
     if first is None:
