@@ -202,7 +202,7 @@ class SaddleElimination:
         weighted, lower, inverse = factors
         z, n = right, self.size
         start = 0
-        for k, touching in enumerate(self.rows if weighted is not None else ()):
+        for k, touching in enumerate(self.rows if self.augmented else ()):
             row = weighted[start : start + len(touching)]
             z = xp.replaced(z, touching, z[touching] + row * z[n + k]) if len(touching) else z
             start += len(touching)
