@@ -15,8 +15,11 @@ from scipy.integrate import solve_ivp
 from sweeps import sweep
 
 import lagjax
-from lagjax import _native
+from lagjax import _native, scenes
+from lagjax._layout import Layout
+from lagjax._machine_code import flow_of
 from lagjax._native import _ir, _kernel, _lanes
+from lagjax._problem import Problem
 from lagjax._program import OPERATIONS, Unlowerable, lower
 
 EPS = 2.0**-52
@@ -649,3 +652,37 @@ def test_kernels_may_come_and_go():
         kernel_of(lambda q, v, t, k=k: -(k + 2.0) * q, 1)
     outcome = kept(TS[None], np.ones((1, 2)), np.zeros((1, 0)), 1e-12, 1e-15, 100)
     np.testing.assert_allclose(outcome.path[0, :, 0], np.cos(TS) + np.sin(TS), atol=1e-11)
+
+
+# ---- one member alone ------------------------------------------------------------------------------------------------
+
+
+MADE = (
+    scenes.cartesian_pendulum, scenes.double_pendulum, scenes.chaplygin_sleigh, scenes.kepler, scenes.chain,
+    scenes.andrews_squeezer,
+)  # fmt: skip
+TWO_TIMES = np.array([0.0, 0.5])
+
+
+@pytest.mark.parametrize("make", sweep(MADE, kept=MADE[:1]))
+def test_a_member_alone_is_bit_for_bit_the_member_of_a_batch(make):
+    scene = make()
+    y0 = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(z)]) for z in (scene.q0, scene.qdot0)]
+    kernel = flow_of(
+        Problem.of(scene.system, Layout.of(scene.q0, scene.qdot0), scene.q0, scene.qdot0, TWO_TIMES, scene.params)
+    ).kernel
+    numbers = np.concatenate([np.zeros(0), *(np.ravel(x) for x in jax.tree.leaves(scene.params))])[None]
+    states, ts = np.tile(np.concatenate(y0), (3, 1)), TWO_TIMES[None]
+    room = np.full(3, 1000)
+    alone, together = (kernel(ts, y, numbers, 1e-9, 1e-12, 1000, room[: len(y)]) for y in (states[:1], states))
+    for one, all_ in zip(alone[:6], together[:6], strict=True):
+        np.testing.assert_array_equal(one[0], all_[1])
+    assert kernel.of_members(1).width == 1 and kernel.of_members(2) is kernel
+    order, cotangents = _kernel.order_for(1e-9), (np.ones_like(together.path), np.ones_like(together.y_end))
+    back = [
+        kernel.vjp(ts, numbers, run.table, room[: len(run.steps)].cumsum() - 1000, run.steps,
+                   *(c[: len(run.steps)] for c in cotangents), order)
+        for run in (alone, together)
+    ]  # fmt: skip
+    for one, all_ in zip(*back, strict=True):
+        np.testing.assert_array_equal(one[0], all_[1])

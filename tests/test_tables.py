@@ -166,7 +166,7 @@ def test_the_code_of_a_table_does_not_grow_with_the_scene():
         states = jax.ShapeDtypeStruct((2 * count,), float)
         program = lower(acceleration, states, states, 1.0)
         series = _native.recurrences(program, 2 * count)
-        functions = Integrator(program, series).motion.module.functions
+        functions = Integrator(program, series, width=8).motion.module.functions
         return sum(len(block.instructions) for function in functions for block in function.blocks)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -53,7 +53,8 @@ def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, t
     `shapes`, are those of the whole.
     """
     _register()
-    kernel, (members, states) = flow.kernel, y0.shape
+    members, states = y0.shape
+    kernel = flow.kernel.of_members(members)
     plan = kernel.plan(tolerances.rtol, tolerances.atol, tolerances.max_steps)
     rows, size = (members,), (kernel.rest_size,)
     of_handler = [(members, ts.shape[1], states), (members, states), *[rows] * 4, size]

@@ -36,7 +36,7 @@ class Adjoint:
 
     job = JOB
 
-    def __init__(self, program: Recurrent, series: Series, projection=None):
+    def __init__(self, program: Recurrent, series: Series, projection=None, *, width: int):
         n, states = series.size, 2 * series.size
         fields = {
             "state_ct": states,  # the cotangent of the state
@@ -47,7 +47,7 @@ class Adjoint:
             "active": 1,
         }
         large = is_large(program, projection, times=2)
-        self.motion = Motion("adjoint", program, series, JOB, fields, large, keep_sums=True)
+        self.motion = Motion("adjoint", program, series, JOB, fields, large, width, keep_sums=True)
         self.n, self.states, self.series = n, states, series
         dtypes = program.dtypes
         self.varied = [i for i, dtype in enumerate(dtypes) if dtype.kind == "f" and i != states]  # all but the time

@@ -28,6 +28,7 @@ Index = int | Value
 Numbers = Any  # vectors by their numbers: a list of values whose indices are known, or `Vectors`
 # Integers of a lane: which member it carries (-1: none), which output comes next, and which step.
 LANE = ("member", "output", "step")
+CACHE_LINE = 8  # doubles
 _KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
 
 
@@ -68,8 +69,8 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """The memory that a thread needs, in doubles."""
-        return self._vectors * self.width
+        """The memory that a thread needs, in doubles: whole cache lines."""
+        return -(-self._vectors * self.width // CACHE_LINE) * CACHE_LINE
 
     def extend(self, name: str, rows: int) -> None:
         """One field more, of so many vectors, behind all others."""

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._frame import LANE, Layout
+from lagjax._native._frame import CACHE_LINE, LANE, Layout
 from lagjax._native._integrator import JOB
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compiled, lanes
 
@@ -97,12 +97,12 @@ class Rest(NamedTuple):
     @staticmethod
     def size(layout: Layout) -> int:
         """How many doubles it takes."""
-        return layout.size + _CACHE_LINE + _integers(layout.width)
+        return layout.size + CACHE_LINE + _INTEGERS
 
     @classmethod
     def of(cls, array: np.ndarray, layout: Layout) -> "Rest":
         """From what a handler wrote: a copy."""
-        integers = array[-_integers(layout.width) :].view(np.int64).copy()
+        integers = array[-_INTEGERS:].view(np.int64).copy()
         lanes, (skipped, *_) = np.split(integers, [-_OTHERS])
         memory = aligned(layout.size)
         memory[: layout.size] = array[skipped : skipped + layout.size]
@@ -119,18 +119,14 @@ class Rest(NamedTuple):
         return int(array[-3:-2].view(np.int64)[0])
 
 
-_CACHE_LINE = 8  # doubles, with which a vector is to begin
 _OTHERS = 4  # integers after those of the lanes
-
-
-def _integers(width: int) -> int:
-    return len(LANE) * width + _OTHERS
+_INTEGERS = len(LANE) * lanes() + _OTHERS  # also where a kernel has fewer lanes
 
 
 def aligned(size: int) -> np.ndarray:
     """Zeros on the boundary of a cache line, which vectors need."""
-    memory = np.zeros(size + _CACHE_LINE)
-    return memory[(-memory.ctypes.data // 8) % _CACHE_LINE :]
+    memory = np.zeros(size + CACHE_LINE)
+    return memory[(-memory.ctypes.data // 8) % CACHE_LINE :]
 
 
 ARGUMENTS: tuple[str, ...] = ("ts", "y0", "params")
@@ -235,8 +231,7 @@ class _Run:
         with code.loop(members * times * states) as i:
             code.store(code.as_value(float("nan"), DOUBLE), code.element(data["path"], i))
         memory, integers = self._rest(data.pop("rest"))
-        width = len(LANE) * code.lanes
-        idle, next_member, more = (code.element(integers, width + i, INTEGER) for i in (1, 2, 3))
+        idle, next_member, more = (code.element(integers, _INTEGERS - _OTHERS + i, INTEGER) for i in (1, 2, 3))
         fields: dict[str, Any] = dict.fromkeys((name for name, _ in JOB._fields_), 0) | data
         fields |= {name: of_plan(name) for name in ("order", "max_steps")}
         fields |= {name: of_plan(name, DOUBLE) for name in ("rtol", "atol")}
@@ -254,14 +249,14 @@ class _Run:
         """The memory of the thread, of zeros and on the boundary of a cache line, and the integers, of zeros."""
         code, size_of_memory = self.code, self._of_plan("memory")
         address = Value(code, code.builder.ptrtoint(rest.it, INTEGER))
-        bytes_left = Value(code, code.builder.and_((0 - address).it, ir.Constant(INTEGER, 8 * _CACHE_LINE - 1)))
+        bytes_left = Value(code, code.builder.and_((0 - address).it, ir.Constant(INTEGER, 8 * CACHE_LINE - 1)))
         skipped = bytes_left / 8
-        memory, integers = code.element(rest, skipped), code.element(rest, size_of_memory + _CACHE_LINE)
+        memory, integers = code.element(rest, skipped), code.element(rest, size_of_memory + CACHE_LINE)
         with code.loop(size_of_memory / code.lanes) as i:
             code.store(code.lanes_of(0.0), code.element(memory, i * code.lanes))
-        with code.loop(code.as_value(_integers(code.lanes), INTEGER)) as i:
+        with code.loop(code.as_value(_INTEGERS, INTEGER)) as i:
             code.store(code.as_value(0, INTEGER), code.element(integers, i, INTEGER))
-        code.store(skipped, code.element(integers, len(LANE) * code.lanes, INTEGER))
+        code.store(skipped, code.element(integers, _INTEGERS - _OTHERS, INTEGER))
         return memory, integers
 
     def _job(self, fields: dict[str, Any]) -> Value:

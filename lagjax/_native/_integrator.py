@@ -52,6 +52,8 @@ class Integrator:
         guards=None,
         error_groups: tuple[int, ...] | None = None,
         base_size: int | None = None,
+        *,
+        width: int,
     ):
         n = series.size
         self.base_size = n if base_size is None else base_size
@@ -59,7 +61,8 @@ class Integrator:
         fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards) | {"active": 1}
         if projection is not None:
             fields |= Projector.fields(n, self.base_size) | _rank_drops.fields(n, self.guards)
-        self.motion = motion = Motion("motion", program, series, JOB, fields, is_large(program, projection, guards))
+        large = is_large(program, projection, guards)
+        self.motion = motion = Motion("motion", program, series, JOB, fields, large, width)
         self.projector = projection and Projector(
             motion, projection.state, projection.velocity_scale, self.base_size
         )  # fmt: skip

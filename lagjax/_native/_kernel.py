@@ -16,7 +16,7 @@ from lagjax._native._constants import DONE, LEAST_ORDER, MAX_ORDER, VECTORS_PER_
 from lagjax._native._frame import LANE, Layout
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
-from lagjax._native._ir import compiled
+from lagjax._native._ir import compiled, lanes
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._graph import Unlowerable
 from lagjax._program._series import Recurrent, Series, series
@@ -90,8 +90,8 @@ class Kernel:
     applied to the state after every step, and to the outputs after the first. `guards`, again from the same inputs, end
     the motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are relative
     to each coordinate, or to the largest one of those with the same number in `error_groups` (n,). Of the coordinates
-    the first `base_size` are the motion, the others its derivatives. Raises `Unlowerable` where an operation has no
-    Taylor series or is not one of doubles.
+    the first `base_size` are the motion, the others its derivatives. Vectors have `width` lanes, by default
+    those of the processor. Raises `Unlowerable` where an operation has no Taylor series or is not one of doubles.
     """
 
     def __init__(
@@ -102,14 +102,33 @@ class Kernel:
         guards: Guards | None = None,
         error_groups: tuple[int, ...] | None = None,
         base_size: int | None = None,
+        width: int | None = None,
     ):
         self._parts = program, recurrences(program, size), projection
-        integrator = Integrator(*self._parts, guards, error_groups, base_size)
-        motion = integrator.motion
-        self.states, self.numbers, self.width = motion.states, motion.numbers, motion.width
+        self._options = guards, error_groups, base_size
+        self.states, self.numbers = 2 * size, program.size - 2 * size - 1
+        self.width = lanes() if width is None else width
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
-        self._forward = _Compiled(motion.module, motion.layout, integrator.job, self._rounds, pointers=4)
-        self.rest_size = Rest.size(motion.layout)  # the doubles of the `rest` that a handler leaves behind
+
+    def of_members(self, members: int) -> "Kernel":
+        """The kernel for so many members: for one alone without lanes, which would be computed and read for nobody."""
+        return self._alone if members == 1 < self.width else self
+
+    @functools.cached_property
+    def _alone(self) -> "Kernel":
+        (program, series, projection), options = self._parts, self._options
+        return Kernel(program, series.size, projection, *options, width=1)
+
+    @functools.cached_property
+    def _forward(self) -> "_Compiled":
+        integrator = Integrator(*self._parts, *self._options, width=self.width)
+        motion = integrator.motion
+        return _Compiled(motion.module, motion.layout, integrator.job, self._rounds, pointers=4)
+
+    @property
+    def rest_size(self) -> int:
+        """The doubles of the `rest` that a handler leaves behind."""
+        return Rest.size(self._forward.layout)
 
     def __call__(
         self, ts, y0, params, rtol: float, atol: float, max_steps: int, room=None, begun: Begun | None = None
@@ -119,6 +138,8 @@ class Kernel:
         `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. With `room` (N,)
         up to so many steps of each member are written down, for `vjp`. What a handler has `begun` is gone on with.
         """
+        if (kernel := self.of_members(len(y0))) is not self:
+            return kernel(ts, y0, params, rtol, atol, max_steps, room, begun)
         ts, y0, params = _contiguous(ts, y0, params)
         members, times = len(y0), ts.shape[1]
         if begun is not None:
@@ -168,6 +189,8 @@ class Kernel:
         `path_ct` (N, T, 2n), of which the first and the last are not looked at, and of the states at the end, `y_ct`
         (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P).
         """
+        if (kernel := self.of_members(len(y_ct))) is not self:
+            return kernel.vjp(ts, params, table, first, counts, path_ct, y_ct, order)
         ts, params, path_ct, table = _contiguous(ts, params, path_ct, table)
         first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
         y_ct, params_ct = np.array(y_ct, np.float64, order="C"), np.zeros((len(y_ct), self.numbers))
@@ -189,7 +212,7 @@ class Kernel:
     @functools.cached_property
     def _backward(self) -> "_Compiled":
         """The transpose, compiled when it is first asked for."""
-        adjoint = Adjoint(*self._parts)
+        adjoint = Adjoint(*self._parts, width=self.width)
         return _Compiled(adjoint.motion.module, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
 
     def _strides(self, ts, params) -> dict[str, int]:
@@ -227,10 +250,10 @@ class _Compiled:
         def work(stopped, _arrays=arrays) -> int:  # whose memory must live as long as somebody works on it
             if rest is None:
                 memory = aligned(self.layout.size)
-                lanes, idle = np.zeros(len(LANE) * self.layout.width, np.int64), np.zeros(1, np.int64)
+                integers, idle = np.zeros(len(LANE) * self.layout.width, np.int64), np.zeros(1, np.int64)
             else:
-                memory, lanes, idle, _ = rest
-            mine = [ctypes.addressof(job), memory.ctypes.data, lanes.ctypes.data]
+                memory, integers, idle, _ = rest
+            mine = [ctypes.addressof(job), memory.ctypes.data, integers.ctypes.data]
             if rest is None:
                 self._begin(*mine)
             if self._counts_idle:

@@ -15,7 +15,7 @@ from llvmlite import ir
 
 from lagjax._native._constants import LARGEST_LINE, MAX_ORDER
 from lagjax._native._frame import Frame, Index, Layout, Numbers, Vectors, integers
-from lagjax._native._ir import DOUBLE, INTEGER, Code, Value, lanes
+from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
 from lagjax._native._tables import Tables
 from lagjax._program._series import Recurrent, Series, StraightLine
@@ -26,8 +26,8 @@ class Motion:
 
     The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n. `fields`
     names what else a thread remembers (see `Layout`), `job` the structure that all threads share. `large` kernels are
-    written as tables (see `is_large`). With `keep_sums` the sums of every order stay in memory, not only those of the
-    last.
+    written as tables (see `is_large`). Vectors have `width` lanes. With `keep_sums` the sums of every order stay in
+    memory, not only those of the last.
     """
 
     def __init__(
@@ -38,6 +38,7 @@ class Motion:
         job: type,
         fields: dict,
         large: bool,
+        width: int,
         keep_sums: bool = False,
     ):
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
@@ -45,7 +46,7 @@ class Motion:
         self.keep_sums, self.job = keep_sums, job
         self.module = ir.Module(name)
         self.module.triple = ""
-        self.layout = Layout(lanes(), self._fields() | fields)
+        self.layout = Layout(width, self._fields() | fields)
         self.width, self.vector = self.layout.width, ir.VectorType(DOUBLE, self.layout.width)
         sincos = sincos_function(self.module, self.width)
         self.form = Tables(self.function, sincos) if large else Lines(sincos)
