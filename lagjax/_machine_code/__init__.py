@@ -38,7 +38,7 @@ class MachineCode(AbstractEngine):
     with the coefficients (q̈)ₖ by recurrences through the scalar operations of the acceleration. Four or eight members
     of a batch stand side by side in the vector registers of every core.
 
-    It is for float64 on CPUs, scenes whose acceleration is a scalar program of at most some thousands of smooth or
+    It is for float64 on CPUs, scenes whose acceleration is a scalar program of at most a million smooth or
     piecewise smooth operations, adaptive steps, no `event` and derivatives by its own adjoint. `System.explain` says
     whether a scene is one of these.
 
