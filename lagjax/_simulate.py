@@ -159,10 +159,10 @@ def simulate_batch(
     axes, size = axes_per_leaf(values, batch_axes)
     batch = Batch.of(system, values, axes, size, ts, rtol, atol, max_steps, event)
     values = {name: as_arrays(value, batch.member.layout.dtype) for name, value in values.items()}
-    astray = inconsistent_members(system, batch.member.layout, batch.member.ts, values, axes)
+    inconsistent = inconsistent_members(system, batch.member.layout, batch.member.ts, values, axes)
     engine = choose(batch.member, asked).engine
     trajectory = _trajectory(batch.member, engine, engine.solve_batch(batch), values["params"], batch_axes[2])
-    return trajectory if astray is None else _refused(trajectory, astray)
+    return trajectory if inconsistent is None else _refused(trajectory, inconsistent)
 
 
 def _trajectory(problem: Problem, engine: AbstractEngine, solution: Solution, params: PyTree, params_axes=None):
@@ -215,13 +215,13 @@ _PROCESS = os.getpid()
 _as_they_are = jax.jit(lambda *arrays: arrays)
 
 
-def _refused(trajectory: Trajectory, astray: jax.Array) -> Trajectory:
+def _refused(trajectory: Trajectory, inconsistent: jax.Array) -> Trajectory:
     """The same without the members that did not start on their constraints: they are NaN, and say so."""
 
     def without(leaf):
-        return jnp.where(astray.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.nan, leaf)
+        return jnp.where(inconsistent.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.nan, leaf)
 
-    result = result_from(jnp.where(astray, RESULTS.inconsistent_start._value, trajectory.result._value))
+    result = result_from(jnp.where(inconsistent, RESULTS.inconsistent_start._value, trajectory.result._value))
     q, qdot = jax.tree.map(without, (trajectory.q, trajectory.qdot))
     return eqx.tree_at(lambda t: (t.q, t.qdot, t.result), trajectory, (q, qdot, result))
 

@@ -20,10 +20,9 @@ from lagjax._program import Unlowerable
 from lagjax._validate import is_concrete
 
 
+# Not an equinox.Module: its methods are pytrees of their own, and to make one takes as long as ten steps.
 @jax.tree_util.register_static
-@dataclass(
-    frozen=True
-)  # methods of an equinox.Module are pytrees of their own, whose making takes as long as ten steps
+@dataclass(frozen=True)
 class MachineCode(AbstractEngine):
     r"""Taylor series in machine code made for the scene: `simulate(..., solver=lagjax.MachineCode())`.
 

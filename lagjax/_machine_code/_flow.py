@@ -169,11 +169,12 @@ class Flow:
         rtol, atol, max_steps, _ = tolerances
         if store is not None and room is None:
             room = np.full(len(y0), min(max_steps, LARGEST_KEPT // ((self.states + 2) * max(1, len(y0)))))
-        done = self.kernel(ts, y0, params, rtol, atol, max_steps, room, begun)
+        kernel = self.kernel.of_members(len(y0))
+        done = kernel(ts, y0, params, rtol, atol, max_steps, room, begun)
         result, event = _RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:
-            ticket = store.keep(self._compact(done.table, room, done.steps, rtol))
+            ticket = store.keep(_compact(kernel, done.table, room, done.steps, rtol))
         solution = Solution(*done[:3], result, done.steps, done.rejected, event, ticket, done.idle)
         if (result == SUCCESSFUL).all():
             return solution
@@ -204,13 +205,6 @@ class Flow:
         solution.result[some[jumps]] = _JUMPS
         solution.result[some[not_finite]] = _NOT_FINITE
         return solution
-
-    def _compact(self, table, room, counts, rtol: float) -> Steps:
-        """The steps of a run, without the room that was not used."""
-        taken, starts = np.minimum(counts, room), np.cumsum(room) - room
-        if not np.array_equal(taken, room):
-            table = np.concatenate([table[:0], *(table[s : s + k] for s, k in zip(starts, taken, strict=True))])
-        return Steps(self.kernel, _native.order_for(rtol), table, np.cumsum(taken) - taken, counts, counts <= room)
 
     def _second_chance(self, result, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
         """The members to run once more, by which flow and with which tolerances.
@@ -244,6 +238,14 @@ class Flow:
             return tangent_programs(self.program, self.projection, n, directions)
 
         return Flow(parts, rows * n, rows * self.numbers, None, groups, self.base_size, general)
+
+
+def _compact(kernel: _native.Kernel, table, room, counts, rtol: float) -> Steps:
+    """The steps of a run, without the room that was not used."""
+    taken, starts = np.minimum(counts, room), np.cumsum(room) - room
+    if not np.array_equal(taken, room):
+        table = np.concatenate([table[:0], *(table[s : s + k] for s, k in zip(starts, taken, strict=True))])
+    return Steps(kernel, _native.order_for(rtol), table, np.cumsum(taken) - taken, counts, counts <= room)
 
 
 def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:

@@ -138,8 +138,6 @@ class Kernel:
         `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. With `room` (N,)
         up to so many steps of each member are written down, for `vjp`. What a handler has `begun` is gone on with.
         """
-        if (kernel := self.of_members(len(y0))) is not self:
-            return kernel(ts, y0, params, rtol, atol, max_steps, room, begun)
         ts, y0, params = _contiguous(ts, y0, params)
         members, times = len(y0), ts.shape[1]
         if begun is not None:
@@ -189,8 +187,6 @@ class Kernel:
         `path_ct` (N, T, 2n), of which the first and the last are not looked at, and of the states at the end, `y_ct`
         (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P).
         """
-        if (kernel := self.of_members(len(y_ct))) is not self:
-            return kernel.vjp(ts, params, table, first, counts, path_ct, y_ct, order)
         ts, params, path_ct, table = _contiguous(ts, params, path_ct, table)
         first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
         y_ct, params_ct = np.array(y_ct, np.float64, order="C"), np.zeros((len(y_ct), self.numbers))
