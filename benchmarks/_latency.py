@@ -94,9 +94,9 @@ def _inside_a_scan(case: Case) -> Callable:
 def _machine_code(case: Case) -> Callable:
     start, ts = _start(case), np.array([[0.0, case.duration]])
     problem = Problem.of(case.scene.system, Layout.of(*start), *start, ts[0], case.scene.params, rtol=TOLERANCE)
-    kernel, y0, numbers = flow_of(problem).kernel, np.asarray(problem.y0)[None], np.asarray(problem.vector)[None]
+    kernel, y0, numbers = flow_of(problem).kernel.of_members(1), problem.y0, problem.vector
     rtol, atol = map(float, problem.tolerances)
-    return functools.partial(kernel, ts, y0, numbers, rtol, atol, problem.max_steps)
+    return functools.partial(kernel, ts, y0[None], numbers[None], rtol, atol, problem.max_steps)
 
 
 def _is_there(name: str) -> bool:
