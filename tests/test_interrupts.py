@@ -19,7 +19,7 @@ import pytest
 import lagjax
 from lagjax._native import _threads
 
-SHORT, LONG, LIMIT = np.linspace(0, 1, 3), np.linspace(0, 1e6, 3), 10**9
+SHORT, LONG, LIMIT = np.linspace(0, 1, 3), np.linspace(0, 1e9, 3), 10**9
 SCENE = lagjax.scenes.pendulum()
 START = np.linspace(0.5, 2.5, 400)
 
