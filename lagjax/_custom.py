@@ -41,9 +41,9 @@ def _jvp(primals, tangents, *, function, count):
 
 def batch_in_front(arrays, axes) -> list:
     """The arguments of a batching rule, each with the batch as its first axis, those that are shared as well."""
-    size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not batching.not_mapped)
+    size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
     return [
-        jnp.broadcast_to(x, (size, *x.shape)) if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0)
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
         for x, axis in zip(arrays, axes, strict=True)
     ]
 

@@ -9,6 +9,9 @@ from pathlib import Path
 # CPU lacks them. It reads its level of logging when it is imported.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
+# Machine code is what most tests are of, and it runs on CPUs. What is of GPUs asks for them itself (`test_gpu.py`).
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
 import jax
 import llvmlite.binding
 import pytest

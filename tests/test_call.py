@@ -6,6 +6,7 @@ on several threads and devices, after a fork, and with what fails.
 
 import ctypes
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -153,6 +154,21 @@ def test_the_interface_is_compared_with_the_header(tmp_path):
         assert old in text
         header.write_text(text.replace(old, new))
         assert reason in _native.unavailable(str(tmp_path))
+    header.write_text(text)
+    assert _native.unavailable(str(tmp_path)) is None
+
+
+@pytest.mark.parametrize(
+    "renamed",
+    [{}, {"Extension_Type": "InternalExtension_Type", "Extension_Base": "InternalExtension", "Execution": "Invoke"}],
+)
+def test_the_interface_by_its_older_and_its_newer_names(tmp_path, renamed):
+    """JAX 0.11 renames three types of the interface, whose structures stay as they are."""
+    header = tmp_path / "xla" / "ffi" / "api" / "c_api.h"
+    header.parent.mkdir(parents=True)
+    text = (tmp_path.__class__(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
+    for old, new in renamed.items():
+        text = re.sub(rf"XLA_FFI_{old}(?=Context|\b)", f"XLA_FFI_{new}", text)
     header.write_text(text)
     assert _native.unavailable(str(tmp_path)) is None
 

@@ -367,7 +367,7 @@ def _curvature_transpose(cotangents, *args, **settings):
 def _batched(primitive):
     def rule(args, axes, **settings):
         given = [
-            jnp.expand_dims(x, 0) if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0)
+            jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(x, axis, 0)
             for x, axis in zip(args, axes, strict=True)
         ]
         outs = primitive.bind(*given, **settings)
@@ -380,12 +380,12 @@ def _several_at_once(primitive, outputs_after):
     """Directions, or cotangents, of one motion are followed together: `outputs_after` axes come after theirs."""
 
     def rule(args, axes, **settings):
-        if any(axis is not batching.not_mapped for axis in axes[:_GIVEN]):
+        if any(axis is not None for axis in axes[:_GIVEN]):
             return _batched(primitive)(args, axes, **settings)
-        size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not batching.not_mapped)
+        size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
         place, linear = args[1].ndim - 1, []  # the axis after those of the batch
         for x, axis in zip(args[_GIVEN:], axes[_GIVEN:], strict=True):
-            if axis is batching.not_mapped:
+            if axis is None:
                 x, axis = jnp.broadcast_to(x, (size, *x.shape)), 0
             x = jnp.moveaxis(x, axis, place)
             m = x.shape[place + 1]

@@ -42,6 +42,12 @@ _STRUCTURES = {
     "Api_Version": _HEAD + "int major_version; int minor_version;",
     "TypeId": "int64_t type_id;",
 }
+# What versions 0.4 and later call by another name, in the order in which it is to be replaced.
+_RENAMED = {
+    "XLA_FFI_InternalExtension_Type": "XLA_FFI_Extension_Type",
+    "XLA_FFI_InternalExtension": "XLA_FFI_Extension_Base",
+    "XLA_FFI_InvokeContext": "XLA_FFI_ExecutionContext",
+}
 # Offsets in bytes that follow from them.
 _EXTENSION, _ARGS, _RETS, _ATTRS = 8, 72, 112, 160
 _METADATA, _MAJOR, _MINOR, _TRAITS, _STATE_TYPE = 24, 24, 28, 32, 40
@@ -60,6 +66,8 @@ def unavailable(include: str) -> str | None:
     major = re.search(r"#define XLA_FFI_API_MAJOR (\d+)", text)
     if major is None or int(major[1]) != MAJOR:
         return f"the version of the interface is {major and major[1]}, not {MAJOR}"
+    for new, old in _RENAMED.items():
+        text = text.replace(new, old)
     for name, fields in _STRUCTURES.items():
         body = re.search(rf"struct XLA_FFI_{name} {{(.*?)\n}}", text, flags=re.DOTALL)
         declared = body and " ".join(body[1].split())

@@ -437,7 +437,7 @@ def _call(expansion, params, *arguments):
 
 @_lowers("scan")
 def _scan(expansion, params, *arguments):
-    consts, carry = params["num_consts"], params["num_carry"]
+    consts, carry = _parts_of_scan(params)
     constants, state, columns = arguments[:consts], arguments[consts : consts + carry], arguments[consts + carry :]
     order = range(params["length"])[:: -1 if params["reverse"] else 1]
     rows = {}
@@ -448,6 +448,14 @@ def _scan(expansion, params, *arguments):
     outputs = params["jaxpr"].out_avals[carry:]
     empty = [np.zeros((0, *aval.shape), dtype=np.int64) for aval in outputs]
     return [*state, *(map(np.stack, zip(*(rows[k] for k in sorted(rows)), strict=True)) if rows else empty)]
+
+
+def _parts_of_scan(params) -> tuple[int, int]:
+    """How many arguments of a scan are constants, and how many are the state that it carries."""
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()  # since JAX 0.11
+    return len(consts), len(carry)
 
 
 @_lowers("while")
