@@ -28,7 +28,7 @@ Three rules keep the error-free steps error-free whatever a compiler does: a pro
 (so contracting it into a fused multiply-add changes nothing), bits are moved by masks, and nothing reads
 (x + constant) - constant, which XLA simplifies to x.
 
-When.  The fast versions serve float64 where JAX's default backend is the CPU, decided while tracing.  Everything else
+When.  The fast versions serve float64 where JAX's default device is a CPU, decided while tracing.  Everything else
 (float32, integers, complex, Python scalars and other weakly typed values, other platforms) goes to `jax.numpy`.  A
 wrong guess of the platform costs time, not digits.
 """
@@ -39,6 +39,7 @@ import numpy as np
 from jax import lax
 
 from lagjax._digits import COS, PI_2, SIN
+from lagjax._platform import default_platform
 
 # 4272943 is a numerator among the continued fraction's convergents of 2 pi: as good as 680060 whole turns.
 TURNS = 4272943.0
@@ -50,7 +51,7 @@ ANGLE_LIMIT = 2.0**53
 def _is_fast(x) -> bool:
     """Whether x is a strongly typed float64, and the platform a CPU."""
     weak = getattr(x, "weak_type", type(x) in (bool, int, float, complex))
-    return not weak and jnp.result_type(x) == jnp.float64 and jax.default_backend() == "cpu"
+    return not weak and jnp.result_type(x) == jnp.float64 and default_platform() == "cpu"
 
 
 # ---- small tools ----------------------------------------------------------------------------------------------------

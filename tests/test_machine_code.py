@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax
+import lagjax._machine_code as machine_code
 
 OSCILLATOR = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
 BY_ARRAYS = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, path="array")
@@ -50,3 +51,15 @@ def test_a_run_without_it_is_an_error_that_says_why(scene, start, options, reaso
 def test_traced_tolerances_are_an_error_too():
     with pytest.raises(ValueError, match="the tolerances are being traced"):
         jax.jit(lambda rtol: lagjax.simulate(OSCILLATOR, 1.0, 0.0, TS, rtol=rtol, **INSIST).q)(1e-6)
+
+
+def test_where_it_runs_is_asked_anew_for_every_run(monkeypatch):
+    """A machine with a GPU, where the device of a run may be the one and then the other."""
+    with monkeypatch.context() as context:
+        context.setattr(machine_code, "default_platform", lambda: "gpu")
+        assert "diffrax" in str(OSCILLATOR.explain(1.0, 0.0))
+        with pytest.raises(ValueError, match=r"default device is a gpu.*jax\.default_device.*chooses a CPU"):
+            lagjax.simulate(OSCILLATOR, 1.0, 0.0, TS, **INSIST)
+    assert lagjax.simulate(OSCILLATOR, 1.0, 0.0, TS, **INSIST).ok
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert lagjax.simulate(OSCILLATOR, 1.0, 0.0, TS, **INSIST).ok

@@ -105,10 +105,10 @@ def _solve_batch(engine: Diffrax, batch: Batch) -> Solution:
 @eqx.filter_jit
 def _solve(engine: Diffrax, problem: Problem) -> Solution:
     derivation, numbers, given = problem.derivation, problem.numbers, jnp.asarray(problem.ts)
-    form, y0 = form_of(derivation, problem.system.path), halves(jnp.asarray(problem.y0))
+    form, y0 = form_of(derivation, problem.system.path), jnp.asarray(problem.y0)
 
     # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
-    start = _state_result(y0, *form.acceleration(given[0], y0, numbers))
+    start = _state_result(y0, *form.acceleration(given[0], halves(y0), numbers))
     ts = jnp.where(start == RESULTS.successful, given, given[0])
     event = None if problem.event is None else _in_coordinates(problem.event, problem.layout, problem.params)
     method = engine.method(problem)
@@ -117,7 +117,7 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
     if derivation.motion.constrained:
         end = halves(solution.y_end)
         schur = derivation.motion.schur_complement
-        lost = rank_lost(schur, (*y0, given[0], numbers), (*end, solution.t_end, numbers))
+        lost = rank_lost(schur, (*halves(y0), given[0], numbers), (*end, solution.t_end, numbers))
         failed = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
         result = RESULTS.where(failed & lost, RESULTS.constraint_rank_lost, result)
         not_projected = solution.result == code_of(RESULTS.promote(Projected.FAILED))
@@ -173,7 +173,7 @@ def _in_coordinates(event: diffrax.Event, layout: Layout, params: PyTree) -> dif
 
     def flat(function):
         def condition(t, y, args, **_):
-            return function(*map(layout.restore, y), t=t, params=eqx.combine(args, params))
+            return function(*map(layout.restore, halves(y)), t=t, params=eqx.combine(args, params))
 
         return condition
 

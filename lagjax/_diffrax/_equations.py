@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax._derivation import Derivation
 from lagjax._motion import Motion
+from lagjax._platform import default_platform
 from lagjax._program import Program, Unlowerable
 
 PyTree = Any
@@ -130,6 +131,11 @@ def _scalars(params: PyTree) -> list[jax.Array]:
 
 
 def _compiled_once(function, *arguments):
-    """Call a jitted function without XLA inlining it: it is compiled once, however many places call it."""
+    """Call a jitted function without XLA inlining it on CPUs: it is compiled once, however many places call it.
+
+    On a GPU a call of its own costs as much as the arithmetic of a step, and compiling ten of them is quick.
+    """
+    if default_platform() != "cpu":
+        return function(*arguments)
     with set_xla_metadata(inlineable="false"):
         return function(*arguments)

@@ -15,6 +15,7 @@ from lagjax._derivation import Derivation
 from lagjax._machine_code import _transforms
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
 from lagjax._native import Guards
+from lagjax._platform import default_platform
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
 from lagjax._program import Unlowerable
 from lagjax._validate import is_concrete
@@ -61,6 +62,8 @@ class MachineCode(AbstractEngine):
             return "an event was asked for"
         if not all(map(is_concrete, problem.tolerances)):
             return "the tolerances are being traced"
+        if (platform := default_platform()) != "cpu":
+            return f"the default device is a {platform}, and `jax.default_device(jax.devices('cpu')[0])` chooses a CPU"
         flow = _flow_of(problem)
         return flow if isinstance(flow, str) else None
 

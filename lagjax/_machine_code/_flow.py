@@ -8,7 +8,6 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from lagjax import _native
@@ -51,8 +50,6 @@ class Tolerances(NamedTuple):
 
 def unfit(program: Program, size: int, dtype) -> str | None:
     """Why there is no machine code for a scene, as the end of a sentence; None where there is."""
-    if (platform := _platform()) != "cpu":
-        return f"the default device is a {platform}, and `jax.default_device(jax.devices('cpu')[0])` chooses a CPU"
     if dtype != np.float64:
         return f"the coordinates are {np.dtype(dtype).name}, not float64"
     if program.operations > LARGEST_PROGRAM:
@@ -65,14 +62,6 @@ def unfit(program: Program, size: int, dtype) -> str | None:
     except Unlowerable as reason:
         return str(reason)
     return None
-
-
-def _platform() -> str:
-    """Where JAX computes unless its arguments say otherwise."""
-    device = jax.config.jax_default_device  # a device or the name of a platform; None without `jax.default_device`
-    if device is None:
-        return jax.default_backend()
-    return device if isinstance(device, str) else device.platform
 
 
 # ---- flows -----------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from lagjax import _elementary
+from lagjax._platform import default_platform
 from lagjax._program._graph import Node
 from lagjax._program._operations import OPERATIONS
 
@@ -116,7 +117,7 @@ def _apart(op: str) -> Callable:
         return single(*xs), jax.jvp(plain, xs, moving)[1]
 
     def call(*xs):
-        if jax.default_backend() != "cpu":
+        if default_platform() != "cpu":
             return function(*xs)
         return on_lanes(*xs) if any(jnp.ndim(x) for x in xs) else single(*xs)
 
