@@ -23,11 +23,13 @@ import numpy as np
 
 from lagjax._constraints import velocity_scales
 from lagjax._layout import Layout, dtype_of
+from lagjax._linear import solve_many
 from lagjax._motion import Motion
 from lagjax._native import Projection
 from lagjax._program import Graph, Program, Unlowerable, lower, lower_formula, lower_scalars, lower_solution
 from lagjax._program._scalars import applied, joined, spread, stacked
 from lagjax._quantities import OwnRules, quantities
+from lagjax._recursion import Recursion, RecursiveElimination
 from lagjax._saddle import SaddleElimination, TwoCoordinates
 
 PyTree = Any
@@ -95,6 +97,7 @@ class Derivation:
         self._programs: dict[tuple[str, ...], Program] = {}
         self._by_q: dict[tuple[int, ...], Program] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
+        self._recursion: Recursion | None = None  # known once the quantities are
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
         self._traced_once: Motion = jax.tree.map(jax.jit, motion)
 
@@ -114,7 +117,8 @@ class Derivation:
             return in_order(self._traced_once.quantities(*jax.tree.unflatten(structure, leaves)))
 
         def on_scalars(expansion, leaves):
-            return in_order(quantities(self.motion, expansion, self.state_shapes, leaves))
+            values, self._recursion = quantities(self.motion, expansion, self.state_shapes, leaves)
+            return in_order(values)
 
         leaves, structure = jax.tree.flatten(self.state_shapes)
         try:
@@ -187,12 +191,17 @@ class Derivation:
     def acceleration(self) -> Program:
         """q̈, then whether M, or its saddle point with the constraints, is singular.
 
+        Where L builds velocities by recursion, and that is shorter, they are eliminated, not M (see `_recursion`): the
+        last output tells where that does not hold.
+
         With constraints M may be singular (a parameter may make it so) as long as the saddle point is not. To allow for
         that costs three times the arithmetic. Where M is regular in general the program is therefore the regular-M
         variant, and its last output tells where that would cost digits; there `otherwise()` is the general variant.
         Machine code changes over where that comes about, with the numbers of the run at hand; XLA, which has to write
         the program down before it knows them, takes the one that always holds (`Program.complete`).
         """
+        if (variant := self._by_recursion()) is not None:
+            return replace(variant, otherwise=lambda: self._general_acceleration)
         if not self.motion.constrained or self._constant_mass or not self._regular(_ACCELERATION):
             return self._general_acceleration
         variant = self._solution(_ACCELERATION, regular_only=True)
@@ -340,6 +349,43 @@ class Derivation:
 
         return system, elimination.solve
 
+    def _by_recursion(self) -> Program | None:
+        """q̈ by the recursion in L; None where there is none, or where it does not hold at a sampled state."""
+        self._whole  # noqa: B018  (its trace finds the recursion)
+        if self._recursion is None:
+            return None
+        self._regular(_ACCELERATION)  # raises where M needs pivoting
+        elimination, n = RecursiveElimination(self._recursion, self.layout.dtype), self.layout.size
+        places, count = elimination.entries, len(elimination.entries)
+        positions = [*self._positions("recursion"), *self._positions("force")]
+        cut = functools.cache(lambda: self._whole.only(positions, in_jax))
+
+        def system(*scalars):
+            whole = self._whole.own_outputs(*scalars)
+            values = cut().vector(*scalars) if whole is None else whole[positions]
+            right = spread(values[count:], np.arange(n), n + 2 * elimination.velocities)
+            return places, values[:count], right, *elimination.factors(values[:count])
+
+        def in_jax(*scalars):  # the same function of the state, with arrays: M is eliminated
+            dense, solve = self._system(_ACCELERATION)
+            _, _, right, factors, singular = dense(*scalars)
+            return [*solve(factors, right), jnp.asarray(singular)]
+
+        program = lower_solution(
+            system, elimination.solve, n, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph, in_jax=in_jax
+        )
+        return program if self._agrees(program) else None
+
+    def _agrees(self, program: Program) -> bool:
+        """Whether a program for q̈ gives that of M q̈ = F at the sampled states."""
+        columns = self._columns
+        of = self.evaluate(["mass_matrix", "force"], columns)
+        exact = solve_many(of["mass_matrix"], of["force"][:, :, None])[:, :, 0]
+        *found, singular = program.evaluate_many(columns)
+        usable = np.isfinite(exact).all(axis=1)
+        error = np.abs(np.array(found).T - exact)[usable]
+        return not singular[usable].any() and bool((error <= 1e-6 * np.abs(exact[usable]).max(initial=0)).all())
+
     def _parts(self, saddle: _Saddle, entries: np.ndarray, constraints: int) -> Callable:
         """A formula for these entries of M and G, the `constraints` numbers of c, and b, end to end."""
         n, starts = self.layout.size, self._starts
@@ -382,10 +428,14 @@ class Derivation:
     @_lowered_once
     def _samples(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """M and G at a few states that nothing speaks for, where they are finite."""
-        n, parts, rng = self.layout.size, self.program("mass_matrix", "jacobian"), np.random.default_rng(0)
-        columns = rng.uniform(0.3, 1.2, (3, parts.size)).T
-        rows = parts.evaluate_many(columns).T
+        n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
+        rows = parts.evaluate_many(self._columns).T
         return [(x[: n * n].reshape(n, n), x[n * n :].reshape(-1, n)) for x in rows if np.isfinite(x).all()]
+
+    @property
+    def _columns(self) -> list[np.ndarray]:
+        """The inputs at these states, one array (states,) for each."""
+        return list(np.random.default_rng(0).uniform(0.3, 1.2, (3, len(self.scalar_shapes))).T)
 
     def _regular(self, saddle: _Saddle) -> bool:
         """Whether M is regular in general: at all of the sampled states. Raises `Unlowerable` where it needs pivoting.

@@ -14,6 +14,8 @@ import numpy as np
 from lagjax._constraints import Constraints
 from lagjax._motion import Motion
 from lagjax._program import Derivatives, Expansion, Tape, has_own_rules, inputs_of, traced
+from lagjax._recursion import Recursion, RecursiveElimination, recursion_of
+from lagjax._saddle import SaddleElimination
 
 PyTree = Any
 Ids = np.ndarray  # scalars of a graph, in the shape of the array that they stand for
@@ -103,15 +105,32 @@ class _State:
             rates[int(self.ids["t"])] = self.expansion.graph.constant(1.0, "float")
         return np.array(self.derivatives.along_one(values.tolist(), rates), dtype=np.int64)
 
+    def zero(self, values: Ids) -> np.ndarray:
+        """Which numbers are zero whatever the state."""
+        graph = self.expansion.graph
+        return np.array([graph.value(i) == 0 for i in values.ravel().tolist()], bool).reshape(values.shape)
+
+    def varying(self, values: Ids) -> np.ndarray:
+        """Which numbers depend on q, q̇ or t."""
+        graph = self.expansion.graph
+        moving = {i for name in ("q", "qdot", "t") for i in self.ids[name].ravel().tolist()}
+        for i in self.derivatives.below(values.ravel().tolist()):
+            if not moving.isdisjoint(graph.nodes[i][1]):
+                moving.add(i)
+        return np.array([i in moving for i in values.ravel().tolist()], bool).reshape(values.shape)
+
     def map(self, op: str, *arrays: Ids) -> Ids:
         """An operation, elementwise."""
         return self.expansion.map(op, *arrays)
 
 
-def quantities(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list[Ids]) -> dict[str, Ids]:
+def quantities(
+    motion: Motion, expansion: Expansion, shapes: tuple, leaves: list[Ids]
+) -> tuple[dict[str, Ids], Recursion | None]:
     """`Motion.quantities`, as ids; `shapes` are those of (q, q̇, t, params) and `leaves` the ids of all their leaves.
 
-    Raises `OwnRules`.
+    Where accelerations take fewer operations by the recursion in L, that comes with them, and its `entries` are one
+    quantity more: `recursion` (k,). Raises `OwnRules`.
     """
     state, everything = _State(expansion, shapes, leaves), ("q", "qdot", "t", "params")
     rates = {"q": state.ids["qdot"], "t": True}
@@ -140,8 +159,48 @@ def quantities(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list
         "generalized_force": generalized,
         **_of_constraints(motion.constraints, state, rates),
     }
+    # Last of all, so that programs of scenes without one are not touched by the search.
+    recursion = _shorter_recursion(motion, state, lagrangian, matrix)
+    if recursion is not None:
+        result["recursion"] = _entries(state, recursion)
     expansion.traced_operations += state.derivatives.operations
-    return result
+    return result, recursion
+
+
+# What a Taylor series costs: a step takes about so many orders, and a sum over all lower orders half as many products.
+_ORDERS = 20
+
+
+def _shorter_recursion(motion: Motion, state: _State, lagrangian: _Taped, matrix: Ids) -> Recursion | None:
+    """The recursion in L, where that takes fewer operations than to eliminate M; two coordinates have Cramer's rule."""
+    if motion.constraints.exist or len(matrix) < 3 or not state.varying(matrix).any():
+        return None
+    recursion = recursion_of(state.derivatives, int(lagrangian.value), state.ids["qdot"].tolist())
+    if recursion is None:
+        return None
+    sparse = RecursiveElimination(recursion, float)
+    dense = SaddleElimination((state.zero(matrix), np.zeros((0, len(matrix)), bool)), float, False, False)
+    if not sparse.complete:
+        return None
+    nodes, entries = matrix[tuple(dense.entries.T)].tolist(), _entries(state, recursion).tolist()
+    graph = state.expansion.graph
+    costs = (
+        _cost(state, entries, sparse.entries, *sparse.operations([graph.value(i) for i in entries])),
+        _cost(state, nodes, dense.entries, dense.operations, dense.solution_operations),
+    )
+    return recursion if all(a < b for a, b in zip(*costs, strict=True)) else None
+
+
+def _cost(state: _State, nodes: list[int], places: np.ndarray, operations: int, solution: int) -> tuple[int, float]:
+    """The operations of an elimination with its matrix, whose `nodes` stand at these places, and those of a step."""
+    operations += state.derivatives.size(nodes)
+    sums = np.where(places[:, 0] == places[:, 1], 1, 2)[state.varying(np.array(nodes))].sum()
+    return operations, operations + _ORDERS * (solution + (2 + _ORDERS / 2) * float(sums))
+
+
+def _entries(state: _State, recursion: Recursion) -> Ids:
+    minus = state.expansion.graph.constant(-1.0, "float")
+    return np.array([minus if i is None else i for i in recursion.entries.values()])
 
 
 # Scalars of a tape beyond which cotangents of equal scalars are always taken together: what they would hide is that

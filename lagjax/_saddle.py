@@ -102,6 +102,11 @@ class SaddleElimination:
         """About how many operations the elimination and one solution take."""
         return sum(len(rows) * (len(rows) + 6) + 3 for rows in self.below.values())
 
+    @property
+    def solution_operations(self) -> int:
+        """About how many of them one solution takes."""
+        return sum(4 * len(rows) + 1 for rows in self.below.values())
+
     # ---- factors ----
 
     def factors(self, values) -> tuple[Any, Any]:

@@ -122,6 +122,17 @@ def test_powers_have_derivatives_where_their_products_and_roots_have_none():
     np.testing.assert_allclose(values["gamma"], [[-2 * 0.09 - 1.5 * 0.16]], rtol=1e-14)
 
 
+def test_derivatives_of_powers_of_multiples():
+    # (c u)² is known as c² u², in which c u no longer appears; its derivative is that of the power.
+    system = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: (0.5 * (q[0] * q[1])) ** 2 - 1.0)
+    q, v = np.array([[1.0, 2.0]]), np.array([[0.3, -0.6]])
+    values = of(system, q[0], v[0])
+    values = values.evaluate(["jacobian", "rates", "gamma"], columns_of(q, v, 0.0, []))
+    np.testing.assert_allclose(values["jacobian"], [[[2.0, 1.0]]], rtol=1e-15)
+    np.testing.assert_allclose(values["rates"], [[0.0]], atol=1e-15)
+    np.testing.assert_allclose(values["gamma"], [[0.36]], rtol=1e-14)  # f = u²/4 − 1: −u̇²/2 − u q̇₁ q̇₂, u = 2, u̇ = 0
+
+
 @pytest.mark.parametrize("make", [scenes.double_pendulum, scenes.chaplygin_sleigh])
 def test_quantities_are_those_of_the_motion(make):
     scene = make()
@@ -179,9 +190,11 @@ def test_a_mass_matrix_in_blocks_costs_what_its_blocks_cost():
 
 
 def test_what_does_not_fit_in_memory_is_refused_before_it_is_tried(monkeypatch):
-    scene = scenes.chain(16)
-    small = of(scene.system, scene.q0, scene.qdot0, scene.params)
-    large = Derivation(small.motion, small.layout, scene.params)
+    def lagrangian(q, v):
+        return 20 * v @ v + jnp.sum(jnp.outer(v, v) * jnp.cos(q[:, None] - q))
+
+    small = of(lagjax.System(lagrangian), np.ones(16), np.ones(16))
+    large = Derivation(small.motion, small.layout, None)
     assert large.program("force").operations > 0
     monkeypatch.setattr(_derivation, "OPERATION_BUDGET", 1000)
     with pytest.raises(Unlowerable, match=r"some \d+ operations, more than the 1000 that are expected to fit"):

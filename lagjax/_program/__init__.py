@@ -133,13 +133,20 @@ def lower_formula(formula: Callable, *shapes, budget: int, graph: Graph | None =
 
 
 def lower_solution(
-    system: Callable, solve: Callable, size: int, *shapes, budget: int, graph: Graph | None = None
+    system: Callable,
+    solve: Callable,
+    size: int,
+    *shapes,
+    budget: int,
+    graph: Graph | None = None,
+    in_jax: Callable | None = None,
 ) -> "Program":
     """The program of the first `size` components of z with A z = r, A symmetric, and of one more number.
 
     Both functions are formulas (see `lower_formula`) on numbers of these `shapes`. `system(*numbers)` gives the rows
     and columns (k, 2) of entries of A on and below its diagonal, these entries (k,), r, what `solve` needs of A, a tree
-    of vectors, and that number; `solve(factors, r)` gives z, and is linear in r.
+    of vectors, and that number; `solve(factors, r)` gives z, and is linear in r. `in_jax` is the function in JAX where
+    that is to be another one than these two.
     """
     counts: list = []
 
@@ -150,10 +157,11 @@ def lower_solution(
         counts.append((places, [x.ids.size for x in (z, entries, right)], [x.shape for x in leaves], factors))
         return [z.ids[:size], _ids_of(expansion, number), z.ids[size:], *(x.ids for x in (entries, right, *leaves))]
 
-    def in_jax(*arguments):
+    def solved(*arguments):
         _, _, right, factors, number = system(*arguments)
         return [*solve(factors, right)[:size], jnp.asarray(number)]
 
+    in_jax = in_jax or solved
     program = lower_scalars(whole, in_jax, tuple(shapes), budget, graph)
     places, (of_z, of_entries, of_right), of_factors, factors = counts[0]
     ends = np.cumsum([size, 1, of_z - size, of_entries, of_right])

@@ -9,13 +9,13 @@ These are derivatives of the operations as they stand. A function with a rule of
 differentiated here: `has_own_rules` finds it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
 from jax.extend import core
 
-from lagjax._program._graph import Graph, Tape
+from lagjax._program._graph import Graph, Node, Tape
 from lagjax._program._operations import OPERATIONS
 
 _Rule = Callable[[int], int]
@@ -44,8 +44,8 @@ class Derivatives:
     def __init__(self, graph: Graph):
         self.graph, self.operations = graph, 0
 
-    def copied(self, tape: Tape, inputs: Sequence[int]) -> list[int]:
-        """What the scalars of a tape are in the graph; `inputs` holds what its inputs are."""
+    def copied(self, tape: Graph, inputs: Sequence[int]) -> list[int]:
+        """What the scalars of a tape, or of another graph, are in the graph; `inputs` holds what its inputs are."""
         nodes: list[int] = []
         for (op, operands, attribute), kind in zip(tape.nodes, tape.kinds, strict=True):
             nodes.append(self._copied(op, [nodes[x] for x in operands], attribute, kind, inputs))
@@ -74,9 +74,25 @@ class Derivatives:
                     cotangents[x] = self._apply("add", cotangents[x], part) if x in cotangents else part
         return [results.get(i, self._number(0.0)) for i in by]
 
+    def slopes(self, output: int, through: Iterable[int], by: Sequence[int]) -> list[int]:
+        """The derivatives of a node by others, as if these were independent: reverse mode on the graph itself.
+
+        `through` holds the nodes that depend on the others, in order, `output` the last of them.
+        """
+        cotangents, ends = {output: self._number(1.0)}, set(by)
+        for i in reversed(list(through)):
+            if i in ends or (g := cotangents.pop(i, None)) is None:
+                continue
+            op, operands, attribute = self.as_derived(i)
+            for x, rule in zip(operands, self._rules(i, op, operands, attribute), strict=False):
+                if rule is not None and self.graph.value(x) is None:
+                    part = rule(g)
+                    cotangents[x] = self._apply("add", cotangents[x], part) if x in cotangents else part
+        return [cotangents.get(i, self._number(0.0)) for i in by]
+
     def size(self, outputs: Sequence[int]) -> int:
         """How many operations some nodes take together."""
-        return sum(bool(self.graph.nodes[i][1]) for i in self._below(outputs))
+        return sum(bool(self.graph.nodes[i][1]) for i in self._reached(outputs, self.graph.nodes.__getitem__))
 
     def _copied(self, op: str, operands: list[int], attribute, kind: str, inputs: Sequence[int]) -> int:
         """A node of a tape in the graph."""
@@ -104,9 +120,9 @@ class Derivatives:
             for i, tangent in direction.items():
                 if self.graph.value(tangent) != 0:
                     tangents.setdefault(i, {})[k] = tangent
-        for i in self._below(outputs) if tangents else ():
+        for i in self.below(outputs) if tangents else ():
             if self.graph.kinds[i] == "float" and i not in tangents:
-                moved = not tangents.keys().isdisjoint(self.graph.nodes[i][1])
+                moved = not tangents.keys().isdisjoint(self.as_derived(i)[1])
                 if moved and (of_node := self._tangents(i, tangents)):
                     tangents[i] = of_node
         return [tangents.get(i, {}) for i in outputs]
@@ -117,11 +133,8 @@ class Derivatives:
 
     def _tangents(self, i: int, tangents: dict[int, Tangents]) -> Tangents:
         """The tangents of a node, from those of its operands."""
-        (op, operands, attribute), result = self.graph.nodes[i], {}
-        if i in self.graph.powers:
-            base, exponent = self.graph.powers[i]
-            op, operands, attribute = "integer_pow", (base,), exponent
-        elif op == "div" and all(x in tangents for x in operands):
+        (op, operands, attribute), result = self.as_derived(i), {}
+        if op == "div" and all(x in tangents for x in operands):
             return self._of_quotient(i, tangents)
         for operand, rule in zip(operands, self._rules(i, op, operands, attribute), strict=False):
             if rule is None:
@@ -140,6 +153,13 @@ class Derivatives:
             result[k] = apply("sub", tangent, apply("mul", i, of_v[k])) if k in of_v else tangent
         return {k: apply("div", tangent, v) for k, tangent in result.items()}
 
+    def as_derived(self, i: int) -> Node:
+        """A node as it is differentiated: a power is one operation, not the products that it consists of."""
+        if i in self.graph.powers:
+            base, exponent = self.graph.powers[i]
+            return "integer_pow", (base,), exponent
+        return self.graph.nodes[i]
+
     def _rules(self, w: int, op: str, operands: Sequence[int], attribute: Any = None) -> Sequence[_Rule | None]:
         """For every operand what takes a cotangent, or a tangent, past w = op(operands); None: there is none."""
         if op == "integer_pow":
@@ -155,15 +175,19 @@ class Derivatives:
         lower = base if exponent == 2 else self._apply("pow", base, self._number(exponent - 1))
         return self._apply("mul", g, self._apply("mul", self._number(exponent), lower))
 
-    def _below(self, outputs: Sequence[int]) -> list[int]:
-        """The nodes that some nodes depend on, and these, in order."""
+    def below(self, outputs: Sequence[int]) -> list[int]:
+        """The nodes that some nodes are derived from, and these, in order."""
+        return sorted(self._reached(outputs, self.as_derived))
+
+    @staticmethod
+    def _reached(outputs: Sequence[int], node_of: Callable[[int], Node]) -> set[int]:
         seen, stack = set(), list(outputs)
         while stack:
             i = stack.pop()
             if i not in seen:
                 seen.add(i)
-                stack.extend(self.graph.nodes[i][1])
-        return sorted(seen)
+                stack.extend(node_of(i)[1])
+        return seen
 
     def _apply(self, op: str, *operands: int, attribute=None) -> int:
         self.operations += 1

@@ -1,0 +1,133 @@
+"""Accelerations by the recursion in a Lagrangian, against M q̈ = F with M as a whole."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import scenes
+from lagjax._derivation import columns_of, derivation_of, numbers_of
+from lagjax._layout import Layout
+
+
+def of(system, q, qdot, params=None):
+    return derivation_of(system, Layout.of(q, qdot), params)
+
+
+def chain(n):
+    scene = scenes.chain(n)
+    return scene.system, scene.params
+
+
+def beam(n):
+    """Links with the velocities of their middles, which are half of the first one and differences of the others."""
+
+    def lagrangian(q, qdot):
+        vx, vy = -jnp.sin(q) * qdot, jnp.cos(q) * qdot
+        x, y = jnp.cumsum(vx) - 0.5 * vx, jnp.cumsum(vy) - 0.5 * vy
+        return 0.5 * jnp.sum(x**2 + y**2) + jnp.sum(qdot**2) / 24 - 3.0 * jnp.sum(jnp.diff(q, prepend=0.0) ** 2)
+
+    return lagjax.System(lagrangian), None
+
+
+def tree(n):
+    """Rotors with shafts that branch, in a turning frame, with a velocity that is squared apart and a magnetic term."""
+
+    def lagrangian(q, qdot, t):
+        total, speeds = 0.0, []
+        for k in range(n):
+            before = speeds[(k - 1) // 2] if k else 0.1 * jnp.sin(t)
+            speeds.append(jnp.cos(q[k]) * qdot[k] + before + 0.3 * q[k])
+            total = total + 0.5 * (1 + k) * speeds[k] ** 2 + 0.05 * qdot[k] ** 2
+        return total + jnp.sum(jnp.sin(q) * qdot) - 0.5 * jnp.sum(q**2)
+
+    return lagjax.System(lagrangian), None
+
+
+def relativistic(n):
+    """A chain whose kinetic energies are not quadratic in its velocities."""
+
+    def lagrangian(q, qdot):
+        vx, vy = jnp.cumsum(jnp.cos(q) * qdot), jnp.cumsum(jnp.sin(q) * qdot)
+        return jnp.sum(0.5 * (vx**2 + vy**2) + 1e-3 * (vx**2 + vy**2) ** 2) + jnp.sum(jnp.cos(q))
+
+    return lagjax.System(lagrangian), None
+
+
+@pytest.mark.parametrize("make", [chain, beam, tree, relativistic])
+def test_accelerations_are_those_of_the_whole_mass_matrix(make):
+    n = 12
+    system, params = make(n)
+    rng = np.random.default_rng(0)
+    q, qdot, t = rng.uniform(-2, 2, (3, n)), rng.uniform(-1, 1, (3, n)), 0.3
+    derivation = of(system, q[0], qdot[0], params)
+    program, columns = derivation.acceleration, columns_of(q, qdot, t, numbers_of(params))
+    assert program.otherwise is not None  # M as a whole is what is left to others
+    assert program.operations < program.complete.operations
+    *found, singular = program.evaluate_many(columns)
+    values = derivation.evaluate(["mass_matrix", "force"], columns)
+    exact = np.linalg.solve(values["mass_matrix"], values["force"][:, :, None])[:, :, 0]
+    condition = np.linalg.cond(values["mass_matrix"]).max()
+    assert not np.any(singular)
+    error = np.abs(np.array(found).T - exact).max()
+    assert error <= 10 * condition * np.finfo(float).eps * np.abs(exact).max()
+
+
+def test_operations_grow_as_the_number_of_links():
+    counts = [of(system, np.ones(n), np.ones(n), params).acceleration.operations
+              for n in (16, 32, 48) for system, params in [chain(n)]]  # fmt: skip
+    assert counts[2] - counts[1] == counts[1] - counts[0]
+
+
+def test_motions_and_derivatives_are_those_of_a_small_scene_without_recursion():
+    # In other words, without what L computes twice, the same Lagrangian has no recursion.
+    n, system = 7, chain(7)[0]
+    first, second = np.triu_indices(n, 1)
+
+    def expanded(q, qdot, params):
+        m, l, g = params["m"], params["l"], params["g"]
+        carried = jnp.cumsum(m[::-1])[::-1]
+        pairs = carried[second] * l[first] * l[second] * jnp.cos(q[first] - q[second]) * qdot[first] * qdot[second]
+        return 0.5 * jnp.sum(carried * l**2 * qdot**2) + jnp.sum(pairs) + g * jnp.sum(carried * l * jnp.cos(q))
+
+    params = {"m": np.linspace(0.5, 1.5, n) / n, "l": np.full(n, 1 / n), "g": 9.81}
+    q0, qdot0, ts = np.linspace(0.3, 1.2, n), np.zeros(n), np.linspace(0.0, 0.3, 3)
+    one, other = lagjax.System(expanded), system
+    assert of(one, q0, qdot0, params).acceleration.otherwise is None
+    assert of(other, q0, qdot0, params).acceleration.otherwise is not None
+
+    def end(system, params, q0):
+        return lagjax.simulate(system, q0, qdot0, ts, params, rtol=1e-11).q[-1]
+
+    np.testing.assert_allclose(end(other, params, q0), end(one, params, q0), rtol=1e-10)
+    weights = jnp.arange(1.0, n + 1)
+    slopes = [jax.grad(lambda q0, s=system: weights @ end(s, params, q0))(q0) for system in (one, other)]
+    np.testing.assert_allclose(*slopes, rtol=1e-8)
+
+
+def test_a_link_without_mass_is_singular_and_says_so():
+    system, params = chain(8)
+    params = params | {"m": np.where(np.arange(8) < 7, 0.1, 0.0)}
+    program = of(system, np.ones(8), np.ones(8), params).acceleration
+    columns = columns_of(np.linspace(0.1, 1.0, 8)[None], np.ones((1, 8)), 0.0, numbers_of(params))
+    assert program.evaluate_many(columns)[-1, 0] == 1.0
+    with pytest.raises(Exception, match="singular"):
+        lagjax.simulate(system, np.linspace(0.1, 1.0, 8), np.ones(8), np.linspace(0.0, 0.1, 3), params)
+
+
+def test_an_energy_of_parts_that_is_negative_leaves_the_mass_matrix_to_decide():
+    # Each velocity counts negative on its own, and M is positive definite all the same.
+    def lagrangian(q, qdot):
+        w = jnp.cumsum(jnp.cos(q) * qdot)
+        return 0.5 * jnp.sum(qdot**2) * 20 - 0.1 * jnp.sum(w**2) - 0.5 * jnp.sum(q**2)
+
+    n, rng = 8, np.random.default_rng(1)
+    derivation = of(lagjax.System(lagrangian), np.ones(n), np.ones(n))
+    columns = columns_of(rng.uniform(-1, 1, (5, n)), rng.uniform(-1, 1, (5, n)), 0.0, [])
+    *found, singular = derivation.acceleration.evaluate_many(columns)
+    exact = np.array(derivation.acceleration.complete.evaluate_many(columns)[:-1])
+    usable = np.asarray(singular) == 0
+    np.testing.assert_allclose(np.array(found)[:, usable], exact[:, usable], rtol=1e-10, atol=1e-12)
+    run = lagjax.simulate(lagjax.System(lagrangian), np.ones(n), np.ones(n), np.linspace(0.0, 1.0, 3))
+    assert run.ok
