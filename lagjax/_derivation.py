@@ -38,6 +38,10 @@ PyTree = Any
 OPERATION_BUDGET = 4_000_000
 
 
+# The order of coordinates of states far away, where a force between bodies is weak: its square is then a millionth.
+_FAR = 1e3
+
+
 class _Saddle(NamedTuple):
     """A linear system M x − Gᵀλ = b, G x = c by the names of b (None: zero) and c, and the sign c is taken with.
 
@@ -97,6 +101,7 @@ class Derivation:
         self._programs: dict[tuple[str, ...], Program] = {}
         self._by_q: dict[tuple[int, ...], Program] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
+        self._sampled: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
         self._recursion: Recursion | None = None  # known once the quantities are
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
         self._traced_once: Motion = jax.tree.map(jax.jit, motion)
@@ -378,7 +383,7 @@ class Derivation:
 
     def _agrees(self, program: Program) -> bool:
         """Whether a program for q̈ gives that of M q̈ = F at the sampled states."""
-        columns = self._columns
+        columns = self._columns()
         of = self.evaluate(["mass_matrix", "force"], columns)
         exact = solve_many(of["mass_matrix"], of["force"][:, :, None])[:, :, 0]
         *found, singular = program.evaluate_many(columns)
@@ -425,31 +430,43 @@ class Derivation:
     def _constant_mass(self) -> bool:
         return not self.reads("mass_matrix")
 
-    @_lowered_once
-    def _samples(self) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _samples(self, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """M and G at a few states that nothing speaks for, where they are finite."""
-        n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
-        rows = parts.evaluate_many(self._columns).T
-        return [(x[: n * n].reshape(n, n), x[n * n :].reshape(-1, n)) for x in rows if np.isfinite(x).all()]
+        if reach not in self._sampled:
+            n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
+            rows = parts.evaluate_many(self._columns(reach)).T
+            self._sampled[reach] = [
+                (x[: n * n].reshape(n, n), x[n * n :].reshape(-1, n)) for x in rows if np.isfinite(x).all()
+            ]
+        return self._sampled[reach]
 
-    @property
-    def _columns(self) -> list[np.ndarray]:
-        """The inputs at these states, one array (states,) for each."""
-        return list(np.random.default_rng(0).uniform(0.3, 1.2, (3, len(self.scalar_shapes))).T)
+    def _columns(self, reach: float = 1.0) -> list[np.ndarray]:
+        """The inputs at these states, one array (states,) for each: of order one, but q of this order."""
+        n, columns = self.layout.size, np.random.default_rng(0).uniform(0.3, 1.2, (3, len(self.scalar_shapes))).T
+        return [reach * x for x in columns[:n]] + list(columns[n:])
 
     def _regular(self, saddle: _Saddle) -> bool:
         """Whether M is regular in general: at all of the sampled states. Raises `Unlowerable` where it needs pivoting.
 
         Elimination without pivoting is for positive definite M. With constraints M may be singular, and is then
-        augmented by GᵀG. The choice is between right answers: a wrong guess is caught by the test on the pivots.
+        augmented by GᵀG. The choice is between right answers: a wrong guess is caught by the test on the pivots. A mass
+        matrix that is a series in something small, as 1/(c² r) in relativity, is positive definite where that is small:
+        a scene counts as positive definite that is so at all states near, or at all far away.
         """
+        for reach in (1.0, _FAR):
+            if (regular := self._definite(saddle, self._samples(reach))) is not None:
+                return regular
+        raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
+
+    def _definite(self, saddle: _Saddle, samples: list[tuple[np.ndarray, np.ndarray]]) -> bool | None:
+        """Whether M is regular at these samples; None where what is eliminated is not positive definite."""
         n, m, regular = self.layout.size, self._rows(saddle), True
-        for matrix, jacobian in self._samples:
+        for matrix, jacobian in samples:
             lowest, size, rows = _lowest_eigenvalue(matrix), np.abs(matrix).max(), jacobian[:m]
             regular = regular and lowest > 1e-10 * size
             augmented = _lowest_eigenvalue(matrix + rows.T @ rows) if m else lowest
             if (n > 2 or m) and augmented < -1e-12 * size:
-                raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
+                return None
         return bool(regular)
 
 

@@ -96,6 +96,17 @@ def singular_threshold(n: int, dtype) -> float:
     return n * float(jnp.finfo(dtype).eps)
 
 
+def eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ascending eigenvalues (n,) of a symmetric matrix (n, n), and eigenvectors, one a column; LAPACK's order n³ work
+    is spared for a diagonal matrix, as large scenes of bodies have them.
+    """
+    diagonal = np.diagonal(matrix)
+    if not np.array_equal(matrix, np.diag(diagonal)):
+        return tuple(np.linalg.eigh(matrix))
+    order = np.argsort(diagonal)
+    return diagonal[order], np.eye(len(matrix), dtype=matrix.dtype)[:, order]
+
+
 def null_directions(matrix: np.ndarray, threshold: float | None = None) -> np.ndarray:
     """Unit vectors, one a row (k, n), that a symmetric matrix (n, n) sends to zero after scaling to a unit diagonal.
 
@@ -103,7 +114,7 @@ def null_directions(matrix: np.ndarray, threshold: float | None = None) -> np.nd
     """
     threshold = singular_threshold(len(matrix), matrix.dtype) if threshold is None else threshold
     scale = diagonal_scale(matrix)
-    values, vectors = np.linalg.eigh(_scaled(matrix, scale))
+    values, vectors = eigen(_scaled(matrix, scale))
     null = np.abs(values) <= threshold * max(np.abs(values).max(), np.finfo(matrix.dtype).tiny)
     directions = (scale[:, None] * vectors[:, null]).T
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)

@@ -407,3 +407,22 @@ def test_findings_are_frozen_sorted_and_fit_a_screen():
     assert str(lagjax.check(lagjax.System(free), 1.0, 0.0)) == "Nothing found."
     with pytest.raises(AttributeError):
         findings.found = ()
+
+
+def test_many_coordinates_are_compared_along_random_directions_first():
+    n = 100
+    q, v = np.linspace(0.2, 1.0, n), np.linspace(1.0, 0.3, n)
+
+    def pairs(q):
+        return jnp.sum(jnp.sqrt(1.0 + jnp.diff(q) ** 2))
+
+    assert kinds(lambda q, v: 0.5 * v @ v - pairs(q), q, v) == set()
+    hidden = lagjax.check(lagjax.System(lambda q, v: 0.5 * v @ v - pairs(q) - q[7] * jax.lax.stop_gradient(q[7])), q, v)
+    assert [(finding.kind, finding.where) for finding in hidden] == [("wrong_derivative", ("q[7]",))]
+    q[40] = 0.0
+    bent = lagjax.check(lagjax.System(lambda q, v: 0.5 * v @ v - pairs(q) - jnp.abs(q[40])), q, v)
+    assert [finding.where for finding in bent if finding.kind == "kink"] == [("q[40]",)]
+    # Oscillators beside each other, one of them stiff.
+    stiff = np.where(np.arange(n) == 3, 1e10, 1.0)
+    masses = np.linspace(1.0, 2.0, n)
+    assert kinds(lambda q, v: 0.5 * masses @ v**2 - 0.5 * stiff @ q**2, q, v) == {"stiff"}

@@ -321,3 +321,19 @@ def test_explain_names_the_engine_that_runs(name, monkeypatch):
     assert facts.path == "scalar" or facts.reason
     if engine == "machine code":
         assert facts.path == "scalar" and facts.operations > 0
+
+
+def test_a_mass_matrix_that_is_a_series_in_weak_forces_is_positive_definite():
+    # Relativity adds G m/(c² r) to masses: with all numbers of order one M is indefinite, and nothing like the scene.
+    scene = scenes.solar_system()
+    derivation = of(scene.system, scene.q0, scene.qdot0, scene.params)
+    state = columns_of(scene.q0.reshape(1, -1), scene.qdot0.reshape(1, -1), 0.0, numbers_of(scene.params))
+    *found, singular = derivation.acceleration.evaluate_many(state)[:, 0]
+    values = derivation.evaluate(["mass_matrix", "force"], state)
+    assert not singular
+    np.testing.assert_allclose(found, np.linalg.solve(values["mass_matrix"][0], values["force"][0]), rtol=1e-10)
+    # One that is indefinite by construction needs pivoting.
+    signs = np.array([1.0, -1.0, 1.0])
+    system = lagjax.System(lambda q, v: jnp.sum(signs * v**2) + v[0] * v[1] * jnp.cos(q[0] - q[1]) + v[1] * v[2])
+    with pytest.raises(Unlowerable, match="not positive definite"):
+        of(system, np.ones(3), np.ones(3)).acceleration  # noqa: B018

@@ -16,7 +16,7 @@ import numpy as np
 
 from lagjax._check._findings import Finding, listed
 from lagjax._check._measure import Scene
-from lagjax._linear import diagonal_scale, null_directions, singular_threshold
+from lagjax._linear import diagonal_scale, eigen, null_directions, singular_threshold
 from lagjax._problem import DEFAULT_RTOL
 
 
@@ -158,12 +158,12 @@ def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[
     usual = 1 / np.sqrt(np.maximum(np.median([np.abs(np.diagonal(k)) for k in others], axis=0), 1e-300))
 
     def smallest(matrix):
-        values, vectors = np.linalg.eigh(usual[:, None] * matrix * usual)
+        values, vectors = eigen(usual[:, None] * matrix * usual)
         place = np.argmin(np.abs(values))
         return np.abs(values[place]) / np.abs(values).max(), vectors[:, place]
 
     lowest, direction = smallest(here)
-    if lowest >= _NEARLY * np.median([smallest(k)[0] for k in others]):
+    if all(np.array_equal(k, here) for k in others) or lowest >= _NEARLY * np.median([smallest(k)[0] for k in others]):
         return []
     where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 0.1)
     message = (
@@ -181,7 +181,7 @@ def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
     free = kernel(rows * scale)
     if not free.shape[1]:
         return []
-    values, vectors = np.linalg.eigh(free.T @ (scale[:, None] * mass * scale) @ free)
+    values, vectors = eigen(free.T @ (scale[:, None] * mass * scale) @ free)
     negative = values < -_rounding(mass) * np.abs(values).max()
     if not negative.any():
         return []
@@ -205,13 +205,20 @@ def kernel(rows: np.ndarray) -> np.ndarray:
     return vectors[rank:].T
 
 
+def _spread(matrix: np.ndarray) -> float:
+    """The largest |eigenvalue| of a symmetric matrix over the smallest."""
+    sizes = np.abs(eigen(matrix)[0])
+    with np.errstate(divide="ignore"):
+        return float(sizes.max() / sizes.min())
+
+
 def _condition(matrix: np.ndarray, names, default_rtol: float) -> list[Finding]:
     scale = diagonal_scale(matrix)
-    condition, raw = np.linalg.cond(scale[:, None] * matrix * scale), np.linalg.cond(matrix)
+    condition, raw = _spread(scale[:, None] * matrix * scale), _spread(matrix)
     lost = condition * np.finfo(matrix.dtype).eps
     if lost <= default_rtol:
         return []
-    _, vectors = np.linalg.eigh(scale[:, None] * matrix * scale)
+    _, vectors = eigen(scale[:, None] * matrix * scale)
     where = tuple(name for name, c in zip(names, vectors[:, 0], strict=True) if abs(c) > 0.1)
     message = (
         f"The mass matrix has the condition {condition:.1e} after scaling each coordinate ({raw:.1e} before): "

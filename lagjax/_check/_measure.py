@@ -48,7 +48,7 @@ class Scene(NamedTuple):
         sizes, derivation = _sizes(layout, q, qdot), derivation_of(system, layout, params)
         steps, offsets = ladder(sizes, layout.dtype), _offsets(layout, q, sizes)
         try:
-            measured = _evaluated(derivation, state, steps, offsets)
+            measured = _evaluated(derivation, state, offsets)
         except Unlowerable:
             measured = jax.tree.map(np.asarray, _measure(system, q, qdot, t, params, steps, offsets))
         return cls(system, layout, derivation, derivation.motion, (q, qdot, t, params), state, sizes, steps, measured)
@@ -58,6 +58,45 @@ class Scene(NamedTuple):
         """The names of the 2n + 1 directions of differences: coordinates, velocities, and along the motion."""
         names = self.layout.names
         return (*names, *(f"d{name}" for name in names), "the motion")
+
+    def sides(self) -> "Sides":
+        """The outputs on both sides of the state, along every coordinate and velocity and along the motion."""
+        if self.measured.sides is not None:
+            return self.measured.sides
+        minus, plus = self.beside(np.eye(2 * self.layout.size + 1), self.steps)
+        one, here = columns_of(*(np.asarray(x)[None] for x in self.state[:2]), *self._others), self.measured
+        noise = self.derivation.program(*_COMPARED).round_off_many(one)[:, 0]
+        lost = {name: value[0] for name, value in self.derivation.round_off(_DERIVED, one).items()}
+        drift = {
+            "lagrangian_by_q": here.by_q, "given_force": here.extra,
+            "dissipation_by_qdot": here.by_v_of_dissipation, "force": here.force,
+        }  # fmt: skip
+        of_drift = sum(lost[name] + np.finfo(self.layout.dtype).eps * abs(value) for name, value in drift.items())
+        round_off = (
+            lost["lagrangian_by_q"], lost["momentum"], lost["mass_matrix"], of_drift, lost["dissipation_by_qdot"],
+            lost["jacobian"],
+        )  # fmt: skip
+        return Sides(minus, plus, noise, round_off)
+
+    def beside(self, directions: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The outputs of `Measured.here` at steps back and ahead, each (directions, rungs, outputs), by programs.
+
+        `directions` (D, 2n + 1) are combinations of the coordinates, the velocities and the motion; `steps` (rungs, D).
+        """
+        (q, v, t), n = (np.asarray(x) for x in self.state[:3]), self.layout.size
+        axes = np.eye(2 * n + 1, dtype=q.dtype)
+        axes[-1, :n] = v
+        moves = np.stack([-steps, steps]).transpose(2, 0, 1)[..., None] * (directions @ axes)[:, None, None]
+        along = (np.concatenate([q, v, t[None]]) + moves).reshape(-1, 2 * n + 1).astype(q.dtype)
+        _, numbers = self._others
+        sides = self.derivation.program(*_COMPARED).evaluate_many([*along.T, *numbers]).T
+        sides = sides.reshape(len(directions), 2, len(steps), -1)
+        return sides[:, 0], sides[:, 1]
+
+    @property
+    def _others(self) -> tuple[np.ndarray, list]:
+        """The time, and every number in params."""
+        return np.asarray(self.state[2]), numbers_of(self.state[3])
 
     @property
     def lagrangian(self) -> np.ndarray:
@@ -135,9 +174,15 @@ class Measured(NamedTuple):
     gamma: Any  # γ of G q̈ = γ, (m,)
     velocity: Any  # (states, n)
     power: Any  # Σ q̇ᵢ ∂D/∂q̇ᵢ, which D takes out of the motion, and Σ |q̇ᵢ ∂D/∂q̇ᵢ|, (states, 2)
-    minus: Any  # the outputs L, p, D (if there is one), f and a at steps back, (2n + 1, rungs, outputs)
-    here: Any  # these outputs at the state, (outputs,)
-    plus: Any  # these outputs at steps ahead, (2n + 1, rungs, outputs)
+    here: Any  # the outputs L, p, D (if there is one), f and a at the state, (outputs,)
+    sides: "Sides | None"  # None: they are yet to be evaluated, by programs
+
+
+class Sides(NamedTuple):
+    """What derivatives are compared with: the outputs of `Measured.here` at states on both sides, and rounding."""
+
+    minus: Any  # at steps back, (directions, rungs, outputs)
+    plus: Any  # at steps ahead, (directions, rungs, outputs)
     noise: Any  # how far rounding may move `here`, (outputs,)
     round_off: Any  # how far it may move by_q, momentum, mass, drift, by_v_of_dissipation and the rows of G, each alike
 
@@ -178,51 +223,37 @@ def _offsets(layout: Layout, q: PyTree, sizes: np.ndarray) -> np.ndarray:
 
 
 _COMPARED = ("lagrangian", "momentum", "dissipation", "residual")
-_DRIFT = ("lagrangian_by_q", "given_force", "dissipation_by_qdot", "force")
+_DERIVED = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissipation_by_qdot", "force", "jacobian")
 
 
-def _evaluated(derivation: Derivation, state, steps: np.ndarray, offsets: np.ndarray) -> Measured:
+def _evaluated(derivation: Derivation, state, offsets: np.ndarray) -> Measured:
     """What is measured, by the programs of a derivation; raises `Unlowerable` where it has none."""
     q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
     n = len(q)
-    near = derivation.evaluate(
-        ("momentum", "mass_matrix", "jacobian"), columns_of(q + offsets[:, :n], v + offsets[:, n:], t, numbers)
-    )
-    damping = columns_of(q + 0 * offsets[:, :n], v + offsets[:, n:], t, numbers)
-    terms = derivation.evaluate(("dissipation_by_qdot",), damping)["dissipation_by_qdot"] * (v + offsets[:, n:])
-    names = ("lagrangian_by_q", "force", "given_force", "dissipation_by_qdot", "gamma")
-    one = columns_of(q[None], v[None], t, numbers)
-    here = {name: value[0] for name, value in derivation.evaluate(names, one).items()}
-
-    directions = np.eye(2 * n + 1, dtype=q.dtype)
-    directions[-1, :n] = v
-    moves = np.stack([-steps, steps]).transpose(2, 0, 1)[..., None] * directions[:, None, None]
-    along = (np.concatenate([q, v, t[None]]) + moves).reshape(-1, 2 * n + 1)
-    sides = derivation.program(*_COMPARED).evaluate_many([*along.T, *numbers]).T
-    sides = sides.reshape(2 * n + 1, 2, len(steps), -1)
-    derived = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissipation_by_qdot", "force", "jacobian")
-    lost = {name: value[0] for name, value in derivation.round_off(derived, one).items()}
+    names = ("momentum", "mass_matrix", "jacobian", "lagrangian_by_q", "force", "given_force", "gamma")
+    names += ("dissipation_by_qdot",)
+    near = derivation.evaluate(names, columns_of(q + offsets[:, :n], v + offsets[:, n:], t, numbers))
+    velocity = v + offsets[:, n:]
+    power = np.zeros((len(offsets), 2))
+    if not derivation.absent("dissipation_by_qdot").all():
+        damping = columns_of(q + 0 * offsets[:, :n], velocity, t, numbers)
+        terms = derivation.evaluate(("dissipation_by_qdot",), damping)["dissipation_by_qdot"] * velocity
+        power = np.stack([terms.sum(axis=1), np.abs(terms).sum(axis=1)], axis=1)
+    here = derivation.program(*_COMPARED).evaluate_many(columns_of(q[None], v[None], t, numbers))
     return Measured(
-        by_q=here["lagrangian_by_q"],
+        by_q=near["lagrangian_by_q"][0],
         momentum=near["momentum"],
         mass=near["mass_matrix"],
-        force=here["force"],
-        extra=here["given_force"],
-        by_v_of_dissipation=here["dissipation_by_qdot"],
+        force=near["force"][0],
+        extra=near["given_force"][0],
+        by_v_of_dissipation=near["dissipation_by_qdot"][0],
         jacobian=near["jacobian"],
-        gamma=here["gamma"],
-        velocity=v + offsets[:, n:],
-        power=np.stack([terms.sum(axis=1), np.abs(terms).sum(axis=1)], axis=1),
-        minus=sides[:, 0],
-        here=derivation.program(*_COMPARED).evaluate_many(one)[:, 0],
-        plus=sides[:, 1],
-        noise=derivation.program(*_COMPARED).round_off_many(one)[:, 0],
-        round_off=(
-            lost["lagrangian_by_q"], lost["momentum"], lost["mass_matrix"],
-            sum(lost[name] + np.finfo(q.dtype).eps * abs(here[name]) for name in _DRIFT),
-            lost["dissipation_by_qdot"], lost["jacobian"],
-        ),
-    )  # fmt: skip
+        gamma=near["gamma"][0],
+        velocity=velocity,
+        power=power,
+        here=here[:, 0],
+        sides=None,
+    )
 
 
 def _program_variation(derivation: Derivation, state, acceleration, multipliers) -> np.ndarray:
@@ -295,13 +326,15 @@ def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
         gamma=gamma[0],
         velocity=velocity,
         power=jax.vmap(dissipated)(offsets),
-        minus=sides[:, 0],
         here=everything(y),
-        plus=sides[:, 1],
-        noise=jnp.zeros_like(everything(y)),
-        round_off=(
-            *map(_rounding, (by_q, momentum[0], mass[0])), _rounding(by_q, extra, dragging, force[0]),
-            *map(_rounding, (dragging, jacobian[0])),
+        sides=Sides(
+            sides[:, 0],
+            sides[:, 1],
+            jnp.zeros_like(everything(y)),
+            (
+                *map(_rounding, (by_q, momentum[0], mass[0])), _rounding(by_q, extra, dragging, force[0]),
+                *map(_rounding, (dragging, jacobian[0])),
+            ),
         ),
     )  # fmt: skip
 

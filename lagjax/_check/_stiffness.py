@@ -19,9 +19,11 @@ def findings(scene: Scene) -> list[Finding]:
     by_q, by_v = free.T @ jacobian[:, :n] @ free, free.T @ jacobian[:, n:] @ free
     if not (np.isfinite(by_q).all() and np.isfinite(by_v).all()) or not free.shape[1]:
         return []
-    f = len(by_q)
-    linear = np.block([[np.zeros((f, f)), np.eye(f)], [by_q, by_v]])
-    values = _trusted(linear, float(np.finfo(scene.layout.dtype).eps))
+    f, eps = len(by_q), float(np.finfo(scene.layout.dtype).eps)
+    if by_v.any():
+        values = _trusted(np.block([[np.zeros((f, f)), np.eye(f)], [by_q, by_v]]), eps)
+    else:
+        values = _trusted_roots(_symmetric(by_q, free.T @ m.mass[0] @ free), eps)
     speeds = np.abs(values)
     if len(values) < 2 or speeds.max() < _RATIO * speeds.min():
         return []
@@ -38,6 +40,34 @@ def findings(scene: Scene) -> list[Finding]:
             "fast motion out, or count on long runs."
         )
     return [Finding("stiff", "advice", (), message)]
+
+
+def _symmetric(matrix: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """A matrix with the eigenvalues of K = M⁻¹ S, M diagonal: symmetric where S is, up to rounding; else K itself."""
+    diagonal = np.diagonal(mass)
+    if not np.array_equal(mass, np.diag(diagonal)) or (diagonal <= 0).any():
+        return matrix
+    scale = np.sqrt(diagonal)
+    scaled = scale[:, None] * matrix / scale
+    symmetric = 0.5 * (scaled + scaled.T)
+    return symmetric if np.abs(scaled - symmetric).max() <= 1e-12 * np.abs(scaled).max() else matrix
+
+
+def _trusted_roots(matrix: np.ndarray, eps: float) -> np.ndarray:
+    """`_trusted` for ẍ = K x, of which the eigenvalues are ±√ of those of K: an eighth of the work."""
+
+    symmetric = np.array_equal(matrix, matrix.T)
+    noise = 64 * eps * np.abs(matrix).max() * np.random.default_rng(0).standard_normal(matrix.shape)
+    if symmetric:
+        noise = 0.5 * (noise + noise.T)
+
+    def roots(k):
+        return np.sqrt((np.linalg.eigvalsh(k) if symmetric else np.linalg.eigvals(k)).astype(complex))
+
+    values, perturbed = roots(matrix), roots(matrix + noise)
+    nearest = np.abs(values[:, None] - perturbed).min(axis=1)
+    trusted = values[(np.abs(values) > 0) & (nearest < 0.1 * np.abs(values))]
+    return np.concatenate([trusted, -trusted])
 
 
 def _trusted(linear: np.ndarray, eps: float) -> np.ndarray:

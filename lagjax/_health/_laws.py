@@ -217,6 +217,8 @@ def _eigenvalues(xp, matrix):
         larger = xp.where(middle < 0, middle - radius, middle + radius)
         smaller = xp.where(larger == 0, 0.0, (a * d - c * c) / xp.where(larger == 0, 1.0, larger))
         return xp.stack([larger, smaller], axis=-1)
+    if xp is np and not np.any(matrix[..., ~np.eye(n, dtype=bool)]):  # bodies: LAPACK would take n³ operations
+        return np.sort(np.diagonal(matrix, axis1=-2, axis2=-1), axis=-1)
     finite = xp.isfinite(matrix).all(axis=(-2, -1))  # NumPy's LAPACK raises where one is not
     symmetric = 0.5 * (matrix + xp.swapaxes(matrix, -1, -2))
     usable = xp.where(finite[..., None, None], symmetric, xp.eye(n, dtype=matrix.dtype))

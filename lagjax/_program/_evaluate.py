@@ -67,13 +67,19 @@ def steps_of(line, precision) -> list[tuple[Callable | None, tuple, object, tupl
             attribute = _dtype(kind, precision).type(attribute)
         elif op == "convert":
             attribute = _dtype(kind, precision)
-        function = None if op in ("input", "constant") else _converted if op == "convert" else OPERATIONS[op].value
+        function = _FUNCTIONS[op]
+        if op == "div" and kind == "float":  # without a look at the kind for every state
+            function = np.divide
         steps.append((function, operands, (op == "input", attribute), tuple(dropped.get(k, ()))))
     return steps
 
 
 def _converted(x, dtype):
     return np.asarray(x).astype(dtype)
+
+
+_FUNCTIONS: dict[str, Callable | None] = {name: row.value for name, row in OPERATIONS.items()}
+_FUNCTIONS |= {"input": None, "constant": None, "convert": _converted}
 
 
 def _values(steps, columns) -> list:

@@ -96,7 +96,7 @@ def _round(x, method):
 
 
 def _divide(x, y):
-    if np.issubdtype(np.result_type(x), np.floating):
+    if np.result_type(x).kind == "f":
         return np.divide(x, y)
     return np.where(y == 0, -1, np.trunc(np.divide(x, np.where(y == 0, 1, y))))[()].astype(np.result_type(x))
 
