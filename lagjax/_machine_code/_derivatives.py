@@ -1,55 +1,87 @@
 """First derivatives of a flow map, for rows of members: `jvp` along directions, `vjp` from cotangents.
 
-`jvp` runs the tangent flow, whose coordinates are those of the motion and of its tangents (`_tangent`). `vjp` goes back
-over the steps of the motion itself, each transposed (`_native._adjoint`): its cost does not grow with the number of
-parameters. The two agree within the tolerance. A name that ends in `_ct` is a cotangent, as in JAX.
+Both go over the steps of the motion itself: forward along each direction (`_native._tangent`), back with each step
+transposed (`_native._adjoint`). They are transposes of each other to round-off, and as accurate as the motion as long
+as its steps suit its tangents: where they do not, they are divided (`_divided`). What `vjp` costs does not grow with
+the number of parameters. A name that ends in `_ct` is a cotangent, one that ends in `_dot` a tangent.
 """
 
 import functools
 import math
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from lagjax import _native
 from lagjax._machine_code._flow import Flow, Tolerances
-from lagjax._machine_code._steps import KEPT, StepStore
-from lagjax._machine_code._tangent import from_rows, to_rows
+from lagjax._machine_code._steps import KEPT, Steps, StepStore
 from lagjax._native import Projection
-from lagjax._program import Program, StraightLine, evaluate, pullback
+from lagjax._program import Program, StraightLine, evaluate, pullback, pushforward
 from lagjax._results import SUCCESSFUL
 
-# Directions that are followed side by side, and coordinates (those of the motion included) that may come of it: more
-# share the work on the motion among more tangents, and take LLVM longer.
-MOST_DIRECTIONS, MOST_TANGENT_COORDINATES = 8, 40
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
+# The last terms that the series of a tangent may have, relative to the tangent, in tolerances. What the series leaves
+# out is smaller by e² at least. Measured on all scenes: a motion that has its own scale takes steps with at most 300.
+EXCESS = 1000.0
+MOST_PARTS, TRIES = 64, 4  # of a step that is too long, at once; and how often they are divided once more
 
 
-def jvp(flow: Flow, ts, y0, params, dy0, dparams, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
+def jvp(flow: Flow, ts, y0, params, solution, dy0, dparams, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
     """The derivative of `Flow.run` along m directions for each of N members, between fixed times.
 
-    `dy0` (N, m, 2n), `dparams` (N, m, P) → δpath (N, m, T, 2n), NaN where the motion did not come, and δy_end
-    (N, m, 2n), NaN where it failed. Each direction is followed in units of its largest number, so that the tolerances
-    mean the same for tangents of any length.
+    `solution` is (path, result, accepted, ticket) of the run; `dy0` (N, m, 2n), `dparams` (N, m, P) → δpath
+    (N, m, T, 2n), NaN where the motion did not come, and δy_end (N, m, 2n), NaN where it failed.
     """
+    path, result, accepted, ticket = solution
     members, m = dy0.shape[:2]
-    widest = max(1, min(MOST_DIRECTIONS, MOST_TANGENT_COORDINATES // flow.size - 1))
-    groups = math.ceil(m / widest)
+    groups = max(1, min(_native.cores() // members, math.ceil(m / _native.lanes())))  # of directions: one a thread
     directions = math.ceil(m / groups)
     padding = ((0, 0), (0, groups * directions - m), (0, 0))
     dy0, dparams = (np.pad(x, padding).reshape(members * groups, directions, -1) for x in (dy0, dparams))
+    # In units of its largest number, so that the tolerances mean the same for tangents of any length.
     length = np.abs(np.concatenate([dy0, dparams], axis=2)).max(axis=2, initial=0.0, keepdims=True)
     unit = np.where(length > 0, length, 1.0)
-    y0, params = (np.repeat(x, groups, axis=0) for x in (y0, _for_all(params, members)))
-    ts = ts if len(ts) == 1 else np.repeat(ts, groups, axis=0)
-    start = np.concatenate([y0[:, None], dy0 / unit], axis=1)  # (rows, 1 + D, 2n)
-    numbers = np.concatenate([params[:, None], dparams / unit], axis=1).reshape(len(start), -1)
-    tangent = flow.tangent(directions)
-    solution = tangent.follow(ts, from_rows(start), numbers, tolerances.with_larger_budget)
-    lengths = unit.reshape(len(start), directions, 1)
-    path, end = (to_rows(x, flow.size)[..., 1:, :] for x in (solution.path, solution.y_end))
-    path, end = path * lengths[:, None], end * lengths
-    end[solution.result != SUCCESSFUL] = np.nan
-    path = np.moveaxis(path, -2, 1).reshape(members, groups * directions, *path.shape[1:-2], flow.states)
-    return path[:, :m], end.reshape(members, groups * directions, flow.states)[:, :m]
+    dy0, dparams = dy0 / unit, dparams / unit
+    rows = np.repeat(np.arange(members), groups)
+    params = _for_all(params, members)
+    some = ts if len(ts) == 1 else ts[rows], y0[rows], params[rows], accepted[rows], ticket[rows]
+    path_dot, y_dot = _jvp_over_steps(flow, *some, dy0, dparams, tolerances)
+    path_dot, y_dot = path_dot * unit[..., None], y_dot * unit
+    path_dot = path_dot.reshape(members, groups * directions, *path.shape[1:])[:, :m]
+    y_dot = y_dot.reshape(members, groups * directions, -1)[:, :m]
+    if flow.projection is not None and path.shape[1] > 2:
+        dparams = (dparams * unit).reshape(members, groups * directions, -1)[:, :m]
+        _projected(flow, flow.projection, ts, path, params, path_dot, dparams)
+    path_dot[:, :, -1] = y_dot
+    path_dot[~np.broadcast_to(np.isfinite(path)[:, None], path_dot.shape)] = np.nan
+    y_dot[result != SUCCESSFUL] = np.nan
+    return path_dot, y_dot
+
+
+def _jvp_over_steps(
+    flow: Flow, ts, y0, params, accepted, ticket, dy0, dparams, tolerances
+) -> tuple[np.ndarray, np.ndarray]:
+    """`jvp` of some directions a row, over the steps that were taken."""
+    y_dot = np.array(dy0, np.float64)
+    path_dot = np.full((*dy0.shape[:2], ts.shape[1], flow.states), np.nan)
+
+    def along(steps: Steps, rows, members):
+        times = ts if len(ts) == 1 else ts[rows]
+        path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(
+            times, params[rows], steps.table, steps.first[members], steps.counts[members], dy0[rows], dparams[rows],
+            steps.order, tolerances.atol / tolerances.rtol,
+        )  # fmt: skip
+        return excess / (EXCESS * tolerances.rtol)
+
+    for steps, rows, members in _steps_of(flow, ts, y0, params, accepted, ticket, tolerances):
+        excess = along(steps, rows, members)
+        for k in np.flatnonzero(excess > 1.0).tolist():
+            row = rows[k : k + 1]
+            again = functools.partial(along, rows=row, members=np.zeros(1, int))
+            if not _over_divided(flow, steps, members[k], params[row[0]], tolerances, excess[k : k + 1], again):
+                path_dot[row], y_dot[row] = np.nan, np.nan
+    at_start = np.broadcast_to((ts == ts[:, :1])[:, None], path_dot.shape[:3])  # also where there was no step
+    return np.where(at_start[..., None], dy0[:, :, None], path_dot), y_dot
 
 
 # ---- vector–Jacobian products ---------------------------------------------------------------------------------------
@@ -64,8 +96,8 @@ def vjp(flow: Flow, ts, y0, params, solution, path_ct, end_ct, tolerances: Toler
     """
     path, result, accepted, ticket = solution
     members, m = end_ct.shape[:2]
-    if m > flow.states + flow.numbers and flow.size * (1 + flow.states + flow.numbers) <= MOST_TANGENT_COORDINATES:
-        return _vjp_by_jacobian(flow, ts, y0, params, path_ct, end_ct, tolerances)
+    if m > flow.states + flow.numbers:
+        return _vjp_by_jacobian(flow, ts, y0, params, solution, path_ct, end_ct, tolerances)
     reached = np.isfinite(path)[:, None]
     lost = ((path_ct != 0) & ~reached).any(axis=(2, 3))
     lost |= (end_ct != 0).any(axis=2) & (result != SUCCESSFUL)[:, None]
@@ -92,34 +124,29 @@ def vjp(flow: Flow, ts, y0, params, solution, path_ct, end_ct, tolerances: Toler
 def _vjp_over_steps(
     flow: Flow, ts, y0, params, accepted, ticket, path_ct, end_ct, tolerances
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`vjp` of one cotangent a row, over the steps that are kept; motions whose steps are gone are run once more."""
+    """`vjp` of one cotangent a row, over the steps that were taken."""
     y_ct, params_ct = np.full(end_ct.shape, np.nan), np.full((len(y0), flow.numbers), np.nan)
-    waiting = np.ones(len(y0), bool)
 
-    def back(store: StepStore, tickets, places):
-        for steps, some, members in store.runs(tickets):
-            rows = places[some]
-            y_ct[rows], params_ct[rows] = steps.kernel.vjp(
-                ts if len(ts) == 1 else ts[rows], params[rows], steps.table, steps.first[members],
-                steps.counts[members], path_ct[rows], end_ct[rows], steps.order,
-            )  # fmt: skip
-            waiting[rows] = False
+    def back(steps: Steps, rows, members):
+        times = ts if len(ts) == 1 else ts[rows]
+        y_ct[rows], params_ct[rows] = steps.kernel.vjp(
+            times, params[rows], steps.table, steps.first[members], steps.counts[members], path_ct[rows],
+            end_ct[rows], steps.order,
+        )  # fmt: skip
 
-    back(KEPT, ticket, np.arange(len(y0)))
-    for places in _portions(np.flatnonzero(waiting), accepted * (flow.states + 2)):
-        store = StepStore()
-        some_ts = ts if len(ts) == 1 else ts[places]
-        again = flow.follow(some_ts, y0[places], params[places], tolerances, store, accepted[places])
-        back(store, again.ticket, places)
+    for steps, rows, members in _steps_of(flow, ts, y0, params, accepted, ticket, tolerances):
+        back(steps, rows, members)
     at_start = (ts == ts[:, :1])[:, :, None]  # outputs that are the initial state; steps begin after them
     return y_ct + np.sum(path_ct * at_start, axis=1), params_ct
 
 
-def _vjp_by_jacobian(flow: Flow, ts, y0, params, path_ct, end_ct, tolerances) -> tuple[np.ndarray, np.ndarray]:
+def _vjp_by_jacobian(
+    flow: Flow, ts, y0, params, solution, path_ct, end_ct, tolerances
+) -> tuple[np.ndarray, np.ndarray]:
     """`vjp` from the whole Jacobian: for more cotangents than there are numbers that vary."""
     inputs = flow.states + flow.numbers
     unit = np.broadcast_to(np.eye(inputs), (len(y0), inputs, inputs))
-    path, end = jvp(flow, ts, y0, params, unit[..., : flow.states], unit[..., flow.states :], tolerances)
+    path, end = jvp(flow, ts, y0, params, solution, unit[..., : flow.states], unit[..., flow.states :], tolerances)
     used = np.einsum("nmts,nrts->nmr", path_ct, np.where(np.isfinite(path), path, 0.0))
     used += np.einsum("nms,nrs->nmr", end_ct, np.where(np.isfinite(end), end, 0.0))
     path_lost, end_lost = (~np.all(np.isfinite(x), axis=1, keepdims=True) for x in (path, end))
@@ -147,11 +174,84 @@ def _through_projection(flow: Flow, projection: Projection, ts, path, params, pa
     params_ct += back[..., flow.states :].sum(axis=2)
 
 
+def _projected(flow: Flow, projection: Projection, ts, path, params, path_dot, dparams) -> None:
+    """Take tangents through the projection that put the outputs on the constraints, all but the first and last.
+
+    Changes `path_dot` in place; `_through_projection` is its transpose.
+    """
+    members, m, times, _ = path_dot.shape
+    shape = members, m, times - 2, flow.states
+    place = np.broadcast_to(np.where(np.isfinite(path), path, path[:, :1])[:, None, 1:-1], shape)
+    t = np.broadcast_to(ts[:, None, 1:-1], shape[:-1])[..., None]
+    numbers, moving = (
+        np.broadcast_to(x, (*shape[:-1], flow.numbers)) for x in (params[:, None, None], dparams[:, :, None])
+    )
+    parts = place, t, numbers, path_dot[:, :, 1:-1], moving
+    columns = [x.reshape(place[..., 0].size, x.shape[-1]).T for x in parts]  # a scene may have no numbers
+    path_dot[:, :, 1:-1] = evaluate(_moved(projection.state, flow.states), list(np.concatenate(columns))).T.reshape(
+        shape
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _moved(program: Program, t: int) -> StraightLine:
+    """From the inputs of a projection, and tangents of them but the time, input `t`, to the tangents of its outputs."""
+    by = [i for i in range(program.size) if i != t]
+    return pushforward(program.line, [np.dtype(float)] * program.size, by, range(t))
+
+
 @functools.lru_cache(maxsize=64)
 def _transposed(program: Program, t: int) -> StraightLine:
     """From the inputs and output cotangents of a projection to the cotangents of its inputs but the time, input `t`."""
     by = [i for i in range(program.size) if i != t]
     return pullback(program.line, [np.dtype(float)] * program.size, by, range(t))
+
+
+# ---- the steps that a derivative goes over ---------------------------------------------------------------------------
+
+
+def _steps_of(
+    flow: Flow, ts, y0, params, accepted, ticket, tolerances
+) -> Iterator[tuple[Steps, np.ndarray, np.ndarray]]:
+    """The steps of all rows: those of a run, whose rows they are, and which members of the run.
+
+    First those that are kept; motions whose steps are gone are run once more.
+    """
+    waiting = np.ones(len(y0), bool)
+    for steps, rows, members in KEPT.runs(ticket):
+        waiting[rows] = False
+        yield steps, rows, members
+    for places in _portions(np.flatnonzero(waiting), accepted * (flow.states + 2)):
+        store, some_ts = StepStore(), ts if len(ts) == 1 else ts[places]
+        again = flow.follow(some_ts, y0[places], params[places], tolerances, store, accepted[places])
+        for steps, rows, members in store.runs(again.ticket):
+            yield steps, places[rows], members
+
+
+def _over_divided(flow: Flow, steps: Steps, member: int, params, tolerances, excess, sweep: Callable) -> bool:
+    """`sweep(steps)` over the steps of a member in ever smaller parts; whether its tangents suit them in the end.
+
+    `excess` (1,), and what `sweep` returns, is how large the last terms of the series are, in units of the limit.
+    """
+    parts = 1
+    for _ in range(TRIES):
+        if not excess > 1.0:
+            return True
+        parts *= math.ceil(min(MOST_PARTS, 1.1 * float(excess[0]) ** (1 / (steps.order - 1))))
+        excess = sweep(_divided(flow, steps, member, params, tolerances, parts))
+    return not excess > 1.0
+
+
+def _divided(flow: Flow, steps: Steps, member: int, params, tolerances: Tolerances, parts: int) -> Steps:
+    """The steps of one member, each in so many parts: the states between are outputs of the motion."""
+    first = steps.first[member]
+    rows = steps.table[first : first + steps.counts[member]]
+    t, h = rows[:, 0], rows[:, 1]
+    times = np.append((t[:, None] + h[:, None] * np.arange(parts) / parts).ravel(), t[-1] + h[-1])
+    path = flow.follow(times[None], rows[:1, 2:], params[None], tolerances).path[0]
+    table = np.concatenate([times[:-1, None], np.diff(times)[:, None], path[:-1]], axis=1)
+    count = np.array([len(table)])
+    return Steps(steps.kernel, steps.order, table, np.zeros(1, int), count, np.ones(1, bool))
 
 
 # ---- rows ------------------------------------------------------------------------------------------------------------

@@ -171,7 +171,7 @@ class Flow:
         result, event = _RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:
-            ticket = store.keep(_compact(kernel, done.table, room, done.steps, rtol))
+            ticket = store.keep(_compact(self.kernel, done.table, room, done.steps, rtol))
         solution = Solution(*done[:3], result, done.steps, done.rejected, event, ticket, done.idle)
         if (result == SUCCESSFUL).all():
             return solution

@@ -88,9 +88,9 @@ def _run_gone_on_with(ts, y0, params, *begun, flow, tolerances, **_):
 
 
 def _jvp_on_host(ts, y0, params, path, result, accepted, ticket, dy0, dparams, *, flow, tolerances):
-    del path, result, accepted, ticket  # what the transpose needs
-    (ts, y0, params, *direction), batch = _rows((ts, y0, params, dy0, dparams), (1, 1, 1, 2, 2), shared=(0, 2))
-    return _in_batch(_derivatives.jvp(flow, ts, y0, params, *direction, tolerances=tolerances), batch)
+    arrays = ts, y0, params, path, result, accepted, ticket, dy0, dparams
+    (ts, y0, params, *rest), batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 2, 2), shared=(0, 2))
+    return _in_batch(_derivatives.jvp(flow, ts, y0, params, rest[:4], *rest[4:], tolerances=tolerances), batch)
 
 
 def _vjp_on_host(ts, y0, params, path, result, accepted, ticket, path_ct, end_ct, *, flow, tolerances):

@@ -16,7 +16,7 @@ one Taylor series, of the order that the tolerance asks for.
     _step        step control
     _events      where guards change sign
     _output      what is written down
-    _integrator  all of these, round by round;  _adjoint: its transpose
+    _integrator  all of these, round by round;  _tangent, _adjoint: its derivatives, forward and back
     _kernel      both as functions of arrays;  _threads: on several cores, interruptible;  _handler: as a call of XLA
 
 Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).
@@ -33,11 +33,12 @@ from lagjax._native._constants import (
     STEP_TOO_SMALL,
 )
 from lagjax._native._handler import Plan, handler, unavailable
+from lagjax._native._ir import lanes
 from lagjax._native._kernel import Begun, Guards, Kernel, Outcome, Projection, cores, order_for, recurrences
 from lagjax._native._series import is_large
 
 __all__ = [
     "DISCONTINUOUS", "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "STEP_TOO_SMALL",
-    "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "cores", "handler", "is_large", "order_for",
-    "recurrences", "unavailable",
+    "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "cores", "handler", "is_large", "lanes",
+    "order_for", "recurrences", "unavailable",
 ]  # fmt: skip

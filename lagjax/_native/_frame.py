@@ -14,6 +14,7 @@ Every function takes three pointers, to the job, the memory and the integers of 
 with.
 """
 
+import copy
 import ctypes
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -55,34 +56,33 @@ def integers(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
 class Layout:
     """Where the vectors of a thread lie: `fields` gives each name a number of vectors, or rows and columns of them.
 
-    `width` is the lanes of a vector.
+    `width` is the lanes of a vector. A layout `beside` another one has vectors of another width in the same memory.
     """
 
-    def __init__(self, width: int, fields: Mapping[str, int | tuple[int, int]]):
+    def __init__(self, width: int, fields: Mapping[str, int | tuple[int, int]], beside: "Layout | None" = None):
         self.width, self._columns, self._offsets = width, {}, {}
-        total = 0
+        self._doubles = [0] if beside is None else beside._doubles  # of all that share the memory
         for name, shape in fields.items():
-            rows, self._columns[name] = shape if isinstance(shape, tuple) else (shape, 1)
-            self._offsets[name] = total
-            total += rows * self._columns[name]
-        self._vectors = total
+            rows, columns = shape if isinstance(shape, tuple) else (shape, 1)
+            self.extend(name, rows, columns)
 
     @property
     def size(self) -> int:
         """The memory that a thread needs, in doubles: whole cache lines."""
-        return -(-self._vectors * self.width // CACHE_LINE) * CACHE_LINE
+        return -(-self._doubles[0] // CACHE_LINE) * CACHE_LINE
 
-    def extend(self, name: str, rows: int) -> None:
+    def extend(self, name: str, rows: int, columns: int = 1) -> None:
         """One field more, of so many vectors, behind all others."""
-        self._offsets[name], self._columns[name] = self._vectors, 1
-        self._vectors += rows
+        begin = -(-self._doubles[0] // self.width) * self.width
+        self._offsets[name], self._columns[name] = begin, columns
+        self._doubles[0] = begin + rows * columns * self.width
 
     def place(self, name: str, *indices: Index) -> Any:
         """The first element of a vector, counted in doubles: `name`, `name[i]` or `name[i, k]`."""
         row, column = (*indices, 0, 0)[:2]
         columns = self._columns[name]
         index = row if columns == 1 else column if isinstance(row, int) and row == 0 else column + row * columns
-        return (index + self._offsets[name]) * self.width
+        return index * self.width + self._offsets[name]
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +166,12 @@ class Frame:
     def lane(self, index: Value) -> "Lane":
         """One lane of the memory."""
         return Lane(self, index)
+
+    def beside(self, layout: Layout) -> "Frame":
+        """The same function, which sees the fields of another layout of the same memory."""
+        other = copy.copy(self)
+        other.layout, other.width = layout, layout.width
+        return other
 
     # ---- the job ----
 

@@ -17,6 +17,7 @@ from lagjax._native._frame import LANE, Layout
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled, lanes
+from lagjax._native._tangent import Tangent
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._graph import Unlowerable
 from lagjax._program._series import Recurrent, Series, series
@@ -108,6 +109,7 @@ class Kernel:
         self._options = guards, error_groups, base_size
         self.states, self.numbers = 2 * size, program.size - 2 * size - 1
         self.width = lanes() if width is None else width
+        self._tangents = functools.cache(self._tangents_of)
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
     def of_members(self, members: int) -> "Kernel":
@@ -196,8 +198,44 @@ class Kernel:
         )  # fmt: skip
         members, times = path_ct.shape[:2]
         numbers = dict(**self._strides(ts, params), members=members, times=times, order=order)
-        self._backward(arrays, numbers, self.threads(members))
+        kernel = self.of_members(1 if members < self.width / 2 else members)  # few are as fast one after the other
+        kernel._backward(arrays, numbers, kernel.threads(members))
         return y_ct, params_ct
+
+    def jvp(
+        self, ts, params, table, first, counts, y_dot, params_dot, order: int, floor: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The derivative of a run along m directions, over the steps it wrote down.
+
+        The steps of member k are `counts[k]` rows of `table` from `first[k]` on. From the tangents of the initial
+        states, `y_dot` (N, m, 2n), and of the parameters, `params_dot` (N, m, P), to those of the outputs, an array
+        (N, m, T, 2n) of which the last is not written, and of the states at the end (N, m, 2n). The last array (N,) says how large
+        the last two terms of the series of a tangent became, at most, relative to the tangent or to the `floor`.
+        """
+        ts, params, params_dot, table = _contiguous(ts, params, params_dot, table)
+        first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
+        y_dot, excess = np.array(y_dot, np.float64, order="C"), np.zeros(len(y_dot))
+        members, directions, times = *y_dot.shape[:2], ts.shape[1]
+        path_dot = np.full((members, directions, times, self.states), np.nan)
+        arrays = dict(
+            next_member=np.zeros(1, np.int64), ts=ts, params=params, record=table, first_step=first, steps=counts,
+            path_dot=path_dot, y_dot=y_dot, params_dot=params_dot, excess=excess,
+        )  # fmt: skip
+        numbers = dict(
+            **self._strides(ts, params), members=members, times=times, order=order, directions=directions,
+            floor=floor,
+        )  # fmt: skip
+        if directions > 1 and members < self.width / 2:
+            self._tangents(True)(arrays, numbers, min(cores(), members))
+        else:
+            kernel = self.of_members(members)
+            kernel._tangents(False)(arrays, numbers, kernel.threads(members))
+        return path_dot, y_dot, excess
+
+    def _tangents_of(self, side_by_side: bool) -> "_Compiled":
+        """The kernel of tangents, whose directions stand side by side or members do; compiled when first asked for."""
+        tangent = Tangent(*self._parts, width=1 if side_by_side else self.width, lanes=self.width)
+        return _Compiled(tangent.motion.module, tangent.motion.layout, tangent.job, self._rounds, pointers=3)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
         """What a handler needs to begin a run; for as long as this kernel lives."""

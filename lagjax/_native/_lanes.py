@@ -122,14 +122,14 @@ def _convert(code, x, before, after):
     return code.intrinsic("trunc", x) if before == "float" and after != "float" else x
 
 
-def sincos_function(module: ir.Module, lanes: int) -> Code:
+def sincos_function(module: ir.Module, lanes: int, name: str = "sincos") -> Code:
     """`(x, address)`: sin x and cos x, stored one after the other.
 
     The method is that of `_elementary`: Cody and Waite's reduction, fdlibm's polynomials; 1 ulp. A vector with an angle
     beyond `LARGEST_ANGLE` asks the C library as well.
     """
     vector = ir.VectorType(ir.DoubleType(), lanes)
-    code = Code(module, "sincos", [vector, ir.PointerType()], lanes)
+    code = Code(module, name, [vector, ir.PointerType()], lanes)
     x, address = code.arguments
     near = code.intrinsic("fabs", x) <= LARGEST_ANGLE
     sine, cosine = _polynomials(code, code.select(near, x, 0.0))

@@ -42,6 +42,7 @@ from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
+from lagjax._program._pushforward import pushforward
 from lagjax._program._rules import Expansion, inputs_of
 from lagjax._program._scalars import Scalars, stacked
 from lagjax._program._series import Series, StraightLine, series
@@ -69,6 +70,7 @@ __all__ = [
     "lower_solution",
     "plain_elementary",
     "pullback",
+    "pushforward",
     "series",
     "traced",
 ]

@@ -1,0 +1,70 @@
+"""The derivative of a straight line along one direction, as a straight line: forward mode on the nodes of a graph.
+
+It is linear in the tangents of the inputs. `_transpose` has its transpose, with the same rules.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lagjax._program._graph import Graph
+from lagjax._program._operations import OPERATIONS
+from lagjax._program._passes import eliminate_dead_code, factor, replace_by_inputs, sink_negations
+from lagjax._program._series import StraightLine
+from lagjax._program._transpose import copied
+
+_LARGEST = 100  # operations that one may become: a bound for errors, three are usual
+
+
+def pushforward(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=()) -> StraightLine:
+    """From the inputs and the tangents of the inputs `by` to the tangents of the outputs `of`.
+
+    `dtypes` has the type of every input of `line`. Its inputs come first, the tangents after them, and after those the
+    values of the outputs `known`, which are not computed once more.
+    """
+    graph = Graph(_LARGEST * len(line.nodes) + 1000)
+    kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in dtypes]
+    inputs = [graph.input(i, kind) for i, kind in enumerate(kinds)]
+    tangents = {i: graph.input(len(inputs) + k, "float") for k, i in enumerate(by)}
+    with np.errstate(all="ignore"):
+        nodes = copied(graph, line, inputs)
+        moved = _along(graph, line, nodes, tangents)
+        zero = graph.constant(0.0, "float")
+        results = [moved.get(line.outputs[i], zero) for i in of] + [nodes[line.outputs[i]] for i in known]
+        done = StraightLine(*eliminate_dead_code(*sink_negations(*factor(graph, results))))
+    results, values = done.outputs[: len(of)], done.outputs[len(of) :]
+    first = len(dtypes) + len(by)
+    positions = {node: first + k for k, node in enumerate(values) if done.nodes[node][1]}
+    return StraightLine(*replace_by_inputs(done.nodes, done.kinds, results, positions))
+
+
+def _along(graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[int, int]) -> dict[int, int]:
+    """The tangents of the nodes of a line that have some, from those of its inputs."""
+    tangents: dict[int, int] = {}
+
+    def number(x: float) -> int:
+        return graph.constant(x, "float")
+
+    for k, (op, operands, attribute) in enumerate(line.nodes):
+        if op == "input" and attribute in of_inputs:
+            tangents[k] = of_inputs[attribute]
+        moving = [i for i in operands if i in tangents]
+        if not moving or line.kinds[k] != "float":
+            continue
+        if op == "div" and operands[1] in tangents:
+            tangent = _of_quotient(graph, nodes[k], nodes[operands[1]], *(tangents.get(i) for i in operands))
+        else:
+            tangent = None
+            for i, rule in zip(operands, OPERATIONS[op].transpose(), strict=False):  # a step has no derivative at all
+                if rule is not None and i in tangents:
+                    part = rule(graph.apply, number, tangents[i], nodes[k], *(nodes[j] for j in operands))
+                    tangent = part if tangent is None else graph.apply("add", tangent, part)
+        if tangent is not None and graph.value(tangent) != 0:
+            tangents[k] = tangent
+    return tangents
+
+
+def _of_quotient(graph: Graph, w: int, v: int, of_u: int | None, of_v: int | None) -> int:
+    """(u′ − w v′)/v: one division, where the two rules have two."""
+    part = graph.apply("mul", w, of_v)
+    return graph.apply("div", graph.apply("neg", part) if of_u is None else graph.apply("sub", of_u, part), v)

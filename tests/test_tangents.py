@@ -1,0 +1,118 @@
+"""Forward-mode derivatives of runs in machine code: over the steps of the motion, with directions or members in lanes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import _native
+from lagjax._layout import Layout
+from lagjax._machine_code import _derivatives, _flow, flow_of
+from lagjax._machine_code._flow import Tolerances
+from lagjax._problem import Problem
+
+TOLERANCES = Tolerances(1e-10, 1e-13, 4096)
+TS = np.array([[0.0, 0.4, 0.5, 1.3, 2.0]])
+
+
+def swing(q, v, params):
+    """Two pendulums, coupled by a spring."""
+    m, k = params["m"], params["k"]
+    return 0.5 * m @ v**2 + 9.81 * m @ jnp.cos(q) - 0.5 * k * (q[0] - q[1]) ** 2
+
+
+@pytest.fixture(scope="module")
+def flow():
+    params = {"m": jnp.ones(2), "k": 1.0}
+    return flow_of(Problem.about(lagjax.System(swing), Layout.of(jnp.zeros(2), jnp.zeros(2)), params))
+
+
+def starts(members):
+    rng = np.random.default_rng(0)
+    return rng.uniform(-1, 1, (members, 4)), rng.uniform(0.5, 2.0, (members, 3)), rng
+
+
+def along(flow, y0, numbers, dy0, dparams, ts=TS):
+    run = flow.run(ts, y0, numbers, TOLERANCES)
+    residuals = run.path, run.result, run.accepted, run.ticket
+    return _derivatives.jvp(flow, ts, y0, numbers, residuals, dy0, dparams, TOLERANCES)
+
+
+def test_tangents_are_central_differences(flow):
+    y0, numbers, rng = starts(1)
+    dy0, dparams = rng.normal(size=(1, 3, 4)), rng.normal(size=(1, 3, 3))
+    path, end = along(flow, y0, numbers, dy0, dparams)
+    h = 1e-3 * np.array([-2, -1, 1, 2])[:, None]
+    for k in range(3):
+        runs = flow.run(TS, y0 + h * dy0[0, k], numbers + h * dparams[0, k], TOLERANCES)
+        weights = np.array([1, -8, 8, -1]) / 0.012
+        # h⁴/30 of a fifth derivative, some hundred in this motion, and the tolerance over h
+        np.testing.assert_allclose(path[0, k], np.einsum("s,stk->tk", weights, runs.path), atol=2e-6)
+        np.testing.assert_allclose(end[0, k], path[0, k, -1])
+    np.testing.assert_array_equal(path[:, :, 0], dy0)
+
+
+@pytest.mark.parametrize(("members", "directions"), [(1, 2), (1, 19), (3, 9), (2, 1), (17, 3)])
+def test_lanes_and_threads_do_not_change_a_tangent(flow, members, directions):
+    y0, numbers, rng = starts(members)
+    dy0, dparams = rng.normal(size=(members, directions, 4)), rng.normal(size=(members, directions, 3))
+    together = along(flow, y0, numbers, dy0, dparams)
+    for i, k in ((0, 0), (members - 1, directions - 1)):
+        one = slice(i, i + 1), slice(k, k + 1)
+        alone = along(flow, y0[one[0]], numbers[one[0]], dy0[one], dparams[one])
+        for a, b in zip(together, alone, strict=True):
+            np.testing.assert_allclose(a[one], b, rtol=1e-13, atol=1e-13)
+
+
+def test_straight_lines_and_tables_have_the_same_tangents(flow, monkeypatch):
+    y0, numbers, rng = starts(2)
+    dy0, dparams = rng.normal(size=(2, 5, 4)), rng.normal(size=(2, 5, 3))
+    written = along(flow, y0, numbers, dy0, dparams)
+    for module in (_native._series, _native._tangent):
+        monkeypatch.setattr(module, "is_large", lambda *_, **__: True)
+    again = type(flow)(lambda: (flow.program, None), flow.size, flow.numbers)
+    for a, b in zip(along(again, y0, numbers, dy0, dparams), written, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
+
+
+def test_tangents_of_a_motion_at_rest():
+    """At rest the series of a motion ends, and its steps could have any length: its tangents oscillate."""
+    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 + params * jnp.cos(q))
+    ts = jnp.linspace(0.0, 10.0, 7)
+
+    def path(x):
+        return lagjax.simulate(scene, x[0], x[1], ts, 9.81, rtol=1e-10).q
+
+    omega = np.sqrt(9.81)
+    expected = np.stack([np.cos(omega * ts), np.sin(omega * ts) / omega], axis=1)
+    assert lagjax.simulate(scene, 0.0, 0.0, ts, 9.81).stats["num_steps"] < 5
+    for start in (jnp.zeros(2), jnp.array([1e-9, 0.0])):
+        np.testing.assert_allclose(jax.jacfwd(path)(start), expected, atol=1e-8)
+
+
+def test_steps_that_suit_no_tangent_give_none(monkeypatch):
+    scene = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+    monkeypatch.setattr(_derivatives, "TRIES", 0)
+    slope = jax.jacfwd(lambda q: lagjax.simulate(scene, q, 0.0, jnp.array([0.0, 10.0]), throw=False).q[-1])(0.0)
+    assert np.isnan(slope)
+
+
+def test_a_failed_motion_has_the_tangents_of_what_it_did():
+    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - params * q - jnp.where(q < -1.0, jnp.log(q + 1.0), 0.0))
+    ts = jnp.array([0.0, 0.5, 3.0])
+    path = lambda g: lagjax.simulate(scene, 0.5, 0.0, ts, g, throw=False).q
+    np.testing.assert_allclose(jax.jacfwd(path)(9.81), [0.0, -0.125, np.nan], atol=1e-10)
+
+
+def test_tangents_of_motions_whose_steps_are_gone(flow, monkeypatch):
+    y0, numbers, rng = starts(5)
+    dy0, dparams = rng.normal(size=(5, 2, 4)), rng.normal(size=(5, 2, 3))
+    run = flow.run(TS, y0, numbers, TOLERANCES, _derivatives.KEPT)
+    residuals = run.path, run.result, run.accepted, run.ticket
+    kept = _derivatives.jvp(flow, TS, y0, numbers, residuals, dy0, dparams, TOLERANCES)
+    runs, follow = [], _flow.Flow.follow
+    monkeypatch.setattr(_flow.Flow, "follow", lambda *given: runs.append(given) or follow(*given))
+    for a, b in zip(along(flow, y0, numbers, dy0, dparams), kept, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert len(runs) == 2  # the motion itself, and once more
