@@ -1,4 +1,4 @@
-"""Forward-mode derivatives of runs in machine code: over the steps of the motion, with directions or members in lanes."""
+"""Forward-mode derivatives of runs in machine code: over the steps of the motion; directions or members in lanes."""
 
 import jax
 import jax.numpy as jnp
@@ -89,6 +89,20 @@ def test_tangents_of_a_motion_at_rest():
     assert lagjax.simulate(scene, 0.0, 0.0, ts, 9.81).stats["num_steps"] < 5
     for start in (jnp.zeros(2), jnp.array([1e-9, 0.0])):
         np.testing.assert_allclose(jax.jacfwd(path)(start), expected, atol=1e-8)
+        np.testing.assert_allclose(jax.grad(lambda x: path(x)[-1])(start), expected[-1], atol=1e-8)
+
+
+def test_tangents_across_a_motion_that_is_simpler_than_they_are():
+    """Along the ridge y = 0 of V = y²/(1 + x²) nothing acts on the motion, and its steps could have any length."""
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v - q[1] ** 2 / (1.0 + 25.0 * q[0] ** 2))
+    ts = jnp.array([0.0, 3.0])
+
+    def end(y):
+        return lagjax.simulate(scene, jnp.array([-1.5, y]), jnp.array([1.0, 0.0]), ts, rtol=1e-10).q[-1, 1]
+
+    beside = (end(1e-4) - end(-1e-4)) / 2e-4  # of motions that need their steps; 1e-8 of a third derivative
+    assert abs(beside) > 0.1
+    np.testing.assert_allclose([jax.jacfwd(end)(0.0), jax.grad(end)(0.0)], beside, rtol=1e-7)
 
 
 def test_steps_that_suit_no_tangent_give_none(monkeypatch):

@@ -78,7 +78,7 @@ def _jvp_over_steps(
         for k in np.flatnonzero(excess > 1.0).tolist():
             row = rows[k : k + 1]
             again = functools.partial(along, rows=row, members=np.zeros(1, int))
-            if not _over_divided(flow, steps, members[k], params[row[0]], tolerances, excess[k : k + 1], again):
+            if _over_divided(flow, steps, members[k], params[row[0]], tolerances, excess[k : k + 1], again) is None:
                 path_dot[row], y_dot[row] = np.nan, np.nan
     at_start = np.broadcast_to((ts == ts[:, :1])[:, None], path_dot.shape[:3])  # also where there was no step
     return np.where(at_start[..., None], dy0[:, :, None], path_dot), y_dot
@@ -129,15 +129,41 @@ def _vjp_over_steps(
 
     def back(steps: Steps, rows, members):
         times = ts if len(ts) == 1 else ts[rows]
-        y_ct[rows], params_ct[rows] = steps.kernel.vjp(
+        y_ct[rows], params_ct[rows], excess = steps.kernel.vjp(
             times, params[rows], steps.table, steps.first[members], steps.counts[members], path_ct[rows],
             end_ct[rows], steps.order,
         )  # fmt: skip
+        return excess > EXCESS * tolerances.rtol
 
     for steps, rows, members in _steps_of(flow, ts, y0, params, accepted, ticket, tolerances):
-        back(steps, rows, members)
+        long = np.flatnonzero(back(steps, rows, members))
+        if not long.size:
+            continue
+        probe = functools.partial(_probed, flow, ts, params, tolerances)
+        excess = probe(steps, rows[long], members[long])
+        for k in np.flatnonzero(excess > 1.0).tolist():
+            row = rows[long[k : k + 1]]
+            again = functools.partial(probe, rows=row, members=np.zeros(1, int))
+            better = _over_divided(
+                flow, steps, members[long[k]], params[row[0]], tolerances, excess[k : k + 1], again
+            )  # fmt: skip
+            if better is None:
+                y_ct[row], params_ct[row] = np.nan, np.nan
+            else:
+                back(better, row, np.zeros(1, int))
     at_start = (ts == ts[:, :1])[:, :, None]  # outputs that are the initial state; steps begin after them
     return y_ct + np.sum(path_ct * at_start, axis=1), params_ct
+
+
+def _probed(flow: Flow, ts, params, tolerances, steps: Steps, rows, members) -> np.ndarray:
+    """How large the last terms of the series of a tangent are, in units of the limit: along any direction at all."""
+    direction = np.random.default_rng(0).normal(size=flow.states + flow.numbers)
+    y_dot, params_dot = (np.tile(x, (len(rows), 1, 1)) for x in np.split(direction, [flow.states]))
+    excess = steps.kernel.jvp(
+        ts if len(ts) == 1 else ts[rows], params[rows], steps.table, steps.first[members], steps.counts[members], y_dot,
+        params_dot, steps.order, tolerances.atol / tolerances.rtol,
+    )[2]  # fmt: skip
+    return excess / (EXCESS * tolerances.rtol)
 
 
 def _vjp_by_jacobian(
@@ -228,18 +254,19 @@ def _steps_of(
             yield steps, places[rows], members
 
 
-def _over_divided(flow: Flow, steps: Steps, member: int, params, tolerances, excess, sweep: Callable) -> bool:
-    """`sweep(steps)` over the steps of a member in ever smaller parts; whether its tangents suit them in the end.
+def _over_divided(flow: Flow, steps: Steps, member: int, params, tolerances, excess, sweep: Callable) -> Steps | None:
+    """`sweep(steps)` over the steps of a member in ever smaller parts: the steps that suit its tangents, or None.
 
     `excess` (1,), and what `sweep` returns, is how large the last terms of the series are, in units of the limit.
     """
     parts = 1
     for _ in range(TRIES):
-        if not excess > 1.0:
-            return True
         parts *= math.ceil(min(MOST_PARTS, 1.1 * float(excess[0]) ** (1 / (steps.order - 1))))
-        excess = sweep(_divided(flow, steps, member, params, tolerances, parts))
-    return not excess > 1.0
+        divided = _divided(flow, steps, member, params, tolerances, parts)
+        excess = sweep(divided)
+        if not excess > 1.0:
+            return divided
+    return None
 
 
 def _divided(flow: Flow, steps: Steps, member: int, params, tolerances: Tolerances, parts: int) -> Steps:

@@ -11,7 +11,8 @@ step to one at its beginning, and adds to the cotangents of the parameters:
 
 Every number it takes is one of the step itself, so the series is made once more from the recorded state. The cost is
 that of two or three motions, however many parameters there are. Steps are those that were taken: as everywhere in
-diffrax, their sizes are not differentiated. Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3.2, 13.
+diffrax, their sizes are not differentiated. `excess` estimates whether they suit derivatives (see `_tangent`), from
+what the transpose has at hand: the rates of the tangents, and the series that are multiplied. Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3.2, 13.
 """
 
 from llvmlite import ir
@@ -26,7 +27,7 @@ from lagjax._program._transpose import pullback
 # `y_ct` is the cotangent of the end, and becomes that of the start.
 JOB = job(
     "AdjointJob",
-    ("next_member", "ts", "params", "record", "first_step", "steps", "path_ct", "y_ct", "params_ct"),
+    ("next_member", "ts", "params", "record", "first_step", "steps", "path_ct", "y_ct", "params_ct", "excess"),
     ("ts_stride", "params_stride", "members", "times", "order"),
 )
 
@@ -44,7 +45,8 @@ class Adjoint:
             "rows_ct": series.rows,
             "values_ct": series.values,
             "params_ct": program.size - states - 1,
-            "active": 1,
+            "before": states,
+            **dict.fromkeys(("active", "excess"), 1),
         }
         large = is_large(program, projection, times=2)
         self.motion = Motion("adjoint", program, series, JOB, fields, large, width, keep_sums=True)
@@ -112,7 +114,7 @@ class Adjoint:
         member = lane["member"]
         there = member >= 0
         lane["active"] = code.select(there, double(code, 1.0), 0.0)
-        lane["h"] = 0.0
+        lane["h"], lane["excess"] = 0.0, 0.0
         lane["step"] = lane["step"] - 1
         lane["output"] = frame.job("times") - 2
         with code.only_if(there):
@@ -144,6 +146,7 @@ class Adjoint:
                     frame.write("y_ct", member * self.states + i, lane["state_ct", i])
                 with code.loop(self.motion.numbers) as i:
                     frame.write("params_ct", member * self.motion.numbers + i, lane["params_ct", i])
+                frame.write("excess", member, lane["excess"])
                 frame.call(self.start_next, index)
 
     # ---- the transpose of a step ----
@@ -190,10 +193,49 @@ class Adjoint:
     def _back_orders(self, back_sums: Code, back_recursion: Code) -> Code:
         """From the last order to the first: the transposes of the Cauchy products, then of the recursion."""
         frame = self.motion.function("back_orders")
-        order = frame.job("order")
-        with frame.code.loop(order, start=1) as i:
+        code, order = frame.code, frame.job("order")
+        measured = self._measured()
+        for i in self.motion.form.each(code, self.states):
+            frame["before", i] = frame["y_ct", i, order - 1]
+        with code.loop(order, start=1) as i:
             frame.call(back_sums, order - i, order)
             frame.call(back_recursion, order - i)
+            with code.only_if(i <= 1):
+                frame.call(measured)
+        return frame.finish()
+
+    def _measured(self) -> Code:
+        """How large the last terms of the series of a tangent may be, from the transpose of the last order."""
+        frame = self.motion.function("measured")
+        code, form, n, order = frame.code, self.motion.form, self.n, frame.job("order")
+        h, p = code.intrinsic("fabs", frame["h"]), code.as_double(frame.job("order"))
+
+        def size(x):
+            return code.intrinsic("fabs", x)
+
+        def change(i):
+            return frame["y_ct", i, order - 1] - frame["before", i]
+
+        # The Jacobian of the acceleration, times the cotangents: a frequency squared, and a rate of decay.
+        velocities = form.largest(code, lambda i: size(frame["y_ct", i + n, order]), n)
+        squared = form.largest(code, lambda i: size(change(i)), n)
+        decay = form.largest(code, lambda i: size(change(i + n) - frame["y_ct", i, order] / p), n)
+        rate = p * decay / velocities + code.intrinsic("sqrt", p * squared / velocities)
+        rate = code.select(velocities > 0.0, rate, 0.0)
+        term, power = code.variable(frame.constant(1.0)), code.variable(frame.constant(1.0))
+        with code.loop(order - 1, start=0) as k:
+            code.store(code.load(term, frame.vector) * (rate * h) / code.as_double(k + 1), term)
+            with code.only_if(k > 0):
+                code.store(code.load(power, frame.vector) * h, power)
+        # The last coefficient of the rows, beside the first two.
+        last, first = code.lanes_of(0.0), code.lanes_of(0.0)
+        if self.series.rows:
+            last = form.largest(code, lambda i: size(frame["rows", i, order - 1]), self.series.rows)
+            first = form.largest(
+                code, lambda i: code.maximum(size(frame["rows", i, 1]), size(frame["rows", i, 2]) * h), self.series.rows
+            )
+        tail = code.select(first > 0.0, last * code.load(power, frame.vector) / first, 0.0)
+        frame["excess"] = code.maximum(code.maximum(code.load(term, frame.vector), tail), frame["excess"])
         return frame.finish()
 
     def _back_sums(self) -> Code:

@@ -182,25 +182,29 @@ class Kernel:
         path, y_end, *others = (block[begin:end] for begin, end in itertools.pairwise(ends))
         return Begun(path.reshape(members, times, states), y_end.reshape(members, states), *others)
 
-    def vjp(self, ts, params, table, first, counts, path_ct, y_ct, order: int) -> tuple[np.ndarray, np.ndarray]:
+    def vjp(
+        self, ts, params, table, first, counts, path_ct, y_ct, order: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The transposed derivative of a run, over the steps it wrote down.
 
         The steps of member k are `counts[k]` rows of `table` from `first[k]` on. From the cotangents of the outputs,
         `path_ct` (N, T, 2n), of which the first and the last are not looked at, and of the states at the end, `y_ct`
-        (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P).
+        (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P). The last array (N,) estimates how
+        large the last terms of the series of a tangent may have been, relative to the tangent.
         """
         ts, params, path_ct, table = _contiguous(ts, params, path_ct, table)
         first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
         y_ct, params_ct = np.array(y_ct, np.float64, order="C"), np.zeros((len(y_ct), self.numbers))
+        excess = np.zeros(len(y_ct))
         arrays = dict(
             next_member=np.zeros(1, np.int64), ts=ts, params=params, record=table, first_step=first, steps=counts,
-            path_ct=path_ct, y_ct=y_ct, params_ct=params_ct,
+            path_ct=path_ct, y_ct=y_ct, params_ct=params_ct, excess=excess,
         )  # fmt: skip
         members, times = path_ct.shape[:2]
         numbers = dict(**self._strides(ts, params), members=members, times=times, order=order)
         kernel = self.of_members(1 if members < self.width / 2 else members)  # few are as fast one after the other
         kernel._backward(arrays, numbers, kernel.threads(members))
-        return y_ct, params_ct
+        return y_ct, params_ct, excess
 
     def jvp(
         self, ts, params, table, first, counts, y_dot, params_dot, order: int, floor: float
@@ -209,8 +213,9 @@ class Kernel:
 
         The steps of member k are `counts[k]` rows of `table` from `first[k]` on. From the tangents of the initial
         states, `y_dot` (N, m, 2n), and of the parameters, `params_dot` (N, m, P), to those of the outputs, an array
-        (N, m, T, 2n) of which the last is not written, and of the states at the end (N, m, 2n). The last array (N,) says how large
-        the last two terms of the series of a tangent became, at most, relative to the tangent or to the `floor`.
+        (N, m, T, 2n) of which the last is not written, and of the states at the end (N, m, 2n). The last array (N,) says
+        how large the last two terms of the series of a tangent became, at most, relative to the tangent or to the
+        `floor`.
         """
         ts, params, params_dot, table = _contiguous(ts, params, params_dot, table)
         first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
