@@ -168,6 +168,8 @@ def batches(options) -> Rows:
     """The double pendulum in batches of 1 to 10⁶, or to 250 times `--batch`."""
     names = ("lagjax", "lagjax, diffrax", "diffrax, by hand", "heyoka, SIMD", "heyoka, threads", "numba")
     contenders = list(named(*names))
+    if options.device == "gpu":  # where lagjax is diffrax
+        contenders = [*map(_on_cpus, named("lagjax")), *(c for c in contenders if c.name != "lagjax, diffrax")]
     rows = []
     for size in (size for size in SIZES if size <= 250 * options.batch):
         case = _shortened(double_pendulum(size), options)
@@ -213,17 +215,28 @@ def _on(allowed: list[int], contender: Contender) -> Contender:
         finally:
             os.sched_setaffinity(0, before)
 
+    return _within(confined, contender, f"{contender.name} on {len(allowed)}")
+
+
+def _on_cpus(contender: Contender) -> Contender:
+    """The contender on the CPUs of a machine with a GPU."""
+    return _within(lambda: jax.default_device(jax.devices("cpu")[0]), contender, f"{contender.name}, CPUs")
+
+
+def _within(place: Callable, contender: Contender, name: str) -> Contender:
+    """The contender whenever it prepares or solves within what `place()` sets up."""
+
     def prepare(case):
-        with confined():
+        with place():
             solve = contender.prepare(case)
 
         def limited(tol):
-            with confined():
+            with place():
                 return solve(tol)
 
         return limited
 
-    return replace(contender, name=f"{contender.name} on {len(allowed)}", prepare=prepare)
+    return replace(contender, name=name, prepare=prepare)
 
 
 def compared(

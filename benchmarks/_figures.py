@@ -12,6 +12,7 @@ COLOURS = {
     "lagjax": "#c1121f",
     "minimal coordinates": "#1d4e89",
     "lagjax, diffrax": "#ef8d7a",
+    "lagjax, CPUs": "#ef8d7a",
     "lagjax, plain vmap": "#b07aa1",
     "lagjax, no jit": "#b07aa1",
     "diffrax, by hand": "#1d4e89",
