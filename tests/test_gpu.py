@@ -88,7 +88,7 @@ def machine_code_under_a_device_of_choice():
         assert "the default device is a gpu" in str(error)
     else:
         raise AssertionError("machine code ran on a GPU")
-    run = on_cpu(jax.jit(lambda q0: batch(q0, solver=lagjax.MachineCode(), throw=False).q), q0)
+    run = on_cpu(jax.jit(lambda q0: batch(q0, solver=lagjax.MachineCode()).q), q0)
     np.testing.assert_array_equal(np.asarray(run), np.asarray(on_cpu(batch).q))
 
 for name in sys.argv[1:]:
