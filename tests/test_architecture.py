@@ -72,7 +72,7 @@ nodes = (("input", (), 0), ("input", (), 3), ("mul", (1, 0), None), ("neg", (2,)
 line = StraightLine(nodes, ("float", "float", "float", "float", "bool"), (3, 4))  # q" = -k q
 program = type("Program", (), dict(line=line, size=4, dtypes=[np.dtype(float)] * 4, linear=None, budget=100))()
 kernel, ts = _native.Kernel(program, 1), np.linspace(0.0, 3.0, 7)[None]
-done = kernel(ts, [[1.0, 0.0]], [[1.0]], 1e-12, 1e-15, 100, np.array([100]))
+done = kernel(ts, [[1.0, 0.0]], [[1.0]], 1e-12, 1e-15, 100, 100)
 np.testing.assert_allclose(done.path[0, :, 0], np.cos(ts[0]), atol=1e-11)
 bars = np.zeros((1, 7, 2)), np.array([[1.0, 0.0]])
 start, numbers, _ = kernel.vjp(ts, [[1.0]], done.table, [0], done.steps, *bars, _native.order_for(1e-12))

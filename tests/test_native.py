@@ -673,8 +673,7 @@ def test_a_member_alone_is_bit_for_bit_the_member_of_a_batch(make):
     ).kernel
     numbers = np.concatenate([np.zeros(0), *(np.ravel(x) for x in jax.tree.leaves(scene.params))])[None]
     states, ts = np.tile(np.concatenate(y0), (3, 1)), TWO_TIMES[None]
-    room = np.full(3, 1000)
-    runs = [kernel.of_members(len(y))(ts, y, numbers, 1e-9, 1e-12, 1000, room[: len(y)]) for y in (states[:1], states)]
+    runs = [kernel.of_members(len(y))(ts, y, numbers, 1e-9, 1e-12, 1000, 3000) for y in (states[:1], states)]
     alone, together = runs
     for one, all_ in zip(alone[:6], together[:6], strict=True):
         np.testing.assert_array_equal(one[0], all_[1])
@@ -682,7 +681,7 @@ def test_a_member_alone_is_bit_for_bit_the_member_of_a_batch(make):
     order, cotangents = _kernel.order_for(1e-9), (np.ones_like(together.path), np.ones_like(together.y_end))
     back = [
         kernel.of_members(len(run.steps)).vjp(
-            ts, numbers, run.table, room[: len(run.steps)].cumsum() - 1000, run.steps,
+            ts, numbers, run.table, run.steps.cumsum() - run.steps, run.steps,
             *(c[: len(run.steps)] for c in cotangents), order,
         )
         for run in runs

@@ -31,8 +31,9 @@ def in_both_forms(*parts, **options):
 
 def run_and_back(kernel, ts, y0, params):
     """A run, and the cotangents of its start and of the parameters, from those of its outputs and its end."""
-    run = kernel(ts[None], y0, params, RTOL, 1e-3 * RTOL, 10_000, np.full(len(y0), ROOM))
-    first, counts = np.arange(len(y0)) * ROOM, np.minimum(run.steps, ROOM)
+    run = kernel(ts[None], y0, params, RTOL, 1e-3 * RTOL, 10_000, ROOM * len(y0))
+    counts = np.where(run.complete, run.steps, 0)
+    first = np.cumsum(counts) - counts
     cotangents = np.random.default_rng(0).normal(size=run.path.shape), np.ones_like(y0)
     return run, kernel.vjp(ts[None], params, run.table, first, counts, *cotangents, _native.order_for(RTOL))
 

@@ -23,6 +23,7 @@ LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 6
 # The last terms that the series of a tangent may have, relative to the tangent, in tolerances. What the series leaves
 # out is smaller by e² at least. Measured on all scenes: a motion that has its own scale takes steps with at most 300.
 EXCESS = 1000.0
+_ROOM_AGAIN = 2  # times the steps that were taken: those that are undone and those of a first try are written, too
 MOST_PARTS, TRIES = 64, 4  # of a step that is too long, at once; and how often they are divided once more
 
 
@@ -247,9 +248,10 @@ def _steps_of(
     for steps, rows, members in KEPT.runs(ticket):
         waiting[rows] = False
         yield steps, rows, members
-    for places in _portions(np.flatnonzero(waiting), accepted * (flow.states + 2)):
+    for places in _portions(np.flatnonzero(waiting), accepted * (flow.states + 4)):
         store, some_ts = StepStore(), ts if len(ts) == 1 else ts[places]
-        again = flow.follow(some_ts, y0[places], params[places], tolerances, store, accepted[places])
+        room = _ROOM_AGAIN * int(accepted[places].sum()) + len(places)
+        again = flow.follow(some_ts, y0[places], params[places], tolerances, store, room)
         for steps, rows, members in store.runs(again.ticket):
             yield steps, places[rows], members
 
@@ -273,10 +275,10 @@ def _divided(flow: Flow, steps: Steps, member: int, params, tolerances: Toleranc
     """The steps of one member, each in so many parts: the states between are outputs of the motion."""
     first = steps.first[member]
     rows = steps.table[first : first + steps.counts[member]]
-    t, h = rows[:, 0], rows[:, 1]
+    t, h, first_state = rows[:, 0], rows[:, 1], rows[:1, 4:]
     times = np.append((t[:, None] + h[:, None] * np.arange(parts) / parts).ravel(), t[-1] + h[-1])
-    path = flow.follow(times[None], rows[:1, 2:], params[None], tolerances).path[0]
-    table = np.concatenate([times[:-1, None], np.diff(times)[:, None], path[:-1]], axis=1)
+    path = flow.follow(times[None], first_state, params[None], tolerances).path[0]
+    table = np.concatenate([np.stack([times[:-1], np.diff(times), *np.zeros((2, len(path) - 1))]).T, path[:-1]], axis=1)
     count = np.array([len(table)])
     return Steps(steps.kernel, steps.order, table, np.zeros(1, int), count, np.ones(1, bool))
 

@@ -144,14 +144,14 @@ class Flow:
         params,
         tolerances: Tolerances,
         store: StepStore | None = None,
-        room: np.ndarray | None = None,
+        room: int | None = None,
         begun: _native.Begun | None = None,
     ) -> Solution:
         """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the motions of N members.
 
-        With a `store` the steps are kept there, up to `room` (N,) of each member: by default to equal parts of what may
-        be kept. Results tell what stopped a member, and not only that its steps became too small, or too many.
-        A run that a handler has `begun` is gone on with.
+        With a `store` the steps are kept there, up to `room` of all members: by default as many as may be kept. Results
+        tell what stopped a member, and not only that its steps became too small, or too many. A run that a handler has
+        `begun` is gone on with.
         """
         solution = self.follow(ts, y0, params, tolerances, store, room, begun)
         if (solution.result != SUCCESSFUL).any():
@@ -165,13 +165,15 @@ class Flow:
         """`run` without a look at what stopped a member: for another try, and for derivatives."""
         rtol, atol, max_steps, _ = tolerances
         if store is not None and room is None:
-            room = np.full(len(y0), min(max_steps, LARGEST_KEPT // ((self.states + 2) * max(1, len(y0)))))
+            room = min(max_steps * len(y0), LARGEST_KEPT // (self.states + 4))
         kernel = self.kernel.of_members(len(y0))
-        done = kernel(ts, y0, params, rtol, atol, max_steps, room, begun)
+        done = kernel(ts, y0, params, rtol, atol, max_steps, room or 0, begun)
         result, event = _RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:
-            ticket = store.keep(_compact(self.kernel, done.table, room, done.steps, rtol))
+            counts = np.where(done.complete, done.steps, 0)
+            first = np.cumsum(counts) - counts
+            ticket = store.keep(Steps(self.kernel, _native.order_for(rtol), done.table, first, counts, done.complete))
         solution = Solution(*done[:3], result, done.steps, done.rejected, event, ticket, done.idle)
         if (result == SUCCESSFUL).all():
             return solution
@@ -179,7 +181,7 @@ class Flow:
         if not again.any():
             return solution
         some_ts, some_y0, some_params = members(again, ts, y0, params)
-        better = flow.follow(some_ts, some_y0, some_params, tolerances, store, None if room is None else room[again])
+        better = flow.follow(some_ts, some_y0, some_params, tolerances, store, room)
         for values, new in zip(solution[:-1], better[:-1], strict=True):
             values[again] = new
         return solution._replace(idle=done.idle + better.idle)
@@ -235,14 +237,6 @@ class Flow:
             return tangent_programs(self.program, self.projection, n, directions)
 
         return Flow(parts, rows * n, rows * self.numbers, None, groups, self.base_size, general)
-
-
-def _compact(kernel: _native.Kernel, table, room, counts, rtol: float) -> Steps:
-    """The steps of a run, without the room that was not used."""
-    taken, starts = np.minimum(counts, room), np.cumsum(room) - room
-    if not np.array_equal(taken, room):
-        table = np.concatenate([table[:0], *(table[s : s + k] for s, k in zip(starts, taken, strict=True))])
-    return Steps(kernel, _native.order_for(rtol), table, np.cumsum(taken) - taken, counts, counts <= room)
 
 
 def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:

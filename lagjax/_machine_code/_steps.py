@@ -21,8 +21,9 @@ LARGEST_KEPT = 2**26  # numbers of steps that are kept for a derivative that is 
 class Steps(NamedTuple):
     """The steps of a run of N members in one kernel, by a series of this order.
 
-    A row of `table` holds the time, the size and the first state of a step; those of a member are `counts` (N,) rows
-    from `first` (N,) on. `complete` (N,) is false for a member that took more steps than there was room for.
+    A row of `table` holds the time and the size of a step, the numbers of its member and of the step, and its first
+    state; those of a member are `counts` (N,) rows from `first` (N,) on. `complete` (N,) is false for a member whose
+    steps are not all there.
     """
 
     kernel: "Kernel"

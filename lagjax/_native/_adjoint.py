@@ -12,7 +12,9 @@ step to one at its beginning, and adds to the cotangents of the parameters:
 Every number it takes is one of the step itself, so the series is made once more from the recorded state. The cost is
 that of two or three motions, however many parameters there are. Steps are those that were taken: as everywhere in
 diffrax, their sizes are not differentiated. `excess` estimates whether they suit derivatives (see `_tangent`), from
-what the transpose has at hand: the rates of the tangents, and the series that are multiplied. Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3.2, 13.
+what the transpose has at hand: the rates of the tangents, and the series that are multiplied.
+
+Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3.2, 13.
 """
 
 from llvmlite import ir
@@ -20,6 +22,7 @@ from llvmlite import ir
 from lagjax._native._constants import MAX_ORDER
 from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
+from lagjax._native._output import RECORDED
 from lagjax._native._series import Motion, double, is_large
 from lagjax._program._series import Recurrent, Series
 from lagjax._program._transpose import pullback
@@ -129,11 +132,11 @@ class Adjoint:
         """The time, size and first state of the step that the lane is to go back."""
         member = lane["member"]
         with frame.code.only_if(member >= 0):
-            row = (frame.read("first_step", member, INTEGER) + lane["step"]) * (self.states + 2)
+            row = (frame.read("first_step", member, INTEGER) + lane["step"]) * (self.states + RECORDED)
             lane["t"] = frame.read("record", row)
             lane["h"] = frame.read("record", row + 1)
             for i in self.motion.form.each(frame.code, self.states):
-                lane["y", i] = frame.read("record", row + (i + 2))
+                lane["y", i] = frame.read("record", row + (i + RECORDED))
 
     def _end_or_go_on(self, frame: Frame, lane: Lane, index: Value) -> None:
         """One step less to go back; after the first one, write down the cotangents and take the next member."""

@@ -190,7 +190,11 @@ class Frame:
 
     def next_member(self) -> Value:
         """The number of the next member that no thread has taken; from `members` on, none is left."""
-        counter = self.job("next_member")
+        return self.next("next_member")
+
+    def next(self, name: str) -> Value:
+        """What a counter of all threads shows, which goes on by one."""
+        counter = self.job(name)
         return Value(self.code, self.code.builder.atomic_rmw("add", counter.it, ir.Constant(INTEGER, 1), "monotonic"))
 
     def time(self, member: Value, index: Index) -> Value:

@@ -28,9 +28,9 @@ from lagjax._program._series import Recurrent, Series
 JOB = job(
     "Job",
     ("next_member", "ts", "y0", "params", "path", "y_end", "t_end", "code", "steps", "rejected", "record",
-     "first_step"),
+     "next_row"),
     # Strides from one member to the next: 0 where all share the output times, or the parameters.
-    ("ts_stride", "params_stride", "members", "times", "order", "max_steps", "recording"),
+    ("ts_stride", "params_stride", "members", "times", "order", "max_steps", "room"),
     ("rtol", "atol"),
 )  # fmt: skip
 
@@ -137,7 +137,7 @@ class Integrator:
                 _rank_drops.return_or_remember(frame, self.motion.form, self.motion.states, self.guards)
             if self.events is not None:
                 self.events.stop(frame, order)
-            with code.only_if(frame.job("recording") > 0), code.loop(self.motion.width) as lane:
+            with code.only_if(frame.job("room") > 0), code.loop(self.motion.width) as lane:
                 self.output.record(frame, frame.lane(lane))
             after, rest = self.step.end_time(frame)
             self.output.write_due(frame, order, after)

@@ -17,6 +17,7 @@ from lagjax._native._frame import LANE, Layout
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled, lanes
+from lagjax._native._output import RECORDED
 from lagjax._native._tangent import Tangent
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._graph import Unlowerable
@@ -34,7 +35,9 @@ class Outcome(NamedTuple):
     - `y_end` (N, 2n), `t_end` (N,): where each member ended; `code` (N,): how.
     - `steps`, `rejected` (N,): how many steps it took, and how many were too long.
     - `idle`: how many steps lanes stood empty for.
-    - `table` (rows, 2n + 2): the time, size and first state of every step that was written down; None without.
+    - `table` (rows, 2n + 4): a row for every step that was written down, member by member: its time, its size, the
+      number of the member, that of the step, its first state; None without.
+    - `complete` (N,): whether all steps of a member are there, Σ steps of such members before it on; None without.
     """
 
     path: np.ndarray
@@ -45,6 +48,7 @@ class Outcome(NamedTuple):
     rejected: np.ndarray
     idle: int
     table: np.ndarray | None
+    complete: np.ndarray | None
 
 
 class Begun(NamedTuple):
@@ -133,18 +137,18 @@ class Kernel:
         return Rest.size(self._forward.layout)
 
     def __call__(
-        self, ts, y0, params, rtol: float, atol: float, max_steps: int, room=None, begun: Begun | None = None
+        self, ts, y0, params, rtol: float, atol: float, max_steps: int, room: int = 0, begun: Begun | None = None
     ) -> Outcome:
         """The motions from the states `y0` (N, 2n), all arrays of float64.
 
-        `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. With `room` (N,)
-        up to so many steps of each member are written down, for `vjp`. What a handler has `begun` is gone on with.
+        `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. So many
+        steps as there is `room` for are written down, for derivatives. What a handler has `begun` is gone on with.
         """
         ts, y0, params = _contiguous(ts, y0, params)
         members, times = len(y0), ts.shape[1]
         if begun is not None:
             begun = Begun(*(np.array(x, np.float64) for x in begun))
-        elif room is None and self.threads(members) == 1:
+        elif room == 0 and self.threads(members) == 1:
             begun = self._begun(ts, y0, params, self.plan(rtol, atol, max_steps))
         if begun is None:
             path, y_end = np.full((members, times, self.states), np.nan), np.empty((members, self.states))
@@ -152,22 +156,22 @@ class Kernel:
         else:
             path, y_end, t_end, code, steps, rejected, rest = begun
             if not Rest.more(rest):
-                return _outcome(path, y_end, t_end, code, steps, rejected, Rest.idle_of(rest), None)
+                return _outcome(path, y_end, t_end, code, steps, rejected, Rest.idle_of(rest))
         rest = None if begun is None else Rest.of(begun.rest, self._forward.layout)
-        table = first_step = None
-        if room is not None:
-            first_step = np.concatenate([[0], np.cumsum(room)]).astype(np.int64)
-            table = np.empty((first_step[-1], self.states + 2))  # the system provides pages when they are written to
+        table, rows = None, np.zeros(1, np.int64)
+        if room:  # the system provides pages when they are written to
+            table = np.empty((room, self.states + RECORDED))
         arrays = dict(
             next_member=np.zeros(1, np.int64) if rest is None else rest.next_member, ts=ts, y0=y0, params=params,
             path=path, y_end=y_end, t_end=t_end, code=code, steps=steps, rejected=rejected, record=table,
-            first_step=first_step,
+            next_row=rows,
         )  # fmt: skip
         numbers = dict(
             **self._strides(ts, params), members=members, times=times, order=order_for(rtol), max_steps=max_steps,
-            recording=table is not None, rtol=rtol, atol=atol,
+            room=room, rtol=rtol, atol=atol,
         )  # fmt: skip
         idle = self._forward(arrays, numbers, self.threads(members) if rest is None else 1, rest)
+        table = None if table is None else table[: rows[0]]
         return _outcome(path, y_end, t_end, code, steps, rejected, idle, table)
 
     def _begun(self, ts, y0, params, plan: Plan) -> Begun:
@@ -213,8 +217,8 @@ class Kernel:
 
         The steps of member k are `counts[k]` rows of `table` from `first[k]` on. From the tangents of the initial
         states, `y_dot` (N, m, 2n), and of the parameters, `params_dot` (N, m, P), to those of the outputs, an array
-        (N, m, T, 2n) of which the last is not written, and of the states at the end (N, m, 2n). The last array (N,) says
-        how large the last two terms of the series of a tangent became, at most, relative to the tangent or to the
+        (N, m, T, 2n) of which the last is not written, and of the states at the end (N, m, 2n). The last array (N,)
+        says how large the last two terms of the series of a tangent became, at most, relative to the tangent or to the
         `floor`.
         """
         ts, params, params_dot, table = _contiguous(ts, params, params_dot, table)
@@ -303,14 +307,33 @@ class _Compiled:
         return together(work, threads)
 
 
-def _outcome(path, y_end, t_end, code, steps, rejected, idle: int, table) -> Outcome:
+def _outcome(path, y_end, t_end, code, steps, rejected, idle: int, table=None) -> Outcome:
     """What is in the arrays when all is done; NaN in the path where a member did not come."""
     ended_badly = code != DONE
     if ended_badly.any():  # a start that is infinite was not reached either
         reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
         path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
     code, steps, rejected = (numbers.astype(int) for numbers in (code, steps, rejected))
-    return Outcome(path, y_end, t_end, code, steps, rejected, idle, table)
+    recorded = (None, None) if table is None else _by_member(table, steps)
+    return Outcome(path, y_end, t_end, code, steps, rejected, idle, *recorded)
+
+
+def _by_member(table: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of the members that all `steps` (N,) are there of, one member after the other; and which these are.
+
+    A step that was undone was written down more than once: the last time counts.
+    """
+    member, step = table[:, 2].astype(np.int64), table[:, 3].astype(np.int64)
+    lasting = np.flatnonzero(step < steps[member])
+    complete = np.bincount(member[lasting], minlength=len(steps)) >= steps
+    lasting = lasting[complete[member[lasting]]]
+    counts = np.where(complete, steps, 0)
+    places = np.full(counts.sum(), -1)
+    places[(np.cumsum(counts) - counts)[member[lasting]] + step[lasting]] = lasting
+    if (places < 0).any():  # one was undone and is not there again
+        missing = np.repeat(np.arange(len(steps)), counts)[places < 0]
+        return _by_member(table[~np.isin(member, missing)], steps)
+    return table[places], complete
 
 
 def _contiguous(*arrays) -> list[np.ndarray]:

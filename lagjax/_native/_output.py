@@ -2,9 +2,11 @@
 
 from lagjax._native._constants import DONE
 from lagjax._native._frame import Frame, Index, Lane
-from lagjax._native._ir import INTEGER, Value
+from lagjax._native._ir import Value
 from lagjax._native._projection import Projector
 from lagjax._native._series import Motion
+
+RECORDED = 4  # numbers of a step that are written down before its state: time, size, member, number of the step
 
 
 class Output:
@@ -75,17 +77,20 @@ class Output:
     # ---- steps, for their transposes ----
 
     def record(self, frame: Frame, lane: Lane) -> None:
-        """Time, size and first state of the step, where a member has room for it."""
+        """Time, size and first state of the step, whose it is and which, as long as there is room.
+
+        All threads write rows into one table, in the order in which they come to it.
+        """
         code, member = frame.code, lane["member"]
         with code.only_if((member >= 0) & code.compare("!=", lane["h"], 0.0)):
-            steps = code.as_integer(lane["steps"])
-            first, after = (frame.read("first_step", member + k, INTEGER) for k in range(2))
-            with code.only_if(first + steps < after):
-                row = (first + steps) * (self.motion.states + 2)
-                for k, name in enumerate(("t", "h")):
-                    frame.write("record", row + k, lane[name])
-                for i in self.motion.form.each(code, self.motion.states):
-                    frame.write("record", row + 2 + i, lane["y", i])
+            number, states = frame.next("next_row"), self.motion.states
+            with code.only_if(number < frame.job("room")):
+                row = number * (states + RECORDED)
+                parts = lane["t"], lane["h"], code.as_double(member), lane["steps"]
+                for k, x in enumerate(parts):
+                    frame.write("record", row + k, x)
+                for i in self.motion.form.each(code, states):
+                    frame.write("record", row + len(parts) + i, lane["y", i])
 
     # ---- the end of a member ----
 

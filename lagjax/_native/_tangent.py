@@ -24,6 +24,7 @@ from lagjax._native._constants import MAX_ORDER
 from lagjax._native._frame import Frame, Lane, Layout, Vectors, integers, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
+from lagjax._native._output import RECORDED
 from lagjax._native._series import Motion, double, integer, is_large
 from lagjax._native._tables import Tables
 from lagjax._program._pushforward import pushforward
@@ -197,14 +198,14 @@ class Tangent:
         code, member = frame.code, lane["member"]
         with code.only_if(member >= 0):
             step = lane["step"]
-            row = (frame.read("first_step", member, INTEGER) + step) * (self.states + 2)
+            row = (frame.read("first_step", member, INTEGER) + step) * (self.states + RECORDED)
             lane["t"] = frame.read("record", row)
             lane["h"] = frame.read("record", row + 1)
             for i in self.motion.form.each(code, self.states):
-                lane["y", i] = frame.read("record", row + (i + 2))
+                lane["y", i] = frame.read("record", row + (i + RECORDED))
             lane["next_begin"] = lane["h"] * float("inf")  # of the last step: all outputs that are left
             with code.only_if(step + 1 < frame.read("steps", member, INTEGER)):
-                lane["next_begin"] = frame.read("record", row + (self.states + 2))
+                lane["next_begin"] = frame.read("record", row + (self.states + RECORDED))
 
     def _end_or_go_on(self, frame: Frame, lane: Lane, index: Value) -> None:
         """One step more; after the last one, write down how large the last terms were and take the next member."""
