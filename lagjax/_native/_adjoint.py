@@ -19,7 +19,7 @@ Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3.2, 13.
 
 from llvmlite import ir
 
-from lagjax._native._constants import MAX_ORDER
+from lagjax._native._constants import MAX_ORDER, NEAR_ZERO
 from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._output import RECORDED
@@ -230,14 +230,14 @@ class Adjoint:
             code.store(code.load(term, frame.vector) * (rate * h) / code.as_double(k + 1), term)
             with code.only_if(k > 0):
                 code.store(code.load(power, frame.vector) * h, power)
-        # The last coefficient of the rows, beside the first two.
+        # The last coefficient of the rows, beside the first two, which may both be near a zero.
         last, first = code.lanes_of(0.0), code.lanes_of(0.0)
         if self.series.rows:
             last = form.largest(code, lambda i: size(frame["rows", i, order - 1]), self.series.rows)
             first = form.largest(
                 code, lambda i: code.maximum(size(frame["rows", i, 1]), size(frame["rows", i, 2]) * h), self.series.rows
             )
-        tail = code.select(first > 0.0, last * code.load(power, frame.vector) / first, 0.0)
+        tail = code.select(first > 0.0, NEAR_ZERO * last * code.load(power, frame.vector) / first, 0.0)
         frame["excess"] = code.maximum(code.maximum(code.load(term, frame.vector), tail), frame["excess"])
         return frame.finish()
 
