@@ -26,7 +26,16 @@ from lagjax._layout import Layout, dtype_of
 from lagjax._linear import solve_many
 from lagjax._motion import Motion
 from lagjax._native import Projection
-from lagjax._program import Graph, Program, Unlowerable, lower, lower_formula, lower_scalars, lower_solution
+from lagjax._program import (
+    Graph,
+    Program,
+    Unlowerable,
+    lower,
+    lower_formula,
+    lower_scalars,
+    lower_solution,
+    without_collections,
+)
 from lagjax._program._scalars import applied, joined, spread, stacked
 from lagjax._quantities import OwnRules, quantities
 from lagjax._recursion import Recursion, RecursiveElimination
@@ -69,7 +78,8 @@ def _lowered_once(make: Callable) -> property:
             with self._lock:  # programs of a large scene share one graph
                 if name not in self._made:
                     try:
-                        self._made[name] = make(self)
+                        with without_collections():
+                            self._made[name] = make(self)
                     except Unlowerable as reason:
                         self._made[name] = reason
         made = self._made[name]

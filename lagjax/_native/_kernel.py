@@ -21,6 +21,7 @@ from lagjax._native._output import RECORDED
 from lagjax._native._tangent import Tangent
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._graph import Unlowerable
+from lagjax._program._memory import without_collections
 from lagjax._program._series import Recurrent, Series, series
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
@@ -127,8 +128,9 @@ class Kernel:
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
-        integrator = Integrator(*self._parts, *self._options, width=self.width)
-        motion = integrator.motion
+        with without_collections():
+            integrator = Integrator(*self._parts, *self._options, width=self.width)
+            motion = integrator.motion
         return _Compiled(motion.module, motion.layout, integrator.job, self._rounds, pointers=4)
 
     @property
@@ -346,7 +348,8 @@ def recurrences(program: Recurrent, size: int) -> Series:
     for (op, _, _), kind in zip(program.line.nodes, program.line.kinds, strict=True):
         if kind not in ("float", "bool") and op not in ("input", "constant", "convert"):
             raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
-    return series(program, size, moving=2 * size + 1)
+    with without_collections():
+        return series(program, size, moving=2 * size + 1)
 
 
 def order_for(rtol: float) -> int:

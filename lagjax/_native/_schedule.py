@@ -14,7 +14,8 @@ from typing import NamedTuple
 from lagjax._native._constants import LARGEST_TREE, MOST, OFTEN, ROUNDS, TIMES, WINDOW
 from lagjax._program._series import StraightLine
 
-_JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))  # what one operation may consist of
+# What one operation may consist of; operands and results of these are of one kind.
+_JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))
 
 
 class Kind(NamedTuple):
@@ -149,9 +150,11 @@ def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Oper
             op, results = "sincos", tuple(angles[operands[0]])
             if i != min(x for x in results if x >= 0):
                 continue
-        key = op, attribute, tuple(line.kinds[x] for x in operands), line.kinds[i]
+        key = (
+            (op, line.kinds[i]) if op in _JOINED else (op, attribute, *[line.kinds[x] for x in operands], line.kinds[i])
+        )
         if key not in numbers:
-            numbers[key] = kinds.number(*key)
+            numbers[key] = kinds.number(op, attribute, tuple(line.kinds[x] for x in operands), line.kinds[i])
         operations.append(Operation(numbers[key], operands, results))
     return operations
 

@@ -92,7 +92,7 @@ class Derivatives:
 
     def size(self, outputs: Sequence[int]) -> int:
         """How many operations some nodes take together."""
-        return sum(bool(self.graph.nodes[i][1]) for i in self._reached(outputs, self.graph.nodes.__getitem__))
+        return sum(bool(self.graph.nodes[i][1]) for i in self.graph.below(outputs))
 
     def _copied(self, op: str, operands: list[int], attribute, kind: str, inputs: Sequence[int]) -> int:
         """A node of a tape in the graph."""
@@ -177,17 +177,7 @@ class Derivatives:
 
     def below(self, outputs: Sequence[int]) -> list[int]:
         """The nodes that some nodes are derived from, and these, in order."""
-        return sorted(self._reached(outputs, self.as_derived))
-
-    @staticmethod
-    def _reached(outputs: Sequence[int], node_of: Callable[[int], Node]) -> set[int]:
-        seen, stack = set(), list(outputs)
-        while stack:
-            i = stack.pop()
-            if i not in seen:
-                seen.add(i)
-                stack.extend(node_of(i)[1])
-        return seen
+        return self.graph.below(outputs, as_derived=True)
 
     def _apply(self, op: str, *operands: int, attribute=None) -> int:
         self.operations += 1

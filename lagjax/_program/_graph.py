@@ -20,7 +20,7 @@ whoever runs the program checks what comes out of it.
 import functools
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,7 @@ LONGEST = 16  # terms of a sum, or factors of a product, that are compared with 
 MANY = 20_000
 
 Node = tuple[str, tuple[int, ...], Any]
+_ARITHMETIC = frozenset(("add", "sub", "mul"))
 
 
 class Graph:
@@ -61,9 +62,50 @@ class Graph:
         self._with_squares: set[int] = set()  # the products that hold a sine twice
         self.powers: dict[int, tuple[int, float]] = {}  # what is a power of another node, and which
 
+    @classmethod
+    def of(cls, line, budget: int) -> "Graph":
+        """A graph of the nodes of a straight line, which have their positions as ids."""
+        graph = cls(budget)
+        graph.nodes, graph.kinds, ids = list(line.nodes), list(line.kinds), graph._ids
+        constants = bytearray(len(graph.nodes))
+        for i, (node, kind) in enumerate(zip(graph.nodes, graph.kinds, strict=True)):
+            op, operands, value = node
+            if op == "constant":
+                constants[i] = True
+                ids[kind, value, math.copysign(1.0, value)] = i
+                graph.plain.append(False)
+                continue
+            ids[node] = i
+            multiple = op == "neg" or (op == "mul" and (constants[operands[0]] or constants[operands[1]]))
+            graph.plain.append(kind == "float" and not multiple)
+        graph._operations = len(graph.nodes)
+        graph._require_room()
+        return graph
+
+    def below(self, outputs: Iterable[int], as_derived: bool = False) -> list[int]:
+        """The nodes that some nodes depend on, and these, in order; `as_derived`, powers depend on their base."""
+        marks, nodes, order = bytearray(len(self.nodes)), self.nodes, []
+        powers = self.powers if as_derived else {}
+        for i in outputs:
+            marks[i] = 1
+        i = marks.rfind(1)
+        while i >= 0:
+            order.append(i)
+            for x in nodes[i][1] if i not in powers else powers[i][:1]:
+                marks[x] = 1
+            i = marks.rfind(1, 0, i)
+        order.reverse()
+        return order
+
     def apply(self, op: str, *operands: int, attribute=None) -> int:
         """The scalar `op(*operands)`, as simple as the rules below make it."""
         nodes = self.nodes
+        if op in _ARITHMETIC and len(nodes) > MANY:
+            a, b = operands
+            if self.plain[a] and self.plain[b] and a != b:
+                i = self._plain_node((op, (b, a) if a > b and op != "sub" else (a, b), None))
+                self._require_room()
+                return i
         for i in operands:
             if nodes[i][0] != "constant":
                 break
@@ -75,23 +117,26 @@ class Graph:
 
     def apply_all(self, op: str, *columns: list[int], attribute=None) -> list[int]:
         """`apply` for many operands."""
-        if op not in ("add", "sub", "mul") or len(self.nodes) <= MANY:
+        if op not in _ARITHMETIC or len(self.nodes) <= MANY:
             return [self.apply(op, *operands, attribute=attribute) for operands in zip(*columns, strict=True)]
-        nodes, ids, plain, results = self.nodes, self._ids, self.plain, []
+        plain, ordered, new, results = self.plain, op == "sub", self._plain_node, []
         for a, b in zip(*columns, strict=True):
-            if not (plain[a] and plain[b]) or a == b:
+            if plain[a] and plain[b] and a != b:
+                results.append(new((op, (b, a) if a > b and not ordered else (a, b), None)))
+            else:
                 results.append(self.apply(op, a, b))
-                continue
-            node = (op, (b, a) if a > b and op != "sub" else (a, b), None)
-            i = ids.setdefault(node, len(nodes))
-            if i == len(nodes):  # as `node` does, without a look at what is not there
-                nodes.append(node)
-                self.kinds.append("float")
-                plain.append(True)
-                self._operations += 1
-            results.append(i)
         self._require_room()
         return results
+
+    def _plain_node(self, node: Node) -> int:
+        """What `node` gives for arithmetic of numbers that are `plain`, without a look at what is not there."""
+        i = self._ids.setdefault(node, len(self.nodes))
+        if i == len(self.nodes):
+            self.nodes.append(node)
+            self.kinds.append("float")
+            self.plain.append(True)
+            self._operations += 1
+        return i
 
     def _require_room(self) -> None:
         if self._operations > self.budget:

@@ -122,11 +122,20 @@ def _negative(graph, i) -> int | None:
 
 def eliminate_dead_code(graph: Graph, outputs: list[int]) -> Line:
     """The nodes that the outputs depend on, renumbered."""
-    kept = [i for i, count in enumerate(_uses(graph, outputs)) if count]
-    position = dict(zip(kept, range(len(kept)), strict=True)).__getitem__
-    nodes = (graph.nodes[i] for i in kept)
-    renumbered = tuple((op, tuple(map(position, operands)), attribute) for op, operands, attribute in nodes)
-    return renumbered, tuple(graph.kinds[i] for i in kept), tuple(map(position, outputs))
+    kept = graph.below(outputs)
+    if len(kept) == len(graph.nodes):
+        return tuple(graph.nodes), tuple(graph.kinds), tuple(outputs)
+    position = dict(zip(kept, range(len(kept)), strict=True))
+    renumbered, nodes = [], graph.nodes
+    for i in kept:
+        node = op, operands, attribute = nodes[i]
+        if len(operands) == 2:
+            a, b = operands
+            node = op, (position[a], position[b]), attribute
+        elif operands:
+            node = op, tuple([position[x] for x in operands]), attribute
+        renumbered.append(node)
+    return tuple(renumbered), tuple([graph.kinds[i] for i in kept]), tuple([position[i] for i in outputs])
 
 
 def live(nodes, kinds, outputs) -> Line:

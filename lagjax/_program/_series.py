@@ -102,14 +102,8 @@ class _Recurrences:
 
     def __init__(self, program: Recurrent, size: int, moving: int):
         self.size, self.moving = size, moving
-        self.zeroth_order, self.order_recursion = Graph(10 * program.budget), Graph(20 * program.budget)
-        for (op, operands, attribute), kind in zip(program.line.nodes, program.line.kinds, strict=True):
-            if op == "input":
-                self.zeroth_order.input(attribute, kind)
-            elif op == "constant":
-                self.zeroth_order.constant(attribute, kind)
-            else:
-                self.zeroth_order.node(op, *operands, attribute=attribute)
+        self.zeroth_order = Graph.of(program.line, 10 * program.budget)
+        self.order_recursion = Graph(20 * program.budget)
         self.outputs = list(program.line.outputs)
         self.order_k = [self.order_recursion.input(i, "float") for i in range(self.moving)]
         self.k, self.inverse_k = (self.order_recursion.input(self.moving + i, "float") for i in range(2))
@@ -288,13 +282,8 @@ class _Recurrences:
 
     def _reached(self, roots: list[int]) -> list[tuple]:
         """The keys of `_given` that these nodes of the recursion depend on, in the order they were first asked for."""
-        seen, stack = set(), list(roots)
-        while stack:
-            node = stack.pop()
-            if node not in seen:
-                seen.add(node)
-                stack.extend(self.order_recursion.nodes[node][1])
-        return [key for key, node in self._given.items() if node in seen]
+        reached = set(self.order_recursion.below(roots))
+        return [key for key, node in self._given.items() if node in reached]
 
     def _renumber(self, positions: dict[int, int]) -> None:
         for node, position in positions.items():

@@ -92,8 +92,11 @@ def whole_power(graph, a: int, exponent: int) -> int:
 
 
 def _noted(graph, a: int, exponent: float, result: int) -> int:
-    """The node of a power, kept in mind as one: its derivative is not that of the products that it consists of."""
-    if exponent not in (0, 0.5, 1) and graph.kinds[a] == "float" and graph.value(result) is None:
+    """The node of a power, kept in mind as one: its derivative is not that of the products that it consists of.
+
+    An earlier node, which was written as another product, is not a power of a later one: derivatives go in order.
+    """
+    if a < result and exponent not in (0, 0.5, 1) and graph.kinds[a] == "float" and graph.value(result) is None:
         graph.powers.setdefault(result, (a, exponent))
     return result
 
