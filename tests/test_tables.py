@@ -19,13 +19,16 @@ MEMBERS, RTOL, ROOM = 3, 1e-9, 300
 ROUND_OFF = 1e-11
 
 
-def in_both_forms(*parts, **options):
-    """A kernel written down operation by operation, and one as tables."""
-    for border in (10**9, -1):
+def in_all_forms(*parts, **options):
+    """A kernel written down operation by operation, one as tables, and one as tables with alike operations in lanes."""
+    for border, width in ((10**9, None), (-1, None), (-1, 1)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(_series, "LARGEST_LINE", border)
-            kernel = _native.Kernel(*parts, **options)
-            kernel._backward  # noqa: B018  (compiled in the same form)
+            kernel = _native.Kernel(*parts, **options, width=width)
+            if width is None:
+                kernel._backward  # noqa: B018  (compiled in the same form)
+            else:
+                kernel._forward  # noqa: B018
         yield kernel
 
 
@@ -39,13 +42,18 @@ def run_and_back(kernel, ts, y0, params):
 
 
 def assert_same(kernels, ts, y0, params):
-    (written, back), (table, back_by_table) = (run_and_back(kernel, ts, y0, params) for kernel in kernels)
+    by_line, by_table, alone = kernels
+    (written, back), (table, back_by_table) = (run_and_back(kernel, ts, y0, params) for kernel in (by_line, by_table))
+    one_by_one = alone(ts[None], y0, params, RTOL, 1e-3 * RTOL, 10_000)
+    np.testing.assert_array_equal(one_by_one.steps, table.steps)
+    np.testing.assert_array_equal(one_by_one.code, table.code)
+    np.testing.assert_allclose(one_by_one.path, table.path, rtol=0, atol=ROUND_OFF * np.nanmax(abs(table.path)))
     np.testing.assert_array_equal(table.code, written.code)
     np.testing.assert_array_equal(table.steps, written.steps)
     np.testing.assert_allclose(table.path, written.path, rtol=0, atol=ROUND_OFF * np.nanmax(abs(written.path)))
-    for by_table, by_line in zip(back_by_table, back, strict=True):
-        if by_line.size:
-            np.testing.assert_allclose(by_table, by_line, rtol=0, atol=ROUND_OFF * np.nanmax(abs(by_line)))
+    for tabled, expected in zip(back_by_table, back, strict=True):
+        if expected.size:
+            np.testing.assert_allclose(tabled, expected, rtol=0, atol=ROUND_OFF * np.nanmax(abs(expected)))
 
 
 # Constraints with a projection, a motion that depends on time; the others in the slow part.
@@ -68,7 +76,7 @@ def test_ready_scenes(scene):
     params = np.array([numbers_of(made.params)], float)
     y0 = np.concatenate([layout.flatten(made.q0), layout.flatten(made.qdot0)])
     duration = {"solar_system": 10.0}.get(scene.__name__, 1.0)
-    assert_same(in_both_forms(*parts), np.linspace(0.0, duration, 4), np.tile(y0, (MEMBERS, 1)), params)
+    assert_same(in_all_forms(*parts), np.linspace(0.0, duration, 4), np.tile(y0, (MEMBERS, 1)), params)
 
 
 def test_piecewise_operations_parameters_that_are_integers_and_guards():
@@ -86,10 +94,11 @@ def test_piecewise_operations_parameters_that_are_integers_and_guards():
 
     events = _native.Guards(lower(guards, *shapes, 1.0, 2), (0,))
     y0 = np.random.default_rng(1).uniform(-0.5, 0.5, (MEMBERS, 4)) + np.array([0.5, 0.5, 0, 0])
-    kernels = list(in_both_forms(program, 2, guards=events))
+    kernels = list(in_all_forms(program, 2, guards=events))
     assert_same(kernels, np.linspace(0.0, 2.0, 5), y0, np.array([[2.0, 1.0]]))
-    codes = kernels[1](np.array([[0.0, 9.0]]), y0, np.array([[2.0, 1.0]]), RTOL, RTOL, 10_000).code
-    assert (codes >= _native.EVENT).any()
+    for kernel in kernels[1:]:
+        codes = kernel(np.array([[0.0, 9.0]]), y0, np.array([[2.0, 1.0]]), RTOL, RTOL, 10_000).code
+        assert (codes >= _native.EVENT).any()
 
 
 # ---- the order in which a table runs --------------------------------------------------------------------------------

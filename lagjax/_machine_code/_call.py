@@ -43,7 +43,7 @@ def on_host(host: Callable, shapes, *arrays) -> tuple:
 
 def has_handler(flow: Flow, members: int) -> bool:
     """Whether a run of so many members begins in the handler."""
-    return NO_HANDLER is None and flow.kernel.threads(members) == 1
+    return NO_HANDLER is None and flow.kernel.to_run(members).threads(members) == 1
 
 
 def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, ts, y0, params) -> tuple:
@@ -54,7 +54,7 @@ def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, t
     """
     _register()
     members, states = y0.shape
-    kernel = flow.kernel.of_members(members)
+    kernel = flow.kernel.to_run(members)
     plan = kernel.plan(tolerances.rtol, tolerances.atol, tolerances.max_steps)
     rows, size = (members,), (kernel.rest_size,)
     of_handler = [(members, ts.shape[1], states), (members, states), *[rows] * 4, size]

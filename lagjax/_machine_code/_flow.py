@@ -166,8 +166,7 @@ class Flow:
         rtol, atol, max_steps, _ = tolerances
         if store is not None and room is None:
             room = min(max_steps * len(y0), LARGEST_KEPT // (self.states + 4))
-        kernel = self.kernel.of_members(len(y0))
-        done = kernel(ts, y0, params, rtol, atol, max_steps, room or 0, begun)
+        done = self.kernel.to_run(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun)
         result, event = _RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:

@@ -44,6 +44,16 @@ MOST, WINDOW = 16, 4096
 # is twice as long and runs no faster.
 LARGEST_TREE, OFTEN, ROUNDS = 10, 24, 12
 
+# For one member alone. Alike operations whose operands lie side by side are a run of their own from so many on; a
+# combination of how operands lie has code of its own where it is that of so many vectors, else its numbers lie
+# anywhere; products are sorted into runs of so many.
+LEAST_RUN, OFTEN_PACKED, LONG_RUN = 5, 8, 8
+# Members of a large scene are integrated one after the other, alike operations in the lanes, where the series of as
+# many as there are lanes take so many bytes: with all that is read beside them they leave a second cache of 2 MiB.
+# Measured there, lanes for members take 0.9 times as long at 2.3 MB (a chain of 32 pendulums), 1.2 times at 2.7 MB
+# (20 bodies), 1.5 times at 3.5 MB (40 pendulums), 2.2 times at 6 MB (30 bodies).
+LARGEST_SHARED = 5 * 2**19
+
 # ---- step control ----------------------------------------------------------------------------------------------------
 
 # Of the step at which the last terms of the series equal the tolerance (Jorba & Zou: e^(−0.7/(p−1)), about the same).

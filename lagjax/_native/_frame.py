@@ -71,6 +71,11 @@ class Layout:
         """The memory that a thread needs, in doubles: whole cache lines."""
         return -(-self._doubles[0] // CACHE_LINE) * CACHE_LINE
 
+    @property
+    def end(self) -> int:
+        """Where the next field will begin, in doubles."""
+        return -(-self._doubles[0] // self.width) * self.width
+
     def extend(self, name: str, rows: int, columns: int = 1) -> None:
         """One field more, of so many vectors, behind all others."""
         begin = -(-self._doubles[0] // self.width) * self.width

@@ -64,6 +64,7 @@ def _machine(level: int) -> llvm.TargetMachine:
     )
 
 
+@functools.cache
 def lanes() -> int:
     """Doubles in a vector register; two registers' worth where those are short, to hide latencies."""
     return 8 if llvm.get_host_cpu_features().get("avx512f", False) else 4
@@ -162,6 +163,13 @@ class Value:
         return Value(self.code, self.code.builder.not_(self.it))
 
 
+@functools.cache
+def _splat(kind: ir.Type, lanes: int) -> tuple[ir.Constant, ...]:
+    """The constants that a number of this kind is put into all lanes with."""
+    undefined = ir.Constant(ir.VectorType(kind, lanes), ir.Undefined)
+    return undefined, ir.Constant(INTEGER, 0), ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
+
+
 class Code:
     """The body of one function, growing at its end."""
 
@@ -184,9 +192,8 @@ class Code:
         if not isinstance(x, Value):
             return Value(self, self._constant(x, like))
         if isinstance(like, ir.VectorType) and not isinstance(x.it.type, ir.VectorType):
-            undefined = ir.Constant(ir.VectorType(x.it.type, self.lanes), ir.Undefined)
-            first = self.builder.insert_element(undefined, x.it, ir.Constant(INTEGER, 0))
-            zeros = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
+            undefined, begin, zeros = _splat(x.it.type, self.lanes)
+            first = self.builder.insert_element(undefined, x.it, begin)
             return Value(self, self.builder.shuffle_vector(first, undefined, zeros))
         return x
 
@@ -267,6 +274,41 @@ class Code:
     def store(self, x: Value, address: Value) -> None:
         """Write a number or vector to an address."""
         self.builder.store(x.it, address.it, align=self._alignment(x.it.type))
+
+    def load_packed(self, address: Value) -> Value:
+        """As many doubles as a vector has lanes, wherever they begin."""
+        return Value(self, self.builder.load(address.it, typ=self.vector, align=8))
+
+    def store_packed(self, x: Value, address: Value) -> None:
+        """Write a vector to wherever an address is."""
+        self.builder.store(x.it, address.it, align=8)
+
+    def offsets(self, words: Value) -> Value:
+        """Distances in bytes, from as many numbers of doubles (32 bits each) as a vector has lanes."""
+        whole, (_, eight, _) = ir.VectorType(INTEGER, self.lanes), self._constants_of_a_gather
+        loaded = self.builder.load(words.it, typ=ir.VectorType(ir.IntType(32), self.lanes), align=4)
+        return Value(self, self.builder.mul(self.builder.zext(loaded, whole), eight))
+
+    def gather(self, base: Value, offsets: Value) -> Value:
+        """The doubles that lie so many bytes behind `base`, one for each lane."""
+        function, _, options = self._constants_of_a_gather
+        first = self.as_value(Value(self, self.builder.ptrtoint(base.it, INTEGER)), offsets.it.type)
+        pointers = ir.VectorType(POINTER, self.lanes)
+        addresses = self.builder.inttoptr(self.builder.add(first.it, offsets.it), pointers)
+        return Value(self, self.builder.call(function, [addresses, *options]))
+
+    @functools.cached_property
+    def _constants_of_a_gather(self) -> tuple:
+        """LLVM's function for it; the bytes of a double, in all lanes; alignment, which lanes, and what else."""
+        word, bits = ir.IntType(32), ir.VectorType(BIT, self.lanes)
+        name = f"llvm.masked.gather.v{self.lanes}f64.v{self.lanes}p0"
+        function = self.module.globals.get(name)
+        if function is None:
+            kind = ir.FunctionType(self.vector, [ir.VectorType(POINTER, self.lanes), word, bits, self.vector])
+            function = ir.Function(self.module, kind, name)
+        every, nothing = ir.Constant(bits, [True] * self.lanes), ir.Constant(self.vector, ir.Undefined)
+        eight = ir.Constant(ir.VectorType(INTEGER, self.lanes), [8] * self.lanes)
+        return function, eight, (ir.Constant(word, 8), every, nothing)
 
     def variable(self, start: Value) -> Value:
         """A place for a value that changes; registers, after LLVM's passes."""

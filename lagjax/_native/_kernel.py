@@ -12,12 +12,13 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._adjoint import Adjoint
-from lagjax._native._constants import DONE, LEAST_ORDER, MAX_ORDER, VECTORS_PER_THREAD
+from lagjax._native._constants import DONE, LARGEST_SHARED, LEAST_ORDER, MAX_ORDER, VECTORS_PER_THREAD
 from lagjax._native._frame import LANE, Layout
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled, lanes
 from lagjax._native._output import RECORDED
+from lagjax._native._series import is_large
 from lagjax._native._tangent import Tangent
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._graph import Unlowerable
@@ -120,6 +121,12 @@ class Kernel:
     def of_members(self, members: int) -> "Kernel":
         """The kernel for so many members: for one alone without lanes, which would be computed and read for nobody."""
         return self._alone if members == 1 < self.width else self
+
+    def to_run(self, members: int) -> "Kernel":
+        """The kernel that integrates so many members: one after the other where lanes would not fit in a cache."""
+        program, series, _ = self._parts
+        large = is_large(program) and series.rows * MAX_ORDER * self.width * 8 > LARGEST_SHARED
+        return self.of_members(1 if large else members)
 
     @functools.cached_property
     def _alone(self) -> "Kernel":

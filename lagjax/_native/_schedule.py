@@ -85,6 +85,12 @@ def schedule(line: StraightLine, stored: int) -> Schedule:
     return Schedule(kinds.all, groups, slots, staying, size, inputs, constants)
 
 
+def joined(line: StraightLine) -> tuple[list[Kind], list[Operation]]:
+    """The operations that the outputs of a program need, each after those that it reads, and their kinds."""
+    uses, kinds = _uses(line), _Kinds()
+    return kinds.all, _joined(_operations(line, uses, kinds), uses, kinds)
+
+
 # ---- operations ------------------------------------------------------------------------------------------------------
 
 

@@ -48,8 +48,8 @@ class Motion:
         self.module.triple = ""
         self.layout = Layout(width, self._fields() | fields)
         self.width, self.vector = self.layout.width, ir.VectorType(DOUBLE, self.layout.width)
-        sincos = sincos_function(self.module, self.width)
-        self.form = Tables(self.function, sincos) if large else Lines(sincos)
+        self.large = large
+        self.form = self._form()
         # The program whose first outputs are q̈. As a table the zeroth order is there already, and little longer.
         line = program.line
         self.acceleration = series.zeroth_order if large else line._replace(outputs=line.outputs[: self.n])
@@ -67,11 +67,20 @@ class Motion:
             **dict.fromkeys(("t", "h", "singular"), 1),
         }
 
+    def _form(self) -> Lines | Tables:
+        sincos = sincos_function(self.module, self.width)
+        return Tables(self.function, sincos) if self.large else Lines(sincos)
+
     def function(self, name: str, *kinds: ir.Type, **options) -> Frame:
         """A new function of the module."""
         return Frame(self.module, self.layout, self.job, name, *kinds, **options)
 
     # ---- the sums ----
+
+    @property
+    def places_of_sums(self) -> int:
+        """How many sums of one order have a place."""
+        return len(self.series.cauchy_products)
 
     def sum_indices(self, i: Index, k: Index) -> tuple[Index, Index]:
         """Where in `sums` product i is at order k."""
@@ -83,7 +92,7 @@ class Motion:
         code, (k,) = frame.code, frame.arguments
         mixed = [pair for pair in self.series.cauchy_products if pair[0] != pair[1]]
         squares = [(a,) for a, b in self.series.cauchy_products if a == b]
-        kinds = [("mixed", mixed, 0, _mixed_sum), ("squares", squares, len(mixed), _square_sum)]
+        kinds = [("mixed", mixed, 0, mixed_sum), ("squares", squares, len(mixed), square_sum)]
         tables = {name: self.table(pairs) for name, pairs, _, _ in kinds}
         end = code.function.append_basic_block("end")
         switch = code.builder.switch(k.it, end)
@@ -119,24 +128,35 @@ class Motion:
         """`(order)`: the series of the state, to that order, from its values."""
         frame = self.function("coefficients", INTEGER)
         code, (order,), series, n, form = frame.code, frame.arguments, self.series, self.n, self.form
-        out = form.run(frame, series.zeroth_order, *self.now(frame), to=frame.vectors("values", series.values))
+        out = form.run(frame, series.zeroth_order, *self.now(frame), to=self.values(frame))
         frame["singular"] = out[n]
         for i in form.each(code, n):
             frame["y", i, 1] = frame["y", i + n]
             frame["y", i + n, 1] = out[i]
-        for i in form.each(code, len(series.cauchy_products)):
+        for i in form.each(code, self.places_of_sums):
             frame["sums", *self.sum_indices(i, integer(code, 1))] = 0.0
 
         with code.loop(order, start=1) as k:
             with code.only_if(k > 1):
                 frame.call(self._sums, k)
             inverse = 1.0 / code.as_double(k + 1)
-            rows = frame.vectors_at("rows", series.rows, k)
-            out = form.run(frame, series.order_recursion, *self.at_order(frame, k), to=rows)
+            out = form.run(frame, series.order_recursion, *self.at_order(frame, k), to=self.rows_at(frame, k))
             for i in form.each(code, n):
                 frame["y", i, k + 1] = frame["y", i + n, k] * inverse
                 frame["y", i + n, k + 1] = out[i] * inverse
         return frame.finish()
+
+    def values(self, frame: Frame) -> Vectors:
+        """What the order recursion reads of the zeroth order."""
+        return frame.vectors("values", self.series.values)
+
+    def sums(self, frame: Frame) -> Vectors:
+        """The sums of the last order."""
+        return frame.vectors("sums", len(self.series.cauchy_products), lambda i: (0, i))
+
+    def rows_at(self, frame: Frame, k: Value) -> Vectors:
+        """The coefficients of order k of all rows."""
+        return frame.vectors_at("rows", self.series.rows, k)
 
     def now(self, frame: Frame) -> list[Vectors]:
         """The inputs of the program at the present time: q, q̇, t, parameters."""
@@ -147,13 +167,13 @@ class Motion:
         """The inputs of the order recursion: the coefficients of order k, k, 1/k, the values and the sums."""
         code, number, products = frame.code, frame.code.as_double(k), len(self.series.cauchy_products)
         time = code.select(code.compare("==", k, 1), number, 0.0)
-        sums = frame.vectors("sums", products, lambda i: (0, i))
+        sums = self.sums(frame)
         if self.keep_sums:
             sums = Vectors(products, lambda i: frame["sums", k, i])
         return [
             Vectors(self.states, lambda i: frame["y", i, k]),
             [code.lanes_of(x) for x in (time, number, 1.0 / number)],
-            frame.vectors("values", self.series.values),
+            self.values(frame),
             sums,
         ]
 
@@ -236,7 +256,7 @@ def double(code: Code, x: float) -> Value:
     return code.as_value(x, DOUBLE)
 
 
-def _mixed_sum(order: int, at, a, b) -> Value:
+def mixed_sum(order: int, at, a, b) -> Value:
     """Σ aⱼ bₖ₋ⱼ, in two strands that do not wait for each other."""
     strands = [at(a, j) * at(b, order - j) for j in range(1, min(3, order))]
     for j in range(3, order):
@@ -244,7 +264,7 @@ def _mixed_sum(order: int, at, a, b) -> Value:
     return strands[0] if len(strands) == 1 else strands[0] + strands[1]
 
 
-def _square_sum(order: int, at, a) -> Value:
+def square_sum(order: int, at, a) -> Value:
     """Σ aⱼ aₖ₋ⱼ: every product but the middle one comes twice."""
     pairs = [at(a, j) * at(a, order - j) for j in range(1, (order + 1) // 2)]
     middle = [] if order % 2 else [at(a, order // 2) * at(a, order // 2)]

@@ -23,7 +23,7 @@ from lagjax._native._lanes import apply, sines_and_cosines
 from lagjax._native._schedule import Kind, Operation, Schedule, schedule
 from lagjax._program._series import StraightLine
 
-_WORD = ir.IntType(32)  # an entry of a table: a kind, or a distance in the memory, in doubles
+WORD = ir.IntType(32)  # an entry of a table: a kind, or a distance in the memory, in doubles
 
 
 class Tables:
@@ -32,15 +32,15 @@ class Tables:
     `function(name, *kinds)` makes a function of the kernel, with its frame.
     """
 
-    def __init__(self, function, sincos: Code):
+    def __init__(self, function, sincos: Code, executing=None):
         self._sincos = sincos
         self._kinds: dict[tuple[Kind, int], int] = {}
         self._constants: dict[bytes, int] = {}
         self._fields: list[str] = []
         self._schedules: dict[int, tuple[StraightLine, Schedule]] = {}  # by the program, which lives as long
-        self._execute: Frame = function("execute", POINTER, INTEGER)
+        self._execute: Frame = (executing or function)("execute", POINTER, INTEGER)
         self._prepare: Frame = function("prepare")
-        self._module, self._layout = self._execute.code.module, self._execute.layout
+        self._module, self._layout = self._prepare.code.module, self._prepare.layout
         self._nowhere = self._layout.place(self._field(1), 0)  # for results that nobody reads
 
     # ---- what a kernel is written with ----
@@ -176,18 +176,18 @@ class Tables:
         head, end = (code.function.append_basic_block(name) for name in ("next", "end"))
         code.builder.branch(head)
         code.builder.position_at_end(head)
-        switch = code.builder.switch(_word(code, code.load(at, POINTER), 0).it, end)
+        switch = code.builder.switch(word(code, code.load(at, POINTER), 0).it, end)
         for (kind, times), number in self._kinds.items():
             block = code.function.append_basic_block(kind.op)
             switch.add_case(ir.Constant(INTEGER, number), block)
             code.builder.position_at_end(block)
             words, size = code.load(at, POINTER), kind.operands + kind.results
             for k in range(times):
-                where = [frame.at(_word(code, words, 1 + k * size + i)) for i in range(size)]
+                where = [frame.at(word(code, words, 1 + k * size + i)) for i in range(size)]
                 operands = (code.load(address, frame.vector) for address in where[: kind.operands])
                 for result, address in zip(self._results(kind, operands), where[kind.operands :], strict=True):
                     code.store(result, code.element(address, shift) if kind.op == "store" else address)
-            code.store(code.element(words, 1 + times * size, _WORD), at)
+            code.store(code.element(words, 1 + times * size, WORD), at)
             code.builder.branch(head)
         code.builder.position_at_end(end)
         frame.finish()
@@ -216,7 +216,7 @@ class Tables:
         frame.finish()
 
 
-def _word(code: Code, words: Value, index: int) -> Value:
+def word(code: Code, words: Value, index: int) -> Value:
     """An entry of a table."""
-    address = code.builder.gep(words.it, [ir.Constant(INTEGER, index)], source_etype=_WORD)
-    return Value(code, code.builder.zext(code.builder.load(address, typ=_WORD, align=4), INTEGER))
+    address = code.builder.gep(words.it, [ir.Constant(INTEGER, index)], source_etype=WORD)
+    return Value(code, code.builder.zext(code.builder.load(address, typ=WORD, align=4), INTEGER))
