@@ -71,7 +71,9 @@ class _State:
         """The derivatives of what is on a tape by each of some of q, qdot and t."""
         inputs = [self.ids[name] for name in by]
         positions = [of.positions[i] for ids in inputs for i in ids.ravel().tolist()]
-        flat = np.array(self.derivatives.gradient(of.tape, of.nodes, of.output, positions, together), dtype=np.int64)
+        again = [of.positions[i] for i in self.ids["qdot"].ravel().tolist()]
+        gradient = self.derivatives.gradient(of.tape, of.nodes, of.output, positions, together, again)
+        flat = np.array(gradient, dtype=np.int64)
         ends = np.cumsum([ids.size for ids in inputs])[:-1]
         return [part.reshape(ids.shape) for part, ids in zip(np.split(flat, ends), inputs, strict=True)]
 

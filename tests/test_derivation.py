@@ -337,3 +337,19 @@ def test_a_mass_matrix_that_is_a_series_in_weak_forces_is_positive_definite():
     system = lagjax.System(lambda q, v: jnp.sum(signs * v**2) + v[0] * v[1] * jnp.cos(q[0] - q[1]) + v[1] * v[2])
     with pytest.raises(Unlowerable, match="not positive definite"):
         of(system, np.ones(3), np.ones(3)).acceleration  # noqa: B018
+
+
+def test_forces_between_bodies_take_what_one_would_write_by_hand():
+    # A pair: 3 differences, 3 squares, 2 sums and 1 of the softening, a root, 2 quotients, a product of masses,
+    # 3 products, 6 sums into the forces; no coordinate more than a quotient by its mass, and whether that is zero.
+    count = 12
+    first, second = np.triu_indices(count, 1)
+
+    def lagrangian(q, v, params):
+        m = params["m"]
+        squared = jnp.sum((q[first] - q[second]) ** 2, axis=1) + 0.01
+        return 0.5 * jnp.sum(m[:, None] * v**2) + jnp.sum(m[first] * m[second] / jnp.sqrt(squared))
+
+    x = np.random.default_rng(0).normal(size=(count, 3))
+    derivation = of(lagjax.System(lagrangian), x, x, {"m": np.ones(count)})
+    assert derivation.acceleration.operations <= 22 * len(first) + 9 * count

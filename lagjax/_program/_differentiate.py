@@ -51,15 +51,19 @@ class Derivatives:
             nodes.append(self._copied(op, [nodes[x] for x in operands], attribute, kind, inputs))
         return nodes
 
-    def gradient(self, tape: Tape, nodes: list[int], output: int, by: Sequence[int], together: bool) -> list[int]:
+    def gradient(
+        self, tape: Tape, nodes: list[int], output: int, by: Sequence[int], together: bool, again: Sequence[int] = ()
+    ) -> list[int]:
         """The derivatives of one scalar of a tape by the inputs at the positions `by`: reverse mode.
+
+        What depends on the inputs `again` will be differentiated once more by these.
 
         `nodes` holds what the tape is in the graph. The cotangents of scalars that are equal are added up at once where
         they are to be taken `together`, else each is followed on its own as far as it is written apart.
         """
         first: dict[int, int] = {}
         same = [first.setdefault(i, k) if together else k for k, i in enumerate(nodes)]
-        varied = self._varied(tape, nodes, frozenset(by))
+        varied, once_more = (self._varied(tape, nodes, frozenset(inputs)) for inputs in (by, again))
         cotangents, results = {same[output]: self._number(1.0)}, {}
         for k in range(output, -1, -1):
             if not varied[k] or (g := cotangents.pop(k, None)) is None:
@@ -67,7 +71,8 @@ class Derivatives:
             op, operands, attribute = tape.nodes[k]
             if op == "input":
                 results[attribute] = g
-            rules = self._rules(nodes[k], op, [nodes[x] for x in operands], attribute)
+            rules_of = self._rules if once_more[k] else self._rules_once
+            rules = rules_of(nodes[k], op, [nodes[x] for x in operands], attribute)
             for x, rule in zip(operands, rules, strict=False):
                 if rule is not None and varied[x]:
                     part, x = rule(g), same[x]
@@ -152,6 +157,14 @@ class Derivatives:
         for k, tangent in of_u.items():
             result[k] = apply("sub", tangent, apply("mul", i, of_v[k])) if k in of_v else tangent
         return {k: apply("div", tangent, v) for k, tangent in result.items()}
+
+    def _rules_once(self, w: int, op: str, operands: Sequence[int], attribute: Any) -> Sequence[_Rule | None]:
+        """`_rules` for the only cotangent of w: factors 2 and ½ are next to others, with which they cancel."""
+        if op == "sqrt":
+            return [lambda g: self._apply("mul", self._number(0.5), self._apply("div", g, w))]
+        if op == "mul" and operands[0] == operands[1]:
+            return [lambda g: self._of_power(operands[0], 2, g)]
+        return self._rules(w, op, operands, attribute)
 
     def as_derived(self, i: int) -> Node:
         """A node as it is differentiated: a power is one operation, not the products that it consists of."""

@@ -55,7 +55,7 @@ def multiply(graph, op, a, b):
 
 
 def divide(graph, op, a, b):
-    """0 / x is 0; division by a power of two is a product; signs move outside."""
+    """0 / x is 0; division by a power of two is a product; signs move outside; (x / √u) / √u is x / u."""
     if graph.value(a) == 0:
         return a
     divisor = graph.value(b)
@@ -67,6 +67,8 @@ def divide(graph, op, a, b):
         return negate(graph, "neg", divide(graph, op, positive, b))
     if (positive := graph.operand_of("neg", b)) is not None:
         return negate(graph, "neg", divide(graph, op, a, positive))
+    if (square := graph.operand_of("sqrt", b)) is not None and graph.nodes[a][0] == "div" and graph.nodes[a][1][1] == b:
+        return graph.apply("div", graph.nodes[a][1][0], square)
     return graph.node("div", a, b)
 
 
