@@ -129,6 +129,7 @@ def test_no_products():
 def test_members_of_a_large_scene_are_integrated_one_after_the_other(monkeypatch):
     """As they are side by side, to the last bit."""
     monkeypatch.setattr(_series, "LARGEST_LINE", -1)
+    monkeypatch.setattr(_packs, "LEAST_FILLED", 0)
     program = cluster(5)
     kernel = _native.Kernel(program, 10)
     assert kernel.to_run(8) is kernel
@@ -141,6 +142,21 @@ def test_members_of_a_large_scene_are_integrated_one_after_the_other(monkeypatch
         np.testing.assert_array_equal(one_by_one, side_by_side)
 
 
+def test_a_scene_in_which_everything_waits_for_what_comes_before_keeps_members_in_lanes(monkeypatch):
+    monkeypatch.setattr(_series, "LARGEST_LINE", -1)
+    monkeypatch.setattr(_kernel, "LARGEST_SHARED", 0)
+
+    def row(q, v, t):  # each of forty coordinates drives the next
+        x = [jnp.sin(q[0])]
+        for k in range(1, 40):
+            x.append(jnp.sin(q[k]) * x[-1] + q[k] / (2.0 + x[-1] * x[-1]))
+        return jnp.stack(x), False
+
+    states = jax.ShapeDtypeStruct((40,), float)
+    assert _native.Kernel(lower(row, states, states, 1.0), 40).to_run(8).width > 1
+    assert _native.Kernel(cluster(16), 32).to_run(8).width == 1
+
+
 def test_the_code_does_not_grow_with_the_scene(monkeypatch):
     from lagjax._native._integrator import Integrator
 
@@ -150,4 +166,5 @@ def test_the_code_does_not_grow_with_the_scene(monkeypatch):
         return sum(len(block.instructions) for function in module.functions for block in function.blocks)
 
     monkeypatch.setattr(_series, "LARGEST_LINE", -1)
+    monkeypatch.setattr(_packs, "LEAST_FILLED", 0)
     assert instructions(20) < 2 * instructions(5)

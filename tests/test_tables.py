@@ -9,7 +9,7 @@ import lagjax
 from lagjax import _native
 from lagjax._derivation import derivation_of, numbers_of
 from lagjax._layout import Layout
-from lagjax._native import _schedule, _series
+from lagjax._native import _packs, _schedule, _series
 from lagjax._program import OPERATIONS, Unlowerable, lower
 
 MEMBERS, RTOL, ROOM = 3, 1e-9, 300
@@ -24,6 +24,7 @@ def in_all_forms(*parts, **options):
     for border, width in ((10**9, None), (-1, None), (-1, 1)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(_series, "LARGEST_LINE", border)
+            patch.setattr(_packs, "LEAST_FILLED", 0)
             kernel = _native.Kernel(*parts, **options, width=width)
             if width is None:
                 kernel._backward  # noqa: B018  (compiled in the same form)

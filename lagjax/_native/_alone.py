@@ -14,9 +14,15 @@ from lagjax._native._frame import CACHE_LINE, Frame, Index, Layout, Vectors, int
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value, lanes
 from lagjax._native._lanes import sincos_function
 from lagjax._native._packed import Packed
-from lagjax._native._packs import ANYWHERE, SIDE_BY_SIDE, Run, runs_of_products, with_few_modes
+from lagjax._native._packs import ANYWHERE, SIDE_BY_SIDE, Run, fills, runs_of_products, with_few_modes
 from lagjax._native._series import Motion, mixed_sum, square_sum
 from lagjax._native._tables import WORD, word
+from lagjax._program._series import Series
+
+
+def fills_lanes(series: Series) -> bool:
+    """Whether a motion has enough alike operations for the lanes of one member."""
+    return fills(series.order_recursion, lanes())
 
 
 class MotionAlone(Motion):

@@ -15,7 +15,7 @@ so that no lane waits for another. Several threads may do so at once: they share
 """
 
 from lagjax._native import _rank_drops
-from lagjax._native._alone import MotionAlone
+from lagjax._native._alone import MotionAlone, fills_lanes
 from lagjax._native._constants import DONE, EVENT, FIRST_STEP, OUT_OF_STEPS, RUNNING, SMALLEST_STEP
 from lagjax._native._events import Events
 from lagjax._native._frame import Frame, Lane, job
@@ -63,7 +63,7 @@ class Integrator:
         if projection is not None:
             fields |= Projector.fields(n, self.base_size) | _rank_drops.fields(n, self.guards)
         large = is_large(program, projection, guards)
-        kind = MotionAlone if large and width == 1 else Motion
+        kind = MotionAlone if large and width == 1 and fills_lanes(series) else Motion
         self.motion = motion = kind("motion", program, series, JOB, fields, large, width)
         self.projector = projection and Projector(
             motion, projection.state, projection.velocity_scale, self.base_size

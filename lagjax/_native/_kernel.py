@@ -12,6 +12,7 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._adjoint import Adjoint
+from lagjax._native._alone import fills_lanes
 from lagjax._native._constants import DONE, LARGEST_SHARED, LEAST_ORDER, MAX_ORDER, VECTORS_PER_THREAD
 from lagjax._native._frame import LANE, Layout
 from lagjax._native._handler import Plan, Rest, aligned, handler
@@ -126,7 +127,7 @@ class Kernel:
         """The kernel that integrates so many members: one after the other where lanes would not fit in a cache."""
         program, series, _ = self._parts
         large = is_large(program) and series.rows * MAX_ORDER * self.width * 8 > LARGEST_SHARED
-        return self.of_members(1 if large else members)
+        return self.of_members(1 if large and fills_lanes(series) else members)
 
     @functools.cached_property
     def _alone(self) -> "Kernel":

@@ -26,10 +26,10 @@ from lagjax._native._packs import (
     Stage,
     arranged,
     runs_of,
-    stages,
+    staged,
     with_few_modes,
 )
-from lagjax._native._schedule import Kind, joined
+from lagjax._native._schedule import Kind, Same
 from lagjax._native._tables import WORD, Tables, word
 from lagjax._program._series import StraightLine
 
@@ -133,9 +133,7 @@ class Packed(Tables):
 
     def _program(self, line: StraightLine, stored: int) -> list[Stage]:
         if id(line) not in self._programs:
-            kinds, operations = joined(line)
-            program = stages(operations, len(line.nodes), line.outputs)
-            self._programs[id(line)] = _Program(line, kinds, program, stored)
+            self._programs[id(line)] = _Program(line, *staged(Same(line)), stored)
         return self._programs[id(line)].stages
 
     # ---- the table of a program ----

@@ -8,14 +8,16 @@
 Nothing here knows LLVM.
 """
 
+import functools
 import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._native._constants import LEAST_RUN, LONG_RUN, OFTEN_PACKED
-from lagjax._native._schedule import Operation
+from lagjax._native._constants import LEAST_FILLED, LEAST_RUN, LONG_RUN, OFTEN_PACKED
+from lagjax._native._schedule import Kind, Operation, Same, joined
+from lagjax._program._series import StraightLine
 
 # How an operand of a run lies in memory: consecutive numbers, one number, or anywhere.
 SIDE_BY_SIDE, ONE, ANYWHERE = range(3)
@@ -68,6 +70,20 @@ def stages(operations: Sequence[Operation], nodes: int, kept: Sequence[int]) -> 
     last[list(kept)] = len(ordered)
     last[-1] = -1  # a result that nobody reads
     return [Stage(kind, operands, results, int(last[results].max())) for kind, operands, results in arrays]
+
+
+@functools.lru_cache(maxsize=4)  # asked for when it is decided how a motion runs, and when it is compiled
+def staged(same: Same) -> tuple[list[Kind], list[Stage]]:
+    """A program in stages, and the kinds of their operations."""
+    kinds, operations = joined(same.line)
+    return kinds, stages(operations, len(same.line.nodes), same.line.outputs)
+
+
+def fills(line: StraightLine, width: int) -> bool:
+    """Whether most lanes of so many have something to do where alike operations of a program stand in them."""
+    _, program = staged(Same(line))
+    counts = np.array([stage.results.shape[1] for stage in program])
+    return bool(counts.sum() >= LEAST_FILLED * width * (-(-counts // width)).sum())
 
 
 class Arranged(NamedTuple):
