@@ -30,7 +30,7 @@ Q = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 2))
 def on_host(monkeypatch):
     """The arguments of every run, or of what is left of one, that Python is asked for."""
     asked = []
-    for name in ("_run_on_host", "_run_gone_on_with"):
+    for name in ("_run_on_host", "_run_gone_on_with", "_run_again", "_jvp_on_host", "_vjp_on_host"):
         function = getattr(_transforms, name)
 
         def counted(*args, function=function, **settings):
@@ -93,6 +93,67 @@ def test_a_loop_of_short_runs_takes_no_python_and_has_derivatives(on_host):
     h = 1e-4
     low, high = (walk(Q[0], SCENE.params | {"m1": 1.0 + s})[-1, 0] for s in (-h, h))
     np.testing.assert_allclose(slope, (high - low) / (2 * h), atol=1e-6)
+
+
+def end(q, m=1.0, ts=TS):
+    found = lagjax.simulate(SCENE.system, q, np.zeros(2), ts, SCENE.params | {"m1": m}, rtol=1e-11)
+    return jnp.sum(found.q**2) + jnp.sum(found.end.qdot)
+
+
+def eagerly(function, monkeypatch):
+    """What a derivative is on the host, over steps that were kept."""
+    with monkeypatch.context() as patch:
+        patch.setattr(_call, "NO_HANDLER", "this test says so")
+        _transforms._compiled.cache_clear()
+        return function()
+
+
+def test_derivatives_of_short_runs_take_no_python(on_host, monkeypatch):
+    both = (0, 1)
+    forms = {
+        "grad": lambda: jax.grad(end, both),
+        "jacobian": lambda: jax.jacfwd(end, both),
+        "along": lambda: lambda q, m: jax.jvp(end, (q, m), (jnp.ones(2), 2.0)),
+        "of a batch": lambda: jax.vmap(jax.grad(end, both), (0, None)),
+        "of a batch, forward": lambda: jax.vmap(jax.jacfwd(end, both), (0, None)),
+    }
+    for name, form in forms.items():
+        q = Q if "batch" in name else Q[0]
+        expected = eagerly(lambda form=form, q=q: jax.jit(form())(q, 1.3), monkeypatch)
+        assert on_host, name
+        on_host.clear()
+        found = jax.jit(form())(q, 1.3)
+        assert not on_host, name
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def test_a_derivative_inside_of_loops_takes_no_python(on_host):
+    def walk(q, m):
+        def step(q, _):
+            slope = jax.checkpoint(jax.grad(end))(q, m, np.array([0.0, 0.05]))
+            return q - 0.1 * slope, None
+
+        return jnp.sum(jax.lax.scan(step, q, None, length=8)[0])
+
+    compiled, h = jax.jit(walk), 1e-4
+    on_host.clear()
+    compiled(Q[0], 1.0)
+    assert not on_host
+    slope = jax.jit(jax.grad(walk, 1))(Q[0], 1.0)  # a second derivative of every run
+    np.testing.assert_allclose(slope, (compiled(Q[0], 1.0 + h) - compiled(Q[0], 1.0 - h)) / (2 * h), atol=1e-7)
+
+
+def test_derivatives_of_long_runs_and_of_rest_are_those_of_kept_steps(on_host, monkeypatch):
+    long = np.linspace(0.0, 40.0, 5)
+    for arguments in ((Q[0], 1.3, long), (np.zeros(2), 1.3, 10 * TS)):  # at rest steps are too long for derivatives
+        compiled = jax.jit(jax.grad(end, (0, 1)))
+        on_host.clear()
+        found = compiled(*arguments)
+        assert on_host
+        expected = eagerly(lambda given=arguments: jax.jit(jax.grad(end, (0, 1)))(*given), monkeypatch)
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
 
 
 def test_a_long_run_is_gone_on_with(on_host, monkeypatch):
@@ -176,6 +237,10 @@ def test_the_interface_by_its_older_and_its_newer_names(tmp_path, renamed):
 # ---- processes -------------------------------------------------------------------------------------------------------
 
 
+def derivatives(q):
+    return jax.grad(end)(q), jax.jacfwd(lambda q: run(q)[0])(q)
+
+
 def on_two_devices():
     from jax.sharding import PartitionSpec as P
 
@@ -184,11 +249,15 @@ def on_two_devices():
     function = jax.vmap(lambda q: run(q)[0])
     sharded = jax.shard_map(function, mesh=mesh, in_specs=P("members"), out_specs=P("members"), check_vma=False)
     assert_equal(jax.jit(sharded)(Q), function(Q))
+    function = jax.vmap(derivatives)
+    sharded = jax.shard_map(function, mesh=mesh, in_specs=P("members"), out_specs=P("members"), check_vma=False)
+    for a, b in zip(jax.tree.leaves(jax.jit(sharded)(Q)), jax.tree.leaves(jax.jit(function)(Q)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)  # other members side by side, to the last digits
 
 
 def on_many_threads():
-    compiled, found = jax.jit(lambda q: run(q)[0]), [None] * 8
-    expected = [run(q)[0] for q in Q]
+    compiled, found = jax.jit(lambda q: (run(q)[0], derivatives(q))), [None] * 8
+    expected = [compiled(q) for q in Q]
 
     def work(place):
         found[place] = [compiled(q) for _ in range(20) for q in Q]
@@ -205,9 +274,12 @@ def after_a_fork():
     """A child has none of JAX's threads, which take up most programs; a run by itself needs none."""
     compiled = jax.jit(lambda q: run(q)[0])
     expected = np.asarray(compiled(Q[0]))
+    slopes = jax.jit(derivatives)
+    before = jax.tree.map(np.asarray, slopes(Q[0]))
     child = os.fork()
     if child == 0:
         signal.alarm(30)
+        assert_equal(slopes(Q[0]), before)
         assert_equal((compiled(Q[0]), run(Q[0])[0]), (expected, expected))
         run(Q[0], np.linspace(0.0, 1.0, 7))  # of a shape that was never sent before
         os._exit(0)

@@ -2,7 +2,8 @@
 
     members that one thread works on ─► handler ─► all ended well? ─► yes: results, without Python
                                                         └─ no: `Flow.run` goes on in a callback
-    more members, steps to be kept   ─► `Flow.run` in a callback
+    more members                     ─► `Flow.run` in a callback
+    derivatives of a short run       ─► handlers, which run it once more; of others ─► `_derivatives` in a callback
 
 Long runs, second chances, failures and what stopped them are Python's, as are threads and Ctrl-C. The handler is for
 the version of XLA's interface that it knows; where `NO_HANDLER` says why that is another one, every run is a callback.
@@ -24,6 +25,7 @@ from lagjax._results import EVENT_OCCURRED, SUCCESSFUL
 
 NO_HANDLER = _native.unavailable(jax.ffi.include_dir())
 _TARGET = "lagjax_integrate"
+_SWEEPS = ("jvp", "vjp")
 _lock = threading.Lock()
 
 
@@ -46,9 +48,17 @@ def has_handler(flow: Flow, members: int) -> bool:
     return NO_HANDLER is None and flow.kernel.to_run(members).threads(members) == 1
 
 
-def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, ts, y0, params) -> tuple:
+def has_sweep(flow: Flow, members: int) -> bool:
+    """Whether derivatives of so many members begin in a handler, with their motion run once more."""
+    return has_handler(flow, members) and flow.projection is None and flow.kernel.rounds_of_sweep > 0
+
+
+def run_by_handler(
+    flow: Flow, tolerances: Tolerances, host: Callable, shapes, ts, y0, params, rounds: int | None = None
+) -> tuple:
     """The run of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), N not too many for one thread.
 
+    The handler goes so many `rounds`, by default those of a slice of time.
     `host(ts, y0, params, *begun)` goes on with what the handler leaves undone (`_native.Begun`); its results, of these
     `shapes`, are those of the whole.
     """
@@ -56,6 +66,7 @@ def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, t
     members, states = y0.shape
     kernel = flow.kernel.to_run(members)
     plan = kernel.plan(tolerances.rtol, tolerances.atol, tolerances.max_steps)
+    plan.rounds = plan.rounds if rounds is None else rounds
     rows, size = (members,), (kernel.rest_size,)
     of_handler = [(members, ts.shape[1], states), (members, states), *[rows] * 4, size]
     call = jax.ffi.ffi_call(_TARGET, [jax.ShapeDtypeStruct(shape, np.float64) for shape in of_handler])
@@ -76,6 +87,22 @@ def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, t
     return tuple(jax.lax.cond(well, finished, unfinished, ts, y0, params, *begun))
 
 
+def sweep_by_handler(kind: str, flow: Flow, tolerances: Tolerances, ts, y0, params, argument, start) -> tuple:
+    """The results of a sweep over the motions of N members, not too many for one thread (`_native.SweepHandler`).
+
+    Then `excess` (N,); whether it is done, () of bool; and what must live as long as the compiled program.
+    """
+    _register()
+    (members, states), times = y0.shape, ts.shape[1]
+    directions = start.shape[1] if kind == "jvp" else 1
+    plan = flow.kernel.sweep_plan(kind, members, times, directions, *tolerances[:3])
+    second = (members, directions, times, states) if kind == "jvp" else (members, flow.numbers)
+    shapes = start.shape, second, (members,), (1,), (plan.scratch(members, times),)
+    call = jax.ffi.ffi_call(f"lagjax_{kind}", [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes])
+    *results, done, _ = call(ts, y0, params, argument, start, plan=np.int64(ctypes.addressof(plan)))
+    return *results, done[0] > 0, (plan, flow.kernel)
+
+
 def _ended_well(begun: _native.Begun):
     """Whether nothing is left to do, and no member failed."""
     more = jax.lax.bitcast_convert_type(begun.rest[-1], np.int64)
@@ -91,8 +118,10 @@ def _register() -> None:
 
 @functools.cache
 def _registered() -> None:
-    capsule = _capsule(_native.handler().address)
-    jax.ffi.register_ffi_target(_TARGET, capsule, platform="cpu", api_version=1)
+    addresses = {_TARGET: _native.handler().address}
+    addresses |= {f"lagjax_{kind}": _native.sweep_handler(kind).address for kind in _SWEEPS}
+    for target, address in addresses.items():
+        jax.ffi.register_ffi_target(target, _capsule(address), platform="cpu", api_version=1)
 
 
 def _capsule(address: int):

@@ -33,7 +33,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from lagjax._machine_code import _derivatives
-from lagjax._machine_code._call import has_handler, on_host, run_by_handler
+from lagjax._machine_code._call import has_handler, has_sweep, on_host, run_by_handler, sweep_by_handler
 from lagjax._machine_code._flow import Flow, Tolerances
 from lagjax._machine_code._steps import KEPT
 from lagjax._machine_code._tangent import from_rows, to_rows
@@ -87,13 +87,18 @@ def _run_gone_on_with(ts, y0, params, *begun, flow, tolerances, **_):
     return flow.run(ts, y0, params, tolerances, begun=Begun(*begun))[:_OUTPUTS]
 
 
-def _jvp_on_host(ts, y0, params, path, result, accepted, ticket, dy0, dparams, *, flow, tolerances):
+def _run_again(ts, y0, params, *_, flow, tolerances, **__):
+    """The results of a run of rows of members whose steps are kept: from the beginning."""
+    return flow.run(ts, y0, params, tolerances, KEPT)[:_OUTPUTS]
+
+
+def _jvp_on_host(ts, y0, params, path, result, accepted, ticket, dy0, dparams, *, flow, tolerances, **_):
     arrays = ts, y0, params, path, result, accepted, ticket, dy0, dparams
     (ts, y0, params, *rest), batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 2, 2), shared=(0, 2))
     return _in_batch(_derivatives.jvp(flow, ts, y0, params, rest[:4], *rest[4:], tolerances=tolerances), batch)
 
 
-def _vjp_on_host(ts, y0, params, path, result, accepted, ticket, path_ct, end_ct, *, flow, tolerances):
+def _vjp_on_host(ts, y0, params, path, result, accepted, ticket, path_ct, end_ct, *, flow, tolerances, **_):
     arrays = ts, y0, params, path, result, accepted, ticket, path_ct, end_ct
     (ts, y0, params, *rest), batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2))
     return _in_batch(_derivatives.vjp(flow, ts, y0, params, rest[:4], *rest[4:], tolerances=tolerances), batch)
@@ -423,18 +428,77 @@ def _run_compiled(ts, y0, params, *, flow, tolerances, keep):
     shapes = _run_shapes(ts, y0, params, **settings)
     rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2), library=jnp)
     with jax.enable_x64(True):  # where the kernel is made, and whatever was set where this is lowered
-        if keep or not has_handler(flow, math.prod(batch)):
+        short = keep and has_sweep(flow, math.prod(batch))  # whose derivatives need no steps that are kept
+        if not (short or (not keep and has_handler(flow, math.prod(batch)))):
             return on_host(functools.partial(_run_on_host, **settings), shapes, ts, y0, params)
         of_rows = [jax.ShapeDtypeStruct((len(rows[1]), *x.shape[len(batch) :]), x.dtype) for x in shapes]
-        return _in_batch(
-            run_by_handler(flow, tolerances, functools.partial(_run_gone_on_with, **settings), of_rows, *rows), batch
+        host = functools.partial(_run_again if keep else _run_gone_on_with, **settings)
+        rounds = flow.kernel.rounds_of_sweep if keep else None
+        return _in_batch(run_by_handler(flow, tolerances, host, of_rows, *rows, rounds=rounds), batch)
+
+
+def _swept_compiled(on_rows, on_host_, shapes_of, inner, args, settings):
+    """A derivative in what XLA compiles: by a handler where the motion was a short one, else on the host.
+
+    `on_rows(*rows)` gives the results for rows of members, whether these are done, and what they need to live.
+    """
+    shapes, function = shapes_of(*args, **settings), functools.partial(on_host_, **settings)
+    (ts, y0, params, *_, a, b), batch = _rows(args, (1, 1, 1, 2, 0, 0, 0, *inner), shared=(0, 2), library=jnp)
+
+    def by_handler(*args):
+        *results, done, needed = on_rows(ts, y0, params, a, b)
+        host = functools.partial(on_host, functools.partial(function, needed=needed), shapes)
+        return jax.lax.cond(done, lambda *_: tuple(_in_batch(results, batch)), host, *args)
+
+    with jax.enable_x64(True):  # where kernels are made, and whatever was set where this is lowered
+        host = functools.partial(on_host, function, shapes)
+        if not has_sweep(settings["flow"], math.prod(batch)):
+            return host(*args)
+        return jax.lax.cond(jnp.all(args[6] < 0), by_handler, host, *args)  # there are no steps that were kept
+
+
+def _jvp_compiled(*args, **settings):
+    """`jvp` of what XLA compiles."""
+    flow, tolerances = settings["flow"], settings["tolerances"]
+
+    def on_rows(ts, y0, params, dy0, dparams):
+        length = jnp.max(jnp.abs(jnp.concatenate([dy0, dparams], axis=2)), axis=2, keepdims=True)
+        unit = jnp.where(length > 0, length, 1.0)
+        end, path, excess, done, needed = sweep_by_handler(
+            "jvp", flow, tolerances, ts, y0, params, dparams / unit, dy0 / unit
         )
+        path = jnp.where((ts == ts[:, :1])[:, None, :, None], dy0[:, :, None] / unit[..., None], path)
+        path = path.at[:, :, -1].set(end)
+        done &= jnp.all(excess <= _derivatives.EXCESS * tolerances.rtol)
+        return path * unit[..., None], end * unit, done, needed
+
+    return _swept_compiled(on_rows, _jvp_on_host, _jvp_shapes, (2, 2), args, settings)
+
+
+def _vjp_compiled(*args, **settings):
+    """`vjp` of what XLA compiles, of one cotangent."""
+    flow, tolerances = settings["flow"], settings["tolerances"]
+
+    def on_rows(ts, y0, params, path_ct, end_ct):
+        path_ct, end_ct = path_ct[:, 0], end_ct[:, 0]
+        y_ct, params_ct, excess, done, needed = sweep_by_handler(
+            "vjp", flow, tolerances, ts, y0, params, path_ct, end_ct + path_ct[:, -1]
+        )
+        at_start = (ts == ts[:, :1])[:, :-1, None]  # outputs that are the initial state; steps begin after them
+        y_ct = y_ct + jnp.sum(path_ct[:, :-1] * at_start, axis=1)
+        done &= jnp.all(excess <= _derivatives.EXCESS * tolerances.rtol)
+        return y_ct[:, None], params_ct[:, None], done, needed
+
+    if args[-1].shape[-2] != 1:
+        return on_host(functools.partial(_vjp_on_host, **settings), _vjp_shapes(*args, **settings), *args)
+    return _swept_compiled(on_rows, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
 
 
 _on_host(run_p, _run_on_host, _run_shapes)
 _on_host(jvp_p, _jvp_on_host, _jvp_shapes)
 _on_host(vjp_p, _vjp_on_host, _vjp_shapes)
-mlir.register_lowering(run_p, mlir.lower_fun(_run_compiled, multiple_results=True), platform="cpu")
+for _primitive, _compiled_form in ((run_p, _run_compiled), (jvp_p, _jvp_compiled), (vjp_p, _vjp_compiled)):
+    mlir.register_lowering(_primitive, mlir.lower_fun(_compiled_form, multiple_results=True), platform="cpu")
 curvature_p.multiple_results = True
 curvature_p.def_abstract_eval(_curvature_shapes)
 curvature_p.def_impl(_curvature_composed)

@@ -18,6 +18,7 @@ one Taylor series, of the order that the tolerance asks for.
     _output      what is written down
     _integrator  all of these, round by round;  _tangent, _adjoint: its derivatives, forward and back
     _kernel      both as functions of arrays;  _threads: on several cores, interruptible;  _handler: as a call of XLA
+    _sweep       derivatives of short motions as calls of XLA
 
 Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).
 """
@@ -36,9 +37,10 @@ from lagjax._native._handler import Plan, handler, unavailable
 from lagjax._native._ir import lanes
 from lagjax._native._kernel import Begun, Guards, Kernel, Outcome, Projection, cores, order_for, recurrences
 from lagjax._native._series import is_large
+from lagjax._native._sweep import SweepPlan, sweep_handler
 
 __all__ = [
     "DISCONTINUOUS", "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "STEP_TOO_SMALL",
-    "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "cores", "handler", "is_large", "lanes",
-    "order_for", "recurrences", "unavailable",
+    "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "SweepPlan", "cores", "handler", "is_large", "lanes",
+    "order_for", "recurrences", "sweep_handler", "unavailable",
 ]  # fmt: skip

@@ -155,7 +155,7 @@ class Handler:
     def __init__(self):
         module = ir.Module("handler")
         module.triple = ""
-        _handler_function(module, _Run(module).code)
+        handler_function(module, _Run(module).code, len(ARGUMENTS), len(RESULTS))
         self._engine, places = compiled(module, ("handler", "begin_run"))
         self.address, pointers = places["handler"], 1 + len(ARGUMENTS) + len(RESULTS)
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_int64] * 4)
@@ -179,26 +179,30 @@ def _made() -> Handler:
 # ---- XLA's side ------------------------------------------------------------------------------------------------------
 
 
-def _handler_function(module: ir.Module, begin_run: Code) -> None:
-    """`XLA_FFI_Error* handler(XLA_FFI_CallFrame*)`, which reads the frame."""
+def handler_function(module: ir.Module, work: Code, arguments: int, results: int) -> None:
+    """`XLA_FFI_Error* handler(XLA_FFI_CallFrame*)`, which reads the frame.
+
+    It calls `work(plan, *arguments, *results, members, times, rows of ts, rows of params)` with their addresses; the
+    first three arguments are `ts`, `y0` and `params`.
+    """
     code, null = Code(module, "handler", [POINTER], lanes(), result=POINTER, public=True), ir.Constant(POINTER, None)
     (frame,) = code.arguments
-    extension = _at(frame, _EXTENSION, POINTER)
+    extension = at(frame, _EXTENSION, POINTER)
     with code.builder.if_then(code.builder.icmp_unsigned("!=", extension.it, null)):
         _tell_version(code, extension)
         code.builder.ret(null)
-    args, rets, attrs = (_at(frame, offset, POINTER) for offset in (_ARGS, _RETS, _ATTRS))
-    plan = _at(_at(_element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
-    buffers = [_element(args, i) for i in range(len(ARGUMENTS))] + [_element(rets, i) for i in range(len(RESULTS))]
-    ts, y0, params = (_at(buffer, _DIMS, POINTER) for buffer in buffers[: len(ARGUMENTS)])
-    sizes = _at(y0, 0, INTEGER), _at(ts, 8, INTEGER), _at(ts, 0, INTEGER), _at(params, 0, INTEGER)
-    code.call(begin_run, plan, *(_at(buffer, _DATA, POINTER) for buffer in buffers), *sizes)
+    args, rets, attrs = (at(frame, offset, POINTER) for offset in (_ARGS, _RETS, _ATTRS))
+    plan = at(at(element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
+    buffers = [element(args, i) for i in range(arguments)] + [element(rets, i) for i in range(results)]
+    ts, y0, params = (at(buffer, _DIMS, POINTER) for buffer in buffers[:3])
+    sizes = at(y0, 0, INTEGER), at(ts, 8, INTEGER), at(ts, 0, INTEGER), at(params, 0, INTEGER)
+    code.call(work, plan, *(at(buffer, _DATA, POINTER) for buffer in buffers), *sizes)
     code.builder.ret(null)
 
 
 def _tell_version(code: Code, extension: Value) -> None:
     """XLA asks once, when the handler is registered, for which version of the interface it was written."""
-    metadata, short = _at(extension, _METADATA, POINTER), ir.IntType(32)
+    metadata, short = at(extension, _METADATA, POINTER), ir.IntType(32)
     for offset, number in ((_MAJOR, MAJOR), (_MINOR, MINOR), (_TRAITS, 0)):
         code.builder.store(ir.Constant(short, number), _address(metadata, offset).it)
     code.store(code.as_value(0, INTEGER), _address(metadata, _STATE_TYPE))  # a handler without state
@@ -209,12 +213,12 @@ def _address(base: Value, offset: int) -> Value:
     return base.code.element(base, offset, ir.IntType(8))
 
 
-def _at(base: Value, offset: int, kind: ir.Type) -> Value:
+def at(base: Value, offset: int, kind: ir.Type) -> Value:
     """The value there."""
     return base.code.load(_address(base, offset), kind)
 
 
-def _element(array: Value, index: int) -> Value:
+def element(array: Value, index: int) -> Value:
     """An element of an array of pointers."""
     return array.code.load(array.code.element(array, index, POINTER), POINTER)
 
@@ -240,18 +244,18 @@ class _Run:
             code.store(code.as_value(float("nan"), DOUBLE), code.element(data["path"], i))
         memory, integers = self._rest(data.pop("rest"))
         idle, next_member, more = (code.element(integers, _INTEGERS - _OTHERS + i, INTEGER) for i in (1, 2, 3))
-        fields: dict[str, Any] = dict.fromkeys((name for name, _ in JOB._fields_), 0) | data
+        fields: dict[str, Any] = dict(data)
         fields |= {name: of_plan(name) for name in ("order", "max_steps")}
         fields |= {name: of_plan(name, DOUBLE) for name in ("rtol", "atol")}
         fields |= dict(members=members, times=times, next_member=next_member)
         fields |= dict(ts_stride=code.select(rows_of_ts > 1, times, 0))
         fields |= dict(params_stride=code.select(rows_of_params > 1, numbers, 0))
-        job = self._job(fields)
-        self._call(of_plan("begin"), ir.VoidType(), job, memory, integers)
-        code.store(self._call(of_plan("run"), INTEGER, job, memory, integers, idle, of_plan("rounds")), more)
+        job = job_of(code, JOB, fields)
+        call(code, of_plan("begin"), ir.VoidType(), job, memory, integers)
+        code.store(call(code, of_plan("run"), INTEGER, job, memory, integers, idle, of_plan("rounds")), more)
 
     def _of_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
-        return _at(self.plan, getattr(Plan, name).offset, kind)
+        return at(self.plan, getattr(Plan, name).offset, kind)
 
     def _rest(self, rest: Value) -> tuple[Value, Value]:
         """The memory of the thread, of zeros and on the boundary of a cache line, and the integers, of zeros."""
@@ -267,25 +271,27 @@ class _Run:
         code.store(skipped, code.element(integers, _INTEGERS - _OTHERS, INTEGER))
         return memory, integers
 
-    def _job(self, fields: dict[str, Any]) -> Value:
-        """The job of one run, on the stack."""
-        code = self.code
-        kinds = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
-        with code.builder.goto_entry_block():
-            place = code.builder.alloca(ir.ArrayType(INTEGER, len(JOB._fields_)))
-        place.align = 8
-        # A pointer of no kind, which llvmlite has no other way to make of one to an array.
-        job = Value(code, code.builder.inttoptr(code.builder.ptrtoint(place, INTEGER), POINTER))
-        for i, (name, kind) in enumerate(JOB._fields_):
-            value = fields[name]
-            if not isinstance(value, Value):
-                kind = ir.Constant(POINTER, None) if kind is ctypes.c_void_p else ir.Constant(kinds[kind], value)
-                value = Value(code, kind)
-            code.store(value, code.element(job, i, INTEGER))
-        return job
 
-    def _call(self, function: Value, result: ir.Type, *arguments: Value) -> Value:
-        """A function of the kernel, by its address."""
-        kind = ir.FunctionType(result, [argument.it.type for argument in arguments])
-        pointer = self.code.builder.inttoptr(function.it, kind.as_pointer())
-        return Value(self.code, self.code.builder.call(pointer, [argument.it for argument in arguments]))
+def job_of(code: Code, kind: type, fields: dict[str, Any]) -> Value:
+    """A job on the stack, a structure of this kind; fields that are not named are zero."""
+    kinds = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
+    declared: Any = kind
+    with code.builder.goto_entry_block():
+        place = code.builder.alloca(ir.ArrayType(INTEGER, len(declared._fields_)))
+    place.align = 8
+    # A pointer of no kind, which llvmlite has no other way to make of one to an array.
+    job = Value(code, code.builder.inttoptr(code.builder.ptrtoint(place, INTEGER), POINTER))
+    for i, (name, of_field) in enumerate(declared._fields_):
+        value = fields.get(name)
+        if value is None:
+            zero = ir.Constant(POINTER, None) if of_field is ctypes.c_void_p else ir.Constant(kinds[of_field], 0)
+            value = Value(code, zero)
+        code.store(value, code.element(job, i, INTEGER))
+    return job
+
+
+def call(code: Code, function: Value, result: ir.Type, *arguments: Value) -> Value:
+    """A function of a kernel, by its address."""
+    kind = ir.FunctionType(result, [argument.it.type for argument in arguments])
+    pointer = code.builder.inttoptr(function.it, kind.as_pointer())
+    return Value(code, code.builder.call(pointer, [argument.it for argument in arguments]))

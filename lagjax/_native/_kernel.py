@@ -20,6 +20,7 @@ from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled, lanes
 from lagjax._native._output import RECORDED
 from lagjax._native._series import is_large
+from lagjax._native._sweep import SweepPlan
 from lagjax._native._tangent import Tangent
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._graph import Unlowerable
@@ -29,6 +30,9 @@ from lagjax._program._series import Recurrent, Series, series
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
 # It decides how long the first slice is, which nobody needs to know well.
 _SECONDS_AN_OPERATION = 1e-7
+# A derivative runs a motion again that takes a thirtieth of a slice, a millisecond at most: less than Python with kept
+# steps. Where fewer rounds than these are in that, hardly a motion ends in time, and would be run twice for nothing.
+_SLICES_OF_SWEEP, _LEAST_ROUNDS = 30, 16
 
 
 class Outcome(NamedTuple):
@@ -216,9 +220,14 @@ class Kernel:
         )  # fmt: skip
         members, times = path_ct.shape[:2]
         numbers = dict(**self._strides(ts, params), members=members, times=times, order=order)
-        kernel = self.of_members(1 if members < self.width / 2 else members)  # few are as fast one after the other
-        kernel._backward(arrays, numbers, kernel.threads(members))
+        back, threads = self._back_over(members)
+        back(arrays, numbers, threads)
         return y_ct, params_ct, excess
+
+    def _back_over(self, members: int) -> "tuple[_Compiled, int]":
+        """The transpose for so many members, and on how many threads."""
+        kernel = self.of_members(1 if members < self.width / 2 else members)  # few are as fast one after the other
+        return kernel._backward, kernel.threads(members)
 
     def jvp(
         self, ts, params, table, first, counts, y_dot, params_dot, order: int, floor: float
@@ -244,12 +253,16 @@ class Kernel:
             **self._strides(ts, params), members=members, times=times, order=order, directions=directions,
             floor=floor,
         )  # fmt: skip
-        if directions > 1 and members < self.width / 2:
-            self._tangents(True)(arrays, numbers, min(cores(), members))
-        else:
-            kernel = self.of_members(members)
-            kernel._tangents(False)(arrays, numbers, kernel.threads(members))
+        forward, threads = self._forward_along(members, directions)
+        forward(arrays, numbers, threads)
         return path_dot, y_dot, excess
+
+    def _forward_along(self, members: int, directions: int) -> "tuple[_Compiled, int]":
+        """The tangents of so many members along so many directions, and on how many threads."""
+        if directions > 1 and members < self.width / 2:
+            return self._tangents(True), min(cores(), members)
+        kernel = self.of_members(members)
+        return kernel._tangents(False), kernel.threads(members)
 
     def _tangents_of(self, side_by_side: bool) -> "_Compiled":
         """The kernel of tangents, whose directions stand side by side or members do; compiled when first asked for."""
@@ -261,6 +274,27 @@ class Kernel:
         begin, run = self._forward.places
         size, rounds = self._forward.layout.size, self._forward.rounds
         return Plan(begin, run, size, self.states, self.numbers, order_for(rtol), max_steps, rounds, rtol, atol)
+
+    @property
+    def rounds_of_sweep(self) -> int:
+        """Rounds of a motion that is rather run again for a derivative than kept; 0 where that would take too long."""
+        rounds = self._rounds // _SLICES_OF_SWEEP
+        return rounds if rounds >= _LEAST_ROUNDS else 0
+
+    def sweep_plan(
+        self, kind: str, members: int, times: int, directions: int, rtol: float, atol: float, max_steps: int
+    ) -> SweepPlan:
+        """What a handler needs for derivatives of so many members; for as long as this kernel lives."""
+        motion = self.of_members(members)._forward
+        sweep, _ = self._forward_along(members, directions) if kind == "jvp" else self._back_over(members)
+        rounds, others = self.rounds_of_sweep, self.numbers if kind == "vjp" else directions * times * self.states
+        sizes = (size for of in (motion, sweep) for size in (of.layout.size, len(LANE) * of.layout.width))
+        memory, integers, memory_of_sweep, integers_of_sweep = sizes
+        return SweepPlan(
+            *motion.places, *sweep.places, memory, integers, memory_of_sweep, integers_of_sweep, self.states,
+            self.numbers, order_for(rtol), max_steps, rounds, rounds * motion.layout.width, directions, others, rtol,
+            atol, atol / rtol,
+        )  # fmt: skip
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
