@@ -34,6 +34,7 @@ from lagjax._program import (
     lower_formula,
     lower_scalars,
     lower_solution,
+    operations_that_fit,
     without_collections,
 )
 from lagjax._program._scalars import applied, joined, spread, stacked
@@ -43,8 +44,8 @@ from lagjax._saddle import SaddleElimination, TwoCoordinates
 
 PyTree = Any
 
-# While it is lowered, an operation takes about a kilobyte: this is what some gigabytes of memory hold.
-OPERATION_BUDGET = 4_000_000
+# While it is lowered, an operation takes about a kilobyte, and two where it is written anew.
+OPERATION_BUDGET = operations_that_fit(2000)
 
 
 # The order of coordinates of states far away, where a force between bodies is weak: its square is then a millionth.

@@ -14,12 +14,12 @@ from lagjax import _native
 from lagjax._machine_code._steps import LARGEST_KEPT, Steps, StepStore
 from lagjax._machine_code._tangent import tangent_programs
 from lagjax._problem import Solution
-from lagjax._program import Program, Unlowerable
+from lagjax._program import Program, Unlowerable, machine_memory, operations_that_fit
 from lagjax._results import RESULTS, SUCCESSFUL, code_of
 from lagjax._stopped import End, what_stopped
 
-# Operations of an acceleration: making its kernel takes some 3 KB for each, with the derivatives some 10 KB.
-LARGEST_PROGRAM = 1_000_000
+# Operations of an acceleration: making its kernel takes some 4 KB for each, with the derivatives some 10 KB.
+LARGEST_PROGRAM = operations_that_fit(10_000)
 # The codes of the kernel, in their order, as results. Beyond `EVENT` they say which guards changed sign.
 _RESULT_OF_CODE = np.array([code_of(result) for result in (
     RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,
@@ -54,8 +54,8 @@ def unfit(program: Program, size: int, dtype) -> str | None:
         return f"the coordinates are {np.dtype(dtype).name}, not float64"
     if program.operations > LARGEST_PROGRAM:
         return (
-            f"its acceleration takes {program.operations} operations, more than the {LARGEST_PROGRAM} whose kernel is "
-            "expected to fit in memory"
+            f"its acceleration takes {program.operations} operations, more than the {LARGEST_PROGRAM} whose kernel and "
+            f"derivatives fit into half of this machine's {machine_memory() / 1e9:.0f} GB of memory"
         )  # fmt: skip
     try:
         _native.recurrences(program, size)

@@ -13,6 +13,7 @@ from collections import Counter, defaultdict
 from typing import NamedTuple
 
 from lagjax._native._constants import LARGEST_TREE, MOST, OFTEN, ROUNDS, TIMES, WINDOW
+from lagjax._program._passes import count_uses
 from lagjax._program._series import StraightLine
 
 # What one operation may consist of; operands and results of these are of one kind.
@@ -73,7 +74,7 @@ def schedule(line: StraightLine, stored: int) -> Schedule:
 
     The last outputs, so many, are `stored` somewhere else as soon as they are there.
     """
-    nodes, uses = line.nodes, _uses(line)
+    nodes, uses = line.nodes, count_uses(line.nodes, line.outputs)
     kinds, operations = _joined_of(Same(line))
     staying = len(line.outputs) - stored
     outputs, copies = _outputs(line, operations, kinds, staying)
@@ -106,7 +107,7 @@ def joined(line: StraightLine) -> tuple[list[Kind], list[Operation]]:
 
 @functools.lru_cache(maxsize=4)  # asked for when it is decided how a motion runs, and when it is compiled
 def _joined_of(same: Same) -> tuple["_Kinds", list[Operation]]:
-    uses, kinds = _uses(same.line), _Kinds()
+    uses, kinds = count_uses(same.line.nodes, same.line.outputs), _Kinds()
     return kinds, _joined(_operations(same.line, uses, kinds), uses, kinds)
 
 
@@ -150,18 +151,6 @@ def _with_part(kind: Kind, place: int, part: Kind) -> Kind:
             break
         place -= width
     return kind._replace(parts=tuple(parts))
-
-
-def _uses(line: StraightLine) -> list[int]:
-    """How often every node is read by what the outputs need, or is an output."""
-    uses = [0] * len(line.nodes)
-    for i in line.outputs:
-        uses[i] += 1
-    for i in range(len(line.nodes) - 1, -1, -1):
-        if uses[i]:
-            for x in line.nodes[i][1]:
-                uses[x] += 1
-    return uses
 
 
 def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Operation]:

@@ -1,8 +1,31 @@
-"""Python's memory while graphs of millions of nodes grow."""
+"""Memory while graphs of millions of nodes grow: what they may take of it, and who looks through it."""
 
 import contextlib
 import gc
+import os
 from collections.abc import Iterator
+from pathlib import Path
+
+SHARE = 0.5  # of the machine's memory, that one scene may take; JAX, other scenes and results have the rest
+_UNKNOWN = 8 * 2**30  # bytes of a machine that does not say how many it has
+_LIMIT = Path("/sys/fs/cgroup/memory.max")  # of a container
+
+
+def machine_memory() -> int:
+    """The bytes of memory that this machine, or the container that this process is in, has."""
+    try:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        memory = _UNKNOWN
+    try:
+        return min(memory, int(_LIMIT.read_text()))
+    except (ValueError, OSError):  # "max", or no such file
+        return memory
+
+
+def operations_that_fit(bytes_each: int) -> int:
+    """How many operations that take so many bytes fit into the `SHARE` of a scene."""
+    return int(SHARE * machine_memory() / bytes_each)
 
 
 @contextlib.contextmanager

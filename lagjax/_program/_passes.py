@@ -2,7 +2,7 @@
 
 import functools
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from lagjax._program._graph import LONGEST, MANY, Graph, Node
 
@@ -15,7 +15,7 @@ def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
     Both happen only where the products that they replace have no other use, so that no operation is added: x(x y)
     becomes x² y, and x y + x z becomes x (y + z). What has become equal by that is shared, sin² + cos² too.
     """
-    uses = _uses(graph, outputs)
+    uses = count_uses(graph.nodes, outputs)
 
     def node_of(new, i, moved):
         op, operands, _ = graph.nodes[i]
@@ -98,7 +98,7 @@ def _common_factor(graph, op, a, b) -> int | None:
 
 def sink_negations(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
     """The graph with every negation moved into the difference or the constant below it, if nothing else uses that."""
-    uses = _uses(graph, outputs)
+    uses = count_uses(graph.nodes, outputs)
 
     def node_of(new, i, moved):
         op, operands, _ = graph.nodes[i]
@@ -153,13 +153,13 @@ def replace_by_inputs(nodes, kinds, outputs, positions: dict[int, int]) -> Line:
     return eliminate_dead_code(graph, list(outputs))
 
 
-def _uses(graph, outputs) -> list[int]:
+def count_uses(nodes: Sequence[Node], outputs: Sequence[int]) -> list[int]:
     """How often each node is used, by a node that is needed or as an output."""
-    uses = [0] * len(graph.nodes)
+    uses = [0] * len(nodes)
     for i in outputs:
         uses[i] += 1
-    for i in range(len(graph.nodes) - 1, -1, -1):
+    for i in range(len(nodes) - 1, -1, -1):
         if uses[i]:
-            for x in graph.nodes[i][1]:
+            for x in nodes[i][1]:
                 uses[x] += 1
     return uses
