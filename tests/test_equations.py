@@ -155,3 +155,11 @@ def test_explain_prints():
     assert "varying, dense; depends on q[0], q[1]" in text and "path              scalar" in text
     large = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2)).explain(jnp.zeros(80), jnp.zeros(80))
     assert large.path == "scalar" and large.cyclic == large.coordinates and "(68 more)" in str(large)
+
+
+@pytest.mark.filterwarnings("error::numpy.exceptions.ComplexWarning")
+@pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
+def test_parameters_may_be_complex():
+    system = lagjax.System(lambda q, v, params: 0.5 * v @ v - 0.5 * jnp.abs(params["z"]) ** 2 * q @ q)
+    run = lagjax.simulate(system, np.ones(2), np.zeros(2), np.linspace(0.0, np.pi, 3), {"z": np.array(0.6 + 0.8j)})
+    np.testing.assert_allclose(run.q[-1], [-1.0, -1.0], rtol=1e-7)
