@@ -55,7 +55,7 @@ LEAST_FILLED = 0.5
 # Members of a large scene whose alike operations fill the lanes are integrated one after the other where the series of
 # as many members as there are lanes take so many bytes: with all that is read beside them they leave a second cache of
 # 2 MiB. Measured there, lanes for members take 0.6 times as long at 1.7 MB (20 bodies), 0.85 times at 2.0 MB (20
-# charges on a sphere), 1.3 times at 2.5 MB (24 bodies), 1.8 times at 3.9 MB (30 bodies), 2.7 times at 11 MB (50 bodies).
+# charges on a sphere), 1.3 times at 2.5 MB (24 bodies), 1.8 times at 3.9 MB (30), 2.7 times at 11 MB (50 bodies).
 LARGEST_SHARED = 2**21
 
 # ---- step control ----------------------------------------------------------------------------------------------------
