@@ -67,7 +67,7 @@ def steps_of(line, precision) -> list[tuple[Callable | None, tuple, object, tupl
             attribute = _dtype(kind, precision).type(attribute)
         elif op == "convert":
             attribute = _dtype(kind, precision)
-        function = _FUNCTIONS[op]
+        function = _BESIDE[op] if op in _BESIDE else OPERATIONS[op].value
         if op == "div" and kind == "float":  # without a look at the kind for every state
             function = np.divide
         steps.append((function, operands, (op == "input", attribute), tuple(dropped.get(k, ()))))
@@ -78,8 +78,7 @@ def _converted(x, dtype):
     return np.asarray(x).astype(dtype)
 
 
-_FUNCTIONS: dict[str, Callable | None] = {name: row.value for name, row in OPERATIONS.items()}
-_FUNCTIONS |= {"input": None, "constant": None, "convert": _converted}
+_BESIDE: dict[str, Callable | None] = {"input": None, "constant": None, "convert": _converted}
 
 
 def _values(steps, columns) -> list:
