@@ -8,6 +8,7 @@ Together with the motion they are a program like any other: a derivative is as a
 Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §I.14.
 """
 
+from collections.abc import Callable
 from typing import cast
 
 import jax
@@ -15,12 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._native import Projection
-from lagjax._program import Program, lower
-
-_BUDGET = 100_000  # operations of a program with tangents
-# Columns of the Jacobian ∂q̈/∂(q, q̇, p) for each direction, up to which the tangents are its products with the
-# directions; where there are more, each is derived along its own.
-_DENSE = 4
+from lagjax._program import Program, with_tangents
 
 
 def from_rows(y):
@@ -41,40 +37,57 @@ def tangent_programs(
     """The program and the projection of a motion over n = `size` coordinates, and of its tangents.
 
     The arguments q, q̇ and params of the new programs have 1 + D rows: those of the motion, then one for each direction.
+    They are derived from the operations of the programs, as the steps' own derivatives are.
     """
-    n, rows, numbers = size, 1 + directions, program.size - 2 * size - 1
-
-    def with_tangents(function, q, v, t, p):
-        """`function(q, v, t, p)` at the first rows, and its derivative along each of the others."""
-
-        def derivative(*direction):
-            return jax.jvp(lambda q, v, p: function(q, v, t, p), (q[0], v[0], p[0]), direction)[1]
-
-        if 2 * n + numbers > _DENSE * directions:
-            tangents = jax.vmap(derivative)(q[1:], v[1:], p[1:])
-        else:
-            by_q, by_v, by_p = jax.jacfwd(function, argnums=(0, 1, 3))(q[0], v[0], t, p[0])
-            tangents = q[1:] @ by_q.T + v[1:] @ by_v.T + p[1:] @ by_p.T
-        return jnp.concatenate([function(q[0], v[0], t, p[0])[None], tangents])
+    rows, numbers = 1 + directions, program.size - 2 * size - 1
+    every = [None, *range(directions)]
 
     def accelerations(q, v, t, p):
-        return jnp.stack(program(*q, *v, t, *p)[:n])
+        scalars = lambda q, v, p: jnp.stack(program(*q, *v, t, *p)[:size])  # noqa: E731
+        return _in_rows(scalars, q, v, p), program(*q[0], *v[0], t, *p[0])[size]
 
-    def all_accelerations(q, v, t, p):
-        return with_tangents(accelerations, q, v, t, p), program(*q[0], *v[0], t, *p[0])[n]
-
-    shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((rows, n), (rows, n), (), (rows, numbers))]
-    larger = lower(all_accelerations, *shapes, budget=_BUDGET)
+    outputs = [(i, row) for row in every for i in range(size)] + [(size, None)]
+    larger = _with_tangents(program, size, rows, numbers, outputs, accelerations)
     if projection is None:
         return larger, None
-
     state, scale = cast(Program, projection.state), cast(Program, projection.velocity_scale)
 
     def projected(q, v, t, p):
-        both = with_tangents(lambda q, v, t, p: jnp.stack(state(*q, *v, t, *p)), q, v, t, p)
-        return both[:, :n], both[:, n:]
+        both = _in_rows(lambda q, v, p: jnp.stack(state(*q, *v, t, *p)), q, v, p)
+        return both[:, :size], both[:, size:]
 
     def velocity_scale(q, v, t, p):
         return scale(*q[0], *v[0], t, *p[0])
 
-    return larger, Projection(*(lower(of, *shapes, budget=_BUDGET) for of in (projected, velocity_scale)))
+    outputs = [(first + i, row) for first in (0, size) for row in every for i in range(size)]
+    scales = [(i, None) for i in range(size)]
+    return larger, Projection(
+        _with_tangents(state, size, rows, numbers, outputs, projected),
+        _with_tangents(scale, size, rows, numbers, scales, velocity_scale),
+    )
+
+
+def _with_tangents(program: Program, n: int, rows: int, numbers: int, outputs, function: Callable) -> Program:
+    """A program of (1 + D) rows of q, q̇ and params, which in JAX is `function`."""
+    first_of_params = 2 * rows * n + 1
+    of_rows = [
+        [*range(k * n, (k + 1) * n), *range((rows + k) * n, (rows + k + 1) * n), 2 * rows * n,
+         *range(first_of_params + k * numbers, first_of_params + (k + 1) * numbers)]
+        for k in range(rows)
+    ]  # fmt: skip
+    directions = [{i: place for i, place in enumerate(row) if i != 2 * n} for row in of_rows[1:]]
+    line = with_tangents(program.line, program.dtypes, of_rows[0], directions, outputs)
+    shapes = ((rows, n), (rows, n), (), (rows, numbers))
+    structs = tuple(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes)
+    budget = max(program.budget, len(line.nodes))
+    return Program(*line, len(line.nodes), lambda *xs: jax.tree.leaves(function(*xs)), structs, budget)
+
+
+def _in_rows(function: Callable, q, v, p):
+    """`function(q, v, p)` at the first rows, and its derivative along each of the others, in JAX."""
+
+    def derivative(*direction):
+        return jax.jvp(function, (q[0], v[0], p[0]), direction)[1]
+
+    tangents = jax.vmap(derivative)(q[1:], v[1:], p[1:])
+    return jnp.concatenate([function(q[0], v[0], p[0])[None], tangents])

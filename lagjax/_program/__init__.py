@@ -43,7 +43,7 @@ from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
 from lagjax._program._memory import machine_memory, operations_that_fit, without_collections
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
-from lagjax._program._pushforward import pushforward
+from lagjax._program._pushforward import pushforward, with_tangents
 from lagjax._program._rules import Expansion, inputs_of
 from lagjax._program._scalars import Scalars, stacked
 from lagjax._program._series import Series, StraightLine, series
@@ -76,6 +76,7 @@ __all__ = [
     "pushforward",
     "series",
     "traced",
+    "with_tangents",
     "without_collections",
 ]
 

@@ -38,6 +38,31 @@ def pushforward(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Seq
     return StraightLine(*replace_by_inputs(done.nodes, done.kinds, results, positions))
 
 
+def with_tangents(
+    line: StraightLine, dtypes: Sequence, places: Sequence[int], directions: Sequence[dict[int, int]], of: Sequence
+) -> StraightLine:
+    """A straight line and its tangents along some directions, in one.
+
+    Input i of `line` is input `places[i]` of the result, its tangent along a direction d input `directions[d][i]`; an
+    input that is not there does not move. The outputs are `of`, pairs of an output and a direction, or None for the
+    output itself.
+    """
+    graph = Graph(_LARGEST * len(line.nodes) * (1 + len(directions)) + 1000)
+    kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in dtypes]
+    with np.errstate(all="ignore"):
+        nodes = copied(graph, line, [graph.input(place, kind) for place, kind in zip(places, kinds, strict=True)])
+        moved = []
+        for direction in directions:
+            tangents = {i: graph.input(place, "float") for i, place in direction.items() if kinds[i] == "float"}
+            moved.append(_along(graph, line, nodes, tangents))
+        zero = graph.constant(0.0, "float")
+        results = []
+        for output, direction in of:
+            node = line.outputs[output]
+            results.append(nodes[node] if direction is None else moved[direction].get(node, zero))
+        return StraightLine(*eliminate_dead_code(*sink_negations(*factor(graph, results))))
+
+
 def _along(graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[int, int]) -> dict[int, int]:
     """The tangents of the nodes of a line that have some, from those of its inputs."""
     tangents: dict[int, int] = {}
