@@ -131,3 +131,17 @@ def test_an_energy_of_parts_that_is_negative_leaves_the_mass_matrix_to_decide():
     np.testing.assert_allclose(np.array(found)[:, usable], exact[:, usable], rtol=1e-10, atol=1e-12)
     run = lagjax.simulate(lagjax.System(lagrangian), np.ones(n), np.ones(n), np.linspace(0.0, 1.0, 3))
     assert run.ok
+
+
+def test_the_program_has_the_derivative_of_the_whole_mass_matrix_in_jax():
+    system, params = chain(7)
+    program = of(system, np.ones(7), np.ones(7), params).acceleration
+    assert program.otherwise is not None
+    rng = np.random.default_rng(2)
+    x, direction = rng.uniform(0.3, 1.2, (2, program.size))
+    step = 1e-5 * direction[:, None] * np.array([-2, -1, 1, 2])
+    ends = program.evaluate_many(list(x[:, None] + step))[:-1]
+    expected = ends @ np.array([1, -8, 8, -1]) / 12e-5
+    values, slopes = jax.jvp(lambda *xs: jnp.stack(program(*xs)[:-1]), tuple(x), tuple(direction))
+    np.testing.assert_allclose(values, program.evaluate_many(list(x[:, None]))[:-1, 0], rtol=1e-11)
+    np.testing.assert_allclose(slopes, expected, rtol=1e-7)

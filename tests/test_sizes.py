@@ -85,3 +85,22 @@ LARGE = [
 def test_gradients_of_large_scenes(name, count):
     found, expected = in_a_process(slopes, name, count)
     np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+# ---- what happens before a large kernel runs -------------------------------------------------------------------------
+
+
+def energy_of(system, run, params):
+    return np.array([float(system.energy(run.q[i], run.qdot[i], 0.0, params)) for i in (0, -1)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "count"), [("chain", 128), ("bodies in space", 60)])
+def test_large_scenes_from_the_first_result_to_health(name, count):
+    system, q0, qdot0, params = SCENES[name](count)
+    assert lagjax.check(system, q0, qdot0, 0.0, params).ok
+    run = lagjax.simulate(system, q0, qdot0, np.linspace(0.0, 0.1, 3), params, rtol=1e-10)
+    assert "Taylor series in machine code" in str(system.explain(q0, qdot0, params=params))
+    before, after = energy_of(system, run, params)
+    assert abs(after - before) < 1e-8 * max(1.0, abs(before))
+    assert not run.health().suspicious
