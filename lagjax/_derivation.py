@@ -374,7 +374,7 @@ class Derivation:
         elimination, n = RecursiveElimination(self._recursion, self.layout.dtype), self.layout.size
         places, count = elimination.entries, len(elimination.entries)
         positions = [*self._positions("recursion"), *self._positions("force")]
-        cut = functools.cache(lambda: self._whole.only(positions, in_jax))
+        cut = functools.cache(lambda: self._whole.only(positions, in_jax))  # of which the operations alone are used
 
         def system(*scalars):
             whole = self._whole.own_outputs(*scalars)
