@@ -97,8 +97,9 @@ def singular_threshold(n: int, dtype) -> float:
 
 
 def eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ascending eigenvalues (n,) of a symmetric matrix (n, n), and eigenvectors, one a column; LAPACK's order n³ work
-    is spared for a diagonal matrix, as large scenes of bodies have them.
+    """Ascending eigenvalues (n,) of a symmetric matrix (n, n), and its eigenvectors, one a column (n, n).
+
+    A diagonal matrix, as large scenes of bodies have, is only sorted: LAPACK would take n³ operations.
     """
     diagonal = np.diagonal(matrix)
     if not np.array_equal(matrix, np.diag(diagonal)):
