@@ -134,12 +134,24 @@ def test_members_of_a_large_scene_are_integrated_one_after_the_other(monkeypatch
     kernel = _native.Kernel(program, 10)
     assert kernel.to_run(8) is kernel
     monkeypatch.setattr(_kernel, "LARGEST_SHARED", 0)
+    kernel = _native.Kernel(program, 10)
     alone = kernel.to_run(8)
     assert alone.width == 1 and kernel.of_members(8) is kernel
     y0, ts = np.random.default_rng(1).normal(size=(3, 20)), np.linspace(0.0, 1.0, 5)[None]
     runs = [k(ts, y0, np.zeros((1, 0)), 1e-9, 1e-12, 1000) for k in (kernel, alone)]
     for side_by_side, one_by_one in zip(*(run[:6] for run in runs), strict=True):
         np.testing.assert_array_equal(one_by_one, side_by_side)
+
+
+def test_the_choice_is_made_once_and_nothing_stays_of_the_compilation(monkeypatch):
+    monkeypatch.setattr(_series, "LARGEST_LINE", -1)
+    monkeypatch.setattr(_kernel, "LARGEST_SHARED", 0)
+    kernel = _native.Kernel(cluster(9), 18)
+    alone = kernel.to_run(8)
+    kernel.to_run(8)._forward  # noqa: B018
+    monkeypatch.setattr(_kernel, "fills_lanes", None)
+    assert kernel.to_run(3) is alone is kernel.of_members(1)
+    assert not _packs.staged.cache_info().currsize and not _schedule._joined_of.cache_info().currsize
 
 
 def test_a_scene_in_which_everything_waits_for_what_comes_before_keeps_members_in_lanes(monkeypatch):

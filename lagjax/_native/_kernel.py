@@ -19,6 +19,8 @@ from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled, lanes
 from lagjax._native._output import RECORDED
+from lagjax._native._packs import forget_stages
+from lagjax._native._schedule import forget_joined
 from lagjax._native._series import is_large
 from lagjax._native._sweep import SweepPlan
 from lagjax._native._tangent import Tangent
@@ -129,9 +131,13 @@ class Kernel:
 
     def to_run(self, members: int) -> "Kernel":
         """The kernel that integrates so many members: one after the other where lanes would not fit in a cache."""
+        return self.of_members(1 if self._one_by_one else members)
+
+    @functools.cached_property
+    def _one_by_one(self) -> bool:
         program, series, _ = self._parts
         large = is_large(program) and series.rows * MAX_ORDER * self.width * 8 > LARGEST_SHARED
-        return self.of_members(1 if large and fills_lanes(series) else members)
+        return large and fills_lanes(series)
 
     @functools.cached_property
     def _alone(self) -> "Kernel":
@@ -143,6 +149,8 @@ class Kernel:
         with without_collections():
             integrator = Integrator(*self._parts, *self._options, width=self.width)
             motion = integrator.motion
+        forget_joined()
+        forget_stages()
         return _Compiled(motion.module, motion.layout, integrator.job, self._rounds, pointers=4)
 
     @property

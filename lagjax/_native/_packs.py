@@ -79,6 +79,11 @@ def staged(same: Same) -> tuple[list[Kind], list[Stage]]:
     return kinds, stages(operations, len(same.line.nodes), same.line.outputs)
 
 
+def forget_stages() -> None:
+    """What has been kept of programs for their compilation is large, and of no use afterwards."""
+    staged.cache_clear()
+
+
 def fills(line: StraightLine, width: int) -> bool:
     """Whether most lanes of so many have something to do where alike operations of a program stand in them."""
     _, program = staged(Same(line))

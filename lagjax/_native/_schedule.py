@@ -111,6 +111,11 @@ def _joined_of(same: Same) -> tuple["_Kinds", list[Operation]]:
     return kinds, _joined(_operations(same.line, uses, kinds), uses, kinds)
 
 
+def forget_joined() -> None:
+    """What has been kept of programs for their compilation is large, and of no use afterwards."""
+    _joined_of.cache_clear()
+
+
 # ---- operations ------------------------------------------------------------------------------------------------------
 
 
