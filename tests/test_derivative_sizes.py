@@ -1,5 +1,7 @@
 """Derivatives of scenes of every size, by everything: state, velocity, parameters, duration; first and second ones.
 
+By the duration only where few coordinates move: XLA compiles the acceleration for it, which takes long for many.
+
 Each scene is differentiated in a process of its own, as in `test_sizes`, and compared with central differences.
 """
 
@@ -12,6 +14,7 @@ from test_sizes import SCENES, STEP, in_a_process
 import lagjax
 
 DURATION, RTOL = 0.5, 1e-12
+MOST_WITH_DURATION = 8  # coordinates
 WEIGHTS = np.array([1, -8, 8, -1]) / (12 * STEP)
 PLACES = STEP * np.array([-2, -1, 1, 2])[:, None]
 
@@ -28,7 +31,7 @@ def problem(name, count):
         q, qdot, *others, duration = (
             part.reshape(like.shape) for part, like in zip(jnp.split(x, ends[:-1]), parts, strict=True)
         )
-        ts = jnp.linspace(0.0, 1.0, 3) * duration
+        ts = np.linspace(0.0, 1.0, 3) * (duration[0] if len(q0) <= MOST_WITH_DURATION else DURATION)
         found = lagjax.simulate(system, q, qdot, ts, jax.tree.unflatten(structure, others), rtol=RTOL)
         return jnp.sum(found.q[1:] ** 2 * weight) + jnp.sum(found.end.qdot * weight)
 
@@ -67,12 +70,8 @@ def assert_second(name, count):
     np.testing.assert_allclose(product, differences, rtol=0, atol=1e-6 * np.abs(differences).max())
 
 
-def test_derivatives_of_three_bodies():
-    assert_first("bodies in the plane", 3)
-
-
 LARGE = [
-    *(("bodies in the plane", count) for count in (2, 4, 5, 6, 8, 10, 12)),
+    *(("bodies in the plane", count) for count in (2, 3, 4, 5, 6, 8, 10, 12)),
     ("bodies in space", 4),
     *(("chain", count) for count in (2, 4, 6, 8, 12, 16)),
 ]
