@@ -85,6 +85,11 @@ def simulate(
     - `throw`: raise when the motion does not reach its end. With `throw=False` look at `trajectory.ok`.
     - `progress`: print how far the integration has come; or any diffrax progress meter.
 
+    **Borders.** Forces and potentials may have kinks and jumps (`where`, `abs`, `sign`, `clip`, `floor`, …), also in
+    time. Machine code ends a step at every border and begins the next one beyond it; where both sides push onto one, as
+    dry friction at rest does, the motion stays on it. First derivatives take part in that; second ones are NaN where a
+    force jumps on the way. With diffrax steps shrink at borders instead, and derivatives do not see a jump.
+
     Functions given here (the event, those inside `system`) are compiled once per function *object*: define them once,
     not in a loop.
 

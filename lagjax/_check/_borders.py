@@ -133,12 +133,12 @@ def _finding(jump: Jump) -> Finding:
     here = jump.sizes == 0
     where = "at this state" if here else f"{jump.distance:.3g} away along {jump.direction}"
     serious = here or jump.what in ("L", "the momentum")
+    mend = " Smooth it (tanh(v/w) for sign(v)), or make two modes of it with a Transition for lagjax.simulate_hybrid."
     consequence = {
-        "L": "No force shows a jump of L itself: the motion goes through it as if it were not there.",
-        "the momentum": "The kick that a jump of the momentum gives to the velocity is not seen.",
-    }.get(jump.what, "Steps shrink there; a motion that comes to rest on it (dry friction) does not get on.")
+        "L": "No force shows a jump of L itself: the motion goes through it as if it were not there." + mend,
+        "the momentum": "The kick that a jump of the momentum gives to the velocity is not seen." + mend,
+    }.get(jump.what, "Machine code ends a step there, and a motion may rest on it; steps of diffrax shrink.")
     return Finding(
         "discontinuity", "warning" if serious else "advice", (jump.direction,),
-        f"{jump.what[0].upper()}{jump.what[1:]} jumps {where}, at {jump.operation}. {consequence} Smooth it (tanh(v/w) "
-        "for sign(v)), or make two modes of it with a Transition for lagjax.simulate_hybrid.",
+        f"{jump.what[0].upper()}{jump.what[1:]} jumps {where}, at {jump.operation}. {consequence}",
     )  # fmt: skip

@@ -277,8 +277,11 @@ def _divided(flow: Flow, steps: Steps, member: int, params, tolerances: Toleranc
     rows = steps.table[first : first + steps.counts[member]]
     t, h, first_state = rows[:, 0], rows[:, 1], rows[:1, 4:]
     times = np.append((t[:, None] + h[:, None] * np.arange(parts) / parts).ravel(), t[-1] + h[-1])
-    path = flow.follow(times[None], first_state, params[None], tolerances).path[0]
-    table = np.concatenate([np.stack([times[:-1], np.diff(times), *np.zeros((2, len(path) - 1))]).T, path[:-1]], axis=1)
+    path = flow.follow(times[None], first_state[:, : flow.states], params[None], tolerances).path[0]
+    more = np.repeat(rows[:, 4 + flow.states :], parts, axis=0)  # of a piecewise program
+    more[:, -1:] = np.where(np.arange(1, len(more) + 1)[:, None] % parts == 0, more[:, -1:], 0.0)
+    begins = np.stack([times[:-1], np.diff(times), *np.zeros((2, len(path) - 1))]).T
+    table = np.concatenate([begins, path[:-1], more], axis=1)
     count = np.array([len(table)])
     return Steps(steps.kernel, steps.order, table, np.zeros(1, int), count, np.ones(1, bool))
 

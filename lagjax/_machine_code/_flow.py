@@ -73,7 +73,8 @@ class Flow:
     `parts` gives the program, which takes q, q̇, t and then the P parameters and gives q̈ and whether the mass matrix is
     singular, and the projection that keeps the motion on its constraints, or None. It is called when machine code is
     first needed. `guards` end a motion early. `groups` (n,) numbers the coordinates whose errors are measured together,
-    and the first `base_size` coordinates are the motion, the others tangents of it. `general` gives the flow of the
+    and the first `levels[0]` coordinates are the motion, the first `levels[1]` that and its tangents, and so on.
+    `general` gives the flow of the
     variant for any mass matrix: members that the regular variant cannot follow start again with it.
     """
 
@@ -84,12 +85,12 @@ class Flow:
         numbers: int,
         guards: _native.Guards | None = None,
         groups: tuple[int, ...] | None = None,
-        base_size: int | None = None,
+        levels: tuple[int, ...] | None = None,
         general: "Callable[[], Flow | None]" = lambda: None,
     ):
         self._parts, self.size, self.numbers, self.guards = functools.cache(parts), size, numbers, guards
         self.groups = tuple(range(size)) if groups is None else groups
-        self.base_size = size if base_size is None else base_size
+        self.levels = (size,) if levels is None else levels
         self.general = functools.cache(general)
         self.tangent = functools.lru_cache(maxsize=8)(self._tangent)
 
@@ -133,7 +134,7 @@ class Flow:
     @functools.cached_property
     def kernel(self) -> _native.Kernel:
         """The machine code."""
-        return _native.Kernel(self.program, self.size, self.projection, self.guards, self.groups, self.base_size)
+        return _native.Kernel(self.program, self.size, self.projection, self.guards, self.groups, self.levels)
 
     # ---- forward ----
 
@@ -235,7 +236,7 @@ class Flow:
         def parts():
             return tangent_programs(self.program, self.projection, n, directions)
 
-        return Flow(parts, rows * n, rows * self.numbers, None, groups, self.base_size, general)
+        return Flow(parts, rows * n, rows * self.numbers, None, groups, (*self.levels, rows * n), general)
 
 
 def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:

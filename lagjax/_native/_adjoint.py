@@ -22,8 +22,10 @@ from llvmlite import ir
 from lagjax._native._constants import MAX_ORDER, NEAR_ZERO
 from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
-from lagjax._native._output import RECORDED
+from lagjax._native._output import RECORDED, recall_pieces
+from lagjax._native._saltation import GuardTable, Saltation
 from lagjax._native._series import Motion, double, is_large
+from lagjax._program._borders import Borders
 from lagjax._program._series import Recurrent, Series
 from lagjax._program._transpose import pullback
 
@@ -40,28 +42,44 @@ class Adjoint:
 
     job = JOB
 
-    def __init__(self, program: Recurrent, series: Series, projection=None, *, width: int):
+    def __init__(
+        self,
+        program: Recurrent,
+        series: Series,
+        projection=None,
+        borders: "Borders | None" = None,
+        levels: tuple[int, ...] = (),
+        *,
+        width: int,
+    ):
         n, states = series.size, 2 * series.size
+        pieces = 0 if borders is None else len(borders.switches)
         fields = {
             "state_ct": states,  # the cotangent of the state
             "y_ct": (states, MAX_ORDER + 1),  # those of its coefficients
             "rows_ct": series.rows,
             "values_ct": series.values,
-            "params_ct": program.size - states - 1,
+            "params_ct": program.size - states - 1 - pieces,
             "before": states,
             **dict.fromkeys(("active", "excess"), 1),
         }
+        if borders is not None:
+            fields |= Saltation.fields(pieces, (n,)) | {"after": n, "has_after": 1, "crossed": 1}
         large = is_large(program, projection, times=2)
-        self.motion = Motion("adjoint", program, series, JOB, fields, large, width, keep_sums=True)
+        self.motion = Motion("adjoint", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces)
         self.n, self.states, self.series = n, states, series
         dtypes = program.dtypes
-        self.varied = [i for i, dtype in enumerate(dtypes) if dtype.kind == "f" and i != states]  # all but the time
+        # All but the time and the pieces.
+        moving = dtypes[: len(dtypes) - self.motion.pieces]
+        self.varied = [i for i, dtype in enumerate(moving) if dtype.kind == "f" and i != states]
         self.zeroth_order, self.order_recursion = self._transposed(dtypes)
         self.start_next = self._start_next()
         steps = [self._seed(), self._back_orders(self._back_sums(), self._back_recursion()), self._back_start()]
         if projection is not None:
             self.projection_line = pullback(projection.state.line, dtypes, self.varied, range(states))
             steps.insert(0, self._back_projection())
+        if borders is not None:
+            steps = [self._back_border(borders, levels or (n,)), *steps, self._note_after()]
         self._run(steps)
         self._begin()
         self.motion.form.finish()
@@ -118,12 +136,14 @@ class Adjoint:
         there = member >= 0
         lane["active"] = code.select(there, double(code, 1.0), 0.0)
         lane["h"], lane["excess"] = 0.0, 0.0
+        if self.motion.pieces:
+            lane["has_after"] = 0.0
         lane["step"] = lane["step"] - 1
         lane["output"] = frame.job("times") - 2
         with code.only_if(there):
             for i in self.motion.form.each(code, self.states):
                 lane["state_ct", i] = frame.read("y_ct", member * self.states + i)
-            with code.loop(self.motion.numbers) as i:
+            with code.loop(self.motion.parameters) as i:
                 lane["params", i] = frame.read("params", member * frame.job("params_stride") + i)
                 lane["params_ct", i] = 0.0
         return frame.finish()
@@ -132,11 +152,14 @@ class Adjoint:
         """The time, size and first state of the step that the lane is to go back."""
         member = lane["member"]
         with frame.code.only_if(member >= 0):
-            row = (frame.read("first_step", member, INTEGER) + lane["step"]) * (self.states + RECORDED)
+            row = (frame.read("first_step", member, INTEGER) + lane["step"]) * (
+                self.states + RECORDED + self.motion.recorded_pieces
+            )
             lane["t"] = frame.read("record", row)
             lane["h"] = frame.read("record", row + 1)
             for i in self.motion.form.each(frame.code, self.states):
                 lane["y", i] = frame.read("record", row + (i + RECORDED))
+            recall_pieces(self.motion, frame, lane, row)
 
     def _end_or_go_on(self, frame: Frame, lane: Lane, index: Value) -> None:
         """One step less to go back; after the first one, write down the cotangents and take the next member."""
@@ -147,8 +170,8 @@ class Adjoint:
             with code.only_if(left < 0):
                 for i in self.motion.form.each(code, self.states):
                     frame.write("y_ct", member * self.states + i, lane["state_ct", i])
-                with code.loop(self.motion.numbers) as i:
-                    frame.write("params_ct", member * self.motion.numbers + i, lane["params_ct", i])
+                with code.loop(self.motion.parameters) as i:
+                    frame.write("params_ct", member * self.motion.parameters + i, lane["params_ct", i])
                 frame.write("excess", member, lane["excess"])
                 frame.call(self.start_next, index)
 
@@ -322,13 +345,37 @@ class Adjoint:
         self._store(frame, motion.form.run(frame, self.projection_line, moved, [frame["t"] + h], params, state_ct))
         return frame.finish()
 
+    def _back_border(self, borders: Borders, levels: tuple[int, ...]) -> Code:
+        """From behind the border that a step ends at to before it, where the acceleration jumps (`_saltation`)."""
+        motion, saltation = self.motion, Saltation(self.motion, borders, levels)
+        table, frame = GuardTable(motion, borders), motion.function("back_border")
+        code, base = frame.code, saltation.base
+        frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], 0.0)
+        with code.only_if(code.any_lane(frame["crossed"] > 0.0)):
+            slopes, rate = saltation.at_end(frame, table)
+            gain = saltation.gain(frame, rate)
+            for i in motion.form.each(code, base):
+                _add(frame, slopes[i] * gain, "state_ct", i)
+                _add(frame, slopes[i + base] * gain, "state_ct", i + self.n)
+            for k in motion.form.each(code, saltation.parameters):
+                _add(frame, slopes[k + (2 * base + 1)] * gain, "params_ct", k)
+        return frame.finish()
+
+    def _note_after(self) -> Code:
+        """The accelerations at the beginning of a step, for the one before it."""
+        frame = self.motion.function("note_after")
+        for i in self.motion.form.each(frame.code, self.n):
+            frame["after", i] = frame["y", i + self.n, 1]
+        frame["has_after"] = 1.0
+        return frame.finish()
+
     def _store(self, frame: Frame, cotangents: Numbers, more: "Vectors | None" = None) -> None:
         """The cotangent of the state takes the place of the one before, with `more`; those of the parameters add up."""
         form, states = self.motion.form, self.states
         for i in form.each(frame.code, states):
             frame["state_ct", i] = cotangents[i] if more is None else more[i] + cotangents[i]
         params = [i - states - 1 for i in self.varied[states:]]
-        if params == list(range(self.motion.numbers)):
+        if params == list(range(self.motion.parameters)):
             for i in form.each(frame.code, len(params)):
                 _add(frame, cotangents[i + states], "params_ct", i)
         else:  # some are integers

@@ -93,6 +93,31 @@ SMALLEST_STEP = 4 * EPS
 # or halved, steps of a fifteenth more or less are looked at once more. Measured: 0.3 looks at those of the planets.
 NEAR_ZERO = 0.01
 
+# ---- borders ---------------------------------------------------------------------------------------------------------
+
+# A polynomial is zero where it is less than `ROOT_NOISE` EPS Σ |cₖ|: some twenty products and sums, each half a unit.
+ROOT_NOISE = 16
+# Moves towards a first root. Five to ten are usual; a double root to rounding takes some fifty. What is not found then
+# ends the step where it has been looked, which costs one step.
+MOST_MOVES = 128
+# Borders of one guard that are crossed at one instant, before the motion is said not to get on.
+MOST_CROSSINGS = 4
+# A switching number is known along a step where its last terms are so many tolerances of its size, at most. They are
+# less than one in a step that suits the state, unless the number is another one than that: there the step is halved.
+SWITCH_TOLERANCES, MOST_HALVINGS = 16.0, 64
+# exp(u) below u = −`FAINT` is 2e-35: nothing, whatever it is multiplied with. Above it, u may rise in one step by
+# `RISE` parts of the order p: then exp(u) is the sum of terms Rᵏ/k! that fall from the last one on, as step control
+# expects.
+FAINT, RISE = 80.0, 0.5
+# The last terms of the argument of a feature, at most.
+ARGUMENT = 0.1
+# Where no series begins beyond a border a step goes `SHORT_OF` the way to it, and when that is less than `NEARBY` of
+# the step, `PAST` times that: if what is beyond matters it fails its check, and half of it does not end at the border.
+# What is narrower is missed. The last terms of the switching number are to be `ABRUPT` of it, at most.
+SHORT_OF, NEARBY, PAST, ABRUPT = 0.9, 1e-4, 1.7, 1e-3
+# Of an acceleration: a smaller difference between both sides of a border is no jump. It stands far above rounding.
+JUMP_NOISE = 2.0**-34
+
 # ---- events ----------------------------------------------------------------------------------------------------------
 
 # A step is looked at in so many intervals: a guard may not have a feature narrower than about one of them. Measured: a

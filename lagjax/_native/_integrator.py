@@ -3,7 +3,8 @@
 Every lane of a vector carries one member. A round takes one step in each lane:
 
     coefficients   q and q̇ as power series about the present time (`_series`)
-    choose         the step that the last two coefficients allow, per lane (`_step`)
+    choose         the step that the last two coefficients allow, per lane (`_step`); it ends at the first border of a
+                   piecewise program (`_borders`)
     check          the series must satisfy the equations of motion along the step, and end near its constraints
                    (`_projection`), or the step is halved
     stop           where a guard changes sign the step ends (`_events`)
@@ -16,6 +17,7 @@ so that no lane waits for another. Several threads may do so at once: they share
 
 from lagjax._native import _rank_drops
 from lagjax._native._alone import MotionAlone, fills_lanes
+from lagjax._native._borders import Borders
 from lagjax._native._constants import DONE, EVENT, FIRST_STEP, OUT_OF_STEPS, RUNNING, SMALLEST_STEP
 from lagjax._native._events import Events
 from lagjax._native._frame import Frame, Lane, job
@@ -24,6 +26,7 @@ from lagjax._native._output import Output
 from lagjax._native._projection import Projector
 from lagjax._native._series import Motion, double, integer, is_large
 from lagjax._native._step import StepControl
+from lagjax._program import _borders
 from lagjax._program._series import Recurrent, Series
 
 JOB = job(
@@ -53,6 +56,8 @@ class Integrator:
         guards=None,
         error_groups: tuple[int, ...] | None = None,
         base_size: int | None = None,
+        borders: "_borders.Borders | None" = None,
+        levels: tuple[int, ...] = (),
         *,
         width: int,
     ):
@@ -62,14 +67,18 @@ class Integrator:
         fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards) | {"active": 1}
         if projection is not None:
             fields |= Projector.fields(n, self.base_size) | _rank_drops.fields(n, self.guards)
+        if borders is not None:
+            fields |= Borders.fields(borders, levels or (n,))
+        pieces = 0 if borders is None else len(borders.switches)
         large = is_large(program, projection, guards)
-        kind = MotionAlone if large and width == 1 and fills_lanes(series) else Motion
-        self.motion = motion = kind("motion", program, series, JOB, fields, large, width)
+        kind = MotionAlone if large and width == 1 and borders is None and fills_lanes(series) else Motion
+        self.motion = motion = kind("motion", program, series, JOB, fields, large, width, pieces=pieces)
         self.projector = projection and Projector(
             motion, projection.state, projection.velocity_scale, self.base_size
         )  # fmt: skip
         self.step = StepControl(motion, tuple(range(n)) if error_groups is None else error_groups, self.projector)
         self.events = guards and Events(motion, self.step, guards.program.line, guards.directions)
+        self.borders = borders and Borders(motion, borders, levels or (n,), projection is not None)
         self.output = Output(motion, self.projector)
         self.start_next = self._start_next()
         self._run()
@@ -110,8 +119,10 @@ class Integrator:
             lane["y", i] = x
             frame.write("path", self.output.place(frame, member, 0, i), x)
             lane["low", i] = 0.0
-        with code.loop(motion.numbers) as i:
+        with code.loop(motion.parameters) as i:
             lane["params", i] = frame.read("params", member * frame.job("params_stride") + i)
+        if self.borders is not None:
+            self.borders.begin(frame, lane)
 
     def _begin(self) -> None:
         """`begin(job, memory, lanes)`: every lane takes a member."""
@@ -132,18 +143,26 @@ class Integrator:
         code, (idle, rounds) = frame.code, frame.arguments
         order = frame.job("order")
         with self.motion.rounds(frame, rounds):
+            if self.motion.pieces:
+                frame.call(self.borders.decide)
             frame.call(self.motion.coefficients, order)
             self.step.choose(frame, order)
+            if self.borders is not None:
+                frame.call(self.borders.stop, order)
             self.step.halve_until_sound(frame, order)
             if self.projector is not None:
                 _rank_drops.return_or_remember(frame, self.motion.form, self.motion.states, self.guards)
             if self.events is not None:
                 self.events.stop(frame, order)
+            if self.motion.pieces:
+                self.borders.settle(frame)
             with code.only_if(frame.job("room") > 0), code.loop(self.motion.width) as lane:
                 self.output.record(frame, frame.lane(lane))
             after, rest = self.step.end_time(frame)
             self.output.write_due(frame, order, after)
             self.step.advance(frame, after, rest)
+            if self.motion.pieces:
+                frame.call(self.borders.cross)
             if self.projector is not None:
                 _rank_drops.shorten(frame)
             self._end_or_go_on(frame, idle)

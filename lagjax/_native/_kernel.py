@@ -25,6 +25,7 @@ from lagjax._native._series import is_large
 from lagjax._native._sweep import SweepPlan
 from lagjax._native._tangent import Tangent
 from lagjax._native._threads import SLICE, in_slices, together
+from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
 from lagjax._program._memory import without_collections
 from lagjax._program._series import Recurrent, Series, series
@@ -45,7 +46,8 @@ class Outcome(NamedTuple):
     - `steps`, `rejected` (N,): how many steps it took, and how many were too long.
     - `idle`: how many steps lanes stood empty for.
     - `table` (rows, 2n + 4): a row for every step that was written down, member by member: its time, its size, the
-      number of the member, that of the step, its first state; None without.
+      number of the member, that of the step, its first state; None without. For a piecewise program the pieces follow,
+      and the number of the border that the step ends at.
     - `complete` (N,): whether all steps of a member are there, Σ steps of such members before it on; None without.
     """
 
@@ -104,8 +106,9 @@ class Kernel:
     applied to the state after every step, and to the outputs after the first. `guards`, again from the same inputs, end
     the motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are relative
     to each coordinate, or to the largest one of those with the same number in `error_groups` (n,). Of the coordinates
-    the first `base_size` are the motion, the others its derivatives. Vectors have `width` lanes, by default
-    those of the processor. Raises `Unlowerable` where an operation has no Taylor series or is not one of doubles.
+    the first `levels[0]` are the motion, the first `levels[1]` that and its tangents, and so on to all of them. Vectors
+    have `width` lanes, by default those of the processor. Raises `Unlowerable` where an operation has no Taylor series
+    or is not one of doubles.
     """
 
     def __init__(
@@ -115,12 +118,21 @@ class Kernel:
         projection: Projection | None = None,
         guards: Guards | None = None,
         error_groups: tuple[int, ...] | None = None,
-        base_size: int | None = None,
+        levels: tuple[int, ...] | None = None,
         width: int | None = None,
     ):
-        self._parts = program, recurrences(program, size), projection
-        self._options = guards, error_groups, base_size
         self.states, self.numbers = 2 * size, program.size - 2 * size - 1
+        levels = (size,) if levels is None else levels
+        self._given, self._borders, self._levels = (
+            (program, size, projection, guards, error_groups, levels),
+            None,
+            levels,
+        )
+        self._parts = program, recurrences(program, size), projection
+        if pieces := pieces_of(program, size, len(levels) == 1):
+            self._borders, of_pieces = pieces
+            self._parts = self._borders.program, of_pieces, projection
+        self._options = guards, error_groups, levels[0]
         self.width = lanes() if width is None else width
         self._tangents = functools.cache(self._tangents_of)
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
@@ -141,17 +153,17 @@ class Kernel:
 
     @functools.cached_property
     def _alone(self) -> "Kernel":
-        (program, series, projection), options = self._parts, self._options
-        return Kernel(program, series.size, projection, *options, width=1)
+        return Kernel(*self._given, width=1)
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
         with without_collections():
-            integrator = Integrator(*self._parts, *self._options, width=self.width)
+            integrator = Integrator(*self._parts, *self._options, self._borders, self._levels, width=self.width)
             motion = integrator.motion
         forget_joined()
         forget_stages()
-        return _Compiled(motion.module, motion.layout, integrator.job, self._rounds, pointers=4)
+        more = motion.recorded_pieces
+        return _Compiled(motion.module, motion.layout, integrator.job, self._rounds, pointers=4, more=more)
 
     @property
     def rest_size(self) -> int:
@@ -182,7 +194,7 @@ class Kernel:
         rest = None if begun is None else Rest.of(begun.rest, self._forward.layout)
         table, rows = None, np.zeros(1, np.int64)
         if room:  # the system provides pages when they are written to
-            table = np.empty((room, self.states + RECORDED))
+            table = np.empty((room, self.states + RECORDED + self._forward.more))
         arrays = dict(
             next_member=np.zeros(1, np.int64) if rest is None else rest.next_member, ts=ts, y0=y0, params=params,
             path=path, y_end=y_end, t_end=t_end, code=code, steps=steps, rejected=rejected, record=table,
@@ -274,7 +286,7 @@ class Kernel:
 
     def _tangents_of(self, side_by_side: bool) -> "_Compiled":
         """The kernel of tangents, whose directions stand side by side or members do; compiled when first asked for."""
-        tangent = Tangent(*self._parts, width=1 if side_by_side else self.width, lanes=self.width)
+        tangent = Tangent(*self._along_steps, width=1 if side_by_side else self.width, lanes=self.width)
         return _Compiled(tangent.motion.module, tangent.motion.layout, tangent.job, self._rounds, pointers=3)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
@@ -285,7 +297,12 @@ class Kernel:
 
     @property
     def rounds_of_sweep(self) -> int:
-        """Rounds of a motion that is rather run again for a derivative than kept; 0 where that would take too long."""
+        """Rounds of a motion that is rather run again for a derivative than kept; 0 where that would take too long.
+
+        Or where more is written down of a step than its state: that of a piecewise program.
+        """
+        if self._along_steps[0] is not self._given[0]:
+            return 0
         rounds = self._rounds // _SLICES_OF_SWEEP
         return rounds if rounds >= _LEAST_ROUNDS else 0
 
@@ -304,10 +321,18 @@ class Kernel:
             atol, atol / rtol,
         )  # fmt: skip
 
+    @property
+    def _along_steps(self) -> tuple:
+        """What derivatives over steps that have been taken are made of: features do not matter to these."""
+        if self._borders is not None and self._borders.switches:
+            return *self._parts, self._borders, self._levels
+        program, size, projection, *_ = self._given
+        return program, recurrences(program, size), projection
+
     @functools.cached_property
     def _backward(self) -> "_Compiled":
         """The transpose, compiled when it is first asked for."""
-        adjoint = Adjoint(*self._parts, width=self.width)
+        adjoint = Adjoint(*self._along_steps, width=self.width)
         return _Compiled(adjoint.motion.module, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
 
     def _strides(self, ts, params) -> dict[str, int]:
@@ -323,11 +348,12 @@ class Kernel:
 class _Compiled:
     """The functions `begin` and `run` of a module: all members of a job, on several threads.
 
-    `rounds` is how many of them a slice has at first.
+    `rounds` is how many of them a slice has at first, `more` the numbers
+    that are written down behind the state of a step.
     """
 
-    def __init__(self, module: ir.Module, layout: Layout, job: Callable, rounds: int, pointers: int):
-        self.rounds = rounds
+    def __init__(self, module: ir.Module, layout: Layout, job: Callable, rounds: int, pointers: int, more: int = 0):
+        self.rounds, self.more = rounds, more
         self.layout, self._job, self._counts_idle = layout, job, pointers == 4
         # The engine holds the code that the others point to.
         self._engine, at = compiled(module, ("begin", "run"))
@@ -400,6 +426,18 @@ def recurrences(program: Recurrent, size: int) -> Series:
             raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
     with without_collections():
         return series(program, size, moving=2 * size + 1)
+
+
+@functools.lru_cache(maxsize=16)
+def pieces_of(program: Recurrent, size: int, slides: bool) -> "tuple[Borders, Series] | None":
+    """The borders of a piecewise program, and the series of its motion along a piece; None where there are none."""
+    try:
+        if (found := borders(program, size, slides)) is not None:
+            with without_collections():
+                return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
+    except Unlowerable:  # a switching number without a series, or more operations than that takes
+        pass
+    return None
 
 
 def order_for(rtol: float) -> int:

@@ -83,14 +83,23 @@ class Output:
         """
         code, member = frame.code, lane["member"]
         with code.only_if((member >= 0) & code.compare("!=", lane["h"], 0.0)):
-            number, states = frame.next("next_row"), self.motion.states
+            number, motion = frame.next("next_row"), self.motion
             with code.only_if(number < frame.job("room")):
-                row = number * (states + RECORDED)
+                row = number * (motion.states + RECORDED + motion.recorded_pieces)
                 parts = lane["t"], lane["h"], code.as_double(member), lane["steps"]
                 for k, x in enumerate(parts):
                     frame.write("record", row + k, x)
-                for i in self.motion.form.each(code, states):
+                for i in motion.form.each(code, motion.states):
                     frame.write("record", row + len(parts) + i, lane["y", i])
+                if motion.pieces:
+                    self._record_pieces(frame, lane, row + (RECORDED + motion.states))
+
+    def _record_pieces(self, frame: Frame, lane: Lane, row: Value) -> None:
+        """The pieces of the step, and the number of the border that it ends at."""
+        pieces = self.motion.pieces
+        with frame.code.loop(pieces) as j:
+            frame.write("record", row + j, lane["params", j + self.motion.parameters])
+        frame.write("record", row + pieces, lane["crossed"])
 
     # ---- the end of a member ----
 
@@ -106,3 +115,12 @@ class Output:
             frame.write("y_end", member * self.motion.states + i, x)
             with code.only_if(done):
                 frame.write("path", self.place(frame, member, frame.job("times") - 1, i), x)
+
+
+def recall_pieces(motion: Motion, frame: Frame, lane: Lane, row: Value) -> None:
+    """From a row of what was written down the pieces of a step, and the number of the border that it ends at."""
+    if motion.pieces:
+        first = row + (RECORDED + motion.states)
+        with frame.code.loop(motion.pieces) as j:
+            lane["params", j + motion.parameters] = frame.read("record", first + j)
+        lane["crossed"] = frame.read("record", first + motion.pieces)

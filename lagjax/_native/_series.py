@@ -26,7 +26,8 @@ class Motion:
 
     The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n. `fields`
     names what else a thread remembers (see `Layout`), `job` the structure that all threads share. `large` kernels are
-    written as tables (see `is_large`). Vectors have `width` lanes. With `keep_sums` the sums of every order stay in
+    written as tables (see `is_large`). Vectors have `width` lanes. The last of the numbers of the program are its
+    `pieces`. With `keep_sums` the sums of every order stay in
     memory, not only those of the last.
     """
 
@@ -40,9 +41,12 @@ class Motion:
         large: bool,
         width: int,
         keep_sums: bool = False,
+        pieces: int = 0,
     ):
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
-        self.numbers = program.size - self.states - 1  # parameters
+        self.numbers = program.size - self.states - 1  # parameters, and the pieces of a piecewise program
+        self.pieces, self.parameters = pieces, self.numbers - pieces
+        self.recorded_pieces = pieces and pieces + 1  # what is written down behind the state of a step
         self.keep_sums, self.job = keep_sums, job
         self.module = ir.Module(name)
         self.module.triple = ""
@@ -136,7 +140,8 @@ class Motion:
         for i in form.each(code, self.places_of_sums):
             frame["sums", *self.sum_indices(i, integer(code, 1))] = 0.0
 
-        with code.loop(order, start=1) as k:
+        # Borders are located on the last order too.
+        with code.loop(self._last_order(code, order) if self.pieces else order, start=1) as k:
             with code.only_if(k > 1):
                 frame.call(self._sums, k)
             inverse = 1.0 / code.as_double(k + 1)
@@ -157,6 +162,9 @@ class Motion:
     def rows_at(self, frame: Frame, k: Value) -> Vectors:
         """The coefficients of order k of all rows."""
         return frame.vectors_at("rows", self.series.rows, k)
+
+    def _last_order(self, code: Code, order: Value) -> Value:
+        return code.select(order < MAX_ORDER, order + 1, MAX_ORDER)
 
     def now(self, frame: Frame) -> list[Vectors]:
         """The inputs of the program at the present time: q, q̇, t, parameters."""

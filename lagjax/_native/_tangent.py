@@ -24,9 +24,11 @@ from lagjax._native._constants import MAX_ORDER
 from lagjax._native._frame import Frame, Lane, Layout, Vectors, integers, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
-from lagjax._native._output import RECORDED
+from lagjax._native._output import RECORDED, recall_pieces
+from lagjax._native._saltation import GuardTable, Saltation
 from lagjax._native._series import Motion, double, integer, is_large
 from lagjax._native._tables import Tables
+from lagjax._program._borders import Borders
 from lagjax._program._pushforward import pushforward
 from lagjax._program._series import Recurrent, Series
 
@@ -48,17 +50,37 @@ class Tangent:
 
     job = JOB
 
-    def __init__(self, program: Recurrent, series: Series, projection=None, *, width: int, lanes: int):
+    def __init__(
+        self,
+        program: Recurrent,
+        series: Series,
+        projection=None,
+        borders: "Borders | None" = None,
+        levels: tuple[int, ...] = (),
+        *,
+        width: int,
+        lanes: int,
+    ):
         n, states = series.size, 2 * series.size
         large = is_large(program, projection, times=2)
         fields = {"active": 1, "next_begin": 1} | ({"moved": states} if projection is not None else {})
-        self.motion = Motion("tangent", program, series, JOB, fields, large, width, keep_sums=True)
-        self.n, self.states, self.series, self.lanes, self.numbers = n, states, series, lanes, self.motion.numbers
+        pieces = 0 if borders is None else len(borders.switches)
+        if borders is not None:
+            fields |= Saltation.fields(pieces, (n,)) | {"crossed": 1}
+        self.motion = Motion("tangent", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces)
+        self.n, self.states, self.series, self.lanes, self.numbers = n, states, series, lanes, self.motion.parameters
+        self.saltation = borders and Saltation(self.motion, borders, levels or (n,))
+        if self.saltation is not None:
+            for name, count in self.saltation.fields_along().items():
+                self.motion.layout.extend(name, count)
+            self.at_border = self.saltation.note_begin(), self.saltation.note_end(GuardTable(self.motion, borders))
         self.layout = Layout(lanes, self._fields(projection is not None), beside=self.motion.layout)
         sincos = sincos_function(self.motion.module, lanes, "sincos_of_tangents")
         self.form = Tables(self.function, sincos) if large else Lines(sincos)
         dtypes = program.dtypes
-        self.varied = [i for i, dtype in enumerate(dtypes) if dtype.kind == "f" and i != states]  # all but the time
+        # All but the time and the pieces.
+        moving = dtypes[: len(dtypes) - pieces]
+        self.varied = [i for i, dtype in enumerate(moving) if dtype.kind == "f" and i != states]
         self._derive(dtypes, projection)
         self.start_next = self._start_next()
         self.cauchy_products, self.recursion = self._cauchy_products(), self._recursion()
@@ -154,11 +176,15 @@ class Tangent:
             with code.loop(self.motion.width) as j:
                 self._recall(frame, frame.lane(j))
             frame.call(self.motion.coefficients, frame.job("order"))
+            if self.saltation is not None:
+                frame.call(self.at_border[0])
             if self.projection is not None:
                 self._move(frame)
             with code.loop((directions + (per_group - 1)) / per_group) as group:
                 for step in steps:
                     frame.call(step, group)
+            if self.saltation is not None:
+                frame.call(self.at_border[1])
             with code.loop(self.motion.width) as j:
                 self._end_or_go_on(frame, frame.lane(j), j)
         frame.finish(self.motion.more(frame))
@@ -189,7 +215,9 @@ class Tangent:
         lane["h"], lane["step"], lane["output"] = 0.0, 0, 1
         for tangents in self.lanes_of_tangents(frame, index):
             tangents["excess"] = 0.0
-        with code.only_if(there), code.loop(self.motion.numbers) as i:
+        if self.saltation is not None:
+            lane["is_hit"] = 0.0
+        with code.only_if(there), code.loop(self.motion.parameters) as i:
             lane["params", i] = frame.read("params", member * frame.job("params_stride") + i)
         return frame.finish()
 
@@ -198,14 +226,16 @@ class Tangent:
         code, member = frame.code, lane["member"]
         with code.only_if(member >= 0):
             step = lane["step"]
-            row = (frame.read("first_step", member, INTEGER) + step) * (self.states + RECORDED)
+            size = self.states + RECORDED + self.motion.recorded_pieces
+            row = (frame.read("first_step", member, INTEGER) + step) * size
             lane["t"] = frame.read("record", row)
             lane["h"] = frame.read("record", row + 1)
             for i in self.motion.form.each(code, self.states):
                 lane["y", i] = frame.read("record", row + (i + RECORDED))
             lane["next_begin"] = lane["h"] * float("inf")  # of the last step: all outputs that are left
             with code.only_if(step + 1 < frame.read("steps", member, INTEGER)):
-                lane["next_begin"] = frame.read("record", row + (self.states + RECORDED))
+                lane["next_begin"] = frame.read("record", row + size)
+            recall_pieces(self.motion, frame, lane, row)
 
     def _end_or_go_on(self, frame: Frame, lane: Lane, index: Value) -> None:
         """One step more; after the last one, write down how large the last terms were and take the next member."""
@@ -247,11 +277,40 @@ class Tangent:
                     lane["dy", i, 0] = frame.read("y_dot", place * self.states + i)
                 with code.loop(self.numbers) as i:
                     lane["dparams", i] = frame.read("params_dot", place * self.numbers + i)
+        if self.saltation is not None:
+            is_hit = self.number_of(frame, "is_hit") > 0.0
+            with code.only_if(code.any_lane(is_hit)):
+                self._jump(frame, is_hit)
         return frame.finish()
+
+    def _jump(self, frame: Frame, is_hit: Value) -> None:
+        """The tangents behind a border, at the beginning of the step from there."""
+        code, form, saltation, n = frame.code, self.form, self.saltation, self.n
+        assert saltation is not None
+        base = saltation.base
+        slopes = self.numbers_of(frame, "slopes", len(saltation.by))
+        jump = self.numbers_of(frame, "jump", n)
+        change = code.variable(frame.constant(0.0))
+        for i in form.each(code, base):
+            part = slopes[i] * frame["dy", i, 0] + slopes[i + base] * frame["dy", i + n, 0]
+            code.store(code.load(change, frame.vector) + part, change)
+        for k in form.each(code, saltation.parameters):
+            part = slopes[k + (2 * base + 1)] * frame["dparams", k]
+            code.store(code.load(change, frame.vector) + part, change)
+        delay = 0.0 - code.load(change, frame.vector) / self.number_of(frame, "rate")
+        always = is_hit & (self.number_of(frame, "jumps") > 0.0)  # where the tangents of the motion jump themselves
+        for first, count in ((0, base), (base, n - base)):
+            if first:
+                delay = code.select(always, float("nan"), delay)
+            for i in form.each(code, count):
+                moves = is_hit & code.compare("!=", jump[i + first], 0.0)
+                moves = moves | always if first else moves
+                moved = code.select(moves, jump[i + first] * delay, 0.0)
+                frame["dy", i + (n + first), 0] = frame["dy", i + (n + first), 0] + moved
 
     def _now(self, frame: Frame, state: Vectors, t: Value, tangents: Vectors) -> list:
         """The inputs of a program at a state, and their tangents: those of the state, and of the parameters."""
-        params = self.numbers_of(frame, "params", self.numbers, in_place=True)
+        params = self.numbers_of(frame, "params", self.motion.numbers, in_place=True)
         of_params = [i - self.states - 1 for i in self.varied[self.states :]]
         moving: Any = [frame["dparams", i] for i in of_params]
         if of_params == list(range(self.numbers)):  # none are integers

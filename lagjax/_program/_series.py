@@ -71,7 +71,8 @@ class Series(NamedTuple):
     `zeroth_order` takes the inputs of the program and gives all its outputs, and `values` numbers more.
     `order_recursion` takes the coefficients of order k of the moving inputs, then k and 1/k, these values, and one sum
     Σ' aⱼ bₖ₋ⱼ for each pair of rows (a, b) in `cauchy_products`; it gives the coefficients of order k of the outputs,
-    and of each of the `rows` that the Cauchy products are made of.
+    and of each of the `rows` that the Cauchy products are made of. The last of `values` and of `rows` are those of the
+    `followed` nodes of the program.
     """
 
     size: int
@@ -81,16 +82,18 @@ class Series(NamedTuple):
     values: int
     cauchy_products: tuple[tuple[int, int], ...]
     rows: int
+    followed: int
 
 
-def series(program: Recurrent, size: int, moving: int) -> Series:
+def series(program: Recurrent, size: int, moving: int, followed: Sequence[int] = ()) -> Series:
     """The recurrences of the first `size` outputs; all inputs but the first `moving` are constant along the motion.
 
     For ẏ = f(t, y) with m components these are m outputs and m + 1 inputs (y and t, in any order); for q̈(q, q̇, t) with
-    n coordinates, n and 2n + 1. Raises `Unlowerable` for an operation whose series is not known here.
+    n coordinates, n and 2n + 1. The nodes `followed` of the program get their series too. Raises `Unlowerable` for an
+    operation whose series is not known here.
     """
     with np.errstate(all="ignore"):  # a constant may be 1/0, where the mass matrix is singular: that is found later
-        return _Recurrences(program, size, moving).finished()
+        return _Recurrences(program, size, moving, tuple(followed)).finished()
 
 
 class _Recurrences:
@@ -100,8 +103,8 @@ class _Recurrences:
     order k.
     """
 
-    def __init__(self, program: Recurrent, size: int, moving: int):
-        self.size, self.moving = size, moving
+    def __init__(self, program: Recurrent, size: int, moving: int, followed: tuple[int, ...]):
+        self.size, self.moving, self.followed = size, moving, followed
         self.zeroth_order = Graph.of(program.line, 10 * program.budget)
         self.order_recursion = Graph(20 * program.budget)
         self.outputs = list(program.line.outputs)
@@ -111,7 +114,7 @@ class _Recurrences:
         self._rows: dict[tuple[int | _Component, bool], int] = {}
         self._coefficients: dict[int, int | _Unknown | None] = {}  # None: constant along the motion
         # Of an elimination no coefficient is needed: it is most of a large program.
-        self._find(self._needed(program.linear))
+        self._find([*self._needed(program.linear), *followed])
         i = len(program.line.nodes)
         while i < len(self.zeroth_order.nodes):  # the rules add derivatives at the end
             self.coefficient(i)
@@ -245,10 +248,11 @@ class _Recurrences:
     def finished(self) -> Series:
         """Both graphs, without the products and values that nothing needs."""
         rates = self.solution[: self.size] or [self._of_output(i) for i in self.outputs[: self.size]]
+        followed = [self._of_output(i) for i in self.followed]
         rows = list(self._rows)
         needed: set[int] = set()
         while True:
-            wanted = self._reached([*rates, *(self._of_row(*rows[r]) for r in needed)])
+            wanted = self._reached([*rates, *followed, *(self._of_row(*rows[r]) for r in needed)])
             read = {row for kind, *which in wanted if kind == "product" for row in which}
             if read == needed:
                 break
@@ -257,9 +261,11 @@ class _Recurrences:
         # Distinct factors first, squares last: a square needs half the work.
         products = sorted((key for key in wanted if key[0] == "product"), key=lambda key: (key[1] == key[2], key[1:]))
         place = {row: k for k, row in enumerate(sorted(needed))}
-        order = [("value", node) for node in values] + products
-        self._renumber({self._given[key]: self.moving + 2 + k for k, key in enumerate(order)})
-        kept = [self._of_row(*rows[r]) for r in sorted(needed)]
+        # Nobody reads the values of what is followed in the recursion.
+        order = [("value", node) for node in values] + [None] * len(followed) + products
+        self._renumber({self._given[key]: self.moving + 2 + k for k, key in enumerate(order) if key is not None})
+        kept = [self._of_row(*rows[r]) for r in sorted(needed)] + followed
+        values += self.followed
         return Series(
             self.size,
             self.moving,
@@ -267,7 +273,8 @@ class _Recurrences:
             StraightLine(*eliminate_dead_code(*sink_negations(self.order_recursion, rates + kept))),
             len(values),
             tuple((place[a], place[b]) for _, a, b in products),
-            len(needed),
+            len(kept),
+            len(followed),
         )
 
     def _of_output(self, node: int) -> int:

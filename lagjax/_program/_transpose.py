@@ -38,6 +38,13 @@ def pullback(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequen
     return StraightLine(*replace_by_inputs(done.nodes, done.kinds, results, positions))
 
 
+def gradient_in(graph: Graph, line: StraightLine, nodes: list[int], node: int, by: Sequence[int]) -> list[int]:
+    """The derivatives of one node of a line by the inputs `by`, as nodes of the graph in which the line is `nodes`."""
+    cotangents: list[int | None] = [None] * len(line.nodes)
+    cotangents[node] = graph.constant(1.0, "float")
+    return _back(graph, line, nodes, cotangents, by)
+
+
 def _kind(dtype) -> str:
     return "float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name
 

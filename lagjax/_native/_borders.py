@@ -1,0 +1,365 @@
+"""Borders of a piecewise program: a step ends at the first one, and the next begins on the piece beyond.
+
+    decide    the pieces of a member that begins, and of one that has crossed a border on which others depend
+    stop      the first root of all guards along the step, by their series: there the step ends; and so it does
+              before a narrow feature comes nearer than a series can tell
+    settle    a border counts only where the step was not shortened further
+    cross     the piece beyond; its guard is zero there, and its slope tells whether the motion stays
+
+What a piece is, and a guard, `_program._borders` says. That a border has been crossed is remembered, so that rounding
+does not decide on which side the next step begins.
+"""
+
+from lagjax._native._constants import (
+    ABRUPT,
+    ARGUMENT,
+    DISCONTINUOUS,
+    FAINT,
+    GROWTH,
+    MAX_ORDER,
+    MOST_CROSSINGS,
+    MOST_HALVINGS,
+    NEARBY,
+    PAST,
+    RISE,
+    SHORT_OF,
+    SWITCH_TOLERANCES,
+)
+from lagjax._native._frame import Frame, Lane
+from lagjax._native._ir import INTEGER, Code, Value
+from lagjax._native._roots import Roots
+from lagjax._native._saltation import NUMBERS, GuardTable, Saltation
+from lagjax._native._series import Motion, double, integer
+from lagjax._program import _borders
+from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
+
+LEAVING, SLIDING = 2.0, 3.0  # what a guard is that has been zero, and that stays zero; 1.0 where it is just crossed
+
+
+class Borders:
+    """The borders of a motion, whose pieces are its last parameters.
+
+    Where it `returns` to long steps (`_rank_drops`), it does not go back over a border, nor because of one.
+    """
+
+    def __init__(self, motion: Motion, borders: _borders.Borders, levels: tuple[int, ...], returns: bool):
+        self.returns = returns
+        self.motion, self.borders, self.guards = motion, borders, borders.guards
+        self.pieces, self.roots = motion.pieces, Roots(motion)
+        if not self.pieces:
+            self.stop = self._stop()
+            return
+        self.table = GuardTable(motion, borders)
+        self.decide, self.stop = self._decide(), self._stop()
+        saltation = Saltation(motion, borders, levels) if len(levels) > 1 else None
+        self.note, self.jump = (saltation.note(self.table), saltation.apply()) if saltation else (None, None)
+        self.cross = self._cross()
+
+    @staticmethod
+    def fields(borders: _borders.Borders, levels: tuple[int, ...]) -> dict:
+        """What a thread remembers for it.
+
+        `touching` is 1 for a guard that is zero where the step begins, 2 where its rate is, too, and 3 where it stays
+        so; `stays` for a piece that is not decided anew;
+        `crossed` is the number of the guard that the step ends at, from 1 on, or 0, and `beyond` the piece there.
+        `planned_h` is the step without borders, `cut` with them, `part` how much of it a series covers, and
+        `idle_crossings` counts those without a step. `approach` is how long the step was from which on others have
+        ended before a border without a series beyond it, 0 where the last one did not.
+        """
+        numbers = (
+            "crossed",
+            "beyond",
+            "planned_h",
+            "cut",
+            "nearest",
+            "undecided",
+            "idle_crossings",
+            "stepped",
+            "part",
+            "approach",
+            "next_approach",
+        )
+        fields = {"touching": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
+        return fields | Roots.fields(MAX_ORDER + 2) | Saltation.fields(len(borders.switches), levels)
+
+    def begin(self, frame: Frame, lane: Lane) -> None:
+        """A lane has taken a member."""
+        lane["approach"] = 0.0
+        if not self.pieces:
+            return
+        for name in ("crossed", "idle_crossings", "stepped"):
+            lane[name] = 0.0
+        lane["undecided"] = 1.0
+        with frame.code.loop(len(self.guards)) as g:
+            lane["touching", g] = 0.0
+        with frame.code.loop(self.pieces) as j:
+            lane["stays", j] = 0.0
+            lane["params", j + self.motion.parameters] = 0.0
+
+    def _piece(self, frame: Frame, j: Value) -> Value:
+        return frame["params", j + self.motion.parameters]
+
+    # ---- where a member begins ----
+
+    def _decide(self) -> Code:
+        """`()`: the pieces of the lanes that are undecided."""
+        frame = self.motion.function("decide")
+        code, undecided = frame.code, frame["undecided"] > 0.0
+        with code.only_if(code.any_lane(undecided)):
+            inputs = [*self.motion.now(frame), frame.vectors("stays", self.pieces)]
+            pieces = self.motion.form.run(frame, self.borders.decide, *inputs)
+            for j in self.motion.form.each(code, self.pieces):
+                place = j + self.motion.parameters
+                frame["params", place] = code.select(undecided, pieces[j], frame["params", place])
+                frame["stays", j] = code.select(undecided, 0.0, frame["stays", j])
+            frame["undecided"] = 0.0
+        return frame.finish()
+
+    # ---- the first border along the step ----
+
+    def _stop(self) -> Code:
+        """`(order)`: the step ends at the first border."""
+        frame = self.motion.function("stop_at_border", INTEGER)
+        code, (order,), h = frame.code, frame.arguments, frame["h"]
+        # Borders have the last order too; see `Motion.coefficients`.
+        degree = code.select(order < MAX_ORDER - 1, order, MAX_ORDER - 1) if self.pieces else order - 1
+        frame["planned_h"], frame["nearest"] = h, 1.0
+        frame["crossed"] = frame["beyond"] = 0.0
+        if self.pieces:
+            with code.loop(len(self.guards)) as g:
+                self._look(frame, g, degree, h)
+        frame["next_approach"] = 0.0
+        for i, feature in enumerate(self.borders.features):
+            self._look_ahead(frame, i, feature, degree, h)
+        frame["approach"] = frame["next_approach"]
+        cut = frame["nearest"] < 1.0
+        frame["h"] = code.select(cut, frame["nearest"] * h, h)
+        frame["cut"] = frame["h"]
+        frame["last"] = code.select(cut, 0.0, frame["last"])
+        if self.returns:
+            frame["h_before"] = code.select(cut, 0.0, frame["h_before"])
+        return frame.finish()
+
+    def _look(self, frame: Frame, g: Value, degree: Value, h: Value) -> None:
+        """Note where guard g is crossed, if that is sooner than what was noted before."""
+        code = frame.code
+        j = self.table.place(code, g, "piece")
+        a, b, d, e, below, above, k, l, _ = (self.table.number(code, g, name) for name in NUMBERS)
+        piece = self._piece(frame, j)
+        level = piece * d + e + code.select(piece <= 0.0, code.lanes_of(below), 0.0)
+        level = level + code.select(piece >= 0.0, code.lanes_of(above), 0.0)
+        side, beyond = piece * a + b, piece * k + l
+        is_share = code.lanes_of(code.select(self.table.place(code, g, "on") >= 0, double(code, 1.0), 0.0)) > 0.0
+        undecided = code.compare("==", side, 0.0)
+        # Nothing is looked for along the border that the motion slides on, or in the share of one that does not.
+        idle = (frame["touching", g] >= SLIDING) | (undecided & is_share)
+        self._polynomial(frame, j, degree, h, code.select(undecided, frame.constant(1.0), side), level)
+        leads = self._leads(frame, degree)
+        self._divide(frame, g, degree)
+        self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), frame.job("atol"))
+        frame.call(self.roots.first_root, degree)
+        # A number that is zero leaves zero as its first coefficient says, or stays.
+        leaves = undecided & code.compare("!=", leads, 0.0)
+        root = code.select(undecided, code.select(leaves, frame.constant(0.0), 2.0), self._place(frame))
+        is_root = leaves | (~undecided & (frame["is_root"] > 0.0) & (frame["root"] < 1.0))
+        sooner = (root < frame["nearest"]) & code.compare("!=", h, 0.0) & ~idle
+        number = code.select(is_root, code.lanes_of(code.as_double(g + 1)), 0.0)
+        frame["nearest"] = code.select(sooner, root, frame["nearest"])
+        frame["crossed"] = code.select(sooner, number, frame["crossed"])
+        frame["beyond"] = code.select(sooner, code.select(undecided, leads, beyond), frame["beyond"])
+
+    def _look_ahead(self, frame: Frame, i: int, feature: Feature, degree: Value, h: Value) -> None:
+        """The step ends where the argument of a feature has come as near as one step may bring it."""
+        code, j = frame.code, integer(frame.code, self.pieces + i)
+        moves, last = self._moves(frame, j, degree, h)
+        rise = code.lanes_of(code.as_double(degree)) * (RISE / feature.scale)
+        near = ~((moves < rise) & (last < ARGUMENT))
+        if feature.kind in (SQUARED, UP_TO):  # which change by more than their argument does
+            near = frame.constant(0.0) <= 0.0
+        with code.only_if(code.any_lane(near)):
+            self._find_feature(frame, j, feature, degree, h)
+
+    def _moves(self, frame: Frame, j: Value, degree: Value, h: Value) -> tuple[Value, Value]:
+        """How far a number may move along the step, Σ |cₖ| for k > 0, and the last of these terms."""
+        code, row = frame.code, j + (self.motion.series.rows - self.motion.series.followed)
+        sum, last = (code.variable(frame.constant(0.0)) for _ in range(2))
+        size = code.intrinsic("fabs", h)
+        with code.loop(degree) as i:
+            c = code.intrinsic("fabs", frame["rows", row, degree - i])
+            code.store((code.load(sum, frame.vector) + c) * size, sum)
+            code.store(code.load(last, frame.vector) * size, last)
+            with code.only_if(i < 3):
+                code.store(code.load(last, frame.vector) + c * size, last)
+        return code.load(sum, frame.vector), code.load(last, frame.vector)
+
+    def _find_feature(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> None:
+        """With its argument u: where α + β u is zero, the step ends."""
+        code, scale = frame.code, feature.scale
+        u = frame["values", j + (self.motion.series.values - self.motion.series.followed)]
+        rise = code.lanes_of(code.as_double(degree)) * RISE
+        side = code.select(u < 0.0, frame.constant(-1.0), 1.0)
+        if feature.kind == UP_TO:
+            matters, slope, start = code.compare("!=", u, 0.0), side, side * u
+        elif feature.kind == SQUARED:
+            near = code.maximum(u * u - rise, 0.0)
+            level = code.intrinsic("sqrt", code.select(near > FAINT, FAINT, near))
+            matters, slope, start = near > 0.0, side, side * u - level
+        else:
+            slope = frame.constant(-scale) if feature.kind == BELOW else scale * side
+            level = code.maximum(rise - slope * u, -FAINT)
+            matters = level < (float("inf") if feature.kind == BELOW else 0.0)
+            start = level + slope * u
+        self._polynomial(frame, j, degree, h, slope, u - start / slope)
+        of_size, absolute = (ABRUPT, 0.0) if feature.kind == UP_TO else (0.0, ARGUMENT)
+        self._shorten(frame, degree, double(code, of_size), double(code, absolute))
+        frame.call(self.roots.first_root, degree)
+        root = self._place(frame)
+        if feature.kind == UP_TO:
+            way, whole = frame["root"] * frame["part"], code.intrinsic("fabs", h)
+            whole = code.maximum(whole, frame["approach"])
+            far = way * code.intrinsic("fabs", h) > NEARBY * whole
+            past = code.select(far, way * SHORT_OF, way * PAST + NEARBY)
+            comes = matters & far & (frame["root"] < 1.0) & (frame["is_root"] > 0.0)
+            frame["next_approach"] = code.select(comes, whole, frame["next_approach"])
+            root = code.select((frame["root"] < 1.0) & (frame["is_root"] > 0.0), past, root)
+        sooner = matters & (root > 0.0) & (root < frame["nearest"]) & code.compare("!=", h, 0.0)
+        frame["nearest"] = code.select(sooner, root, frame["nearest"])
+        frame["crossed"] = code.select(sooner, 0.0, frame["crossed"])
+
+    def _polynomial(self, frame: Frame, j: Value, degree: Value, h: Value, side: Value, level: Value) -> None:
+        """σ (u − level) over the step as a polynomial on [0, 1], into `poly`."""
+        code, series = frame.code, self.motion.series
+        first_row, first_value = series.rows - series.followed, series.values - series.followed
+        frame["poly", 0] = side * (frame["values", j + first_value] - level)
+        power = code.variable(side * h)
+        with code.loop(degree + 1, start=1) as k:
+            frame["poly", k] = frame["rows", j + first_row, k] * code.load(power, frame.vector)
+            code.store(code.load(power, frame.vector) * h, power)
+        frame["poly", degree + 1] = 0.0
+
+    def _leads(self, frame: Frame, degree: Value) -> Value:
+        """The sign of the first coefficient behind c₀ that is not zero."""
+        code, leads = frame.code, frame.code.variable(frame.constant(0.0))
+        with code.loop(degree) as i:
+            c = frame["poly", degree - i]
+            sign = code.select(c > 0.0, frame.constant(1), -1.0)
+            code.store(code.select(code.compare("!=", c, 0.0), sign, code.load(leads, frame.vector)), leads)
+        return code.load(leads, frame.vector)
+
+    def _size(self, frame: Frame, degree: Value) -> Value:
+        """Σ |cₖ|."""
+        code, size = frame.code, frame.code.variable(frame.constant(0.0))
+        with code.loop(degree + 1) as k:
+            code.store(code.load(size, frame.vector) + code.intrinsic("fabs", frame["poly", k]), size)
+        return code.load(size, frame.vector)
+
+    def _shorten(self, frame: Frame, degree: Value, rtol: Value, atol: Value) -> None:
+        """Halve the interval until the last terms are below atol + rtol Σ |cₖ|; `part` of it is left.
+
+        They are three: one may have been divided away, and one be zero by symmetry.
+        """
+        code = frame.code
+        frame["part"] = 1.0
+        again, left = code.variable(integer(code, 1)), code.variable(integer(code, MOST_HALVINGS))
+        with code.repeat_while(lambda: (code.load(again, INTEGER) > 0) & (code.load(left, INTEGER) > 0)):
+            code.store(code.load(left, INTEGER) - 1, left)
+            code.store(integer(code, 0), again)
+            last = [code.intrinsic("fabs", frame["poly", degree - k]) for k in range(3)]
+            long = last[0] + last[1] + last[2] > self._size(frame, degree) * rtol + code.lanes_of(atol)
+            with code.only_if(code.any_lane(long)):
+                code.store(integer(code, 1), again)
+                half, power = code.select(long, frame.constant(0.5), 1.0), code.variable(frame.constant(1.0))
+                frame["part"] = frame["part"] * half
+                with code.loop(degree + 1) as k:
+                    frame["poly", k] = frame["poly", k] * code.load(power, frame.vector)
+                    code.store(code.load(power, frame.vector) * half, power)
+
+    def _place(self, frame: Frame) -> Value:
+        """The first root in parts of the step; or how far was looked, or 2 where there is none in all of it."""
+        code, root, part = frame.code, frame["root"], frame["part"]
+        return code.select(root < 1.0, root * part, code.select(part < 1.0, part, 2.0))
+
+    def _divide(self, frame: Frame, g: Value, degree: Value) -> None:
+        """Where guard g is zero at the beginning, divide its polynomial by as many powers as vanish."""
+        code = frame.code
+        divided, twice = frame["touching", g] > 0.0, frame["touching", g] >= LEAVING
+        for power in range(3):
+            with code.only_if(code.any_lane(divided)), code.loop(degree + 1) as k:
+                frame["poly", k] = code.select(divided, frame["poly", k + 1], frame["poly", k])
+            vanishes = code.compare("==", frame["poly", 0], 0.0)
+            divided = divided & (vanishes | twice) if power == 0 else divided & vanishes
+
+    # ---- beyond it ----
+
+    def settle(self, frame: Frame) -> None:
+        """A step that has become shorter than planned does not reach its border."""
+        code = frame.code
+        reached = code.compare("==", frame["h"], frame["cut"])
+        frame["crossed"] = code.select(reached, frame["crossed"], 0.0)
+        frame["stepped"] = code.select(code.compare("!=", frame["h"], 0.0), frame.constant(1), 0.0)
+
+    def _cross(self) -> Code:
+        """`()`: after the step, the pieces beyond the borders that were reached."""
+        frame = self.motion.function("cross")
+        code = frame.code
+        stepped, crossed = frame["stepped"] > 0.0, frame["crossed"]
+        crosses, was_cut = crossed > 0.0, code.compare("!=", frame["cut"], frame["planned_h"])
+        with code.loop(len(self.guards)) as g:
+            ends = stepped & (frame["touching", g] < SLIDING)
+            frame["touching", g] = code.select(ends, 0.0, frame["touching", g])
+        with code.only_if(code.any_lane(crosses | was_cut)):
+            # What a cut step was to be says more about the next one than what it became.
+            planned = code.intrinsic("fabs", frame["planned_h"])
+            reached = was_cut & code.compare("==", frame["h"], frame["cut"])
+            frame["longest"] = code.select(reached, GROWTH * planned, frame["longest"])
+            frame["h"] = code.select(reached, frame["planned_h"], frame["h"])
+            if self.note is not None:
+                frame.call(self.note)
+            self._go_beyond(frame, crossed)
+            if self.returns:
+                frame["h_before"] = code.select(crosses, 0.0, frame["h_before"])
+            if self.borders.nested:
+                frame["undecided"] = code.select(crosses, frame.constant(1), frame["undecided"])
+                frame.call(self.decide)
+            if self.jump is not None:
+                frame.call(self.jump)
+            idle = code.select(crosses & ~stepped, frame["idle_crossings"] + 1.0, 0.0)
+            frame["idle_crossings"] = code.select(stepped | crosses, idle, frame["idle_crossings"])
+            many = frame["idle_crossings"] > float(MOST_CROSSINGS * len(self.guards))
+            frame["code"] = code.select(many, frame.constant(DISCONTINUOUS), frame["code"])
+        return frame.finish()
+
+    def _go_beyond(self, frame: Frame, crossed: Value) -> None:
+        """The pieces beyond the borders, which touch them; a piece that touches one is not decided anew.
+
+        A motion that would go back over the border at once is pushed onto it from both sides: it slides.
+        """
+        code, again = frame.code, frame["stepped"] <= 0.0
+        with code.loop(len(self.guards)) as g:
+            hit = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
+            j, back, slide = (self.table.place(code, g, name) for name in ("piece", "back", "slide"))
+            place = j + self.motion.parameters
+            slides = hit & again & (frame["touching", g] > 0.0)
+            slides = slides & (code.lanes_of(code.as_double(slide)) >= 0.0)
+            frame["params", place] = code.select(hit & ~slides, frame["beyond"], frame["params", place])
+            touches = code.select(slides, frame.constant(SLIDING), 1.0)
+            frame["touching", back] = code.select(hit, touches, frame["touching", back])
+            with code.only_if(slide >= 0):
+                place = slide + self.motion.parameters
+                frame["params", place] = code.select(slides, frame.constant(1), frame["params", place])
+            self._leave(frame, g, hit, again)
+        with code.loop(len(self.guards)) as g:
+            j = self.table.place(code, g, "piece")
+            stays = frame["touching", g] > 0.0
+            frame["stays", j] = code.select(stays, frame.constant(1), frame["stays", j])
+
+    def _leave(self, frame: Frame, g: Value, hit: Value, again: Value) -> None:
+        """Where the share of a sliding motion comes to 0 or 1, it goes on along one side; u̇ is zero after a slide."""
+        code = frame.code
+        on = self.table.place(code, g, "on")
+        with code.only_if(on >= 0):
+            place = self.table.place(code, on, "piece") + self.motion.parameters
+            side = code.lanes_of(self.table.number(code, g, "goes_on"))
+            frame["params", place] = code.select(hit, side, frame["params", place])
+            leaves = code.select(again, frame.constant(1), LEAVING)
+            frame["touching", on] = code.select(hit, leaves, frame["touching", on])

@@ -1,0 +1,504 @@
+"""What a program decides on: its piecewise operations, each by a number whose series tells when the piece changes.
+
+    comparisons, abs, max, min, sign    the sign of a switching number u: −1, 0 or 1
+    floor, ceil, round                  the whole number below a switching number x
+    rem, conversion to integers         the whole number between x and zero
+
+A *piece* is what was decided: one of these numbers, constant along a step. Here a program becomes one that takes its
+pieces as further inputs, so that along every step it is smooth; beside it stand the switching numbers, and the program
+that decides where a motion begins. A *guard* is a border of a piece: σ (u − level) > 0 on it, with σ = ±1.
+
+Beside them stand *features*: functions that are flat to rounding until their argument comes near, where they change
+within a unit of it, as exp(u) does below u = −80. No series shows one from afar, but its argument has one.
+
+Not followed are `eq` and `ne`, whose border is a point, and what does not change along the motion. Where a root or a
+power that is not whole begins right at a border, as in max(q, 0)**1.5, there is no series to begin with beyond it: such
+a border is no piece but a feature, and a step that is to pass it begins next to it.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lagjax._program._graph import Graph
+from lagjax._program._operations import OPERATIONS
+from lagjax._program._passes import eliminate_dead_code, live
+from lagjax._program._series import Recurrent, StraightLine
+from lagjax._program._transpose import copied, gradient_in, pullback
+
+SIGN, FLOOR, TRUNC, SLIDE = range(4)  # the kinds of pieces
+MOST_SLIDING = 4  # pieces whose border a motion may slide along: each makes the program longer
+LARGEST_SLIDING = 4000  # operations of a program with such pieces
+# What a function is flat like: exp(u) below, exp(−|u|) on both sides, exp(−u²), or zero up to a border; and in which
+# units of its argument.
+BELOW, BESIDE, SQUARED, UP_TO = range(4)
+_FEATURES = {
+    "exp": (BELOW, 1.0), "exp2": (BELOW, math.log(2.0)), "expm1": (BELOW, 1.0), "logistic": (BESIDE, 1.0),
+    "tanh": (BESIDE, 2.0), "sinh": (BESIDE, 2.0), "cosh": (BESIDE, 2.0), "erf": (SQUARED, 1.0), "erfc": (SQUARED, 1.0),
+}  # fmt: skip
+_LARGEST = 10  # operations that one may become: a bound for errors, three are usual
+_COMPARISONS = ("lt", "le", "gt", "ge")
+_WITHOUT_SERIES = ("rsqrt", "log", "log1p")  # at zero, or −1; besides the operations that are `steep`
+
+
+class Guard(NamedTuple):
+    """A border of piece number `piece`, with p the piece: of its switching number u, σ (u − level) > 0.
+
+    σ = a p + b. The level is d p + e, and `below` more where p ≤ 0, `above` more where p ≥ 0. Beyond it the piece is
+    k p + l, whose border on this side is guard `back`.
+
+    Where both sides push onto the border of `piece`, piece number `slide` becomes 1: the motion slides along it, with
+    α of the acceleration on the upper side and 1 − α of that on the lower one. α is the switching number of `slide`;
+    beyond its guards the motion goes on with the guard `on` at the piece `goes_on`. All three are −1 where there is
+    none.
+    """
+
+    piece: int
+    a: float
+    b: float
+    d: float
+    e: float
+    below: float
+    above: float
+    k: float
+    l: float
+    back: int
+    slide: int = -1
+    on: int = -1
+    goes_on: float = 0.0
+
+
+class Feature(NamedTuple):
+    """A narrow feature: what it is flat like, and in which units of its argument."""
+
+    kind: int
+    scale: float
+
+
+class Pieced(NamedTuple):
+    """A program that takes its pieces as its last inputs (`Recurrent`)."""
+
+    line: StraightLine
+    size: int
+    dtypes: tuple
+    linear: Any
+    budget: int
+
+
+class Borders(NamedTuple):
+    """The borders of a program with m pieces, and its features.
+
+    `program` takes the inputs, then the pieces; `switches` (m,) are the nodes of the switching numbers in it, and
+    `arguments` those of the arguments of `features`. `decide`
+    takes the same and then m flags: it gives the pieces of a state, or the piece that is given where the flag is 1.
+    `nested` says whether switching numbers depend on pieces.
+    """
+
+    program: Pieced
+    switches: tuple[int, ...]
+    kinds: tuple[int, ...]
+    decide: StraightLine
+    guards: tuple[Guard, ...]
+    nested: bool
+    arguments: tuple[int, ...]
+    features: tuple[Feature, ...]
+
+    @property
+    def followed(self) -> tuple[int, ...]:
+        """The nodes whose series are wanted."""
+        return self.switches + self.arguments
+
+
+class _LinearSystem(NamedTuple):
+    """The linear system of a program, with its nodes in the new one."""
+
+    z: tuple[int, ...]
+    entries: dict[tuple[int, int], int]
+    right: tuple[int, ...]
+    factors: tuple[int, ...]
+    solve: Any
+
+
+def borders(program: Recurrent, size: int, slides: bool = True) -> Borders | None:
+    """The borders of a program of q, q̇, t and parameters whose first `size` outputs are q̈; None where it is smooth.
+
+    Along borders that depend on velocities the motion may slide (`slides`; see `_sliding`).
+    """
+    with np.errstate(all="ignore"):
+        rewriting = _Rewriting(program, size, slides)
+        return rewriting.finished() if rewriting.switches or rewriting.features else None
+
+
+class _Rewriting:
+    """The program anew, with an input for every piece where the program decides."""
+
+    def __init__(self, program: Recurrent, size: int, slides: bool):
+        self.program, self.size, self.moving, self.slides = program, size, 2 * size + 1, slides
+        self._jumping: set[int] = set()  # pieces that something may jump with
+        self.graph = Graph(_LARGEST * len(program.line.nodes) + 1000)
+        self.switches: list[int] = []
+        self.kinds: list[int] = []
+        self.pieces: list[int] = []
+        self._known: dict[tuple[int, int], int] = {}
+        self._extremes: dict[int, tuple] = {}  # the operations that have been decided
+        self._one = self.graph.constant(1.0, "float")
+        self._moves: list[bool] = []
+        self.features: dict[int, Feature] = {}
+        self.abrupt: set[int] = set()
+        self.decisive = self._decisive()
+        self.places: list[int] = []
+        if any(self._decides(i) or program.line.nodes[i][0] in _FEATURES for i in self.decisive | self.abrupt):
+            for i in range(len(program.line.nodes)):
+                self.places.append(self._place(i))
+
+    # ---- which operations decide ----
+
+    def _decisive(self) -> set[int]:
+        """The nodes that q̈ depends on, without those of the elimination of a linear system."""
+        linear, line = self.program.linear, self.program.line
+        roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
+        needed = _below(line, roots)
+        self.abrupt = self._without_series(needed)
+        return needed - self.abrupt
+
+    def _without_series(self, needed: set[int]) -> set[int]:
+        """The decisions at whose border a root has no series."""
+        nodes, singular = self.program.line.nodes, set()
+        for i in needed:
+            op, operands, _ = nodes[i]
+            if operands and (op in _WITHOUT_SERIES or OPERATIONS[op].steep):
+                singular |= {self._base(x) for x in operands}
+        if not singular:
+            return set()
+        out = {i for i in singular if nodes[i][0] in ("abs", "max", "min")}
+        of_selects = [nodes[i][1][0] for i in singular if nodes[i][0] == "select"]
+        out |= _below(self.program.line, of_selects)
+        for i in needed:
+            op, operands, _ = nodes[i]
+            if op in (*_COMPARISONS, "abs", "max", "min", "sign") and {self._base(x) for x in operands} & singular:
+                out.add(i)
+        return out
+
+    def _base(self, i: int) -> int:
+        """What a node is a multiple of."""
+        nodes = self.program.line.nodes
+        while True:
+            op, operands, _ = nodes[i]
+            if op == "neg":
+                i = operands[0]
+            elif op == "mul" and nodes[operands[0]][0] == "constant":
+                i = operands[1]
+            elif op == "mul" and nodes[operands[1]][0] == "constant":
+                i = operands[0]
+            else:
+                return i
+
+    def _decides(self, i: int) -> bool:
+        """Whether a node is a piecewise operation on floats."""
+        (op, operands, attribute), kinds = self.program.line.nodes[i], self.program.line.kinds
+        if op == "convert":
+            return kinds[operands[0]] == "float" and attribute not in ("float", "bool")
+        decides = op in (*_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "round", "rem")
+        return decides and all(kinds[x] == "float" for x in operands)
+
+    # ---- the new nodes ----
+
+    def _place(self, i: int) -> int:
+        """A node of the program in the new one."""
+        (op, operands, attribute), kind = self.program.line.nodes[i], self.program.line.kinds[i]
+        if op == "input":
+            return self.graph.input(attribute, kind)
+        if op == "constant":
+            return self.graph.constant(attribute, kind)
+        of = [self.places[x] for x in operands]
+        if i in self.decisive and self._decides(i):
+            decided = self._decided(op, of, attribute)
+            if decided is not None:
+                self._extremes[decided] = op, *of
+                return decided
+        if op in ("eq", "ne") and (sign := self._known_sign(*of)) is not None:
+            return self.graph.apply(op, sign, self.graph.constant(0.0, "float"))
+        if i in self.abrupt and self._decides(i):
+            self._note_border(op, of)
+        if op in _FEATURES and i in self.decisive and self._is_moving(of[0]):
+            self.features.setdefault(of[0], Feature(*_FEATURES[op]))
+        return self.graph.node(op, *of, attribute=attribute)
+
+    def _decided(self, op: str, of: list[int], attribute) -> int | None:
+        """The result of a piecewise operation by its piece; None where that does not change along the motion."""
+        f, number = self.graph.apply, lambda x: self.graph.constant(x, "float")
+        if op in (*_COMPARISONS, "max", "min"):
+            sign = self._sign(f("sub", *of))
+            if sign is None:
+                return None
+            if op in _COMPARISONS:
+                self._jumping.add(self._base_of(sign))
+                return f(op, sign, number(0.0))
+            return f("select", f("gt" if op == "max" else "lt", sign, number(0.0)), of[1], of[0])
+        if op in ("abs", "sign"):
+            sign = self._sign(of[0])
+            if op == "sign" and sign is not None:
+                self._jumping.add(self._base_of(sign))
+            return None if sign is None else sign if op == "sign" else f("mul", sign, of[0])
+        if op == "floor":
+            return self._piece(FLOOR, of[0])
+        if op == "ceil":
+            below = self._piece(FLOOR, f("neg", of[0]))
+            return None if below is None else f("neg", below)
+        if op == "round":
+            return self._piece(FLOOR, f("add", of[0], number(0.5)))
+        if op == "rem":
+            whole = self._piece(TRUNC, f("div", *of))
+            return None if whole is None else f("sub", of[0], f("mul", whole, of[1]))
+        whole = self._piece(TRUNC, of[0])
+        return None if whole is None else f("convert", whole, attribute=attribute)
+
+    def _base_of(self, piece: int) -> int:
+        return self.graph.term(piece)[1]
+
+    def _known_sign(self, a: int, b: int) -> int | None:
+        """What decides whether two numbers are equal, where that has a piece.
+
+        Of x and max(x, y), say, which are equal where x is larger: 0 there, and else 1.
+        """
+        f, zero = self.graph.apply, self.graph.constant(0.0, "float")
+        for x, z in ((a, b), (b, a)):
+            op, *of = self._extremes.get(z, ("",))
+            if op in ("max", "min") and x in of:
+                sign = self._sign(f("sub", *of))
+                assert sign is not None
+                larger = sign if x == of[0] else f("neg", sign)
+                return f("select", f("ge" if op == "max" else "le", larger, zero), self._one, zero)
+        if self.graph.kinds[a] != "float" or self.graph.kinds[b] != "float":
+            return None
+        return self._known.get((SIGN, self.graph.term(f("sub", a, b))[1]))
+
+    def _sign(self, u: int) -> int | None:
+        """The sign of a number, by the piece of what it is a multiple of."""
+        coefficient, base = self.graph.term(u)
+        piece = self._piece(SIGN, base)
+        return piece if piece is None or coefficient > 0 else self.graph.apply("neg", piece)
+
+    def _piece(self, kind: int, x: int) -> int | None:
+        """The input that says which piece a number is on; None where the number stays as it is along the motion."""
+        if not self._is_moving(x):
+            return None
+        if (kind, x) not in self._known:
+            self._known[kind, x] = self.graph.input(self.program.size + len(self.switches), "float")
+            self.switches.append(x)
+            self.kinds.append(kind)
+            self.pieces.append(self._known[kind, x])
+        return self._known[kind, x]
+
+    def _is_moving(self, x: int) -> bool:
+        """Whether a number changes along a piece of the motion."""
+        nodes, moves = self.graph.nodes, self._moves
+        for op, operands, attribute in nodes[len(moves) :]:
+            if op == "input":
+                moves.append(attribute < self.moving)
+            else:
+                moves.append(any(moves[i] for i in operands) and not (op != "constant" and OPERATIONS[op].is_step))
+        return moves[x]
+
+    def _note_border(self, op: str, of: list[int]) -> None:
+        """A border without a series beyond it, as a feature."""
+        u = None
+        if op in (*_COMPARISONS, "max", "min"):
+            u = self.graph.apply("sub", *of)
+        elif op in ("abs", "sign"):
+            u = of[0]
+        if u is not None and self._is_moving(u):
+            self.features.setdefault(self.graph.term(u)[1], Feature(UP_TO, 1.0))
+
+    # ---- the end ----
+
+    def finished(self) -> Borders:
+        """The parts of the result."""
+        program, features = self.program, self.features
+        line = StraightLine(
+            tuple(self.graph.nodes), tuple(self.graph.kinds), tuple(self.places[i] for i in program.line.outputs)
+        )
+        nested = not _below(line, self.switches).isdisjoint(self.pieces)
+        sliding, switches, arguments = self._sliding(line), list(self.switches), list(features)
+        linear = program.linear and self._linear(program.linear)
+        if sliding:
+            linear = None
+            line, places, shares = _with_sliding(line, self.size, program.size, self.switches, sliding)
+            switches, arguments = [places[i] for i in switches] + shares, [places[i] for i in arguments]
+        count = len(switches)
+        dtypes = (*program.dtypes, *[np.dtype(float)] * count)
+        pieced = Pieced(line, program.size + count, dtypes, linear, _LARGEST * program.budget)
+        kinds = (*self.kinds, *[SLIDE] * len(sliding))
+        return Borders(
+            pieced, tuple(switches), kinds, self._decide(count), _guards(kinds, sliding), nested,
+            tuple(arguments), tuple(features.values()),
+        )  # fmt: skip
+
+    def _linear(self, linear) -> _LinearSystem:
+        return _LinearSystem(
+            tuple(self.places[i] for i in linear.z),
+            {place: self.places[i] for place, i in linear.entries.items()},
+            tuple(self.places[i] for i in linear.right),
+            tuple(self.places[i] for i in linear.factors),
+            linear.solve,
+        )
+
+    def _sliding(self, line: StraightLine) -> list[int]:
+        """The pieces whose border a motion may slide along: they decide by a velocity, and something jumps with them.
+
+        None where they depend on other pieces, or where they are too many.
+        """
+        if not self.slides or len(line.nodes) > LARGEST_SLIDING:
+            return []
+        velocities, found = range(self.size, 2 * self.size), []
+        for j, kind in enumerate(self.kinds):
+            if kind == SIGN and self.pieces[j] in self._jumping:
+                below = _below(line, [self.switches[j]])
+                read = {line.nodes[i][2] for i in below if line.nodes[i][0] == "input"}
+                if not read.isdisjoint(velocities) and below.isdisjoint(self.pieces):
+                    found.append(j)
+        return found if len(found) <= MOST_SLIDING else []
+
+    def _decide(self, count: int) -> StraightLine:
+        """From the inputs, `count` pieces, and a flag for each that is to stay, to the pieces; a slide goes on."""
+        graph, first = Graph(2 * self.graph.budget), self.program.size
+        nodes: list[int] = []
+        for (op, operands, attribute), kind in zip(self.graph.nodes, self.graph.kinds, strict=True):
+            if op == "input" and attribute >= first:
+                j = attribute - first
+                raw = _raw(graph, self.kinds[j], nodes[self.switches[j]])
+                stays = graph.apply("gt", graph.input(first + count + j, "float"), graph.constant(0.5, "float"))
+                nodes.append(graph.apply("select", stays, raw, graph.input(attribute, "float")))
+            elif op == "input":
+                nodes.append(graph.input(attribute, kind))
+            elif op == "constant":
+                nodes.append(graph.constant(attribute, kind))
+            else:
+                nodes.append(graph.apply(op, *(nodes[i] for i in operands), attribute=attribute))
+        slides = [graph.input(first + j, "float") for j in range(len(self.pieces), count)]
+        return StraightLine(*eliminate_dead_code(graph, [nodes[i] for i in self.pieces] + slides))
+
+
+def _with_sliding(
+    line: StraightLine, n: int, first: int, switches: Sequence[int], sliding: Sequence[int]
+) -> tuple[StraightLine, list[int], list[int]]:
+    """A program whose motion slides along the borders of the pieces `sliding` where flags, its last inputs, are 1.
+
+    There the acceleration is a = a⁻ + Σ αₖ (aₖ⁺ − a⁻), with the shares αₖ that keep all switching numbers of sliding
+    pieces at zero: u̇ = 0. (Filippov; where several pieces slide, what one does to a is not to depend on the others.)
+    Returns the program, where the nodes of the line are in it, and the shares. `first` is the input of the first piece.
+    """
+    graph, kinds = Graph(200 * len(line.nodes) + 10_000), line.kinds
+    f, number, pieces, count = graph.apply, lambda x: graph.constant(x, "float"), len(switches), len(sliding)
+    given = [(node[2], kind) for node, kind in zip(line.nodes, kinds, strict=True) if node[0] == "input"]
+    inputs = {attribute: graph.input(attribute, kind) for attribute, kind in given}
+    slides = [f("gt", graph.input(first + pieces + k, "float"), number(0.5)) for k in range(count)]
+    zero, one = number(0.0), number(1.0)
+
+    def copy(upper: int | None) -> list[int]:
+        given = dict(inputs)
+        for k, j in enumerate(sliding):
+            side = one if k == upper else number(-1.0)
+            given[first + j] = f("select", slides[k], graph.input(first + j, "float"), side)
+        size = max(given) + 1
+        return copied(graph, line, [given.get(i, zero) for i in range(size)])
+
+    base = copy(None)
+    a = [base[i] for i in line.outputs]
+    more = [
+        [f("sub", places[i], x) for i, x in zip(line.outputs[:n], a, strict=False)]
+        for places in map(copy, range(count))
+    ]
+    rows, right = [], []
+    for k, j in enumerate(sliding):
+        slopes = gradient_in(graph, line, base, switches[j], range(2 * n + 1))
+        velocity = [graph.input(n + i, "float") for i in range(n)]
+        rate = _dot(graph, [*slopes[:n], *slopes[n : 2 * n]], [*velocity, *a[:n]])
+        rate = f("add", rate, slopes[2 * n])
+        right.append(f("select", slides[k], zero, f("neg", rate)))
+        row = []
+        for m in range(count):
+            both = f("and", slides[k], slides[m])
+            row.append(f("select", both, one if k == m else zero, _dot(graph, slopes[n : 2 * n], more[m])))
+        rows.append(row)
+    shares = _solved(graph, rows, right)
+    for i in range(n):
+        for k in range(count):
+            a[i] = f("add", a[i], f("select", slides[k], zero, f("mul", shares[k], more[k][i])))
+    return StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(a)), base, shares
+
+
+def _dot(graph: Graph, xs: Sequence[int], ys: Sequence[int]) -> int:
+    total = graph.constant(0.0, "float")
+    for x, y in zip(xs, ys, strict=True):
+        total = graph.apply("add", total, graph.apply("mul", x, y))
+    return total
+
+
+def _solved(graph: Graph, rows: list[list[int]], right: list[int]) -> list[int]:
+    """The solution of a few linear equations, by elimination; pieces that do not slide have rows of the identity."""
+    f, n = graph.apply, len(right)
+    for k in range(n):
+        for i in range(k + 1, n):
+            factor = f("div", rows[i][k], rows[k][k])
+            for j in range(k + 1, n):
+                rows[i][j] = f("sub", rows[i][j], f("mul", factor, rows[k][j]))
+            right[i] = f("sub", right[i], f("mul", factor, right[k]))
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            right[k] = f("sub", right[k], f("mul", rows[k][j], right[j]))
+        right[k] = f("div", right[k], rows[k][k])
+    return right
+
+
+def _raw(graph: Graph, kind: int, x: int) -> int:
+    """The piece that a number is on."""
+    if kind == SIGN:
+        return graph.apply("sign", x)
+    below = graph.apply("floor", x)
+    if kind == FLOOR:
+        return below
+    return graph.apply("select", graph.apply("lt", x, graph.constant(0.0, "float")), below, graph.apply("ceil", x))
+
+
+def _guards(kinds: Sequence[int], sliding: Sequence[int]) -> tuple[Guard, ...]:
+    """The guards of all pieces; piece number `sliding[k]` slides where the last but k-th piece is 1."""
+    guards: list[Guard] = []
+    first = len(kinds) - len(sliding)
+    of_piece: dict[int, int] = {}
+    for j, kind in enumerate(kinds):
+        k = of_piece[j] = len(guards)
+        if kind == SIGN:
+            slide = first + sliding.index(j) if j in sliding else -1
+            guards.append(Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, k, slide))
+        elif kind == SLIDE:
+            on = of_piece[sliding[j - first]]
+            guards.append(Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, k, on=on, goes_on=-1.0))
+            guards.append(Guard(j, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, k + 1, on=on, goes_on=1.0))
+        else:
+            floors = kind == FLOOR
+            below, above = (0.0, 0.0) if floors else (-1.0, 1.0)
+            guards.append(Guard(j, 0.0, 1.0, 1.0, 0.0, below, 0.0, 1.0, -1.0, k + 1))
+            guards.append(Guard(j, 0.0, -1.0, 1.0, 1.0 if floors else 0.0, 0.0, above, 1.0, 1.0, k))
+    return tuple(guards)
+
+
+def _below(line: StraightLine, roots: Sequence[int]) -> set[int]:
+    """The nodes that some nodes depend on, and these."""
+    seen: set[int] = set()
+    stack = list(roots)
+    while stack:
+        i = stack.pop()
+        if i not in seen:
+            seen.add(i)
+            stack.extend(line.nodes[i][1])
+    return seen
+
+
+def gradient(borders: Borders, by: Sequence[int]) -> StraightLine:
+    """The derivatives by the inputs `by` of Σ hⱼ uⱼ, with numbers hⱼ after the inputs of the program."""
+    program = borders.program
+    line = StraightLine(*live(program.line.nodes, program.line.kinds, borders.switches))
+    return pullback(line, program.dtypes, by, range(len(borders.switches)))
