@@ -103,7 +103,8 @@ def eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     diagonal = np.diagonal(matrix)
     if not np.array_equal(matrix, np.diag(diagonal)):
-        return tuple(np.linalg.eigh(matrix))
+        values, vectors = np.linalg.eigh(matrix)
+        return values, vectors
     order = np.argsort(diagonal)
     return diagonal[order], np.eye(len(matrix), dtype=matrix.dtype)[:, order]
 

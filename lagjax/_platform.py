@@ -5,7 +5,7 @@ import jax
 
 def default_platform() -> str:
     """`"cpu"`, `"gpu"` or another one: that of `jax.default_device` if there is one, else of JAX's default backend."""
-    device = jax.config.jax_default_device  # also the name of a platform
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]  # also a platform's name
     if device is None:
         return jax.default_backend()
     return device if isinstance(device, str) else device.platform

@@ -166,7 +166,7 @@ def _agree(scene: Scene) -> bool:
     for _, _, derivative, axes, outputs in _blocks(scene, exact):
         outside = np.delete(directions, list(axes), axis=1)
         rows = np.flatnonzero(~outside.any(axis=1))
-        chosen = np.ix_(rows, range(len(steps)), outputs)
+        chosen = np.ix_(rows, np.arange(len(steps)), np.asarray(outputs))
         both, ahead, behind = slopes(
             minus[chosen], m.here[list(outputs)], plus[chosen], steps[:, rows], place[rows], float(np.finfo(dtype).eps)
         )

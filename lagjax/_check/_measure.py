@@ -64,7 +64,8 @@ class Scene(NamedTuple):
         if self.measured.sides is not None:
             return self.measured.sides
         minus, plus = self.beside(np.eye(2 * self.layout.size + 1), self.steps)
-        one, here = columns_of(*(np.asarray(x)[None] for x in self.state[:2]), *self._others), self.measured
+        q, qdot, *_ = self.state
+        one, here = columns_of(np.asarray(q)[None], np.asarray(qdot)[None], *self._others), self.measured
         noise = self.derivation.program(*_COMPARED).round_off_many(one)[:, 0]
         lost = {name: value[0] for name, value in self.derivation.round_off(_DERIVED, one).items()}
         drift = {

@@ -146,7 +146,7 @@ def _vjp_over_steps(
             row = rows[long[k : k + 1]]
             again = functools.partial(probe, rows=row, members=np.zeros(1, int))
             better = _over_divided(
-                flow, steps, members[long[k]], params[row[0]], tolerances, excess[k : k + 1], again
+                flow, steps, int(members[long[k]]), params[row[0]], tolerances, excess[k : k + 1], again
             )  # fmt: skip
             if better is None:
                 y_ct[row], params_ct[row] = np.nan, np.nan

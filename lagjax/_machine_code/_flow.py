@@ -171,6 +171,7 @@ class Flow:
         result, event = _RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:
+            assert done.complete is not None and done.table is not None
             counts = np.where(done.complete, done.steps, 0)
             first = np.cumsum(counts) - counts
             ticket = store.keep(Steps(self.kernel, _native.order_for(rtol), done.table, first, counts, done.complete))

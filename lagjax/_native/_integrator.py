@@ -141,28 +141,29 @@ class Integrator:
         """
         frame = self.motion.function("run", POINTER, INTEGER, result=INTEGER, public=True)
         code, (idle, rounds) = frame.code, frame.arguments
-        order = frame.job("order")
+        order, borders = frame.job("order"), self.borders
+        crossings = borders if self.motion.pieces else None  # features alone have no pieces
         with self.motion.rounds(frame, rounds):
-            if self.motion.pieces:
-                frame.call(self.borders.decide)
+            if crossings is not None:
+                frame.call(crossings.decide)
             frame.call(self.motion.coefficients, order)
             self.step.choose(frame, order)
-            if self.borders is not None:
-                frame.call(self.borders.stop, order)
+            if borders is not None:
+                frame.call(borders.stop, order)
             self.step.halve_until_sound(frame, order)
             if self.projector is not None:
                 _rank_drops.return_or_remember(frame, self.motion.form, self.motion.states, self.guards)
             if self.events is not None:
                 self.events.stop(frame, order)
-            if self.motion.pieces:
-                self.borders.settle(frame)
+            if crossings is not None:
+                crossings.settle(frame)
             with code.only_if(frame.job("room") > 0), code.loop(self.motion.width) as lane:
                 self.output.record(frame, frame.lane(lane))
             after, rest = self.step.end_time(frame)
             self.output.write_due(frame, order, after)
             self.step.advance(frame, after, rest)
-            if self.motion.pieces:
-                frame.call(self.borders.cross)
+            if crossings is not None:
+                frame.call(crossings.cross)
             if self.projector is not None:
                 _rank_drops.shorten(frame)
             self._end_or_go_on(frame, idle)

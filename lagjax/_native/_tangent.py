@@ -70,7 +70,7 @@ class Tangent:
         self.motion = Motion("tangent", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces)
         self.n, self.states, self.series, self.lanes, self.numbers = n, states, series, lanes, self.motion.parameters
         self.saltation = borders and Saltation(self.motion, borders, levels or (n,))
-        if self.saltation is not None:
+        if borders is not None and self.saltation is not None:
             for name, count in self.saltation.fields_along().items():
                 self.motion.layout.extend(name, count)
             self.at_border = self.saltation.note_begin(), self.saltation.note_end(GuardTable(self.motion, borders))
@@ -494,6 +494,7 @@ class Tangent:
 
     def _projected(self) -> Code:
         """`(group)`: the tangents of the state on the constraints, from those of the end of the series."""
+        assert self.projection is not None
         frame, code, _ = self._step("projected")
         moved = self.numbers_of(frame, "moved", self.states, in_place=True)
         t = self.number_of(frame, "t") + self.number_of(frame, "h")

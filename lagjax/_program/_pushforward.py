@@ -77,7 +77,9 @@ def _along(graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[i
         if not moving or line.kinds[k] != "float":
             continue
         if op == "div" and operands[1] in tangents:
-            tangent = _of_quotient(graph, nodes[k], nodes[operands[1]], *(tangents.get(i) for i in operands))
+            tangent = _of_quotient(
+                graph, nodes[k], nodes[operands[1]], tangents.get(operands[0]), tangents[operands[1]]
+            )
         else:
             tangent = None
             for i, rule in zip(operands, OPERATIONS[op].transpose(), strict=False):  # a step has no derivative at all
@@ -89,7 +91,7 @@ def _along(graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[i
     return tangents
 
 
-def _of_quotient(graph: Graph, w: int, v: int, of_u: int | None, of_v: int | None) -> int:
+def _of_quotient(graph: Graph, w: int, v: int, of_u: int | None, of_v: int) -> int:
     """(u′ − w v′)/v: one division, where the two rules have two."""
     part = graph.apply("mul", w, of_v)
     return graph.apply("div", graph.apply("neg", part) if of_u is None else graph.apply("sub", of_u, part), v)
