@@ -18,10 +18,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "negative number, a branch of `where` that is not taken."
     )
     acceleration_discontinuous = (
-        "The acceleration jumps there, and no step fits over it or the budget of steps was spent on it: a kink of the "
-        "Lagrangian such as abs(q) at zero, dry friction at rest, a branch of `where` whose sides do not meet. Make "
-        "the two sides modes of simulate_hybrid, or round the kink off over a width that the motion can resolve. A "
-        "jump that is merely crossed costs some forty steps: then raise max_steps or loosen rtol."
+        "The acceleration jumps there, and no step fits over it or the budget of steps was spent on it: a corner "
+        "that the motion rests on, such as abs(q) at zero, or, with a solver of diffrax, dry friction at rest. Make "
+        "its two sides modes of simulate_hybrid, or round it off over a width that the motion can resolve. Machine "
+        "code ends a step at a jump that is merely crossed; diffrax takes some forty steps for it: then raise "
+        "max_steps or loosen rtol."
     )
     max_transitions_reached = "The budget of transitions was spent. Raise max_transitions, or end ts earlier."
     zeno = (

@@ -77,8 +77,8 @@ def simulate(
       changes sign, a Boolean one after the step on which it becomes true. `diffrax.Event` around such functions sets
       the direction and the root finder. Where the motion starts on the zero itself, give a direction.
     - `adjoint`: how derivatives are taken. By default machine code goes back over its own steps in reverse mode
-      (`jax.grad`, `jax.vjp`), at the cost of four or five motions however many parameters there are, and integrates
-      sensitivities along with the motion in forward mode (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist.
+      (`jax.grad`, `jax.vjp`), at the cost of a few motions however many parameters there are, and forward over them
+      along all directions together (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist.
       What diffrax integrates is differentiated over the recorded steps, in reverse mode only. Pass
       `diffrax.ForwardMode()` for forward mode there, or any other diffrax adjoint. With an event the default is
       `diffrax.RecursiveCheckpointAdjoint()`.

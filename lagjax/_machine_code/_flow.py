@@ -120,7 +120,12 @@ class Flow:
 
     @functools.cached_property
     def anywhere(self) -> Program:
-        """The program that holds for any mass matrix, if there is one, else the flow's own."""
+        """The program that holds for any mass matrix, if there is one, else the flow's own.
+
+        That is enough where there are no constraints: all pivots are positive if and only if the mass matrix is.
+        """
+        if self.projection is None:
+            return self.program
         try:
             return self.program.complete
         except Unlowerable:
@@ -209,11 +214,12 @@ class Flow:
     def _second_chance(self, result, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
         """The members to run once more, by which flow and with which tolerances.
 
-        A program that assumes a regular mass matrix gives way to one that does not. And where constraints become
+        A program that assumes a regular mass matrix gives way to one that does not, which is long where a recursion in
+        L made it short: without constraints, only if that matrix seems singular. And where constraints become
         dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇, or allow no step from
         there. The kernel takes such steps again; where that does not help, steps of other sizes all along may.
         """
-        given_up = np.isin(result, _GIVEN_UP)
+        given_up = np.isin(result, _GIVEN_UP if self.projection is not None else _SINGULAR)
         if given_up.any() and (general := self.general()) is not None:
             return given_up, general, tolerances
         stuck = result == _NOT_PROJECTED
