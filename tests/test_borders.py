@@ -376,3 +376,26 @@ def test_pulses_over_a_hundred_thousand_periods():
     v = (1 - np.exp(-0.002)) * np.exp(-0.008) / (1 - np.exp(-0.01))
     np.testing.assert_allclose(run.qdot[1:], v, atol=1e-10)
     assert run.stats["num_rejected_steps"] == 0
+
+
+# ---- borders at one instant ------------------------------------------------------------------------------------------
+
+AT_ONE_INSTANT = {
+    "a sawtooth of both signs": lambda q, qdot: -jnp.sin(jnp.mod(q, 2.0)),
+    "a sawtooth backward": lambda q, qdot: 2 * jnp.mod(q, -0.7),
+    "stairs on a sawtooth": lambda q, qdot: -jnp.floor(jnp.mod(4 * q, 3.0)) - 0.1,
+    "stiff contact by Hertz": lambda q, qdot: 40.0 * jnp.maximum(-q, 0.0) ** 1.5 - 1.0,
+}
+
+
+@pytest.mark.parametrize("name", AT_ONE_INSTANT)
+def test_derivatives_where_several_borders_lie_at_one_instant(name):
+    scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=AT_ONE_INSTANT[name])
+
+    def last(q0):
+        return lagjax.simulate(scene, q0, -0.4, jnp.array([0.0, 3.0]), rtol=1e-11).q[-1]
+
+    h = 1e-5
+    difference = float(last(0.8 + h) - last(0.8 - h)) / (2 * h)
+    for slope in (jax.grad(last)(0.8), jax.jvp(last, (0.8,), (1.0,))[1]):
+        assert float(slope) == pytest.approx(difference, rel=1e-6)

@@ -13,6 +13,7 @@ does not decide on which side the next step begins.
 from lagjax._native._constants import (
     ABRUPT,
     ARGUMENT,
+    AT_ONCE,
     DISCONTINUOUS,
     FAINT,
     GROWTH,
@@ -162,7 +163,9 @@ class Borders:
         leaves = undecided & code.compare("!=", leads, 0.0)
         root = code.select(undecided, code.select(leaves, frame.constant(0.0), 2.0), self._place(frame))
         is_root = leaves | (~undecided & (frame["is_root"] > 0.0) & (frame["root"] < 1.0))
-        sooner = (root < frame["nearest"]) & code.compare("!=", h, 0.0) & ~idle
+        # Of two at one instant that of the piece on which the other one depends, which comes first, is crossed.
+        apart = code.select(frame["crossed"] > 0.0, 1.0 - AT_ONCE, frame.constant(1.0)) if self.borders.nested else 1.0
+        sooner = (root < frame["nearest"] * apart) & code.compare("!=", h, 0.0) & ~idle
         number = code.select(is_root, code.lanes_of(code.as_double(g + 1)), 0.0)
         frame["nearest"] = code.select(sooner, root, frame["nearest"])
         frame["crossed"] = code.select(sooner, number, frame["crossed"])

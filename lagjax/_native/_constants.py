@@ -100,6 +100,8 @@ ROOT_NOISE = 16
 # Moves towards a first root. Five to ten are usual; a double root to rounding takes some fifty. What is not found then
 # ends the step where it has been looked, which costs one step.
 MOST_MOVES = 128
+# Borders of several guards lie at one instant where their roots differ by so little: rounding of both, with room.
+AT_ONCE = 2.0**-36
 # Borders of one guard that are crossed at one instant, before the motion is said not to get on.
 MOST_CROSSINGS = 4
 # A switching number is known along a step where its last terms are so many tolerances of its size, at most. They are

@@ -1,7 +1,7 @@
 """What a program decides on: its piecewise operations, each by a number whose series tells when the piece changes.
 
     comparisons, abs, max, min, sign    the sign of a switching number u: −1, 0 or 1
-    floor, ceil, round                  the whole number below a switching number x
+    floor, ceil, round, mod             the whole number below a switching number x
     rem, conversion to integers         the whole number between x and zero
 
 A *piece* is what was decided: one of these numbers, constant along a step. Here a program becomes one that takes its
@@ -17,7 +17,7 @@ a border is no piece but a feature, and a step that is to pass it begins next to
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -147,9 +147,11 @@ class _Rewriting:
         self._moves: list[bool] = []
         self.features: dict[int, Feature] = {}
         self.abrupt: set[int] = set()
+        self.moduli = _moduli(program.line)
         self.decisive = self._decisive()
         self.places: list[int] = []
-        if any(self._decides(i) or program.line.nodes[i][0] in _FEATURES for i in self.decisive | self.abrupt):
+        relevant = self.decisive | self.abrupt
+        if any(i in self.moduli or self._decides(i) or program.line.nodes[i][0] in _FEATURES for i in relevant):
             for i in range(len(program.line.nodes)):
                 self.places.append(self._place(i))
 
@@ -159,7 +161,7 @@ class _Rewriting:
         """The nodes that q̈ depends on, without those of the elimination of a linear system."""
         linear, line = self.program.linear, self.program.line
         roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
-        needed = _below(line, roots)
+        needed = _below(line, roots, self.moduli)
         self.abrupt = self._without_series(needed)
         return needed - self.abrupt
 
@@ -213,7 +215,9 @@ class _Rewriting:
         if op == "constant":
             return self.graph.constant(attribute, kind)
         of = [self.places[x] for x in operands]
-        if i in self.decisive and self._decides(i):
+        if i in self.decisive and (i in self.moduli or self._decides(i)):
+            if i in self.moduli:
+                op, of = "mod", [self.places[x] for x in self.moduli[i]]
             decided = self._decided(op, of, attribute)
             if decided is not None:
                 self._extremes[decided] = op, *of
@@ -249,6 +253,9 @@ class _Rewriting:
             return None if below is None else f("neg", below)
         if op == "round":
             return self._piece(FLOOR, f("add", of[0], number(0.5)))
+        if op == "mod":
+            whole = self._piece(FLOOR, f("div", *of))
+            return None if whole is None else f("sub", of[0], f("mul", whole, of[1]))
         if op == "rem":
             whole = self._piece(TRUNC, f("div", *of))
             return None if whole is None else f("sub", of[0], f("mul", whole, of[1]))
@@ -485,16 +492,53 @@ def _guards(kinds: Sequence[int], sliding: Sequence[int]) -> tuple[Guard, ...]:
     return tuple(guards)
 
 
-def _below(line: StraightLine, roots: Sequence[int]) -> set[int]:
-    """The nodes that some nodes depend on, and these."""
+def _below(line: StraightLine, roots: Sequence[int], instead: Mapping[int, Sequence[int]] | None = None) -> set[int]:
+    """The nodes that some nodes depend on, and these. Some read `instead` other nodes than their operands."""
     seen: set[int] = set()
-    stack = list(roots)
+    stack, instead = list(roots), instead or {}
     while stack:
         i = stack.pop()
         if i not in seen:
             seen.add(i)
-            stack.extend(line.nodes[i][1])
+            stack.extend(instead[i] if i in instead else line.nodes[i][1])
     return seen
+
+
+def _moduli(line: StraightLine) -> dict[int, tuple[int, int]]:
+    """The nodes that are x mod y, with the sign of y, and x and y: one border, where rem and its sign have three.
+
+    NumPy and JAX write them as r = rem(x, y), and r + y in its place where r ≠ 0 and (r < 0) ≠ (y < 0).
+    """
+    nodes, found = line.nodes, {}
+
+    def is_sign_apart(i: int, r: int, y: int) -> bool:
+        """Whether node i says that (r < 0) ≠ (y < 0)."""
+        op, operands, _ = nodes[i]
+        positive = nodes[y][2] > 0 if nodes[y][0] == "constant" else None
+        if op == "lt":
+            return operands[0] == r and positive is True
+        below = [x for x in operands if nodes[x][0] == "lt" and nodes[x][1][0] == r]
+        others = [x for x in operands if x not in below]
+        if op != "ne" or len(below) != 1 or len(others) != 1:
+            return False
+        other = nodes[others[0]]
+        if other[0] == "constant":
+            return positive is not None and bool(other[2]) != positive
+        return other[0] == "lt" and other[1][0] == y
+
+    for i, (op, operands, _) in enumerate(nodes):
+        if op != "select" or nodes[operands[0]][0] != "and":
+            continue
+        condition, r, total = operands
+        if nodes[r][0] != "rem" or nodes[total][0] != "add" or line.kinds[r] != "float":
+            continue
+        x, y = nodes[r][1]
+        parts = nodes[condition][1]
+        not_zero = [p for p in parts if nodes[p][0] == "ne" and r in nodes[p][1]]
+        apart = [p for p in parts if is_sign_apart(p, r, y)]
+        if set(nodes[total][1]) == {r, y} and not_zero and apart:
+            found[i] = x, y
+    return found
 
 
 def gradient(borders: Borders, by: Sequence[int]) -> StraightLine:

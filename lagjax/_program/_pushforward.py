@@ -11,7 +11,7 @@ from lagjax._program._graph import Graph
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, replace_by_inputs, sink_negations
 from lagjax._program._series import StraightLine
-from lagjax._program._transpose import copied
+from lagjax._program._transpose import copied, zero_where_zero
 
 _LARGEST = 100  # operations that one may become: a bound for errors, three are usual
 
@@ -85,6 +85,7 @@ def _along(graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[i
             for i, rule in zip(operands, OPERATIONS[op].transpose(), strict=False):  # a step has no derivative at all
                 if rule is not None and i in tangents:
                     part = rule(graph.apply, number, tangents[i], nodes[k], *(nodes[j] for j in operands))
+                    part = zero_where_zero(graph, line, k, tangents[i], part)
                     tangent = part if tangent is None else graph.apply("add", tangent, part)
         if tangent is not None and graph.value(tangent) != 0:
             tangents[k] = tangent

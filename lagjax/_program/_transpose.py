@@ -81,11 +81,22 @@ def _back(graph: Graph, line: StraightLine, nodes: list[int], cotangents: list, 
             continue
         for i, rule in zip(operands, OPERATIONS[op].transpose(), strict=False):  # a step has no derivative at all
             if rule is not None and varied[i]:
-                part = rule(
-                    graph.apply, lambda x: graph.constant(x, "float"), g, nodes[k], *(nodes[j] for j in operands)
-                )
-                _add(graph, cotangents, i, part)
+                part = rule(graph.apply, number, g, nodes[k], *(nodes[j] for j in operands))
+                _add(graph, cotangents, i, zero_where_zero(graph, line, k, g, part))
     return [results[i] if i in results else graph.constant(0.0, "float") for i in by]
+
+
+def zero_where_zero(graph: Graph, line: StraightLine, k: int, g: int, part: int) -> int:
+    """What node k passes on of `g`: 0 of 0, also where its slope is infinite, as that of u**0.5 at 0.
+
+    There a program has a number in the place of the slope (`_recurrences.finite`), so that g is 0.
+    """
+    op, operands, _ = line.nodes[k]
+    by_root = op == "div" and (of := line.nodes[operands[1]][0]) not in ("input", "constant") and OPERATIONS[of].steep
+    if not (OPERATIONS[op].steep or by_root):
+        return part
+    zero = graph.constant(0.0, "float")
+    return graph.apply("select", graph.apply("eq", g, zero), part, zero)
 
 
 def _add(graph: Graph, cotangents: list, i: int, part: int) -> None:
