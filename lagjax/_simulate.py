@@ -62,7 +62,7 @@ def simulate(
     - `rtol`, `atol`: local error per step, |error| ≤ atol + rtol·|y|, in every component of the state (with diffrax, in
       root mean square over them). By default rtol = 1e-9 in float64 and 1e-5 in float32, and atol = rtol/1000. `atol`
       is in the units of the state. In float32 times, parameters and all arithmetic are float32 too; the ready scenes
-      then come out to 3e-4 of the size of their motion, which is a few periods long. `Trajectory.health` tells more.
+      then come out to 4e-4 of the size of their motion, which is a few periods long. `Trajectory.health` tells more.
 
     **Rarer ones**
 

@@ -87,7 +87,15 @@ def test_one_trajectory_after_the_other():
 
 
 OPTIONS = SimpleNamespace(
-    batch=4, links=2, duration=0.2, repeats=1, budget=1e3, tolerances=[1e-6, 1e-10], cases=["wedge"], contenders=None
+    batch=4,
+    links=2,
+    duration=0.2,
+    repeats=1,
+    budget=1e3,
+    tolerances=[1e-6, 1e-10],
+    cases=["wedge"],
+    contenders=None,
+    device="cpu",
 )
 
 

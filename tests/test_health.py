@@ -455,4 +455,4 @@ def test_float32_end_to_end_is_as_accurate_as_stated(make):
     ts, start = np.asarray(trajectory.ts, float), jax.tree.map(lambda x: jnp.asarray(x, float), (q0, qdot0, params))
     exact = jax.jit(jax.vmap(lambda t: scene.exact(t, *start)))(ts)
     for x, truth in zip(jax.tree.leaves((trajectory.q, trajectory.qdot)), jax.tree.leaves(exact), strict=True):
-        assert np.abs(x - truth).max() <= 3e-4 * (np.abs(truth).max() + 1e-3)
+        assert np.abs(x - truth).max() <= 4e-4 * (np.abs(truth).max() + 1e-3)

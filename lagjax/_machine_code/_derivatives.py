@@ -259,15 +259,23 @@ def _steps_of(
 def _over_divided(flow: Flow, steps: Steps, member: int, params, tolerances, excess, sweep: Callable) -> Steps | None:
     """`sweep(steps)` over the steps of a member in ever smaller parts: the steps that suit its tangents, or None.
 
-    `excess` (1,), and what `sweep` returns, is how large the last terms of the series are, in units of the limit.
+    `excess` (1,), and what `sweep` returns, is how large the last terms of the series are, in units of the limit. Those
+    of a motion with constraints that do not fall as its steps do are rounding, as beside a dead centre: its own steps
+    are right.
     """
     parts = 1
     for _ in range(TRIES):
+        before = float(excess[0])
         parts *= math.ceil(min(MOST_PARTS, 1.1 * float(excess[0]) ** (1 / (steps.order - 1))))
         divided = _divided(flow, steps, member, params, tolerances, parts)
         excess = sweep(divided)
         if not excess > 1.0:
             return divided
+        if flow.projection is not None and float(excess[0]) > 0.5 * before:
+            one = slice(member, member + 1)
+            own = steps._replace(first=steps.first[one], counts=steps.counts[one], complete=steps.complete[one])
+            sweep(own)
+            return own
     return None
 
 
