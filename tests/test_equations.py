@@ -157,6 +157,7 @@ def test_explain_prints():
     assert large.path == "scalar" and large.cyclic == large.coordinates and "(68 more)" in str(large)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error::numpy.exceptions.ComplexWarning")
 @pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
 def test_parameters_may_be_complex():

@@ -80,6 +80,7 @@ def members(count):
     return np.concatenate([[0.0, 1.0], rng.uniform(0, 1, count - 2)]), rng.uniform(0.1, 0.8, count)
 
 
+@pytest.mark.slow
 def test_rolling_cylinder_leaves_where_it_must_and_then_flies():
     alpha, theta = members(1000)
     runs = jax.jit(jax.vmap(rolling))(alpha, theta)

@@ -46,6 +46,7 @@ def test_a_chain_is_solved_as_by_dense_algebra(augmented):
     assert np.abs(found - expected).max() < 4 * n * np.finfo(float).eps * np.linalg.cond(full) * np.abs(expected).max()
 
 
+@pytest.mark.slow
 def test_constraints_that_depend_on_others_leave_the_solution():
     # Wherever the dependent rows stand: between the others they are eliminated between the others.
     rng = np.random.default_rng(1)
@@ -63,6 +64,7 @@ def test_constraints_that_depend_on_others_leave_the_solution():
     assert solved(matrix, more, b, right, regular_only=True)[2]
 
 
+@pytest.mark.slow
 def test_coordinates_without_mass_are_held_by_constraints_or_reported():
     rng = np.random.default_rng(2)
     matrix, rows = chain(4, rng)

@@ -68,6 +68,7 @@ def in_a_process(function, *arguments):
         return pool.submit(function, *arguments).result()
 
 
+@pytest.mark.slow
 def test_a_gradient_that_llvm_must_survive():
     found, expected = in_a_process(slopes, "bodies in the plane", 5)
     np.testing.assert_allclose(found, expected, rtol=1e-9)

@@ -88,6 +88,7 @@ def test_a_hundred_parameters():
     np.testing.assert_allclose(along, jax.grad(jax.grad(of_mean))(1.7) * jnp.mean(direction) / 100, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_second_derivatives_on_a_constraint_are_those_of_the_angle():
     # By gravity and speed: a family of starts that stay on the circle.
     bead = lambda q, v, params: 0.5 * jnp.sum(v**2) - params * q[1]
