@@ -37,6 +37,7 @@ from lagjax._program import (
     operations_that_fit,
     without_collections,
 )
+from lagjax._program._borders import Borders, borders
 from lagjax._program._scalars import applied, joined, spread, stacked
 from lagjax._quantities import OwnRules, quantities
 from lagjax._recursion import Recursion, RecursiveElimination
@@ -303,6 +304,11 @@ class Derivation:
         """The coordinates whose momenta are constant: neither L, nor a force, nor a constraint acts on them."""
         untouched = self.absent("generalized_force") & self.absent("jacobian").all(axis=0)
         return tuple(np.flatnonzero(untouched).tolist())
+
+    @_lowered_once
+    def borders(self) -> Borders | None:
+        """What the accelerations decide on along a motion, and their narrow features; None where there are none."""
+        return borders(self.acceleration, self.layout.size)
 
     @property
     def traced_operations(self) -> int:

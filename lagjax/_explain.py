@@ -10,12 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from lagjax._blame import pieces_of as pieces_in
 from lagjax._diffrax._equations import ArrayEquations, form_of
 from lagjax._engine import choose
 from lagjax._linear import dependent_rows
-from lagjax._native import is_large
+from lagjax._native import is_large, pieces_of
 from lagjax._problem import Problem
 from lagjax._program import Program, Unlowerable
+from lagjax._program._borders import FLOOR, SIGN, TRUNC
+
+_PIECES = {SIGN: "the sign", FLOOR: "the whole part", TRUNC: "the whole part"}
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,10 @@ class Explanation:
       the coordinates, velocities (`d` before the name) and `t` that it reads.
     - `velocity_terms`: whether forces depend on the velocities; `explicit_time`: whether anything depends on `t`.
     - `energy_conserved`: whether h = p·q̇ − L is constant along every motion.
+    - `borders`: where the accelerations change their piece, as the sign or the whole part of a number and what that
+      reads; on the array path as the operation and its line. `borders_located`: whether steps end exactly there. Else
+      they go across, and derivatives do not see a jump. `narrow`: functions that are flat until their argument comes
+      near (exp, tanh, …), which is watched along every step of machine code.
     - `operations`: scalar operations of one acceleration (with constraints in machine code, where M is regular);
       `traced_operations`: of its derivatives before reduction.
     - `constraints`: the name of every number that is to be zero; `dependent_constraints`: those that, at the state
@@ -49,6 +57,9 @@ class Explanation:
     velocity_terms: bool | None = None
     explicit_time: bool | None = None
     energy_conserved: bool | None = None
+    borders: tuple[str, ...] | None = None
+    borders_located: bool | None = None
+    narrow: tuple[str, ...] | None = None
     operations: int | None = None
     traced_operations: int | None = None
     constraints: tuple[str, ...] = ()
@@ -76,6 +87,11 @@ class Explanation:
                 ("explicit time", "yes" if self.explicit_time else "no"),
                 ("energy conserved", "yes" if self.energy_conserved else "no"),
             ]
+        if self.borders:
+            how = "steps end there" if self.borders_located else "not located: steps of diffrax go across"
+            rows.append(("borders", f"{_counted(self.borders)}; {how}"))
+        if self.narrow:
+            rows.append(("narrow features", _counted(self.narrow)))
         if self.constraints:
             rows.append(("constraints", f"{len(self.constraints)}: {_listed(self.constraints)}"))
         for name, others in (self.dependent_constraints or {}).items():
@@ -97,7 +113,7 @@ def explain(problem: Problem) -> Explanation:
     try:
         matrix, force = derivation.program("mass_matrix"), derivation.reads("force")
     except Unlowerable:
-        return Explanation(**known)
+        return Explanation(**known, **_borders_in_lines(problem))
 
     inputs = (*names, *(f"d{name}" for name in names), "t")
 
@@ -107,6 +123,7 @@ def explain(problem: Problem) -> Explanation:
     mass, lagrangian = named("mass_matrix"), named("lagrangian")
     return Explanation(
         **known,
+        **_borders(problem, inputs),
         cyclic=tuple(name for name in names if name not in lagrangian),
         mass_matrix=f"{'varying' if mass else 'constant'}, {_pattern(matrix, n)}",
         mass_matrix_depends_on=tuple(name for name in inputs if name in mass),
@@ -133,6 +150,42 @@ def _engine(problem: Problem) -> dict[str, Any]:
     operations, of_projection = (None if program is None else program.operations for program in programs)
     costs = {"operations": operations, "projection_operations": of_projection}
     return {"solver": solver, "path": "scalar", "reason": reason, **costs}
+
+
+def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
+    """The borders and the narrow features of the accelerations, each by what it is and which inputs it reads."""
+    derivation, n = problem.derivation, problem.derivation.layout.size
+    try:
+        borders = derivation.borders
+    except Unlowerable:
+        return _borders_in_lines(problem)
+    if borders is None:
+        return {"borders": (), "narrow": (), "borders_located": True}
+
+    def read_by(node: int) -> str:
+        return _listed(tuple(inputs[i] for i in sorted(borders.read_by(node)) if i < len(inputs)))
+
+    kinds = zip(borders.switches, borders.kinds, strict=True)
+    return {
+        "borders": tuple(f"{_PIECES[kind]} of {read_by(node)}" for node, kind in kinds if kind in _PIECES),
+        "narrow": tuple(f"a function of {read_by(node)}" for node in borders.arguments),
+        "borders_located": choose(problem).refusal is None and pieces_of(derivation.acceleration, n, True) is not None,
+    }
+
+
+def _borders_in_lines(problem: Problem) -> dict[str, Any]:
+    """The piecewise operations of the user's functions, by their lines."""
+    motion, n = problem.derivation.motion, problem.derivation.layout.size
+    functions = [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
+    state = problem.y0[:n], problem.y0[n:], problem.ts[0], problem.numbers
+    pieces = [piece for function in functions for piece in pieces_in(function, *state)]
+    names = tuple(f"{name}{place}" for name, place, size in pieces for _ in range(size))
+    return {"borders": names, "borders_located": not names}
+
+
+def _counted(names: tuple[str, ...]) -> str:
+    """How many there are, and each once."""
+    return f"{len(names)}: {_listed(tuple(dict.fromkeys(names)))}"
 
 
 def _pattern(parts: Program, n: int) -> str:

@@ -150,6 +150,23 @@ def test_explain_reads_the_facts():
         assert facts.path == "scalar" and facts.operations < facts.traced_operations
 
 
+def test_explain_names_borders_and_says_whether_they_are_located():
+    def forces(q, v, t):
+        return jnp.where(t > 5, 1.0, 0.0) - 0.2 * jnp.sign(v) + jnp.floor(q) * jnp.exp(-((t / 0.01) ** 2))
+
+    system = lagjax.System(lambda q, v: 0.5 * v**2, forces=forces)
+    facts = system.explain(0.0, 1.0)
+    assert sorted(facts.borders) == ["the sign of dq", "the sign of t", "the whole part of q"]
+    assert facts.narrow == ("a function of t",) and facts.borders_located and "steps end there" in str(facts)
+    smooth = explained(scenes.double_pendulum)
+    assert smooth.borders == () and smooth.narrow == () and smooth.borders_located
+    assert "borders" not in str(smooth)
+    single = system.explain(np.float32(0.0), np.float32(1.0))  # in diffrax, by a scalar program
+    assert single.borders == facts.borders and not single.borders_located and "not located" in str(single)
+    arrays = lagjax.System(lambda q, v: 0.5 * v**2, forces=forces, path="array").explain(0.0, 1.0)
+    assert not arrays.borders_located
+
+
 def test_explain_prints():
     text = str(explained(scenes.double_pendulum))
     assert "varying, dense; depends on q[0], q[1]" in text and "path              scalar" in text

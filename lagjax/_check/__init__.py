@@ -3,9 +3,8 @@
 Everything is computed once, by the programs of the scene: values, derivatives, their finite differences, the mass
 matrix at states nearby, the linearised motion. What follows is NumPy and sentences, each file for one question:
 
-    Scene.of ─► _derivatives ─► _constraints ─► _mass ─► _borders ─► _stiffness ─► Findings
+    Scene.of ─► _derivatives ─► _constraints ─► _mass ─► _borders ─► _ahead ─► _stiffness ─► Findings
     _measure    _differences
-                _operations: which line of the user's code is to blame
 """
 
 from typing import Any
@@ -17,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from lagjax._check import _borders, _constraints, _derivatives, _mass, _stiffness
+from lagjax._check import _ahead, _borders, _constraints, _derivatives, _mass, _stiffness
 from lagjax._check._findings import Finding, Findings, listed
 from lagjax._check._measure import Scene
 from lagjax._layout import Layout
@@ -50,7 +49,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     - warning: `creates_energy` (a dissipation function of the wrong sign), `indefinite_mass_matrix`,
       `near_coordinate_singularity`, `velocity_constraint_not_affine`, `discontinuity`.
     - advice: `single_precision`, `integer_parameter`, `small_state`, `ill_conditioned`, `dependent_constraints`,
-      `stiff`, `explicit_time`.
+      `stiff`, `explicit_time`, `border` and `narrow_feature` (what lies ahead: a force switched on at t = 5).
 
     **Raises** `TypeError`, `ValueError` for a state or for functions that no motion can begin with, in the words of
     `simulate`; `ValueError` inside `jit`, where there are no numbers.
@@ -82,7 +81,9 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     reported += _constraints.findings(scene)
     reported += _mass.findings(scene)
     if not any(finding.level == "error" for finding in reported):
-        reported += [*_acceleration(scene), *_borders.findings(scene), *_stiffness.findings(scene)]
+        nearby = _borders.findings(scene)
+        ahead = [finding for finding in _ahead.findings(scene) if finding.where not in [f.where for f in nearby]]
+        reported += [*_acceleration(scene), *nearby, *ahead, *_stiffness.findings(scene)]
     return Findings.of([*reported, *_time(scene)])
 
 

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._blame import borders, pieces_of
 from lagjax._check._findings import Finding
 from lagjax._check._measure import Scene
-from lagjax._check._operations import borders, pieces_of
 from lagjax._derivation import numbers_of
 from lagjax._program import Unlowerable, lower
 

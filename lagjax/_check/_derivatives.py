@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from lagjax._blame import Offender, offenders, pieces_of
 from lagjax._check._differences import Slopes, differ, ladder, slopes
 from lagjax._check._findings import Finding, listed
 from lagjax._check._measure import Scene, Sides
-from lagjax._check._operations import Offender, offenders, pieces_of
 
 _SHOWN = 3  # findings of one kind about one function
 # Coordinates beyond which derivatives are first compared along `_RANDOM` directions of q, as many of q̇, and along the

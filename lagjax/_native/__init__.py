@@ -35,12 +35,12 @@ from lagjax._native._constants import (
 )
 from lagjax._native._handler import Plan, handler, unavailable
 from lagjax._native._ir import lanes
-from lagjax._native._kernel import Begun, Guards, Kernel, Outcome, Projection, cores, order_for, recurrences
+from lagjax._native._kernel import Begun, Guards, Kernel, Outcome, Projection, cores, order_for, pieces_of, recurrences
 from lagjax._native._series import is_large
 from lagjax._native._sweep import SweepPlan, sweep_handler
 
 __all__ = [
     "DISCONTINUOUS", "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "STEP_TOO_SMALL",
     "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "SweepPlan", "cores", "handler", "is_large", "lanes",
-    "order_for", "recurrences", "sweep_handler", "unavailable",
+    "order_for", "pieces_of", "recurrences", "sweep_handler", "unavailable",
 ]  # fmt: skip

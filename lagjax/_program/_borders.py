@@ -110,6 +110,11 @@ class Borders(NamedTuple):
         """The nodes whose series are wanted."""
         return self.switches + self.arguments
 
+    def read_by(self, node: int) -> frozenset[int]:
+        """The inputs that a node of the program depends on; pieces are the last ones."""
+        nodes = self.program.line.nodes
+        return frozenset(nodes[i][2] for i in _below(self.program.line, [node]) if nodes[i][0] == "input")
+
 
 class _LinearSystem(NamedTuple):
     """The linear system of a program, with its nodes in the new one."""

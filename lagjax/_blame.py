@@ -16,7 +16,7 @@ from jax.extend import core, source_info_util
 
 from lagjax._program import OPERATIONS, in_jax
 
-_PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+_PACKAGE = os.path.dirname(os.path.abspath(__file__))
 
 
 class Offender(NamedTuple):
