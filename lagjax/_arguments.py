@@ -18,6 +18,7 @@ from typing import Any
 import equinox as eqx
 
 _BY_POSITION = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+_SHOWN = 40  # characters of a parameter, default and annotation included
 _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 
 
@@ -65,11 +66,11 @@ def accept(
     except ValueError:
         raise TypeError(f"The signature of {role} cannot be read; wrap it in a plain function {expected}.") from None
 
-    parameters = list(signature.parameters.values())
+    parameters = [_readable(p) for p in signature.parameters.values()]
     leading, rest = parameters[: len(roles)], parameters[len(roles) :]
     positional = [p for p in leading if p.kind in _BY_POSITION and p.name not in extras]
     if len(positional) < len(roles):
-        raise TypeError(f"{role} must have the form {expected}; got {role}{signature}.")
+        raise TypeError(f"{role} must have the form {expected}; got {role}({', '.join(map(str, parameters))}).")
 
     bound = function.keywords if isinstance(function, functools.partial) else {}
     wanted = [p for p in rest if p.name not in bound]
@@ -81,3 +82,9 @@ def accept(
         )
     arrays, code = eqx.partition(function, eqx.is_array)
     return Function(arrays, code, tuple(p.name for p in wanted))
+
+
+def _readable(parameter: inspect.Parameter) -> inspect.Parameter:
+    """A parameter as a sentence shows it: without a default that would fill the screen."""
+    short = len(str(parameter)) <= _SHOWN
+    return parameter if short else parameter.replace(default=parameter.empty, annotation=parameter.empty)

@@ -165,6 +165,7 @@ def v_squared(v):
         (lambda: 0.0, "must have the form"),
         (lambda t, q, qdot: 0.0, "must have the form"),
         (lambda q, qdot, parms: 0.0, "asks for `parms`"),
+        (lambda q, qdot, table=(0.0,) * 99: 0.0, "asks for `table`, which"),
         (lambda q, qdot, m=1.0: 0.0, "asks for `m=1.0`"),
         (lambda *state: 0.0, "must have the form"),
         (lambda q, qdot, **rest: 0.0, "asks for `\\*\\*rest`"),
