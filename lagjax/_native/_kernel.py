@@ -286,7 +286,10 @@ class Kernel:
 
     def _tangents_of(self, side_by_side: bool) -> "_Compiled":
         """The kernel of tangents, whose directions stand side by side or members do; compiled when first asked for."""
-        tangent = Tangent(*self._along_steps, width=1 if side_by_side else self.width, lanes=self.width)
+        with without_collections():
+            tangent = Tangent(*self._along_steps, width=1 if side_by_side else self.width, lanes=self.width)
+        forget_joined()
+        forget_stages()
         return _Compiled(tangent.motion.module, tangent.motion.layout, tangent.job, self._rounds, pointers=3)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
@@ -332,7 +335,10 @@ class Kernel:
     @functools.cached_property
     def _backward(self) -> "_Compiled":
         """The transpose, compiled when it is first asked for."""
-        adjoint = Adjoint(*self._along_steps, width=self.width)
+        with without_collections():
+            adjoint = Adjoint(*self._along_steps, width=self.width)
+        forget_joined()
+        forget_stages()
         return _Compiled(adjoint.motion.module, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
 
     def _strides(self, ts, params) -> dict[str, int]:

@@ -65,8 +65,9 @@ def copied(graph: Graph, line: StraightLine, inputs: list[int]) -> list[int]:
 def _back(graph: Graph, line: StraightLine, nodes: list[int], cotangents: list, by: Sequence[int]) -> list[int]:
     """The cotangents of the inputs `by`, from those of the outputs."""
     varied: list[bool] = []
+    wanted = frozenset(by)
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
-        varied.append(kind == "float" and (attribute in by if op == "input" else any(varied[i] for i in operands)))
+        varied.append(kind == "float" and (attribute in wanted if op == "input" else any(varied[i] for i in operands)))
     results = {}
 
     def number(x: float) -> int:
