@@ -40,6 +40,7 @@ _FEATURES = {
 }  # fmt: skip
 _LARGEST = 10  # operations that one may become: a bound for errors, three are usual
 _COMPARISONS = ("lt", "le", "gt", "ge")
+_PIECEWISE = {*_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "round", "rem", "convert"}
 _WITHOUT_SERIES = ("rsqrt", "log", "log1p")  # at zero, or −1; besides the operations that are `steep`
 
 
@@ -131,6 +132,8 @@ def borders(program: Recurrent, size: int, slides: bool = True) -> Borders | Non
 
     Along borders that depend on velocities the motion may slide (`slides`; see `_sliding`).
     """
+    if _PIECEWISE.union(_FEATURES).isdisjoint(op for op, *_ in program.line.nodes):
+        return None  # most scenes, and the largest ones, at no cost
     with np.errstate(all="ignore"):
         rewriting = _Rewriting(program, size, slides)
         return rewriting.finished() if rewriting.switches or rewriting.features else None
@@ -207,8 +210,7 @@ class _Rewriting:
         (op, operands, attribute), kinds = self.program.line.nodes[i], self.program.line.kinds
         if op == "convert":
             return kinds[operands[0]] == "float" and attribute not in ("float", "bool")
-        decides = op in (*_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "round", "rem")
-        return decides and all(kinds[x] == "float" for x in operands)
+        return op in _PIECEWISE and all(kinds[x] == "float" for x in operands)
 
     # ---- the new nodes ----
 
