@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from lagjax._arguments import accept
 from lagjax._derivation import Derivation, derivation_of
-from lagjax._layout import Layout, as_vector, taken_apart
+from lagjax._layout import Layout, as_vector, dtype_of, taken_apart
 from lagjax._validate import (
     all_finite,
     as_arrays,
@@ -268,8 +268,14 @@ def _shape_of_one(leaf, axis):
     """A leaf of one member: zeros of its shape, which cost nothing, or what all members share."""
     if axis is None:
         return leaf
-    shape = jnp.shape(leaf)
-    return np.broadcast_to(np.zeros((), jnp.result_type(leaf)), (*shape[:axis], *shape[axis:][1:]))
+    shape = np.shape(leaf)
+    return _zeros((*shape[:axis], *shape[axis:][1:]), np.dtype(dtype_of(leaf)))
+
+
+@functools.lru_cache(maxsize=256)
+def _zeros(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """One zero, seen as an array of this shape."""
+    return np.broadcast_to(np.zeros((), dtype), shape)
 
 
 def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTree], int]:

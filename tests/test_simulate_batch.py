@@ -127,3 +127,13 @@ def test_bad_input_gets_a_sentence(changes, sentence):
     arguments = {"q0": Q0, "qdot0": QDOT0, "ts": TS, "params": PARAMS} | changes
     with pytest.raises(ValueError, match=sentence):
         lagjax.simulate_batch(SCENE, **arguments)
+
+
+def test_a_batch_that_comes_again_and_again_stays_what_it_is():
+    """After some calls its arrays are sent to JAX by a compiled function (`_simulate._sent`)."""
+    scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+    q0, ts = np.linspace(0.1, 0.4, 3), np.linspace(0.0, 1.0, 5)
+    first, *_, last = (lagjax.simulate_batch(scene, q0 + k, np.zeros(3), ts) for k in (*[0.0] * 60, 1.0))
+    np.testing.assert_allclose(first.q, q0[:, None] * np.cos(ts), atol=1e-8)
+    np.testing.assert_allclose(last.q, (q0 + 1)[:, None] * np.cos(ts), atol=1e-8)
+    assert all(isinstance(x, jax.Array) for run in (first, last) for x in (run.q, run.qdot, run.ts, run.result._value))
