@@ -12,6 +12,7 @@ from lagjax._hybrid import Transition, simulate_hybrid
 from lagjax._machine_code import MachineCode
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
+from lagjax._samples import samples
 from lagjax._simulate import simulate, simulate_batch
 from lagjax._system import System
 from lagjax._trajectory import State, Trajectory, Transitions
@@ -35,6 +36,7 @@ __all__ = [
     "WorkPrecisionRow",
     "check",
     "plot",
+    "samples",
     "scenes",
     "simulate",
     "simulate_batch",

@@ -41,7 +41,8 @@ from lagjax._program._emit import emit, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
 from lagjax._program._memory import machine_memory, operations_that_fit, without_collections
-from lagjax._program._operations import OPERATIONS
+from lagjax._program._look_ups import look_up, table_of
+from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
 from lagjax._program._pushforward import pushforward, with_tangents
 from lagjax._program._rules import Expansion, inputs_of
@@ -121,7 +122,7 @@ def lower_scalars(
     arguments = inputs_of(expansion.graph, shapes)
     with np.errstate(all="ignore"):
         results = scalars(expansion, arguments)
-    outputs = [i for result in results for i in result.ravel().tolist()]
+    outputs = [expansion.graph.real(i) for result in results for i in result.ravel().tolist()]
     graph, places = expansion.graph, outputs
     if not added:  # else what a new program consists of has been through this, and the rest would follow it
         graph, places = sink_negations(*factor(graph, places))
@@ -268,9 +269,15 @@ class Program:
             return jnp.stack(self(*scalars))
         if (own := self.own_outputs(*scalars)) is not None:
             return own
-        nodes = copied(first.expansion.graph, self.line, stacked(scalars).ids.tolist())
+        graph, ids = first.expansion.graph, stacked(scalars).ids.tolist()
+        nodes = copied(graph, self.line, ids, [graph.position(i) for i in ids] if self.looks_up else None)
         first.expansion.traced_operations += self.operations
         return Scalars(first.expansion, np.array([nodes[i] for i in self.outputs], dtype=np.int64))
+
+    @functools.cached_property
+    def looks_up(self) -> bool:
+        """Whether it reads tables (see `_look_ups`)."""
+        return any(op in LOOK_UPS for op, _, _ in self.nodes)
 
     @property
     def size(self) -> int:
@@ -291,6 +298,8 @@ class Program:
                     value = numbers[attribute]
                 elif op == "constant":
                     value = attribute
+                elif op in LOOK_UPS:
+                    value = look_up(op, attribute, numbers, values[operands[0]])
                 else:
                     extra = () if attribute is None else (attribute,)
                     value = OPERATIONS[op].value(*(values[i] for i in operands), *extra)
@@ -326,8 +335,7 @@ class Program:
         first = next((x for x in scalars if isinstance(x, Scalars)), None)
         if self.origin is None or first is None or self.origin.graph is not first.expansion.graph:
             return None
-        inputs = [i for ids in inputs_of(self.origin.graph, self.shapes) for i in ids.ravel().tolist()]
-        same = stacked(scalars).ids.tolist() == inputs
+        same = [self.origin.graph.position(i) for i in stacked(scalars).ids.tolist()] == list(range(self.size))
         return Scalars(first.expansion, np.array(self.origin.outputs, dtype=np.int64)) if same else None
 
     def only(self, positions: Sequence[int], function: Callable) -> "Program":
@@ -355,7 +363,9 @@ class Program:
             if i not in seen:
                 seen.add(i)
                 stack.extend(self.nodes[i][1])
-        return frozenset(self.nodes[i][2] for i in seen if self.nodes[i][0] == "input")
+        read = {self.nodes[i][2] for i in seen if self.nodes[i][0] == "input"}
+        tables = (table_of(self.nodes[i][2]).positions for i in seen if self.nodes[i][0] in LOOK_UPS)
+        return frozenset(read.union(*tables))
 
     def depends(self, output: int) -> frozenset[int]:
         """The positions of the inputs that an output depends on."""
@@ -370,6 +380,9 @@ class Program:
             masks.append(functools.reduce(int.__or__, (masks[i] for i in operands), 0))
             if op == "input":
                 masks[-1] = 1 << attribute
+            elif op in LOOK_UPS:
+                for position in table_of(attribute).positions:
+                    masks[-1] |= 1 << position
         return masks
 
     # ---- derivatives: from the function, not from the emitted code ----

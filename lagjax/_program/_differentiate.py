@@ -102,7 +102,7 @@ class Derivatives:
     def _copied(self, op: str, operands: list[int], attribute, kind: str, inputs: Sequence[int]) -> int:
         """A node of a tape in the graph."""
         if op == "input":
-            return inputs[attribute]
+            return self.graph.real(inputs[attribute])
         if op == "constant":
             return self.graph.constant(attribute, kind)
         if op == "integer_pow":

@@ -14,7 +14,8 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from lagjax import _elementary
 from lagjax._platform import default_platform
 from lagjax._program._graph import Node
-from lagjax._program._operations import OPERATIONS
+from lagjax._program._look_ups import table_of
+from lagjax._program._operations import LOOK_UPS, OPERATIONS
 
 _state = threading.local()
 
@@ -51,6 +52,8 @@ def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ..
             values[i] = lax.convert_element_type(jnp.asarray(scalars[attribute]), dtypes[i])
         elif op == "convert":
             values[i] = lax.convert_element_type(values[operands[0]], dtypes[i])
+        elif op in LOOK_UPS:
+            values[i] = _looked_up(op, attribute, scalars, precision, values[operands[0]])
         elif op in ("sin", "cos") and operands[0] in paired:
             if operands[0] not in pairs:
                 pairs[operands[0]] = _apart("sincos")(values[operands[0]])
@@ -59,6 +62,26 @@ def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ..
             xs = _aligned([values[operand] for operand in operands])
             values[i] = _apart(op)(*xs) if op in fast else _apply(op, xs, attribute)
     return tuple(jnp.broadcast_to(jnp.asarray(values[i]), shape) for i in outputs)
+
+
+def _looked_up(op: str, attribute, scalars: tuple, precision, x) -> jax.Array:
+    """An entry of a table, or the piece of one that x is on, for lanes too."""
+    table = table_of(attribute)
+    if table.numbers is not None:
+        entries = jnp.asarray(table.known, precision)
+    else:
+        entries = jnp.stack(jnp.broadcast_arrays(*(scalars[i] for i in table.positions))).astype(precision)
+    x = jnp.asarray(x)
+    lanes = entries.reshape(table.count, *[1] * (x.ndim + 1 - entries.ndim), *entries.shape[1:])
+    lanes = jnp.broadcast_to(lanes, (table.count, *jnp.broadcast_shapes(x.shape, lanes.shape[1:])))
+    x = jnp.broadcast_to(x, lanes.shape[1:])
+    if op == "take":
+        index = jnp.clip(jnp.where(jnp.isnan(x), 0, x), 0, table.count - 1).astype(int)
+        return jnp.take_along_axis(lanes, index[None], axis=0)[0]
+    found = jnp.sum(lanes <= x, axis=0) - 1
+    if attribute.closed:
+        found = jnp.where(x == lanes[-1], table.count - 2, found)
+    return jnp.where(jnp.isnan(x), -1, found).astype(precision)
 
 
 def _precision(nodes, kinds, scalars):

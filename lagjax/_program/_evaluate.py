@@ -8,7 +8,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lagjax._program._operations import OPERATIONS, in_numpy
+from lagjax._program._look_ups import cotangents as of_entries
+from lagjax._program._look_ups import look_up, table_of
+from lagjax._program._operations import LOOK_UPS, OPERATIONS, in_numpy
 
 # States looked at together. A value of 2048 states has 16 KB, so that some tens of live values stay in a core's second
 # cache, and the microsecond that NumPy takes to begin an operation is no more than what the operation takes itself.
@@ -28,7 +30,8 @@ def evaluate(line, columns: Sequence, steps: Callable | None = None) -> np.ndarr
     results = np.empty((len(line.outputs), count), precision)
     with np.errstate(all="ignore"):
         for start in range(0, count, CHUNK):
-            values = _values(sequence, [x if x.ndim == 0 else x[start : start + CHUNK] for x in columns])
+            part = columns if count <= CHUNK else [x if np.ndim(x) == 0 else x[start : start + CHUNK] for x in columns]
+            values = _values(sequence, part)
             for row, i in enumerate(line.outputs):
                 results[row, start : start + CHUNK] = values[i]
     return results
@@ -36,14 +39,19 @@ def evaluate(line, columns: Sequence, steps: Callable | None = None) -> np.ndarr
 
 def _prepared(line, columns) -> tuple[list[np.ndarray], np.dtype, int]:
     """The columns as arrays of their kinds, the precision of floats, and the number of states."""
-    columns = [np.asarray(x) for x in columns]
     of_input = {
         attribute: kind for (op, _, attribute), kind in zip(line.nodes, line.kinds, strict=True) if op == "input"
     }
-    floats = [columns[i].dtype for i, kind in of_input.items() if kind == "float"]
+    for op, _, attribute in line.nodes:
+        if op in LOOK_UPS:
+            of_input |= dict.fromkeys(table_of(attribute).positions, "float")
+    read = {i: np.asarray(columns[i]) for i in of_input}  # what nobody reads is passed on as it is
+    floats = [read[i].dtype for i, kind in of_input.items() if kind == "float"]
     precision = np.result_type(*floats) if floats else np.dtype(float)
-    typed = [x.astype(_dtype(of_input.get(i, "float"), precision), copy=False) for i, x in enumerate(columns)]
-    return typed, precision, max((x.size for x in columns if x.ndim), default=1)
+    typed, sizes = list(columns), [np.size(x) for x in columns if np.ndim(x)]
+    for i, x in read.items():
+        typed[i] = x.astype(_dtype(of_input[i], precision), copy=False)
+    return typed, precision, max(sizes, default=1)
 
 
 def _dtype(kind: str, precision: np.dtype) -> np.dtype:
@@ -68,6 +76,8 @@ def steps_of(line, precision) -> list[tuple[Callable | None, tuple, object, tupl
         elif op == "convert":
             attribute = _dtype(kind, precision)
         function = _BESIDE[op] if op in _BESIDE else OPERATIONS[op].value
+        if op in LOOK_UPS:
+            function, attribute = _LOOK_UP, (op, attribute)
         if op == "div" and kind == "float":  # without a look at the kind for every state
             function = np.divide
         steps.append((function, operands, (op == "input", attribute), tuple(dropped.get(k, ()))))
@@ -76,6 +86,10 @@ def steps_of(line, precision) -> list[tuple[Callable | None, tuple, object, tupl
 
 def _converted(x, dtype):
     return np.asarray(x).astype(dtype)
+
+
+def _LOOK_UP(x, attribute):  # noqa: N802  (only its identity counts)
+    raise AssertionError
 
 
 _BESIDE: dict[str, Callable | None] = {"input": None, "constant": None, "convert": _converted}
@@ -87,6 +101,8 @@ def _values(steps, columns) -> list:
     for k, (function, operands, (is_input, attribute), dropped) in enumerate(steps):
         if function is None:
             values[k] = columns[attribute] if is_input else attribute
+        elif function is _LOOK_UP:
+            values[k] = look_up(*attribute, columns, values[operands[0]])
         elif attribute is None:
             values[k] = function(*[values[i] for i in operands])
         else:
@@ -142,7 +158,10 @@ def vjp(line, columns: Sequence, cotangents: Sequence) -> list:
             if of_nodes[k] is None:
                 continue
             if op == "input":
-                inputs[attribute] = of_nodes[k]
+                inputs[attribute] = of_nodes[k] if inputs[attribute] is None else inputs[attribute] + of_nodes[k]
+            if op == "take":
+                for i, part in of_entries(attribute, values[operands[0]], of_nodes[k]).items():
+                    inputs[i] = part if inputs[i] is None else inputs[i] + part
             for i, partial in zip(operands, _transpose(op), strict=False):
                 if partial is not None and kinds[i] == "float" and nodes[i][0] != "constant":
                     _add(

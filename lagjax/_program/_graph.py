@@ -25,7 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from lagjax._program._operations import OPERATIONS
+from lagjax._program._look_ups import look_up, table_of
+from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._simplify import whole_power
 
 
@@ -37,6 +38,10 @@ LONGEST = 16  # terms of a sum, or factors of a product, that are compared with 
 # Nodes of a graph beyond which sums and products are not compared any more, but for equal operands: among so many that
 # takes most of the time and saves less than a hundredth of the operations.
 MANY = 20_000
+
+# Ids from here on are inputs by their positions, and those from `NUMBERS` on numbers of long arrays, as long as nothing
+# computes with them: of an array that is only looked up in, no entry becomes a node.
+INPUTS, NUMBERS = 2**40, 2**50
 
 Node = tuple[str, tuple[int, ...], Any]
 _ARITHMETIC = frozenset(("add", "sub", "mul"))
@@ -61,6 +66,8 @@ class Graph:
         self._sums: dict[frozenset, tuple[int, float]] = {}  # and whether it is that sum or its negative
         self._with_squares: set[int] = set()  # the products that hold a sine twice
         self.powers: dict[int, tuple[int, float]] = {}  # what is a power of another node, and which
+        self._arrays: list[bytes] = []  # long arrays of numbers, and where their ids begin and end
+        self._ends = [NUMBERS]
 
     @classmethod
     def of(cls, line, budget: int) -> "Graph":
@@ -162,6 +169,38 @@ class Graph:
         known = self._ids.get(node)
         return self._append(node, node, kind) if known is None else known
 
+    def real(self, i: int) -> int:
+        """The node of an id that may stand for an input or a number without one."""
+        if i < INPUTS:
+            return i
+        if i < NUMBERS:
+            return self.input(i - INPUTS, "float")
+        numbers, first = self.array_of(i)
+        return self.constant(float(np.frombuffer(numbers)[i - first]), "float")
+
+    def position(self, i: int) -> int | None:
+        """Which input an id is, or None."""
+        if i >= NUMBERS:
+            return None
+        if i >= INPUTS:
+            return i - INPUTS
+        op, _, attribute = self.nodes[i]
+        return attribute if op == "input" else None
+
+    def array(self, numbers: np.ndarray) -> np.ndarray:
+        """Ids of the numbers of a long array, in its shape."""
+        data = np.ascontiguousarray(numbers, np.float64).tobytes()
+        if data not in self._arrays:
+            self._arrays.append(data)
+            self._ends.append(self._ends[-1] + numbers.size)
+        first = self._ends[self._arrays.index(data)]
+        return np.arange(first, first + numbers.size).reshape(numbers.shape)
+
+    def array_of(self, i: int) -> tuple[bytes, int]:
+        """The long array that an id is a number of, and where its ids begin."""
+        k = int(np.searchsorted(self._ends, i, side="right")) - 1
+        return self._arrays[k], self._ends[k]
+
     def constant(self, value, kind: str) -> int:
         value = float(value) if kind == "float" else np.dtype(kind).type(value).item()
         if value != value:
@@ -197,9 +236,20 @@ class Graph:
         return self._ids[key]
 
     def _fold(self, op: str, operands: tuple[int, ...], attribute: Any) -> int:
+        if op in LOOK_UPS:
+            return self._looked_up(op, operands[0], attribute)
         values = [np.dtype(self.kinds[i]).type(self.nodes[i][2]) for i in operands]
         extra = () if attribute is None else (attribute,)
         return self.constant(OPERATIONS[op].value(*values, *extra), self._kind(op, operands, attribute))
+
+    def _looked_up(self, op: str, x: int, attribute: Any) -> int:
+        """A look-up at a number: an entry is that input, or a number."""
+        value, table = self.nodes[x][2], table_of(attribute)
+        if table.numbers is not None:
+            return self.constant(float(look_up(op, attribute, (), value)), "float")
+        if op == "locate" or table.tangents:
+            return self.node(op, x, attribute=attribute)
+        return self.input(table.positions[int(min(max(value, 0), table.count - 1))], "float")
 
     def _kind(self, op: str, operands: tuple[int, ...], attribute: Any) -> str:
         """The kind of a result."""

@@ -18,7 +18,8 @@ applies an operation, `c(x)` makes a number, `w` is the result and `u`, `v` (or 
 
 Two operations carry an attribute: `round` (1: ties to even, 0: away from zero) and `convert` (the kind of the result).
 `convert` has no code here because it depends on both kinds. Sine and cosine of one angle are computed together by
-`_emit` and `_native._lanes`; `_elementary.FAST` has faster forms of some operations for XLA on CPUs.
+`_emit` and `_native._lanes`; `_elementary.FAST` has faster forms of some operations for XLA on CPUs. What is looked up
+in a table is no elementwise operation: see `_look_ups`.
 """
 
 import math
@@ -99,6 +100,10 @@ def _divide(x, y):
     if np.result_type(x).kind == "f":
         return np.divide(x, y)
     return np.where(y == 0, -1, np.trunc(np.divide(x, np.where(y == 0, 1, y))))[()].astype(np.result_type(x))
+
+
+def _unfolded(x, attribute):
+    raise TypeError("a look-up has no value without its table")
 
 
 def _select(predicate, no, yes):
@@ -337,4 +342,17 @@ _ROWS = (
     Operation("not", 1, np.invert, lambda code, a: ~a, lax="bitwise_not", simplify=_simplify.invert, is_step=True),
 )  # fmt: skip
 
-OPERATIONS: dict[str, Operation] = {row.name: row for row in _ROWS}
+# Look-ups in tables (`_look_ups`): their operand is a number, and a whole array stands in their attribute.
+LOOK_UPS = {
+    name: Operation(name, 1, _unfolded, None, is_step=True, exact=True) for name in ("take", "locate")
+}  # fmt: skip
+
+
+class _Rows(dict):
+    """The elementwise operations by their names; look-ups are known, but are none of them."""
+
+    def __missing__(self, name: str) -> Operation:
+        return LOOK_UPS[name]
+
+
+OPERATIONS: dict[str, Operation] = _Rows({row.name: row for row in _ROWS})

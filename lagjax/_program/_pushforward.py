@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lagjax._program._graph import Graph
+from lagjax._program._graph import INPUTS, Graph
+from lagjax._program._look_ups import Table
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, replace_by_inputs, sink_negations
 from lagjax._program._series import StraightLine
@@ -28,7 +29,8 @@ def pushforward(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Seq
     tangents = {i: graph.input(len(inputs) + k, "float") for k, i in enumerate(by)}
     with np.errstate(all="ignore"):
         nodes = copied(graph, line, inputs)
-        moved = _along(graph, line, nodes, tangents)
+        places = {i: len(inputs) + k for k, i in enumerate(by)}
+        moved = _along(graph, line, nodes, tangents, places, beside=True)
         zero = graph.constant(0.0, "float")
         results = [moved.get(line.outputs[i], zero) for i in of] + [nodes[line.outputs[i]] for i in known]
         done = StraightLine(*eliminate_dead_code(*sink_negations(*factor(graph, results))))
@@ -50,11 +52,12 @@ def with_tangents(
     graph = Graph(_LARGEST * len(line.nodes) * (1 + len(directions)) + 1000)
     kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in dtypes]
     with np.errstate(all="ignore"):
-        nodes = copied(graph, line, [graph.input(place, kind) for place, kind in zip(places, kinds, strict=True)])
+        ids = [place + INPUTS if kind == "float" else graph.input(place, kind) for place, kind in zip(places, kinds, strict=True)]
+        nodes = copied(graph, line, ids, places)
         moved = []
         for direction in directions:
-            tangents = {i: graph.input(place, "float") for i, place in direction.items() if kinds[i] == "float"}
-            moved.append(_along(graph, line, nodes, tangents))
+            tangents = {i: place + INPUTS for i, place in direction.items() if kinds[i] == "float"}
+            moved.append(_along(graph, line, nodes, tangents, direction))
         zero = graph.constant(0.0, "float")
         results = []
         for output, direction in of:
@@ -63,8 +66,13 @@ def with_tangents(
         return StraightLine(*eliminate_dead_code(*sink_negations(*factor(graph, results))))
 
 
-def _along(graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[int, int]) -> dict[int, int]:
-    """The tangents of the nodes of a line that have some, from those of its inputs."""
+def _along(
+    graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[int, int], places: dict[int, int], beside=False
+) -> dict[int, int]:
+    """The tangents of the nodes of a line that have some, from those of its inputs.
+
+    The tangent of input i is input `places[i]`. Tables that are not among these have theirs `beside` the inputs.
+    """
     tangents: dict[int, int] = {}
 
     def number(x: float) -> int:
@@ -72,7 +80,10 @@ def _along(graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[i
 
     for k, (op, operands, attribute) in enumerate(line.nodes):
         if op == "input" and attribute in of_inputs:
-            tangents[k] = of_inputs[attribute]
+            tangents[k] = graph.real(of_inputs[attribute])
+        if op == "take" and (table := _tangents_of(attribute, places, beside)) is not None:
+            tangents[k] = graph.apply("take", nodes[operands[0]], attribute=table)
+            continue
         moving = [i for i in operands if i in tangents]
         if not moving or line.kinds[k] != "float":
             continue
@@ -90,6 +101,17 @@ def _along(graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[i
         if tangent is not None and graph.value(tangent) != 0:
             tangents[k] = tangent
     return tangents
+
+
+def _tangents_of(table: Table, places: dict[int, int], beside: bool) -> Table | None:
+    """The table of the tangents of the entries of another one; None where they have none."""
+    if table.numbers is not None:
+        return None
+    if table.first not in places:
+        return table._replace(tangents=True) if beside else None
+    first = places[table.first]
+    stride = places[table.first + table.stride] - first if table.count > 1 else 1
+    return table._replace(first=first, stride=stride)
 
 
 def _of_quotient(graph: Graph, w: int, v: int, of_u: int | None, of_v: int) -> int:

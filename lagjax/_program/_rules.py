@@ -17,12 +17,16 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend import core
 
-from lagjax._program._graph import Graph, Unlowerable
+from lagjax._program._graph import INPUTS, Graph, Unlowerable
+from lagjax._program._indexing import known, located, looked_up
 from lagjax._program._operations import OPERATIONS
 
 # Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
 # takes some minutes.
 WORK_PER_OPERATION = 50
+# Numbers of an array beyond which they become nodes one by one only when something computes with them; and numbers in
+# all. Both only decide what a lowering costs.
+LARGEST_UNFOLDED, MOST_NUMBERS = 256, 2000
 LARGEST_WORK = 20_000_000
 
 
@@ -50,17 +54,26 @@ class Expansion:
     def run_closed(self, jaxpr, arguments) -> list[np.ndarray]:
         return self.run(jaxpr.jaxpr, [self.constants(value) for value in jaxpr.consts], arguments)
 
+    def real(self, array: np.ndarray) -> np.ndarray:
+        """The array with a node for every scalar of it: what computes with an entry of a table makes it one."""
+        if not array.size or array.max() < INPUTS:
+            return array
+        self.work(array.size)
+        return _ids([self.graph.real(i) for i in array.ravel().tolist()], array.shape)
+
     def constants(self, value) -> np.ndarray:
         if isinstance(value, Tracer):
             raise Unlowerable("the function closes over a traced value; pass it as an argument")
         kind = kind_of(value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype)
         value = np.asarray(value)
+        if kind == "float" and value.size > LARGEST_UNFOLDED:
+            return self.graph.array(value)
         self.work(value.size)
         return _ids([self.graph.constant(x, kind) for x in value.ravel().tolist()], value.shape)
 
     def map(self, op: str, *arrays: np.ndarray, attribute=None) -> np.ndarray:
         """`op` elementwise."""
-        arrays = np.broadcast_arrays(*arrays)
+        arrays = np.broadcast_arrays(*map(self.real, arrays))
         shape, size = arrays[0].shape, arrays[0].size
         self.work(size)
         self.traced_operations += size
@@ -95,6 +108,8 @@ class Expansion:
         for variable in equation.outvars:
             kind_of(variable.aval.dtype)
             self.work(variable.aval.size)
+        if name not in MOVES and name not in _PASSING_ON:
+            arguments = [self.real(x) for x in arguments]
         if name in MOVES:
             result = MOVES[name](equation.params, *arguments)
         elif name in LOWER:
@@ -116,11 +131,15 @@ def kind_of(dtype) -> str:
 
 
 def inputs_of(graph: Graph, shapes) -> list[np.ndarray]:
-    """The inputs of a graph for arrays of these shapes, as ids."""
-    arguments, count = [], 0
+    """The inputs of a graph for arrays of these shapes, as ids; those of long arrays are no nodes yet."""
+    arguments, count, many = [], 0, len(shapes) > MOST_NUMBERS
     for shape in shapes:
         kind = kind_of(shape.dtype)
-        arguments.append(_ids([graph.input(count + k, kind) for k in range(shape.size)], shape.shape))
+        places = range(count, count + shape.size)
+        if kind == "float" and (many or shape.size > LARGEST_UNFOLDED):
+            arguments.append((np.array(places, dtype=np.int64) + INPUTS).reshape(shape.shape))
+        else:
+            arguments.append(_ids([graph.input(k, kind) for k in places], shape.shape))
         count += shape.size
     return arguments
 
@@ -193,6 +212,11 @@ MOVES: dict[str, Callable] = {
 # ---- primitives that compute ----------------------------------------------------------------------------------------
 
 LOWER: dict[str, Callable] = {}
+# What passes arrays on, or looks up entries in them: these may have ids without nodes.
+_PASSING_ON = frozenset((
+    "gather", "dynamic_slice", "lagjax_locate", "convert_element_type", "jit", "pjit", "closed_call", "core_call", "remat", "remat2",
+    "checkpoint", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
+))  # fmt: skip
 
 
 def _lowers(*names):
@@ -234,6 +258,9 @@ def _round(expansion, params, x):
 @_lowers("convert_element_type")
 def _convert_element_type(expansion, params, x):
     kind = kind_of(params["new_dtype"])
+    if kind == "float" and x.size and x.min() >= INPUTS:  # of floats without nodes
+        return x
+    x = expansion.real(x)
     if kind == "bool":
         zeros = [expansion.graph.constant(0, expansion.graph.kinds[i]) for i in x.ravel().tolist()]
         return expansion.map("ne", x, _ids(zeros, x.shape))
@@ -343,8 +370,10 @@ LOWER.update({name: _cumulation(op) for name, op in CUMULATIONS.items()})
 
 @_lowers("dynamic_slice")
 def _dynamic_slice(expansion, params, x, *starts):
-    sizes = params["slice_sizes"]
-    starts = expansion.known(np.array(starts[: x.ndim]), "the start of a slice")
+    sizes, starts = params["slice_sizes"], expansion.real(np.array(starts[: x.ndim]))
+    if not known(expansion, starts):
+        return looked_up(expansion, x, starts, range(x.ndim), sizes, None)
+    starts = expansion.known(starts, "the start of a slice")
     starts = [min(max(start, 0), n - size) for start, n, size in zip(starts, x.shape, sizes, strict=True)]
     return x[tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))]
 
@@ -386,9 +415,22 @@ def _clips(mode) -> bool:
     return jax.lax.GatherScatterMode.from_any(mode) == jax.lax.GatherScatterMode.CLIP
 
 
+@_lowers("lagjax_locate")
+def _locate(expansion, params, knots, x):
+    return located(expansion, knots, x, params["closed"])
+
+
 @_lowers("gather")
 def _gather(expansion, params, x, indices):
-    indices, d = expansion.known(indices, "an index"), params["dimension_numbers"]
+    d, indices = params["dimension_numbers"], expansion.real(indices)
+    if not known(expansion, indices) and not d.operand_batching_dims:
+        missing = np.nan if params["fill_value"] is None else params["fill_value"]
+        found = looked_up(
+            expansion, x, indices, d.start_index_map, params["slice_sizes"], None if _clips(params["mode"]) else missing
+        )
+        found = np.squeeze(found, tuple(indices.ndim - 1 + axis for axis in d.collapsed_slice_dims))
+        return np.moveaxis(found, range(indices.ndim - 1, found.ndim), d.offset_dims)
+    indices = expansion.known(indices, "an index")
     places = _places(
         indices, x.shape, d.offset_dims, d.collapsed_slice_dims, d.start_index_map, d.operand_batching_dims,
         d.start_indices_batching_dims, params["slice_sizes"], _clips(params["mode"]),

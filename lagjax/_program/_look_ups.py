@@ -1,0 +1,93 @@
+"""Look-ups in tables: what a scalar program reads of arrays that are too long to be scalars of it.
+
+An array of 25 000 samples is one `Table`, not 25 000 inputs. Two operations read it, both constant along a step:
+
+    take     an entry, by an index that is rounded to nothing: it is a whole number already; clipped to the table
+    locate   how many entries of an increasing table are at most x, less one: the piece of it that x is on
+
+An entry is an input of the program, or a number of the program itself. Derivatives by the entries are sparse: `take`
+passes its tangent on from the same place of a table of tangents, and its cotangent to one place (`_transpose`).
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Table(NamedTuple):
+    """Entry i is input `first` + i `stride` of the program, for i from 0 up to `count`.
+
+    Where `numbers` are there, the bytes of float64, it is that one of them instead. Where `tangents` is set, it is the
+    tangent of that input, in a program whose inputs do not include it.
+    """
+
+    first: int
+    stride: int
+    count: int
+    numbers: bytes | None = None
+    tangents: bool = False
+
+    @property
+    def known(self) -> np.ndarray:
+        """The entries of a table of numbers, (count,)."""
+        assert self.numbers is not None
+        numbers = np.frombuffer(self.numbers)
+        return numbers[self.first : self.first + self.stride * (self.count - 1) + 1 : self.stride]
+
+    @property
+    def positions(self) -> range:
+        """The inputs that the entries are; none for numbers."""
+        if self.numbers is not None or self.tangents:
+            return range(0)
+        return range(self.first, self.first + self.stride * self.count, self.stride)
+
+
+class Located(NamedTuple):
+    """The attribute of `locate`: an increasing table, and whether its last entry still belongs to the last piece."""
+
+    table: Table
+    closed: bool
+
+
+def table_of(attribute: "Table | Located") -> Table:
+    """The table that a look-up reads."""
+    return attribute.table if isinstance(attribute, Located) else attribute
+
+
+def moved(attribute: "Table | Located", places: Sequence[int]) -> "Table | Located":
+    """A look-up in a program whose input `places[i]` is what input i was."""
+    table = table_of(attribute)
+    if table.numbers is not None:
+        return attribute
+    first = places[table.first]
+    stride = places[table.first + table.stride] - first if table.count > 1 else 1
+    table = table._replace(first=first, stride=stride)
+    return attribute._replace(table=table) if isinstance(attribute, Located) else table
+
+
+def look_up(op: str, attribute: Any, columns: Sequence, x) -> np.ndarray:
+    """The result of `take` or `locate` at many states, (S,); `columns` holds a number or (S,) for every input."""
+    table, x = table_of(attribute), np.asarray(x)
+    if table.numbers is not None:
+        entries = table.known
+    else:
+        entries = np.stack(np.broadcast_arrays(*[columns[i] for i in table.positions]))
+    if op == "take":
+        index = np.clip(np.where(np.isnan(x), 0, x), 0, table.count - 1).astype(int)
+        return entries[index] if entries.ndim == 1 else entries[(index, np.arange(entries.shape[1]))]
+    if entries.ndim == 1:
+        found = np.searchsorted(entries, x, side="right") - 1
+    else:
+        found = (entries <= x).sum(axis=0) - 1
+    if isinstance(attribute, Located) and attribute.closed:
+        found = np.where(x == entries[-1], table.count - 2, found)
+    return np.where(np.isnan(x), -1, found).astype(float)[()]
+
+
+def cotangents(table: Table, index, g) -> dict[int, np.ndarray]:
+    """By input, what the cotangent g of entries `index` at many states is for them, (S,) each."""
+    if not len(table.positions):
+        return {}
+    index = np.clip(np.where(np.isnan(index), 0, index), 0, table.count - 1).astype(int)
+    return {table.positions[i]: np.where(index == i, g, 0.0) for i in np.unique(index).tolist()}

@@ -1,0 +1,229 @@
+"""`samples`: a measured or designed input, given at instants, as a function of time."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Float
+
+from lagjax._validate import is_concrete
+
+HOLDS = ("zero", "linear", "cubic")
+
+
+def samples(
+    knots: Float[Any, " K"], values: Float[Any, "K *m"], hold: str = "zero"
+) -> Callable[[Any], Float[Array, "*m"]]:
+    r"""The function of time that has these `values` at these `knots`: for `forces`, a Lagrangian, a constraint.
+
+    Between two knots, for xᵢ ≤ t < xᵢ₊₁ and with s = (t − xᵢ)/(xᵢ₊₁ − xᵢ),
+
+        zero      u(t) = vᵢ                                the last sample stays until the next one (a D/A converter)
+        linear    u(t) = (1 − s) vᵢ + s vᵢ₊₁
+        cubic     u(t) = the cubic with the values vᵢ, vᵢ₊₁ and the slopes mᵢ, mᵢ₊₁ at its ends
+
+    where mᵢ is the slope at xᵢ of the parabola through the three samples about it, at the ends through the three
+    nearest. That is `scipy.interpolate.CubicHermiteSpline(x, v, numpy.gradient(v, x, axis=0, edge_order=2))`: its slope
+    is continuous, no sample matters farther than two knots away, and it may overshoot. No natural spline: its
+    coefficients depend on all samples at once, so that none could be computed where it is needed.
+
+    Outside of the knots nothing is made up: before the first one u is NaN, after the last one the last sample stays
+    with "zero", and u is NaN with "linear" and "cubic". The last knot itself is inside. A motion that comes to where u
+    is NaN fails there, with a sentence that says when.
+
+    **Takes**
+
+    - `knots` (K,): instants in increasing order, not necessarily evenly spaced; K ≥ 2, or 1 with "zero".
+    - `values` (K,) or (K, m): the samples. Both may be arrays of NumPy or JAX, or leaves of `params`.
+    - `hold`: "zero", "linear" or "cubic".
+
+    **Gives** u, a function of a time () that returns () or (m,); or of times (…), that returns (…) or (…, m).
+
+    u is a plain JAX function: it can be differentiated by t, by the values, and by the knots except for where it jumps,
+    batched, and compiled. In machine code a step ends at every knot exactly, without a search for it, an entry is read
+    where it is needed, and a gradient by all samples costs as much as one by a single number; so long as knots and
+    values reach `samples` as they are in `params`, or are known numbers: compute with u(t) instead of with the values.
+    Where u jumps, with "zero", derivatives of the motion by the values are exact, and those by the knots contain what a
+    later jump changes. Engines of diffrax do not see the knots, and integrate over them.
+
+    **Raises** `TypeError` or `ValueError` for knots that do not increase, shapes that do not fit, samples that are not
+    finite, and an unknown `hold`; of what is traced, only the shapes can be looked at.
+
+    ```python
+    import jax, jax.numpy as jnp, lagjax
+    jax.config.update("jax_enable_x64", True)
+
+    knots = jnp.linspace(0.0, 2.0, 2001)[:-1]  # a force measured at 1 kHz
+
+
+    def motor(q, qdot, t, params):
+        return lagjax.samples(knots, params["force"])(t) - 0.3 * qdot
+
+
+    axis = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=motor)
+
+
+    def end(force):
+        return lagjax.simulate(axis, 0.0, 0.0, jnp.array([0.0, 2.0]), {"force": force}).q[-1]
+
+
+    slopes = jax.grad(end)(jnp.sin(knots))  # by each of the 2000 samples
+    ```
+    """
+    if hold not in HOLDS:
+        raise ValueError(f"hold={hold!r} is not known. It is one of 'zero', 'linear' and 'cubic'.")
+    knots, values = _checked(knots, values, hold)
+    return functools.partial({"zero": _zero, "linear": _linear, "cubic": _cubic}[hold], knots, values)
+
+
+def _checked(knots: Any, values: Any, hold: str) -> tuple:
+    """Knots and values as arrays of floats of one precision; what is known is copied."""
+    arrays = []
+    for name, x in (("knots", knots), ("values", values)):
+        x = x if hasattr(x, "dtype") else np.asarray(x)
+        if np.issubdtype(x.dtype, np.complexfloating) or x.dtype.kind not in "fiubV":
+            raise TypeError(f"samples: `{name}` must be real numbers, not of type {x.dtype}.")
+        arrays.append(x)
+    knots, values = arrays
+    least = 1 if hold == "zero" else 2
+    if knots.ndim != 1 or len(knots) < least:
+        raise ValueError(f"samples: `knots` must have the shape (K,) with K ≥ {least}, not {knots.shape}.")
+    if values.ndim not in (1, 2) or len(values) != len(knots):
+        raise ValueError(
+            f"samples: `values` must have the shape (K,) or (K, m) with one row for each of the {len(knots)} knots, not "
+            f"{values.shape}."
+        )
+    if is_concrete(knots):
+        _require_increasing(np.asarray(knots))
+    if is_concrete(values) and not np.isfinite(np.asarray(values)).all():
+        first = int(np.flatnonzero(~np.isfinite(np.asarray(values)).reshape(len(values), -1).all(axis=1))[0])
+        raise ValueError(f"samples: values[{first}] is {np.asarray(values)[first]}, but samples must be finite numbers.")
+    dtype = jnp.result_type(*(x for x in (knots, values) if jnp.issubdtype(x.dtype, jnp.floating)) or (float,))
+    return tuple(np.array(x, dtype) if is_concrete(x) else x.astype(dtype) for x in (knots, values))
+
+
+def _require_increasing(knots: np.ndarray) -> None:
+    wrong = np.flatnonzero(~(np.diff(knots) > 0))
+    if not np.isfinite(knots).all():
+        first = int(np.flatnonzero(~np.isfinite(knots))[0])
+        raise ValueError(f"samples: knots[{first}] is {knots[first]}, but knots must be finite numbers.")
+    if wrong.size:
+        i = int(wrong[0])
+        raise ValueError(
+            f"samples: knots must increase, but knots[{i + 1}] = {knots[i + 1]:g} comes after knots[{i}] = "
+            f"{knots[i]:g}. Sort the samples by time, and keep one of those at the same time."
+        )
+
+
+# ---- the functions ---------------------------------------------------------------------------------------------------
+
+
+def _zero(knots, values, t):
+    t = jnp.asarray(t, knots.dtype)
+    i = _locate(knots, t, closed=False)
+    (v,) = _window(values, i, 1)
+    return jnp.where(_beside(i < 0, v), jnp.nan, v)
+
+
+def _linear(knots, values, t):
+    t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
+    (x0, x1), (v0, v1) = _window(knots, i, 2), _window(values, i, 2)
+    slope = (v1 - v0) / _beside(x1 - x0, v0)
+    return jnp.where(_beside(inside, v0), v0 + slope * _beside(t - x0, v0), jnp.nan)
+
+
+def _cubic(knots, values, t):
+    t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
+    (x0, x1), (v0, v1) = _window(knots, i, 2), _window(values, i, 2)
+    step, s = _beside(x1 - x0, v0), _beside(t - x0, v0)
+    chord = (v1 - v0) / step
+    m0, m1 = _slopes(knots, values, i, chord)
+    second, third = (3.0 * chord - 2.0 * m0 - m1) / step, (m0 + m1 - 2.0 * chord) / (step * step)
+    return jnp.where(_beside(inside, v0), v0 + s * (m0 + s * (second + s * third)), jnp.nan)
+
+
+def _piece(knots, t):
+    """The piece that a time is on, and whether that is one of those between two knots."""
+    i = _locate(knots, jnp.asarray(t, knots.dtype), closed=True)
+    return i, (i >= 0) & (i < len(knots) - 1)
+
+
+def _slopes(knots, values, i, chord):
+    """The slopes at both ends of piece i: of the parabolas through three samples."""
+    count = len(knots)
+    if count == 2:
+        return chord, chord
+    size = min(count, 4)
+    x, v = _window(knots, i - 1, size), _window(values, i - 1, size)
+    steps = [_beside(b - a, v[0]) for a, b in zip(x, x[1:], strict=False)]
+    chords = [(b - a) / step for a, b, step in zip(v, v[1:], steps, strict=False)]
+
+    def about(k):  # sample k + 1 of the window
+        return (steps[k + 1] * chords[k] + steps[k] * chords[k + 1]) / (steps[k] + steps[k + 1])
+
+    def at_end(one, other):  # of the first of two pieces, at its outer end
+        return chords[one] - steps[one] * (chords[other] - chords[one]) / (steps[one] + steps[other])
+
+    first, last = _beside(i <= 0, v[0]), _beside(i >= count - 2, v[0])
+    left, right = about(0), about(size - 3)
+    m0 = jnp.where(first, at_end(0, 1), jnp.where(last, right, left))
+    m1 = jnp.where(last, at_end(-1, -2), jnp.where(first, left, right))
+    return m0, m1
+
+
+def _window(table, start, size: int) -> list:
+    """Entries `start`, `start` + 1, … of a table, `size` of them; those that fit, where these would stick out."""
+    where = start.ndim
+    dimensions = jax.lax.GatherDimensionNumbers(
+        offset_dims=tuple(range(where, where + table.ndim)), collapsed_slice_dims=(), start_index_map=(0,)
+    )
+    found = jax.lax.gather(
+        table, start[..., None], dimensions, (size, *table.shape[1:]), mode=jax.lax.GatherScatterMode.CLIP
+    )
+    return [jax.lax.index_in_dim(found, k, where, keepdims=False) for k in range(size)]
+
+
+def _beside(x, v):
+    """An array over times, for arithmetic with one over times and columns."""
+    return x if x.ndim == v.ndim else x[..., None]
+
+
+# ---- where a time is -------------------------------------------------------------------------------------------------
+
+
+def _locate(knots, t, closed: bool):
+    """How many knots are at most t, less one, of int32; with `closed` the last knot belongs to the last piece."""
+    return _locate_p.bind(jnp.asarray(knots), t, closed=closed)
+
+
+def _found(knots, t, *, closed):
+    i = jnp.searchsorted(knots, t, side="right").astype(np.int32) - 1
+    if closed:
+        i = jnp.where(t == knots[-1], len(knots) - 2, i)
+    return jnp.where(jnp.isnan(t), -1, i).astype(np.int32)
+
+
+def _of_batch(arguments, axes, *, closed):
+    knots, t = arguments
+    if axes[0] is batching.not_mapped:
+        return _locate_p.bind(knots, t, closed=closed), axes[1]
+    return jax.vmap(functools.partial(_found, closed=closed), in_axes=tuple(axes))(knots, t), 0
+
+
+def _derivative(primals, tangents, *, closed):
+    found = _locate_p.bind(*primals, closed=closed)
+    return found, ad.Zero(jax.typeof(found).to_tangent_aval())
+
+
+_locate_p = Primitive("lagjax_locate")  # `_program._rules` knows it by this name
+_locate_p.def_impl(jax.jit(_found, static_argnames="closed"))
+_locate_p.def_abstract_eval(lambda knots, t, *, closed: ShapedArray(t.shape, np.dtype(np.int32)))
+mlir.register_lowering(_locate_p, mlir.lower_fun(_found, multiple_results=False))
+ad.primitive_jvps[_locate_p] = _derivative
+batching.primitive_batchers[_locate_p] = _of_batch
