@@ -22,12 +22,14 @@ from llvmlite import ir
 from lagjax._native._constants import MAX_ORDER, NEAR_ZERO
 from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
+from lagjax._native._look_ups import lane_of
 from lagjax._native._output import RECORDED, recall_pieces
 from lagjax._native._saltation import GuardTable, Saltation
-from lagjax._native._series import Motion, double, is_large
+from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._program._borders import Borders
+from lagjax._program._look_ups import Table
 from lagjax._program._series import Recurrent, Series
-from lagjax._program._transpose import pullback
+from lagjax._program._transpose import pullback, pullback_and_entries
 
 # `y_ct` is the cotangent of the end, and becomes that of the start.
 JOB = job(
@@ -49,6 +51,7 @@ class Adjoint:
         projection=None,
         borders: "Borders | None" = None,
         levels: tuple[int, ...] = (),
+        chosen: Chosen | None = None,
         *,
         width: int,
     ):
@@ -66,32 +69,37 @@ class Adjoint:
         if borders is not None:
             fields |= Saltation.fields(pieces, (n,)) | {"after": n, "has_after": 1, "crossed": 1}
         large = is_large(program, projection, times=2)
-        self.motion = Motion("adjoint", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces)
+        self.motion = Motion(
+            "adjoint", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
+        )
         self.n, self.states, self.series = n, states, series
         dtypes = program.dtypes
         # All but the time and the pieces.
         moving = dtypes[: len(dtypes) - self.motion.pieces]
         self.varied = [i for i, dtype in enumerate(moving) if dtype.kind == "f" and i != states]
-        self.zeroth_order, self.order_recursion = self._transposed(dtypes)
+        self.zeroth_order, self.tables, self.order_recursion = self._transposed(dtypes)
         self.start_next = self._start_next()
         steps = [self._seed(), self._back_orders(self._back_sums(), self._back_recursion()), self._back_start()]
         if projection is not None:
-            self.projection_line = pullback(projection.state.line, dtypes, self.varied, range(states))
+            self.projection_line, self.tables_of_projection = pullback_and_entries(
+                projection.state.line, dtypes, self.varied, range(states)
+            )
             steps.insert(0, self._back_projection())
         if borders is not None:
             steps = [self._back_border(borders, levels or (n,)), *steps, self._note_after()]
         self._run(steps)
         self._begin()
-        self.motion.form.finish()
+        self.motion.finish()
 
     def _transposed(self, dtypes):
         """The transposes of the zeroth order and of the order recursion."""
         series, n = self.series, self.n
         outputs = [*range(n), *range(n + 1, n + 1 + series.values)]
-        zeroth = pullback(series.zeroth_order, dtypes, self.varied, outputs)
+        zeroth, tables = pullback_and_entries(series.zeroth_order, dtypes, self.varied, outputs)
         first, read = self.states + 3, series.values + len(series.cauchy_products)
         by, rows = [*range(self.states), *range(first, first + read)], range(n, n + series.rows)
-        return zeroth, pullback(series.order_recursion, [dtypes[0]] * (first + read), by, range(n + series.rows), rows)
+        recursion = pullback(series.order_recursion, [dtypes[0]] * (first + read), by, range(n + series.rows), rows)
+        return zeroth, tables, recursion
 
     # ---- rounds ----
 
@@ -143,8 +151,10 @@ class Adjoint:
         with code.only_if(there):
             for i in self.motion.form.each(code, self.states):
                 lane["state_ct", i] = frame.read("y_ct", member * self.states + i)
+            first = member * frame.job("params_stride")
+            lane["first_number"] = code.as_double(first)
             with code.loop(self.motion.parameters) as i:
-                lane["params", i] = frame.read("params", member * frame.job("params_stride") + i)
+                lane["params", i] = frame.read("params", first + self.motion.place_of_number(code, i))
                 lane["params_ct", i] = 0.0
         return frame.finish()
 
@@ -171,7 +181,8 @@ class Adjoint:
                 for i in self.motion.form.each(code, self.states):
                     frame.write("y_ct", member * self.states + i, lane["state_ct", i])
                 with code.loop(self.motion.parameters) as i:
-                    frame.write("params_ct", member * self.motion.parameters + i, lane["params_ct", i])
+                    place = member * self.motion.of_member + self.motion.place_of_number(code, i)
+                    frame.write("params_ct", place, lane["params_ct", i])
                 frame.write("excess", member, lane["excess"])
                 frame.call(self.start_next, index)
 
@@ -333,6 +344,7 @@ class Adjoint:
         values_ct = frame.vectors("values_ct", self.series.values)
         out = form.run(frame, self.zeroth_order, *self.motion.now(frame), accelerations_ct, values_ct)
         self._store(frame, out, frame.vectors("y_ct", self.states, lambda i: (i, 0)))
+        self._store_entries(frame, self.tables, out, len(self.varied))
         return frame.finish()
 
     def _back_projection(self) -> Code:
@@ -342,7 +354,9 @@ class Adjoint:
         moved = motion.moved(frame, motion.increments(frame, frame.job("order"), h)[0])
         _, _, params = motion.now(frame)
         state_ct = frame.vectors("state_ct", self.states)
-        self._store(frame, motion.form.run(frame, self.projection_line, moved, [frame["t"] + h], params, state_ct))
+        out = motion.form.run(frame, self.projection_line, moved, [frame["t"] + h], params, state_ct)
+        self._store(frame, out)
+        self._store_entries(frame, self.tables_of_projection, out, len(self.varied))
         return frame.finish()
 
     def _back_border(self, borders: Borders, levels: tuple[int, ...]) -> Code:
@@ -381,6 +395,22 @@ class Adjoint:
         else:  # some are integers
             for k, i in enumerate(params):
                 _add(frame, cotangents[states + k], "params_ct", i)
+
+
+    def _store_entries(
+        self, frame: Frame, tables: tuple[Table, ...], out: Numbers, first: int, factor: "Value | None" = None
+    ) -> None:
+        """Add the cotangents of entries of tables, outputs from the `first` on, to those of the numbers of members."""
+        code, motion = frame.code, self.motion
+        for k, table in enumerate(tables):
+            cotangent = out[first + 2 * k + 1] if factor is None else out[first + 2 * k + 1] * factor
+            places = motion.look_up.places(frame, table, out[first + 2 * k])
+            for j, place in enumerate(places):
+                lane = frame.lane(integer(code, j))
+                member = lane["member"]
+                with code.only_if(member >= 0):
+                    address = code.element(frame.job("params_ct"), member * motion.of_member + place)
+                    code.store(code.load(address, DOUBLE) + lane_of(code, cotangent, j), address)
 
 
 def _add(frame: Frame, x: Value, name: str, *indices: Index) -> None:

@@ -15,6 +15,7 @@ from lagjax._native._constants import (
     ARGUMENT,
     AT_ONCE,
     DISCONTINUOUS,
+    EPS,
     FAINT,
     GROWTH,
     MAX_ORDER,
@@ -34,6 +35,7 @@ from lagjax._native._series import Motion, double, integer
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
 
+NOWHERE = 1e300  # a level that no switching number comes to
 LEAVING, SLIDING = 2.0, 3.0  # what a guard is that has been zero, and that stays zero; 1.0 where it is just crossed
 
 
@@ -68,6 +70,7 @@ class Borders:
         ended before a border without a series beyond it, 0 where the last one did not.
         """
         numbers = (
+            "at_knots",
             "crossed",
             "beyond",
             "planned_h",
@@ -81,6 +84,7 @@ class Borders:
             "next_approach",
         )
         fields = {"touching": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
+        fields["level"] = len(borders.guards) if _borders.TABLE in borders.kinds else 0
         return fields | Roots.fields(MAX_ORDER + 2) | Saltation.fields(len(borders.switches), levels)
 
     def begin(self, frame: Frame, lane: Lane) -> None:
@@ -88,7 +92,7 @@ class Borders:
         lane["approach"] = 0.0
         if not self.pieces:
             return
-        for name in ("crossed", "idle_crossings", "stepped"):
+        for name in ("crossed", "idle_crossings", "stepped", "at_knots"):
             lane[name] = 0.0
         lane["undecided"] = 1.0
         with frame.code.loop(len(self.guards)) as g:
@@ -127,6 +131,9 @@ class Borders:
         frame["planned_h"], frame["nearest"] = h, 1.0
         frame["crossed"] = frame["beyond"] = 0.0
         if self.pieces:
+            for c, j in enumerate(self.borders.clocks):
+                self._look_at_clock(frame, c, j, h)
+            self._note_levels(frame)
             with code.loop(len(self.guards)) as g:
                 self._look(frame, g, degree, h)
         frame["next_approach"] = 0.0
@@ -149,6 +156,9 @@ class Borders:
         piece = self._piece(frame, j)
         level = piece * d + e + code.select(piece <= 0.0, code.lanes_of(below), 0.0)
         level = level + code.select(piece >= 0.0, code.lanes_of(above), 0.0)
+        if _borders.TABLE in self.borders.kinds:
+            is_table = code.lanes_of(code.as_double(self.table.place(code, g, "of_table"))) > 0.0
+            level = code.select(is_table, frame["level", g], level)
         side, beyond = piece * a + b, piece * k + l
         is_share = code.lanes_of(code.select(self.table.place(code, g, "on") >= 0, double(code, 1.0), 0.0)) > 0.0
         undecided = code.compare("==", side, 0.0)
@@ -170,6 +180,52 @@ class Borders:
         frame["nearest"] = code.select(sooner, root, frame["nearest"])
         frame["crossed"] = code.select(sooner, number, frame["crossed"])
         frame["beyond"] = code.select(sooner, code.select(undecided, leads, beyond), frame["beyond"])
+
+    # ---- tables: borders at their entries ----
+
+    def _knot(self, frame: Frame, j: int, index: Value) -> tuple[Value, Value]:
+        """An entry of the table of piece j, and whether there is one of this number."""
+        located = self.borders.tables[j]
+        assert located is not None
+        inside = (index >= 0.0) & (index <= float(located.table.count - 1))
+        return self.motion.look_up.take(frame, located.table, index), inside
+
+    def _until_next_knot(self, frame: Frame, j: int) -> tuple[Value, Value]:
+        """How long it is to the next entry of the table that the time is on, and whether there is one."""
+        code, forward = frame.code, frame["forward"]
+        index = self._piece(frame, integer(code, j)) + code.select(forward > 0.0, frame.constant(1), 0.0)
+        knot, inside = self._knot(frame, j, index)
+        return ((knot - frame["t"]) - frame["t_low"]) * forward, inside
+
+    def _look_at_clock(self, frame: Frame, c: int, j: int, h: Value) -> None:
+        """The step ends at the next entry of a table that the time is on: nobody has to look for that."""
+        code = frame.code
+        left, inside = self._until_next_knot(frame, j)
+        left = code.maximum(left, frame.constant(0.0))
+        size = code.intrinsic("fabs", h)
+        sooner = inside & (left < frame["nearest"] * size)
+        frame["nearest"] = code.select(sooner, left / size, frame["nearest"])
+        frame["crossed"] = code.select(sooner, float(len(self.guards) + 1 + c), frame["crossed"])
+
+    def _note_levels(self, frame: Frame) -> None:
+        """The entries on both sides of the pieces of tables, which are the levels of their guards."""
+        code = frame.code
+        for g, guard in enumerate(self.guards):
+            if self.borders.kinds[guard.piece] == _borders.TABLE:
+                index = self._piece(frame, integer(code, guard.piece)) + guard.e
+                knot, inside = self._knot(frame, guard.piece, index)
+                frame["level", g] = code.select(inside, knot, NOWHERE if guard.e else -NOWHERE)
+
+    def _pass_knots(self, frame: Frame, going: Value) -> None:
+        """The pieces of tables whose next entry the time has come to: all that are there at one instant."""
+        code, clocks = frame.code, self.borders.clocks
+        near = code.maximum(code.intrinsic("fabs", frame["t"]), frame["smallest"]) * (4.0 * EPS)
+        for j in clocks:
+            left, inside = self._until_next_knot(frame, j)
+            passes = going & inside & (left <= near)
+            place = self.motion.parameters + j
+            frame["params", place] = frame["params", place] + code.select(passes, frame["forward"], 0.0)
+            frame["stays", j] = 1.0
 
     def _look_ahead(self, frame: Frame, i: int, feature: Feature, degree: Value, h: Value) -> None:
         """The step ends where the argument of a feature has come as near as one step may bring it."""
@@ -300,6 +356,8 @@ class Borders:
         reached = code.compare("==", frame["h"], frame["cut"])
         frame["crossed"] = code.select(reached, frame["crossed"], 0.0)
         frame["stepped"] = code.select(code.compare("!=", frame["h"], 0.0), frame.constant(1), 0.0)
+        at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > float(len(self.guards)))
+        frame["at_knots"] = frame["at_knots"] + code.select(at_knot, frame.constant(1), 0.0)
 
     def _cross(self) -> Code:
         """`()`: after the step, the pieces beyond the borders that were reached."""
@@ -319,6 +377,8 @@ class Borders:
             if self.note is not None:
                 frame.call(self.note)
             self._go_beyond(frame, crossed)
+            if self.borders.clocks:
+                self._pass_knots(frame, crosses)
             if self.returns:
                 frame["h_before"] = code.select(crosses, 0.0, frame["h_before"])
             if self.borders.nested:
@@ -328,7 +388,7 @@ class Borders:
                 frame.call(self.jump)
             idle = code.select(crosses & ~stepped, frame["idle_crossings"] + 1.0, 0.0)
             frame["idle_crossings"] = code.select(stepped | crosses, idle, frame["idle_crossings"])
-            many = frame["idle_crossings"] > float(MOST_CROSSINGS * len(self.guards))
+            many = frame["idle_crossings"] > float(MOST_CROSSINGS * (len(self.guards) + len(self.borders.clocks)))
             frame["code"] = code.select(many, frame.constant(DISCONTINUOUS), frame["code"])
         return frame.finish()
 

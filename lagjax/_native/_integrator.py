@@ -24,7 +24,7 @@ from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._ir import INTEGER, POINTER, Code, Value
 from lagjax._native._output import Output
 from lagjax._native._projection import Projector
-from lagjax._native._series import Motion, double, integer, is_large
+from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._native._step import StepControl
 from lagjax._program import _borders
 from lagjax._program._series import Recurrent, Series
@@ -58,6 +58,7 @@ class Integrator:
         base_size: int | None = None,
         borders: "_borders.Borders | None" = None,
         levels: tuple[int, ...] = (),
+        chosen: Chosen | None = None,
         *,
         width: int,
     ):
@@ -71,8 +72,9 @@ class Integrator:
             fields |= Borders.fields(borders, levels or (n,))
         pieces = 0 if borders is None else len(borders.switches)
         large = is_large(program, projection, guards)
-        kind = MotionAlone if large and width == 1 and borders is None and fills_lanes(series) else Motion
-        self.motion = motion = kind("motion", program, series, JOB, fields, large, width, pieces=pieces)
+        alone = large and width == 1 and borders is None and chosen is None
+        kind = MotionAlone if alone and fills_lanes(series) else Motion
+        self.motion = motion = kind("motion", program, series, JOB, fields, large, width, pieces=pieces, chosen=chosen)
         self.projector = projection and Projector(
             motion, projection.state, projection.velocity_scale, self.base_size
         )  # fmt: skip
@@ -83,7 +85,7 @@ class Integrator:
         self.start_next = self._start_next()
         self._run()
         self._begin()
-        motion.form.finish()
+        motion.finish()
 
     # ---- members ----
 
@@ -119,8 +121,10 @@ class Integrator:
             lane["y", i] = x
             frame.write("path", self.output.place(frame, member, 0, i), x)
             lane["low", i] = 0.0
+        first = member * frame.job("params_stride")
+        lane["first_number"] = code.as_double(first)
         with code.loop(motion.parameters) as i:
-            lane["params", i] = frame.read("params", member * frame.job("params_stride") + i)
+            lane["params", i] = frame.read("params", first + motion.place_of_number(code, i))
         if self.borders is not None:
             self.borders.begin(frame, lane)
 
@@ -175,7 +179,10 @@ class Integrator:
         ending, steps, rejected = (frame[name] for name in ("code", "steps", "rejected"))
         limit = code.as_double(frame.job("max_steps"))
         running = ending < 0.0
-        ending = code.select(running & (steps + rejected >= limit), frame.constant(OUT_OF_STEPS), ending)
+        counted = steps + rejected
+        if self.motion.pieces:  # there are no more of those that end at entries of tables than there are entries
+            counted = counted - frame["at_knots"]
+        ending = code.select(running & (counted >= limit), frame.constant(OUT_OF_STEPS), ending)
         ending = code.select(frame["last"] > 0.0, frame.constant(DONE), ending)
         event = frame["event"]
         ending = code.select(event >= 0.0, event + float(EVENT), ending)

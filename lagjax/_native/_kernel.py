@@ -6,6 +6,7 @@ import itertools
 import math
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,14 +22,16 @@ from lagjax._native._ir import compiled, lanes
 from lagjax._native._output import RECORDED
 from lagjax._native._packs import forget_stages
 from lagjax._native._schedule import forget_joined
-from lagjax._native._series import is_large
+from lagjax._native._look_ups import SET_NUMBERS
+from lagjax._native._series import Chosen, Motion, is_large
 from lagjax._native._sweep import SweepPlan
 from lagjax._native._tangent import Tangent
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
 from lagjax._program._memory import without_collections
-from lagjax._program._series import Recurrent, Series, series
+from lagjax._program._operations import LOOK_UPS
+from lagjax._program._series import Recurrent, Series, StraightLine, series
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
 # It decides how long the first slice is, which nobody needs to know well.
@@ -128,6 +131,8 @@ class Kernel:
             None,
             levels,
         )
+        program, projection, guards, self._chosen = parameters_chosen(program, projection, guards, 2 * size + 1, size // levels[0])
+        self._smooth = program, projection
         self._parts = program, recurrences(program, size), projection
         if pieces := pieces_of(program, size, len(levels) == 1):
             self._borders, of_pieces = pieces
@@ -158,12 +163,14 @@ class Kernel:
     @functools.cached_property
     def _forward(self) -> "_Compiled":
         with without_collections():
-            integrator = Integrator(*self._parts, *self._options, self._borders, self._levels, width=self.width)
+            integrator = Integrator(
+                *self._parts, *self._options, self._borders, self._levels, self._chosen, width=self.width
+            )
             motion = integrator.motion
         forget_joined()
         forget_stages()
         more = motion.recorded_pieces
-        return _Compiled(motion.module, motion.layout, integrator.job, self._rounds, pointers=4, more=more)
+        return _Compiled(motion, motion.layout, integrator.job, self._rounds, pointers=4, more=more)
 
     @property
     def rest_size(self) -> int:
@@ -290,7 +297,7 @@ class Kernel:
             tangent = Tangent(*self._along_steps, width=1 if side_by_side else self.width, lanes=self.width)
         forget_joined()
         forget_stages()
-        return _Compiled(tangent.motion.module, tangent.motion.layout, tangent.job, self._rounds, pointers=3)
+        return _Compiled(tangent.motion, tangent.motion.layout, tangent.job, self._rounds, pointers=3)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
         """What a handler needs to begin a run; for as long as this kernel lives."""
@@ -304,7 +311,7 @@ class Kernel:
 
         Or where more is written down of a step than its state: that of a piecewise program.
         """
-        if self._along_steps[0] is not self._given[0]:
+        if self._borders is not None and self._borders.switches:
             return 0
         rounds = self._rounds // _SLICES_OF_SWEEP
         return rounds if rounds >= _LEAST_ROUNDS else 0
@@ -328,9 +335,9 @@ class Kernel:
     def _along_steps(self) -> tuple:
         """What derivatives over steps that have been taken are made of: features do not matter to these."""
         if self._borders is not None and self._borders.switches:
-            return *self._parts, self._borders, self._levels
-        program, size, projection, *_ = self._given
-        return program, recurrences(program, size), projection
+            return *self._parts, self._borders, self._levels, self._chosen
+        program, projection = self._smooth
+        return program, recurrences(program, self._given[1]), projection, None, (), self._chosen
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
@@ -339,7 +346,7 @@ class Kernel:
             adjoint = Adjoint(*self._along_steps, width=self.width)
         forget_joined()
         forget_stages()
-        return _Compiled(adjoint.motion.module, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
+        return _Compiled(adjoint.motion, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
 
     def _strides(self, ts, params) -> dict[str, int]:
         return dict(
@@ -358,11 +365,15 @@ class _Compiled:
     that are written down behind the state of a step.
     """
 
-    def __init__(self, module: ir.Module, layout: Layout, job: Callable, rounds: int, pointers: int, more: int = 0):
+    def __init__(self, motion: Motion, layout: Layout, job: Callable, rounds: int, pointers: int, more: int = 0):
         self.rounds, self.more = rounds, more
         self.layout, self._job, self._counts_idle = layout, job, pointers == 4
+        self._numbers = motion.look_up.numbers
+        names = ("begin", "run") if self._numbers is None else ("begin", "run", SET_NUMBERS)
         # The engine holds the code that the others point to.
-        self._engine, at = compiled(module, ("begin", "run"))
+        self._engine, at = compiled(motion.module, names)
+        if self._numbers is not None:
+            ctypes.CFUNCTYPE(None, ctypes.c_void_p)(at[SET_NUMBERS])(self._numbers.ctypes.data)
         self.places = at["begin"], at["run"]
         self._begin = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(at["begin"])
         self._run = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * pointers, ctypes.c_int64)(at["run"])
@@ -422,6 +433,52 @@ def _by_member(table: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _contiguous(*arrays) -> list[np.ndarray]:
     return [np.ascontiguousarray(x, dtype=np.float64) for x in arrays]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fewer:
+    """A program of those numbers of a member that it computes with (`Recurrent`); others are only looked up."""
+
+    line: StraightLine
+    size: int
+    dtypes: tuple
+    linear: Any
+    budget: int
+
+
+@functools.lru_cache(maxsize=16)
+def parameters_chosen(
+    program: Recurrent, projection: Projection | None, guards: Guards | None, first: int, rows: int
+) -> "tuple[Recurrent, Projection | None, Guards | None, Chosen | None]":
+    """The programs with the parameters that they compute with, where they look up others in tables; and which.
+
+    The numbers of a member begin at input `first`, and are `rows` times as many as those of the motion without its
+    tangents: what is a parameter of one row is one of each.
+    """
+    programs: list = [program]
+    programs += [] if projection is None else [projection.state, projection.velocity_scale]
+    programs += [] if guards is None else [guards.program]
+    if not any(op in LOOK_UPS for one in programs for op, _, _ in one.line.nodes):
+        return program, projection, guards, None
+    read = {node[2] - first for one in programs for node in one.line.nodes if node[0] == "input"}
+    of = program.size - first
+    own = of // rows
+    columns = sorted({i % own for i in read if i >= 0}) if own else []
+    positions = tuple(row * own + i for row in range(rows) for i in columns)
+    place = {first + i: first + k for k, i in enumerate(positions)}
+
+    def fewer(one):
+        nodes = tuple((op, xs, place.get(a, a) if op == "input" else a) for op, xs, a in one.line.nodes)
+        dtypes = (*one.dtypes[:first], *(one.dtypes[first + i] for i in positions))
+        return _Fewer(one.line._replace(nodes=nodes), first + len(positions), dtypes, one.linear, one.budget)
+
+    done = iter([fewer(one) for one in programs])
+    return (
+        next(done),
+        projection and Projection(next(done), next(done)),
+        guards and guards._replace(program=next(done)),
+        Chosen(positions, of),
+    )
 
 
 @functools.lru_cache(maxsize=16)  # asked for when it is decided what runs, and when that is compiled

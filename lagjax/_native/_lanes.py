@@ -10,7 +10,7 @@ from lagjax._native._constants import LARGEST_ANGLE
 from lagjax._native._frame import Frame, Numbers, Vectors
 from lagjax._native._ir import BIT, Code, Value
 from lagjax._program._graph import Unlowerable
-from lagjax._program._operations import OPERATIONS
+from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._series import StraightLine
 
 
@@ -20,8 +20,8 @@ class Lines:
     `Tables` is that of large ones, with the same methods.
     """
 
-    def __init__(self, sincos: Code):
-        self._sincos = sincos
+    def __init__(self, sincos: Code, look_up: Callable):
+        self._sincos, self._look_up = sincos, look_up
 
     def run(
         self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors", to: "Vectors | None" = None
@@ -36,7 +36,7 @@ class Lines:
             values, i = parts[position]
             return values[i]
 
-        out = emit(frame.code, line, read, self._sincos)
+        out = emit(frame.code, line, read, self._sincos, functools.partial(self._look_up, frame))
         kinds = (line.kinds[i] for i in line.outputs)
         out = [frame.code.as_double(x) if kind == "bool" else x for x, kind in zip(out, kinds, strict=True)]
         if to is not None:
@@ -77,8 +77,13 @@ class Lines:
         """After all programs of the kernel."""
 
 
-def emit(code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos: Code | None) -> list[Value]:
-    """The outputs of a straight line; `inputs(i)` is its i-th input, as a vector. Integers are doubles here."""
+def emit(
+    code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos: Code | None, look_up: Callable
+) -> list[Value]:
+    """The outputs of a straight line; `inputs(i)` is its i-th input, as a vector. Integers are doubles here.
+
+    `look_up(op, attribute, x)` reads tables.
+    """
     values: list[Value] = []
     turns: dict[int, tuple[Value, Value]] = {}
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
@@ -89,6 +94,8 @@ def emit(code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos:
                 value = code.compare("!=", value, 0.0)
         elif op == "constant":
             value = code.as_value(attribute, code.vector if kind != "bool" else ir.VectorType(BIT, code.lanes))
+        elif op in LOOK_UPS:
+            value = look_up(op, attribute, xs[0])
         elif op in ("sin", "cos") and sincos is not None:
             if operands[0] not in turns:
                 turns[operands[0]] = sines_and_cosines(code, sincos, xs[0])

@@ -23,17 +23,18 @@ from lagjax._native._series import Motion
 from lagjax._program._borders import Borders, gradient
 
 NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "goes_on")
-PLACES = ("piece", "back", "slide", "on")
+PLACES = ("piece", "back", "slide", "on", "of_table")
 
 
 class GuardTable:
     """The guards of all pieces (`_program._borders.Guard`) as constants of a kernel, for loops over them."""
 
     def __init__(self, motion: Motion, borders: Borders):
-        numbers = np.array([[getattr(guard, name) for name in NUMBERS] for guard in borders.guards])
+        numbers = np.array([[getattr(guard, name) for name in NUMBERS] for guard in borders.guards] or [[0.0]])
         self._numbers = integers(motion.module, np.frombuffer(numbers.tobytes(), np.int64))
         self._places = integers(
-            motion.module, np.array([[getattr(g, name) for name in PLACES] for g in borders.guards], np.int64)
+            motion.module,
+            np.array([[getattr(g, name) for name in PLACES] for g in borders.guards] or [[0]], np.int64),
         )
         self.guards = len(borders.guards)
 
@@ -59,7 +60,7 @@ class Saltation:
         self.base, n = levels[0], levels[-1]
         self.parameters = motion.parameters * self.base // n  # of the motion alone
         self.by = [*range(self.base), *range(n, n + self.base), *(2 * n + i for i in range(1 + self.parameters))]
-        self.line = gradient(borders, self.by)
+        self.line, self.tables = gradient(borders, self.by)
 
     @staticmethod
     def fields(pieces: int, levels: tuple[int, ...]) -> dict:

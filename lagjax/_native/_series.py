@@ -9,6 +9,7 @@
 import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -17,8 +18,19 @@ from lagjax._native._constants import LARGEST_LINE, MAX_ORDER
 from lagjax._native._frame import Frame, Index, Layout, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
+from lagjax._native._look_ups import LookUps
 from lagjax._native._tables import Tables
 from lagjax._program._series import Recurrent, Series, StraightLine
+
+
+class Chosen(NamedTuple):
+    """Which of the numbers of a member are parameters of a motion: those at `positions`, `of` so many.
+
+    The others are only looked up (`_look_ups`).
+    """
+
+    positions: tuple[int, ...]
+    of: int
 
 
 class Motion:
@@ -27,7 +39,7 @@ class Motion:
     The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n. `fields`
     names what else a thread remembers (see `Layout`), `job` the structure that all threads share. `large` kernels are
     written as tables (see `is_large`). Vectors have `width` lanes. The last of the numbers of the program are its
-    `pieces`. With `keep_sums` the sums of every order stay in
+    `pieces`, the others the `chosen` ones of a member, or all. With `keep_sums` the sums of every order stay in
     memory, not only those of the last.
     """
 
@@ -42,6 +54,7 @@ class Motion:
         width: int,
         keep_sums: bool = False,
         pieces: int = 0,
+        chosen: "Chosen | None" = None,
     ):
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
         self.numbers = program.size - self.states - 1  # parameters, and the pieces of a piecewise program
@@ -50,6 +63,9 @@ class Motion:
         self.keep_sums, self.job = keep_sums, job
         self.module = ir.Module(name)
         self.module.triple = ""
+        self.look_up = LookUps(self.module, self.states + 1)
+        self.of_member = self.parameters if chosen is None else chosen.of
+        self._chosen = None if chosen is None else integers(self.module, np.array(chosen.positions, np.int64))
         self.layout = Layout(width, self._fields() | fields)
         self.width, self.vector = self.layout.width, ir.VectorType(DOUBLE, self.layout.width)
         self.large = large
@@ -68,16 +84,28 @@ class Motion:
             "sums": (MAX_ORDER if self.keep_sums else 1, products),
             "values": series.values,  # what the order recursion reads of the zeroth order
             "params": self.numbers,
-            **dict.fromkeys(("t", "h", "singular"), 1),
+            # Where the numbers of a member begin; its parameters, and what tables are of.
+            **dict.fromkeys(("t", "h", "singular", "first_number"), 1),
         }
 
     def _form(self) -> Lines | Tables:
         sincos = sincos_function(self.module, self.width)
-        return Tables(self.function, sincos) if self.large else Lines(sincos)
+        return Tables(self.function, sincos, look_up=self.look_up) if self.large else Lines(sincos, self.look_up)
 
     def function(self, name: str, *kinds: ir.Type, **options) -> Frame:
         """A new function of the module."""
         return Frame(self.module, self.layout, self.job, name, *kinds, **options)
+
+    def finish(self) -> None:
+        """After all programs of the kernel."""
+        self.form.finish()
+        self.look_up.finish()
+
+    def place_of_number(self, code: Code, i: Index) -> Index:
+        """Where parameter i lies among the numbers of a member."""
+        if self._chosen is None:
+            return i
+        return code.load(code.element(Value(code, self._chosen), i, INTEGER), INTEGER)
 
     # ---- the sums ----
 

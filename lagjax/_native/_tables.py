@@ -21,6 +21,7 @@ from lagjax._native._frame import Frame, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
 from lagjax._native._lanes import apply, sines_and_cosines
 from lagjax._native._schedule import Kind, Operation, Schedule, schedule
+from lagjax._program._operations import LOOK_UPS
 from lagjax._program._series import StraightLine
 
 WORD = ir.IntType(32)  # an entry of a table: a kind, or a distance in the memory, in doubles
@@ -32,8 +33,8 @@ class Tables:
     `function(name, *kinds)` makes a function of the kernel, with its frame.
     """
 
-    def __init__(self, function, sincos: Code, executing=None):
-        self._sincos = sincos
+    def __init__(self, function, sincos: Code, executing=None, look_up: Callable | None = None):
+        self._sincos, self._look_up = sincos, look_up
         self._kinds: dict[tuple[Kind, int], int] = {}
         self._constants: dict[bytes, int] = {}
         self._fields: list[str] = []
@@ -200,6 +201,9 @@ class Tables:
             return (xs[0],)
         if kind.op == "sincos":
             return sines_and_cosines(code, self._sincos, xs[0])
+        if kind.op in LOOK_UPS:
+            assert self._look_up is not None
+            return (self._look_up(self._execute, kind.op, kind.attribute, xs[0]),)
         xs = [code.compare("!=", x, 0.0) if of == "bool" else x for x, of in zip(xs, kind.kinds, strict=True)]
         result = apply(code, kind.op, xs, kind.attribute, kind.kinds, kind.result)
         return (code.as_double(result) if kind.result == "bool" else result,)

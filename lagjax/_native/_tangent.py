@@ -26,7 +26,7 @@ from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
 from lagjax._native._output import RECORDED, recall_pieces
 from lagjax._native._saltation import GuardTable, Saltation
-from lagjax._native._series import Motion, double, integer, is_large
+from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._native._tables import Tables
 from lagjax._program._borders import Borders
 from lagjax._program._pushforward import pushforward
@@ -57,6 +57,7 @@ class Tangent:
         projection=None,
         borders: "Borders | None" = None,
         levels: tuple[int, ...] = (),
+        chosen: Chosen | None = None,
         *,
         width: int,
         lanes: int,
@@ -67,7 +68,9 @@ class Tangent:
         pieces = 0 if borders is None else len(borders.switches)
         if borders is not None:
             fields |= Saltation.fields(pieces, (n,)) | {"crossed": 1}
-        self.motion = Motion("tangent", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces)
+        self.motion = Motion(
+            "tangent", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
+        )
         self.n, self.states, self.series, self.lanes, self.numbers = n, states, series, lanes, self.motion.parameters
         self.saltation = borders and Saltation(self.motion, borders, levels or (n,))
         if borders is not None and self.saltation is not None:
@@ -76,7 +79,8 @@ class Tangent:
             self.at_border = self.saltation.note_begin(), self.saltation.note_end(GuardTable(self.motion, borders))
         self.layout = Layout(lanes, self._fields(projection is not None), beside=self.motion.layout)
         sincos = sincos_function(self.motion.module, lanes, "sincos_of_tangents")
-        self.form = Tables(self.function, sincos) if large else Lines(sincos)
+        look_up = self.motion.look_up
+        self.form = Tables(self.function, sincos, look_up=look_up) if large else Lines(sincos, look_up)
         dtypes = program.dtypes
         # All but the time and the pieces.
         moving = dtypes[: len(dtypes) - pieces]
@@ -89,9 +93,9 @@ class Tangent:
             steps.insert(4, self._projected())
         self._run(steps)
         self._begin()
-        self.motion.form.finish()
         if self.form is not self.motion.form:
             self.form.finish()
+        self.motion.finish()
 
     def _fields(self, projected: bool) -> dict:
         """What a thread remembers of the direction at hand, in every lane: the tangents of the motion's fields."""
@@ -105,7 +109,8 @@ class Tangent:
             "end": states,  # of the step
             "between": states,  # at an output
         }
-        return fields | dict.fromkeys(("power", "power_before", "next_output", "s", "is_due", "excess"), 1)
+        numbers = "power", "power_before", "next_output", "s", "is_due", "excess", "first_number", "first_dot"
+        return fields | dict.fromkeys(numbers, 1)
 
     def function(self, name: str, *kinds: ir.Type, **options) -> Frame:
         """A new function of the module, whose vectors are tangents."""
@@ -217,8 +222,11 @@ class Tangent:
             tangents["excess"] = 0.0
         if self.saltation is not None:
             lane["is_hit"] = 0.0
-        with code.only_if(there), code.loop(self.motion.parameters) as i:
-            lane["params", i] = frame.read("params", member * frame.job("params_stride") + i)
+        first = member * frame.job("params_stride")
+        with code.only_if(there):
+            lane["first_number"] = code.as_double(first)
+            with code.loop(self.motion.parameters) as i:
+                lane["params", i] = frame.read("params", first + self.motion.place_of_number(code, i))
         return frame.finish()
 
     def _recall(self, frame: Frame, lane: Lane) -> None:
@@ -272,11 +280,14 @@ class Tangent:
         with code.loop(self.lanes) as index:
             lane, (place, there) = frame.lane(index), self._place(frame, group, index)
             lane["next_output"] = code.as_double(self.lane_of_motion(frame, index)["output"])
+            lane["first_number"] = self.lane_of_motion(frame, index)["first_number"]
+            first = place * self.motion.of_member
+            lane["first_dot"] = code.select(there, code.as_double(first), 0.0)
             with code.only_if(there):
                 for i in self.form.each(code, self.states):
                     lane["dy", i, 0] = frame.read("y_dot", place * self.states + i)
                 with code.loop(self.numbers) as i:
-                    lane["dparams", i] = frame.read("params_dot", place * self.numbers + i)
+                    lane["dparams", i] = frame.read("params_dot", first + self.motion.place_of_number(code, i))
         if self.saltation is not None:
             is_hit = self.number_of(frame, "is_hit") > 0.0
             with code.only_if(code.any_lane(is_hit)):

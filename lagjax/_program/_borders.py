@@ -3,6 +3,7 @@
     comparisons, abs, max, min, sign    the sign of a switching number u: −1, 0 or 1
     floor, ceil, round, mod             the whole number below a switching number x
     rem, conversion to integers         the whole number between x and zero
+    look-ups (`locate`)                 the piece of an increasing table that a number x is on
 
 A *piece* is what was decided: one of these numbers, constant along a step. Here a program becomes one that takes its
 pieces as further inputs, so that along every step it is smooth; beside it stand the switching numbers, and the program
@@ -23,12 +24,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._program._graph import Graph
+from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, live
 from lagjax._program._series import Recurrent, StraightLine
-from lagjax._program._transpose import copied, gradient_in, pullback
+from lagjax._program._transpose import copied, gradient_in, pullback_and_entries
 
-SIGN, FLOOR, TRUNC, SLIDE = range(4)  # the kinds of pieces
+# The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders nobody has to look for.
+SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK = range(6)
 MOST_SLIDING = 4  # pieces whose border a motion may slide along: each makes the program longer
 LARGEST_SLIDING = 4000  # operations of a program with such pieces
 # What a function is flat like: exp(u) below, exp(−|u|) on both sides, exp(−u²), or zero up to a border; and in which
@@ -40,7 +43,7 @@ _FEATURES = {
 }  # fmt: skip
 _LARGEST = 10  # operations that one may become: a bound for errors, three are usual
 _COMPARISONS = ("lt", "le", "gt", "ge")
-_PIECEWISE = {*_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "round", "rem", "convert"}
+_PIECEWISE = {*_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "round", "rem", "convert", "locate"}
 _WITHOUT_SERIES = ("rsqrt", "log", "log1p")  # at zero, or −1; besides the operations that are `steep`
 
 
@@ -53,7 +56,7 @@ class Guard(NamedTuple):
     Where both sides push onto the border of `piece`, piece number `slide` becomes 1: the motion slides along it, with
     α of the acceleration on the upper side and 1 − α of that on the lower one. α is the switching number of `slide`;
     beyond its guards the motion goes on with the guard `on` at the piece `goes_on`. All three are −1 where there is
-    none.
+    none. Where `of_table` is 1 the level is the entry of that number of the table of the piece.
     """
 
     piece: int
@@ -69,6 +72,7 @@ class Guard(NamedTuple):
     slide: int = -1
     on: int = -1
     goes_on: float = 0.0
+    of_table: int = 0
 
 
 class Feature(NamedTuple):
@@ -94,7 +98,8 @@ class Borders(NamedTuple):
     `program` takes the inputs, then the pieces; `switches` (m,) are the nodes of the switching numbers in it, and
     `arguments` those of the arguments of `features`. `decide`
     takes the same and then m flags: it gives the pieces of a state, or the piece that is given where the flag is 1.
-    `nested` says whether switching numbers depend on pieces.
+    `nested` says whether switching numbers depend on pieces. `tables` (m,) has that of every piece that is one of a
+    table; those of a `CLOCK` have no guards.
     """
 
     program: Pieced
@@ -105,6 +110,12 @@ class Borders(NamedTuple):
     nested: bool
     arguments: tuple[int, ...]
     features: tuple[Feature, ...]
+    tables: tuple[Located | None, ...] = ()
+
+    @property
+    def clocks(self) -> tuple[int, ...]:
+        """The pieces that change at instants that are known."""
+        return tuple(j for j, kind in enumerate(self.kinds) if kind == CLOCK)
 
     @property
     def followed(self) -> tuple[int, ...]:
@@ -149,7 +160,8 @@ class _Rewriting:
         self.switches: list[int] = []
         self.kinds: list[int] = []
         self.pieces: list[int] = []
-        self._known: dict[tuple[int, int], int] = {}
+        self.tables: list[Located | None] = []
+        self._known: dict[tuple, int] = {}
         self._extremes: dict[int, tuple] = {}  # the operations that have been decided
         self._one = self.graph.constant(1.0, "float")
         self._moves: list[bool] = []
@@ -253,6 +265,9 @@ class _Rewriting:
             if op == "sign" and sign is not None:
                 self._jumping.add(self._base_of(sign))
             return None if sign is None else sign if op == "sign" else f("mul", sign, of[0])
+        if op == "locate":
+            is_time = self.graph.nodes[of[0]][:1] + self.graph.nodes[of[0]][2:] == ("input", self.moving - 1)
+            return self._piece(CLOCK if is_time else TABLE, of[0], attribute)
         if op == "floor":
             return self._piece(FLOOR, of[0])
         if op == "ceil":
@@ -295,16 +310,18 @@ class _Rewriting:
         piece = self._piece(SIGN, base)
         return piece if piece is None or coefficient > 0 else self.graph.apply("neg", piece)
 
-    def _piece(self, kind: int, x: int) -> int | None:
+    def _piece(self, kind: int, x: int, table: Located | None = None) -> int | None:
         """The input that says which piece a number is on; None where the number stays as it is along the motion."""
         if not self._is_moving(x):
             return None
-        if (kind, x) not in self._known:
-            self._known[kind, x] = self.graph.input(self.program.size + len(self.switches), "float")
+        key = (kind, x) if table is None else (kind, x, table)
+        if key not in self._known:
+            self._known[key] = self.graph.input(self.program.size + len(self.switches), "float")
             self.switches.append(x)
             self.kinds.append(kind)
-            self.pieces.append(self._known[kind, x])
-        return self._known[kind, x]
+            self.tables.append(table)
+            self.pieces.append(self._known[key])
+        return self._known[key]
 
     def _is_moving(self, x: int) -> bool:
         """Whether a number changes along a piece of the motion."""
@@ -347,7 +364,7 @@ class _Rewriting:
         kinds = (*self.kinds, *[SLIDE] * len(sliding))
         return Borders(
             pieced, tuple(switches), kinds, self._decide(count), _guards(kinds, sliding), nested,
-            tuple(arguments), tuple(features.values()),
+            tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)),
         )  # fmt: skip
 
     def _linear(self, linear) -> _LinearSystem:
@@ -382,7 +399,7 @@ class _Rewriting:
         for (op, operands, attribute), kind in zip(self.graph.nodes, self.graph.kinds, strict=True):
             if op == "input" and attribute >= first:
                 j = attribute - first
-                raw = _raw(graph, self.kinds[j], nodes[self.switches[j]])
+                raw = _raw(graph, self.kinds[j], nodes[self.switches[j]], self.tables[j])
                 stays = graph.apply("gt", graph.input(first + count + j, "float"), graph.constant(0.5, "float"))
                 nodes.append(graph.apply("select", stays, raw, graph.input(attribute, "float")))
             elif op == "input":
@@ -467,8 +484,10 @@ def _solved(graph: Graph, rows: list[list[int]], right: list[int]) -> list[int]:
     return right
 
 
-def _raw(graph: Graph, kind: int, x: int) -> int:
+def _raw(graph: Graph, kind: int, x: int, table: Located | None) -> int:
     """The piece that a number is on."""
+    if table is not None:
+        return graph.apply("locate", x, attribute=table)
     if kind == SIGN:
         return graph.apply("sign", x)
     below = graph.apply("floor", x)
@@ -484,6 +503,8 @@ def _guards(kinds: Sequence[int], sliding: Sequence[int]) -> tuple[Guard, ...]:
     of_piece: dict[int, int] = {}
     for j, kind in enumerate(kinds):
         k = of_piece[j] = len(guards)
+        if kind == CLOCK:
+            continue
         if kind == SIGN:
             slide = first + sliding.index(j) if j in sliding else -1
             guards.append(Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, k, slide))
@@ -492,10 +513,11 @@ def _guards(kinds: Sequence[int], sliding: Sequence[int]) -> tuple[Guard, ...]:
             guards.append(Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, k, on=on, goes_on=-1.0))
             guards.append(Guard(j, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, k + 1, on=on, goes_on=1.0))
         else:
-            floors = kind == FLOOR
+            floors = kind in (FLOOR, TABLE)  # between numbers p and p + 1, or the entries with these indices
             below, above = (0.0, 0.0) if floors else (-1.0, 1.0)
-            guards.append(Guard(j, 0.0, 1.0, 1.0, 0.0, below, 0.0, 1.0, -1.0, k + 1))
-            guards.append(Guard(j, 0.0, -1.0, 1.0, 1.0 if floors else 0.0, 0.0, above, 1.0, 1.0, k))
+            of = int(kind == TABLE)
+            guards.append(Guard(j, 0.0, 1.0, 1.0, 0.0, below, 0.0, 1.0, -1.0, k + 1, of_table=of))
+            guards.append(Guard(j, 0.0, -1.0, 1.0, 1.0 if floors else 0.0, 0.0, above, 1.0, 1.0, k, of_table=of))
     return tuple(guards)
 
 
@@ -548,8 +570,11 @@ def _moduli(line: StraightLine) -> dict[int, tuple[int, int]]:
     return found
 
 
-def gradient(borders: Borders, by: Sequence[int]) -> StraightLine:
-    """The derivatives by the inputs `by` of Σ hⱼ uⱼ, with numbers hⱼ after the inputs of the program."""
+def gradient(borders: Borders, by: Sequence[int]) -> tuple[StraightLine, tuple[Table, ...]]:
+    """The derivatives by the inputs `by` of Σ hⱼ uⱼ, with numbers hⱼ after the inputs of the program.
+
+    Behind them come those by entries of tables (`_transpose.pullback_and_entries`).
+    """
     program = borders.program
     line = StraightLine(*live(program.line.nodes, program.line.kinds, borders.switches))
-    return pullback(line, program.dtypes, by, range(len(borders.switches)))
+    return pullback_and_entries(line, program.dtypes, by, range(len(borders.switches)))

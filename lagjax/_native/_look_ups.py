@@ -1,0 +1,126 @@
+"""Look-ups in tables (`_program._look_ups`): entries are read from memory, where the numbers of a member lie.
+
+    take      an entry at a whole number, which is clipped to the table: no lane reads what is not there
+    locate    the piece of an increasing table, by bisection; needed where a motion begins, not along it
+
+Tables that consist of numbers of the program lie in one array, whose address the module is told once it is compiled:
+they are part of no text that LLVM reads.
+"""
+
+import functools
+
+import numpy as np
+from llvmlite import ir
+
+from lagjax._native._frame import Frame
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
+from lagjax._program._look_ups import Located, Table
+
+SET_NUMBERS = "set_numbers"
+
+
+class LookUps:
+    """The look-ups of a module. `first` is the input of its programs that comes first in the numbers of a member."""
+
+    def __init__(self, module: ir.Module, first: int):
+        self.module, self.first = module, first
+        self._begins: dict[bytes, int] = {}
+        self._size = 0
+
+    @property
+    def numbers(self) -> np.ndarray | None:
+        """All tables of numbers end to end; None where there are none."""
+        return np.concatenate([np.frombuffer(data) for data in self._begins]) if self._begins else None
+
+    def finish(self) -> None:
+        """After all programs of the module: a function that is told where the tables of numbers are."""
+        if self._begins:
+            code = Code(self.module, SET_NUMBERS, [POINTER], 1, public=True)
+            code.builder.store(code.arguments[0].it, self._address_of_numbers, align=8)
+            code.finish()
+
+    def __call__(self, frame: Frame, op: str, attribute: Table | Located, x: Value) -> Value:
+        """The result of a look-up, in every lane."""
+        if op == "take":
+            assert isinstance(attribute, Table)
+            return self.take(frame, attribute, x)
+        assert isinstance(attribute, Located)
+        table, code = attribute.table, frame.code
+        base, first = self._base(frame, table)
+        found = code.lanes_of(0.0)
+        for lane, (begin, number) in enumerate(zip(self._whole(code, first), _lanes(code, x), strict=True)):
+            constants = (code.as_value(n, INTEGER) for n in (table.stride, table.count, attribute.closed))
+            piece = code.call(self._locate, code.element(base, begin), *constants, number)
+            found = _with_lane(code, found, lane, piece)
+        return found
+
+    def take(self, frame: Frame, table: Table, x: Value) -> Value:
+        """The entries with these numbers."""
+        code, (base, first), found = frame.code, self._base(frame, table), frame.constant(0.0)
+        for lane, place in enumerate(self._whole(code, self._clipped(code, table, x) * float(table.stride) + first)):
+            found = _with_lane(code, found, lane, code.load(code.element(base, place), DOUBLE))
+        return found
+
+    def places(self, frame: Frame, table: Table, x: Value) -> list[Value]:
+        """Where the entries with these numbers lie among the numbers of a member, lane by lane."""
+        x = self._clipped(frame.code, table, x) * float(table.stride) + float(table.first - self.first)
+        return self._whole(frame.code, x)
+
+    @staticmethod
+    def _clipped(code: Code, table: Table, x: Value) -> Value:
+        """A number that the table has; of what is NaN the first."""
+        x, last = code.select(x > 0.0, x, 0.0), float(table.count - 1)
+        return code.select(x < last, x, last)
+
+    def _base(self, frame: Frame, table: Table) -> tuple[Value, Value]:
+        """Where doubles are counted from, and the number of the first entry in every lane."""
+        code = frame.code
+        if table.numbers is not None:
+            if table.numbers not in self._begins:
+                self._begins[table.numbers] = self._size
+                self._size += len(table.numbers) // 8
+            base = Value(code, code.builder.load(self._address_of_numbers, typ=POINTER, align=8))
+            return base, code.lanes_of(float(self._begins[table.numbers] + table.first))
+        name, begin = ("params_dot", "first_dot") if table.tangents else ("params", "first_number")
+        return frame.job(name), frame[begin] + float(table.first - self.first)
+
+    @functools.cached_property
+    def _address_of_numbers(self) -> ir.GlobalVariable:
+        place = ir.GlobalVariable(self.module, POINTER, "address_of_numbers")
+        place.linkage, place.align, place.initializer = "internal", 8, ir.Constant(POINTER, None)
+        return place
+
+    @functools.cached_property
+    def _locate(self) -> Code:
+        """`(base, stride, count, closed, x)`: how many entries are at most x, less one."""
+        code = Code(self.module, "locate", [POINTER, INTEGER, INTEGER, INTEGER, DOUBLE], 1, result=DOUBLE)
+        base, stride, count, closed, x = code.arguments
+        low, high = code.variable(code.as_value(0, INTEGER)), code.variable(count)
+        with code.repeat_while(lambda: code.load(low, INTEGER) < code.load(high, INTEGER)):
+            middle = (code.load(low, INTEGER) + code.load(high, INTEGER)) / 2
+            below = code.load(code.element(base, middle * stride), DOUBLE) <= x
+            code.store(code.select(below, middle + 1, code.load(low, INTEGER)), low)
+            code.store(code.select(below, code.load(high, INTEGER), middle), high)
+        found = code.load(low, INTEGER) - 1
+        last = code.load(code.element(base, (count - 1) * stride), DOUBLE)
+        ends = code.compare("==", x, last) & (closed > 0)
+        return code.finish(code.as_double(code.select(ends, count - 2, found)))
+
+    @staticmethod
+    def _whole(code: Code, x: Value) -> list[Value]:
+        """The whole numbers in the lanes of a vector, as integers: below 2⁵³ a double is exact."""
+        return _lanes(code, Value(code, code.builder.fptosi(x.it, ir.VectorType(INTEGER, code.lanes))))
+
+
+def _lanes(code: Code, x: Value) -> list[Value]:
+    """The numbers in the lanes of a vector."""
+    return [lane_of(code, x, k) for k in range(code.lanes)]
+
+
+def lane_of(code: Code, x: Value, lane: int) -> Value:
+    """The number in one lane of a vector."""
+    return Value(code, code.builder.extract_element(x.it, ir.Constant(INTEGER, lane)))
+
+
+def _with_lane(code: Code, x: Value, lane: int, number: Value) -> Value:
+    return Value(code, code.builder.insert_element(x.it, number.it, ir.Constant(INTEGER, lane)))
