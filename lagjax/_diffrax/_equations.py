@@ -119,6 +119,8 @@ def form_of(derivation: Derivation, path: str = "auto") -> "ScalarEquations | Ar
         if path == "scalar":
             raise ValueError(f"This scene has no scalar program: {reason}.") from None
         return ArrayEquations(motion, str(reason))
+    if path == "auto" and program.looks_up:  # whose inputs would be the entries of tables, one by one
+        return ArrayEquations(motion, "it looks up entries of tables")
     if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:
         reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
         return ArrayEquations(motion, reason)

@@ -19,6 +19,7 @@ Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3.2, 13.
 
 from llvmlite import ir
 
+from lagjax._native._clocks import Clocks
 from lagjax._native._constants import MAX_ORDER, NEAR_ZERO
 from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
@@ -86,7 +87,9 @@ class Adjoint:
             )
             steps.insert(0, self._back_projection())
         if borders is not None:
-            steps = [self._back_border(borders, levels or (n,)), *steps, self._note_after()]
+            clocks = Clocks(self.motion, borders)
+            at_knot = [self._back_knot(clocks, levels or (n,))] if clocks.exist else []
+            steps = [self._back_border(borders, levels or (n,)), *at_knot, *steps, self._note_after()]
         self._run(steps)
         self._begin()
         self.motion.finish()
@@ -373,6 +376,26 @@ class Adjoint:
                 _add(frame, slopes[i + base] * gain, "state_ct", i + self.n)
             for k in motion.form.each(code, saltation.parameters):
                 _add(frame, slopes[k + (2 * base + 1)] * gain, "params_ct", k)
+            self._store_entries(frame, saltation.tables, slopes, len(saltation.by), gain)
+        return frame.finish()
+
+    def _back_knot(self, clocks: Clocks, levels: tuple[int, ...]) -> Code:
+        """To the entry of a table that the time is on, where a step ends at one (`_clocks`)."""
+        frame = self.motion.function("back_knot")
+        code = frame.code
+        with code.only_if(code.any_lane(clocks.is_crossed(frame))):
+            cotangent, there = clocks.cotangent(frame)
+            without = clocks.moves(frame, levels)
+            if without is not None:
+                for i in self.motion.form.each(code, self.states):
+                    x = frame["state_ct", i]
+                    frame["state_ct", i] = code.select(there & without, x * float("nan"), x)
+            for c, j, table in clocks.tables:
+                both = code.compare("==", frame["crossed"], clocks.coincide)
+                hit = there & (code.compare("==", frame["crossed"], float(clocks.first + c)) | both)
+                of_both = code.select(code.compare("!=", cotangent, 0.0), frame.constant(float("nan")), 0.0)
+                entry = code.select(hit, code.select(both, of_both, cotangent), 0.0)
+                self._store_entries(frame, (table,), [clocks.index(frame, j), entry], 0)
         return frame.finish()
 
     def _note_after(self) -> Code:

@@ -10,6 +10,7 @@ What a piece is, and a guard, `_program._borders` says. That a border has been c
 does not decide on which side the next step begins.
 """
 
+from lagjax._native._clocks import Clocks
 from lagjax._native._constants import (
     ABRUPT,
     ARGUMENT,
@@ -53,9 +54,15 @@ class Borders:
             self.stop = self._stop()
             return
         self.table = GuardTable(motion, borders)
+        self.clocks = Clocks(motion, borders)
         self.decide, self.stop = self._decide(), self._stop()
         saltation = Saltation(motion, borders, levels) if len(levels) > 1 else None
         self.note, self.jump = (saltation.note(self.table), saltation.apply()) if saltation else (None, None)
+        self.jump_at_knot = None
+        if self.clocks.exist and len(levels) > 1:
+            for name, count in self.clocks.fields().items():
+                motion.layout.extend(name, count)
+            self.jump_at_knot = self.clocks.jump_of_tangents(levels)
         self.cross = self._cross()
 
     @staticmethod
@@ -133,6 +140,8 @@ class Borders:
         if self.pieces:
             for c, j in enumerate(self.borders.clocks):
                 self._look_at_clock(frame, c, j, h)
+            if self.clocks.exist and len(self.borders.clocks) > 1:
+                self._note_coincidence(frame, h)
             self._note_levels(frame)
             with code.loop(len(self.guards)) as g:
                 self._look(frame, g, degree, h)
@@ -207,6 +216,24 @@ class Borders:
         frame["nearest"] = code.select(sooner, left / size, frame["nearest"])
         frame["crossed"] = code.select(sooner, float(len(self.guards) + 1 + c), frame["crossed"])
 
+    def _note_coincidence(self, frame: Frame, h: Value) -> None:
+        """Entries of several tables at one instant, one of which may be moved."""
+        code, size = frame.code, frame.code.intrinsic("fabs", h)
+        count, moves = frame.constant(0.0), frame.constant(0.0)
+        movable = [j for _, j, _ in self.clocks.tables]
+        for j in self.borders.clocks:
+            left, inside = self._until_next_knot(frame, j)
+            distance = code.intrinsic("fabs", left - frame["nearest"] * size)
+            at_once = inside & (frame["crossed"] > 0.0) & (distance <= self._instant(frame))
+            count = count + code.select(at_once, frame.constant(1), 0.0)
+            if j in movable:
+                moves = moves + code.select(at_once, frame.constant(1), 0.0)
+        frame["crossed"] = code.select((count > 1.0) & (moves > 0.0), self.clocks.coincide, frame["crossed"])
+
+    def _instant(self, frame: Frame) -> Value:
+        """What two times may differ by that are the same."""
+        return frame.code.maximum(frame.code.intrinsic("fabs", frame["t"]), frame["smallest"]) * (4.0 * EPS)
+
     def _note_levels(self, frame: Frame) -> None:
         """The entries on both sides of the pieces of tables, which are the levels of their guards."""
         code = frame.code
@@ -219,10 +246,9 @@ class Borders:
     def _pass_knots(self, frame: Frame, going: Value) -> None:
         """The pieces of tables whose next entry the time has come to: all that are there at one instant."""
         code, clocks = frame.code, self.borders.clocks
-        near = code.maximum(code.intrinsic("fabs", frame["t"]), frame["smallest"]) * (4.0 * EPS)
         for j in clocks:
             left, inside = self._until_next_knot(frame, j)
-            passes = going & inside & (left <= near)
+            passes = going & inside & (left <= self._instant(frame))
             place = self.motion.parameters + j
             frame["params", place] = frame["params", place] + code.select(passes, frame["forward"], 0.0)
             frame["stays", j] = 1.0
@@ -376,6 +402,8 @@ class Borders:
             frame["h"] = code.select(reached, frame["planned_h"], frame["h"])
             if self.note is not None:
                 frame.call(self.note)
+            if self.jump_at_knot is not None:
+                self.clocks.note(frame, self.motion.evaluate_now(frame, self.motion.acceleration))
             self._go_beyond(frame, crossed)
             if self.borders.clocks:
                 self._pass_knots(frame, crosses)
@@ -386,6 +414,8 @@ class Borders:
                 frame.call(self.decide)
             if self.jump is not None:
                 frame.call(self.jump)
+            if self.jump_at_knot is not None:
+                frame.call(self.jump_at_knot)
             idle = code.select(crosses & ~stepped, frame["idle_crossings"] + 1.0, 0.0)
             frame["idle_crossings"] = code.select(stepped | crosses, idle, frame["idle_crossings"])
             many = frame["idle_crossings"] > float(MOST_CROSSINGS * (len(self.guards) + len(self.borders.clocks)))

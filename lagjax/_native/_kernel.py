@@ -29,6 +29,7 @@ from lagjax._native._tangent import Tangent
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
+from lagjax._program._look_ups import BESIDE, shifted
 from lagjax._program._memory import without_collections
 from lagjax._program._operations import LOOK_UPS
 from lagjax._program._series import Recurrent, Series, StraightLine, series
@@ -468,7 +469,10 @@ def parameters_chosen(
     place = {first + i: first + k for k, i in enumerate(positions)}
 
     def fewer(one):
-        nodes = tuple((op, xs, place.get(a, a) if op == "input" else a) for op, xs, a in one.line.nodes)
+        nodes = tuple(
+            (op, xs, place.get(a, a) if op == "input" else shifted(a, BESIDE - first) if op in LOOK_UPS else a)
+            for op, xs, a in one.line.nodes
+        )
         dtypes = (*one.dtypes[:first], *(one.dtypes[first + i] for i in positions))
         return _Fewer(one.line._replace(nodes=nodes), first + len(positions), dtypes, one.linear, one.budget)
 

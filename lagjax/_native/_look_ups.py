@@ -14,16 +14,16 @@ from llvmlite import ir
 
 from lagjax._native._frame import Frame
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
-from lagjax._program._look_ups import Located, Table
+from lagjax._program._look_ups import BESIDE, Located, Table
 
 SET_NUMBERS = "set_numbers"
 
 
 class LookUps:
-    """The look-ups of a module. `first` is the input of its programs that comes first in the numbers of a member."""
+    """The look-ups of a module, in programs of `Chosen` numbers of a member: tables count from `BESIDE`."""
 
-    def __init__(self, module: ir.Module, first: int):
-        self.module, self.first = module, first
+    def __init__(self, module: ir.Module):
+        self.module = module
         self._begins: dict[bytes, int] = {}
         self._size = 0
 
@@ -63,7 +63,7 @@ class LookUps:
 
     def places(self, frame: Frame, table: Table, x: Value) -> list[Value]:
         """Where the entries with these numbers lie among the numbers of a member, lane by lane."""
-        x = self._clipped(frame.code, table, x) * float(table.stride) + float(table.first - self.first)
+        x = self._clipped(frame.code, table, x) * float(table.stride) + float(table.first - BESIDE)
         return self._whole(frame.code, x)
 
     @staticmethod
@@ -82,7 +82,7 @@ class LookUps:
             base = Value(code, code.builder.load(self._address_of_numbers, typ=POINTER, align=8))
             return base, code.lanes_of(float(self._begins[table.numbers] + table.first))
         name, begin = ("params_dot", "first_dot") if table.tangents else ("params", "first_number")
-        return frame.job(name), frame[begin] + float(table.first - self.first)
+        return frame.job(name), frame[begin] + float(table.first - BESIDE)
 
     @functools.cached_property
     def _address_of_numbers(self) -> ir.GlobalVariable:

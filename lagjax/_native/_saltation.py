@@ -21,6 +21,7 @@ from lagjax._native._frame import Frame, Index, Numbers, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._series import Motion
 from lagjax._program._borders import Borders, gradient
+from lagjax._program._look_ups import shifted
 
 NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "goes_on")
 PLACES = ("piece", "back", "slide", "on", "of_table")
@@ -61,6 +62,11 @@ class Saltation:
         self.parameters = motion.parameters * self.base // n  # of the motion alone
         self.by = [*range(self.base), *range(n, n + self.base), *(2 * n + i for i in range(1 + self.parameters))]
         self.line, self.tables = gradient(borders, self.by)
+
+    @property
+    def slopes(self) -> int:
+        """How many numbers its gradient has, with those of tables."""
+        return len(self.by) + 2 * len(self.tables)
 
     @staticmethod
     def fields(pieces: int, levels: tuple[int, ...]) -> dict:
@@ -144,6 +150,11 @@ class Saltation:
                 for k in motion.form.each(code, self.parameters):
                     part = slopes[k + (2 * self.base + 1)] * frame["params", k + d * numbers]
                     code.store(code.load(change, frame.vector) + part, change)
+                for k, table in enumerate(self.tables):
+                    own = shifted(table, d * motion.of_member * inner // n)
+                    first = len(self.by) + 2 * k
+                    part = slopes[first + 1] * motion.look_up.take(frame, own, slopes[first])
+                    code.store(code.load(change, frame.vector) + part, change)
                 delay = 0.0 - code.load(change, frame.vector) / rate
                 for i in motion.form.each(code, self.base):
                     self._move(frame, n + d * inner, i, jump, is_hit, delay)
@@ -190,7 +201,7 @@ class Saltation:
 
     def fields_along(self) -> dict:
         """What a thread remembers from the end of one step to the beginning of the next, for tangents."""
-        return {"slopes": len(self.by), "rate": 1, "jump": self.motion.n, "jumps": 1}
+        return {"slopes": self.slopes, "rate": 1, "jump": self.motion.n, "jumps": 1}
 
     def note_end(self, table: GuardTable) -> Code:
         """`()`: what is to be known of the border at the end of a step."""
@@ -199,7 +210,7 @@ class Saltation:
         frame["is_hit"] = 0.0
         with code.only_if(code.any_lane(frame["crossed"] > 0.0)):
             slopes, frame["rate"] = self.at_end(frame, table)
-            for i in self.motion.form.each(code, len(self.by)):
+            for i in self.motion.form.each(code, self.slopes):
                 frame["slopes", i] = slopes[i]
         return frame.finish()
 

@@ -63,7 +63,7 @@ class Motion:
         self.keep_sums, self.job = keep_sums, job
         self.module = ir.Module(name)
         self.module.triple = ""
-        self.look_up = LookUps(self.module, self.states + 1)
+        self.look_up = LookUps(self.module)
         self.of_member = self.parameters if chosen is None else chosen.of
         self._chosen = None if chosen is None else integers(self.module, np.array(chosen.positions, np.int64))
         self.layout = Layout(width, self._fields() | fields)

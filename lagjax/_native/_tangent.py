@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
+from lagjax._native._clocks import Clocks
 from lagjax._native._constants import MAX_ORDER
 from lagjax._native._frame import Frame, Lane, Layout, Vectors, integers, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
@@ -72,10 +73,17 @@ class Tangent:
             "tangent", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
         )
         self.n, self.states, self.series, self.lanes, self.numbers = n, states, series, lanes, self.motion.parameters
+        self.clocks: Clocks | None = None
+        self.base = levels[0] if levels else n
         self.saltation = borders and Saltation(self.motion, borders, levels or (n,))
         if borders is not None and self.saltation is not None:
             for name, count in self.saltation.fields_along().items():
                 self.motion.layout.extend(name, count)
+            clocks = Clocks(self.motion, borders)
+            if clocks.exist:
+                for name, count in clocks.fields().items():
+                    self.motion.layout.extend(name, count)
+                self.clocks, self.note_knot = clocks, clocks.note_end()
             self.at_border = self.saltation.note_begin(), self.saltation.note_end(GuardTable(self.motion, borders))
         self.layout = Layout(lanes, self._fields(projection is not None), beside=self.motion.layout)
         sincos = sincos_function(self.motion.module, lanes, "sincos_of_tangents")
@@ -190,6 +198,8 @@ class Tangent:
                     frame.call(step, group)
             if self.saltation is not None:
                 frame.call(self.at_border[1])
+            if self.clocks is not None:
+                frame.call(self.note_knot)
             with code.loop(self.motion.width) as j:
                 self._end_or_go_on(frame, frame.lane(j), j)
         frame.finish(self.motion.more(frame))
@@ -222,6 +232,8 @@ class Tangent:
             tangents["excess"] = 0.0
         if self.saltation is not None:
             lane["is_hit"] = 0.0
+        if self.clocks is not None:
+            lane["knot_of"] = 0.0
         first = member * frame.job("params_stride")
         with code.only_if(there):
             lane["first_number"] = code.as_double(first)
@@ -292,14 +304,31 @@ class Tangent:
             is_hit = self.number_of(frame, "is_hit") > 0.0
             with code.only_if(code.any_lane(is_hit)):
                 self._jump(frame, is_hit)
+        if self.clocks is not None:
+            with code.only_if(code.any_lane(self.number_of(frame, "knot_of") > 0.0)):
+                self._jump_at_knot(frame, self.clocks)
         return frame.finish()
+
+    def _jump_at_knot(self, frame: Frame, clocks: Clocks) -> None:
+        """The tangents behind an entry of a table that the time is on, at the beginning of the step from there."""
+        code, n = frame.code, self.n
+        knot_of, knot = self.number_of(frame, "knot_of"), self.number_of(frame, "knot")
+        change = clocks.moved(frame, knot_of, knot, lambda table: table._replace(tangents=True))
+        before = self.numbers_of(frame, "before_knot", n)
+        jump = clocks.jump(code, before, self.numbers_of(frame, "y", n, lambda i: (i + n, 1)))
+        moves = (knot_of > 0.0) & code.compare("!=", change, 0.0)
+        if self.base < n:
+            change = code.select(moves, float("nan"), change)
+        for i in self.form.each(code, n):
+            moved = code.select(moves & code.compare("!=", jump(i), 0.0), jump(i) * change, 0.0)
+            frame["dy", i + n, 0] = frame["dy", i + n, 0] + moved
 
     def _jump(self, frame: Frame, is_hit: Value) -> None:
         """The tangents behind a border, at the beginning of the step from there."""
         code, form, saltation, n = frame.code, self.form, self.saltation, self.n
         assert saltation is not None
         base = saltation.base
-        slopes = self.numbers_of(frame, "slopes", len(saltation.by))
+        slopes = self.numbers_of(frame, "slopes", saltation.slopes)
         jump = self.numbers_of(frame, "jump", n)
         change = code.variable(frame.constant(0.0))
         for i in form.each(code, base):
@@ -308,6 +337,10 @@ class Tangent:
         for k in form.each(code, saltation.parameters):
             part = slopes[k + (2 * base + 1)] * frame["dparams", k]
             code.store(code.load(change, frame.vector) + part, change)
+        for k, table in enumerate(saltation.tables):
+            first = len(saltation.by) + 2 * k
+            entry = self.motion.look_up.take(frame, table._replace(tangents=True), slopes[first])
+            code.store(code.load(change, frame.vector) + slopes[first + 1] * entry, change)
         delay = 0.0 - code.load(change, frame.vector) / self.number_of(frame, "rate")
         always = is_hit & (self.number_of(frame, "jumps") > 0.0)  # where the tangents of the motion jump themselves
         for first, count in ((0, base), (base, n - base)):

@@ -15,6 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 
+# The first of the numbers of a member, in a program whose inputs are only those of them that it computes with.
+BESIDE = 2**40
+
+
 class Table(NamedTuple):
     """Entry i is input `first` + i `stride` of the program, for i from 0 up to `count`.
 
@@ -53,6 +57,15 @@ class Located(NamedTuple):
 def table_of(attribute: "Table | Located") -> Table:
     """The table that a look-up reads."""
     return attribute.table if isinstance(attribute, Located) else attribute
+
+
+def shifted(attribute: "Table | Located", by: int) -> "Table | Located":
+    """A look-up in a program whose inputs come so much later."""
+    table = table_of(attribute)
+    if table.numbers is not None:
+        return attribute
+    table = table._replace(first=table.first + by)
+    return attribute._replace(table=table) if isinstance(attribute, Located) else table
 
 
 def moved(attribute: "Table | Located", places: Sequence[int]) -> "Table | Located":
