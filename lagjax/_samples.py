@@ -1,6 +1,7 @@
 """`samples`: a measured or designed input, given at instants, as a function of time."""
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +19,7 @@ HOLDS = ("zero", "linear", "cubic")
 
 
 def samples(
-    knots: Float[Any, " K"], values: Float[Any, "K *m"], hold: str = "zero"
+    knots: Float[Any, " K"], values: Float[Any, " K *m"], hold: str = "zero"
 ) -> Callable[[Any], Float[Array, "*m"]]:
     r"""The function of time that has these `values` at these `knots`: for `forces`, a Lagrangian, a constraint.
 
@@ -96,15 +97,15 @@ def _checked(knots: Any, values: Any, hold: str) -> tuple:
         raise ValueError(f"samples: `knots` must have the shape (K,) with K ≥ {least}, not {knots.shape}.")
     if values.ndim not in (1, 2) or len(values) != len(knots):
         raise ValueError(
-            f"samples: `values` must have the shape (K,) or (K, m) with one row for each of the {len(knots)} knots, not "
+            f"samples: `values` must have the shape (K,) or (K, m) with one row for each of {len(knots)} knots, not "
             f"{values.shape}."
         )
     if is_concrete(knots):
         _require_increasing(np.asarray(knots))
     if is_concrete(values) and not np.isfinite(np.asarray(values)).all():
         first = int(np.flatnonzero(~np.isfinite(np.asarray(values)).reshape(len(values), -1).all(axis=1))[0])
-        raise ValueError(f"samples: values[{first}] is {np.asarray(values)[first]}, but samples must be finite numbers.")
-    dtype = jnp.result_type(*(x for x in (knots, values) if jnp.issubdtype(x.dtype, jnp.floating)) or (float,))
+        raise ValueError(f"samples: values[{first}] is {np.asarray(values)[first]}, but samples are finite numbers.")
+    dtype = jnp.result_type(float, *(x for x in (knots, values) if jnp.issubdtype(x.dtype, jnp.floating)))
     return tuple(np.array(x, dtype) if is_concrete(x) else x.astype(dtype) for x in (knots, values))
 
 
@@ -161,8 +162,8 @@ def _slopes(knots, values, i, chord):
         return chord, chord
     size = min(count, 4)
     x, v = _window(knots, i - 1, size), _window(values, i - 1, size)
-    steps = [_beside(b - a, v[0]) for a, b in zip(x, x[1:], strict=False)]
-    chords = [(b - a) / step for a, b, step in zip(v, v[1:], steps, strict=False)]
+    steps = [_beside(b - a, v[0]) for a, b in itertools.pairwise(x)]
+    chords = [(b - a) / step for (a, b), step in zip(itertools.pairwise(v), steps, strict=True)]
 
     def about(k):  # sample k + 1 of the window
         return (steps[k + 1] * chords[k] + steps[k] * chords[k + 1]) / (steps[k] + steps[k + 1])

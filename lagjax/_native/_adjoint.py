@@ -419,7 +419,6 @@ class Adjoint:
             for k, i in enumerate(params):
                 _add(frame, cotangents[states + k], "params_ct", i)
 
-
     def _store_entries(
         self, frame: Frame, tables: tuple[Table, ...], out: Numbers, first: int, factor: "Value | None" = None
     ) -> None:

@@ -25,6 +25,7 @@ from lagjax._native._constants import (
     NEARBY,
     PAST,
     RISE,
+    ROUND_OFF,
     SHORT_OF,
     SWITCH_TOLERANCES,
 )
@@ -243,6 +244,27 @@ class Borders:
                 knot, inside = self._knot(frame, guard.piece, index)
                 frame["level", g] = code.select(inside, knot, NOWHERE if guard.e else -NOWHERE)
 
+    def _go_on(self, frame: Frame, going: Value) -> None:
+        """Past the entries of tables. A motion that slides along a border, or touches it, does not if that jumps."""
+        shaken, line = self.borders.shaken, self.borders.switching
+        if not shaken:
+            return self._pass_knots(frame, going)
+        code, before = frame.code, self.motion.evaluate_now(frame, line)
+        before = [code.variable(before[j]) for j in shaken]
+        self._pass_knots(frame, going)
+        after = self.motion.evaluate_now(frame, line)
+        for j, was in zip(shaken, before, strict=True):
+            jump = code.intrinsic("fabs", after[j] - code.load(was, frame.vector))
+            least = code.intrinsic("fabs", after[j]) * ROUND_OFF + code.lanes_of(frame.job("atol"))
+            jumps = going & (jump > least)
+            frame["stays", j] = code.select(jumps, 0.0, frame["stays", j])
+            for g, guard in enumerate(self.guards):
+                if guard.piece == j:
+                    frame["touching", g] = code.select(jumps, 0.0, frame["touching", g])
+                    if guard.slide >= 0:
+                        place = self.motion.parameters + guard.slide
+                        frame["params", place] = code.select(jumps, 0.0, frame["params", place])
+
     def _pass_knots(self, frame: Frame, going: Value) -> None:
         """The pieces of tables whose next entry the time has come to: all that are there at one instant."""
         code, clocks = frame.code, self.borders.clocks
@@ -406,7 +428,7 @@ class Borders:
                 self.clocks.note(frame, self.motion.evaluate_now(frame, self.motion.acceleration))
             self._go_beyond(frame, crossed)
             if self.borders.clocks:
-                self._pass_knots(frame, crosses)
+                self._go_on(frame, crosses)
             if self.returns:
                 frame["h_before"] = code.select(crosses, 0.0, frame["h_before"])
             if self.borders.nested:

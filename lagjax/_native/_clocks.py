@@ -8,12 +8,13 @@ A table of numbers has no such derivatives, and nothing is done for it. Second o
 acceleration jumps, and so are first ones by those of two tables that coincide: a⁻ − a⁺ is that of both.
 """
 
+import itertools
 from collections.abc import Callable
 
 from lagjax._native._constants import JUMP_NOISE
 from lagjax._native._frame import Frame, Numbers
 from lagjax._native._ir import Code, Value
-from lagjax._native._series import Motion, integer
+from lagjax._native._series import Motion
 from lagjax._program._borders import Borders
 from lagjax._program._look_ups import Table, shifted, table_of
 
@@ -88,7 +89,7 @@ class Clocks:
         after = motion.evaluate_now(frame, motion.acceleration)
         jump, hit = self.jump(code, frame.vectors("before_knot", n), after), frame["knot_of"] > 0.0
         own = motion.of_member * base // n
-        for level, (inner, outer) in enumerate(zip(levels, levels[1:], strict=False)):
+        for level, (inner, outer) in enumerate(itertools.pairwise(levels)):
             for d in range(1, outer // inner):
                 shift = own * (inner // base) * d
                 change = self.moved(frame, frame["knot_of"], frame["knot"], lambda t, s=shift: shifted(t, s))

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
 
 from lagjax._native._adjoint import Adjoint
 from lagjax._native._alone import fills_lanes
@@ -19,10 +18,10 @@ from lagjax._native._frame import LANE, Layout
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled, lanes
+from lagjax._native._look_ups import SET_NUMBERS
 from lagjax._native._output import RECORDED
 from lagjax._native._packs import forget_stages
 from lagjax._native._schedule import forget_joined
-from lagjax._native._look_ups import SET_NUMBERS
 from lagjax._native._series import Chosen, Motion, is_large
 from lagjax._native._sweep import SweepPlan
 from lagjax._native._tangent import Tangent
@@ -132,7 +131,9 @@ class Kernel:
             None,
             levels,
         )
-        program, projection, guards, self._chosen = parameters_chosen(program, projection, guards, 2 * size + 1, size // levels[0])
+        program, projection, guards, self._chosen = parameters_chosen(
+            program, projection, guards, 2 * size + 1, size // levels[0]
+        )
         self._smooth = program, projection
         self._parts = program, recurrences(program, size), projection
         if pieces := pieces_of(program, size, len(levels) == 1):

@@ -40,8 +40,8 @@ from lagjax._program._differentiate import Derivatives, has_own_rules
 from lagjax._program._emit import emit, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
-from lagjax._program._memory import machine_memory, operations_that_fit, without_collections
 from lagjax._program._look_ups import look_up, table_of
+from lagjax._program._memory import machine_memory, operations_that_fit, without_collections
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
 from lagjax._program._pushforward import pushforward, with_tangents

@@ -118,6 +118,22 @@ class Borders(NamedTuple):
         return tuple(j for j, kind in enumerate(self.kinds) if kind == CLOCK)
 
     @property
+    def shaken(self) -> tuple[int, ...]:
+        """The pieces whose switching numbers may jump as a clock goes on."""
+        first, clocks = self.program.size - len(self.switches), self.clocks
+        return tuple(
+            j
+            for j, node in enumerate(self.switches if clocks else ())
+            if any(self.program.line.nodes[i] in (("input", (), first + c) for c in clocks)
+                   for i in _below(self.program.line, [node]))
+        )  # fmt: skip
+
+    @property
+    def switching(self) -> StraightLine:
+        """The program of the switching numbers."""
+        return StraightLine(*live(self.program.line.nodes, self.program.line.kinds, self.switches))
+
+    @property
     def followed(self) -> tuple[int, ...]:
         """The nodes whose series are wanted."""
         return self.switches + self.arguments
@@ -379,16 +395,17 @@ class _Rewriting:
     def _sliding(self, line: StraightLine) -> list[int]:
         """The pieces whose border a motion may slide along: they decide by a velocity, and something jumps with them.
 
-        None where they depend on other pieces, or where they are too many.
+        None where they depend on other pieces than those that the time is on, or where they are too many.
         """
         if not self.slides or len(line.nodes) > LARGEST_SLIDING:
             return []
         velocities, found = range(self.size, 2 * self.size), []
+        others = [piece for piece, kind in zip(self.pieces, self.kinds, strict=True) if kind != CLOCK]
         for j, kind in enumerate(self.kinds):
             if kind == SIGN and self.pieces[j] in self._jumping:
                 below = _below(line, [self.switches[j]])
                 read = {line.nodes[i][2] for i in below if line.nodes[i][0] == "input"}
-                if not read.isdisjoint(velocities) and below.isdisjoint(self.pieces):
+                if not read.isdisjoint(velocities) and below.isdisjoint(others):
                     found.append(j)
         return found if len(found) <= MOST_SLIDING else []
 

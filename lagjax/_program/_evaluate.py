@@ -88,7 +88,7 @@ def _converted(x, dtype):
     return np.asarray(x).astype(dtype)
 
 
-def _LOOK_UP(x, attribute):  # noqa: N802  (only its identity counts)
+def _LOOK_UP(x, attribute):
     raise AssertionError
 
 

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-
 # The first of the numbers of a member, in a program whose inputs are only those of them that it computes with.
 BESIDE = 2**40
 

@@ -52,7 +52,10 @@ def with_tangents(
     graph = Graph(_LARGEST * len(line.nodes) * (1 + len(directions)) + 1000)
     kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in dtypes]
     with np.errstate(all="ignore"):
-        ids = [place + INPUTS if kind == "float" else graph.input(place, kind) for place, kind in zip(places, kinds, strict=True)]
+        ids = [
+            place + INPUTS if kind == "float" else graph.input(place, kind)
+            for place, kind in zip(places, kinds, strict=True)
+        ]
         nodes = copied(graph, line, ids, places)
         moved = []
         for direction in directions:

@@ -214,8 +214,8 @@ MOVES: dict[str, Callable] = {
 LOWER: dict[str, Callable] = {}
 # What passes arrays on, or looks up entries in them: these may have ids without nodes.
 _PASSING_ON = frozenset((
-    "gather", "dynamic_slice", "lagjax_locate", "convert_element_type", "jit", "pjit", "closed_call", "core_call", "remat", "remat2",
-    "checkpoint", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
+    "gather", "dynamic_slice", "lagjax_locate", "convert_element_type", "jit", "pjit", "closed_call", "core_call",
+    "remat", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
 ))  # fmt: skip
 
 

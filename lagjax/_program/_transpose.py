@@ -64,9 +64,7 @@ def _kind(dtype) -> str:
     return "float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name
 
 
-def copied(
-    graph: Graph, line: StraightLine, inputs: Sequence[int], places: Sequence[int] | None = None
-) -> list[int]:
+def copied(graph: Graph, line: StraightLine, inputs: Sequence[int], places: Sequence[int] | None = None) -> list[int]:
     """The nodes of the line in the graph; tables begin at other inputs where `places` says what input i has become."""
     nodes: list[int] = []
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
