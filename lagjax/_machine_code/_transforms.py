@@ -200,6 +200,12 @@ def _value(tangent):
 def _slope(flow: Flow, t, y, params):
     """(q̇, q̈) at a state, shape (…, 2n); zero where it is not finite: there the motion has ended."""
     n = flow.size
+    if flow.anywhere.looks_up:
+        shape = jnp.broadcast_shapes(y.shape[:-1], t.shape)
+        y, time = jnp.broadcast_to(y, (*shape, 2 * n)), jnp.broadcast_to(t, shape)[..., None]
+        acceleration = flow.anywhere.of_rows(jnp.concatenate([y, time], axis=-1), params)[:n]
+        rate = jnp.stack(jnp.broadcast_arrays(*(y[..., n + i] for i in range(n)), *acceleration), axis=-1)
+        return jnp.where(jnp.isfinite(rate), rate, 0.0)
     scalars = (*(y[..., i] for i in range(2 * n)), t, *(params[..., i] for i in range(flow.numbers)))
     acceleration = flow.anywhere(*jnp.broadcast_arrays(*scalars))[:n]
     rate = jnp.stack(jnp.broadcast_arrays(*(y[..., n + i] for i in range(n)), *acceleration), axis=-1)

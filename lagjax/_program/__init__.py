@@ -37,7 +37,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 
 from lagjax._program._differentiate import Derivatives, has_own_rules
-from lagjax._program._emit import emit, in_jax, plain_elementary
+from lagjax._program._emit import Rows, emit, emit_rows, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
 from lagjax._program._look_ups import look_up, table_of
@@ -278,6 +278,13 @@ class Program:
     def looks_up(self) -> bool:
         """Whether it reads tables (see `_look_ups`)."""
         return any(op in LOOK_UPS for op, _, _ in self.nodes)
+
+    def of_rows(self, first, numbers) -> tuple:
+        """The outputs for the first inputs, an array (…, m), and the others (…, P), where most are only looked up.
+
+        Its derivatives are those of the operations as they stand.
+        """
+        return emit_rows(self.line, Rows(first, numbers))
 
     @property
     def size(self) -> int:

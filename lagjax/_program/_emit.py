@@ -4,6 +4,7 @@ import contextlib
 import functools
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +15,9 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from lagjax import _elementary
 from lagjax._platform import default_platform
 from lagjax._program._graph import Node
-from lagjax._program._look_ups import table_of
+from lagjax._program._look_ups import Table, table_of
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
+from lagjax._program._series import StraightLine
 
 _state = threading.local()
 
@@ -38,6 +40,15 @@ def plain_elementary() -> Iterator[None]:
 def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ...], scalars: tuple) -> tuple:
     """The outputs for these inputs, all of the shape the inputs broadcast to."""
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in scalars))
+
+    def entries(table):
+        return jnp.stack(jnp.broadcast_arrays(*(scalars[i] for i in table.positions)), axis=-1)
+
+    return _emitted(nodes, kinds, outputs, scalars, shape, entries)
+
+
+def _emitted(nodes, kinds, outputs, scalars, shape: tuple[int, ...], entries: Callable) -> tuple:
+    """The outputs, of this shape."""
     fast = frozenset() if getattr(_state, "plain", False) else _elementary.FAST.keys()
     precision = _precision(nodes, kinds, scalars)
     dtypes = [precision if kind == "float" else np.dtype(kind) for kind in kinds]
@@ -53,7 +64,7 @@ def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ..
         elif op == "convert":
             values[i] = lax.convert_element_type(values[operands[0]], dtypes[i])
         elif op in LOOK_UPS:
-            values[i] = _looked_up(op, attribute, scalars, precision, values[operands[0]])
+            values[i] = _looked_up(op, attribute, entries, precision, values[operands[0]])
         elif op in ("sin", "cos") and operands[0] in paired:
             if operands[0] not in pairs:
                 pairs[operands[0]] = _apart("sincos")(values[operands[0]])
@@ -64,24 +75,44 @@ def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ..
     return tuple(jnp.broadcast_to(jnp.asarray(values[i]), shape) for i in outputs)
 
 
-def _looked_up(op: str, attribute, scalars: tuple, precision, x) -> jax.Array:
-    """An entry of a table, or the piece of one that x is on, for lanes too."""
+class Rows(NamedTuple):
+    """The inputs of a program as arrays: `first` (…, m) of those that come first, then `numbers` (…, P)."""
+
+    first: Any
+    numbers: Any
+
+    def __getitem__(self, i: int):
+        m = self.first.shape[-1]
+        return self.first[..., i] if i < m else self.numbers[..., i - m]
+
+    def entries(self, table: Table):
+        """The entries of a table of them, (…, count)."""
+        first = table.first - self.first.shape[-1]
+        return self.numbers[..., first : first + table.stride * (table.count - 1) + 1 : table.stride]
+
+
+def emit_rows(line: StraightLine, rows: Rows) -> tuple:
+    """`emit` for inputs of which most are looked up in tables: none of these is taken apart."""
+    shape = jnp.broadcast_shapes(rows.first.shape[:-1], rows.numbers.shape[:-1])
+    return _emitted(line.nodes, line.kinds, line.outputs, rows, shape, rows.entries)
+
+
+def _looked_up(op: str, attribute, entries: Callable, precision, x) -> jax.Array:
+    """An entry of a table, or the piece of one that x is on; `entries(table)` has shape (…, count)."""
     table = table_of(attribute)
-    if table.numbers is not None:
-        entries = jnp.asarray(table.known, precision)
-    else:
-        entries = jnp.stack(jnp.broadcast_arrays(*(scalars[i] for i in table.positions))).astype(precision)
-    x = jnp.asarray(x)
-    lanes = entries.reshape(table.count, *[1] * (x.ndim + 1 - entries.ndim), *entries.shape[1:])
-    lanes = jnp.broadcast_to(lanes, (table.count, *jnp.broadcast_shapes(x.shape, lanes.shape[1:])))
-    x = jnp.broadcast_to(x, lanes.shape[1:])
+    known = table.numbers is not None
+    values = jnp.asarray(table.known if known else entries(table)).astype(precision)
     if op == "take":
-        index = jnp.clip(jnp.where(jnp.isnan(x), 0, x), 0, table.count - 1).astype(int)
-        return jnp.take_along_axis(lanes, index[None], axis=0)[0]
-    found = jnp.sum(lanes <= x, axis=0) - 1
-    if attribute.closed:
-        found = jnp.where(x == lanes[-1], table.count - 2, found)
-    return jnp.where(jnp.isnan(x), -1, found).astype(precision)
+        x = jnp.clip(jnp.where(jnp.isnan(x), 0, x), 0, table.count - 1).astype(int)
+        return jnp.vectorize(lambda of, i: of[i], signature="(k),()->()")(values, x)
+
+    def piece(of, x):
+        found = jnp.searchsorted(of, x, side="right") - 1
+        if attribute.closed:
+            found = jnp.where(x == of[-1], table.count - 2, found)
+        return jnp.where(jnp.isnan(x), -1, found).astype(precision)
+
+    return jnp.vectorize(piece, signature="(k),()->()")(values, x)
 
 
 def _precision(nodes, kinds, scalars):
