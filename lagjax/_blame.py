@@ -196,7 +196,7 @@ def _place(equation) -> str:
     """The user's line, as the end of a sentence; empty where it is one of lagjax."""
     summary = source_info_util.summarize(equation.source_info)  # file:line (function)
     file = summary.partition(":")[0]
-    own = os.path.relpath(file, _PACKAGE).startswith("_")
+    own = not file or os.path.relpath(file, _PACKAGE).startswith("_")
     return "" if own or file == summary else f" at {os.path.basename(summary)}"
 
 

@@ -28,9 +28,9 @@ from lagjax._native._tangent import Tangent
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
-from lagjax._program._look_ups import BESIDE, shifted
+from lagjax._program._look_ups import BESIDE, shifted, table_of
 from lagjax._program._memory import without_collections
-from lagjax._program._operations import LOOK_UPS
+from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._series import Recurrent, Series, StraightLine, series
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
@@ -492,8 +492,25 @@ def recurrences(program: Recurrent, size: int) -> Series:
     for (op, _, _), kind in zip(program.line.nodes, program.line.kinds, strict=True):
         if kind not in ("float", "bool") and op not in ("input", "constant", "convert"):
             raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
+    if any(op == "locate" for op, *_ in program.line.nodes):
+        _require_known_knots(program.line, 2 * size)
     with without_collections():
         return series(program, size, moving=2 * size + 1)
+
+
+def _require_known_knots(line: StraightLine, time: int) -> None:
+    """Raise `Unlowerable` where the state is located among parameters: what follows from moving these is not known."""
+    moves: list[bool] = []
+    for op, operands, attribute in line.nodes:
+        if op == "locate" and table_of(attribute).numbers is None and moves[operands[0]]:
+            of, _, which = line.nodes[operands[0]]
+            if (of, which) != ("input", time):
+                raise Unlowerable(
+                    "it looks up where a moving number is among knots that are parameters: of the time itself they may "
+                    "be, otherwise give the knots as known numbers"
+                )
+        step = op not in ("input", "constant") and OPERATIONS[op].is_step
+        moves.append(attribute <= time if op == "input" else not step and any(moves[i] for i in operands))
 
 
 @functools.lru_cache(maxsize=16)
