@@ -185,7 +185,8 @@ class Adjoint:
                     frame.write("y_ct", member * self.states + i, lane["state_ct", i])
                 with code.loop(self.motion.parameters) as i:
                     place = member * self.motion.of_member + self.motion.place_of_number(code, i)
-                    frame.write("params_ct", place, lane["params_ct", i])
+                    before = frame.read("params_ct", place)  # it may be an entry of a table, too
+                    frame.write("params_ct", place, lane["params_ct", i] + before)
                 frame.write("excess", member, lane["excess"])
                 frame.call(self.start_next, index)
 

@@ -78,8 +78,16 @@ def _as_float(graph: Graph, i: int) -> int:
     if kind != "bool" and op in ("add", "sub", "mul", "neg", "max", "min"):
         return graph.apply(op, *(_as_float(graph, x) for x in operands))
     if kind != "bool" and op == "select":
-        return graph.apply(op, operands[0], *(_as_float(graph, x) for x in operands[1:]))
+        return graph.apply(op, _of_floats(graph, operands[0]), *(_as_float(graph, x) for x in operands[1:]))
     return graph.constant(attribute, "float") if op == "constant" else graph.apply("convert", i, attribute="float")
+
+
+def _of_floats(graph: Graph, i: int) -> int:
+    """A comparison of integers as one of floats."""
+    op, operands, _ = graph.nodes[i]
+    if op in ("lt", "le", "gt", "ge", "eq", "ne") and graph.kinds[operands[0]] not in ("float", "bool"):
+        return graph.apply(op, *(_as_float(graph, x) for x in operands))
+    return i
 
 
 def _table(expansion: Any, x: Ids) -> Table:
@@ -104,6 +112,6 @@ def _table(expansion: Any, x: Ids) -> Table:
     if None not in values:
         return Table(0, 1, ids.size, np.array(values, np.float64).tobytes())
     raise Unlowerable(
-        "an index depends on the values of the inputs, and the array that it looks into is computed from them: look "
-        "into an array of params or of numbers, and compute with the entry"
+        "an index depends on the values of the inputs, and the array that it looks into is computed from them: pass the "
+        "array in params as it is to be looked into, or compute with the entry"
     )

@@ -232,6 +232,16 @@ def _add_any(expansion, params, x, y):
     return expansion.map("add", x, y)
 
 
+@_lowers("lt_to")
+def _is_less_in_total_order(expansion, params, x, y):
+    return expansion.map("lt", x, y)
+
+
+@_lowers("le_to")
+def _is_not_more_in_total_order(expansion, params, x, y):
+    return expansion.map("le", x, y)
+
+
 @_lowers("square")
 def _square(expansion, params, x):
     return expansion.map("mul", x, x)
@@ -472,9 +482,31 @@ LOWER.update({name: _scatter(op) for name, op in {**SCATTERS, "scatter-min": "mi
          "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
 def _call(expansion, params, *arguments):
     body = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
+    if params.get("name") == "searchsorted" and _searches_from_the_right(body, arguments):
+        knots, x = arguments
+        return [expansion.map("add", located(expansion, knots, x, closed=False), expansion.constants(np.int32(1)))]
     if isinstance(body, core.ClosedJaxpr):
         return expansion.run_closed(body, arguments)
     return expansion.run(body, (), arguments)
+
+
+def _searches_from_the_right(body, arguments) -> bool:
+    """Whether a function that is named so is `jnp.searchsorted(knots, x, side="right")`, for which `jnp.interp` asks.
+
+    It is tried with numbers: knots 0, 1, …, and a number below them, between two of them, at one, and beyond them.
+    """
+    if len(arguments) != 2 or arguments[0].ndim != 1 or not len(arguments[0]) or len(body.out_avals) != 1:
+        return False
+    shapes, count = [variable.aval for variable in body.jaxpr.invars], len(arguments[0])
+    if not all(jnp.issubdtype(shape.dtype, jnp.floating) for shape in shapes) or body.out_avals[0].shape != shapes[1].shape:
+        return False
+    trial = Expansion(Graph(10_000))
+    for x in (-1.0, 0.5, float(count // 2), count + 1.0):
+        given = [trial.constants(np.arange(count, dtype=float)), trial.constants(np.full(shapes[1].shape, x))]
+        (found,) = trial.run_closed(body, given)
+        if not (trial.known(trial.real(found), "it") == np.searchsorted(np.arange(count), x, side="right")).all():
+            return False
+    return True
 
 
 @_lowers("scan")
