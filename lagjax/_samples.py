@@ -125,6 +125,7 @@ def _require_increasing(knots: np.ndarray) -> None:
 # ---- the functions ---------------------------------------------------------------------------------------------------
 
 
+@jax.jit
 def _zero(knots, values, t):
     t = jnp.asarray(t, knots.dtype)
     i = _locate(knots, t, closed=False)
@@ -132,6 +133,7 @@ def _zero(knots, values, t):
     return jnp.where(_beside(i < 0, v), jnp.nan, v)
 
 
+@jax.jit
 def _linear(knots, values, t):
     t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
     (x0, x1), (v0, v1) = _window(knots, i, 2), _window(values, i, 2)
@@ -139,6 +141,7 @@ def _linear(knots, values, t):
     return jnp.where(_beside(inside, v0), v0 + slope * _beside(t - x0, v0), jnp.nan)
 
 
+@jax.jit
 def _cubic(knots, values, t):
     t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
     (x0, x1), (v0, v1) = _window(knots, i, 2), _window(values, i, 2)

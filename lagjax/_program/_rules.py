@@ -498,7 +498,10 @@ def _searches_from_the_right(body, arguments) -> bool:
     if len(arguments) != 2 or arguments[0].ndim != 1 or not len(arguments[0]) or len(body.out_avals) != 1:
         return False
     shapes, count = [variable.aval for variable in body.jaxpr.invars], len(arguments[0])
-    if not all(jnp.issubdtype(shape.dtype, jnp.floating) for shape in shapes) or body.out_avals[0].shape != shapes[1].shape:
+    if (
+        not all(jnp.issubdtype(shape.dtype, jnp.floating) for shape in shapes)
+        or body.out_avals[0].shape != shapes[1].shape
+    ):
         return False
     trial = Expansion(Graph(10_000))
     for x in (-1.0, 0.5, float(count // 2), count + 1.0):
