@@ -78,11 +78,11 @@ class Lines:
 
 
 def emit(
-    code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos: Code | None, look_up: Callable
+    code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos: Code | None, look_up: Callable | None
 ) -> list[Value]:
     """The outputs of a straight line; `inputs(i)` is its i-th input, as a vector. Integers are doubles here.
 
-    `look_up(op, attribute, x)` reads tables.
+    `look_up(op, attribute, x)` reads tables, where the line does.
     """
     values: list[Value] = []
     turns: dict[int, tuple[Value, Value]] = {}
@@ -95,6 +95,7 @@ def emit(
         elif op == "constant":
             value = code.as_value(attribute, code.vector if kind != "bool" else ir.VectorType(BIT, code.lanes))
         elif op in LOOK_UPS:
+            assert look_up is not None
             value = look_up(op, attribute, xs[0])
         elif op in ("sin", "cos") and sincos is not None:
             if operands[0] not in turns:

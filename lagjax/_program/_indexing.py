@@ -112,6 +112,6 @@ def _table(expansion: Any, x: Ids) -> Table:
     if None not in values:
         return Table(0, 1, ids.size, np.array(values, np.float64).tobytes())
     raise Unlowerable(
-        "an index depends on the values of the inputs, and the array that it looks into is computed from them: pass the "
-        "array in params as it is to be looked into, or compute with the entry"
+        "an index depends on the values of the inputs, and the array that it looks into is computed from them: pass "
+        "the array in params as it is to be looked into, or compute with the entry"
     )
