@@ -16,13 +16,16 @@ from lagjax._native._constants import (
     ARGUMENT,
     AT_ONCE,
     DISCONTINUOUS,
+    EARLY,
     EPS,
     FAINT,
     GROWTH,
     MAX_ORDER,
     MOST_CROSSINGS,
     MOST_HALVINGS,
+    MOST_LOOKS,
     NEARBY,
+    NO_TIME,
     PAST,
     RISE,
     ROUND_OFF,
@@ -38,7 +41,7 @@ from lagjax._program import _borders
 from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
 
 NOWHERE = 1e300  # a level that no switching number comes to
-LEAVING, SLIDING = 2.0, 3.0  # what a guard is that has been zero, and that stays zero; 1.0 where it is just crossed
+SLIDING = 4.0  # a guard that stays zero; of others that touch the border so many rates are zero, and one less
 
 
 class Borders:
@@ -70,17 +73,18 @@ class Borders:
     def fields(borders: _borders.Borders, levels: tuple[int, ...]) -> dict:
         """What a thread remembers for it.
 
-        `touching` is 1 for a guard that is zero where the step begins, 2 where its rate is, too, and 3 where it stays
-        so; `stays` for a piece that is not decided anew;
-        `crossed` is the number of the guard that the step ends at, from 1 on, or 0, and `beyond` the piece there.
-        `planned_h` is the step without borders, `cut` with them, `part` how much of it a series covers, and
-        `idle_crossings` counts those without a step. `approach` is how long the step was from which on others have
+        `touching` is 1 for a guard that is zero where the step begins, 2 where its rate is, too, 3 with the next one,
+        and 4 where it stays so; `stays` for a piece that is not decided anew; `crossed` is the number of the guard that
+        the step ends at, from 1 on, or 0, and `beyond` the piece there. `planned_h` is the step without borders, `cut`
+        with them, `part` how much of it a series covers, and `idle_crossings` counts those without a step. `at_rest` is
+        1 where the motion would be there in no time. `approach` is how long the step was from which on others have
         ended before a border without a series beyond it, 0 where the last one did not.
         """
         numbers = (
             "at_knots",
             "crossed",
             "beyond",
+            "at_rest",
             "planned_h",
             "cut",
             "nearest",
@@ -125,6 +129,11 @@ class Borders:
                 place = j + self.motion.parameters
                 frame["params", place] = code.select(undecided, pieces[j], frame["params", place])
                 frame["stays", j] = code.select(undecided, 0.0, frame["stays", j])
+            with code.loop(len(self.guards)) as g:
+                slide = self.table.place(code, g, "slide")
+                with code.only_if(slide >= 0):
+                    slides = undecided & (self._piece(frame, slide) > 0.0)
+                    frame["touching", g] = code.select(slides, frame.constant(SLIDING), frame["touching", g])
             frame["undecided"] = 0.0
         return frame.finish()
 
@@ -179,6 +188,10 @@ class Borders:
         self._divide(frame, g, degree)
         self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), frame.job("atol"))
         frame.call(self.roots.first_root, degree)
+        self._look_closer(frame, degree)
+        # At rest but for what it gains in so little time: u̇ is of the size of ü t.
+        gain = 4.0 * (code.intrinsic("fabs", frame["poly", 2]) * frame["root"])
+        at_rest = (frame["touching", g] > 0.0) | (code.intrinsic("fabs", frame["poly", 1]) <= gain)
         # A number that is zero leaves zero as its first coefficient says, or stays.
         leaves = undecided & code.compare("!=", leads, 0.0)
         root = code.select(undecided, code.select(leaves, frame.constant(0.0), 2.0), self._place(frame))
@@ -188,6 +201,7 @@ class Borders:
         sooner = (root < frame["nearest"] * apart) & code.compare("!=", h, 0.0) & ~idle
         number = code.select(is_root, code.lanes_of(code.as_double(g + 1)), 0.0)
         frame["nearest"] = code.select(sooner, root, frame["nearest"])
+        frame["at_rest"] = code.select(sooner, code.select(at_rest, frame.constant(1), 0.0), frame["at_rest"])
         frame["crossed"] = code.select(sooner, number, frame["crossed"])
         frame["beyond"] = code.select(sooner, code.select(undecided, leads, beyond), frame["beyond"])
 
@@ -244,18 +258,21 @@ class Borders:
                 knot, inside = self._knot(frame, guard.piece, index)
                 frame["level", g] = code.select(inside, knot, NOWHERE if guard.e else -NOWHERE)
 
-    def _go_on(self, frame: Frame, going: Value) -> None:
-        """Past the entries of tables. A motion that slides along a border, or touches it, does not if that jumps."""
-        shaken, line = self.borders.shaken, self.borders.switching
-        if not shaken:
-            return self._pass_knots(frame, going)
-        code, before = frame.code, self.motion.evaluate_now(frame, line)
-        before = [code.variable(before[j]) for j in shaken]
-        self._pass_knots(frame, going)
-        after = self.motion.evaluate_now(frame, line)
-        for j, was in zip(shaken, before, strict=True):
-            jump = code.intrinsic("fabs", after[j] - code.load(was, frame.vector))
-            least = code.intrinsic("fabs", after[j]) * ROUND_OFF + code.lanes_of(frame.job("atol"))
+    def _go_on(self, frame: Frame, crossed: Value, going: Value) -> None:
+        """Past borders, and entries of tables.
+
+        A motion that slides along another border, or touches it, does so no more where that jumps.
+        """
+        shaken, line, code = self.borders.shaken, self.borders.switching, frame.code
+        before = self.motion.evaluate_now(frame, line) if shaken else []
+        before = [code.variable(before[k]) for k in range(len(shaken))]
+        self._go_beyond(frame, crossed)
+        if self.borders.clocks:
+            self._pass_knots(frame, going)
+        after = self.motion.evaluate_now(frame, line) if shaken else []
+        for k, j in enumerate(shaken):
+            jump = code.intrinsic("fabs", after[k] - code.load(before[k], frame.vector))
+            least = code.intrinsic("fabs", after[k]) * ROUND_OFF + code.lanes_of(frame.job("atol"))
             jumps = going & (jump > least)
             frame["stays", j] = code.select(jumps, 0.0, frame["stays", j])
             for g, guard in enumerate(self.guards):
@@ -375,11 +392,31 @@ class Borders:
             long = last[0] + last[1] + last[2] > self._size(frame, degree) * rtol + code.lanes_of(atol)
             with code.only_if(code.any_lane(long)):
                 code.store(integer(code, 1), again)
-                half, power = code.select(long, frame.constant(0.5), 1.0), code.variable(frame.constant(1.0))
-                frame["part"] = frame["part"] * half
-                with code.loop(degree + 1) as k:
-                    frame["poly", k] = frame["poly", k] * code.load(power, frame.vector)
-                    code.store(code.load(power, frame.vector) * half, power)
+                self._stretch(frame, degree, code.select(long, frame.constant(0.5), 1.0))
+
+    def _look_closer(self, frame: Frame, degree: Value) -> None:
+        """A root that comes early is as exact as what lies before it allows, and not the whole step."""
+        code, left = frame.code, frame.code.variable(integer(frame.code, MOST_LOOKS))
+
+        def early():
+            is_root = (frame["is_root"] > 0.0) & (frame["poly", 0] > 0.0)
+            return is_root & (frame["root"] < EARLY)
+
+        with code.repeat_while(lambda: code.any_lane(early()) & (code.load(left, INTEGER) > 0)):
+            code.store(code.load(left, INTEGER) - 1, left)
+            straight = 0.0 - 4.0 * frame["poly", 0] / frame["poly", 1]  # for a root that is zero to rounding
+            reach = code.select(frame["root"] > 0.0, 2.0 * frame["root"], straight)
+            self._stretch(frame, degree, code.select(early() & (reach > 0.0) & (reach < 1.0), reach, 1.0))
+            frame.call(self.roots.first_root, degree)
+
+    def _stretch(self, frame: Frame, degree: Value, part: Value) -> None:
+        """The polynomial over a part of its interval."""
+        code = frame.code
+        frame["part"] = frame["part"] * part
+        power = code.variable(frame.constant(1.0))
+        with code.loop(degree + 1) as k:
+            frame["poly", k] = frame["poly", k] * code.load(power, frame.vector)
+            code.store(code.load(power, frame.vector) * part, power)
 
     def _place(self, frame: Frame) -> Value:
         """The first root in parts of the step; or how far was looked, or 2 where there is none in all of it."""
@@ -389,12 +426,13 @@ class Borders:
     def _divide(self, frame: Frame, g: Value, degree: Value) -> None:
         """Where guard g is zero at the beginning, divide its polynomial by as many powers as vanish."""
         code = frame.code
-        divided, twice = frame["touching", g] > 0.0, frame["touching", g] >= LEAVING
+        touching = frame["touching", g]
+        divided = touching > 0.0
         for power in range(3):
             with code.only_if(code.any_lane(divided)), code.loop(degree + 1) as k:
                 frame["poly", k] = code.select(divided, frame["poly", k + 1], frame["poly", k])
             vanishes = code.compare("==", frame["poly", 0], 0.0)
-            divided = divided & (vanishes | twice) if power == 0 else divided & vanishes
+            divided = divided & (vanishes | (touching > float(power + 1)))
 
     # ---- beyond it ----
 
@@ -426,9 +464,7 @@ class Borders:
                 frame.call(self.note)
             if self.jump_at_knot is not None:
                 self.clocks.note(frame, self.motion.evaluate_now(frame, self.motion.acceleration))
-            self._go_beyond(frame, crossed)
-            if self.borders.clocks:
-                self._go_on(frame, crosses)
+            self._go_on(frame, crossed, crosses)
             if self.returns:
                 frame["h_before"] = code.select(crosses, 0.0, frame["h_before"])
             if self.borders.nested:
@@ -447,17 +483,25 @@ class Borders:
     def _go_beyond(self, frame: Frame, crossed: Value) -> None:
         """The pieces beyond the borders, which touch them; a piece that touches one is not decided anew.
 
-        A motion that would go back over the border at once is pushed onto it from both sides: it slides.
+        A motion that would go back over the border at once is pushed onto it from both sides: it slides. So does one
+        that has come back in no time that can be told: it bounces off the border, less and less, and comes to rest.
         """
         code, again = frame.code, frame["stepped"] <= 0.0
+        no_time = ~again & (code.intrinsic("fabs", frame["cut"]) <= NO_TIME * frame["smallest"])
+        no_time = no_time & (frame["at_rest"] > 0.0)
         with code.loop(len(self.guards)) as g:
             hit = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
             j, back, slide = (self.table.place(code, g, name) for name in ("piece", "back", "slide"))
             place = j + self.motion.parameters
-            slides = hit & again & (frame["touching", g] > 0.0)
+            by_position = code.select(self.table.place(code, g, "order") > 1, double(code, 1.0), 0.0)
+            bounces = no_time & (code.lanes_of(by_position) > 0.0)
+            slides = hit & (bounces | (again & (frame["touching", g] > 0.0)))
             slides = slides & (code.lanes_of(code.as_double(slide)) >= 0.0)
             frame["params", place] = code.select(hit & ~slides, frame["beyond"], frame["params", place])
             touches = code.select(slides, frame.constant(SLIDING), 1.0)
+            # A share jumps to where it is: it need not touch the border that it had crossed before.
+            is_share = code.select(self.table.place(code, g, "on") >= 0, double(code, 1.0), 0.0)
+            touches = code.select(code.lanes_of(is_share) > 0.0, 0.0, touches)
             frame["touching", back] = code.select(hit, touches, frame["touching", back])
             with code.only_if(slide >= 0):
                 place = slide + self.motion.parameters
@@ -469,12 +513,16 @@ class Borders:
             frame["stays", j] = code.select(stays, frame.constant(1), frame["stays", j])
 
     def _leave(self, frame: Frame, g: Value, hit: Value, again: Value) -> None:
-        """Where the share of a sliding motion comes to 0 or 1, it goes on along one side; u̇ is zero after a slide."""
+        """Where the share of a sliding motion comes to 0 or 1, it goes on along one side.
+
+        The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all.
+        """
         code = frame.code
         on = self.table.place(code, g, "on")
         with code.only_if(on >= 0):
             place = self.table.place(code, on, "piece") + self.motion.parameters
             side = code.lanes_of(self.table.number(code, g, "goes_on"))
             frame["params", place] = code.select(hit, side, frame["params", place])
-            leaves = code.select(again, frame.constant(1), LEAVING)
+            order = code.lanes_of(code.as_double(self.table.place(code, on, "order")))
+            leaves = code.select(again, order, order + 1.0)
             frame["touching", on] = code.select(hit, leaves, frame["touching", on])

@@ -100,10 +100,16 @@ ROOT_NOISE = 16
 # Moves towards a first root. Five to ten are usual; a double root to rounding takes some fifty. What is not found then
 # ends the step where it has been looked, which costs one step.
 MOST_MOVES = 128
+# Before this part of the step a root is looked for once more, so often at most: its rounding is that of the whole step,
+# which may be long. Each time takes seven digits.
+EARLY, MOST_LOOKS = 0.25, 8
 # Borders of several guards lie at one instant where their roots differ by so little: rounding of both, with room.
 AT_ONCE = 2.0**-36
 # Borders of one guard that are crossed at one instant, before the motion is said not to get on.
 MOST_CROSSINGS = 4
+# A border that is reached within this part of the smallest step from another one is bounced off without end: the
+# motion rests on it. What is left of its velocity is as small as that.
+NO_TIME = 0.25
 # A switching number is known along a step where its last terms are so many tolerances of its size, at most. They are
 # less than one in a step that suits the state, unless the number is another one than that: there the step is halved.
 SWITCH_TOLERANCES, MOST_HALVINGS = 16.0, 64

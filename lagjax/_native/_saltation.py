@@ -24,7 +24,7 @@ from lagjax._program._borders import Borders, gradient
 from lagjax._program._look_ups import shifted
 
 NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "goes_on")
-PLACES = ("piece", "back", "slide", "on", "of_table")
+PLACES = ("piece", "back", "slide", "on", "order", "of_table")
 
 
 class GuardTable:

@@ -47,7 +47,7 @@ from lagjax._program._passes import eliminate_dead_code, factor, live, sink_nega
 from lagjax._program._pushforward import pushforward, with_tangents
 from lagjax._program._rules import Expansion, inputs_of
 from lagjax._program._scalars import Scalars, stacked
-from lagjax._program._series import Series, StraightLine, series
+from lagjax._program._series import LinearSystem, Series, StraightLine, series
 from lagjax._program._transpose import copied, pullback
 
 __all__ = [
@@ -209,20 +209,6 @@ class Origin(NamedTuple):
 
     graph: Graph
     outputs: tuple[int, ...]
-
-
-class LinearSystem(NamedTuple):
-    """A z = r, of which the outputs of a program are the solution: nodes of that program, made by `lower_solution`.
-
-    `entries` holds those of the symmetric A on and below its diagonal, by row and column. `solve()` is the program that
-    takes the factors and then r, and gives z.
-    """
-
-    z: tuple[int, ...]
-    entries: dict[tuple[int, int], int]
-    right: tuple[int, ...]
-    factors: tuple[int, ...]
-    solve: "Callable[[], Program]"
 
 
 @dataclass(frozen=True, eq=False)

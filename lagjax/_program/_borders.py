@@ -27,13 +27,12 @@ from lagjax._program._graph import Graph
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, live
-from lagjax._program._series import Recurrent, StraightLine
-from lagjax._program._transpose import copied, gradient_in, pullback_and_entries
+from lagjax._program._series import LinearSystem, Recurrent, StraightLine
+from lagjax._program._sliding import MOST_SLIDING, Slide, dot, with_sliding
+from lagjax._program._transpose import gradient_in, pullback_and_entries
 
 # The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders nobody has to look for.
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK = range(6)
-MOST_SLIDING = 4  # pieces whose border a motion may slide along: each makes the program longer
-LARGEST_SLIDING = 4000  # operations of a program with such pieces
 # What a function is flat like: exp(u) below, exp(−|u|) on both sides, exp(−u²), or zero up to a border; and in which
 # units of its argument.
 BELOW, BESIDE, SQUARED, UP_TO = range(4)
@@ -55,8 +54,9 @@ class Guard(NamedTuple):
 
     Where both sides push onto the border of `piece`, piece number `slide` becomes 1: the motion slides along it, with
     α of the acceleration on the upper side and 1 − α of that on the lower one. α is the switching number of `slide`;
-    beyond its guards the motion goes on with the guard `on` at the piece `goes_on`. All three are −1 where there is
-    none. Where `of_table` is 1 the level is the entry of that number of the table of the piece.
+    beyond its guards the motion goes on with the guard `on` at the piece `goes_on`. These are −1 where there is none.
+    `order` is that of the rate of u that is zero there (`_sliding.Slide`). Where `of_table` is 1 the level is
+    the entry of that number of the table of the piece.
     """
 
     piece: int
@@ -71,6 +71,7 @@ class Guard(NamedTuple):
     back: int
     slide: int = -1
     on: int = -1
+    order: int = 0
     goes_on: float = 0.0
     of_table: int = 0
 
@@ -119,19 +120,20 @@ class Borders(NamedTuple):
 
     @property
     def shaken(self) -> tuple[int, ...]:
-        """The pieces whose switching numbers may jump as a clock goes on."""
-        first, clocks = self.program.size - len(self.switches), self.clocks
-        return tuple(
-            j
-            for j, node in enumerate(self.switches if clocks else ())
-            if any(self.program.line.nodes[i] in (("input", (), first + c) for c in clocks)
-                   for i in _below(self.program.line, [node]))
-        )  # fmt: skip
+        """The pieces whose switching numbers may jump as a clock goes on, or another piece changes."""
+        first = self.program.size - len(self.switches)
+        pieces = {("input", (), first + j) for j, kind in enumerate(self.kinds) if kind != SLIDE}
+        nodes, shaken = self.program.line.nodes, []
+        for j, node in enumerate(self.switches):
+            if self.kinds[j] != SLIDE and any(nodes[i] in pieces for i in _below(self.program.line, [node])):
+                shaken.append(j)
+        return tuple(shaken)
 
     @property
     def switching(self) -> StraightLine:
-        """The program of the switching numbers."""
-        return StraightLine(*live(self.program.line.nodes, self.program.line.kinds, self.switches))
+        """The program of the switching numbers that are `shaken`."""
+        nodes = [self.switches[j] for j in self.shaken]
+        return StraightLine(*live(self.program.line.nodes, self.program.line.kinds, nodes))
 
     @property
     def followed(self) -> tuple[int, ...]:
@@ -142,16 +144,6 @@ class Borders(NamedTuple):
         """The inputs that a node of the program depends on; pieces are the last ones."""
         nodes = self.program.line.nodes
         return frozenset(nodes[i][2] for i in _below(self.program.line, [node]) if nodes[i][0] == "input")
-
-
-class _LinearSystem(NamedTuple):
-    """The linear system of a program, with its nodes in the new one."""
-
-    z: tuple[int, ...]
-    entries: dict[tuple[int, int], int]
-    right: tuple[int, ...]
-    factors: tuple[int, ...]
-    solve: Any
 
 
 def borders(program: Recurrent, size: int, slides: bool = True) -> Borders | None:
@@ -183,11 +175,14 @@ class _Rewriting:
         self._moves: list[bool] = []
         self.features: dict[int, Feature] = {}
         self.abrupt: set[int] = set()
-        self.moduli = _moduli(program.line)
+        self.moduli, self.quotients = _moduli(program.line), _floor_divisions(program.line)
         self.decisive = self._decisive()
         self.places: list[int] = []
         relevant = self.decisive | self.abrupt
-        if any(i in self.moduli or self._decides(i) or program.line.nodes[i][0] in _FEATURES for i in relevant):
+        if any(
+            i in self.moduli or i in self.quotients or self._decides(i) or program.line.nodes[i][0] in _FEATURES
+            for i in relevant
+        ):
             for i in range(len(program.line.nodes)):
                 self.places.append(self._place(i))
 
@@ -197,7 +192,7 @@ class _Rewriting:
         """The nodes that q̈ depends on, without those of the elimination of a linear system."""
         linear, line = self.program.linear, self.program.line
         roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
-        needed = _below(line, roots, self.moduli)
+        needed = _below(line, roots, self.moduli | self.quotients)
         self.abrupt = self._without_series(needed)
         return needed - self.abrupt
 
@@ -250,13 +245,8 @@ class _Rewriting:
         if op == "constant":
             return self.graph.constant(attribute, kind)
         of = [self.places[x] for x in operands]
-        if i in self.decisive and (i in self.moduli or self._decides(i)):
-            if i in self.moduli:
-                op, of = "mod", [self.places[x] for x in self.moduli[i]]
-            decided = self._decided(op, of, attribute)
-            if decided is not None:
-                self._extremes[decided] = op, *of
-                return decided
+        if i in self.decisive and (decided := self._of_piece(i, op, of, attribute)) is not None:
+            return decided
         if op in ("eq", "ne") and (sign := self._known_sign(*of)) is not None:
             return self.graph.apply(op, sign, self.graph.constant(0.0, "float"))
         if i in self.abrupt and self._decides(i):
@@ -264,6 +254,19 @@ class _Rewriting:
         if op in _FEATURES and i in self.decisive and self._is_moving(of[0]):
             self.features.setdefault(of[0], Feature(*_FEATURES[op]))
         return self.graph.node(op, *of, attribute=attribute)
+
+    def _of_piece(self, i: int, op: str, of: list[int], attribute) -> int | None:
+        """The result of a node by its piece; None where it has none."""
+        if i in self.moduli:
+            op, of = "mod", [self.places[x] for x in self.moduli[i]]
+        elif i in self.quotients:
+            op, of = "floor", [self.graph.apply("div", *(self.places[x] for x in self.quotients[i]))]
+        elif not self._decides(i):
+            return None
+        decided = self._decided(op, of, attribute)
+        if decided is not None:
+            self._extremes[decided] = op, *of
+        return decided
 
     def _decided(self, op: str, of: list[int], attribute) -> int | None:
         """The result of a piecewise operation by its piece; None where that does not change along the motion."""
@@ -370,21 +373,26 @@ class _Rewriting:
         nested = not _below(line, self.switches).isdisjoint(self.pieces)
         sliding, switches, arguments = self._sliding(line), list(self.switches), list(features)
         linear = program.linear and self._linear(program.linear)
-        if sliding:
-            linear = None
-            line, places, shares = _with_sliding(line, self.size, program.size, self.switches, sliding)
+        at_rest = [slide for slide in sliding if slide.order == 1]
+        for slides in (sliding, at_rest):
+            done = with_sliding(line, self.size, program.size, self.switches, slides, linear)
+            if done is not None:
+                break
+        sliding = slides if done is not None else []
+        if done is not None:
+            line, places, shares, linear = done
             switches, arguments = [places[i] for i in switches] + shares, [places[i] for i in arguments]
         count = len(switches)
         dtypes = (*program.dtypes, *[np.dtype(float)] * count)
         pieced = Pieced(line, program.size + count, dtypes, linear, _LARGEST * program.budget)
         kinds = (*self.kinds, *[SLIDE] * len(sliding))
         return Borders(
-            pieced, tuple(switches), kinds, self._decide(count), _guards(kinds, sliding), nested,
+            pieced, tuple(switches), kinds, self._decide(count, sliding), _guards(kinds, sliding), nested,
             tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)),
         )  # fmt: skip
 
-    def _linear(self, linear) -> _LinearSystem:
-        return _LinearSystem(
+    def _linear(self, linear) -> LinearSystem:
+        return LinearSystem(
             tuple(self.places[i] for i in linear.z),
             {place: self.places[i] for place, i in linear.entries.items()},
             tuple(self.places[i] for i in linear.right),
@@ -392,25 +400,37 @@ class _Rewriting:
             linear.solve,
         )
 
-    def _sliding(self, line: StraightLine) -> list[int]:
-        """The pieces whose border a motion may slide along: they decide by a velocity, and something jumps with them.
+    def _sliding(self, line: StraightLine) -> list[Slide]:
+        """The borders that a motion may slide along: those of signs that something jumps with.
 
-        None where they depend on other pieces than those that the time is on, or where they are too many.
+        Those that depend on velocities come first, and are all there or none.
         """
-        if not self.slides or len(line.nodes) > LARGEST_SLIDING:
-            return []
-        velocities, found = range(self.size, 2 * self.size), []
-        others = [piece for piece, kind in zip(self.pieces, self.kinds, strict=True) if kind != CLOCK]
-        for j, kind in enumerate(self.kinds):
+        by_velocity, by_position = [], []
+        for j, kind in enumerate(self.kinds if self.slides else ()):
             if kind == SIGN and self.pieces[j] in self._jumping:
                 below = _below(line, [self.switches[j]])
                 read = {line.nodes[i][2] for i in below if line.nodes[i][0] == "input"}
-                if not read.isdisjoint(velocities) and below.isdisjoint(others):
-                    found.append(j)
-        return found if len(found) <= MOST_SLIDING else []
+                if not read.isdisjoint(range(self.size, 2 * self.size)):
+                    by_velocity.append(Slide(j, 1))
+                elif not read.isdisjoint(range(self.size)):
+                    by_position.append(Slide(j, 2))
+        both = by_velocity + by_position
+        return both if len(both) <= MOST_SLIDING else by_velocity if len(by_velocity) <= MOST_SLIDING else []
 
-    def _decide(self, count: int) -> StraightLine:
-        """From the inputs, `count` pieces, and a flag for each that is to stay, to the pieces; a slide goes on."""
+    def _rate(self, graph: Graph, nodes: list[int], slide: Slide) -> int:
+        """u̇ of a border, in a graph in which those of the program are `nodes`."""
+        n, line = self.size, StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), ())
+        slopes = gradient_in(graph, line, nodes, self.switches[slide.piece], range(2 * n + 1))
+        velocities = [graph.input(n + i, "float") for i in range(n)]
+        return graph.apply("add", dot(graph, slopes[:n], velocities), slopes[2 * n])
+
+    def _decide(self, count: int, slides: Sequence[Slide]) -> StraightLine:
+        """From the inputs, `count` pieces, and a flag for each that is to stay, to the pieces; a slide goes on.
+
+        A motion that begins on a border slides along it, and leaves it at once where it may; on one that depends on
+        positions it has to be at rest. To begin with all of several borders takes few turns until it is known which
+        ones it leaves.
+        """
         graph, first = Graph(2 * self.graph.budget), self.program.size
         nodes: list[int] = []
         for (op, operands, attribute), kind in zip(self.graph.nodes, self.graph.kinds, strict=True):
@@ -425,80 +445,14 @@ class _Rewriting:
                 nodes.append(graph.constant(attribute, kind))
             else:
                 nodes.append(graph.apply(op, *(nodes[i] for i in operands), attribute=attribute))
-        slides = [graph.input(first + j, "float") for j in range(len(self.pieces), count)]
-        return StraightLine(*eliminate_dead_code(graph, [nodes[i] for i in self.pieces] + slides))
-
-
-def _with_sliding(
-    line: StraightLine, n: int, first: int, switches: Sequence[int], sliding: Sequence[int]
-) -> tuple[StraightLine, list[int], list[int]]:
-    """A program whose motion slides along the borders of the pieces `sliding` where flags, its last inputs, are 1.
-
-    There the acceleration is a = a⁻ + Σ αₖ (aₖ⁺ − a⁻), with the shares αₖ that keep all switching numbers of sliding
-    pieces at zero: u̇ = 0. (Filippov; where several pieces slide, what one does to a is not to depend on the others.)
-    Returns the program, where the nodes of the line are in it, and the shares. `first` is the input of the first piece.
-    """
-    graph, kinds = Graph(200 * len(line.nodes) + 10_000), line.kinds
-    f, number, pieces, count = graph.apply, lambda x: graph.constant(x, "float"), len(switches), len(sliding)
-    given = [(node[2], kind) for node, kind in zip(line.nodes, kinds, strict=True) if node[0] == "input"]
-    inputs = {attribute: graph.input(attribute, kind) for attribute, kind in given}
-    slides = [f("gt", graph.input(first + pieces + k, "float"), number(0.5)) for k in range(count)]
-    zero, one = number(0.0), number(1.0)
-
-    def copy(upper: int | None) -> list[int]:
-        given = dict(inputs)
-        for k, j in enumerate(sliding):
-            side = one if k == upper else number(-1.0)
-            given[first + j] = f("select", slides[k], graph.input(first + j, "float"), side)
-        size = max(given) + 1
-        return copied(graph, line, [given.get(i, zero) for i in range(size)])
-
-    base = copy(None)
-    a = [base[i] for i in line.outputs]
-    more = [
-        [f("sub", places[i], x) for i, x in zip(line.outputs[:n], a, strict=False)]
-        for places in map(copy, range(count))
-    ]
-    rows, right = [], []
-    for k, j in enumerate(sliding):
-        slopes = gradient_in(graph, line, base, switches[j], range(2 * n + 1))
-        velocity = [graph.input(n + i, "float") for i in range(n)]
-        rate = _dot(graph, [*slopes[:n], *slopes[n : 2 * n]], [*velocity, *a[:n]])
-        rate = f("add", rate, slopes[2 * n])
-        right.append(f("select", slides[k], zero, f("neg", rate)))
-        row = []
-        for m in range(count):
-            both = f("and", slides[k], slides[m])
-            row.append(f("select", both, one if k == m else zero, _dot(graph, slopes[n : 2 * n], more[m])))
-        rows.append(row)
-    shares = _solved(graph, rows, right)
-    for i in range(n):
-        for k in range(count):
-            a[i] = f("add", a[i], f("select", slides[k], zero, f("mul", shares[k], more[k][i])))
-    return StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(a)), base, shares
-
-
-def _dot(graph: Graph, xs: Sequence[int], ys: Sequence[int]) -> int:
-    total = graph.constant(0.0, "float")
-    for x, y in zip(xs, ys, strict=True):
-        total = graph.apply("add", total, graph.apply("mul", x, y))
-    return total
-
-
-def _solved(graph: Graph, rows: list[list[int]], right: list[int]) -> list[int]:
-    """The solution of a few linear equations, by elimination; pieces that do not slide have rows of the identity."""
-    f, n = graph.apply, len(right)
-    for k in range(n):
-        for i in range(k + 1, n):
-            factor = f("div", rows[i][k], rows[k][k])
-            for j in range(k + 1, n):
-                rows[i][j] = f("sub", rows[i][j], f("mul", factor, rows[k][j]))
-            right[i] = f("sub", right[i], f("mul", factor, right[k]))
-    for k in range(n - 1, -1, -1):
-        for j in range(k + 1, n):
-            right[k] = f("sub", right[k], f("mul", rows[k][j], right[j]))
-        right[k] = f("div", right[k], rows[k][k])
-    return right
+        goes_on, zero, one = [], graph.constant(0.0, "float"), graph.constant(1.0, "float")
+        for k, slide in enumerate(slides):
+            begins = graph.apply("eq", nodes[self.pieces[slide.piece]], zero)
+            if slide.order > 1:
+                begins = graph.apply("and", begins, graph.apply("eq", self._rate(graph, nodes, slide), zero))
+            flag = graph.input(first + len(self.pieces) + k, "float")
+            goes_on.append(graph.apply("select", begins, flag, one))
+        return StraightLine(*eliminate_dead_code(graph, [nodes[i] for i in self.pieces] + goes_on))
 
 
 def _raw(graph: Graph, kind: int, x: int, table: Located | None) -> int:
@@ -513,22 +467,27 @@ def _raw(graph: Graph, kind: int, x: int, table: Located | None) -> int:
     return graph.apply("select", graph.apply("lt", x, graph.constant(0.0, "float")), below, graph.apply("ceil", x))
 
 
-def _guards(kinds: Sequence[int], sliding: Sequence[int]) -> tuple[Guard, ...]:
-    """The guards of all pieces; piece number `sliding[k]` slides where the last but k-th piece is 1."""
+def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
+    """The guards of all pieces; piece number `slides[k].piece` slides where the k-th of the last ones is 1.
+
+    Those of one piece stand side by side: of several that are violated where no time passes the first one counts, and
+    so many borders that push onto each other come to rest (Murty, Linear Algebra Appl. 9 (1974) 65).
+    """
     guards: list[Guard] = []
+    sliding = [slide.piece for slide in slides]
     first = len(kinds) - len(sliding)
-    of_piece: dict[int, int] = {}
-    for j, kind in enumerate(kinds):
-        k = of_piece[j] = len(guards)
+    for j, kind in enumerate(kinds[:first]):
+        k = len(guards)
         if kind == CLOCK:
             continue
-        if kind == SIGN:
-            slide = first + sliding.index(j) if j in sliding else -1
-            guards.append(Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, k, slide))
-        elif kind == SLIDE:
-            on = of_piece[sliding[j - first]]
-            guards.append(Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, k, on=on, goes_on=-1.0))
-            guards.append(Guard(j, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, k + 1, on=on, goes_on=1.0))
+        if kind == SIGN and j in sliding:
+            slide = first + sliding.index(j)
+            order = slides[sliding.index(j)].order
+            guards.append(Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, k, slide, order=order))
+            guards.append(Guard(slide, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, k + 1, on=k, goes_on=-1.0))
+            guards.append(Guard(slide, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, k + 2, on=k, goes_on=1.0))
+        elif kind == SIGN:
+            guards.append(Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, k))
         else:
             floors = kind in (FLOOR, TABLE)  # between numbers p and p + 1, or the entries with these indices
             below, above = (0.0, 0.0) if floors else (-1.0, 1.0)
@@ -583,6 +542,30 @@ def _moduli(line: StraightLine) -> dict[int, tuple[int, int]]:
         not_zero = [p for p in parts if nodes[p][0] == "ne" and r in nodes[p][1]]
         apart = [p for p in parts if is_sign_apart(p, r, y)]
         if set(nodes[total][1]) == {r, y} and not_zero and apart:
+            found[i] = x, y
+    return found
+
+
+def _floor_divisions(line: StraightLine) -> dict[int, tuple[int, int]]:
+    """The nodes that are the whole number below x / y, and x and y: one border, where they are written with five.
+
+    JAX writes x // y as round(d), d = (x − r) / y with r = rem(x, y), and d − 1 where r ≠ 0 and sign(r) ≠ sign(y).
+    """
+    nodes, found = line.nodes, {}
+    for i, (op, operands, _) in enumerate(nodes):
+        if op != "round" or nodes[operands[0]][0] != "select":
+            continue
+        condition, d, lower = nodes[operands[0]][1]
+        if nodes[condition][0] != "and" or nodes[d][0] != "div" or nodes[lower][0] != "sub" or nodes[lower][1][0] != d:
+            continue
+        whole, y = nodes[d][1]
+        if nodes[whole][0] != "sub":
+            continue
+        x, r = nodes[whole][1]
+        parts = nodes[condition][1]
+        not_zero = any(nodes[p][0] == "ne" and r in nodes[p][1] for p in parts)
+        signs = any(nodes[p][0] == "ne" and any(nodes[z] == ("sign", (r,), None) for z in nodes[p][1]) for p in parts)
+        if nodes[r][0] == "rem" and nodes[r][1] == (x, y) and not_zero and signs:
             found[i] = x, y
     return found
 

@@ -27,7 +27,7 @@ by means of high-order Taylor methods*, Exp. Math. 14 (2005) 99–117, §2.1; Gr
 (2008), ch. 13.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -44,6 +44,21 @@ class StraightLine(NamedTuple):
     nodes: tuple[Node, ...]
     kinds: tuple[str, ...]
     outputs: tuple[int, ...]
+
+
+class LinearSystem(NamedTuple):
+    """A z = r, of which the outputs of a program are the solution: nodes of that program.
+
+    `entries` holds those of the symmetric A on and below its diagonal, by row and column; `others` entries that are not
+    symmetric. `solve()` is the straight line that takes the factors and then r, and gives z.
+    """
+
+    z: tuple[int, ...]
+    entries: dict[tuple[int, int], int]
+    right: tuple[int, ...]
+    factors: tuple[int, ...]
+    solve: Callable[[], Any]
+    others: dict[tuple[int, int], int] = {}  # noqa: RUF012  (never written to)
 
 
 class Recurrent(Protocol):
@@ -114,16 +129,26 @@ class _Recurrences:
         self._rows: dict[tuple[int | _Component, bool], int] = {}
         self._coefficients: dict[int, int | _Unknown | None] = {}  # None: constant along the motion
         # Of an elimination no coefficient is needed: it is most of a large program.
-        self._find([*self._needed(program.linear), *followed])
-        i = len(program.line.nodes)
-        while i < len(self.zeroth_order.nodes):  # the rules add derivatives at the end
-            self.coefficient(i)
-            i += 1
+        self._find(self._needed(program.linear))
+        self._find_added(len(program.line.nodes))
         self.solution = [] if program.linear is None else self._solution(program.linear)
+        if program.linear is not None:  # what is followed may depend on it
+            self._coefficients = dict(zip(program.linear.z, self.solution, strict=True)) | self._coefficients
+        added = len(self.zeroth_order.nodes)
+        self._find(list(followed))
+        self._find_added(added)
 
     def _needed(self, linear) -> list[int]:
         """The nodes whose coefficients are asked for: of the linear system, or of the outputs themselves."""
-        return self.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
+        if linear is None:
+            return self.outputs[: self.size]
+        return [*linear.right, *linear.entries.values(), *linear.others.values()]
+
+    def _find_added(self, first: int) -> None:
+        """The coefficients of the nodes from `first` on: the rules add derivatives at the end."""
+        while first < len(self.zeroth_order.nodes):
+            self.coefficient(first)
+            first += 1
 
     # ---- what the order recursion reads ----
 
@@ -211,10 +236,11 @@ class _Recurrences:
         """The coefficients zₖ where A z = r: A₀ zₖ = rₖ − Aₖ z₀ − Σ' Aⱼ zₖ₋ⱼ, solved with the factors of A₀."""
         apply = self.order_recursion.apply
         residual = [self._of_output(node) for node in system.right]
-        for (i, j), node in system.entries.items():
+        entries = [(dict.fromkeys([(i, j), (j, i)]), node) for (i, j), node in system.entries.items()]
+        for places, node in [*entries, *(([place], node) for place, node in system.others.items())]:
             if self.coefficient(node) is not None:
                 c = self._of_output(node)
-                for row, column in dict.fromkeys([(i, j), (j, i)]):
+                for row, column in places:
                     taken = apply("mul", c, self.value(system.z[column]))
                     taken = apply("add", taken, self.cauchy_product(node, _Component(column)))
                     residual[row] = apply("sub", residual[row], taken)

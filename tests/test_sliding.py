@@ -1,0 +1,152 @@
+"""Motion on borders: many joints that stick, and corners that a motion comes to rest on.
+
+Every scene has a closed form: parabolas and half swings, or the balance of forces at rest.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+GRAVITY = 9.81
+
+
+def springs(count):
+    """As many blocks, each on its own spring, with dry friction."""
+    return lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v * v) - 0.5 * jnp.sum(q * q), forces=lambda q, v, params: -params * jnp.sign(v)
+    )
+
+
+def swings(q0, mu, t):
+    """q and v of a unit mass on a unit spring with dry friction: half a swing takes π, and 2μ of the amplitude."""
+    side = np.sign(q0)
+    amplitude, n = abs(q0), 0
+    while amplitude > mu and (n + 1) * np.pi < t:
+        amplitude, side, n = amplitude - 2 * mu, -side, n + 1
+        amplitude, side = abs(amplitude), side * np.sign(amplitude)
+    if amplitude <= mu:
+        return side * amplitude, 0.0
+    s = t - n * np.pi
+    return side * (mu + (amplitude - mu) * np.cos(s)), -side * (amplitude - mu) * np.sin(s)
+
+
+def chain(count):
+    """A chain of pendulums of unit masses and rods, by absolute angles, with dry friction in its joints."""
+
+    def lagrangian(q, v):
+        x, y = jnp.cumsum(jnp.cos(q) * v), jnp.cumsum(jnp.sin(q) * v)
+        return 0.5 * jnp.sum(x * x + y * y) + GRAVITY * jnp.sum(jnp.cumsum(jnp.cos(q)))
+
+    def friction(q, v, params):
+        torque = -params * jnp.sign(jnp.diff(v, prepend=0.0))
+        return torque - jnp.append(torque[1:], 0.0)
+
+    return lagjax.System(lagrangian, forces=friction)
+
+
+def torques(q):
+    """What the joints of a chain at rest have to hold."""
+    weights = GRAVITY * (len(q) - np.arange(len(q))) * np.sin(q)
+    return np.cumsum(weights[::-1])[::-1]
+
+
+def test_twenty_blocks_stick_each_at_its_place():
+    q0, ts = np.linspace(-3.0, 2.5, 20), np.array([0.0, 3.0, 7.0, 40.0])
+    run = lagjax.simulate(springs(20), q0, np.zeros(20), ts, 0.3)
+    exact = np.array([[swings(x, 0.3, t) for x in q0] for t in ts[1:]])
+    np.testing.assert_allclose(run.q[1:], exact[:, :, 0], atol=1e-8)
+    np.testing.assert_allclose(run.qdot[1:], exact[:, :, 1], atol=1e-8)
+    assert abs(run.qdot[-1]).max() < 1e-12 and run.stats["num_steps"] < 400
+
+
+@pytest.mark.parametrize("count", [2, 8])
+def test_a_chain_rests_as_long_as_its_joints_hold(count):
+    q0 = 0.4 + 0.1 * np.cos(np.arange(count))
+    limit, scene, ts = np.abs(torques(q0)).max(), chain(count), np.array([0.0, 1.0])
+    held = lagjax.simulate(scene, q0, np.zeros(count), ts, 1.001 * limit)
+    np.testing.assert_allclose(held.q[-1], q0, atol=1e-12)
+    # Of all joints the first gives way: the rest goes on as one body, with θ" = (what is not held) / I.
+    moves = lagjax.simulate(scene, q0, np.zeros(count), 1e-2 * ts, 0.999 * limit)
+    x, y = np.cumsum(np.sin(q0)), np.cumsum(np.cos(q0))
+    rate = -1e-3 * limit / np.sum(x * x + y * y)
+    np.testing.assert_allclose(moves.qdot[-1], 1e-2 * rate, rtol=1e-2)
+
+
+@pytest.mark.slow
+def test_twenty_joints_of_a_thousand_chains():
+    q0 = np.linspace(0.2, 0.9, 1000)[:, None] + np.zeros(20)
+    run = lagjax.simulate_batch(chain(20), q0, np.zeros((1000, 20)), np.array([0.0, 1.0]), 3.0, batch_axes=(0, 0, None))
+    alone = lagjax.simulate(chain(20), q0[500], np.zeros(20), np.array([0.0, 1.0]), 3.0)
+    assert bool(run.ok.all())
+    np.testing.assert_allclose(run.q[500, -1], alone.q[-1], atol=1e-10)
+
+
+def test_derivatives_through_many_that_stick():
+    q0 = np.linspace(-1.9, 2.3, 6)
+
+    def last(mu):
+        return lagjax.simulate(springs(6), q0, np.zeros(6), np.array([0.0, 30.0]), mu).q[-1]
+
+    # Half swings n until |q| ≤ μ: the end is ±(|q0| − 2 n μ).
+    turns = np.array([np.ceil((abs(x) - 0.3) / 0.6) for x in q0])
+    exact = -2 * turns * np.sign(q0) * (-1.0) ** turns
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(last)(0.3), exact, atol=1e-7)
+
+
+# ---- a corner at rest ------------------------------------------------------------------------------------------------
+
+VALLEY = lagjax.System(
+    lambda q, v: 0.5 * v * v - jnp.abs(q), forces=lambda q, v, t, params: params[1] * t - params[0] * jnp.sign(v)
+)
+
+
+def test_a_motion_comes_to_rest_in_a_corner():
+    mu = 0.5
+    # It falls with 1 − μ and rises with 1 + μ, a third as high each time: times are a geometric series.
+    ratio = (1 - mu) / (1 + mu)
+    whole = np.sqrt(2 / (1 - mu)) * (1 + ratio) / (1 - np.sqrt(ratio))
+    run = lagjax.simulate(VALLEY, 1.0, 0.0, np.array([0.0, 0.99 * whole, 1.01 * whole, 50.0]), jnp.array([mu, 0.0]))
+    assert abs(run.q[1]) > 1e-7
+    np.testing.assert_allclose(run.q[2:], 0.0, atol=1e-12)
+    np.testing.assert_allclose(run.qdot[2:], 0.0, atol=1e-13)
+    assert run.stats["num_steps"] < 300
+
+
+def test_a_motion_is_pulled_out_of_a_corner():
+    # At rest in it until the force t/5 is 1 + μ.
+    run = lagjax.simulate(VALLEY, 0.0, 0.0, np.array([0.0, 7.4, 8.5]), jnp.array([0.5, 0.2]))
+    np.testing.assert_allclose(run.q[1:], [0.0, 0.2 / 6], atol=1e-9)
+    np.testing.assert_allclose(run.qdot[1:], [0.0, 0.1], atol=1e-9)
+
+
+def test_a_corner_without_friction_is_passed_and_kept_at_rest():
+    ts = np.array([0.0, 1.0, 50.0])
+    at_rest = lagjax.simulate(VALLEY, 0.0, 0.0, ts, jnp.zeros(2))
+    np.testing.assert_array_equal(at_rest.q, 0.0)
+    moves = lagjax.simulate(VALLEY, 0.0, 1.0, ts, jnp.zeros(2))  # parabolas of the length 2
+    np.testing.assert_allclose(moves.q[1:], [0.5, 0.0], atol=1e-12)
+
+
+def test_static_friction_is_larger_than_kinetic():
+    # At rest until 0.1 t is 0.5, then with 0.3.
+    def force(q, v, t, params):
+        return 0.1 * t - jnp.where(jnp.abs(v) < params, 0.5, 0.3) * jnp.sign(v)
+
+    scene = lagjax.System(lambda q, v: 0.5 * v * v, forces=force)
+    run = lagjax.simulate(scene, 0.0, 0.0, np.array([0.0, 4.9, 7.0]), 1e-9)
+    np.testing.assert_allclose(run.qdot[1:], [0.0, 0.05 * (49 - 25) - 0.3 * 2], atol=1e-4)
+
+
+def test_a_belt_that_changes_its_speed():
+    # With friction 1: it goes along with 0.5, from t = 1 on it brakes to −0.25, from t = 2 on to rest.
+    def force(q, v, t):
+        return -jnp.sign(v - jnp.where(t < 1.0, 0.5, jnp.where(t < 2.0, -0.25, 0.0)))
+
+    scene = lagjax.System(lambda q, v: 0.5 * v * v, forces=force)
+    run = lagjax.simulate(scene, 0.0, 0.5, np.array([0.0, 1.0, 1.5, 1.75, 2.0, 2.25, 3.0]))
+    np.testing.assert_allclose(run.q, [0.0, 0.5, 0.625, 0.59375, 0.53125, 0.5, 0.5], atol=1e-12)
+    np.testing.assert_allclose(run.qdot, [0.5, 0.5, 0.0, -0.25, -0.25, 0.0, 0.0], atol=1e-12)
