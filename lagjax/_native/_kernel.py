@@ -18,6 +18,7 @@ from lagjax._native._frame import LANE, Layout
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled, lanes
+from lagjax._native._lanes import INTEGERS
 from lagjax._native._look_ups import SET_NUMBERS
 from lagjax._native._output import RECORDED
 from lagjax._native._packs import forget_stages
@@ -490,7 +491,7 @@ def parameters_chosen(
 def recurrences(program: Recurrent, size: int) -> Series:
     """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
     for (op, _, _), kind in zip(program.line.nodes, program.line.kinds, strict=True):
-        if kind not in ("float", "bool") and op not in ("input", "constant", "convert"):
+        if kind not in ("float", "bool") and op not in ("input", "constant", "convert", *INTEGERS):
             raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
     if any(op == "locate" for op, *_ in program.line.nodes):
         _require_known_knots(program.line, 2 * size)

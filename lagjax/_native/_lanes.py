@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
 from llvmlite import ir
 
 from lagjax._digits import COS, PI_2, PI_2_ROUNDED, SIN
@@ -114,6 +115,8 @@ def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str],
     """
     if op == "convert":
         return _convert(code, xs[0], kinds[0], kind)
+    if kind not in ("float", "bool"):
+        return _of_integers(code, op, xs, kind)
     how = OPERATIONS[op].llvm
     if how is None:
         raise Unlowerable(f"`{op}` has no machine code here")
@@ -127,7 +130,35 @@ def _convert(code, x, before, after):
         return code.as_double(x)
     if after == "bool":
         return code.compare("!=", x, 0.0)
-    return code.intrinsic("trunc", x) if before == "float" and after != "float" else x
+    if after == "float":
+        return x
+    return _in_range(code, code.intrinsic("trunc", x) if before == "float" else x, after)
+
+
+# What is done with integers, which are whole doubles. Where the result is not listed it may leave their range.
+INTEGERS = {
+    "add": lambda code, a, b: a + b,
+    "sub": lambda code, a, b: a - b,
+    "mul": lambda code, a, b: a * b,
+    "neg": lambda code, a: -a,
+    "div": lambda code, a, b: code.intrinsic("trunc", a / b),
+    **{op: OPERATIONS[op].llvm for op in ("abs", "max", "min", "sign", "rem", "select")},
+}
+
+
+def _of_integers(code: Code, op: str, xs: list[Value], kind: str) -> Value:
+    """An operation whose result is an integer: NaN, and not another number, where that leaves the range of its type."""
+    how = INTEGERS.get(op)
+    if how is None:
+        raise Unlowerable(f"`{op}` of integers has no machine code here")
+    return _in_range(code, code.library(how, *xs) if isinstance(how, str) else how(code, *xs), kind)
+
+
+def _in_range(code: Code, x: Value, kind: str) -> Value:
+    """An integer, or NaN where its type does not hold it, or no double holds it exactly."""
+    limits = np.iinfo(kind)
+    low, high = max(int(limits.min), -(2**53)), min(int(limits.max), 2**53)
+    return code.select((x >= float(low)) & (x <= float(high)), x, float("nan"))
 
 
 def sincos_function(module: ir.Module, lanes: int, name: str = "sincos") -> Code:

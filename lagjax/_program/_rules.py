@@ -375,6 +375,46 @@ def _cumulation(op):
 LOWER.update({name: _reduction(*meaning) for name, meaning in REDUCTIONS.items()})
 LOWER.update({name: _cumulation(op) for name, op in CUMULATIONS.items()})
 
+
+def _first_extreme(better):
+    """Where the largest or smallest element along an axis is, the first of equal ones."""
+
+    def rule(expansion, params, x):
+        (axis,), kind = params["axes"], kind_of(params["index_dtype"])
+        rows = np.moveaxis(x, axis, 0)
+        best, place = rows[0], np.full(rows.shape[1:], expansion.graph.constant(0, kind))
+        for k, row in enumerate(rows[1:], 1):
+            is_better = expansion.map(better, row, best)
+            here = np.full(row.shape, expansion.graph.constant(k, kind))
+            best = expansion.map("select", is_better, best, row)
+            place = expansion.map("select", is_better, place, here)
+        return place
+
+    return rule
+
+
+LOWER.update({"argmax": _first_extreme("gt"), "argmin": _first_extreme("lt")})
+
+
+@_lowers("sort")
+def _sort(expansion, params, *operands):
+    """Neighbours are exchanged until all are in order: n (n − 1) / 2 comparisons, for a few numbers."""
+    if params["num_keys"] != 1:
+        raise Unlowerable("the primitive `sort` by several keys has no scalar form here")
+    rows = [list(np.moveaxis(x, params["dimension"], 0)) for x in operands]
+    for end in range(len(rows[0]) - 1, 0, -1):
+        for k in range(end):
+            if len(operands) == 1:
+                (key,) = rows
+                key[k], key[k + 1] = (expansion.map(op, key[k], key[k + 1]) for op in ("min", "max"))
+                continue
+            wrong = expansion.map("lt", rows[0][k + 1], rows[0][k])
+            for row in rows:
+                pair = row[k], row[k + 1]
+                row[k], row[k + 1] = (expansion.map("select", wrong, *of) for of in (pair, pair[::-1]))
+    return [np.stack(row, params["dimension"]) if row else x for row, x in zip(rows, operands, strict=True)]
+
+
 # ---- indexing with arrays: the indices must fold to numbers ---------------------------------------------------------
 
 
