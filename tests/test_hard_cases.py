@@ -22,14 +22,14 @@ pytest.importorskip("scipy", reason="the references are computed with it")
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-from benchmarks import hard_cases, soak  # noqa: E402
+from benchmarks import hard_cases, population, soak  # noqa: E402
 from benchmarks._hard import CASES, Case, Experiment, _constrained, _gravity, _integrable, _rotation  # noqa: E402
 
 # Those that take a second or two, one at least in every file of the table.
 FAST = (
     "Double pendulum", "Pendulum on a rod", "Chaplygin's sleigh", "10⁴ members", "Charge",
     "Kepler", "Arenstorf's orbit", "Figure eight", "Swinging Atwood machine", "Toda lattice",
-    "Calogero and Moser", "Dzhanibekov's body",
+    "Calogero and Moser", "Dzhanibekov's body", "Stick–slip on a belt", "Corner at rest",
 )  # fmt: skip
 
 
@@ -146,3 +146,8 @@ def test_a_leak_would_be_seen():
     leaking = [(k, size + max(0.0, k - soak.WARM_UP)) for k, size in steady]
     assert abs(soak.growth_of(steady)) < 0.01 < soak.FLAT < soak.growth_of(leaking)
     assert soak.growth_of(steady[:50]) is None
+
+
+@pytest.mark.slow
+def test_of_random_scenes_with_borders_none_is_wrong_without_a_word():
+    assert population.main(["--scenes", "40"])["wrong"] == 0

@@ -6,7 +6,7 @@ from pathlib import Path as File
 import numpy as np
 
 from benchmarks._figures import COLOURS, GREY, STYLE
-from benchmarks._hard import _chaos, _fields, _gravity, _rotation
+from benchmarks._hard import _borders, _chaos, _fields, _gravity, _rotation
 from benchmarks._hard._case import Path, follow
 from lagjax import scenes
 
@@ -42,6 +42,10 @@ def _blade(path: Path) -> list:
     return [(path.q.x, path.q.y)]
 
 
+def _phases(path: Path) -> list:
+    return [(path.q, path.qdot)]
+
+
 # The first words of a case: its scene, the time shown, and the lines to draw.
 PORTRAITS: dict[str, tuple[Callable, float, Callable]] = {
     "Arenstorf": (scenes.restricted_three_body, 17.0652, _plane),
@@ -54,6 +58,7 @@ PORTRAITS: dict[str, tuple[Callable, float, Callable]] = {
     "Kovalevskaya": (_rotation.kovalevskaya_top, 60.0, _vertical),
     "Hénon": (_chaos.henon_heiles, 300.0, _plane),
     "Chaplygin": (scenes.chaplygin_sleigh, 5.0, _blade),
+    **{name: (*portrait, _phases) for name, portrait in _borders.PORTRAITS.items()},  # velocity against place
 }
 IN_A_ROW = 5
 
