@@ -306,14 +306,14 @@ class Borders:
     def _moves(self, frame: Frame, j: Value, degree: Value, h: Value) -> tuple[Value, Value]:
         """How far a number may move along the step, Σ |cₖ| for k > 0, and the last of these terms."""
         code, row = frame.code, j + (self.motion.series.rows - self.motion.series.followed)
-        sum, last = (code.variable(frame.constant(0.0)) for _ in range(2))
-        size = code.intrinsic("fabs", h)
-        with code.loop(degree) as i:
+        size, sum = code.intrinsic("fabs", h), frame.constant(0.0)
+        for i in range(3):
+            sum = (sum + code.intrinsic("fabs", frame["rows", row, degree - i])) * size
+        sum, last = code.variable(sum), code.variable(sum)
+        with code.loop(degree, start=3) as i:
             c = code.intrinsic("fabs", frame["rows", row, degree - i])
             code.store((code.load(sum, frame.vector) + c) * size, sum)
             code.store(code.load(last, frame.vector) * size, last)
-            with code.only_if(i < 3):
-                code.store(code.load(last, frame.vector) + c * size, last)
         return code.load(sum, frame.vector), code.load(last, frame.vector)
 
     def _find_feature(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> None:

@@ -221,8 +221,8 @@ class _Unknowns:
             for (row, column), d in others.items():
                 if row >= count:
                     ends[row - count] = graph.apply("sub", ends[row - count], graph.apply("mul", at[d], y[column]))
-            moved = [[[at[x] for x in row] for row in table] for table in (rows, lower)]
-            mu = substitute(graph, *moved, ends)
+            upper, factors_below = ([[at[x] for x in row] for row in table] for table in (rows, lower))
+            mu = substitute(graph, upper, factors_below, ends)
             for (row, column), c in others.items():
                 if column >= count:
                     right[row] = graph.apply("sub", right[row], graph.apply("mul", at[c], mu[column - count]))
