@@ -5,6 +5,7 @@ System(L)  →  simulate(system, q0, qdot0, ts, params)  →  Trajectory
 
 from lagjax import plot, scenes
 from lagjax._check import Finding, Findings, check
+from lagjax._crossings import Crossings, crossings
 from lagjax._diffrax._solvers import FineOutput
 from lagjax._explain import Explanation
 from lagjax._health import Health
@@ -20,6 +21,7 @@ from lagjax._trajectory import State, Trajectory, Transitions
 __version__ = "0.1.0"
 __all__ = [
     "RESULTS",
+    "Crossings",
     "Explanation",
     "Finding",
     "Findings",
@@ -35,6 +37,7 @@ __all__ = [
     "WorkPrecision",
     "WorkPrecisionRow",
     "check",
+    "crossings",
     "plot",
     "samples",
     "scenes",

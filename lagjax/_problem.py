@@ -59,8 +59,8 @@ class Problem:
     - `ts` (T,): the output times, of which the first is that of the initial state `y0` (2n,), q and then q̇.
     - `tolerances`: rtol and atol of a step; an engine with fixed steps does not look at them.
     - `max_steps`: the budget of steps, rejected ones included.
-    - `event`: functions of the user's state that end the motion, for diffrax.
-    - `guards`: the same as a program for machine code (`_native.Guards`), whose signs end the motion.
+    - `event`: functions of the user's state that end the motion.
+    - `guards`: the same as a program for machine code (`_native.Guards`), whose signs end the motion; of hybrid motion.
     """
 
     system: Any
@@ -189,7 +189,7 @@ class Batch(eqx.Module):
 class Solution(NamedTuple):
     """The motion that answers a problem; of a batch, with the members as first axis of everything.
 
-    - `path` (T, 2n): the states at the output times, NaN where not reached.
+    - `path` (T, 2n): the states at the output times, NaN where not reached; or what was noted on the way.
     - `y_end` (2n,), `t_end` (): the state and the time at which the motion ended.
     - `result` (): how it ended, as the integer of a `lagjax.RESULTS`.
     - `accepted`, `rejected` (): counts of steps.
@@ -365,6 +365,11 @@ def _event(event, dtype) -> diffrax.Event | None:
     tolerance = 4 * float(jnp.finfo(dtype).eps)
     root_finder = event.root_finder or _SignChange(rtol=tolerance, atol=tolerance)
     return diffrax.Event(conditions, root_finder, event.direction)
+
+
+def has_own_root_finder(event: diffrax.Event) -> bool:
+    """Whether the user has chosen how the instant of an event is found."""
+    return not isinstance(event.root_finder, _SignChange)
 
 
 class _SignChange(optx.Bisection):

@@ -25,6 +25,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "max_steps or loosen rtol."
     )
     max_transitions_reached = "The budget of transitions was spent. Raise max_transitions, or end ts earlier."
+    max_crossings_reached = (
+        "There are more crossings after that than there is room for. Raise `count`, or end ts earlier."
+    )
     zeno = (
         "Transitions follow each other at ever shorter times that add up to a finite one (Zeno), as the bounces of a "
         "ball do: no budget of transitions leads beyond it. End ts before that time, or add a transition to a mode at "

@@ -89,11 +89,14 @@ def test_piecewise_operations_parameters_that_are_integers_and_guards():
     shapes = jnp.ones(2), jnp.ones(2), 1.0
     program = lower(acceleration, *shapes, 1.0, 2)
 
+    def value(q, v, t, k, n):
+        return q[0] * q[1] - 0.7
+
     def guards(q, v, t, k, n):
-        g = q[0] * q[1] - 0.7
+        g = value(q, v, t, k, n)
         return g, v[0] * q[1] + q[0] * v[1], abs(g) + 1.4, abs(v[0] * q[1]) + abs(q[0] * v[1])
 
-    events = _native.Guards(lower(guards, *shapes, 1.0, 2), (0,))
+    events = _native.Guards(lower(value, *shapes, 1.0, 2), lower(guards, *shapes, 1.0, 2), (0,))
     y0 = np.random.default_rng(1).uniform(-0.5, 0.5, (MEMBERS, 4)) + np.array([0.5, 0.5, 0, 0])
     kernels = list(in_all_forms(program, 2, guards=events))
     assert_same(kernels, np.linspace(0.0, 2.0, 5), y0, np.array([[2.0, 1.0]]))

@@ -23,10 +23,9 @@ from lagjax._arguments import Function, accept
 from lagjax._custom import differentiated_as
 from lagjax._derivation import Derivation
 from lagjax._layout import Layout, halves
-from lagjax._machine_code import MachineCode, flow_of
-from lagjax._native import Guards
+from lagjax._machine_code import MachineCode, Surfaces, flow_of, moved_with, require_one_number, scalars_of
 from lagjax._problem import Problem, Solution
-from lagjax._program import Program, Unlowerable, lower
+from lagjax._program import Unlowerable
 from lagjax._system import System
 
 PyTree = Any
@@ -71,18 +70,6 @@ class Transition(eqx.Module):
         self.reset = None if reset is None else accept(reset, "reset")
 
 
-class Surfaces(NamedTuple):
-    """The guards of a mode as programs of (q, q̇, t, params), and how each has to change sign: −1, 0, +1.
-
-    `values` gives all g. `complete` gives what `_native.Guards` wants: g, then ġ, then the sizes of both, which bound
-    their round-off.
-    """
-
-    values: Program
-    complete: Program
-    directions: tuple[int, ...]
-
-
 class Mode(NamedTuple):
     """One mode: a problem that lacks a state and times, and the transitions that leave it, with their numbers.
 
@@ -106,6 +93,9 @@ class Mode(NamedTuple):
                 raise Unlowerable(refusal)
             transitions = tuple(transition for _, transition in leaving)
             surfaces = _surfaces(problem.derivation, problem.system, transitions, tuple(code), structure)
+            guarded = problem if surfaces is None else dataclasses.replace(problem, guards=surfaces.guards())
+            if refusal := MachineCode().refuses(guarded):
+                raise Unlowerable(refusal)
         except Unlowerable as why:
             raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
         return cls(problem, leaving, surfaces, problem.params, jnp.asarray(problem.vector))
@@ -128,7 +118,7 @@ class Mode(NamedTuple):
 
     def solve_to_event(self, ts, y0) -> Solution:
         """The motion to the last of the times `ts`, or to the first zero of a guard; it has no derivatives."""
-        guards = None if self.surfaces is None else Guards(self.surfaces.complete, self.surfaces.directions)
+        guards = None if self.surfaces is None else self.surfaces.guards()
         solution = MachineCode().solve(dataclasses.replace(self.problem, ts=ts, y0=y0, guards=guards))
         return jax.tree.map(jax.lax.stop_gradient, solution)
 
@@ -143,29 +133,9 @@ class Mode(NamedTuple):
     def crossing(self, k: int) -> Callable:
         """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero and stays so as what went in varies.
 
-        With δg the variation of the guard, f the rate of the state and ′ the derivative along the motion, the time
-        moves by
-
-            s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
-
-        up to third order in δg, which is zero itself: first and second derivatives are right.
+        See `_machine_code.moved_with`.
         """
-        n, still, count = self.layout.size, jax.lax.stop_gradient, len(self.leaving)
-        program, surfaces = flow_of(self.problem).anywhere, self._surfaces
-
-        def rates(t, y, numbers):
-            acceleration = jnp.stack(program(*y, t, *numbers)[:n])
-            return surfaces.complete(*y, t, *numbers)[count + k], jnp.concatenate([y[n:], acceleration])
-
-        def moved(taken, t, y, numbers):
-            value, (rate, slope) = surfaces.values(*y, t, *numbers)[k], rates(t, y, numbers)
-            direction = jnp.ones_like(t), slope
-            bend, turn = map(still, jax.jvp(lambda t, y: rates(t, y, numbers), (t, y), direction)[1])
-            rate = jnp.where(taken & (rate != 0), rate, 1.0)
-            part = jnp.where(taken, value - still(value), 0.0) / rate
-            later = -part - 0.5 * still(bend / rate) * part**2
-            return t + later, y + slope * later + 0.5 * turn * later**2
-
+        moved = moved_with(self._surfaces, flow_of(self.problem).anywhere, k)
         return lambda taken, t, y, numbers: differentiated_as(moved, (t, y), taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):
@@ -188,44 +158,30 @@ def _surfaces(
     """
     if not leaving:
         return None
-    n, layout, numbers = derivation.layout.size, derivation.layout, derivation.numbers
-    program, multipliers = derivation.acceleration, derivation.multipliers
+    layout, multipliers = derivation.layout, derivation.multipliers
+    n = layout.size
 
-    def values(y, numbers):
-        q, v, t = y[:n], y[n:-1], y[-1]
-        extras = {"t": t, "params": eqx.combine(numbers, structure.unflatten(code))}
-        if multipliers is not None:
-            flat = jnp.stack(multipliers(*y, *_scalars(numbers)))
-            extras["multipliers"] = system.by_constraint(flat, layout, extras["params"])
-        return jnp.stack([_value(one.guard, layout.restore(q), layout.restore(v), extras) for one in leaving])
+    def extras(y, params):
+        if multipliers is None:
+            return {}
+        flat = jnp.stack(multipliers(*y, *scalars_of(eqx.filter(params, eqx.is_array_like))))
+        return {"multipliers": system.by_constraint(flat, layout, params)}
 
-    def complete(y, numbers):
-        acceleration = jnp.stack(program.complete(*y, *_scalars(numbers))[:n])
-        rate = jnp.concatenate([y[n:-1], acceleration, jnp.ones(1)])
-        by_y = jax.jacfwd(values)(y, numbers)
-        terms, moving = by_y * y, by_y * rate
-        return values(y, numbers), moving.sum(1), jnp.abs(terms).sum(1), jnp.abs(moving).sum(1)
+    def value(guard):
+        return lambda y, params: _value(
+            guard, *map(layout.restore, (y[:n], y[n:-1])), {"t": y[-1], "params": params} | extras(y, params)
+        )
 
-    y = jax.ShapeDtypeStruct((2 * n + 1,), layout.dtype)
+    functions = [value(transition.guard) for transition in leaving]
     directions = tuple(transition.direction for transition in leaving)
-    return Surfaces(lower(values, y, numbers), lower(complete, y, numbers), directions)
-
-
-def _scalars(numbers: PyTree) -> list[jax.Array]:
-    return [x for leaf in jax.tree.leaves(numbers) for x in jnp.ravel(leaf)]
+    return Surfaces.of(derivation, functions, directions, code, structure)
 
 
 def _value(guard: Function, q, qdot, extras) -> jax.Array:
     """The value of a guard, after checking that it is one real number."""
     if "multipliers" in guard.extras and "multipliers" not in extras:
         raise ValueError("A guard asks for `multipliers`, but its mode has no constraints.")
-    value = guard(q, qdot, **extras)
-    if len(jax.tree.leaves(value)) != 1 or value is not jax.tree.leaves(value)[0]:
-        raise TypeError(f"A guard must return one real number; got {type(value).__name__}.")
-    value = jnp.asarray(value)
-    if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
-        raise TypeError(f"A guard must return one real number; got shape {value.shape} of {value.dtype}.")
-    return value
+    return require_one_number(guard(q, qdot, **extras), "A guard")
 
 
 def state_after(transition: Transition, layout: Layout, t, y, params) -> jax.Array:

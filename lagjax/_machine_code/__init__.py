@@ -4,6 +4,7 @@ Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is trace
 of JAX, where something is.
 """
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 
@@ -13,12 +14,19 @@ import numpy as np
 
 from lagjax._derivation import Derivation
 from lagjax._machine_code import _transforms
+from lagjax._machine_code._events import MOST_GUARDS, Noted, along_crossings, surfaces_of, surfaces_of_event, to_event
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
-from lagjax._native import Guards
+from lagjax._machine_code._surfaces import Surfaces, moved_with, require_one_number, scalars_of
+from lagjax._native import Guards, watched
 from lagjax._platform import default_platform
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
 from lagjax._program import Unlowerable
 from lagjax._validate import is_concrete
+
+__all__ = [
+    "MOST_GUARDS", "Flow", "MachineCode", "Noted", "Surfaces", "flow_of", "moved_with", "require_one_number",
+    "scalars_of", "surfaces_of",
+]  # fmt: skip
 
 
 # Not an equinox.Module: its methods are pytrees of their own, and to make one takes as long as ten steps.
@@ -39,8 +47,8 @@ class MachineCode(AbstractEngine):
     of a batch stand side by side in the vector registers of every core.
 
     It is for float64 on CPUs, scenes whose acceleration is a scalar program of at most a million smooth or
-    piecewise smooth operations, adaptive steps, no `event` and derivatives by its own adjoint. `System.explain` says
-    whether a scene is one of these.
+    piecewise smooth operations, adaptive steps, events that are real numbers, and derivatives by its own adjoint.
+    `System.explain` says whether a scene is one of these.
 
     **Raises** nothing itself; the run raises `ValueError`, before anything is integrated, where it has no machine code.
 
@@ -58,12 +66,12 @@ class MachineCode(AbstractEngine):
 
     def refuses(self, problem: Problem) -> str | None:
         """Why it cannot solve the problem, as the end of a sentence; None where it can."""
-        if problem.event is not None:
-            return "an event was asked for"
         if not all(map(is_concrete, problem.tolerances)):
             return "the tolerances are being traced"
         if (platform := default_platform()) != "cpu":
             return f"the default device is a {platform}, and `jax.default_device(jax.devices('cpu')[0])` chooses a CPU"
+        if problem.event is not None and isinstance(surfaces := surfaces_of_event(problem), str):
+            return surfaces
         flow = _flow_of(problem)
         return flow if isinstance(flow, str) else None
 
@@ -74,7 +82,25 @@ class MachineCode(AbstractEngine):
             ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
             return Solution._make([*(x[0] for x in flow.run(ts, y0, params, tolerances)[:-1]), None])
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
-        return _transforms.run(flow, tolerances, ts, y0, params)
+        if problem.event is None:
+            return _transforms.run(flow, tolerances, ts, y0, params)
+        return to_event(flow, _without_guards(problem), _surfaces_of(problem), tolerances, ts, y0, params)
+
+    def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
+        """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""
+        return self.refuses(dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True)))
+
+    def crossings(self, problem: Problem, surfaces: Surfaces, room: int) -> tuple[Solution, Noted]:
+        """The motion of one member, and the crossings of its surfaces, `room` for each, on the way."""
+        noting = dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True))
+        flow, tolerances = flow_of(noting), _tolerances(problem)._replace(notes=room)
+        if problem.is_known:
+            ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
+            solution = flow.run(ts, y0, params, tolerances)
+            solution = Solution._make([*(x[0] for x in solution[:-1]), None])
+            return solution, Noted.read(solution.path, len(surfaces.directions))
+        ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
+        return along_crossings(flow, _without_guards(problem), surfaces, tolerances, ts, y0, params)
 
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, in the lanes of vectors and on all cores."""
@@ -92,8 +118,19 @@ def flow_of(problem: Problem) -> Flow:
     return flow
 
 
+def _without_guards(problem: Problem) -> Flow:
+    return flow_of(dataclasses.replace(problem, event=None, guards=None))
+
+
+def _surfaces_of(problem: Problem) -> Surfaces:
+    surfaces = surfaces_of_event(problem)
+    assert not isinstance(surfaces, str), surfaces
+    return surfaces
+
+
 def _flow_of(problem: Problem) -> Flow | str:
-    return _made(problem.derivation, problem.system.path, problem.guards)
+    guards = problem.guards if problem.event is None else _surfaces_of(problem).guards()
+    return _made(problem.derivation, problem.system.path, guards)
 
 
 @functools.lru_cache(maxsize=64)
@@ -108,7 +145,14 @@ def _made(derivation: Derivation, path: str, guards: Guards | None) -> Flow | st
     except Unlowerable as reason:
         return str(reason)
     n = derivation.layout.size
-    return unfit(program, n, derivation.layout.dtype) or Flow.of(program, n, projection, guards)
+    if reason := unfit(program, n, derivation.layout.dtype):
+        return reason
+    try:
+        if guards is not None:
+            watched(program, n, guards.values, True)
+    except Unlowerable as reason:
+        return f"of a guard, {reason}"
+    return Flow.of(program, n, projection, guards)
 
 
 def _tolerances(problem: Problem) -> Tolerances:

@@ -45,7 +45,8 @@ def on_host(host: Callable, shapes, *arrays) -> tuple:
 
 def has_handler(flow: Flow, members: int) -> bool:
     """Whether a run of so many members begins in the handler."""
-    return NO_HANDLER is None and flow.kernel.to_run(members).threads(members) == 1
+    notes = flow.guards is not None and flow.guards.notes
+    return NO_HANDLER is None and not notes and flow.kernel.to_run(members).threads(members) == 1
 
 
 def has_sweep(flow: Flow, members: int) -> bool:

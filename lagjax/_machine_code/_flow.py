@@ -30,12 +30,13 @@ _GIVEN_UP = (_SINGULAR, _NOT_FINITE, _SHRANK, _NOT_PROJECTED)  # what another va
 
 
 class Tolerances(NamedTuple):
-    """The local error of a step, and what a run may cost."""
+    """The local error of a step, what a run may cost, and how often each guard may be noted on the way."""
 
     rtol: float
     atol: float
     max_steps: int
     tries: int = 4
+    notes: int = 0
 
     @property
     def perturbed(self) -> "Tolerances":
@@ -136,6 +137,12 @@ class Flow:
         """Numbers in a state: q, then q̇."""
         return 2 * self.size
 
+    def path_shape(self, times: int, notes: int) -> tuple[int, ...]:
+        """The shape of the `path` of a member: of states at so many output times, or of what is noted."""
+        if self.guards is None or not self.guards.notes:
+            return times, self.states
+        return len(self.guards.directions) * (notes + 1), self.states + 1
+
     @functools.cached_property
     def kernel(self) -> _native.Kernel:
         """The machine code."""
@@ -169,10 +176,10 @@ class Flow:
 
     def follow(self, ts, y0, params, tolerances, store=None, room=None, begun=None) -> Solution:
         """`run` without a look at what stopped a member: for another try, and for derivatives."""
-        rtol, atol, max_steps, _ = tolerances
+        rtol, atol, max_steps, _, notes = tolerances
         if store is not None and room is None:
             room = min(max_steps * len(y0), LARGEST_KEPT // (self.states + 4))
-        done = self.kernel.to_run(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun)
+        done = self.kernel.to_run(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes)
         result, event = _RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:

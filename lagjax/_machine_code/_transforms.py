@@ -124,10 +124,10 @@ def _floats(*shapes):
     return [ShapedArray(shape, np.dtype(float)) for shape in shapes]
 
 
-def _run_shapes(ts, y0, params, *, flow, **_):
+def _run_shapes(ts, y0, params, *, flow, tolerances, **_):
     batch = _batch_of((ts, y0, params), (1, 1, 1))
     counts = [ShapedArray(batch, np.dtype(int))] * (_OUTPUTS - 3)
-    floats = _floats((*batch, ts.shape[-1], flow.states), (*batch, flow.states), batch)
+    floats = _floats((*batch, *flow.path_shape(ts.shape[-1], tolerances.notes)), (*batch, flow.states), batch)
     return [*floats, *counts]
 
 

@@ -14,7 +14,8 @@ one Taylor series, of the order that the tolerance asks for.
     _series      the coefficients of a motion, and what is read off them along a step
     _projection  the way back to the constraints;  _rank_drops: where these become dependent
     _step        step control
-    _events      where guards change sign
+    _guards      functions of the state that are watched;  _events: where they change sign
+    _roots       where a polynomial is zero: borders and guards have series
     _output      what is written down
     _integrator  all of these, round by round;  _tangent, _adjoint: its derivatives, forward and back
     _kernel      both as functions of arrays;  _threads: on several cores, interruptible;  _handler: as a call of XLA
@@ -33,14 +34,15 @@ from lagjax._native._constants import (
     SINGULAR,
     STEP_TOO_SMALL,
 )
+from lagjax._native._guards import Guards, watched
 from lagjax._native._handler import Plan, handler, unavailable
 from lagjax._native._ir import lanes
-from lagjax._native._kernel import Begun, Guards, Kernel, Outcome, Projection, cores, order_for, pieces_of, recurrences
+from lagjax._native._kernel import Begun, Kernel, Outcome, Projection, cores, order_for, pieces_of, recurrences
 from lagjax._native._series import is_large
 from lagjax._native._sweep import SweepPlan, sweep_handler
 
 __all__ = [
     "DISCONTINUOUS", "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "STEP_TOO_SMALL",
     "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "SweepPlan", "cores", "handler", "is_large", "lanes",
-    "order_for", "pieces_of", "recurrences", "sweep_handler", "unavailable",
+    "order_for", "pieces_of", "recurrences", "sweep_handler", "unavailable", "watched",
 ]  # fmt: skip

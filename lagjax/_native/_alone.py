@@ -177,6 +177,23 @@ class MotionAlone(Motion):
         column = frame.vectors_at("rows", self.series.rows, k, by_row=True)
         return Vectors(len(ranks), column.read, column.write, lambda i: first + ranks[i], column.shift)
 
+    def followed_value(self, frame: Frame, j: Value) -> Value:
+        """What the program gives for number j of those that are followed."""
+        first = self.layout.place("values", 0)
+        return self._followed(frame, first + self._value_ranks, j)
+
+    def followed_coefficient(self, frame: Frame, j: Value, k: Index) -> Value:
+        """Its coefficient of order k > 0."""
+        first = self.layout.place("rows", 0, 0)
+        return self._followed(frame, first + self._row_ranks, j, k * self._stride)
+
+    def _followed(self, frame: Frame, places: np.ndarray, j: Value, more: Index = 0) -> Value:
+        """A vector `more` doubles behind the j-th of the last of these places, one for each number that is followed."""
+        code = frame.code
+        table = integers(self.module, places[len(places) - self.series.followed :].astype(np.int64))
+        place = code.load(code.element(Value(code, table), j, INTEGER), INTEGER)
+        return code.load(frame.at(place + more), frame.vector)
+
     def at_order(self, frame: Frame, k: Value) -> list:
         """The inputs of the order recursion: the coefficients of order k, k, 1/k, the values and the sums."""
         coefficients, scalars, values, sums = super().at_order(frame, k)

@@ -128,29 +128,22 @@ JUMP_NOISE = 2.0**-34
 
 # ---- events ----------------------------------------------------------------------------------------------------------
 
-# A step is looked at in so many intervals: a guard may not have a feature narrower than about one of them. Measured: a
-# guard that is a pulse of width 0.02 is missed with 4 and seen with 8; doubled, every step costs twice the guards.
-INTERVALS = 8
-# Two places more, in intervals, at which a cubic through the neighbours must be right. They lie by the golden ratio:
-# a wave whose period is in step with the samples is not in step with these.
-BETWEEN = (1.382, 5.236)
-SAMPLES = INTERVALS + 3 + len(BETWEEN)  # one sample beyond either end of the step
-# How far the cubic may be off: in parts of the guard there, or else of what it varies over three intervals. A wave of
-# less than about four intervals is off by more. Measured: halved, a wave takes 40 % more steps; doubled, as many.
-NOTICEABLE, SMOOTH = 0.01, 0.05
-# Smallest steps: in a step shorter than this a guard that is not smooth jumps, and there is nothing to halve.
-JUMP = 2.0**20
-# Between samples of one sign a guard is looked into where the parabola through three of them comes down to half of the
-# least, or where the least is this small against the bend: the parabola's own error. Doubled, more is looked into.
-NEAR_LEAST = 0.02
-# Golden sections to find where a guard is least: 0.618³² = 2e-7 of two intervals, half of the digits, as a minimum has
-# no more. Measured: with 16, two crossings 2e-5 apart are lost; with 64 nothing is gained.
-SECTIONS, GOLDEN = 32, 0.6180339887498949
-# Of the guard at the samples beside: what goes no further through the surface has touched it. It stands above the
-# rounding of what a guard is computed from, some hundred EPS. A crossing that deep lasts 6e-7 of an interval; doubled,
-# 1.4 times that.
-TOUCHING = 1e-13
-# Halvings of an interval to find the zero: more than the digits of a double.
+# The last three terms of the series of a guard along a step, in parts of Σ |cₖ|, at most: else the step ends where they
+# are that small. Those of the state are, at the loosest tolerance; a guard that varies faster makes steps of its own.
+GUARD_TERMS = 1 / 128
+# And they are to be this part of the three before them, by a half each, or else less than what can be seen: terms that
+# do not fall are those of a pole ahead, about which the guard may do anything.
+FALL, SEEN = 1 / 8, 2.0**-48
+# A guard that was zero where a step ended at a border of its own is so at the beginning of the next one, if it is not
+# more than this part of Σ |cₖ|: it has not jumped.
+CONTINUOUS = 2.0**-20
+# Changes of one guard in one step: more than the roots of its polynomial.
+MOST_CHANGES = 32
+# Newton's steps from the root of the polynomial to that of the guard: two or three at the tolerances there are.
+MOST_CORRECTIONS = 8
+# Where a guard has no series, this part of the step is taken, and its end looked at.
+WITHOUT_SERIES = 1 / 8
+# Halvings of such a step to find the zero: more than the digits of a double.
 BISECTIONS = 60
 # Where a run begins, a guard of less than `GUARD_NOISE` Σ |∂g/∂yᵢ yᵢ|, or that its rate makes up for within `INSTANT`
 # smallest steps, is on the surface: it takes its side from its rate, or from where it is after `LITTLE` of the step.

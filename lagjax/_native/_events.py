@@ -1,69 +1,92 @@
-"""Where a motion meets a surface: the first change of sign of its guards along a step, to the last digit.
+"""Where a motion meets a surface: the changes of sign of its guards along a step, on their own series.
 
-    begin_sides    which side of every surface a motion begins on
-    sample         the guards along the step; it is halved until they are smooth there
-    first change   between samples of different sign, or about the least of samples of one sign
-    root           by bisection
+    begin_sides   which side of every surface a motion begins on
+    look          for every guard the roots of its polynomial, one after the other (`_roots`), each to the last digit of
+                  the guard itself; those in its direction end the motion, or are written down and the motion goes on
 
-The step then ends at the earliest change of all guards.
+A guard changes sign, too, where it jumps, at a border of its own: that is seen where the next step begins. A step ends
+where the series of a guard does not say what it does beyond. Where a guard has no series at all, as the square root of
+what is zero, the step is short, and its end is looked at.
 """
 
-import functools
-from collections.abc import Callable
-from typing import NamedTuple
+import numpy as np
 
 from lagjax._native._constants import (
-    BETWEEN,
     BISECTIONS,
-    GOLDEN,
+    CONTINUOUS,
+    EPS,
+    FALL,
     GUARD_NOISE,
+    GUARD_TERMS,
     INSTANT,
-    INTERVALS,
-    JUMP,
     LITTLE,
-    NEAR_LEAST,
-    NOTICEABLE,
-    SAMPLES,
-    SECTIONS,
-    SMOOTH,
-    TOUCHING,
+    MOST_CHANGES,
+    MOST_CORRECTIONS,
+    NOT_FINITE,
+    ROOT_NOISE,
+    SEEN,
+    WITHOUT_SERIES,
 )
-from lagjax._native._frame import Frame
+from lagjax._native._frame import Frame, Lane, integers
 from lagjax._native._ir import INTEGER, Code, Value
+from lagjax._native._output import Output
+from lagjax._native._roots import Roots
 from lagjax._native._series import Motion, double, integer
-from lagjax._native._step import StepControl, note_halved
+from lagjax._native._step import StepControl
 from lagjax._program._series import StraightLine
 
-
-class _Change(NamedTuple):
-    """Variables of a search: the side before, the bracket about the first change, and 1 (falls), 2 (rises) or 0."""
-
-    side: Value
-    low: Value
-    high: Value
-    kind: Value
+_FALLS, _RISES = 1.0, 2.0  # the kinds of changes
+_ON, _ALONG = 1.0, 2.0  # a motion that begins on the surface, and one that does not leave it at a rate
 
 
 class Events:
-    """The changes of sign that end a motion: those of the guards `line`, each in its direction (−1, 0, +1).
+    """The changes of sign of the guards `values`, each in its direction (−1, 0, +1): they end the motion, or are noted.
 
-    The outputs of `line` are what `Guards` says of its program.
+    The guards are what the series follow from number `first` on; those that are `piecewise` depend on pieces. The
+    outputs of `complete` are what `Guards` says of its program.
     """
 
-    def __init__(self, motion: Motion, step: StepControl, line: StraightLine, directions: tuple[int, ...]):
-        self.motion, self.step, self.line, self.directions = motion, step, line, directions
+    def __init__(
+        self,
+        motion: Motion,
+        step: StepControl,
+        output: Output,
+        roots: Roots,
+        values: StraightLine,
+        complete: StraightLine,
+        directions: tuple[int, ...],
+        piecewise: tuple[bool, ...],
+        first: int,
+        notes: bool,
+    ):
+        self.motion, self.step, self.output, self.roots = motion, step, output, roots
+        self.values, self.complete, self.count, self.first, self.notes = values, complete, len(directions), first, notes
+        self.can_jump = any(piecewise)
+        self.table = integers(motion.module, np.array(list(zip(directions, piecewise, strict=True)), np.int64))
         self.guard = self._guard()
         self.begin_sides = self._begin_sides()
+        self.note = self._note() if notes else None
+        self.look = self._look()
 
     @staticmethod
     def fields(guards: int) -> dict:
         """What a thread remembers for it.
 
-        For every guard its value, the side before the step, its rounding, where it changes and how; then the guards at
-        the samples, the step before it was cut, and the event.
+        For every guard its value, the side before the step and at its end, whether a motion begins on it, where it
+        changes and how; how often it has been noted, when it was last gone through, and whether it was zero at the
+        border where the step before ended. For all of them the step before it was cut, how far they can be seen, as a
+        part of it, the first change, and the event.
         """
-        numbers = dict.fromkeys(("guard", "side", "noise", "root", "change"), guards)
-        return numbers | {"samples": (guards, SAMPLES), "planned": 1, "event": 1}
+        each = ("guard", "side", "side_begin", "resting", "root_at", "change", "noted", "noted_begin", "passed_at")
+        each = (*each, "waits", "waited")
+        return dict.fromkeys(each, guards) | dict.fromkeys(("planned", "seen", "is_cut", "first_at", "event"), 1)
+
+    def begin(self, frame: Frame, lane: Lane) -> None:
+        """A lane has taken a member."""
+        with frame.code.loop(self.count) as g:
+            lane["passed_at", g] = float("inf")
+            for name in ("noted", "resting", "waits"):
+                lane[name, g] = 0.0
 
     # ---- the guards ----
 
@@ -71,215 +94,308 @@ class Events:
         """`(order, s)`: the guards at that time after the present one, lane by lane, into `guard`."""
         frame = self.motion.function("guard", INTEGER, self.motion.vector)
         order, s = frame.arguments
-        line = self.line._replace(outputs=self.line.outputs[: len(self.directions)])
         moved = self.motion.moved(frame, self.motion.increments(frame, order, s)[0])
-        guards = self.motion.evaluate(frame, line, moved, s)
-        for i in range(len(self.directions)):
+        guards = self.motion.evaluate(frame, self.values, moved, s)
+        for i in range(self.count):
             frame["guard", i] = guards[i]
         return frame.finish()
 
-    def _at(self, frame: Frame, order: Value, i: int, s: Value) -> Value:
-        """Guard i a time s after the present one."""
+    def _at(self, frame: Frame, order: Value, g: Value, s: Value) -> Value:
+        """Guard g a time s after the present one."""
         frame.call(self.guard, order, s)
-        return frame["guard", i]
+        return frame["guard", g]
 
     def _begin_sides(self) -> Code:
-        """`(order)`: for lanes at the start of a run, the side of each surface they are on, into `side`;
-        and what rounding makes of a guard, into `noise`.
+        """`(order)`: for lanes at the start of a run, the side of each surface they are on, into `side`.
 
         On the surface, to rounding, it is the side that the motion goes to: by its rate or, where that is zero to
         rounding too, by where it is a little later.
         """
         frame = self.motion.function("begin_sides", INTEGER)
-        code, (order,), count = frame.code, frame.arguments, len(self.directions)
+        code, (order,), count = frame.code, frame.arguments, self.count
         fresh = code.compare("==", frame["steps"], 0.0)
+        with code.loop(count) as g:
+            frame["resting", g] = 0.0
         with code.only_if(code.any_lane(fresh)):
             frame.call(self.guard, order, LITTLE * frame["h"])
             instant = INSTANT * frame["smallest"]
-            out = self.motion.evaluate_now(frame, self.line)
+            out = self.motion.evaluate_now(frame, self.complete)
             for i in range(count):
                 value, rate, size, rate_size = (out[i + k * count] for k in range(4))
                 moved = code.intrinsic("fabs", rate)
                 on_it = code.intrinsic("fabs", value) <= GUARD_NOISE * size + moved * instant
-                going = code.select(moved > GUARD_NOISE * rate_size, rate, frame["guard", i])
-                frame["side", i] = code.select(fresh, code.select(on_it, going, value), frame["side", i])
-                frame["noise", i] = code.select(fresh, GUARD_NOISE * size, frame["noise", i])
+                leaves = moved > GUARD_NOISE * rate_size
+                rate = rate * frame["forward"]
+                going = code.select(leaves, rate, frame["guard", i])
+                side = self._sign(frame, code.select(on_it, going, value))
+                frame["side", i] = code.select(fresh, side, frame["side", i])
+                rests = code.select(on_it, code.select(leaves, frame.constant(_ON), _ALONG), 0.0)
+                frame["resting", i] = code.select(fresh, rests, 0.0)
         return frame.finish()
 
-    # ---- the earliest change ends the step ----
+    def _sign(self, frame: Frame, x: Value) -> Value:
+        code = frame.code
+        return code.select(x > 0.0, frame.constant(1), code.select(x < 0.0, frame.constant(-1), 0.0))
+
+    # ---- a step ----
 
     def stop(self, frame: Frame, order: Value) -> None:
-        """Where a guard changes sign along the step, the step ends there: at the earliest change of all guards."""
+        """Look along the step. It ends at the earliest change of all guards, or as far as these can be seen."""
         code = frame.code
         frame.call(self.begin_sides, order)
-        self._sample(frame, order)
-        for i, direction in enumerate(self.directions):
-            self._first_change(frame, order, i, direction)
-        nearest = frame["h"]
-        changes = [(frame["change", i], frame["root", i]) for i in range(len(self.directions))]
-        for change, root in changes:
-            sooner = (change > 0.0) & (code.intrinsic("fabs", root) < code.intrinsic("fabs", nearest))
-            nearest = code.select(sooner, root, nearest)
-        latest = code.intrinsic("fabs", nearest) + frame["smallest"]  # the same instant
-        event = frame.constant(0.0)
-        for i, (change, root) in enumerate(changes):
-            event = event + code.select(code.intrinsic("fabs", root) <= latest, change * float(4**i), 0.0)
-        stops = event > 0.0
-        frame["event"] = code.select(stops, event, -1.0)
-        frame["last"] = code.select(stops, 0.0, frame["last"])
-        frame["h"] = nearest
-        with code.only_if(code.any_lane(code.compare("!=", nearest, frame["planned"]))):
+        frame["planned"], frame["is_cut"] = frame["h"], 0.0
+        with code.loop(self.count) as g:
+            frame["side_begin", g], frame["noted_begin", g] = frame["side", g], frame["noted", g]
+            frame["waited", g], frame["waits", g] = frame["waits", g], 0.0
+        frame.call(self.look, order)
+        size = code.intrinsic("fabs", frame["h"])
+        cut = (frame["seen"] < 1.0) & (frame["seen"] * size < frame["first_at"])
+        with code.only_if(code.any_lane(cut)):
+            least = INSTANT * frame["smallest"]
+            after = code.maximum(frame["seen"] * size, code.select(least < size, least, size))
+            frame["h"] = code.select(cut, after * frame["forward"], frame["h"])
+            frame["is_cut"] = code.select(cut, frame.constant(1), 0.0)
+            frame["last"] = code.select(cut, 0.0, frame["last"])
+            with code.loop(self.count) as g:
+                frame["side", g], frame["noted", g] = frame["side_begin", g], frame["noted_begin", g]
+            frame.call(self.look, order)
+        if not self.notes:
+            self._end_at_first(frame)
+        with code.only_if(code.any_lane(code.compare("!=", frame["h"], frame["planned"]))):
             frame.call(self.step.defect, order, double(code, 1.0))  # leaves the increment of the new step
             if self.step.projector is not None:
                 frame.call(self.step.projector.project)
 
-    # ---- samples ----
+    def _end_at_first(self, frame: Frame) -> None:
+        """The step ends at the earliest change, and the motion there; `event` tells of all at that instant."""
+        code, event = frame.code, frame.code.variable(frame.constant(0.0))
+        happens = frame["first_at"] < float("inf")
+        latest, power = frame["first_at"] + frame["smallest"], code.variable(frame.constant(1.0))
+        with code.loop(self.count) as g:
+            of = code.load(power, frame.vector)
+            now = happens & (frame["root_at", g] <= latest)
+            more = code.select(now, frame["change", g] * of, 0.0)
+            code.store(code.load(event, frame.vector) + more, event)
+            code.store(4.0 * of, power)
+        frame["event"] = code.select(happens, code.load(event, frame.vector), -1.0)
+        frame["last"] = code.select(happens, 0.0, frame["last"])
+        frame["h"] = code.select(happens, frame["first_at"] * frame["forward"], frame["h"])
 
-    def _sample(self, frame: Frame, order: Value) -> None:
-        """The guards at equal distances along the step and one beyond either end, into `samples`.
+    def _look(self) -> Code:
+        """`(order)`: the changes of all guards along the step."""
+        frame = self.motion.function("look_at_guards", INTEGER)
+        code, (order,) = frame.code, frame.arguments
+        frame["seen"], frame["first_at"] = 1.0, float("inf")
+        with code.loop(self.count) as g:
+            frame["root_at", g], frame["change", g] = float("inf"), 0.0
+            self._look_at(frame, order, g)
+        return frame.finish()
 
-        Two more between them must be where the others say, or the step is too long to see what its guards do: it is
-        halved.
-        """
+    def _look_at(self, frame: Frame, order: Value, g: Value) -> None:
+        """The changes of guard g along the step."""
+        code, roots, h = frame.code, self.roots, frame["h"]
+        degree, j = self.motion.followed_degree(code, order), g + self.first
+        moving, value = code.compare("!=", h, 0.0), self.motion.followed_value(frame, j)
+        side = frame["side", g]
+        side = code.select(code.compare("==", side, 0.0), self._sign(frame, value), side)
+        roots.polynomial(frame, j, degree, h, side, 0.0)
+        clear = self._is_clear(frame, degree)
+        with code.only_if(code.any_lane(moving & ~clear)):
+            self._look_closely(frame, order, g, degree, side)
+
+    def _is_clear(self, frame: Frame, degree: Value) -> Value:
+        """Where the polynomial has no root, as seen from its coefficients alone; most often that is all."""
+        code, zero = frame.code, frame.constant(0.0)
+        falls, rises = code.variable(zero), code.variable(zero)
+        with code.loop(degree + 1, start=1) as k:
+            c = frame["poly", k]
+            negative = code.select(c < 0.0, c, zero)
+            code.store(code.load(falls, frame.vector) - negative, falls)
+            code.store(code.load(rises, frame.vector) + (c - negative), rises)
+        start, falls, rises = frame["poly", 0], *(code.load(x, frame.vector) for x in (falls, rises))
+        last, before = (self.roots.last_terms(frame, degree, first) for first in (0, 3))
+        size = start + falls + rises
+        return (start > falls + last) & ~self._is_long(last, before, size)
+
+    def _look_closely(self, frame: Frame, order: Value, g: Value, degree: Value, side: Value) -> None:
+        code, roots, h = frame.code, self.roots, frame["h"]
+        size, value = roots.size(frame, degree), frame["poly", 0]
+        self._leave_surface(frame, g, size)
+        moving = code.compare("!=", h, 0.0)
+        unknown = moving & ~(code.intrinsic("fabs", value) < float("inf"))
+        frame["code"] = code.select(unknown, float(NOT_FINITE), frame["code"])
+        frame["last"] = code.select(unknown, 0.0, frame["last"])
+        frame["h"] = code.select(unknown, 0.0, h)
+        sound, moving = size < float("inf"), moving & ~unknown
+
+        def is_long():
+            last, before = (roots.last_terms(frame, degree, first) for first in (0, 3))
+            return self._is_long(last, before, roots.size(frame, degree))
+
+        roots.shorten(frame, degree, is_long)
+        roots.sum_up(frame, degree)
+        frame["doubt"], frame["begin"] = roots.last_terms(frame, degree), 0.0
+        instant = 0.25 * frame["smallest"]  # no time is known better than this
+        frame["instant"] = instant / (code.intrinsic("fabs", h) * frame["part"])
+        rounding = (ROOT_NOISE * EPS) * frame["kept", g]
+        rounding = code.select((rounding < float("inf")) & ~(frame["resting", g] > 0.0), rounding, 0.0)
+        frame["unsure"] = code.intrinsic("fabs", frame["poly", 1]) * frame["instant"] + rounding
+        ahead = code.variable(side)
+        self._along(frame, order, g, degree, ahead, moving & sound)
+        self._without_series(frame, order, g, ahead, moving & ~sound)
+        frame["side", g] = code.select(moving, code.load(ahead, frame.vector), frame["side", g])
+
+    def _is_long(self, last: Value, before: Value, size: Value) -> Value:
+        """Where the last terms of a polynomial are large, or do not fall: it may leave out as much as they are."""
+        return (last > GUARD_TERMS * size) | ((last > FALL * before) & (last > SEEN * size))
+
+    def _leave_surface(self, frame: Frame, g: Value, size: Value) -> None:
+        """A motion that begins on the surface, or has just gone through it, is not to do so by rounding."""
+        code, rests = frame.code, frame["resting", g]
+        since = code.intrinsic("fabs", frame["t"] - frame["passed_at", g])
+        known = (since <= INSTANT * frame["smallest"]) | (frame["waited", g] > 0.0)
+        on = (rests > 0.0) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= CONTINUOUS * size))
+        frame["poly", 0] = code.select(on, 0.0, frame["poly", 0])
+        rate = frame["poly", 1]
+        frame["poly", 1] = code.select((rests >= _ALONG) & (rate < 0.0), 0.0, rate)
+
+    def _along(self, frame: Frame, order: Value, g: Value, degree: Value, ahead: Value, where: Value) -> None:
+        """The roots of the polynomial, one after the other, as long as none ends the motion."""
         code = frame.code
-        frame["planned"] = frame["h"]
-        again = code.variable(integer(code, 1))
-        with code.repeat_while(lambda: code.load(again, INTEGER) > 0):
-            h = frame["h"]
+        looking, left = (code.variable(x) for x in (
+            code.select(where, frame.constant(1), 0.0), integer(code, MOST_CHANGES),
+        ))  # fmt: skip
 
-            def keep(k, place, h=h):
-                frame.call(self.guard, order, code.lanes_of(place / INTERVALS) * h)
-                for i in range(len(self.directions)):
-                    frame["samples", i, k] = frame["guard", i]
+        def on():
+            return code.load(looking, frame.vector) > 0.0
 
-            with code.loop(INTERVALS + 3) as k:
-                keep(k, code.as_double(k) - 1.0)
-            for k, place in enumerate(BETWEEN):
-                keep(integer(code, INTERVALS + 3 + k), double(code, place))
-            unseen = (code.intrinsic("fabs", h) > JUMP * frame["smallest"]) & self._unseen(frame)
-            code.store(integer(code, 0), again)
-            with code.only_if(code.any_lane(unseen)):
-                code.store(integer(code, 1), again)
-                frame["h"] = code.select(unseen, 0.5 * h, h)
-                note_halved(frame, unseen)
+        with code.repeat_while(lambda: code.any_lane(on()) & (code.load(left, INTEGER) > 0)):
+            code.store(code.load(left, INTEGER) - 1, left)
+            frame.call(self.roots.next_root, degree)
+            root, part = frame["root"], frame["part"]
+            is_root = on() & (root < 1.0) & (frame["is_root"] > 0.0)
+            seen = code.select(root < 1.0, root * part, code.select(part < 1.0, part, frame.constant(1.0)))
+            self._see(frame, on() & ~is_root, seen)
+            waits = is_root & self._waits(frame, g)
+            frame["waits", g] = code.select(waits, frame.constant(1), frame["waits", g])
+            changes = is_root & ~waits
+            with code.only_if(code.any_lane(changes)):
+                s = self._exact(frame, order, g, changes, code.load(ahead, frame.vector))
+                inside = code.intrinsic("fabs", s) <= code.intrinsic("fabs", frame["h"])  # else of the next step
+                goes_on = self._take(frame, order, g, changes & inside, s, ahead)
+                self.roots.turn(frame, degree, goes_on)
+                frame["begin"] = code.select(goes_on, root, frame["begin"])
+                code.store(code.select(goes_on, frame.constant(1), 0.0), looking)
+            code.store(code.select(changes, code.load(looking, frame.vector), 0.0), looking)
+        self._see(frame, on(), frame["begin"] * frame["part"])
 
-    def _unseen(self, frame: Frame) -> Value:
-        """Where a guard is not what the cubic through four samples says, by more than a part of what it varies."""
+    def _see(self, frame: Frame, where: Value, seen: Value) -> None:
+        """In some lanes a guard is seen only up to a part of the step, the first time it is looked at."""
+        less = where & (seen < frame["seen"]) & ~(frame["is_cut"] > 0.0)
+        frame["seen"] = frame.code.select(less, seen, frame["seen"])
+
+    def _waits(self, frame: Frame, g: Value) -> Value:
+        """Whether what a guard does is for the next step to say: its own border is where this one ends."""
         code = frame.code
-        unseen = frame.constant(0.0) > 1.0
-        for i in range(len(self.directions)):
-            for k, place in enumerate(BETWEEN):
-                first, x = int(place), place - int(place)
-                four = [frame["samples", i, first + j] for j in range(4)]
-                weights = (
-                    -x * (x - 1) * (x - 2) / 6, (x + 1) * (x - 1) * (x - 2) / 2, -x * (x + 1) * (x - 2) / 2,
-                    x * (x + 1) * (x - 1) / 6,
-                )  # fmt: skip
-                between = frame["samples", i, INTERVALS + 3 + k]
-                cubic = functools.reduce(Value.__add__, (w * y for w, y in zip(weights, four, strict=True)))
-                highest, lowest = four[0], four[0]
-                for y in four[1:]:
-                    highest, lowest = code.select(highest > y, highest, y), code.select(lowest < y, lowest, y)
-                far = code.intrinsic("fabs", between - cubic)
-                matters = (far > NOTICEABLE * code.intrinsic("fabs", between)) & (far > frame["noise", i])
-                unseen = unseen | (matters & (far > SMOOTH * (highest - lowest)))
-        return unseen
+        if not self.can_jump:
+            return frame.constant(0.0) > 1.0
+        piecewise = code.load(code.element(Value(code, self.table), g * 2 + 1, INTEGER), INTEGER)
+        at_border = (frame["crossed"] > 0.0) & code.compare("==", frame["h"], frame["cut"])
+        left = (1.0 - frame["root"] * frame["part"]) * code.intrinsic("fabs", frame["slope"])
+        at_border = at_border & (frame["root"] > 0.0)  # else it has jumped already
+        return (left <= 8.0 * frame["error"]) & at_border & (code.lanes_of(code.as_double(piecewise)) > 0.0)
 
-    # ---- the first change of one guard ----
+    def _exact(self, frame: Frame, order: Value, g: Value, where: Value, side: Value) -> Value:
+        """The time of a root, by Newton's steps on the guard itself; a root at 0 is where it has jumped."""
+        code, root = frame.code, frame["root"]
+        scale = frame["part"] * frame["h"]
+        start, rate = root * scale, frame["slope"] / scale
+        at, again, left = (code.variable(x) for x in (start, integer(code, 1), integer(code, MOST_CORRECTIONS)))
+        moves = where & (root > 0.0)
+        with code.repeat_while(lambda: (code.load(again, INTEGER) > 0) & (code.load(left, INTEGER) > 0)):
+            code.store(code.load(left, INTEGER) - 1, left)
+            here = code.load(at, frame.vector)
+            after = here - side * self._at(frame, order, g, here) / rate
+            near = code.intrinsic("fabs", after - start) <= 0.1 * code.intrinsic("fabs", scale)
+            after = code.select(moves & near, after, here)
+            after = code.select(after * frame["forward"] > 0.0, after, 0.0)
+            code.store(after, at)
+            moved = code.intrinsic("fabs", after - here)
+            far = moved > INSTANT * frame["smallest"]
+            code.store(code.select(code.any_lane(far & moves), integer(code, 1), 0), again)
+        at = code.load(at, frame.vector)
+        lost = (frame["resting", g] > 0.0) & (code.intrinsic("fabs", at) <= 0.25 * INSTANT * frame["smallest"])
+        return code.select(lost, 0.0, at)  # time does not move
 
-    def _first_change(self, frame: Frame, order: Value, i: int, direction: int) -> None:
-        """The first allowed change of sign of guard i: its time into `root`, and 1 (falls) or 2 (rises) into `change`.
+    def _take(self, frame: Frame, order: Value, g: Value, changes: Value, s: Value, ahead: Value) -> Value:
+        """Changes at the times s: the event, or a note, where they are in the direction; which lanes go on beyond."""
+        code, side = frame.code, _now(frame, ahead)
+        direction = code.load(code.element(Value(code, self.table), g * 2, INTEGER), INTEGER)
+        direction = code.lanes_of(code.as_double(direction))
+        counts = changes & ~(side * direction > 0.0)
+        if self.notes:
+            frame["is_due"] = code.select(counts, frame.constant(1), 0.0)
+            with code.only_if(code.any_lane(counts)):
+                frame.call(self.note, order, g, s)
+            goes_on = changes
+        else:
+            size = code.intrinsic("fabs", s)
+            frame["root_at", g] = code.select(counts, size, frame["root_at", g])
+            kind = code.select(side > 0.0, frame.constant(_FALLS), _RISES)
+            frame["change", g] = code.select(counts, kind, frame["change", g])
+            sooner = counts & (size < frame["first_at"])
+            frame["first_at"] = code.select(sooner, size, frame["first_at"])
+            goes_on = changes & ~counts
+        code.store(code.select(goes_on, 0.0 - side, side), ahead)
+        now = frame["t"] + (frame["t_low"] + s)
+        frame["passed_at", g] = code.select(goes_on, now, frame["passed_at", g])
+        return goes_on
 
-        `change` is 0 where there is none. Signs of neighbouring samples differ where it crosses once; between samples
-        of one sign it can still cross twice, about the least of them.
-        """
-        code, h = frame.code, frame["h"]
-        moving, spacing = code.compare("!=", h, 0.0), h * (1.0 / INTERVALS)
-        begin, zero = frame["side", i], frame.constant(0.0)
-        first = _Change(*(code.variable(x) for x in (begin, zero, zero, zero)))
-        note = self._noter(frame, first, moving, direction)
-        with code.loop(INTERVALS + 1) as k:
-            place = code.lanes_of(code.as_double(k))
-            before, here, after = (frame["samples", i, k + j] for j in range(3))
-            sign = code.load(first.side, frame.vector)
-            above = sign > 0.0
-            sizes = [code.select(above, x, 0.0 - x) for x in (before, here, after)]
-            sided = above | (sign < 0.0)
-            least = sided & self._dips(frame, i, sizes) & moving & (code.load(first.kind, frame.vector) <= 0.0)
-            self._look_into_dip(frame, order, i, note, place, spacing, above, least, sizes)
-            inside = place < float(INTERVALS)
-            crosses = inside & ((above & (after < 0.0)) | (sided & ~above & (after > 0.0)))
-            note(crosses, above, place * spacing, (place + 1.0) * spacing)
-            passed = inside & (code.intrinsic("fabs", after) > 0.0)  # a zero, or a NaN, is on no side
-            code.store(code.select(passed, after, sign), first.side)
-        frame["side", i] = code.load(first.side, frame.vector)
-        kind = code.load(first.kind, frame.vector)
-        frame["change", i] = kind
-        with code.only_if(code.any_lane(kind > 0.0)):
-            low, high = code.load(first.low, frame.vector), code.load(first.high, frame.vector)
-            frame["root", i] = self._root(frame, order, i, low, high, kind)
+    def _without_series(self, frame: Frame, order: Value, g: Value, ahead: Value, where: Value) -> None:
+        """A part of the step, at whose end the guard is looked at; a change before that is found by bisection."""
+        code, side, h = frame.code, _now(frame, ahead), frame["h"]
+        with code.only_if(code.any_lane(where)):
+            self._see(frame, where, frame.constant(WITHOUT_SERIES))
+            changes = where & (side * self._at(frame, order, g, h) < 0.0)
+            low, high = code.variable(frame.constant(0.0)), code.variable(h)
+            with code.loop(BISECTIONS):
+                middle = 0.5 * (code.load(low, frame.vector) + code.load(high, frame.vector))
+                same = side * self._at(frame, order, g, middle) > 0.0
+                for end, here in ((low, same), (high, ~same)):
+                    code.store(code.select(here, middle, code.load(end, frame.vector)), end)
+            self._take(frame, order, g, changes, code.load(high, frame.vector), ahead)
 
-    def _noter(self, frame: Frame, first: _Change, moving: Value, direction: int) -> Callable:
-        """`(where, falls, start, end)`: note a change between two times, if it is the first and of that direction.
+    # ---- what is noted ----
 
-        `falls` where the sign before is positive.
-        """
-        code = frame.code
+    def _note(self) -> Code:
+        """`(order, g, s)`: write down a change of guard g and the state there, in the lanes that are due."""
+        frame = self.motion.function("note_change", INTEGER, INTEGER, self.motion.vector)
+        code, (order, g, s) = frame.code, frame.arguments
+        self.output.interpolate(frame, order, s)
+        frame["reached"] = frame["t"] + (frame["t_low"] + s)
+        with code.loop(self.motion.width) as k:
+            lane = frame.lane(k)
+            with code.only_if(lane["is_due"] > 0.0):
+                number = lane["noted", g]
+                lane["noted", g] = number + 1.0
+                with code.only_if(number < code.as_double(frame.job("room_of_notes"))):
+                    row = self._row(frame, lane["member"], g, code.as_integer(number))
+                    frame.write("path", row, lane["reached"])
+                    for i in self.motion.form.each(code, self.motion.states):
+                        frame.write("path", row + 1 + i, lane["between", i])
+        return frame.finish()
 
-        def note(where: Value, falls: Value, start: Value, end: Value) -> None:
-            allowed = falls if direction < 0 else ~falls if direction > 0 else frame.constant(0.0) <= 0.0
-            new = where & allowed & (code.load(first.kind, frame.vector) <= 0.0) & moving
-            kind = code.select(falls, frame.constant(1), 2.0)
-            for variable, value in ((first.low, start), (first.high, end), (first.kind, kind)):
-                code.store(code.select(new, value, code.load(variable, frame.vector)), variable)
+    def write_counts(self, frame: Frame, lane: Lane) -> None:
+        """At the end of a member, how often each guard was noted: behind its notes."""
+        with frame.code.loop(self.count) as g:
+            row = self._row(frame, lane["member"], g, frame.job("room_of_notes"))
+            frame.write("path", row, lane["noted", g])
 
-        return note
+    def _row(self, frame: Frame, member: Value, g: Value, number: Value) -> Value:
+        rows = frame.job("room_of_notes") + 1
+        return ((member * self.count + g) * rows + number) * (self.motion.states + 1)
 
-    def _dips(self, frame: Frame, i: int, sizes: list[Value]) -> Value:
-        """Where the middle one of three neighbouring samples is least, and the guard may cross zero twice about it."""
-        before, here, after = sizes
-        bend, tilt = before - 2.0 * here + after, after - before
-        # The parabola through them comes down to half of the least, or so near that its error matters.
-        deep = (4.0 * bend * here < tilt * tilt) | (here < NEAR_LEAST * bend)
-        return deep & (here > frame["noise", i]) & (here < before) & (here <= after)
 
-    def _look_into_dip(self, frame: Frame, order, i: int, note, place, spacing, above, least, sizes) -> None:
-        """Find the least of guard i about a sample; if that is beyond the surface, note a change on either side."""
-        code = frame.code
-        with code.only_if(code.any_lane(least)):
-            start = code.select(place > 0.0, place - 1.0, 0.0) * spacing
-            end = code.select(place < float(INTERVALS), place + 1.0, float(INTERVALS)) * spacing
-            bottom = self._bottom(frame, order, i, above, start, end)
-            depth = self._at(frame, order, i, bottom)
-            depth = code.select(above, 0.0 - depth, depth)
-            through = least & (depth > TOUCHING * (sizes[0] + sizes[2])) & (depth > frame["noise", i])
-            note(through, above, start, bottom)
-            note(through, ~above, bottom, end)
-
-    def _bottom(self, frame: Frame, order: Value, i: int, above: Value, start: Value, end: Value) -> Value:
-        """Where the size of guard i is least between two times, by golden sections."""
-        code = frame.code
-        low, high = code.variable(start), code.variable(end)
-        with code.loop(SECTIONS):
-            a, b = code.load(low, frame.vector), code.load(high, frame.vector)
-            sizes, places = [], [b - (b - a) * GOLDEN, a + (b - a) * GOLDEN]
-            for place in places:
-                value = self._at(frame, order, i, place)
-                sizes.append(code.select(above, value, 0.0 - value))
-            left = sizes[0] < sizes[1]
-            code.store(code.select(left, a, places[0]), low)
-            code.store(code.select(left, places[1], b), high)
-        return 0.5 * (code.load(low, frame.vector) + code.load(high, frame.vector))
-
-    def _root(self, frame: Frame, order: Value, i: int, start: Value, end: Value, kind: Value) -> Value:
-        """Where guard i changes sign, by bisection: the end of the bracket, where it has changed."""
-        code = frame.code
-        low, high, falls = code.variable(start), code.variable(end), kind < 1.5
-        with code.loop(BISECTIONS):
-            a, b = code.load(low, frame.vector), code.load(high, frame.vector)
-            middle = 0.5 * (a + b)
-            value = self._at(frame, order, i, middle)
-            same = code.select(falls, value, 0.0 - value) > 0.0
-            code.store(code.select(same, middle, a), low)
-            code.store(code.select(same, b, middle), high)
-        return code.load(high, frame.vector)
+def _now(frame: Frame, variable: Value) -> Value:
+    """What a variable holds."""
+    return frame.code.load(variable, frame.vector)

@@ -18,15 +18,18 @@ so that no lane waits for another. Several threads may do so at once: they share
 from lagjax._native import _rank_drops
 from lagjax._native._alone import MotionAlone, fills_lanes
 from lagjax._native._borders import Borders
-from lagjax._native._constants import DONE, EVENT, FIRST_STEP, OUT_OF_STEPS, RUNNING, SMALLEST_STEP
+from lagjax._native._constants import DONE, EVENT, FIRST_STEP, MAX_ORDER, OUT_OF_STEPS, RUNNING, SMALLEST_STEP
 from lagjax._native._events import Events
 from lagjax._native._frame import Frame, Lane, job
+from lagjax._native._guards import Guards
 from lagjax._native._ir import INTEGER, POINTER, Code, Value
 from lagjax._native._output import Output
 from lagjax._native._projection import Projector
+from lagjax._native._roots import Roots
 from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._native._step import StepControl
 from lagjax._program import _borders
+from lagjax._program._borders import reads_inputs
 from lagjax._program._series import Recurrent, Series
 
 JOB = job(
@@ -34,7 +37,7 @@ JOB = job(
     ("next_member", "ts", "y0", "params", "path", "y_end", "t_end", "code", "steps", "rejected", "record",
      "next_row"),
     # Strides from one member to the next: 0 where all share the output times, or the parameters.
-    ("ts_stride", "params_stride", "members", "times", "order", "max_steps", "room"),
+    ("ts_stride", "params_stride", "members", "times", "order", "max_steps", "room", "room_of_notes"),
     ("rtol", "atol"),
 )  # fmt: skip
 
@@ -53,7 +56,7 @@ class Integrator:
         program: Recurrent,
         series: Series,
         projection=None,
-        guards=None,
+        guards: Guards | None = None,
         error_groups: tuple[int, ...] | None = None,
         base_size: int | None = None,
         borders: "_borders.Borders | None" = None,
@@ -65,27 +68,42 @@ class Integrator:
         n = series.size
         self.base_size = n if base_size is None else base_size
         self.guards = 0 if guards is None else len(guards.directions)
+        self.notes = guards is not None and guards.notes  # in the place of states at output times
         fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards) | {"active": 1}
         if projection is not None:
             fields |= Projector.fields(n, self.base_size) | _rank_drops.fields(n, self.guards)
+        if guards is not None:
+            fields |= Roots.fields(MAX_ORDER + 2)
         if borders is not None:
             fields |= Borders.fields(borders, levels or (n,))
         pieces = 0 if borders is None else len(borders.switches)
         large = is_large(program, projection, guards)
         alone = large and width == 1 and borders is None and chosen is None
         kind = MotionAlone if alone and fills_lanes(series) else Motion
-        self.motion = motion = kind("motion", program, series, JOB, fields, large, width, pieces=pieces, chosen=chosen)
+        options = dict(pieces=pieces, chosen=chosen, kept=self.guards)
+        self.motion = motion = kind("motion", program, series, JOB, fields, large, width, **options)
         self.projector = projection and Projector(
             motion, projection.state, projection.velocity_scale, self.base_size
         )  # fmt: skip
         self.step = StepControl(motion, tuple(range(n)) if error_groups is None else error_groups, self.projector)
-        self.events = guards and Events(motion, self.step, guards.program.line, guards.directions)
         self.borders = borders and Borders(motion, borders, levels or (n,), projection is not None)
         self.output = Output(motion, self.projector)
+        self.events = guards and self._events(program, guards)
         self.start_next = self._start_next()
         self._run()
         self._begin()
         motion.finish()
+
+    def _events(self, program: Recurrent, guards: Guards) -> Events:
+        """The guards, whose values are the last outputs of the program."""
+        roots = Roots(self.motion) if self.borders is None else self.borders.roots
+        outputs = program.line.outputs[len(program.line.outputs) - self.guards :]
+        piecewise = reads_inputs(program.line, outputs, program.size - self.motion.pieces)
+        lines = guards.values.line, guards.program.line
+        first = self.motion.series.followed - self.guards
+        return Events(
+            self.motion, self.step, self.output, roots, *lines, guards.directions, piecewise, first, self.notes
+        )  # fmt: skip
 
     # ---- members ----
 
@@ -119,7 +137,8 @@ class Integrator:
         for i in motion.form.each(code, motion.states):
             x = frame.read("y0", member * motion.states + i)
             lane["y", i] = x
-            frame.write("path", self.output.place(frame, member, 0, i), x)
+            if not self.notes:
+                frame.write("path", self.output.place(frame, member, 0, i), x)
             lane["low", i] = 0.0
         first = member * frame.job("params_stride")
         lane["first_number"] = code.as_double(first)
@@ -127,6 +146,8 @@ class Integrator:
             lane["params", i] = frame.read("params", first + motion.place_of_number(code, i))
         if self.borders is not None:
             self.borders.begin(frame, lane)
+        if self.events is not None:
+            self.events.begin(frame, lane)
 
     def _begin(self) -> None:
         """`begin(job, memory, lanes)`: every lane takes a member."""
@@ -164,7 +185,8 @@ class Integrator:
             with code.only_if(frame.job("room") > 0), code.loop(self.motion.width) as lane:
                 self.output.record(frame, frame.lane(lane))
             after, rest = self.step.end_time(frame)
-            self.output.write_due(frame, order, after)
+            if not self.notes:
+                self.output.write_due(frame, order, after)
             self.step.advance(frame, after, rest)
             if crossings is not None:
                 frame.call(crossings.cross)
@@ -194,5 +216,7 @@ class Integrator:
             with code.only_if(member < 0):
                 code.store(code.load(idle, INTEGER) + 1, idle)
             with code.only_if((member >= 0) & (lane["code"] >= 0.0)):
-                self.output.write_end(frame, lane)
+                self.output.write_end(frame, lane, states=not self.notes)
+                if self.events is not None and self.notes:
+                    self.events.write_counts(frame, lane)
                 frame.call(self.start_next, j)

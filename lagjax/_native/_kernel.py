@@ -15,10 +15,10 @@ from lagjax._native._adjoint import Adjoint
 from lagjax._native._alone import fills_lanes
 from lagjax._native._constants import DONE, LARGEST_SHARED, LEAST_ORDER, MAX_ORDER, VECTORS_PER_THREAD
 from lagjax._native._frame import LANE, Layout
+from lagjax._native._guards import Guards, require_lanes, watched
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled, lanes
-from lagjax._native._lanes import INTEGERS
 from lagjax._native._look_ups import SET_NUMBERS
 from lagjax._native._output import RECORDED
 from lagjax._native._packs import forget_stages
@@ -29,9 +29,9 @@ from lagjax._native._tangent import Tangent
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
-from lagjax._program._look_ups import BESIDE, shifted, table_of
+from lagjax._program._look_ups import BESIDE, shifted
 from lagjax._program._memory import without_collections
-from lagjax._program._operations import LOOK_UPS, OPERATIONS
+from lagjax._program._operations import LOOK_UPS
 from lagjax._program._series import Recurrent, Series, StraightLine, series
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
@@ -81,17 +81,6 @@ class Begun(NamedTuple):
     rest: Any
 
 
-class Guards(NamedTuple):
-    """Functions of the state that end the motion where they change sign, and for each −1, 0 or +1: when it counts.
-
-    With y the state and the time, the outputs of the program are all g; their rates ġ = Σ ∂g/∂yᵢ ẏᵢ; then Σ |∂g/∂yᵢ yᵢ|
-    and Σ |∂g/∂yᵢ ẏᵢ|, of which round-off is a part.
-    """
-
-    program: Recurrent
-    directions: tuple[int, ...]
-
-
 class Projection(NamedTuple):
     """What keeps a motion on its constraints: two programs of (q, q̇, t, parameters).
 
@@ -108,7 +97,8 @@ class Kernel:
 
     The outputs of the program are the n accelerations, then whether the mass matrix is singular. `projection` is
     applied to the state after every step, and to the outputs after the first. `guards`, again from the same inputs, end
-    the motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises). Errors are relative
+    the motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises); or they are noted
+    and the motion goes on: then there are notes in the place of states at output times. Errors are relative
     to each coordinate, or to the largest one of those with the same number in `error_groups` (n,). Of the coordinates
     the first `levels[0]` are the motion, the first `levels[1]` that and its tangents, and so on to all of them. Vectors
     have `width` lanes, by default those of the processor. Raises `Unlowerable` where an operation has no Taylor series
@@ -137,7 +127,10 @@ class Kernel:
         )
         self._smooth = program, projection
         self._parts = program, recurrences(program, size), projection
-        if pieces := pieces_of(program, size, len(levels) == 1):
+        if guards is not None:
+            whole, of_whole, self._borders = watched(program, size, guards.values, len(levels) == 1)
+            self._parts = whole, of_whole, projection
+        elif pieces := pieces_of(program, size, len(levels) == 1):
             self._borders, of_pieces = pieces
             self._parts = self._borders.program, of_pieces, projection
         self._options = guards, error_groups, levels[0]
@@ -176,26 +169,44 @@ class Kernel:
         return _Compiled(motion, motion.layout, integrator.job, self._rounds, pointers=4, more=more)
 
     @property
+    def _notes(self) -> bool:
+        return self._options[0] is not None and self._options[0].notes
+
+    @property
     def rest_size(self) -> int:
         """The doubles of the `rest` that a handler leaves behind."""
         return Rest.size(self._forward.layout)
 
     def __call__(
-        self, ts, y0, params, rtol: float, atol: float, max_steps: int, room: int = 0, begun: Begun | None = None
+        self,
+        ts,
+        y0,
+        params,
+        rtol: float,
+        atol: float,
+        max_steps: int,
+        room: int = 0,
+        begun: Begun | None = None,
+        room_of_notes: int = 0,
     ) -> Outcome:
         """The motions from the states `y0` (N, 2n), all arrays of float64.
 
         `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. So many
         steps as there is `room` for are written down, for derivatives. What a handler has `begun` is gone on with.
+        Where guards are noted, with room for so many notes of each, `path` holds these for one guard after the other: a
+        time, and the state then, (N, guards (room + 1), 1 + 2n); behind them how many there would have been.
         """
         ts, y0, params = _contiguous(ts, y0, params)
         members, times = len(y0), ts.shape[1]
         if begun is not None:
             begun = Begun(*(np.array(x, np.float64) for x in begun))
-        elif room == 0 and self.threads(members) == 1:
+        elif room == 0 and self.threads(members) == 1 and not self._notes:
             begun = self._begun(ts, y0, params, self.plan(rtol, atol, max_steps))
         if begun is None:
-            path, y_end = np.full((members, times, self.states), np.nan), np.empty((members, self.states))
+            shape = (times, self.states)
+            if self._notes and (guards := self._options[0]) is not None:
+                shape = len(guards.directions) * (room_of_notes + 1), self.states + 1
+            path, y_end = np.full((members, *shape), np.nan), np.empty((members, self.states))
             t_end, code, steps, rejected = np.empty((4, members))
         else:
             path, y_end, t_end, code, steps, rejected, rest = begun
@@ -212,7 +223,7 @@ class Kernel:
         )  # fmt: skip
         numbers = dict(
             **self._strides(ts, params), members=members, times=times, order=order_for(rtol), max_steps=max_steps,
-            room=room, rtol=rtol, atol=atol,
+            room=room, room_of_notes=room_of_notes, rtol=rtol, atol=atol,
         )  # fmt: skip
         idle = self._forward(arrays, numbers, self.threads(members) if rest is None else 1, rest)
         table = None if table is None else table[: rows[0]]
@@ -408,7 +419,7 @@ class _Compiled:
 def _outcome(path, y_end, t_end, code, steps, rejected, idle: int, table=None) -> Outcome:
     """What is in the arrays when all is done; NaN in the path where a member did not come."""
     ended_badly = code != DONE
-    if ended_badly.any():  # a start that is infinite was not reached either
+    if ended_badly.any() and path.shape[2] == y_end.shape[1]:  # a start that is infinite was not reached either
         reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
         path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
     code, steps, rejected = (numbers.astype(int) for numbers in (code, steps, rejected))
@@ -460,7 +471,7 @@ def parameters_chosen(
     """
     programs: list = [program]
     programs += [] if projection is None else [projection.state, projection.velocity_scale]
-    programs += [] if guards is None else [guards.program]
+    programs += [] if guards is None else [guards.values, guards.program]
     if not any(op in LOOK_UPS for one in programs for op, _, _ in one.line.nodes):
         return program, projection, guards, None
     read = {node[2] - first for one in programs for node in one.line.nodes if node[0] == "input"}
@@ -482,7 +493,7 @@ def parameters_chosen(
     return (
         next(done),
         projection and Projection(next(done), next(done)),
-        guards and guards._replace(program=next(done)),
+        guards and guards._replace(values=next(done), program=next(done)),
         Chosen(positions, of),
     )
 
@@ -490,28 +501,9 @@ def parameters_chosen(
 @functools.lru_cache(maxsize=16)  # asked for when it is decided what runs, and when that is compiled
 def recurrences(program: Recurrent, size: int) -> Series:
     """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
-    for (op, _, _), kind in zip(program.line.nodes, program.line.kinds, strict=True):
-        if kind not in ("float", "bool") and op not in ("input", "constant", "convert", *INTEGERS):
-            raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
-    if any(op == "locate" for op, *_ in program.line.nodes):
-        _require_known_knots(program.line, 2 * size)
+    require_lanes(program.line, 2 * size)
     with without_collections():
         return series(program, size, moving=2 * size + 1)
-
-
-def _require_known_knots(line: StraightLine, time: int) -> None:
-    """Raise `Unlowerable` where the state is located among parameters: what follows from moving these is not known."""
-    moves: list[bool] = []
-    for op, operands, attribute in line.nodes:
-        if op == "locate" and table_of(attribute).numbers is None and moves[operands[0]]:
-            of, _, which = line.nodes[operands[0]]
-            if (of, which) != ("input", time):
-                raise Unlowerable(
-                    "it looks up where a moving number is among knots that are parameters: of the time itself they may "
-                    "be, otherwise give the knots as known numbers"
-                )
-        step = op not in ("input", "constant") and OPERATIONS[op].is_step
-        moves.append(attribute <= time if op == "input" else not step and any(moves[i] for i in operands))
 
 
 @functools.lru_cache(maxsize=16)

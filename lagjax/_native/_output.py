@@ -49,7 +49,7 @@ class Output:
         with code.repeat_while(lambda: code.any_lane(due())):
             there = due()
             s = code.select(there, (frame["due"] * forward - t) - low, 0.0)
-            self._interpolate(frame, order, s)
+            self.interpolate(frame, order, s)
             frame["is_due"] = code.select(there, frame.constant(1.0), 0.0)
             with code.loop(self.motion.width) as j:
                 lane = frame.lane(j)
@@ -59,7 +59,7 @@ class Output:
                         frame.write("path", self.place(frame, member, index, i), lane["between", i])
                     self.await_next(frame, lane, index + 1)
 
-    def _interpolate(self, frame: Frame, order: Value, s: Value) -> None:
+    def interpolate(self, frame: Frame, order: Value, s: Value) -> None:
         """The state a time s after the present one: that of the series, on the constraints if that is near."""
         states, form = self.motion.states, self.motion.form
         increments, _ = self.motion.increments(frame, order, s)
@@ -103,8 +103,8 @@ class Output:
 
     # ---- the end of a member ----
 
-    def write_end(self, frame: Frame, lane: Lane) -> None:
-        """Where a member has ended, how, and after how many steps."""
+    def write_end(self, frame: Frame, lane: Lane, states: bool) -> None:
+        """Where a member has ended, how, and after how many steps; as its last output too, if there are `states`."""
         code, member = frame.code, lane["member"]
         frame.write("t_end", member, lane["t"])
         for name in ("code", "steps", "rejected"):
@@ -113,8 +113,9 @@ class Output:
         for i in self.motion.form.each(code, self.motion.states):
             x = lane["y", i]
             frame.write("y_end", member * self.motion.states + i, x)
-            with code.only_if(done):
-                frame.write("path", self.place(frame, member, frame.job("times") - 1, i), x)
+            if states:
+                with code.only_if(done):
+                    frame.write("path", self.place(frame, member, frame.job("times") - 1, i), x)
 
 
 def recall_pieces(motion: Motion, frame: Frame, lane: Lane, row: Value) -> None:

@@ -15,7 +15,7 @@ from lagjax._native._tables import Tables
 
 def fields(n: int, guards: int) -> dict:
     """What a thread remembers: the beginning of the last long step, its size, and the returns to it."""
-    before = {"y_before": 2 * n, "low_before": 2 * n, "side_before": guards}
+    before = {"y_before": 2 * n, "low_before": 2 * n, "side_before": guards, "noted_before": guards}
     return before | dict.fromkeys(("t_before", "t_low_before", "steps_before", "h_before", "returns", "returned"), 1)
 
 
@@ -49,7 +49,8 @@ def _beginnings(frame: Frame, form: Lines | Tables, states: int, guards: int) ->
     """The addresses of what a step begins with, and of what the last long one began with."""
     for i in form.each(frame.code, states):
         yield frame.address("y", i), frame.address("y_before", i)
-    for name, count in {"low": states, "side": guards, **dict.fromkeys(("t", "t_low", "steps"), 1)}.items():
+    of_guards = dict.fromkeys(("side", "noted"), guards)
+    for name, count in {"low": states, **of_guards, **dict.fromkeys(("t", "t_low", "steps"), 1)}.items():
         for i in form.each(frame.code, count):
             yield frame.address(name, i), frame.address(name + "_before", i)
 

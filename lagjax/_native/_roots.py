@@ -1,76 +1,197 @@
-"""The first root of a polynomial on [0, 1], lane by lane: no sampling, so that none is stepped over.
+"""Roots of a polynomial on [0, 1], lane by lane: no sampling, so that none is stepped over.
 
-With M ≥ −P″ on the whole interval, P(x + d) ≥ P(x) + P′(x) d − M d²/2: as long as the right side is positive there is
-no root. From x = 0 on, x moves to where it vanishes. That converges to the first root, at a simple one quadratically;
-past a touch, where P is zero to rounding and does not fall, it hops, by less than what P could do unseen.
+With M ≥ |P″| on the whole interval, P(x + d) ≥ P(x) + P′(x) d − M d²/2: as long as the right side is positive there is
+no root. From where it begins, x moves to where it vanishes. That converges to the first root, at a simple one
+quadratically; past a touch, where P is zero to rounding and does not fall for certain, it hops, by less than what P
+could do unseen.
+
+What a series leaves out is not rounding, but it is known: about as much as its last terms, times the power that follows
+them. Where P comes so near to zero without going through, nobody knows from here whether it does: the search ends
+there, and a step that ends there, too, has a series that knows.
 """
 
-from lagjax._native._constants import EPS, MOST_MOVES, ROOT_NOISE
+from collections.abc import Callable
+
+from lagjax._native._constants import EPS, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE
 from lagjax._native._frame import Frame
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._series import Motion, integer
 
 
 class Roots:
-    """The function `first_root(degree)`: from the coefficients in `poly` the first root, into `root`; 2 without any.
+    """Functions of the polynomial in `poly`, of which `degree + 1` coefficients are there.
 
-    Where P(0) is negative beyond rounding the root is 0. `is_root` is 0 where only a part of the way was looked at: up
-    to `root`, where there is none.
+    `first_root(degree)` finds the first root, into `root`; 2 without any. Where P(0) is negative beyond rounding the
+    root is 0. `is_root` is 0 where only a part of the way was looked at: up to `root`, where there is none.
+
+    `next_root(degree)` begins at `begin`, where P may be zero, with the sums of `sum_up`. P is known to rounding,
+    `unsure`, and `doubt` times the power after its last one; what is closer than `instant` is one place. It leaves the
+    `slope` at the root, and how well P is known there, in `error`.
     """
 
     def __init__(self, motion: Motion):
         self.motion = motion
+        self.next_root = self._next_root()
         self.first_root = self._first_root()
 
     @staticmethod
     def fields(columns: int) -> dict:
         """What a thread remembers for it."""
-        return {"poly": columns, "root": 1, "is_root": 1}
+        numbers = ("root", "is_root", "slope", "error", "begin", "unsure", "doubt", "instant", "part")
+        return {"poly": columns, **dict.fromkeys((*numbers, "falls", "rises", "down", "up"), 1)}
+
+    # ---- a number along the step as a polynomial ----
+
+    def polynomial(self, frame: Frame, j: Value, degree: Value, h: Value, side: Value, level: "Value | float") -> None:
+        """σ (u − level) over the step as a polynomial on [0, 1], into `poly`, of what is followed as number j."""
+        code, motion = frame.code, self.motion
+        frame["poly", 0] = side * (motion.followed_value(frame, j) - level)
+        power = code.variable(side * h)
+        with code.loop(degree + 1, start=1) as k:
+            frame["poly", k] = motion.followed_coefficient(frame, j, k) * code.load(power, frame.vector)
+            code.store(code.load(power, frame.vector) * h, power)
+        frame["poly", degree + 1] = 0.0
+
+    def size(self, frame: Frame, degree: Value) -> Value:
+        """Σ |cₖ|."""
+        code, size = frame.code, frame.code.variable(frame.constant(0.0))
+        with code.loop(degree + 1) as k:
+            code.store(code.load(size, frame.vector) + code.intrinsic("fabs", frame["poly", k]), size)
+        return code.load(size, frame.vector)
+
+    def last_terms(self, frame: Frame, degree: Value, first: int = 0) -> Value:
+        """The size of the last three, or of those before: one may have been divided away, one be zero by symmetry."""
+        last = [frame.code.intrinsic("fabs", frame["poly", degree - (first + k)]) for k in range(3)]
+        return last[0] + last[1] + last[2]
+
+    def shorten(self, frame: Frame, degree: Value, is_long: Callable[[], Value]) -> None:
+        """Halve the interval as long as it is said to be long; `part` of it is left."""
+        code = frame.code
+        frame["part"] = 1.0
+        again, left = code.variable(integer(code, 1)), code.variable(integer(code, MOST_HALVINGS))
+        with code.repeat_while(lambda: (code.load(again, INTEGER) > 0) & (code.load(left, INTEGER) > 0)):
+            code.store(code.load(left, INTEGER) - 1, left)
+            code.store(integer(code, 0), again)
+            long = is_long()
+            with code.only_if(code.any_lane(long)):
+                code.store(integer(code, 1), again)
+                half, power = code.select(long, frame.constant(0.5), 1.0), code.variable(frame.constant(1.0))
+                frame["part"] = frame["part"] * half
+                with code.loop(degree + 1) as k:
+                    frame["poly", k] = frame["poly", k] * code.load(power, frame.vector)
+                    code.store(code.load(power, frame.vector) * half, power)
+
+    # ---- its roots ----
 
     def _first_root(self) -> Code:
         frame = self.motion.function("first_root", INTEGER)
-        code, (degree,), zero = frame.code, frame.arguments, frame.constant(0.0)
-        falls, size, bend = (code.variable(x) for x in (zero, code.intrinsic("fabs", frame["poly", 0]), zero))
-        with code.loop(degree + 1, start=1) as k:
-            c, number = frame["poly", k], code.as_double(k)
-            down = code.select(c < 0.0, -c, zero)
-            for sum, term in ((falls, down), (size, code.intrinsic("fabs", c)), (bend, down * (number * (number - 1)))):
-                code.store(code.load(sum, frame.vector) + term, sum)
-        start, falls, size, bend = frame["poly", 0], *(code.load(x, frame.vector) for x in (falls, size, bend))
-        frame["root"], frame["is_root"] = 2.0, 1.0
-        searching = ~(start > falls) & ((falls > 0.0) | (start < 0.0))
-        with code.only_if(code.any_lane(searching)):
-            self._march(frame, degree, searching, bend, (ROOT_NOISE * EPS) * size)
+        for name in ("begin", "unsure", "doubt"):
+            frame[name] = 0.0
+        frame["instant"] = EPS
+        self.sum_up(frame, *frame.arguments)
+        frame.call(self.next_root, *frame.arguments)
         return frame.finish()
 
-    def _march(self, frame: Frame, degree: Value, searching: Value, bend: Value, noise: Value) -> None:
+    def sum_up(self, frame: Frame, degree: Value) -> None:
+        """How far P falls and rises, at most, and how much it bends down and up: for `next_root`."""
+        code, zero = frame.code, frame.constant(0.0)
+        sums = {name: code.variable(zero) for name in ("falls", "rises", "down", "up")}
+
+        def add(name: str, x: Value) -> None:
+            code.store(code.load(sums[name], frame.vector) + x, sums[name])
+
+        with code.loop(degree + 1, start=1) as k:
+            c, number = frame["poly", k], code.as_double(k)
+            negative, bend = code.select(c < 0.0, c, zero), number * (number - 1.0)
+            positive = c - negative
+            add("falls", 0.0 - negative)
+            add("rises", positive)
+            add("down", negative * (0.0 - bend))
+            add("up", positive * bend)
+        for name, sum in sums.items():
+            frame[name] = code.load(sum, frame.vector)
+
+    def turn(self, frame: Frame, degree: Value, where: Value) -> None:
+        """In some lanes the polynomial with the other sign."""
         code = frame.code
+        with code.loop(degree + 1) as k:
+            c = frame["poly", k]
+            frame["poly", k] = code.select(where, 0.0 - c, c)
+        for one, other in (("falls", "rises"), ("down", "up")):
+            a, b = frame[one], frame[other]
+            frame[one], frame[other] = code.select(where, b, a), code.select(where, a, b)
+
+    def _next_root(self) -> Code:
+        frame = self.motion.function("next_root", INTEGER)
+        code, (degree,), start, falls = frame.code, frame.arguments, frame["poly", 0], frame["falls"]
+        frame["root"], frame["is_root"] = 2.0, 1.0
+        searching = ~(start > falls + frame["doubt"]) & ((falls > 0.0) | (start < 0.0)) & (frame["begin"] < 1.0)
+        with code.only_if(code.any_lane(searching)):
+            self._march(frame, degree, searching)
+        return frame.finish()
+
+    def _march(self, frame: Frame, degree: Value, searching: Value) -> None:
+        """From `begin` on, by the bounds `down` of −P″ and `up` of P″."""
+        code, down = frame.code, frame["down"]
+        bend = code.maximum(down, frame["up"])
+        at_start = (ROOT_NOISE * EPS) * code.intrinsic("fabs", frame["poly", 0]) + frame["unsure"]
+        along = (ROOT_NOISE * EPS) * (frame["falls"] + frame["rises"])
         x, going, left = (code.variable(y) for y in (
-            frame.constant(0.0), code.select(searching, frame.constant(1), 0.0), integer(code, MOST_MOVES),
+            frame["begin"], code.select(searching, frame.constant(1), 0.0), integer(code, MOST_MOVES),
         ))  # fmt: skip
-        steep = code.intrinsic("sqrt", 2.0 * (bend * noise))  # a slope that noise and bend cannot undo
-        hop = code.intrinsic("sqrt", 2.0 * noise / bend)
 
         def active():
             return code.load(going, frame.vector) > 0.0
 
         with code.repeat_while(lambda: code.any_lane(active()) & (code.load(left, INTEGER) > 0)):
             code.store(code.load(left, INTEGER) - 1, left)
-            here = code.load(x, frame.vector)
+            here, now = code.load(x, frame.vector), active()
             value, slope = self._at(frame, degree, here)
-            falling = slope < 0.0 - steep
-            near = value <= noise
-            is_root = active() & ((value < 0.0 - noise) | (near & falling))
-            mended = here - code.select(near & falling & (here > 0.0), value / slope, 0.0)
-            frame["root"] = code.select(is_root, code.select(mended > 0.0, mended, 0.0), frame["root"])
-            root = code.intrinsic("sqrt", slope * slope + 2.0 * (bend * value))
-            ahead = code.select(slope > 0.0, (slope + root) / bend, 2.0 * value / (root - slope))
-            after = here + code.select(near, hop, ahead)
-            code.store(code.select(active(), after, here), x)
-            goes_on = active() & ~is_root & (after < 1.0)
-            code.store(code.select(goes_on, frame.constant(1), 0.0), going)
+            noise, left_out = at_start + along * here, frame["doubt"] * self._power(here)
+            error = noise + left_out
+            # A slope that what is not known, and the bend, cannot undo.
+            near, steep = value <= error, slope * slope > 4.0 * (bend * error)
+            is_root = now & ((value < 0.0 - error) | (near & steep & (slope < 0.0)))
+            open = now & near & ~is_root & ~(steep & (slope > 0.0))
+            ends = is_root | (open & (left_out > noise))
+            with code.only_if(code.any_lane(ends)):
+                self._note_root(frame, here, (value, slope, error, bend), is_root, ends)
+            root = code.intrinsic("sqrt", code.maximum(slope * slope + 2.0 * (down * value), 0.0))
+            rising = slope > 0.0
+            numerator, denominator = (
+                code.select(rising, slope + root, 2.0 * value),
+                code.select(rising, down, root - slope),
+            )
+            after = code.variable(here + numerator / denominator)
+            with code.only_if(code.any_lane(open)):
+                hop = here + self._hop(frame, error, bend)
+                code.store(code.select(open, hop, code.load(after, frame.vector)), after)
+            after = code.load(after, frame.vector)
+            code.store(code.select(now, after, here), x)
+            code.store(code.select(now & ~ends & (after < 1.0), frame.constant(1), 0.0), going)
         frame["is_root"] = code.select(active(), 0.0, frame["is_root"])
         frame["root"] = code.select(active(), code.load(x, frame.vector), frame["root"])
+
+    def _note_root(self, frame: Frame, here: Value, known: tuple[Value, ...], is_root: Value, ends: Value) -> None:
+        """The place of a root, or where the search ends; near it one step of Newton's more, and not a long one."""
+        code, (value, slope, error, bend) = frame.code, known
+        hop, back = self._hop(frame, error, bend), value / slope
+        back = code.select((slope < 0.0) & (here > frame["begin"]), code.select(back < hop, back, hop), 0.0)
+        place = code.select(is_root, code.maximum(here - back, frame["begin"]), here)
+        of_root = (("root", place), ("is_root", code.select(is_root, frame.constant(1), 0.0)),
+                   ("slope", slope), ("error", error))  # fmt: skip
+        for name, number in of_root:
+            frame[name] = code.select(ends, number, frame[name])
+
+    def _hop(self, frame: Frame, error: Value, bend: Value) -> Value:
+        """How far P does not come from zero to beyond what is known of it, and back."""
+        code = frame.code
+        return code.maximum(code.intrinsic("sqrt", 2.0 * error / bend), frame["instant"])
+
+    def _power(self, x: Value) -> Value:
+        """x⁸, which bounds the power after the last one of any order."""
+        square = x * x
+        return (square * square) * (square * square)
 
     def _at(self, frame: Frame, degree: Value, x: Value) -> tuple[Value, Value]:
         """The polynomial and its slope, by Horner's scheme."""

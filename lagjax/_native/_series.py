@@ -39,7 +39,8 @@ class Motion:
     The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n. `fields`
     names what else a thread remembers (see `Layout`), `job` the structure that all threads share. `large` kernels are
     written as tables (see `is_large`). Vectors have `width` lanes. The last of the numbers of the program are its
-    `pieces`, the others the `chosen` ones of a member, or all. With `keep_sums` the sums of every order stay in
+    `pieces`, the others the `chosen` ones of a member, or all. Of its outputs so many are `kept`, behind the first
+    ones. With `keep_sums` the sums of every order stay in
     memory, not only those of the last.
     """
 
@@ -55,10 +56,11 @@ class Motion:
         keep_sums: bool = False,
         pieces: int = 0,
         chosen: "Chosen | None" = None,
+        kept: int = 0,
     ):
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
         self.numbers = program.size - self.states - 1  # parameters, and the pieces of a piecewise program
-        self.pieces, self.parameters = pieces, self.numbers - pieces
+        self.pieces, self.parameters, self.kept = pieces, self.numbers - pieces, kept
         self.recorded_pieces = pieces and pieces + 1  # what is written down behind the state of a step
         self.keep_sums, self.job = keep_sums, job
         self.module = ir.Module(name)
@@ -84,6 +86,7 @@ class Motion:
             "sums": (MAX_ORDER if self.keep_sums else 1, products),
             "values": series.values,  # what the order recursion reads of the zeroth order
             "params": self.numbers,
+            "kept": self.kept,
             # Where the numbers of a member begin; its parameters, and what tables are of.
             **dict.fromkeys(("t", "h", "singular", "first_number"), 1),
         }
@@ -162,6 +165,8 @@ class Motion:
         code, (order,), series, n, form = frame.code, frame.arguments, self.series, self.n, self.form
         out = form.run(frame, series.zeroth_order, *self.now(frame), to=self.values(frame))
         frame["singular"] = out[n]
+        for i in range(self.kept):
+            frame["kept", i] = out[n + 1 + i]
         for i in form.each(code, n):
             frame["y", i, 1] = frame["y", i + n]
             frame["y", i + n, 1] = out[i]
@@ -190,6 +195,20 @@ class Motion:
     def rows_at(self, frame: Frame, k: Value) -> Vectors:
         """The coefficients of order k of all rows."""
         return frame.vectors_at("rows", self.series.rows, k)
+
+    def followed_value(self, frame: Frame, j: Value) -> Value:
+        """What the program gives for number j of those that are followed."""
+        return frame["values", j + (self.series.values - self.series.followed)]
+
+    def followed_coefficient(self, frame: Frame, j: Value, k: Index) -> Value:
+        """Its coefficient of order k > 0."""
+        return frame["rows", j + (self.series.rows - self.series.followed), k]
+
+    def followed_degree(self, code: Code, order: Value) -> Value:
+        """The order of its last coefficient."""
+        if self.pieces:  # see `coefficients`
+            return code.select(order < MAX_ORDER - 1, order, MAX_ORDER - 1)
+        return order - 1
 
     def _last_order(self, code: Code, order: Value) -> Value:
         return code.select(order < MAX_ORDER, order + 1, MAX_ORDER)

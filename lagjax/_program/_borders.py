@@ -27,12 +27,14 @@ from lagjax._program._graph import Graph
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, live
+from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._sliding import MOST_SLIDING, Slide, dot, with_sliding
-from lagjax._program._transpose import gradient_in, pullback_and_entries
+from lagjax._program._transpose import copied, gradient_in, pullback_and_entries
 
 # The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders nobody has to look for.
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK = range(6)
+LARGEST_WITH_ROUNDING = 500  # operations of numbers that are watched, and whose rounding is: three times as many
 # What a function is flat like: exp(u) below, exp(−|u|) on both sides, exp(−u²), or zero up to a border; and in which
 # units of its argument.
 BELOW, BESIDE, SQUARED, UP_TO = range(4)
@@ -146,23 +148,25 @@ class Borders(NamedTuple):
         return frozenset(nodes[i][2] for i in _below(self.program.line, [node]) if nodes[i][0] == "input")
 
 
-def borders(program: Recurrent, size: int, slides: bool = True) -> Borders | None:
+def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0) -> Borders | None:
     """The borders of a program of q, q̇, t and parameters whose first `size` outputs are q̈; None where it is smooth.
 
-    Along borders that depend on velocities the motion may slide (`slides`; see `_sliding`).
+    Along borders that depend on velocities the motion may slide (`slides`; see `_sliding`). So many of the last outputs
+    are `watched` along the motion: what they decide on has borders too.
     """
     if _PIECEWISE.union(_FEATURES).isdisjoint(op for op, *_ in program.line.nodes):
         return None  # most scenes, and the largest ones, at no cost
     with np.errstate(all="ignore"):
-        rewriting = _Rewriting(program, size, slides)
+        rewriting = _Rewriting(program, size, slides, watched)
         return rewriting.finished() if rewriting.switches or rewriting.features else None
 
 
 class _Rewriting:
     """The program anew, with an input for every piece where the program decides."""
 
-    def __init__(self, program: Recurrent, size: int, slides: bool):
+    def __init__(self, program: Recurrent, size: int, slides: bool, watched: int = 0):
         self.program, self.size, self.moving, self.slides = program, size, 2 * size + 1, slides
+        self.watched = program.line.outputs[len(program.line.outputs) - watched :]
         self._jumping: set[int] = set()  # pieces that something may jump with
         self.graph = Graph(_LARGEST * len(program.line.nodes) + 1000)
         self.switches: list[int] = []
@@ -192,7 +196,10 @@ class _Rewriting:
         """The nodes that q̈ depends on, without those of the elimination of a linear system."""
         linear, line = self.program.linear, self.program.line
         roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
-        needed = _below(line, roots, self.moduli | self.quotients)
+        instead = self.moduli | self.quotients
+        needed = _below(line, roots, instead)
+        if self.watched:  # which may read the solution of a linear system, but not decide on its elimination
+            needed |= _below(line, self.watched, instead) - (_below(line, line.outputs[: self.size]) - needed)
         self.abrupt = self._without_series(needed)
         return needed - self.abrupt
 
@@ -405,9 +412,10 @@ class _Rewriting:
 
         Those that depend on velocities come first, and are all there or none.
         """
+        acting = self._jumping & _below(line, line.outputs[: self.size])
         by_velocity, by_position = [], []
         for j, kind in enumerate(self.kinds if self.slides else ()):
-            if kind == SIGN and self.pieces[j] in self._jumping:
+            if kind == SIGN and self.pieces[j] in acting:
                 below = _below(line, [self.switches[j]])
                 read = {line.nodes[i][2] for i in below if line.nodes[i][0] == "input"}
                 if not read.isdisjoint(range(self.size, 2 * self.size)):
@@ -507,6 +515,31 @@ def _below(line: StraightLine, roots: Sequence[int], instead: Mapping[int, Seque
             seen.add(i)
             stack.extend(instead[i] if i in instead else line.nodes[i][1])
     return seen
+
+
+def with_outputs(program: Recurrent, more: StraightLine, moving: int) -> Pieced:
+    """A program with the outputs of another line of the same inputs behind its own; what both compute is shared.
+
+    Before these stands how far rounding may move each of them (`rounding`); zero for a line that is long.
+    """
+    graph = Graph.of(program.line, program.budget + 2 * _LARGEST * len(more.nodes) + 1000)
+    kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in program.dtypes]
+    with np.errstate(all="ignore"):
+        places = copied(graph, more, [graph.input(i, kind) for i, kind in enumerate(kinds)])
+        errors = [graph.constant(0.0, "float")] * len(more.outputs)
+        if len(more.nodes) <= LARGEST_WITH_ROUNDING:
+            errors = rounding(graph, more, places, moving)
+    outputs = (*program.line.outputs, *errors, *(places[i] for i in more.outputs))
+    line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
+    return Pieced(line, program.size, program.dtypes, program.linear, graph.budget)
+
+
+def reads_inputs(line: StraightLine, nodes: Sequence[int], first: int) -> tuple[bool, ...]:
+    """For each of these nodes whether it reads an input from number `first` on."""
+    reads: list[bool] = []
+    for op, operands, attribute in line.nodes:
+        reads.append(attribute >= first if op == "input" else any(reads[i] for i in operands))
+    return tuple(reads[i] for i in nodes)
 
 
 def _moduli(line: StraightLine) -> dict[int, tuple[int, int]]:

@@ -137,6 +137,12 @@ class _Recurrences:
         added = len(self.zeroth_order.nodes)
         self._find(list(followed))
         self._find_added(added)
+        done = 0
+        while done < len(self._rows):  # a derivative may be a number that nothing else needed
+            new, done = list(self._rows)[done:], len(self._rows)
+            for of, _ in new:
+                if not isinstance(of, _Component):
+                    self.coefficient(of)
 
     def _needed(self, linear) -> list[int]:
         """The nodes whose coefficients are asked for: of the linear system, or of the outputs themselves."""

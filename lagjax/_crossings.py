@@ -1,0 +1,170 @@
+"""`crossings`: where a function of the state changes sign along a motion.
+
+The motion is one run of machine code, which goes on over every crossing and writes it down (`_native._events`).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._arguments import accept
+from lagjax._consistent import has_constraints, require_consistent
+from lagjax._failures import raise_where_failed, sentence
+from lagjax._layout import Layout, halves
+from lagjax._machine_code import MOST_GUARDS, MachineCode, Noted, Surfaces, surfaces_of
+from lagjax._problem import Problem, Solution
+from lagjax._results import RESULTS, SUCCESSFUL, SimulationError, code_of
+from lagjax._system import System, require_system
+from lagjax._validate import as_arrays, is_concrete, require_budget, require_flag
+
+PyTree = Any
+_TOO_MANY = code_of(RESULTS.max_crossings_reached)
+
+
+class Crossings(NamedTuple):
+    """Where a section was crossed, in the order of the motion; NaN beyond the last crossing.
+
+    - `t`, shape (count,): when; `q`, `qdot`: the state then, with that axis in front of every leaf.
+    - `count`: how many crossings there were, also where that is more than there is room for.
+    - `ok`: whether the motion reached its end, and all crossings are there.
+    """
+
+    t: jax.Array
+    q: PyTree
+    qdot: PyTree
+    count: jax.Array
+    ok: jax.Array
+
+
+def crossings(
+    system: System,
+    section: Callable | dict[str, Callable],
+    q0: PyTree,
+    qdot0: PyTree,
+    ts: jax.Array,
+    params: PyTree = None,
+    *,
+    direction: int | dict[str, int] = 0,
+    count: int = 64,
+    rtol: float | None = None,
+    atol: float | None = None,
+    max_steps: int = 65_536,
+    throw: bool = True,
+) -> Crossings | dict[str, Crossings]:
+    r"""Where the motion of `system` from (q0, qdot0) at `ts[0]` crosses a section s(q, q̇, t) = 0 before `ts[-1]`.
+
+    - `section`: a function of (q, qdot), and of `t` and `params` by name, that returns one real number. A crossing is
+      where that changes sign; to touch zero is none, and to begin on it neither. A dict of functions gives a dict of
+      `Crossings`, found in one run.
+    - `ts`: times, of which only the first and the last matter; decreasing, to go back in time.
+    - `direction`: −1 only where the section falls, +1 only where it rises, 0 both, as the motion meets it; for a dict
+      of sections one for all, or a dict.
+    - `count`: the room for the crossings of each section. A motion that has more is an error, or with `throw=False` not
+      `ok`: the first ones are there, and `Crossings.count` tells how many there were.
+
+    The other arguments are those of `simulate`. Crossings are found on the Taylor series of the section along each
+    step, by a bound on that polynomial and without sampling, so that none is stepped over, to the rounding of the time;
+    where the section jumps through zero is one, too. Sections may be piecewise (`abs`, `where`, `max`, …).
+
+    It works under `jax.jit` and `jax.vmap`, which makes one batch of all members, and has first and second derivatives:
+    with s′ the rate of the section along the motion, those of a crossing time are −ds / s′, and those of the state
+    there include the rate of the state times that. They take one more run. Where the motion only grazes the section s′
+    is zero, and there is no derivative.
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right; `SimulationError` when the motion cannot
+    be followed to its end, or has more crossings than `count`. It needs a scene that has machine code (see
+    `System.explain`): float64, on the CPU.
+
+    Source: Hénon, *On the numerical computation of Poincaré maps*, Physica D 5 (1982) 412, for the problem; Jorba &
+    Zou, Exp. Math. 14 (2005) 99, for the series.
+
+    ```python
+    import jax, jax.numpy as jnp, lagjax
+    jax.config.update("jax_enable_x64", True)
+
+    pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q))
+    upward = lagjax.crossings(pendulum, lambda q, qdot: q, 1.0, 0.0, jnp.array([0.0, 10.0]), direction=1)
+    period = upward.t[1] - upward.t[0]
+    ```
+    """
+    require_system(system)
+    require_flag(throw, "throw")
+    require_budget(count, "count")
+    names, functions = _sections(section)
+    directions = _directions(direction, names)
+    layout = Layout.of(q0, qdot0)
+    problem = Problem.of(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
+    if has_constraints(system):
+        q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
+        require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
+    surfaces = _surfaces(problem, functions, directions, names)
+    solution, noted = MachineCode().crossings(problem, surfaces, count)
+    result = jnp.where(jnp.any(noted.count > count), _TOO_MANY, solution.result)
+    result = jnp.where(solution.result == SUCCESSFUL, result, solution.result)
+    if throw:
+        noted = _raise_unless_ok(problem, solution, noted, result, count)
+    ok = (solution.result == SUCCESSFUL) & (noted.count <= count)
+    q, qdot = map(layout.restore, map(jnp.asarray, halves(noted.y)))
+    found = Crossings(jnp.asarray(noted.t), q, qdot, jnp.asarray(noted.count).astype(int), jnp.asarray(ok))
+    of_each = [jax.tree.map(lambda x, k=k: x[k], found) for k in range(len(functions))]
+    return of_each[0] if names is None else dict(zip(names, of_each, strict=True))
+
+
+def _raise_unless_ok(problem: Problem, solution: Solution, noted: Noted, result, count: int) -> Noted:
+    """What was noted, where all went well; else `SimulationError`, at run time where it is being traced."""
+    latest = jnp.nanmax(jnp.where(jnp.any(noted.count > count), noted.t, jnp.nan), initial=-jnp.inf)
+    forward = problem.ts[-1] > problem.ts[0]
+    t_end = jnp.where((result == _TOO_MANY) & forward, latest, solution.t_end)
+    end, names = (t_end, solution.y_end), problem.layout.names
+    if not all(map(is_concrete, (result, *end, problem.ts))):
+        t, y = raise_where_failed((noted.t, noted.y), result, end, problem.ts[-1], names)
+        return noted._replace(t=t, y=y)
+    if text := sentence(result, *end[:1], np.asarray(problem.ts)[-1], end[1], names):
+        raise SimulationError(text, None)
+    return noted
+
+
+# ---- what can be wrong -----------------------------------------------------------------------------------------------
+
+
+def _sections(section) -> tuple[tuple[str, ...] | None, tuple]:
+    """The names of a dict of sections, or None, and the functions."""
+    if not isinstance(section, dict):
+        return None, (accept(section, "section"),)
+    if not section:
+        raise ValueError("section is an empty dict: give a function, or a dict of functions by name.")
+    if len(section) > MOST_GUARDS:
+        raise ValueError(f"There are {len(section)} sections, more than the {MOST_GUARDS} that one run can watch.")
+    return tuple(section), tuple(accept(function, f"section[{name!r}]") for name, function in section.items())
+
+
+def _directions(direction, names) -> tuple[int, ...]:
+    if isinstance(direction, dict):
+        if names is None or set(direction) != set(names):
+            raise ValueError("direction is a dict: give the same names as in the dict of sections.")
+        ways = [direction[name] for name in names]
+    else:
+        ways = [direction] * (1 if names is None else len(names))
+    for way in ways:
+        if isinstance(way, bool) or not isinstance(way, int | np.integer) or abs(way) > 1:
+            raise ValueError(f"direction must be -1 (falling), +1 (rising) or 0 (both); got {way!r}.")
+    return tuple(map(int, ways))
+
+
+def _surfaces(problem: Problem, functions, directions, names) -> Surfaces:
+    """The sections as programs. Raises `ValueError` where there is no machine code, or a section never changes."""
+    refusal = MachineCode().refuses(problem)
+    surfaces = refusal or surfaces_of(problem, functions, directions, "A section")
+    if not isinstance(surfaces, str):
+        refusal = MachineCode().refuses_crossings(problem, surfaces)
+        surfaces = refusal or surfaces
+    if isinstance(surfaces, str):
+        raise ValueError(f"crossings are found in machine code, which this motion has none of: {surfaces}.")
+    for k in range(len(functions)):
+        if not surfaces.values.depends(k) & set(range(2 * problem.layout.size + 1)):
+            which = "section" if names is None else f"section[{names[k]!r}]"
+            raise ValueError(f"{which} depends on neither the state nor the time: it cannot change its sign.")
+    return surfaces

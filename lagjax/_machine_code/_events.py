@@ -1,0 +1,189 @@
+"""Events and crossings of one member under every transformation of JAX: where they are, and how they vary.
+
+    located   by machine code that watches guards along the steps, without derivatives
+    varied    by one more run, without guards, whose outputs are at the times that were located: the states there vary
+              as at any output time, and with them the times (`_surfaces.moved_with`)
+
+The second run is only for derivatives. Its outputs lie some roundings before the crossings: where a force jumps on the
+surface itself, the state, its rate and its derivatives are then all those before the jump, and agree.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._custom import differentiated_as
+from lagjax._derivation import Derivation
+from lagjax._failures import differentiable_where, lost_unless
+from lagjax._layout import halves
+from lagjax._machine_code import _transforms
+from lagjax._machine_code._flow import Flow, Tolerances
+from lagjax._machine_code._surfaces import Surfaces, moved_with, require_one_number
+from lagjax._problem import Problem, Solution, has_own_root_finder
+from lagjax._program import Unlowerable
+from lagjax._results import ENDED_WELL, EVENT_OCCURRED
+
+_BEFORE = 64 * np.finfo(np.float64).eps  # of the largest time: more than the rounding of a time, and of a border's
+MOST_GUARDS = 24  # two bits each in the code of an event, which the kernel keeps in a double of 53
+
+
+class Noted(NamedTuple):
+    """The crossings of each of G surfaces, `room` at most, NaN beyond the last one.
+
+    `t` (G, room) and `y` (G, room, 2n): when, and the state then; `count` (G,): how many there were.
+    """
+
+    t: Any
+    y: Any
+    count: Any
+
+    @classmethod
+    def read(cls, path, surfaces: int) -> "Noted":
+        """From the `path` of a motion that notes them, (G (room + 1), 2n + 1)."""
+        rows = path.reshape(surfaces, -1, path.shape[-1])
+        count = rows[:, -1, 0]
+        return cls(rows[:, :-1, 0], rows[:, :-1, 1:], count)
+
+
+# ---- an event as a surface -------------------------------------------------------------------------------------------
+
+
+def surfaces_of_event(problem: Problem) -> Surfaces | str:
+    """The functions of an event as surfaces, or why they are not for machine code, as the end of a sentence."""
+    event = problem.event
+    assert event is not None
+    if has_own_root_finder(event):
+        return "the event has a root finder of its own"
+    conditions = jax.tree.leaves(event.cond_fn, is_leaf=lambda leaf: callable(leaf))
+    if any(eqx.is_array(leaf) for leaf in jax.tree.leaves(conditions)):
+        return "the event holds arrays of its own"
+    if len(conditions) > MOST_GUARDS:
+        return f"the event has {len(conditions)} functions, more than {MOST_GUARDS}"
+    ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
+    directions = tuple(0 if way is None else 1 if way else -1 for way in ways)
+    return surfaces_of(problem, tuple(conditions), directions, "An event")
+
+
+def surfaces_of(problem: Problem, functions: tuple, directions: tuple[int, ...], what: str) -> Surfaces | str:
+    """Functions of (q, qdot), and of t and params, as surfaces; or why they are not for machine code.
+
+    Raises `TypeError` where one of them is not one real number; `what` it is.
+    """
+    code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
+    try:
+        return _lowered(problem.derivation, functions, directions, tuple(code), structure, what)
+    except Unlowerable as reason:
+        return str(reason)
+
+
+@functools.lru_cache(maxsize=64)
+def _lowered(derivation: Derivation, functions, directions, code, structure, what: str) -> Surfaces:
+    restore = derivation.layout.restore
+
+    def value(function):
+        def of(y, params):
+            given = function(*map(restore, halves(y[:-1])), t=y[-1], params=params)
+            if what == "An event" and jnp.result_type(given) == np.dtype(bool):
+                raise Unlowerable("the event is true or false")
+            return require_one_number(given, what)
+
+        return of
+
+    if derivation.layout.dtype != np.float64:
+        raise Unlowerable(f"the coordinates are {derivation.layout.dtype.name}, not float64")
+    return Surfaces.of(derivation, [value(function) for function in functions], directions, code, structure)
+
+
+# ---- to the first event ----------------------------------------------------------------------------------------------
+
+
+def to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params) -> Solution:
+    """The motion to its event, or to the last of `ts` (T,), with derivatives of all orders up to the second."""
+    still = jax.lax.stop_gradient
+    solution = jax.tree.map(still, _transforms.run(guarded, tolerances, still(ts), still(y0), still(params)))
+    reached = jnp.isfinite(solution.path).all(axis=1)
+    values, where = (solution.path, solution.y_end, solution.t_end), (solution.result, solution.event)
+    varied = _varied_to_event(flow, surfaces, tolerances)
+    path, y_end, t_end = differentiated_as(varied, values, ts, y0, params, solution.t_end, *where)
+    well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL))
+    return solution._replace(
+        path=lost_unless(reached[:, None], path, (ts, y0, params)),
+        y_end=differentiable_where(well, y_end),
+        t_end=differentiable_where(well, t_end),
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _varied_to_event(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
+    """`(ts, y0, params, t_end, result, event)` → path, y_end, t_end, for the sake of their derivatives."""
+    ways = [moved_with(surfaces, flow.anywhere, k) for k in range(len(surfaces.directions))]
+
+    @jax.jit
+    def varied(ts, y0, params, t_stop, result, event):
+        fired, stop = result == EVENT_OCCURRED, _before(ts, t_stop)
+        end = jnp.where(fired, stop, ts[-1])
+        times = jnp.where((end - ts) * (ts[-1] - ts[0]) >= 0, ts, end)
+        times = jnp.concatenate([ts[:1], times[1:-1], end[None]])
+        solution = _transforms.run(flow, tolerances, times, y0, params)
+        t_end, y_end, earlier = end, solution.y_end, jnp.asarray(False)
+        for k, moved in enumerate(ways):
+            taken = fired & (((event >> (2 * k)) & 3) > 0) & ~earlier
+            earlier = earlier | taken
+            t_k, y_k = moved(taken, end, solution.y_end, params)
+            t_end, y_end = jnp.where(taken, t_k, t_end), jnp.where(taken, y_k, y_end)
+        return solution.path, y_end, t_end
+
+    return varied
+
+
+# ---- all crossings ---------------------------------------------------------------------------------------------------
+
+
+def along_crossings(
+    noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params
+) -> tuple[Solution, Noted]:
+    """The motion to the last of `ts`, and the crossings of its surfaces, with derivatives up to the second."""
+    still = jax.lax.stop_gradient
+    solution = jax.tree.map(still, _transforms.run(noting, tolerances, still(ts), still(y0), still(params)))
+    noted = Noted.read(solution.path, len(surfaces.directions))
+    varied = _varied_crossings(flow, surfaces, tolerances._replace(notes=0))
+    t, y = differentiated_as(varied, (noted.t, noted.y), ts, y0, params, noted.t)
+    there, inputs = jnp.isfinite(noted.t), (ts, y0, params)
+    return solution, Noted(
+        lost_unless(there, t, inputs), lost_unless(there[..., None], y, inputs), noted.count
+    )  # fmt: skip
+
+
+@functools.lru_cache(maxsize=64)
+def _varied_crossings(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
+    """`(ts, y0, params, t)` → t (G, room) and y (G, room, 2n), for the sake of their derivatives."""
+    ways = [moved_with(surfaces, flow.anywhere, k) for k in range(len(surfaces.directions))]
+
+    @jax.jit
+    def varied(ts, y0, params, t):
+        there = jnp.isfinite(t)
+        times = jnp.where(there, _before(ts, t), jax.lax.stop_gradient(ts[-1])).ravel()
+        order = jnp.argsort(times * jnp.sign(ts[-1] - ts[0]))
+        solution = _transforms.run(
+            flow, tolerances, jnp.concatenate([ts[:1], times[order], ts[-1:]]), y0, params
+        )  # fmt: skip
+        path = jnp.zeros_like(solution.path[1:-1]).at[order].set(solution.path[1:-1])
+        y, times = path.reshape(*t.shape, -1), times.reshape(t.shape)
+        moved = [
+            jax.vmap(way, (0, 0, 0, None))(*of, params) for way, *of in zip(ways, there, times, y, strict=True)
+        ]  # fmt: skip
+        return tuple(jnp.stack(part) for part in zip(*moved, strict=True))
+
+    return varied
+
+
+def _before(ts, t):
+    """A few roundings earlier than t, but not before the first time."""
+    first, last = jax.lax.stop_gradient((ts[0], ts[-1]))
+    step = _BEFORE * jnp.maximum(abs(first), abs(last))
+    earlier = t - jnp.sign(last - first) * step
+    return jnp.where((earlier - first) * (last - first) > 0, earlier, first)

@@ -1,0 +1,108 @@
+"""Surfaces that a motion meets: guards as programs, and how the time and the state of a crossing vary.
+
+Where a guard vanishes is found by machine code, without derivatives (`_native._events`). Those of the crossing come
+from the implicit function: with g the guard and ġ its rate along the motion,
+
+    dt* = −dg / ġ        dy* = dy + ẏ dt*
+
+and the same to second order (`moved_with`).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from lagjax._derivation import Derivation
+from lagjax._native import Guards
+from lagjax._program import Program, lower
+
+PyTree = Any
+
+
+class Surfaces(NamedTuple):
+    """Guards as programs of (q, q̇, t, params), and how each has to change sign: −1, 0, +1.
+
+    `values` gives all g. `complete` gives what `_native.Guards` wants: g, then ġ, then the sizes of both, which bound
+    their round-off.
+    """
+
+    values: Program
+    complete: Program
+    directions: tuple[int, ...]
+
+    def guards(self, notes: bool = False) -> Guards:
+        """They as machine code watches them: a change ends the motion or, with `notes`, is written down."""
+        return Guards(self.values, self.complete, self.directions, notes)
+
+    @classmethod
+    def of(
+        cls, derivation: Derivation, functions: Sequence[Callable], directions: tuple[int, ...], code: tuple, structure
+    ) -> "Surfaces":
+        """The surfaces of functions of y = (q, q̇, t), (2n + 1,), and params; each gives one number.
+
+        `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
+        """
+        n, program = derivation.layout.size, derivation.acceleration
+
+        def values(y, numbers):
+            params = eqx.combine(numbers, structure.unflatten(code))
+            return jnp.stack([function(y, params) for function in functions])
+
+        def complete(y, numbers):
+            acceleration = jnp.stack(program.complete(*y, *scalars_of(numbers))[:n])
+            rate = jnp.concatenate([y[n:-1], acceleration, jnp.ones(1)])
+            by_y = jax.jacfwd(values)(y, numbers)
+            terms, moving = by_y * y, by_y * rate
+            return values(y, numbers), moving.sum(1), jnp.abs(terms).sum(1), jnp.abs(moving).sum(1)
+
+        y = jax.ShapeDtypeStruct((2 * n + 1,), derivation.layout.dtype)
+        numbers = derivation.numbers
+        return cls(lower(values, y, numbers), lower(complete, y, numbers), directions)
+
+
+def scalars_of(numbers: PyTree) -> list[jax.Array]:
+    """Every number of a pytree, one by one."""
+    return [x for leaf in jax.tree.leaves(numbers) for x in jnp.ravel(leaf)]
+
+
+def require_one_number(value, what: str) -> jax.Array:
+    """The value of a guard as an array. Raises `TypeError` where it is not one real number."""
+    if len(jax.tree.leaves(value)) != 1 or value is not jax.tree.leaves(value)[0]:
+        raise TypeError(f"{what} must return one real number; got {type(value).__name__}.")
+    value = jnp.asarray(value)
+    if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
+        raise TypeError(f"{what} must return one real number; got shape {value.shape} of {value.dtype}.")
+    return value
+
+
+def moved_with(surfaces: Surfaces, program: Program, k: int) -> Callable:
+    """`(taken, t, y, numbers)` → (t, y): how the state at t, where guard k is zero, moves to where it is zero then.
+
+    With δg the variation of the guard, f the rate of the state by the `program` of q̈, and ′ the derivative along the
+    motion, the time moves by
+
+        s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
+
+    up to third order in δg, which is zero itself: first and second derivatives are right. Where it is not `taken`
+    nothing moves.
+    """
+    still, count = jax.lax.stop_gradient, len(surfaces.directions)
+
+    def rates(t, y, numbers):
+        n = y.shape[0] // 2
+        acceleration = jnp.stack(program(*y, t, *numbers)[:n])
+        return surfaces.complete(*y, t, *numbers)[count + k], jnp.concatenate([y[n:], acceleration])
+
+    def moved(taken, t, y, numbers):
+        value, (rate, slope) = surfaces.values(*y, t, *numbers)[k], rates(t, y, numbers)
+        direction = jnp.ones_like(t), slope
+        bend, turn = map(still, jax.jvp(lambda t, y: rates(t, y, numbers), (t, y), direction)[1])
+        rate = jnp.where(taken & (rate != 0), rate, 1.0)
+        part = jnp.where(taken, value - still(value), 0.0) / rate
+        later = -part - 0.5 * still(bend / rate) * part**2
+        return t + later, y + slope * later + 0.5 * turn * later**2
+
+    return moved

@@ -1,0 +1,81 @@
+"""Guards: functions of the state that are watched along a motion, as part of the program of its acceleration."""
+
+import functools
+from typing import NamedTuple
+
+from lagjax._native._lanes import INTEGERS
+from lagjax._program._borders import Borders, borders, with_outputs
+from lagjax._program._graph import Unlowerable
+from lagjax._program._look_ups import table_of
+from lagjax._program._memory import without_collections
+from lagjax._program._operations import OPERATIONS
+from lagjax._program._series import Recurrent, Series, StraightLine, series
+
+
+class Guards(NamedTuple):
+    """Functions of the state that are watched, and for each −1, 0 or +1: when a change of its sign counts.
+
+    That ends the motion or, with `notes`, is written down. `values` gives all g. With y the state and the time, the
+    outputs of `program` are all g; their rates ġ = Σ ∂g/∂yᵢ ẏᵢ; then Σ |∂g/∂yᵢ yᵢ| and Σ |∂g/∂yᵢ ẏᵢ|, of which
+    round-off is a part.
+    """
+
+    values: Recurrent
+    program: Recurrent
+    directions: tuple[int, ...]
+    notes: bool = False
+
+
+class Watched(NamedTuple):
+    """A program whose last outputs are the rounding of guards, and guards; the series of its motion and of the guards.
+
+    And its borders, or None.
+    """
+
+    program: Recurrent
+    series: Series
+    borders: Borders | None
+
+
+@functools.lru_cache(maxsize=32)
+def watched(program: Recurrent, size: int, values: Recurrent, slides: bool) -> Watched:
+    """A program of q̈ with guards behind it. Raises `Unlowerable` where one of them has no series."""
+    with without_collections():
+        count = len(values.line.outputs)
+        whole = with_outputs(program, values.line, 2 * size + 1)
+        require_lanes(whole.line, 2 * size)
+        try:
+            if (found := borders(whole, size, slides, count)) is not None:
+                return Watched(found.program, _followed(found.program, size, found.followed, count), found)
+        except Unlowerable:  # a switching number without a series, or more operations than that takes
+            pass
+        return Watched(whole, _followed(whole, size, (), count), None)
+
+
+def require_lanes(line: StraightLine, time: int) -> None:
+    """Raise `Unlowerable` where the lanes of a kernel cannot run a program."""
+    for (op, _, _), kind in zip(line.nodes, line.kinds, strict=True):
+        if kind not in ("float", "bool") and op not in ("input", "constant", "convert", *INTEGERS):
+            raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
+    if any(op == "locate" for op, *_ in line.nodes):
+        _require_known_knots(line, time)
+
+
+def _require_known_knots(line: StraightLine, time: int) -> None:
+    """Raise `Unlowerable` where the state is located among parameters: what follows from moving these is not known."""
+    moves: list[bool] = []
+    for op, operands, attribute in line.nodes:
+        if op == "locate" and table_of(attribute).numbers is None and moves[operands[0]]:
+            of, _, which = line.nodes[operands[0]]
+            if (of, which) != ("input", time):
+                raise Unlowerable(
+                    "it looks up where a moving number is among knots that are parameters: of the time itself they may "
+                    "be, otherwise give the knots as known numbers"
+                )
+        step = op not in ("input", "constant") and OPERATIONS[op].is_step
+        moves.append(attribute <= time if op == "input" else not step and any(moves[i] for i in operands))
+
+
+def _followed(program: Recurrent, size: int, nodes: tuple[int, ...], count: int) -> Series:
+    guards = program.line.outputs[len(program.line.outputs) - count :]
+    return series(program, size, moving=2 * size + 1, followed=(*nodes, *guards))

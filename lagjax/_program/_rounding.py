@@ -1,0 +1,35 @@
+"""How far rounding may move numbers of a straight line, as nodes of a graph: running errors, to first order.
+
+Every operation adds one unit in the last place of its result to what its operands bring along, so that terms that
+cancel leave theirs behind. `_evaluate.round_off` says the same of arrays. Source: Higham, *Accuracy and Stability of
+Numerical Algorithms*, §3.3.
+"""
+
+from collections.abc import Sequence
+
+from lagjax._program._graph import Graph
+from lagjax._program._operations import OPERATIONS
+from lagjax._program._series import StraightLine
+
+
+def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int) -> list[int]:
+    """The errors of the outputs of a line in units of round-off, where its first `moving` inputs are rounded, too.
+
+    `nodes` are those of the line in the graph, to which the errors are added.
+    """
+    zero, errors = graph.constant(0.0, "float"), []
+
+    def number(x: float) -> int:
+        return graph.constant(x, "float")
+
+    for (op, operands, attribute), kind, node in zip(line.nodes, line.kinds, nodes, strict=True):
+        if kind != "float" or op == "constant" or (op == "input" and attribute >= moving):
+            errors.append(zero)
+            continue
+        error = zero if op != "input" and OPERATIONS[op].exact else graph.apply("abs", node)
+        for i, rule in zip(operands, () if op == "input" else OPERATIONS[op].transpose(), strict=False):
+            if rule is not None and errors[i] != zero:
+                part = rule(graph.apply, number, errors[i], node, *(nodes[j] for j in operands))
+                error = graph.apply("add", error, graph.apply("abs", part))
+        errors.append(error)
+    return [errors[i] for i in line.outputs]

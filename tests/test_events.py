@@ -1,0 +1,146 @@
+"""Events in machine code: where `event=` ends a motion, under every transformation, and which engine takes it."""
+
+import functools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import lagjax
+
+FALL = lagjax.System(lambda q, v, params: 0.5 * v**2 - params * q)
+FREE = lagjax.System(lambda q, v: 0.5 * v**2)
+TS = jnp.linspace(0.0, 2.0, 9)
+
+
+def floor(q, v):
+    return q
+
+
+def fall(h, g=9.81, ts=TS, event=floor, **options):
+    return lagjax.simulate(FALL, h, 0.0, ts, g, event=event, solver=lagjax.MachineCode(), **options)
+
+
+def flight(event, end=1.0, **options):
+    """Along q = t."""
+    ts = jnp.array([0.0, end])
+    return lagjax.simulate(FREE, 0.0, 1.0, ts, event=event, solver=lagjax.MachineCode(), **options)
+
+
+def test_outputs_and_the_end():
+    run = fall(2.0)
+    landing = np.sqrt(4 / 9.81)
+    assert run.ok and run.result == lagjax.RESULTS.event_occurred
+    np.testing.assert_allclose([run.end.t, run.end.qdot], [landing, -9.81 * landing], rtol=1e-14)
+    assert abs(run.end.q) < 1e-15
+    np.testing.assert_array_equal(np.isfinite(run.q), np.asarray(TS) <= landing)
+    before = np.asarray(TS)[:3]
+    np.testing.assert_allclose(run.q[:3], 2 - 9.81 * before**2 / 2, rtol=1e-14)
+    assert fall(200.0).result == lagjax.RESULTS.successful
+    back = fall(2.0, ts=-TS)
+    np.testing.assert_allclose(back.end.t, -landing, rtol=1e-14)
+
+
+def test_batches_are_one_run():
+    h = jnp.array([0.5, 1.0, 2.0, 200.0])
+    landing = np.where(h < 100, np.sqrt(2 * h / 9.81), 2.0)
+    runs = lagjax.simulate_batch(FALL, h, jnp.zeros(4), TS, 9.81, event=floor, solver=lagjax.MachineCode())
+    np.testing.assert_allclose(runs.end.t, landing, rtol=1e-14)
+    assert runs.ok.all()
+    mapped = jax.jit(jax.vmap(fall))(h)
+    np.testing.assert_array_equal(mapped.end.t, runs.end.t)
+    np.testing.assert_array_equal(mapped.q, runs.q)
+
+
+def test_how_the_end_varies():
+    def outcome(x):
+        run = fall(x[0], x[1], rtol=1e-12)
+        return jnp.stack([run.end.t, run.end.q, run.end.qdot, run.q[2], run.qdot[2]])
+
+    def closed(x):
+        t = jnp.sqrt(2 * x[0] / x[1])
+        return jnp.stack([t, 0 * t, -x[1] * t, x[0] - x[1] * TS[2] ** 2 / 2, -x[1] * TS[2]])
+
+    x = jnp.array([2.0, 9.81])
+    for mode in (jax.jacrev, jax.jacfwd):
+        np.testing.assert_allclose(mode(outcome)(x), mode(closed)(x), atol=1e-12)
+    assert np.isnan(jax.grad(lambda h: fall(h).q[-1])(2.0)), "it was not reached"
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_the_end():
+    # A pendulum to the bottom: the time is K(sin(q⁰/2)).
+    scene = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+
+    def bottom(q0):
+        return lagjax.simulate(scene, q0, 0.0, jnp.array([0.0, 5.0]), event=floor, rtol=1e-13).end.t
+
+    h, tight = 1e-3, [float(bottom(2.0 + k * 1e-3)) for k in (-2, -1, 0, 1, 2)]
+    first = (tight[0] - 8 * tight[1] + 8 * tight[3] - tight[4]) / (12 * h)
+    second = (-tight[0] + 16 * tight[1] - 30 * tight[2] + 16 * tight[3] - tight[4]) / (12 * h * h)
+    np.testing.assert_allclose(jax.grad(bottom)(2.0), first, rtol=1e-9)
+    np.testing.assert_allclose(jax.grad(jax.grad(bottom))(2.0), second, rtol=1e-5)
+    np.testing.assert_allclose(jax.hessian(bottom)(2.0), second, rtol=1e-5)
+
+
+def test_which_of_several_and_in_which_direction():
+    wave = lambda q, v: jnp.cos(jnp.pi * q)
+    late = lambda q, v, t: t - 0.9
+    for direction, end in ((None, 0.5), (False, 0.5), (True, 0.9)):
+        event = diffrax.Event({"wave": wave, "late": late}, direction={"wave": direction, "late": None})
+        np.testing.assert_allclose(flight(event).end.t, end, rtol=1e-14)
+    np.testing.assert_allclose(flight(diffrax.Event(wave, direction=True), 3.0).end.t, 1.5, rtol=1e-14)
+
+
+def test_a_pulse_that_no_sample_sees():
+    dip = lambda q, v: 0.5 - 1 / (1 + ((q - 7.3) / 1e-3) ** 2)
+    np.testing.assert_allclose(flight(dip, 20.0).end.t, 7.299, rtol=1e-13)
+
+
+def test_nan_between_two_steps_is_seen():
+    # NaN from 0.4 to 0.6 only.
+    gap = lambda q, v: 2.0 + jnp.sqrt((q - 0.4) * (q - 0.6))
+    with pytest.raises(lagjax.SimulationError, match="NaN or infinite"):
+        flight(gap)
+
+
+def test_simultaneous_events_and_a_start_on_one():
+    both = diffrax.Event([lambda q, v: q - 0.3, lambda q, v: 1 - q / 0.3])
+    np.testing.assert_allclose(flight(both).end.t, 0.3, rtol=1e-15)
+    assert flight(floor).result == lagjax.RESULTS.successful
+
+
+@pytest.mark.parametrize(
+    ("event", "reason"),
+    [
+        (lambda q, v: q < 0.0, "the event is true or false"),
+        (diffrax.Event(floor, optx.Newton(1e-8, 1e-8)), "a root finder of its own"),
+        (jax.tree_util.Partial(lambda w, q, v: q - w, jnp.ones(())), "holds arrays of its own"),
+    ],
+)
+def test_what_goes_to_diffrax(event, reason):
+    with pytest.raises(ValueError, match=reason):
+        flight(event)
+
+
+def test_an_event_that_is_no_number():
+    with pytest.raises(TypeError, match=r"one real number; got shape .2,."):
+        flight(lambda q, v: jnp.stack([q, v]))
+
+
+@pytest.mark.slow
+def test_guards_of_a_large_scene():
+    # As tables: twelve pendulums in a chain; alone and in a batch, with and without an event.
+    scene = lagjax.scenes.chain()
+    first = lambda q, v: jax.tree.leaves(q)[0].ravel()[0] - 0.1
+    run = functools.partial(lagjax.simulate, scene.system, scene.q0, scene.qdot0, jnp.linspace(0.0, 1.0, 101))
+    plain, ended = run(scene.params), run(scene.params, event=first, solver=lagjax.MachineCode())
+    angle = np.asarray(jax.tree.leaves(plain.q)[0]).reshape(101, -1)[:, 0] - 0.1
+    changes = np.flatnonzero(np.sign(angle[1:]) != np.sign(angle[:-1]))
+    if len(changes):
+        assert plain.ts[changes[0]] <= ended.end.t <= plain.ts[changes[0] + 1]
+    else:
+        assert ended.result == lagjax.RESULTS.successful
