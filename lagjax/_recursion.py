@@ -256,8 +256,8 @@ class RecursiveElimination:
 
     def solve(self, factors: Scalars, right: Scalars) -> Scalars:
         """q̈, w and μ, linear in `right`, of as many numbers."""
-        apply, z, of_steps, end = right.expansion.graph.apply, right.ids.tolist(), [], 0
-        ids = factors.ids.tolist()
+        graph, of_steps, end = right.expansion.graph, [], 0
+        apply, z, ids = graph.apply, *([graph.real(i) for i in x.ids.tolist()] for x in (right, factors))
 
         def minus(sum_, c, x):
             return apply("sub", sum_, apply("mul", c, x))
@@ -305,7 +305,8 @@ class _Elimination:
         self._energy: dict[tuple[int, int], int] = {}
         self._definitions: dict[int, Form] = {}
         first = elimination.size + elimination.velocities
-        for (row, column), node in zip(elimination.entries.tolist(), values.ids.tolist(), strict=True):
+        for (row, column), i in zip(elimination.entries.tolist(), values.ids.tolist(), strict=True):
+            node = graph.real(i)
             if row < first:
                 self._energy[row, column] = node
             elif column != row - elimination.velocities:
