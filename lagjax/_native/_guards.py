@@ -52,6 +52,13 @@ def watched(program: Recurrent, size: int, values: Recurrent, slides: bool) -> W
         return Watched(whole, _followed(whole, size, (), count), None)
 
 
+def along_pieces(found: Borders, size: int) -> tuple[Recurrent, Series]:
+    """The program along the pieces that were found, without the guards, and its series: for derivatives over steps."""
+    line = found.program.line
+    program = found.program._replace(line=line._replace(outputs=line.outputs[: size + 1]))
+    return program, series(program, size, moving=2 * size + 1, followed=found.followed)
+
+
 def require_lanes(line: StraightLine, time: int) -> None:
     """Raise `Unlowerable` where the lanes of a kernel cannot run a program."""
     for (op, _, _), kind in zip(line.nodes, line.kinds, strict=True):

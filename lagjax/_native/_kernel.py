@@ -15,7 +15,7 @@ from lagjax._native._adjoint import Adjoint
 from lagjax._native._alone import fills_lanes
 from lagjax._native._constants import DONE, LARGEST_SHARED, LEAST_ORDER, MAX_ORDER, VECTORS_PER_THREAD
 from lagjax._native._frame import LANE, Layout
-from lagjax._native._guards import Guards, require_lanes, watched
+from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled, lanes
@@ -349,7 +349,10 @@ class Kernel:
     def _along_steps(self) -> tuple:
         """What derivatives over steps that have been taken are made of: features do not matter to these."""
         if self._borders is not None and self._borders.switches:
-            return *self._parts, self._borders, self._levels, self._chosen
+            parts = self._parts
+            if self._options[0] is not None:
+                parts = *along_pieces(self._borders, self._given[1]), parts[2]
+            return *parts, self._borders, self._levels, self._chosen
         program, projection = self._smooth
         return program, recurrences(program, self._given[1]), projection, None, (), self._chosen
 
