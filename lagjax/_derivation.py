@@ -323,12 +323,14 @@ class Derivation:
         q, t = jax.ShapeDtypeStruct((self.layout.size,), self.layout.dtype), jax.ShapeDtypeStruct((), self.layout.dtype)
         return q, q, t, self.numbers
 
-    @property
+    @functools.cached_property
     def scalar_shapes(self) -> list[jax.ShapeDtypeStruct]:
         """Those of the inputs of every program: q, q̇, t and every number in params, one by one."""
         leaves = jax.tree.leaves(self.numbers)
-        numbers = [leaf.dtype for leaf in leaves for _ in range(leaf.size)]
-        return [jax.ShapeDtypeStruct((), dtype) for dtype in [self.layout.dtype] * (2 * self.layout.size + 1) + numbers]
+        numbers = [dtype for leaf in leaves for dtype in [leaf.dtype] * leaf.size]
+        dtypes = [self.layout.dtype] * (2 * self.layout.size + 1) + numbers
+        of = {dtype: jax.ShapeDtypeStruct((), dtype) for dtype in set(dtypes)}  # one for all: there may be many
+        return [of[dtype] for dtype in dtypes]
 
     # ---- linear systems ----
 

@@ -26,6 +26,7 @@ function and lowered in turn, when they are first asked for.
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -118,7 +119,7 @@ def lower_scalars(
     """
     added = graph is not None
     expansion = Expansion(graph if added else Graph(budget))
-    expansion.work(sum(shape.size for shape in shapes))
+    expansion.work(sum(math.prod(shape.shape) for shape in shapes))
     arguments = inputs_of(expansion.graph, shapes)
     with np.errstate(all="ignore"):
         results = scalars(expansion, arguments)
@@ -272,15 +273,15 @@ class Program:
         """
         return emit_rows(self.line, Rows(first, numbers))
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """How many scalars it takes."""
-        return sum(shape.size for shape in self.shapes)
+        return sum(math.prod(shape.shape) for shape in self.shapes)
 
-    @property
+    @functools.cached_property
     def dtypes(self) -> tuple[np.dtype, ...]:
         """The type of every scalar it takes."""
-        return tuple(shape.dtype for shape in self.shapes for _ in range(shape.size))
+        return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
     def evaluate(self, *numbers) -> tuple:
         """The outputs at these numbers, or arrays of numbers, operation by operation in NumPy: nothing is compiled."""

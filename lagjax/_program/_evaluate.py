@@ -48,7 +48,7 @@ def _prepared(line, columns) -> tuple[list[np.ndarray], np.dtype, int]:
     read = {i: np.asarray(columns[i]) for i in of_input}  # what nobody reads is passed on as it is
     floats = [read[i].dtype for i, kind in of_input.items() if kind == "float"]
     precision = np.result_type(*floats) if floats else np.dtype(float)
-    typed, sizes = list(columns), [np.size(x) for x in columns if np.ndim(x)]
+    typed, sizes = list(columns), [np.size(x) for x in columns if getattr(x, "ndim", 0)]
     for i, x in read.items():
         typed[i] = x.astype(_dtype(of_input[i], precision), copy=False)
     return typed, precision, max(sizes, default=1)

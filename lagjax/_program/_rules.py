@@ -132,9 +132,14 @@ def kind_of(dtype) -> str:
 
 def inputs_of(graph: Graph, shapes) -> list[np.ndarray]:
     """The inputs of a graph for arrays of these shapes, as ids; those of long arrays are no nodes yet."""
-    arguments, count, many = [], 0, len(shapes) > MOST_NUMBERS
+    arguments, count, many, kinds = [], 0, len(shapes) > MOST_NUMBERS, {}
     for shape in shapes:
-        kind = kind_of(shape.dtype)
+        if (kind := kinds.get(shape.dtype)) is None:
+            kind = kinds[shape.dtype] = kind_of(shape.dtype)
+        if many and kind == "float" and not shape.shape:
+            arguments.append(np.array(count + INPUTS))
+            count += 1
+            continue
         places = range(count, count + shape.size)
         if kind == "float" and (many or shape.size > LARGEST_UNFOLDED):
             arguments.append((np.array(places, dtype=np.int64) + INPUTS).reshape(shape.shape))
