@@ -17,9 +17,12 @@ from lagjax._linear import dependent_rows
 from lagjax._native import is_large, pieces_of
 from lagjax._problem import Problem
 from lagjax._program import Program, Unlowerable
-from lagjax._program._borders import FLOOR, SIGN, TRUNC
+from lagjax._program._borders import CLOCK, FLOOR, SIGN, TABLE, TRUNC
 
-_PIECES = {SIGN: "the sign", FLOOR: "the whole part", TRUNC: "the whole part"}
+_PIECES = {
+    SIGN: "the sign of", FLOOR: "the whole part of", TRUNC: "the whole part of", CLOCK: "samples by",
+    TABLE: "a table by",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -167,7 +170,7 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
 
     kinds = zip(borders.switches, borders.kinds, strict=True)
     return {
-        "borders": tuple(f"{_PIECES[kind]} of {read_by(node)}" for node, kind in kinds if kind in _PIECES),
+        "borders": tuple(f"{_PIECES[kind]} {read_by(node)}" for node, kind in kinds if kind in _PIECES),
         "narrow": tuple(f"a function of {read_by(node)}" for node in borders.arguments),
         "borders_located": choose(problem).refusal is None and pieces_of(derivation.acceleration, n, True) is not None,
     }

@@ -351,6 +351,24 @@ def test_what_machine_code_does_not_look_up_is_said():
 
 
 @pytest.mark.slow
+def test_health_does_not_blame_what_lies_between_outputs():
+    for hold, count in (("zero", 50), ("linear", 50), ("zero", 12)):
+        ts = jnp.asarray(KNOTS) if count == 12 else jnp.linspace(0.0, KNOTS[-1], count)
+        report = lagjax.simulate(driven(hold), 0.3, 0.1, ts, {"t": KNOTS, "u": VALUES}).health()
+        assert not report.suspicious
+        if count == 12:  # outputs at the knots: between them nothing jumps
+            assert report.energy.value < 1e-12 and report.work_error < 1e-9
+
+
+@pytest.mark.slow
+def test_explain_and_check_know_samples():
+    params = {"t": KNOTS, "u": VALUES}
+    text = str(driven("zero").explain(0.3, 0.1, params=params))
+    assert "1: samples by t; steps end there" in text and "machine code" in text
+    assert not [f for f in lagjax.check(driven("zero"), 0.3, 0.1, params=params) if f.level == "error"]
+
+
+@pytest.mark.slow
 def test_times_of_outputs_and_rates():
     def end(t):
         params = {"t": KNOTS, "u": VALUES}

@@ -17,7 +17,7 @@ from lagjax._derivation import Derivation, columns_of, derivation_of
 from lagjax._layout import Layout
 from lagjax._linear import saddle_many
 from lagjax._motion import Motion
-from lagjax._program import Program, Unlowerable, lower
+from lagjax._program import Program, Unlowerable, evaluate, lower
 from lagjax._system import System
 
 _CHUNK = 2**21  # numbers that programs return together, 16 MB
@@ -87,6 +87,24 @@ class Law(NamedTuple):
         """dh/dt at S states, shape (S,)."""
         width = sum(self.derivation.count(name) for name in _QUANTITIES)
         return _in_parts(self._powers, max(1, _CHUNK // width), len(q), q, qdot, t, numbers)
+
+    @property
+    def decides(self) -> bool:
+        """Whether the accelerations are known to be made of pieces."""
+        try:
+            borders = self.derivation.borders
+        except Unlowerable:
+            return False
+        return borders is not None and bool(borders.switches)
+
+    def pieces(self, q, qdot, t, numbers: Sequence) -> np.ndarray:
+        """A number for each of S states, shape (S,), that is another one where other pieces are decided on."""
+        if not self.decides:
+            return np.zeros(len(q))
+        borders = self.derivation.borders
+        flags = np.zeros(2 * len(borders.switches))
+        found = evaluate(borders.decide, [*columns_of(q, qdot, t, numbers), *flags])
+        return np.sqrt(np.arange(2, 2 + len(found))) @ np.where(np.isfinite(found), found, 0.5)
 
     def _samples(self, momenta, tolerances, q, qdot, t, numbers) -> Sample:
         columns, derivation = columns_of(q, qdot, t, numbers), self.derivation

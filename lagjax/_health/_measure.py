@@ -226,8 +226,12 @@ class _Members:
         def powers(law, index, member, q, qdot, t, numbers):
             return law.powers(q, qdot, t, numbers)
 
+        def pieces(law, index, member, q, qdot, t, numbers):
+            return law.pieces(q, qdot, t, numbers)
+
         with np.errstate(all="ignore"):
-            fields = _report(path, laws, momenta, partial(by_mode, sampled), partial(by_mode, powers))
+            decided = partial(by_mode, pieces) if any(law.decides for law in laws) else None
+            fields = _report(path, laws, momenta, partial(by_mode, sampled), partial(by_mode, powers), decided)
         return jax.tree.map(lambda x: jnp.asarray(np.reshape(x, self.batch + np.shape(x)[1:])), fields)
 
 
@@ -307,8 +311,18 @@ def _in_chunks(function, arrays, size: int):
 # ---- what the path shows: arrays of either library -------------------------------------------------------------------
 
 
-def _report(path: Path, laws: list[Law], momenta: tuple[int, ...], sample: Callable, power: Callable) -> dict:
-    """All measured fields; `sample(q, qdot, t, mode)` gives `Sample`s of states, `power` dh/dt at states."""
+def _report(
+    path: Path,
+    laws: list[Law],
+    momenta: tuple[int, ...],
+    sample: Callable,
+    power: Callable,
+    decided: Callable | None = None,
+) -> dict:
+    """All measured fields; `sample(q, qdot, t, mode)` gives `Sample`s of states, `power` dh/dt at states.
+
+    `decided` gives a number that changes where the pieces of a piecewise program do, if that is known.
+    """
     xp, axis, T, dtype = path.library, path.time, path.ts.shape[-1], path.q.dtype
     q, qdot, t, mode = path[:4]
     reached = xp.isfinite(q).all(axis=-1) & xp.isfinite(qdot).all(axis=-1) & (mode >= 0)
@@ -316,7 +330,7 @@ def _report(path: Path, laws: list[Law], momenta: tuple[int, ...], sample: Calla
     q, qdot = (xp.where(reached[..., None], x, x[..., :1, :]) for x in (q, qdot))
     path = path._replace(q=q, qdot=qdot, t=xp.where(reached, t, t[..., :1]))
     samples = sample(q, qdot, path.t, xp.maximum(mode, 0))
-    drifts, work_error = _drifts(path, laws, momenta, samples, reached, power)
+    drifts, work_error = _drifts(path, laws, momenta, samples, reached, power, decided)
     here = jax.tree.map(lambda leaf: leaf[(slice(None),) * axis + (slice(T),)], samples)
     on_path, extreme = reached[..., :T], partial(_extreme, xp, axis, path.ts)
     limits, size = _limits(path, here, on_path)
@@ -367,7 +381,7 @@ def _ends(xp, ts, transitions):
     return xp.where(between, T + first, xp.arange(1, T))
 
 
-def _drifts(path: Path, laws, momenta, samples: Sample, reached, power: Callable) -> tuple[Any, Any]:
+def _drifts(path: Path, laws, momenta, samples: Sample, reached, power: Callable, decided) -> tuple[Any, Any]:
     """|h − h₀ − W| and |pᵢ − pᵢ₀| at every output, a column each, and how far W may be off, (…).
 
     A piece of the path, from an output to its entry in `ends`, counts for a quantity that its mode conserves; whatever
@@ -381,7 +395,7 @@ def _drifts(path: Path, laws, momenta, samples: Sample, reached, power: Callable
     measurable = until(reached) & reached[..., : T - 1]
     work, work_error = xp.zeros_like(start[..., 0]), xp.zeros_like(start[..., 0, 0])
     if any(law.works for law in laws):
-        work, work_error = _work(path, samples, measurable, power)
+        work, work_error = _work(path, samples, measurable, power, decided)
     expected = xp.concatenate([work[..., None], xp.zeros_like(start[..., 1:])], axis=-1)
     conserves = xp.asarray(np.array([[True, *(i in (law.conserved or ()) for i in momenta)] for law in laws]))
     counted = conserves[xp.maximum(until(path.mode), 0)] & measurable[..., None]
@@ -401,14 +415,16 @@ def _at_ends(xp, axis: int, ends, x):
 # Points and weights of Gauss and Legendre on (0, 1): exact for polynomials of degree seven.
 _POINTS, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(4))
 _POINTS = _POINTS + 0.5
+INSIDE = 1e-9  # how far from its ends a piece of the path is asked what its program decides there
 
 
-def _work(path: Path, samples: Sample, measurable, power: Callable) -> tuple[Any, Any]:
+def _work(path: Path, samples: Sample, measurable, power: Callable, decided: Callable | None) -> tuple[Any, Any]:
     """∫ P dt over every piece, (…, T − 1), and how far the sum of them may be off, (…).
 
     Between its ends the motion is replaced by the polynomial of degree five that has their q, q̇ and q̈: its error of
     order six in q integrates to an error of order six in W. The cubic through q and q̇ is of order four and the
-    trapezoidal rule of order two; the differences between the three estimate the error.
+    trapezoidal rule of order two; the differences between the three estimate the error. Where the power may jump, as
+    the pieces of the program change, it is as large as the power varies.
     """
     xp, axis, T, n = path.library, path.time, path.ts.shape[-1], path.q.shape[-1]
     until = partial(_at_ends, xp, axis, path.ends)
@@ -418,8 +434,8 @@ def _work(path: Path, samples: Sample, measurable, power: Callable) -> tuple[Any
     a0, a1 = a[..., :last, :], until(a)
     mode = xp.maximum(until(path.mode), 0)
 
-    def integrated(coefficients):
-        """∫ P over a polynomial in s from 0 to 1, with coefficients (…, T − 1, n) of s⁰, s¹, …"""
+    def along(coefficients, function, points):
+        """A function of states over a polynomial in s, with coefficients (…, T − 1, n) of s⁰, s¹, …, at these s."""
 
         def summed(powers):
             return sum((c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=False)), start=zero)
@@ -430,8 +446,12 @@ def _work(path: Path, samples: Sample, measurable, power: Callable) -> tuple[Any
         times = t[..., :last, None] + h[..., None] * points
         velocities = slope / h[..., None, None]
         modes = xp.broadcast_to(mode[..., None], times.shape)
-        values = power(at.reshape(*shape, n), velocities.reshape(*shape, n), times.reshape(shape), modes.reshape(shape))
-        return h * xp.sum(values.reshape(times.shape) * weights, axis=-1)
+        states = at.reshape(*shape, n), velocities.reshape(*shape, n), times.reshape(shape), modes.reshape(shape)
+        return function(*states).reshape(times.shape)
+
+    def integrated(coefficients):
+        """∫ P from s = 0 to 1."""
+        return h * xp.sum(along(coefficients, power, points) * weights, axis=-1)
 
     q0, q1, v0, v1 = q[..., :last, :], until(q), h[..., None] * v[..., :last, :], h[..., None] * until(v)
     a0, a1 = (h**2)[..., None] * a0 / 2, (h**2)[..., None] * a1
@@ -450,6 +470,11 @@ def _work(path: Path, samples: Sample, measurable, power: Callable) -> tuple[Any
     # Once pieces are short enough, errors fall from order to order by the same factor, or a larger one. Where they do
     # not fall by four, the pieces are longer than what they should show, and a small difference is an accident.
     error = xp.where(fine <= rough / 4, fine * fine / xp.where(rough > 0, rough, 1.0), xp.maximum(fine, rough))
+    if decided is not None:
+        pieces = along(quintic, decided, np.concatenate([[INSIDE], points, [1 - INSIDE]]))
+        jumps = (pieces != pieces[..., :1]).any(axis=-1)
+        values = along(quintic, power, np.concatenate([[INSIDE], points, [1 - INSIDE]]))
+        error = xp.where(jumps, h * (values.max(axis=-1) - values.min(axis=-1)), error)
     error = xp.where(smooth, error, math.inf)
     return xp.where(smooth, sixth, second), xp.sum(xp.where(measurable, error, 0.0), axis=-1)
 
