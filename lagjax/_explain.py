@@ -172,7 +172,7 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
     return {
         "borders": tuple(f"{_PIECES[kind]} {read_by(node)}" for node, kind in kinds if kind in _PIECES),
         "narrow": tuple(f"a function of {read_by(node)}" for node in borders.arguments),
-        "borders_located": choose(problem).refusal is None and pieces_of(derivation.acceleration, n, True) is not None,
+        "borders_located": choose(problem).refusal is None and pieces_of(derivation.acceleration, (n,)) is not None,
     }
 
 

@@ -244,13 +244,6 @@ def test_second_derivatives_where_the_force_is_continuous(name):
         np.testing.assert_allclose(second(x), exact, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["a region is entered", "friction"])
-def test_second_derivatives_where_the_force_jumps_are_nan(name):
-    # The jump of the first derivative would have to be differentiated: no number is better than a wrong one.
-    f, x, _ = DERIVATIVES[name]
-    assert np.isnan(jax.jacfwd(jax.jacfwd(f))(x)) and np.isnan(jax.jacfwd(jax.grad(f))(x))
-
-
 # ---- sliding and sticking --------------------------------------------------------------------------------------------
 
 BLOCK = particle(lambda q, params: 0.5 * q * q, lambda q, v, params: -params * jnp.sign(v))

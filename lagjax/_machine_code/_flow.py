@@ -75,8 +75,8 @@ class Flow:
     singular, and the projection that keeps the motion on its constraints, or None. It is called when machine code is
     first needed. `guards` end a motion early. `groups` (n,) numbers the coordinates whose errors are measured together,
     and the first `levels[0]` coordinates are the motion, the first `levels[1]` that and its tangents, and so on.
-    `general` gives the flow of the
-    variant for any mass matrix: members that the regular variant cannot follow start again with it.
+    `motion` gives the program of the motion alone, where the flow's has tangents too; `general` the flow of the variant
+    for any mass matrix: members that the regular variant cannot follow start again with it.
     """
 
     def __init__(
@@ -88,7 +88,9 @@ class Flow:
         groups: tuple[int, ...] | None = None,
         levels: tuple[int, ...] | None = None,
         general: "Callable[[], Flow | None]" = lambda: None,
+        motion: "Callable[[], Program] | None" = None,
     ):
+        self._of_motion: Callable = (lambda: self.program) if motion is None else motion
         self._parts, self.size, self.numbers, self.guards = functools.cache(parts), size, numbers, guards
         self.groups = tuple(range(size)) if groups is None else groups
         self.levels = (size,) if levels is None else levels
@@ -146,7 +148,8 @@ class Flow:
     @functools.cached_property
     def kernel(self) -> _native.Kernel:
         """The machine code."""
-        return _native.Kernel(self.program, self.size, self.projection, self.guards, self.groups, self.levels)
+        parts = self.program, self.size, self.projection, self.guards, self.groups, self.levels
+        return _native.Kernel(*parts, motion=self._of_motion())
 
     # ---- forward ----
 
@@ -250,7 +253,8 @@ class Flow:
         def parts():
             return tangent_programs(self.program, self.projection, n, directions)
 
-        return Flow(parts, rows * n, rows * self.numbers, None, groups, (*self.levels, rows * n), general)
+        levels = (*self.levels, rows * n)
+        return Flow(parts, rows * n, rows * self.numbers, None, groups, levels, general, self._of_motion)
 
 
 def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:

@@ -21,11 +21,12 @@ from llvmlite import ir
 
 from lagjax._native._clocks import Clocks
 from lagjax._native._constants import MAX_ORDER, NEAR_ZERO
+from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._look_ups import lane_of
 from lagjax._native._output import RECORDED, recall_pieces
-from lagjax._native._saltation import GuardTable, Saltation
+from lagjax._native._saltation import GuardTable, Saltation, jump_along
 from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._program._borders import Borders
 from lagjax._program._look_ups import Table
@@ -67,9 +68,11 @@ class Adjoint:
             "before": states,
             **dict.fromkeys(("active", "excess"), 1),
         }
+        jump = jump_along(borders, levels or (n,))
         if borders is not None:
-            fields |= Saltation.fields(pieces, (n,)) | {"after": n, "has_after": 1, "crossed": 1}
-        large = is_large(program, projection, times=2)
+            fields |= FirstSaltation.fields(pieces, (n,)) if jump is None else Saltation.fields(pieces)
+            fields |= {"after": n, "pieces_after": pieces, "has_after": 1, "crossed": 1}
+        large = is_large(program, projection, times=2, more=() if jump is None else [jump.line] * 2)
         self.motion = Motion(
             "adjoint", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
         )
@@ -89,7 +92,11 @@ class Adjoint:
         if borders is not None:
             clocks = Clocks(self.motion, borders)
             at_knot = [self._back_knot(clocks, levels or (n,))] if clocks.exist else []
-            steps = [self._back_border(borders, levels or (n,)), *at_knot, *steps, self._note_after()]
+            if jump is None:
+                at_border = self._back_first_border(borders, levels or (n,))
+            else:
+                at_border = self._back_border(Saltation(self.motion, borders, levels[0] if levels else n, jump))
+            steps = [at_border, *at_knot, *steps, self._note_after()]
         self._run(steps)
         self._begin()
         self.motion.finish()
@@ -363,9 +370,28 @@ class Adjoint:
         self._store_entries(frame, self.tables_of_projection, out, len(self.varied))
         return frame.finish()
 
-    def _back_border(self, borders: Borders, levels: tuple[int, ...]) -> Code:
-        """From behind the border that a step ends at to before it, where the acceleration jumps (`_saltation`)."""
-        motion, saltation = self.motion, Saltation(self.motion, borders, levels)
+    def _back_border(self, saltation: Saltation) -> Code:
+        """From behind the border that a step ends at to before it (`_saltation`)."""
+        motion = self.motion
+        for name, count in saltation.fields_along().items():
+            motion.layout.extend(name, count)
+        frame = motion.function("back_border")
+        code, base, numbers = frame.code, saltation.base, saltation.parameters
+        frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], 0.0)
+        with code.only_if(code.any_lane(frame["crossed"] > 0.0)):
+            saltation.note_edge(frame)
+            gain = saltation.gained(frame, frame.vectors("pieces_after", motion.pieces))
+            for row in range(saltation.jump.lower):
+                for part in range(2):
+                    for i in motion.form.each(code, base):
+                        _add(frame, gain(row, i + part * base), "state_ct", i + (part * self.n + row * base))
+                for k in motion.form.each(code, numbers):
+                    _add(frame, gain(row, k + 2 * base), "params_ct", k + row * numbers)
+        return frame.finish()
+
+    def _back_first_border(self, borders: Borders, levels: tuple[int, ...]) -> Code:
+        """`_back_border` of a program that looks up tables (`_first_saltation`)."""
+        motion, saltation = self.motion, FirstSaltation(self.motion, borders, levels)
         table, frame = GuardTable(motion, borders), motion.function("back_border")
         code, base = frame.code, saltation.base
         frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], 0.0)
@@ -400,8 +426,10 @@ class Adjoint:
         return frame.finish()
 
     def _note_after(self) -> Code:
-        """The accelerations at the beginning of a step, for the one before it."""
+        """The accelerations at the beginning of a step, and its pieces, for the one before it."""
         frame = self.motion.function("note_after")
+        with frame.code.loop(self.motion.pieces) as j:
+            frame["pieces_after", j] = frame["params", j + self.motion.parameters]
         for i in self.motion.form.each(frame.code, self.n):
             frame["after", i] = frame["y", i + self.n, 1]
         frame["has_after"] = 1.0

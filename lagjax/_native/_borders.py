@@ -32,6 +32,7 @@ from lagjax._native._constants import (
     SHORT_OF,
     SWITCH_TOLERANCES,
 )
+from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._roots import Roots
@@ -39,6 +40,7 @@ from lagjax._native._saltation import NUMBERS, GuardTable, Saltation
 from lagjax._native._series import Motion, double, integer
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
+from lagjax._program._saltation import Jump, looks_up
 
 NOWHERE = 1e300  # a level that no switching number comes to
 SLIDING = 4.0  # a guard that stays zero; of others that touch the border so many rates are zero, and one less
@@ -47,10 +49,13 @@ SLIDING = 4.0  # a guard that stays zero; of others that touch the border so man
 class Borders:
     """The borders of a motion, whose pieces are its last parameters.
 
-    Where it `returns` to long steps (`_rank_drops`), it does not go back over a border, nor because of one.
+    Where it `returns` to long steps (`_rank_drops`), it does not go back over a border, nor because of one. With
+    tangents (`levels`) it has a `jump` of these.
     """
 
-    def __init__(self, motion: Motion, borders: _borders.Borders, levels: tuple[int, ...], returns: bool):
+    def __init__(
+        self, motion: Motion, borders: _borders.Borders, levels: tuple[int, ...], returns: bool, jump: Jump | None
+    ):
         self.returns = returns
         self.motion, self.borders, self.guards = motion, borders, borders.guards
         self.pieces, self.roots = motion.pieces, Roots(motion)
@@ -60,8 +65,14 @@ class Borders:
         self.table = GuardTable(motion, borders)
         self.clocks = Clocks(motion, borders)
         self.decide, self.stop = self._decide(), self._stop()
-        saltation = Saltation(motion, borders, levels) if len(levels) > 1 else None
-        self.note, self.jump = (saltation.note(self.table), saltation.apply()) if saltation else (None, None)
+        self.note, self.jump = None, None
+        if jump is not None:
+            saltation = Saltation(motion, borders, levels[0], jump)
+            self.note, self.jump = saltation.note(), saltation.apply()
+        elif len(levels) > 1:
+            first = FirstSaltation(motion, borders, levels)
+            self.note, self.jump = first.note(self.table), first.apply()
+        self.graze = None if looks_up(borders.program) else self._graze(levels[0])
         self.jump_at_knot = None
         if self.clocks.exist and len(levels) > 1:
             for name, count in self.clocks.fields().items():
@@ -97,7 +108,8 @@ class Borders:
         )
         fields = {"touching": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
         fields["level"] = len(borders.guards) if _borders.TABLE in borders.kinds else 0
-        return fields | Roots.fields(MAX_ORDER + 2) | Saltation.fields(len(borders.switches), levels)
+        of_tangents = FirstSaltation.fields(len(borders.switches), levels) | Saltation.fields(len(borders.switches))
+        return fields | Roots.fields(MAX_ORDER + 2) | of_tangents
 
     def begin(self, frame: Frame, lane: Lane) -> None:
         """A lane has taken a member."""
@@ -444,6 +456,51 @@ class Borders:
         frame["stepped"] = code.select(code.compare("!=", frame["h"], 0.0), frame.constant(1), 0.0)
         at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > float(len(self.guards)))
         frame["at_knots"] = frame["at_knots"] + code.select(at_knot, frame.constant(1), 0.0)
+        frame["grazes"] = 0.0
+        if self.graze is not None:
+            frame.call(self.graze)
+
+    def _graze(self, base: int) -> Code:
+        """`()`: whether the border is grazed that the step ends at, into `grazes`.
+
+        With the rate u̇ of its switching number a motion that is moved by the tolerance, u by ε, does not cross it, or
+        has before, where u̇² ≤ 2 |ü| ε.
+        """
+        frame, motion, n = self.motion.function("graze"), self.motion, self.motion.n
+        code, order, by = frame.code, frame.job("order"), [*range(base), *range(n, n + base)]
+        line, _ = _borders.gradient(self.borders, by)
+        frame["grazes"] = 0.0
+        with code.only_if(code.any_lane(frame["crossed"] > 0.0)):
+            self.table.note_hit(frame)
+            state = motion.moved(frame, motion.increments(frame, order, frame["h"])[0])
+            inputs = state, [frame["t"] + frame["h"]], frame.vectors("params", motion.numbers)
+            slopes = motion.form.run(frame, line, *inputs, frame.vectors("hit", self.pieces))
+            error, rtol, atol = code.variable(frame.constant(0.0)), frame.job("rtol"), frame.job("atol")
+            for part in range(2):
+                for i in motion.form.each(code, base):
+                    size = rtol * code.intrinsic("fabs", state[i + part * n]) + code.lanes_of(atol)
+                    moved = code.intrinsic("fabs", slopes[i + part * base]) * size
+                    code.store(code.load(error, frame.vector) + moved, error)
+            rate, bend = self._rates(frame, order)
+            near = rate * rate <= 2.0 * (code.intrinsic("fabs", bend) * code.load(error, frame.vector))
+            frame["grazes"] = code.select(near & (frame["is_hit"] > 0.0), frame.constant(1), 0.0)
+        return frame.finish()
+
+    def _rates(self, frame: Frame, order: Value) -> tuple[Value, Value]:
+        """u̇ and ü at the end of the step, of the switching number that is `hit`."""
+        code, h = frame.code, frame["h"]
+        degree = code.select(order < MAX_ORDER, order, MAX_ORDER - 1)
+        first = self.motion.series.rows - self.motion.series.followed
+        rate, bend = (code.variable(frame.constant(0.0)) for _ in range(2))
+        with code.loop(degree, start=0) as i:
+            k = code.lanes_of(code.as_double(degree - i))
+            c = code.variable(frame.constant(0.0))
+            with code.loop(self.pieces) as j:
+                code.store(code.load(c, frame.vector) + frame["hit", j] * frame["rows", j + first, degree - i], c)
+            term = code.load(c, frame.vector) * k
+            code.store(code.load(bend, frame.vector) * h + code.load(rate, frame.vector), bend)
+            code.store(code.load(rate, frame.vector) * h + term, rate)
+        return code.load(rate, frame.vector), code.load(bend, frame.vector)
 
     def _cross(self) -> Code:
         """`()`: after the step, the pieces beyond the borders that were reached."""

@@ -26,6 +26,7 @@ from lagjax._native._ir import INTEGER, POINTER, Code, Value
 from lagjax._native._output import Output
 from lagjax._native._projection import Projector
 from lagjax._native._roots import Roots
+from lagjax._native._saltation import jump_over
 from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._native._step import StepControl
 from lagjax._program import _borders
@@ -77,7 +78,8 @@ class Integrator:
         if borders is not None:
             fields |= Borders.fields(borders, levels or (n,))
         pieces = 0 if borders is None else len(borders.switches)
-        large = is_large(program, projection, guards)
+        jump = None if borders is None or borders.motion is None else jump_over(borders, levels)
+        large = is_large(program, projection, guards, more=() if jump is None else [jump.line])
         alone = large and width == 1 and borders is None and chosen is None
         kind = MotionAlone if alone and fills_lanes(series) else Motion
         options = dict(pieces=pieces, chosen=chosen, kept=self.guards)
@@ -86,7 +88,7 @@ class Integrator:
             motion, projection.state, projection.velocity_scale, self.base_size
         )  # fmt: skip
         self.step = StepControl(motion, tuple(range(n)) if error_groups is None else error_groups, self.projector)
-        self.borders = borders and Borders(motion, borders, levels or (n,), projection is not None)
+        self.borders = borders and Borders(motion, borders, levels or (n,), projection is not None, jump)
         self.output = Output(motion, self.projector)
         self.events = guards and self._events(program, guards)
         self.start_next = self._start_next()

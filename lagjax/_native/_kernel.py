@@ -32,6 +32,7 @@ from lagjax._program._graph import Unlowerable
 from lagjax._program._look_ups import BESIDE, shifted
 from lagjax._program._memory import without_collections
 from lagjax._program._operations import LOOK_UPS
+from lagjax._program._saltation import looks_up, with_levels
 from lagjax._program._series import Recurrent, Series, StraightLine, series
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
@@ -100,7 +101,8 @@ class Kernel:
     the motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises); or they are noted
     and the motion goes on: then there are notes in the place of states at output times. Errors are relative
     to each coordinate, or to the largest one of those with the same number in `error_groups` (n,). Of the coordinates
-    the first `levels[0]` are the motion, the first `levels[1]` that and its tangents, and so on to all of them. Vectors
+    the first `levels[0]` are the motion, the first `levels[1]` that and its tangents, and so on to all of them; then
+    `motion` is the program of the motion alone. Vectors
     have `width` lanes, by default those of the processor. Raises `Unlowerable` where an operation has no Taylor series
     or is not one of doubles.
     """
@@ -114,6 +116,7 @@ class Kernel:
         error_groups: tuple[int, ...] | None = None,
         levels: tuple[int, ...] | None = None,
         width: int | None = None,
+        motion: Recurrent | None = None,
     ):
         self.states, self.numbers = 2 * size, program.size - 2 * size - 1
         levels = (size,) if levels is None else levels
@@ -127,10 +130,11 @@ class Kernel:
         )
         self._smooth = program, projection
         self._parts = program, recurrences(program, size), projection
+        self._motion = motion
         if guards is not None:
             whole, of_whole, self._borders = watched(program, size, guards.values, len(levels) == 1)
             self._parts = whole, of_whole, projection
-        elif pieces := pieces_of(program, size, len(levels) == 1):
+        elif pieces := pieces_of(program, levels, motion):
             self._borders, of_pieces = pieces
             self._parts = self._borders.program, of_pieces, projection
         self._options = guards, error_groups, levels[0]
@@ -154,7 +158,7 @@ class Kernel:
 
     @functools.cached_property
     def _alone(self) -> "Kernel":
-        return Kernel(*self._given, width=1)
+        return Kernel(*self._given, width=1, motion=self._motion)
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
@@ -510,10 +514,24 @@ def recurrences(program: Recurrent, size: int) -> Series:
 
 
 @functools.lru_cache(maxsize=16)
-def pieces_of(program: Recurrent, size: int, slides: bool) -> "tuple[Borders, Series] | None":
-    """The borders of a piecewise program, and the series of its motion along a piece; None where there are none."""
+def pieces_of(
+    program: Recurrent, levels: tuple[int, ...], motion: Recurrent | None = None
+) -> "tuple[Borders, Series] | None":
+    """The borders of a piecewise program, and the series of its motion along a piece; None where there are none.
+
+    Of a motion with its tangents (`levels`, see `Kernel`) they are those of the `motion` alone, moved along.
+    """
+    size = levels[-1]
+    if motion is not None and len(levels) > 1 and not looks_up(motion):
+        if (of_motion := pieces_of(motion, levels[:1])) is None:
+            return None
+        found = of_motion[0]
+        for inner, outer in itertools.pairwise(levels):
+            found = with_levels(found, inner, outer // inner - 1)
+        with without_collections():
+            return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
     try:
-        if (found := borders(program, size, slides)) is not None:
+        if (found := borders(program, size, len(levels) == 1)) is not None:
             with without_collections():
                 return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
     except Unlowerable:  # a switching number without a series, or more operations than that takes

@@ -6,6 +6,7 @@ from lagjax._native._ir import Value
 from lagjax._native._projection import Projector
 from lagjax._native._series import Motion
 
+GRAZED = 0.5
 RECORDED = 4  # numbers of a step that are written down before its state: time, size, member, number of the step
 
 
@@ -95,11 +96,11 @@ class Output:
                     self._record_pieces(frame, lane, row + (RECORDED + motion.states))
 
     def _record_pieces(self, frame: Frame, lane: Lane, row: Value) -> None:
-        """The pieces of the step, and the number of the border that it ends at."""
+        """The pieces of the step, and the number of the border that it ends at; a half more where that is grazed."""
         pieces = self.motion.pieces
         with frame.code.loop(pieces) as j:
             frame.write("record", row + j, lane["params", j + self.motion.parameters])
-        frame.write("record", row + pieces, lane["crossed"])
+        frame.write("record", row + pieces, lane["crossed"] + lane["grazes"] * GRAZED)
 
     # ---- the end of a member ----
 

@@ -1,27 +1,22 @@
-"""What derivatives do at a border: the jump of a tangent, and of a cotangent, where the acceleration jumps.
+"""What derivatives do at a border: the jump of tangents, and of cotangents, to every order (`_program._saltation`).
 
-The border is crossed at another time when the motion is varied, δt = −δu / u̇ with its switching number u. Up to then
-the acceleration is a⁻, and from then on a⁺, so that
-
-    δv⁺ = δv⁻ + (a⁻ − a⁺) δt          λ⁻ = λ⁺ − ∇u (λᵥ · (a⁻ − a⁺)) / u̇
-
-while δq goes on as it is. Where a is continuous nothing happens. Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math.
-11 (1958) 225; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204, §III.
-
-A motion with tangents, of which tangents are taken again, is a motion of its own: where its own tangents jump too,
-second derivatives are NaN.
+The border is crossed at another time when the motion is varied; up to then the acceleration is a⁻, and from then on a⁺.
+First tangents of a velocity jump by (a⁻ − a⁺) δt where the acceleration jumps, tangents of tangents also where only its
+derivative does. Where the border is grazed, so that a change of the state within the tolerance decides whether it is
+crossed, none of this exists: derivatives are NaN there, but for first ones where the acceleration is continuous.
 """
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
 
 from lagjax._native._constants import JUMP_NOISE
-from lagjax._native._frame import Frame, Index, Numbers, integers
+from lagjax._native._frame import Frame, Index, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._series import Motion
-from lagjax._program._borders import Borders, gradient
-from lagjax._program._look_ups import shifted
+from lagjax._program._borders import Borders
+from lagjax._program._saltation import Jump, looks_up, over_border
 
 NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "goes_on")
 PLACES = ("piece", "back", "slide", "on", "order", "of_table")
@@ -31,6 +26,7 @@ class GuardTable:
     """The guards of all pieces (`_program._borders.Guard`) as constants of a kernel, for loops over them."""
 
     def __init__(self, motion: Motion, borders: Borders):
+        self.motion = motion
         numbers = np.array([[getattr(guard, name) for name in NUMBERS] for guard in borders.guards] or [[0.0]])
         self._numbers = integers(motion.module, np.frombuffer(numbers.tobytes(), np.int64))
         self._places = integers(
@@ -49,179 +45,183 @@ class GuardTable:
         place = g * len(PLACES) + PLACES.index(name)
         return code.load(code.element(Value(code, self._places), place, INTEGER), INTEGER)
 
-
-class Saltation:
-    """The jumps of a motion over `levels[0]` coordinates with tangents.
-
-    `levels` holds the coordinates of the motion, then with its tangents, then with tangents of these, and so on.
-    """
-
-    def __init__(self, motion: Motion, borders: Borders, levels: tuple[int, ...]):
-        self.motion, self.levels, self.pieces = motion, levels, motion.pieces
-        self.base, n = levels[0], levels[-1]
-        self.parameters = motion.parameters * self.base // n  # of the motion alone
-        self.by = [*range(self.base), *range(n, n + self.base), *(2 * n + i for i in range(1 + self.parameters))]
-        self.line, self.tables = gradient(borders, self.by)
-
-    @property
-    def slopes(self) -> int:
-        """How many numbers its gradient has, with those of tables."""
-        return len(self.by) + 2 * len(self.tables)
-
-    @staticmethod
-    def fields(pieces: int, levels: tuple[int, ...]) -> dict:
-        """What a thread remembers for it: a⁻, and which switching number is crossed."""
-        return {"rate_before": levels[-1], "hit": pieces, "is_hit": 1}
-
-    # ---- what both directions need ----
-
-    def gradient_at(self, frame: Frame, state: Numbers, time: Numbers) -> tuple[Numbers, Value]:
-        """∂u/∂(q, q̇, t, params) of the switching number that is `hit`, and its rate u̇ with the accelerations a⁻."""
-        motion, code = self.motion, frame.code
-        hit = frame.vectors("hit", self.pieces)
-        out = motion.form.run(frame, self.line, state, time, frame.vectors("params", motion.numbers), hit)
-        rate = code.variable(out[2 * self.base])
-        for i in motion.form.each(code, self.base):
-            moved = out[i] * state[i + motion.n] + out[i + self.base] * frame["rate_before", i]
-            code.store(code.load(rate, frame.vector) + moved, rate)
-        return out, code.load(rate, frame.vector)
-
-    def note_hit(self, frame: Frame, table: GuardTable) -> None:
-        """Which switching number the guard `crossed` has, into `hit`; none where a motion begins on the border."""
-        code = frame.code
+    def note_hit(self, frame: Frame) -> None:
+        """The pieces, and which switching number the guard `crossed` has; none where a motion begins on the border."""
+        motion, code, crossed = self.motion, frame.code, frame.code.intrinsic("floor", frame["crossed"])
         frame["is_hit"] = 0.0
-        with code.loop(self.pieces) as j:
+        with code.loop(motion.pieces) as j:
             frame["hit", j] = 0.0
-        with code.loop(table.guards) as g:
-            j = table.place(code, g, "piece")
-            piece = frame["params", j + self.motion.parameters]
-            side = piece * table.number(code, g, "a") + table.number(code, g, "b")
-            hit = code.compare("==", frame["crossed"], code.lanes_of(code.as_double(g + 1)))
+            frame["pieces_before", j] = frame["params", j + motion.parameters]
+        with code.loop(self.guards) as g:
+            j = self.place(code, g, "piece")
+            side = frame["pieces_before", j] * self.number(code, g, "a") + self.number(code, g, "b")
+            hit = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
             hit = hit & code.compare("!=", side, 0.0)
             frame["hit", j] = code.select(hit, frame.constant(1), frame["hit", j])
             frame["is_hit"] = code.select(hit, frame.constant(1), frame["is_hit"])
 
-    def jump(self, frame: Frame, after: Numbers) -> Callable:
-        """`(i)`: a⁻ − a⁺ of coordinate i; zero where that is rounding."""
-        code = frame.code
 
-        def of(i):
-            one, other = frame["rate_before", i], after[i]
-            larger = code.maximum(code.intrinsic("fabs", one), code.intrinsic("fabs", other))
-            difference = one - other
-            return code.select(code.intrinsic("fabs", difference) > JUMP_NOISE * larger, difference, 0.0)
+def jump_over(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
+    """What becomes of tangents at a border; None without borders, without tangents, and where tables are looked up.
 
-        return of
+    `levels` holds the coordinates of the motion, then with its tangents, then with tangents of these, and so on; the
+    last tangents may be those of a derivative over steps that have been taken.
+    """
+    if borders is None or not borders.switches or len(levels) < 2 or looks_up(borders.program):
+        return None
+    directions = tuple(outer // inner - 1 for inner, outer in itertools.pairwise(levels))
+    return over_border(borders.motion or borders, levels[0], directions)
 
-    def jumps(self, frame: Frame, jump: Callable) -> Value:
-        """Whether the acceleration of the motion itself jumps."""
-        code, sum = frame.code, frame.code.variable(frame.constant(0.0))
-        for i in self.motion.form.each(code, self.base):
-            code.store(code.load(sum, frame.vector) + code.intrinsic("fabs", jump(i)), sum)
-        return ~(code.load(sum, frame.vector) <= 0.0)
 
-    # ---- forward ----
+def jump_along(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
+    """`jump_over` for tangents of the motion at hand, whose own `levels` these are."""
+    if borders is None or (len(levels) > 1 and borders.motion is None):
+        return None
+    return jump_over(borders, (*levels, 2 * levels[-1]))
 
-    def note(self, table: GuardTable) -> Code:
-        """`()`: the accelerations before the border, into `rate_before`, and which switching number is zero there."""
+
+class Saltation:
+    """The jumps (`jump_over`) of a motion with tangents, whose first `base` coordinates are the motion alone."""
+
+    def __init__(self, motion: Motion, borders: Borders, base: int, jump: Jump):
+        self.motion, self.base, self.pieces, self.jump = motion, base, motion.pieces, jump
+        self.table = GuardTable(motion, borders)
+        self.parameters = motion.parameters * self.base // motion.n  # of the motion alone
+
+    @staticmethod
+    def fields(pieces: int) -> dict:
+        """What a thread remembers for it: the pieces before the border, and which switching number is zero there.
+
+        `is_hit` is 1 where one is, `grazes` where its rate is zero to the tolerance.
+        """
+        return {"pieces_before": pieces, "hit": pieces, "is_hit": 1, "grazes": 1}
+
+    # ---- what jumps ----
+
+    def _jumps(self, code: Code, before: Numbers, behind: Numbers) -> Callable[[Index], Value]:
+        """`(i)`: whether acceleration i jumps by more than rounding."""
+
+        def jumps(i):
+            larger = code.maximum(code.intrinsic("fabs", before[i]), code.intrinsic("fabs", behind[i]))
+            return code.intrinsic("fabs", before[i] - behind[i]) > JUMP_NOISE * larger
+
+        return jumps
+
+    def jumped(self, frame: Frame, out: Numbers, is_hit: Value, grazes: Value) -> Callable:
+        """`(row, i, part)`: what is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
+        code, n = frame.code, self.base
+        first = (len(self.jump.orders) - 1) * 2 * n
+        jumps = self._jumps(code, *(_some(out, first + k * n, n) for k in range(2)))
+
+        def added(row: int, i: Index, part: int) -> Value:
+            step = out[i + ((row - 1) * 2 + part) * n]
+            step = code.select(grazes, float("nan"), step)
+            moves = is_hit & jumps(i) if self.jump.orders[row] == 1 else is_hit
+            if self.jump.orders[row] == 1 and not part:
+                return frame.constant(0.0)
+            return code.select(moves, step, 0.0)
+
+        return added
+
+    # ---- in a run: the motion with its tangents ----
+
+    def note(self) -> Code:
+        """`()`: the pieces before the border, and which switching number is zero there."""
         frame = self.motion.function("note_before")
-        before = self.motion.evaluate_now(frame, self.motion.acceleration)
-        for i in self.motion.form.each(frame.code, self.motion.n):
-            frame["rate_before", i] = before[i]
-        self.note_hit(frame, table)
+        self.table.note_hit(frame)
         return frame.finish()
 
     def apply(self) -> Code:
         """`()`: the tangents beyond the border that is `hit`, on the pieces there."""
         frame = self.motion.function("jump_of_tangents")
-        motion, code, n = self.motion, frame.code, self.motion.n
-        state, time, _ = motion.now(frame)
-        slopes, rate = self.gradient_at(frame, state, time)
-        after = motion.evaluate_now(frame, motion.acceleration)
-        jump, is_hit = self.jump(frame, after), frame["is_hit"] > 0.0
-        jumps = self.jumps(frame, jump)
-        for level, (inner, outer) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
-            numbers = self.parameters * inner // self.base
-            for d in range(1, outer // inner):
-                change = code.variable(frame.constant(0.0))
-                for i in motion.form.each(code, self.base):
-                    part = slopes[i] * state[i + d * inner] + slopes[i + self.base] * state[i + (n + d * inner)]
-                    code.store(code.load(change, frame.vector) + part, change)
-                for k in motion.form.each(code, self.parameters):
-                    part = slopes[k + (2 * self.base + 1)] * frame["params", k + d * numbers]
-                    code.store(code.load(change, frame.vector) + part, change)
-                for k, table in enumerate(self.tables):
-                    own = shifted(table, d * motion.of_member * inner // n)
-                    first = len(self.by) + 2 * k
-                    part = slopes[first + 1] * motion.look_up.take(frame, own, slopes[first])
-                    code.store(code.load(change, frame.vector) + part, change)
-                delay = 0.0 - code.load(change, frame.vector) / rate
-                for i in motion.form.each(code, self.base):
-                    self._move(frame, n + d * inner, i, jump, is_hit, delay)
-                if level:
-                    delay = code.select(jumps, float("nan"), delay)
-                    for i in motion.form.each(code, inner - self.base):
-                        self._move(frame, n + d * inner, i + self.base, jump, is_hit, delay, jumps)
+        motion, code, n, base = self.motion, frame.code, self.motion.n, self.base
+        with code.only_if(code.any_lane(frame["is_hit"] > 0.0)):
+            lower, numbers = self.jump.lower * base, self.jump.lower * self.parameters
+            parts = [
+                _field(frame, "y", lower, 0, True), _field(frame, "y", lower, n, True), frame.vectors("t", 1),
+                _field(frame, "params", numbers), frame.vectors("pieces_before", self.pieces),
+                _field(frame, "params", self.pieces, motion.parameters), frame.vectors("hit", self.pieces),
+                _field(frame, "y", n - lower, lower, True), _field(frame, "y", n - lower, n + lower, True),
+                _field(frame, "params", motion.parameters - numbers, numbers),
+            ]  # fmt: skip
+            out = motion.form.run(frame, self.jump.line, *parts)
+            added = self.jumped(frame, out, frame["is_hit"] > 0.0, frame["grazes"] > 0.0)
+            for row in range(1, len(self.jump.orders)):
+                for part in range(2):
+                    for i in motion.form.each(code, base):
+                        place = i + (part * n + row * base)
+                        frame["y", place] = frame["y", place] + added(row, i, part)
         return frame.finish()
-
-    def _move(self, frame: Frame, first: int, i: Index, jump: Callable, is_hit: Value, delay, always=None) -> None:
-        """The velocity of coordinate i of a direction, whose velocities begin at `first`."""
-        code, of_i = frame.code, jump(i)
-        moves = code.compare("!=", of_i, 0.0)
-        moves = moves if always is None else moves | always
-        frame["y", i + first] = frame["y", i + first] + code.select(is_hit & moves, of_i * delay, 0.0)
 
     # ---- over steps that have been taken ----
 
-    def at_end(self, frame: Frame, table: GuardTable) -> tuple[Numbers, Value]:
-        """∂u/∂(q, q̇, t, params) at the end of a step, and u̇, of the switching number that is zero there.
-
-        The accelerations before the border go into `rate_before`.
-        """
-        motion = self.motion
-        self.note_hit(frame, table)
-        moved = motion.moved(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
-        before = motion.evaluate(frame, motion.acceleration, moved, frame["h"])
-        for i in motion.form.each(frame.code, motion.n):
-            frame["rate_before", i] = before[i]
-        return self.gradient_at(frame, moved, [frame["t"] + frame["h"]])
-
-    def gain(self, frame: Frame, rate: Value) -> Value:
-        """What of ∂u the cotangents gain: `after` holds a⁺, `state_ct` the cotangent behind the border."""
-        motion, code = self.motion, frame.code
-        jump, total = self.jump(frame, frame.vectors("after", motion.n)), code.variable(frame.constant(0.0))
-        for i in motion.form.each(code, motion.n):
-            part = frame["state_ct", i + motion.n] * jump(i)
-            code.store(code.load(total, frame.vector) + part, total)
-        total, jumps = code.load(total, frame.vector), self.jumps(frame, jump)
-        gain = code.select(code.compare("!=", total, 0.0), 0.0 - total / rate, 0.0)
-        if len(self.levels) > 1:
-            gain = code.select(jumps, float("nan"), gain)
-        return code.select(frame["is_hit"] > 0.0, gain, 0.0)
-
     def fields_along(self) -> dict:
-        """What a thread remembers from the end of one step to the beginning of the next, for tangents."""
-        return {"slopes": self.slopes, "rate": 1, "jump": self.motion.n, "jumps": 1}
+        """What a thread remembers from the end of one step to the beginning of the next: the state at the border."""
+        return {"edge": self.motion.states, "edge_t": 1}
 
-    def note_end(self, table: GuardTable) -> Code:
+    def note_edge(self, frame: Frame) -> None:
+        """The state at the end of a step, and what is to be known of the border there."""
+        motion, code = self.motion, frame.code
+        self.table.note_hit(frame)
+        grazes = frame["crossed"] > code.intrinsic("floor", frame["crossed"])
+        frame["grazes"] = code.select(grazes, frame.constant(1), 0.0)
+        moved = motion.moved(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
+        for i in motion.form.each(code, motion.states):
+            frame["edge", i] = moved[i]
+        frame["edge_t"] = frame["t"] + frame["h"]
+
+    def note_end(self) -> Code:
         """`()`: what is to be known of the border at the end of a step."""
         frame = self.motion.function("note_end")
-        code = frame.code
         frame["is_hit"] = 0.0
-        with code.only_if(code.any_lane(frame["crossed"] > 0.0)):
-            slopes, frame["rate"] = self.at_end(frame, table)
-            for i in self.motion.form.each(code, self.slopes):
-                frame["slopes", i] = slopes[i]
+        with frame.code.only_if(frame.code.any_lane(frame["crossed"] > 0.0)):
+            self.note_edge(frame)
         return frame.finish()
 
-    def note_begin(self) -> Code:
-        """`()`: the jump of the accelerations, where the next step begins."""
-        frame = self.motion.function("note_begin")
-        code, n = frame.code, self.motion.n
-        with code.only_if(code.any_lane(frame["is_hit"] > 0.0)):
-            after = frame.vectors("y", n, lambda i: (i + n, 1))
-            jump = self.jump(frame, after)
-            for i in self.motion.form.each(code, n):
-                frame["jump", i] = code.select(frame["is_hit"] > 0.0, jump(i), 0.0)
-            frame["jumps"] = code.select(self.jumps(frame, jump), frame.constant(1), 0.0)
-        return frame.finish()
+    def at_edge(self, numbers: Callable, behind: Vectors) -> list:
+        """The inputs of the jump but for its upper rows; `numbers(name, count)` gives vectors of the motion."""
+        return [
+            numbers("edge", self.motion.states), numbers("edge_t", 1), numbers("params", self.motion.parameters),
+            numbers("pieces_before", self.pieces), behind, numbers("hit", self.pieces),
+        ]  # fmt: skip
+
+    def gained(self, frame: Frame, behind: Vectors) -> Callable:
+        """`(row, i)`: what the cotangent of number i of a row, q, q̇ and then the parameters, gains at the `edge`.
+
+        Of `state_ct`, with the pieces `behind` the border.
+        """
+        n, rows, motion, code = self.base, self.jump.lower, self.motion, frame.code
+        inputs = self.at_edge(lambda name, count: frame.vectors(name, count), behind)
+        out = motion.form.run(frame, self.jump.accelerations(n), *inputs)
+        jumps = self._jumps(code, _some(out, 0, n), _some(out, n, n))
+        cotangents, sum = motion.form.room(frame, rows * 2 * n), code.variable(frame.constant(0.0))
+        for row in range(rows):
+            for part in range(2):
+                for i in motion.form.each(code, n):
+                    ct = frame["state_ct", i + (part * motion.n + row * n)]
+                    if row == 0:
+                        ct = code.select(jumps(i), ct, 0.0) if part else frame.constant(0.0)
+                    cotangents[i + (2 * row + part) * n] = ct
+                    code.store(code.load(sum, frame.vector) + code.intrinsic("fabs", ct), sum)
+        line = self.jump.transposed(n, self.parameters, self.pieces)
+        gains = motion.form.run(frame, line, *inputs, cotangents)
+        moves = (frame["is_hit"] > 0.0) & ~(code.load(sum, frame.vector) <= 0.0)
+        without = frame["grazes"] > 0.0
+
+        def gain(row: int, i: Index) -> Value:
+            step = gains[i + row * (2 * n + self.parameters)]
+            return code.select(moves, code.select(without, float("nan"), step), 0.0)
+
+        return gain
+
+
+def _some(numbers: Numbers, first: int, count: int) -> Numbers:
+    """So many of some numbers, from one on."""
+    if isinstance(numbers, Vectors):
+        return Vectors(count, lambda i: numbers[i + first])
+    return numbers[first : first + count]
+
+
+def _field(frame: Frame, name: str, count: int, first: int = 0, of_series: bool = False) -> Vectors:
+    """So many vectors of a field from one on; of a series, the zeroth coefficients."""
+    return frame.vectors(name, count, (lambda i: (i + first, 0)) if of_series else (lambda i: (i + first,)))

@@ -7,7 +7,7 @@
 """
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -291,14 +291,14 @@ class Motion:
         return frame.code.any_lane(frame["active"] > 0.0)
 
 
-def is_large(program: Recurrent, projection=None, guards=None, times: int = 1) -> bool:
-    """Whether a kernel that has the operations of these programs so many times is written as tables."""
+def is_large(program: Recurrent, projection=None, guards=None, times: int = 1, more: Sequence = ()) -> bool:
+    """Whether a kernel that has the operations of these programs so many times, and of `more` lines, is in tables."""
     lines = [program.line]
     if projection is not None:
         lines += [projection.state.line, projection.velocity_scale.line]
     if guards is not None:
         lines.append(guards.program.line)
-    return times * sum(len(line.nodes) for line in lines) > LARGEST_LINE
+    return times * sum(len(line.nodes) for line in lines) + sum(len(line.nodes) for line in more) > LARGEST_LINE
 
 
 def integer(code: Code, x: int) -> Value:

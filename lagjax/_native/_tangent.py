@@ -22,15 +22,17 @@ from llvmlite import ir
 
 from lagjax._native._clocks import Clocks
 from lagjax._native._constants import MAX_ORDER
+from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Lane, Layout, Vectors, integers, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
 from lagjax._native._output import RECORDED, recall_pieces
-from lagjax._native._saltation import GuardTable, Saltation
+from lagjax._native._saltation import GuardTable, Saltation, jump_along
 from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._native._tables import Tables
 from lagjax._program._borders import Borders
 from lagjax._program._pushforward import pushforward
+from lagjax._program._saltation import Jump
 from lagjax._program._series import Recurrent, Series
 
 # `y_dot` is the tangent of the start, and becomes that of the end.
@@ -64,27 +66,27 @@ class Tangent:
         lanes: int,
     ):
         n, states = series.size, 2 * series.size
-        large = is_large(program, projection, times=2)
+        jump = jump_along(borders, levels or (n,))
+        large = is_large(program, projection, times=2, more=() if jump is None else [jump.line])
         fields = {"active": 1, "next_begin": 1} | ({"moved": states} if projection is not None else {})
         pieces = 0 if borders is None else len(borders.switches)
         if borders is not None:
-            fields |= Saltation.fields(pieces, (n,)) | {"crossed": 1}
+            fields |= FirstSaltation.fields(pieces, (n,)) if jump is None else Saltation.fields(pieces)
+            fields["crossed"] = 1
         self.motion = Motion(
             "tangent", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
         )
         self.n, self.states, self.series, self.lanes, self.numbers = n, states, series, lanes, self.motion.parameters
         self.clocks: Clocks | None = None
         self.base = levels[0] if levels else n
-        self.saltation = borders and Saltation(self.motion, borders, levels or (n,))
-        if borders is not None and self.saltation is not None:
-            for name, count in self.saltation.fields_along().items():
-                self.motion.layout.extend(name, count)
+        self.saltation: Saltation | FirstSaltation | None = None
+        if borders is not None:
+            self._note_borders(borders, levels or (n,), jump)
             clocks = Clocks(self.motion, borders)
             if clocks.exist:
                 for name, count in clocks.fields().items():
                     self.motion.layout.extend(name, count)
                 self.clocks, self.note_knot = clocks, clocks.note_end()
-            self.at_border = self.saltation.note_begin(), self.saltation.note_end(GuardTable(self.motion, borders))
         self.layout = Layout(lanes, self._fields(projection is not None), beside=self.motion.layout)
         sincos = sincos_function(self.motion.module, lanes, "sincos_of_tangents")
         look_up = self.motion.look_up
@@ -104,6 +106,22 @@ class Tangent:
         if self.form is not self.motion.form:
             self.form.finish()
         self.motion.finish()
+
+    def _note_borders(self, borders: Borders, levels: tuple[int, ...], jump: Jump | None) -> None:
+        """What is done at the ends of steps, and where the next ones begin."""
+        if jump is not None:
+            self.saltation = Saltation(self.motion, borders, levels[0], jump)
+            self._remember(self.saltation.fields_along())
+            self.note_border = self.saltation.note_end()
+        else:
+            self.saltation = FirstSaltation(self.motion, borders, levels)
+            self._remember(self.saltation.fields_along())
+            self.begin_behind = self.saltation.note_begin()
+            self.note_border = self.saltation.note_end(GuardTable(self.motion, borders))
+
+    def _remember(self, fields: dict) -> None:
+        for name, count in fields.items():
+            self.motion.layout.extend(name, count)
 
     def _fields(self, projected: bool) -> dict:
         """What a thread remembers of the direction at hand, in every lane: the tangents of the motion's fields."""
@@ -189,15 +207,15 @@ class Tangent:
             with code.loop(self.motion.width) as j:
                 self._recall(frame, frame.lane(j))
             frame.call(self.motion.coefficients, frame.job("order"))
-            if self.saltation is not None:
-                frame.call(self.at_border[0])
+            if isinstance(self.saltation, FirstSaltation):
+                frame.call(self.begin_behind)
             if self.projection is not None:
                 self._move(frame)
             with code.loop((directions + (per_group - 1)) / per_group) as group:
                 for step in steps:
                     frame.call(step, group)
             if self.saltation is not None:
-                frame.call(self.at_border[1])
+                frame.call(self.note_border)
             if self.clocks is not None:
                 frame.call(self.note_knot)
             with code.loop(self.motion.width) as j:
@@ -303,7 +321,10 @@ class Tangent:
         if self.saltation is not None:
             is_hit = self.number_of(frame, "is_hit") > 0.0
             with code.only_if(code.any_lane(is_hit)):
-                self._jump(frame, is_hit)
+                if isinstance(self.saltation, FirstSaltation):
+                    self._jump_first(frame, self.saltation, is_hit)
+                else:
+                    self._jump(frame, self.saltation, is_hit)
         if self.clocks is not None:
             with code.only_if(code.any_lane(self.number_of(frame, "knot_of") > 0.0)):
                 self._jump_at_knot(frame, self.clocks)
@@ -323,10 +344,27 @@ class Tangent:
             moved = code.select(moves & code.compare("!=", jump(i), 0.0), jump(i) * change, 0.0)
             frame["dy", i + n, 0] = frame["dy", i + n, 0] + moved
 
-    def _jump(self, frame: Frame, is_hit: Value) -> None:
+    def _jump(self, frame: Frame, saltation: Saltation, is_hit: Value) -> None:
         """The tangents behind a border, at the beginning of the step from there."""
-        code, form, saltation, n = frame.code, self.form, self.saltation, self.n
-        assert saltation is not None
+        form, n, behind = self.form, self.n, self.motion.parameters
+        base, jump = saltation.base, saltation.jump
+
+        def numbers(name, count, first=0):
+            return self.numbers_of(frame, name, count, lambda i: (i + first,), in_place=True)
+
+        tangents = [frame.vectors("dy", n, lambda i: (i, 0)), frame.vectors("dy", n, lambda i: (i + n, 0))]
+        inputs = saltation.at_edge(numbers, numbers("params", self.motion.pieces, behind))
+        out = form.run(frame, jump.line, *inputs, *tangents, frame.vectors("dparams", self.numbers))
+        added = saltation.jumped(frame, out, is_hit, self.number_of(frame, "grazes") > 0.0)
+        for row in range(jump.lower):
+            for part in range(2):
+                for i in form.each(frame.code, base):
+                    place = i + (part * n + row * base)
+                    frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
+
+    def _jump_first(self, frame: Frame, saltation: FirstSaltation, is_hit: Value) -> None:
+        """The tangents behind a border of a program that looks up tables."""
+        code, form, n = frame.code, self.form, self.n
         base = saltation.base
         slopes = self.numbers_of(frame, "slopes", saltation.slopes)
         jump = self.numbers_of(frame, "jump", n)

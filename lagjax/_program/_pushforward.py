@@ -30,7 +30,7 @@ def pushforward(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Seq
     with np.errstate(all="ignore"):
         nodes = copied(graph, line, inputs)
         places = {i: len(inputs) + k for k, i in enumerate(by)}
-        moved = _along(graph, line, nodes, tangents, places, beside=True)
+        moved = along(graph, line, nodes, tangents, places, beside=True)
         zero = graph.constant(0.0, "float")
         results = [moved.get(line.outputs[i], zero) for i in of] + [nodes[line.outputs[i]] for i in known]
         done = StraightLine(*eliminate_dead_code(*sink_negations(*factor(graph, results))))
@@ -60,7 +60,7 @@ def with_tangents(
         moved = []
         for direction in directions:
             tangents = {i: place + INPUTS for i, place in direction.items() if kinds[i] == "float"}
-            moved.append(_along(graph, line, nodes, tangents, direction))
+            moved.append(along(graph, line, nodes, tangents, direction))
         zero = graph.constant(0.0, "float")
         results = []
         for output, direction in of:
@@ -69,12 +69,13 @@ def with_tangents(
         return StraightLine(*eliminate_dead_code(*sink_negations(*factor(graph, results))))
 
 
-def _along(
+def along(
     graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[int, int], places: dict[int, int], beside=False
 ) -> dict[int, int]:
     """The tangents of the nodes of a line that have some, from those of its inputs.
 
-    The tangent of input i is input `places[i]`. Tables that are not among these have theirs `beside` the inputs.
+    The line is `nodes` in the graph, of which the tangents become part. The tangent of input i is input `places[i]`.
+    Tables that are not among these have theirs `beside` the inputs.
     """
     tangents: dict[int, int] = {}
 

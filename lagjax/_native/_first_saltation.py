@@ -1,0 +1,200 @@
+"""The jumps of tangents at a border where a program looks up entries of tables: first derivatives alone.
+
+The border is crossed at another time when the motion is varied, δt = −δu / u̇ with its switching number u. Up to then
+the acceleration is a⁻, and from then on a⁺, so that
+
+    δv⁺ = δv⁻ + (a⁻ − a⁺) δt          λ⁻ = λ⁺ − ∇u (λᵥ · (a⁻ − a⁺)) / u̇
+
+while δq goes on as it is. Where a is continuous nothing happens. Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math.
+11 (1958) 225; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204, §III.
+
+A motion with tangents, of which tangents are taken again, is a motion of its own: where its own tangents jump too,
+second derivatives are NaN.
+"""
+
+from collections.abc import Callable
+
+from lagjax._native._constants import JUMP_NOISE
+from lagjax._native._frame import Frame, Index, Numbers
+from lagjax._native._ir import Code, Value
+from lagjax._native._saltation import GuardTable
+from lagjax._native._series import Motion
+from lagjax._program._borders import Borders, gradient
+from lagjax._program._look_ups import shifted
+
+
+class FirstSaltation:
+    """The jumps of a motion over `levels[0]` coordinates with tangents.
+
+    `levels` holds the coordinates of the motion, then with its tangents, then with tangents of these, and so on.
+    """
+
+    def __init__(self, motion: Motion, borders: Borders, levels: tuple[int, ...]):
+        self.motion, self.levels, self.pieces = motion, levels, motion.pieces
+        self.base, n = levels[0], levels[-1]
+        self.parameters = motion.parameters * self.base // n  # of the motion alone
+        self.by = [*range(self.base), *range(n, n + self.base), *(2 * n + i for i in range(1 + self.parameters))]
+        self.line, self.tables = gradient(borders, self.by)
+
+    @property
+    def slopes(self) -> int:
+        """How many numbers its gradient has, with those of tables."""
+        return len(self.by) + 2 * len(self.tables)
+
+    @staticmethod
+    def fields(pieces: int, levels: tuple[int, ...]) -> dict:
+        """What a thread remembers for it: a⁻, and which switching number is crossed."""
+        return {"rate_before": levels[-1], "hit": pieces, "is_hit": 1}
+
+    # ---- what both directions need ----
+
+    def gradient_at(self, frame: Frame, state: Numbers, time: Numbers) -> tuple[Numbers, Value]:
+        """∂u/∂(q, q̇, t, params) of the switching number that is `hit`, and its rate u̇ with the accelerations a⁻."""
+        motion, code = self.motion, frame.code
+        hit = frame.vectors("hit", self.pieces)
+        out = motion.form.run(frame, self.line, state, time, frame.vectors("params", motion.numbers), hit)
+        rate = code.variable(out[2 * self.base])
+        for i in motion.form.each(code, self.base):
+            moved = out[i] * state[i + motion.n] + out[i + self.base] * frame["rate_before", i]
+            code.store(code.load(rate, frame.vector) + moved, rate)
+        return out, code.load(rate, frame.vector)
+
+    def note_hit(self, frame: Frame, table: GuardTable) -> None:
+        """Which switching number the guard `crossed` has, into `hit`; none where a motion begins on the border."""
+        code = frame.code
+        frame["is_hit"] = 0.0
+        with code.loop(self.pieces) as j:
+            frame["hit", j] = 0.0
+        with code.loop(table.guards) as g:
+            j = table.place(code, g, "piece")
+            piece = frame["params", j + self.motion.parameters]
+            side = piece * table.number(code, g, "a") + table.number(code, g, "b")
+            hit = code.compare("==", frame["crossed"], code.lanes_of(code.as_double(g + 1)))
+            hit = hit & code.compare("!=", side, 0.0)
+            frame["hit", j] = code.select(hit, frame.constant(1), frame["hit", j])
+            frame["is_hit"] = code.select(hit, frame.constant(1), frame["is_hit"])
+
+    def jump(self, frame: Frame, after: Numbers) -> Callable:
+        """`(i)`: a⁻ − a⁺ of coordinate i; zero where that is rounding."""
+        code = frame.code
+
+        def of(i):
+            one, other = frame["rate_before", i], after[i]
+            larger = code.maximum(code.intrinsic("fabs", one), code.intrinsic("fabs", other))
+            difference = one - other
+            return code.select(code.intrinsic("fabs", difference) > JUMP_NOISE * larger, difference, 0.0)
+
+        return of
+
+    def jumps(self, frame: Frame, jump: Callable) -> Value:
+        """Whether the acceleration of the motion itself jumps."""
+        code, sum = frame.code, frame.code.variable(frame.constant(0.0))
+        for i in self.motion.form.each(code, self.base):
+            code.store(code.load(sum, frame.vector) + code.intrinsic("fabs", jump(i)), sum)
+        return ~(code.load(sum, frame.vector) <= 0.0)
+
+    # ---- forward ----
+
+    def note(self, table: GuardTable) -> Code:
+        """`()`: the accelerations before the border, into `rate_before`, and which switching number is zero there."""
+        frame = self.motion.function("note_before")
+        before = self.motion.evaluate_now(frame, self.motion.acceleration)
+        for i in self.motion.form.each(frame.code, self.motion.n):
+            frame["rate_before", i] = before[i]
+        self.note_hit(frame, table)
+        return frame.finish()
+
+    def apply(self) -> Code:
+        """`()`: the tangents beyond the border that is `hit`, on the pieces there."""
+        frame = self.motion.function("jump_of_tangents")
+        motion, code, n = self.motion, frame.code, self.motion.n
+        state, time, _ = motion.now(frame)
+        slopes, rate = self.gradient_at(frame, state, time)
+        after = motion.evaluate_now(frame, motion.acceleration)
+        jump, is_hit = self.jump(frame, after), frame["is_hit"] > 0.0
+        jumps = self.jumps(frame, jump)
+        for level, (inner, outer) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
+            numbers = self.parameters * inner // self.base
+            for d in range(1, outer // inner):
+                change = code.variable(frame.constant(0.0))
+                for i in motion.form.each(code, self.base):
+                    part = slopes[i] * state[i + d * inner] + slopes[i + self.base] * state[i + (n + d * inner)]
+                    code.store(code.load(change, frame.vector) + part, change)
+                for k in motion.form.each(code, self.parameters):
+                    part = slopes[k + (2 * self.base + 1)] * frame["params", k + d * numbers]
+                    code.store(code.load(change, frame.vector) + part, change)
+                for k, table in enumerate(self.tables):
+                    own = shifted(table, d * motion.of_member * inner // n)
+                    first = len(self.by) + 2 * k
+                    part = slopes[first + 1] * motion.look_up.take(frame, own, slopes[first])
+                    code.store(code.load(change, frame.vector) + part, change)
+                delay = 0.0 - code.load(change, frame.vector) / rate
+                for i in motion.form.each(code, self.base):
+                    self._move(frame, n + d * inner, i, jump, is_hit, delay)
+                if level:
+                    delay = code.select(jumps, float("nan"), delay)
+                    for i in motion.form.each(code, inner - self.base):
+                        self._move(frame, n + d * inner, i + self.base, jump, is_hit, delay, jumps)
+        return frame.finish()
+
+    def _move(self, frame: Frame, first: int, i: Index, jump: Callable, is_hit: Value, delay, always=None) -> None:
+        """The velocity of coordinate i of a direction, whose velocities begin at `first`."""
+        code, of_i = frame.code, jump(i)
+        moves = code.compare("!=", of_i, 0.0)
+        moves = moves if always is None else moves | always
+        frame["y", i + first] = frame["y", i + first] + code.select(is_hit & moves, of_i * delay, 0.0)
+
+    # ---- over steps that have been taken ----
+
+    def at_end(self, frame: Frame, table: GuardTable) -> tuple[Numbers, Value]:
+        """∂u/∂(q, q̇, t, params) at the end of a step, and u̇, of the switching number that is zero there.
+
+        The accelerations before the border go into `rate_before`.
+        """
+        motion = self.motion
+        self.note_hit(frame, table)
+        moved = motion.moved(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
+        before = motion.evaluate(frame, motion.acceleration, moved, frame["h"])
+        for i in motion.form.each(frame.code, motion.n):
+            frame["rate_before", i] = before[i]
+        return self.gradient_at(frame, moved, [frame["t"] + frame["h"]])
+
+    def gain(self, frame: Frame, rate: Value) -> Value:
+        """What of ∂u the cotangents gain: `after` holds a⁺, `state_ct` the cotangent behind the border."""
+        motion, code = self.motion, frame.code
+        jump, total = self.jump(frame, frame.vectors("after", motion.n)), code.variable(frame.constant(0.0))
+        for i in motion.form.each(code, motion.n):
+            part = frame["state_ct", i + motion.n] * jump(i)
+            code.store(code.load(total, frame.vector) + part, total)
+        total, jumps = code.load(total, frame.vector), self.jumps(frame, jump)
+        gain = code.select(code.compare("!=", total, 0.0), 0.0 - total / rate, 0.0)
+        if len(self.levels) > 1:
+            gain = code.select(jumps, float("nan"), gain)
+        return code.select(frame["is_hit"] > 0.0, gain, 0.0)
+
+    def fields_along(self) -> dict:
+        """What a thread remembers from the end of one step to the beginning of the next, for tangents."""
+        return {"slopes": self.slopes, "rate": 1, "jump": self.motion.n, "jumps": 1}
+
+    def note_end(self, table: GuardTable) -> Code:
+        """`()`: what is to be known of the border at the end of a step."""
+        frame = self.motion.function("note_end")
+        code = frame.code
+        frame["is_hit"] = 0.0
+        with code.only_if(code.any_lane(frame["crossed"] > 0.0)):
+            slopes, frame["rate"] = self.at_end(frame, table)
+            for i in self.motion.form.each(code, self.slopes):
+                frame["slopes", i] = slopes[i]
+        return frame.finish()
+
+    def note_begin(self) -> Code:
+        """`()`: the jump of the accelerations, where the next step begins."""
+        frame = self.motion.function("note_begin")
+        code, n = frame.code, self.motion.n
+        with code.only_if(code.any_lane(frame["is_hit"] > 0.0)):
+            after = frame.vectors("y", n, lambda i: (i + n, 1))
+            jump = self.jump(frame, after)
+            for i in self.motion.form.each(code, n):
+                frame["jump", i] = code.select(frame["is_hit"] > 0.0, jump(i), 0.0)
+            frame["jumps"] = code.select(self.jumps(frame, jump), frame.constant(1), 0.0)
+        return frame.finish()

@@ -1,0 +1,320 @@
+"""What a border does to derivatives of a motion, of any order, as a straight line.
+
+A motion that is varied crosses the border u = 0 a little later, by δ(y). Seen from the time at which the motion itself
+crosses it, the state jumps: along the field before the border to where u is zero, and the same time back along that
+behind it,
+
+    J(y) = Φ⁺₋δ(Φ⁻_δ(y)),    u(Φ⁻_δ(y)) = 0.
+
+J is the identity at the state of the motion, where δ = 0; its derivatives are not. A first tangent jumps by
+
+    J′ y′ = y′ + (f⁻ − f⁺) δ′,    δ′ = −∇u·y′ / u̇,
+
+and a tangent of tangents by J″ and so on, which are not zero either where f itself is continuous. All of them follow
+by the arithmetic of jets: a number is what it is, and all its mixed derivatives along the directions at hand. The flows
+Φ need no more than a Runge–Kutta step of as many stages as there are orders, since the rest is of a higher order in δ.
+Source of the first order: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & Pai, IEEE Trans.
+Circuits Syst. I 47 (2000) 204, §III.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._program._borders import Borders, Pieced
+from lagjax._program._graph import Graph, Unlowerable
+from lagjax._program._passes import eliminate_dead_code, live
+from lagjax._program._pushforward import along, with_tangents
+from lagjax._program._series import Recurrent, StraightLine
+from lagjax._program._transpose import copied, pullback
+
+# Explicit Runge–Kutta methods of order s with s stages: what of the stages before goes into each, and into the step.
+# Source: Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.1.
+_STAGES: tuple[tuple[tuple[float, ...], ...], ...] = (
+    ((), (1.0,)),
+    ((), (0.5,), (0.0, 1.0)),
+    ((), (0.5,), (-1.0, 2.0), (1 / 6, 2 / 3, 1 / 6)),
+    ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)),
+)
+_LARGEST = 1000  # operations that one may become: a bound for errors
+
+Jet = list  # of nodes of a graph, one a row: the number itself, then its derivatives; None where one is zero
+
+
+class Jump(NamedTuple):
+    """How the tangents of a motion over n coordinates jump: rows of them, as `line` takes and gives them.
+
+    `line` takes the lower rows of q, of q̇, t, the lower rows of the parameters, the m pieces before and behind the
+    border, m numbers that choose the switching number Σ hⱼ uⱼ, then the upper rows of q, of q̇ and of the parameters:
+    those that move along the last directions. It gives the jumps of q and q̇, row after row from row 1 on, then the
+    accelerations before and behind the border. `orders` says how many derivatives each row is.
+    """
+
+    line: StraightLine
+    orders: tuple[int, ...]
+    lower: int
+
+    def accelerations(self, size: int) -> StraightLine:
+        """From the same inputs to the accelerations before and behind the border alone."""
+        return StraightLine(*live(self.line.nodes, self.line.kinds, self.line.outputs[-2 * size :]))
+
+    def transposed(self, size: int, parameters: int, pieces: int) -> StraightLine:
+        """From all but the upper rows, and cotangents of their jumps, to cotangents of these rows.
+
+        The upper rows are as many as the lower ones, for along one direction they are linear. Cotangents come and go
+        row after row; those of a row are of q and q̇, and where they go to also of its parameters.
+        """
+        n, rows = size, self.lower
+        first = rows * (2 * n + parameters) + 1 + 3 * pieces
+        upper = rows * (2 * n + parameters)
+        by = [
+            place
+            for row in range(rows)
+            for place in (
+                *(first + row * n + i for i in range(n)),
+                *(first + (rows + row) * n + i for i in range(n)),
+                *(first + 2 * rows * n + row * parameters + i for i in range(parameters)),
+            )
+        ]
+        of = range((rows - 1) * 2 * n, (2 * rows - 1) * 2 * n)
+        line = pullback(self.line, [np.dtype(float)] * (first + upper), by, of)
+        nodes = []
+        for op, operands, attribute in line.nodes:
+            if op == "input" and attribute >= first + upper:
+                attribute -= upper
+            nodes.append((op, operands, attribute))
+        return line._replace(nodes=tuple(nodes))
+
+
+def looks_up(program: Recurrent) -> bool:
+    """Whether a program reads tables, of which the jumps here know nothing."""
+    return any(op in ("take", "locate") for op, *_ in program.line.nodes)
+
+
+def with_levels(borders: Borders, size: int, directions: int) -> Borders:
+    """The borders of a motion together with its tangents along so many directions; along a piece these are smooth.
+
+    The inputs q, q̇ and the parameters have 1 + D rows, those of the motion and then one for each direction, and so have
+    the accelerations.
+    """
+    program, pieces, n, rows = borders.program, len(borders.switches), size, 1 + directions
+    numbers = program.size - 2 * n - 1 - pieces
+    first_piece = rows * (2 * n + numbers) + 1
+    of_rows = [_places(n, numbers, rows, row) for row in range(rows)]
+    places = [*of_rows[0], *(first_piece + j for j in range(pieces))]
+    moving = [{i: place for i, place in enumerate(row) if i != 2 * n} for row in of_rows[1:]]
+    followed = list(borders.followed)
+    line = program.line._replace(outputs=(*program.line.outputs[: n + 1], *followed))
+    every = [None, *range(directions)]
+    of = [(i, row) for row in every for i in range(n)] + [(n + k, None) for k in range(1 + len(followed))]
+    line = with_tangents(line, program.dtypes, places, moving, of)
+    switches = line.outputs[rows * n + 1 :]
+    dtypes = (np.dtype(float),) * (first_piece + pieces)
+    decided = {i: place for i, place in enumerate(places)}
+    decided |= {program.size + j: first_piece + pieces + j for j in range(pieces)}
+    line = line._replace(outputs=line.outputs[: rows * n + 1])
+    return borders._replace(
+        program=Pieced(line, len(dtypes), dtypes, None, max(program.budget, len(line.nodes))),
+        switches=switches[:pieces], arguments=switches[pieces:], decide=_renumbered(borders.decide, decided),
+        motion=borders.motion or borders,
+    )  # fmt: skip
+
+
+def _places(n: int, numbers: int, rows: int, row: int) -> list[int]:
+    """Where q, q̇, t and the numbers of a row are among the inputs of a motion with rows."""
+    first = 2 * rows * n + 1
+    return [
+        *range(row * n, (row + 1) * n), *range((rows + row) * n, (rows + row + 1) * n), 2 * rows * n,
+        *range(first + row * numbers, first + (row + 1) * numbers),
+    ]  # fmt: skip
+
+
+def _renumbered(line: StraightLine, places: dict[int, int]) -> StraightLine:
+    """The line with other numbers of its inputs."""
+    return line._replace(nodes=tuple((op, of, places[x]) if op == "input" else (op, of, x) for op, of, x in line.nodes))
+
+
+# ---- the jump --------------------------------------------------------------------------------------------------------
+
+
+def over_border(borders: Borders, size: int, directions: tuple[int, ...]) -> Jump:
+    """The jump of the tangents of a motion, of tangents of these and so on, along so many `directions` each.
+
+    `borders` are those of the motion alone. Raises `Unlowerable` where directions are of too many kinds.
+    """
+    if len(directions) > len(_STAGES):
+        raise Unlowerable(
+            f"derivatives of order {len(directions)} over a border are not known, of {len(_STAGES)} they are"
+        )
+    with np.errstate(all="ignore"):
+        return _OverBorder(borders, size, directions).finished()
+
+
+class _OverBorder:
+    """One graph, in which numbers are jets: row (i₁, i₂, …) is the derivative along direction i₁ of the first kind, …
+
+    A direction 0 is none. Rows are numbered with i₁ as the first to change.
+    """
+
+    def __init__(self, borders: Borders, size: int, directions: tuple[int, ...]):
+        program = borders.program
+        self.n, self.pieces, self.directions = size, len(borders.switches), directions
+        self.numbers = program.size - 2 * size - 1 - self.pieces
+        self.moving = 2 * size + 1 + self.numbers  # inputs of a row
+        self.indices = [index[::-1] for index in itertools.product(*(range(1 + d) for d in directions[::-1]))]
+        self.rows = len(self.indices)
+        self.orders = tuple(sum(i > 0 for i in index) for index in self.indices)
+        self.lower = self.rows // (1 + directions[-1])
+        self.terms = self._leibniz()
+        self.stages = _STAGES[len(directions) - 1]
+        dtypes = [*program.dtypes[: self.moving], *[np.dtype(float)] * (2 * self.pieces)]
+        line = StraightLine(*live(program.line.nodes, program.line.kinds, program.line.outputs[:size]))
+        self.switch = _chosen(borders, program.size)
+        self.field, self.switches = (self._with_rows(line, dtypes) for line in (line, self.switch))
+        largest = len(self.field.nodes) + len(self.switches.nodes) + len(line.nodes)
+        self.graph = Graph(_LARGEST * largest + 10_000)
+
+    def _leibniz(self) -> list[list[tuple[int, int]]]:
+        """For every row the pairs of rows whose products it is the sum of, of a product of two numbers."""
+        place = {index: row for row, index in enumerate(self.indices)}
+        terms = []
+        for index in self.indices:
+            parts = itertools.product(*((0, i) if i else (0,) for i in index))
+            pairs = [(part, tuple(i - p for i, p in zip(index, part, strict=True))) for part in parts]
+            terms.append([(place[a], place[b]) for a, b in pairs])
+        return terms
+
+    def _with_rows(self, line: StraightLine, dtypes: Sequence) -> StraightLine:
+        """A line of inputs that move, and of 2m that do not, with all rows of its outputs; rows of inputs alike."""
+        outputs, rows, first = len(line.outputs), 1, self.rows * self.moving
+        kinds = [np.dtype(float)] * (first + 2 * self.pieces)
+        kinds[: self.moving] = dtypes[: self.moving]
+        line = _renumbered(line, {i: i if i < self.moving else i - self.moving + first for i in range(len(dtypes))})
+        for count in self.directions:
+            moving = [
+                {row * self.moving + i: (row + d * rows) * self.moving + i
+                 for row in range(rows) for i in range(self.moving)}
+                for d in range(1, 1 + count)
+            ]  # fmt: skip
+            of = [(i, d) for d in (None, *range(count)) for i in range(rows * outputs)]
+            line = with_tangents(line, kinds, range(len(kinds)), moving, of)
+            rows *= 1 + count
+        return line
+
+    # ---- jets ----
+
+    def _product(self, a: Jet, b: Jet) -> Jet:
+        """Their product, by Leibniz's rule."""
+        apply, result = self.graph.apply, []
+        for terms in self.terms:
+            total = None
+            for i, j in terms:
+                if a[i] is not None and b[j] is not None:
+                    part = apply("mul", a[i], b[j])
+                    total = part if total is None else apply("add", total, part)
+            result.append(total)
+        return result
+
+    def _sum(self, a: Jet, b: Jet, factor: float = 1.0) -> Jet:
+        """a + factor · b."""
+        graph, result = self.graph, []
+        for x, y in zip(a, b, strict=True):
+            scaled = None if y is None else graph.apply("mul", graph.constant(factor, "float"), y)
+            result.append(x if scaled is None else scaled if x is None else graph.apply("add", x, scaled))
+        return result
+
+    def _values(self, line: StraightLine, place: list[Jet], fixed: Sequence[int]) -> list[Jet]:
+        """The outputs of one of the lines with rows at a place; `fixed` are the inputs that do not move."""
+        zero = self.graph.constant(0.0, "float")
+        inputs = [zero if jet[row] is None else jet[row] for row in range(self.rows) for jet in place]
+        nodes = copied(self.graph, line, [*inputs, *fixed])
+        count = len(line.outputs) // self.rows
+        return [[nodes[line.outputs[row * count + i]] for row in range(self.rows)] for i in range(count)]
+
+    # ---- flows ----
+
+    def _rates(self, place: list[Jet], pieces: Sequence[int]) -> list[Jet]:
+        """The rates of all that moves: q̇, q̈, 1 of the time, 0 of parameters."""
+        unused = [self.graph.constant(0.0, "float")] * self.pieces
+        none: Jet = [None] * self.rows
+        one: Jet = [self.graph.constant(1.0, "float"), *none[1:]]
+        acceleration = self._values(self.field, place, [*pieces, *unused])
+        return [*place[self.n : 2 * self.n], *acceleration, one, *[none] * self.numbers]
+
+    def _flow(self, place: list[Jet], pieces: Sequence[int], delay: Jet) -> list[Jet]:
+        """Where a state is after the `delay`, on these pieces."""
+        rates: list[list[Jet]] = []
+        for weights in self.stages:
+            here = place
+            for weight, rate in zip(weights, rates, strict=True):
+                if weight:
+                    here = [self._sum(x, self._product(delay, r), weight) for x, r in zip(here, rate, strict=True)]
+            if len(weights) == len(self.stages) - 1:
+                return here
+            rates.append(self._rates(here, pieces))
+        raise AssertionError
+
+    def _delay(self, place: list[Jet], before: Sequence[int], hit: Sequence[int], rate: int) -> Jet:
+        """δ, order by order: what is left of u is due to the highest one."""
+        delay: Jet = [None] * self.rows
+        for order in range(1, 1 + max(self.orders)):
+            there = place if order == 1 else self._flow(place, before, delay)
+            (left,) = self._values(self.switches, there, [*before, *hit])
+            for row in range(self.rows):
+                if self.orders[row] == order:
+                    delay[row] = self.graph.apply("neg", self.graph.apply("div", left[row], rate))
+        return delay
+
+    def finished(self) -> Jump:
+        graph, n, zero = self.graph, self.n, self.graph.constant(0.0, "float")
+        place, before, behind, hit = self._inputs()
+        base = [jet[0] for jet in place]
+        first = self._rates(place, before)
+        a_before = [first[n + i][0] for i in range(n)]
+        a_behind = [jet[0] for jet in self._rates(place, behind)[n : 2 * n]]
+        nodes = copied(graph, self.switch, [*base, *before, *hit])
+        rates = [*base[n : 2 * n], *a_before, graph.constant(1.0, "float")]
+        rate = along(graph, self.switch, nodes, dict(enumerate(rates)), {}).get(self.switch.outputs[0], zero)
+        delay = self._delay(place, before, hit, rate)
+        there = self._flow(place, before, delay)
+        back = self._flow(there, behind, [None if x is None else graph.apply("neg", x) for x in delay])
+        results = []
+        for row in range(1, self.rows):
+            for x, y in zip(place[: 2 * n], back[: 2 * n], strict=True):
+                results.append(zero if y[row] is None else graph.apply("sub", y[row], x[row]))
+        line = StraightLine(*eliminate_dead_code(graph, [*results, *a_before, *a_behind]))
+        return Jump(line, self.orders, self.lower)
+
+    def _inputs(self) -> tuple[list[Jet], list[int], list[int], list[int]]:
+        """The inputs of the result, in the order of `Jump`: the jets of all that moves, and pieces."""
+        n, numbers, lower, m = self.n, self.numbers, self.lower, self.pieces
+        upper, count = self.rows - lower, itertools.count()
+
+        def some(size):
+            return [self.graph.input(next(count), "float") for _ in range(size)]
+
+        q, v, (t,), p = some(lower * n), some(lower * n), some(1), some(lower * numbers)
+        before, behind, hit = some(m), some(m), some(m)
+        q, v, p = q + some(upper * n), v + some(upper * n), p + some(upper * numbers)
+        time: Jet = [t, *[None] * (self.rows - 1)]
+        jets: list[Jet] = [[q[row * n + i] for row in range(self.rows)] for i in range(n)]
+        jets += [[v[row * n + i] for row in range(self.rows)] for i in range(n)]
+        jets += [time]
+        jets += [[p[row * numbers + i] for row in range(self.rows)] for i in range(numbers)]
+        return jets, before, behind, hit
+
+
+def _chosen(borders: Borders, size: int) -> StraightLine:
+    """Σ hⱼ uⱼ, with the numbers hⱼ behind the inputs of the program."""
+    program = borders.program
+    line = StraightLine(*live(program.line.nodes, program.line.kinds, borders.switches))
+    graph = Graph(10 * len(line.nodes) + 1000)
+    kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
+    nodes = copied(graph, line, [graph.input(i, kinds.get(i, "float")) for i in range(size)])
+    total = graph.constant(0.0, "float")
+    for j, node in enumerate(line.outputs):
+        weight = graph.input(size + j, "float")
+        total = graph.apply("add", total, graph.apply("mul", weight, nodes[node]))
+    return StraightLine(*eliminate_dead_code(graph, [total]))
