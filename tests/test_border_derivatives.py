@@ -85,3 +85,18 @@ def test_hessians_of_many_members_at_once():
     np.testing.assert_allclose(
         jax.jit(jax.vmap(jax.hessian(value)))(members), jax.vmap(jax.hessian(exact))(members), atol=2e-7
     )
+
+
+@pytest.mark.slow
+def test_output_times_of_a_motion_that_slides():
+    # A relay: from q + v = 0 on v falls like −e⁻ᵗ, which the program alone, ±1 beside the border, does not say.
+    relay = lagjax.System(lambda q, v: 0.5 * v * v, forces=lambda q, v: -jnp.sign(q + v))
+
+    def speed(t):
+        return lagjax.simulate(relay, 1.0, 0.0, jnp.array([0.0, t]), rtol=1e-11).qdot[-1]
+
+    v = float(speed(2.0))
+    np.testing.assert_allclose(v, -(np.sqrt(3) - 1) * np.exp(-(2.0 - np.sqrt(3) + 1)), rtol=1e-9)
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(derivative(speed)(2.0), -v, rtol=1e-9)
+    np.testing.assert_allclose(jax.grad(jax.grad(speed))(2.0), v, rtol=1e-9)

@@ -151,6 +151,11 @@ class Flow:
         parts = self.program, self.size, self.projection, self.guards, self.groups, self.levels
         return _native.Kernel(*parts, motion=self._of_motion())
 
+    @property
+    def borders(self):
+        """The borders of its program, where steps end; None without."""
+        return self.kernel.borders
+
     # ---- forward ----
 
     def run(

@@ -35,6 +35,7 @@ from jax.interpreters import ad, batching, mlir
 from lagjax._machine_code import _derivatives
 from lagjax._machine_code._call import has_handler, has_sweep, on_host, run_by_handler, sweep_by_handler
 from lagjax._machine_code._flow import Flow, Tolerances
+from lagjax._machine_code._rates import rate
 from lagjax._machine_code._steps import KEPT
 from lagjax._machine_code._tangent import from_rows, to_rows
 from lagjax._native import Begun
@@ -197,21 +198,6 @@ def _value(tangent):
     return ad.instantiate_zeros(tangent)
 
 
-def _slope(flow: Flow, t, y, params):
-    """(q̇, q̈) at a state, shape (…, 2n); zero where it is not finite: there the motion has ended."""
-    n = flow.size
-    if flow.anywhere.looks_up:
-        shape = jnp.broadcast_shapes(y.shape[:-1], t.shape)
-        y, time = jnp.broadcast_to(y, (*shape, 2 * n)), jnp.broadcast_to(t, shape)[..., None]
-        acceleration = flow.anywhere.of_rows(jnp.concatenate([y, time], axis=-1), params)[:n]
-        rate = jnp.stack(jnp.broadcast_arrays(*(y[..., n + i] for i in range(n)), *acceleration), axis=-1)
-        return jnp.where(jnp.isfinite(rate), rate, 0.0)
-    scalars = (*(y[..., i] for i in range(2 * n)), t, *(params[..., i] for i in range(flow.numbers)))
-    acceleration = flow.anywhere(*jnp.broadcast_arrays(*scalars))[:n]
-    rate = jnp.stack(jnp.broadcast_arrays(*(y[..., n + i] for i in range(n)), *acceleration), axis=-1)
-    return jnp.where(jnp.isfinite(rate), rate, 0.0)
-
-
 def _derivative_of_run(primals, tangents, *, flow, tolerances, keep):
     (ts, y0, params), (dts, dy0, dparams) = primals, tangents
     if flow.guards is not None or all(map(_zero, tangents)):
@@ -221,14 +207,14 @@ def _derivative_of_run(primals, tangents, *, flow, tolerances, keep):
     solution = Solution(*outs)
     dy0, dparams = _value(dy0), _value(dparams)
     if not _zero(dts):
-        dy0 = dy0 - _slope(flow, ts[..., 0], y0, params) * dts[..., :1]
+        dy0 = dy0 - rate(flow, ts[..., 0], y0, params) * dts[..., :1]
     direction = [x[..., None, :] for x in (dy0, dparams)]
     d_path, d_end = jvp_p.bind(*primals, *_residuals(solution), *direction, flow=flow, tolerances=tolerances)
     d_path, d_end, d_t_end = d_path[..., 0, :, :], d_end[..., 0, :], jnp.zeros_like(solution.t_end)
     if not _zero(dts):
         reached, done = jnp.isfinite(solution.path), solution.result == SUCCESSFUL
         places = jnp.where(reached, solution.path, y0[..., None, :])
-        rates = _slope(flow, ts, places, params[..., None, :]) * dts[..., None]
+        rates = rate(flow, ts, places, params[..., None, :]) * dts[..., None]
         d_path = d_path + jnp.where(reached, rates, 0.0)
         d_end = d_end + jnp.where(done[..., None], rates[..., -1, :], 0.0)
         d_t_end = jnp.where(done, dts[..., -1], 0.0)
@@ -282,7 +268,7 @@ def _vjp_moved(primals, tangents, outs, settings):
     dy0, dparams = _value(dy0), _value(dparams)
     if not _zero(dts):
         total = _vjp_moved_in_time(primals, dts, outs, settings)
-        dy0 = dy0 - _slope(settings["flow"], ts[..., 0], y0, params) * dts[..., :1]
+        dy0 = dy0 - rate(settings["flow"], ts[..., 0], y0, params) * dts[..., :1]
     given = [x[..., None, :] for x in (ts, y0, params)]
     direction = [x[..., None, :] for x in (dy0, dparams)]
     more = curvature_p.bind(*given, *cts, *direction, **settings)
@@ -302,10 +288,10 @@ def _vjp_moved_in_time(primals, dts, outs, settings):
     weights = weights.at[..., -1, :].add(jnp.where(done[..., None, None], end_ct, 0.0))
 
     def rates(places, numbers):
-        return _slope(flow, ts[..., None, :], places, numbers[..., None, :]) * dts[..., None, :, None]
+        return rate(flow, ts[..., None, :], places, numbers[..., None, :]) * dts[..., None, :, None]
 
     def first_rate(y, numbers):
-        return -_slope(flow, ts[..., None, 0], y, numbers) * dts[..., None, :1]
+        return -rate(flow, ts[..., None, 0], y, numbers) * dts[..., None, :1]
 
     def transposed(function, place, cotangent, numbers_shape):
         place = jnp.broadcast_to(place, cotangent.shape)

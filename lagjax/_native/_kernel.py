@@ -120,7 +120,7 @@ class Kernel:
     ):
         self.states, self.numbers = 2 * size, program.size - 2 * size - 1
         levels = (size,) if levels is None else levels
-        self._given, self._borders, self._levels = (
+        self._given, self.borders, self._levels = (
             (program, size, projection, guards, error_groups, levels),
             None,
             levels,
@@ -132,11 +132,11 @@ class Kernel:
         self._parts = program, recurrences(program, size), projection
         self._motion = motion
         if guards is not None:
-            whole, of_whole, self._borders = watched(program, size, guards.values, len(levels) == 1)
+            whole, of_whole, self.borders = watched(program, size, guards.values, len(levels) == 1)
             self._parts = whole, of_whole, projection
         elif pieces := pieces_of(program, levels, motion):
-            self._borders, of_pieces = pieces
-            self._parts = self._borders.program, of_pieces, projection
+            self.borders, of_pieces = pieces
+            self._parts = self.borders.program, of_pieces, projection
         self._options = guards, error_groups, levels[0]
         self.width = lanes() if width is None else width
         self._tangents = functools.cache(self._tangents_of)
@@ -164,7 +164,7 @@ class Kernel:
     def _forward(self) -> "_Compiled":
         with without_collections():
             integrator = Integrator(
-                *self._parts, *self._options, self._borders, self._levels, self._chosen, width=self.width
+                *self._parts, *self._options, self.borders, self._levels, self._chosen, width=self.width
             )
             motion = integrator.motion
         forget_joined()
@@ -329,7 +329,7 @@ class Kernel:
 
         Or where more is written down of a step than its state: that of a piecewise program.
         """
-        if self._borders is not None and self._borders.switches:
+        if self.borders is not None and self.borders.switches:
             return 0
         rounds = self._rounds // _SLICES_OF_SWEEP
         return rounds if rounds >= _LEAST_ROUNDS else 0
@@ -352,11 +352,11 @@ class Kernel:
     @property
     def _along_steps(self) -> tuple:
         """What derivatives over steps that have been taken are made of: features do not matter to these."""
-        if self._borders is not None and self._borders.switches:
+        if self.borders is not None and self.borders.switches:
             parts = self._parts
             if self._options[0] is not None:
-                parts = *along_pieces(self._borders, self._given[1]), parts[2]
-            return *parts, self._borders, self._levels, self._chosen
+                parts = *along_pieces(self.borders, self._given[1]), parts[2]
+            return *parts, self.borders, self._levels, self._chosen
         program, projection = self._smooth
         return program, recurrences(program, self._given[1]), projection, None, (), self._chosen
 

@@ -1,0 +1,76 @@
+"""The rate of a state, with which an output moves when its time does: of a motion that slides, too.
+
+A program that decides anew at the state does not see that the motion slides along a border (`_program._borders`): on
+which side of it a state lies there is rounding. The motion slides where both sides push onto the border, and the state
+comes to it within an instant.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from lagjax._machine_code._flow import Flow
+from lagjax._program import emit
+
+INSTANT = 1e-9  # of the time; what a border is off by while a motion slides along it is rounding
+
+
+def rate(flow: Flow, t, y, params):
+    """(q̇, q̈) at states y (…, 2n), t (…), params (…, P); zero where it is not finite: there the motion has ended."""
+    n = flow.size
+    if flow.anywhere.looks_up:
+        return _from_rows(flow, t, y, params)
+    scalars = (*(y[..., i] for i in range(2 * n)), t, *(params[..., i] for i in range(flow.numbers)))
+    scalars = jnp.broadcast_arrays(*scalars)
+    borders = flow.borders
+    if borders is None or not any(guard.slide >= 0 for guard in borders.guards):
+        acceleration = flow.anywhere(*scalars)[:n]
+    else:
+        acceleration = _on_pieces(borders, scalars, _pieces(borders, scalars, n))[0][:n]
+    return _stacked(flow, y, acceleration)
+
+
+def _stacked(flow: Flow, y, acceleration):
+    velocity = (y[..., flow.size + i] for i in range(flow.size))
+    slope = jnp.stack(jnp.broadcast_arrays(*velocity, *acceleration), axis=-1)
+    return jnp.where(jnp.isfinite(slope), slope, 0.0)
+
+
+def _from_rows(flow: Flow, t, y, params):
+    """Of a program that looks up tables, whose parameters are too many to be taken apart."""
+    shape = jnp.broadcast_shapes(y.shape[:-1], t.shape)
+    y, time = jnp.broadcast_to(y, (*shape, 2 * flow.size)), jnp.broadcast_to(t, shape)[..., None]
+    acceleration = flow.anywhere.of_rows(jnp.concatenate([y, time], axis=-1), params)[: flow.size]
+    return _stacked(flow, y, acceleration)
+
+
+def _on_pieces(borders, scalars, pieces) -> tuple[tuple, tuple]:
+    """The outputs of the program on these pieces, and the switching numbers."""
+    line = borders.program.line
+    outputs = (*line.outputs, *borders.switches)
+    values = emit(line.nodes, line.kinds, outputs, (*scalars, *pieces))
+    return values[: len(line.outputs)], values[len(line.outputs) :]
+
+
+def _pieces(borders, scalars, n: int) -> list[Any]:
+    """The pieces at a state; 1 for those that say that the motion slides."""
+    count, zero, decide = len(borders.switches), jnp.zeros_like(scalars[0]), borders.decide
+    pieces = list(emit(*decide, (*scalars, *[zero] * (2 * count))))
+    sliding = {guard.piece: guard.slide for guard in borders.guards if guard.slide >= 0}
+
+    def rates(side: float):
+        """Of the switching numbers, where all pieces that may slide are on one side of their border."""
+        there = [jnp.full_like(zero, side) if j in sliding else piece for j, piece in enumerate(pieces)]
+        out, _ = _on_pieces(borders, scalars, there)
+        moving = [*scalars[n : 2 * n], *out[:n], jnp.ones_like(zero)]
+        moving += [jnp.zeros_like(zero)] * (len(scalars) - 2 * n - 1)
+        return jax.jvp(lambda *at: _on_pieces(borders, at, there)[1], tuple(scalars), tuple(moving))
+
+    (switches, below), (_, above) = rates(-1.0), rates(1.0)
+    for j, slide in sliding.items():
+        fast = jnp.maximum(jnp.abs(below[j]), jnp.abs(above[j]))
+        near = jnp.abs(switches[j]) <= INSTANT * jnp.abs(scalars[2 * n]) * fast
+        pieces[slide] = jnp.where(near & (below[j] > 0.0) & (above[j] < 0.0), 1.0, zero)
+    return [lax.stop_gradient(piece) for piece in pieces]
