@@ -203,6 +203,7 @@ def _trajectory(problem: Problem, engine: AbstractEngine, solution: Solution, pa
         transitions=None,
         mode_names=(),
         tolerances=None if fixed_steps else problem.tolerances,
+        engine=type(engine).__name__,
     )
 
 

@@ -56,6 +56,7 @@ class Trajectory(eqx.Module):
       step before it failed.
     - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
     - `tolerances`: rtol and atol of a step; None where it had a fixed size.
+    - `engine`: what integrated it, "MachineCode" or "Diffrax"; "" for a hybrid motion.
     - `mode`, `transitions`: of a hybrid motion (`simulate_hybrid`), else None. `system` is then the dict of its modes,
       and quantities are those of the mode at every time, NaN where it is −1. A mode is a place in `mode_names`: the
       dict itself loses its order in `jax.jit`.
@@ -74,6 +75,7 @@ class Trajectory(eqx.Module):
     transitions: "Transitions | None" = None
     mode_names: tuple[str, ...] = eqx.field(static=True, default=())
     tolerances: tuple[Number, Number] | None = None
+    engine: str = eqx.field(static=True, default="")
 
     @classmethod
     def of(cls, **fields) -> "Trajectory":

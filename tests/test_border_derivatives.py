@@ -3,6 +3,7 @@
 One scene has a particle of unit mass for each kind of border, so that all of them share their machine code.
 """
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -85,6 +86,66 @@ def test_hessians_of_many_members_at_once():
     np.testing.assert_allclose(
         jax.jit(jax.vmap(jax.hessian(value)))(members), jax.vmap(jax.hessian(exact))(members), atol=2e-7
     )
+
+
+# ---- grazing, and what health says of borders ------------------------------------------------------------------------
+
+# Thrown up with g = 1, it comes to v²/2; beyond 1 a force pulls it back, or a spring does.
+THROWN = lagjax.System(
+    lambda q, v: 0.5 * v * v - q,
+    forces=lambda q, v, params: -params[0] * jnp.where(q > 1.0, 1.0, 0.0) - params[1] * jnp.maximum(q - 1.0, 0.0),
+)
+PULLED, SPRUNG = jnp.array([0.7, 0.0]), jnp.array([0.0, 0.7])
+
+
+def falls_to(v, params, **options):
+    return lagjax.simulate(THROWN, 0.0, v, jnp.array([0.0, 2.5]), params, **options).q[-1]
+
+
+def test_where_a_border_is_grazed_there_is_no_derivative():
+    grazing = jnp.sqrt(2.0)
+    slopes = jax.vmap(jax.grad(falls_to), (0, None))
+    v = grazing + jnp.array([0.0, 1e-2, -1e-2])
+    jumps, bends = slopes(v, PULLED), slopes(v, SPRUNG)
+    assert np.isnan(jumps[0]) and np.isnan(jax.jvp(lambda v: falls_to(v, PULLED), (grazing,), (1.0,))[1])
+    h = 1e-5
+    difference = (falls_to(v[1] + h, PULLED, rtol=1e-12) - falls_to(v[1] - h, PULLED, rtol=1e-12)) / (2 * h)
+    np.testing.assert_allclose(jumps[1:], [difference, 2.5], rtol=1e-4)
+    np.testing.assert_allclose(bends[0], 2.5, atol=1e-3)  # the force is continuous
+
+
+@pytest.mark.slow
+def test_where_a_border_is_grazed_there_is_no_second_derivative():
+    grazing = jnp.sqrt(2.0)
+    for params in (PULLED, SPRUNG):
+        for second in (jax.jacfwd(jax.jacfwd(falls_to)), jax.jacfwd(jax.grad(falls_to)), jax.hessian(falls_to)):
+            assert np.isnan(second(grazing, params)) and second(grazing - 1e-3, params) == 0.0
+
+
+def test_health_counts_borders():
+    v = jnp.sqrt(2.0) + jnp.array([-0.1, 0.0, 0.1])
+    run = lagjax.simulate_batch(THROWN, jnp.zeros(3), v, jnp.linspace(0.0, 2.5, 5), PULLED)
+    health = run.health()
+    assert health.borders.crossed.tolist()[::2] == [0, 2] and health.borders.grazed.tolist()[::2] == [0, 0]
+    assert health.borders.grazed[1] > 0 and health.suspicious.tolist() == [False, True, False]
+    np.testing.assert_allclose(health.borders.t[1], np.sqrt(2.0), atol=1e-4)
+    assert "grazed in 1 of 3 members" in str(health)
+
+
+@pytest.mark.slow
+def test_health_says_where_borders_are_not_located():
+    run = lagjax.simulate(
+        THROWN, 0.0, 1.5, jnp.linspace(0.0, 2.5, 5), PULLED, solver=diffrax.Tsit5(), rtol=1e-4, throw=False
+    )
+    health = run.health()
+    assert not health.borders_located and health.borders is None and "does not locate them" in str(health)
+
+
+def test_health_counts_where_a_motion_comes_to_rest():
+    block = lagjax.System(lambda q, v: 0.5 * (v * v - q * q), forces=lambda q, v: -0.3 * jnp.sign(v))
+    health = lagjax.simulate(block, 2.0, 0.0, jnp.linspace(0.0, 20.0, 5)).health()
+    assert (health.borders.crossed, health.borders.slid, health.borders.grazed) == (2, 1, 0)
+    assert "2 crossed; 1 slid along" in str(health) and not health.suspicious
 
 
 @pytest.mark.slow

@@ -33,9 +33,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from lagjax._health._borders import Met, is_piecewise, met
 from lagjax._health._compare import global_error
-from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measured
+from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, Members, measured
+from lagjax._layout import Layout
 from lagjax._results import RESULTS, advice
+from lagjax._system import System
 from lagjax._validate import is_concrete
 
 __all__ = ["Extreme", "Health", "examine"]
@@ -47,6 +50,7 @@ UNSTEADY = 0.5
 def examine(trajectory, reference=None) -> "Health":
     """The `Health` of a trajectory, with its global error if there is a reference; see `Trajectory.health`."""
     fields, names = measured(trajectory)
+    located, counts = _borders(trajectory)
     return Health(
         result=trajectory.result,
         ok=jnp.asarray(trajectory.ok),
@@ -54,12 +58,34 @@ def examine(trajectory, reference=None) -> "Health":
         accepted_steps=jnp.asarray(trajectory.stats["num_accepted_steps"]),
         rejected_steps=jnp.asarray(trajectory.stats["num_rejected_steps"]),
         global_error=None if reference is None else global_error(trajectory, reference),
+        borders=counts,
+        borders_located=located,
         outputs=trajectory.ts.shape[-1],
         works=names.works,
         momentum_names=names.momenta,
         constraint_names=names.constraints,
         **fields,
     )
+
+
+def _borders(trajectory) -> tuple[bool, Met | None]:
+    """`met`, with the batch axes of the trajectory; of a piecewise scene not known where something is traced."""
+    if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
+        members = Members(trajectory)
+        located, counts = met(trajectory, members)
+        return located, counts and Met(*(jnp.asarray(np.reshape(x, members.batch)) for x in counts))
+    system, piecewise = trajectory.system, []
+    if not isinstance(system, System):
+        return True, None
+
+    def none(q, qdot, times_and_tolerances, params, mode):
+        layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
+        piecewise.append(is_piecewise(system, layout, params))
+        return jnp.zeros((), int)
+
+    zero = trajectory.over_members(none)
+    located = trajectory.engine == "MachineCode" or not piecewise[0]
+    return located, None if piecewise[0] else Met(zero, zero, zero, jnp.full(zero.shape, jnp.nan))
 
 
 class Health(eqx.Module):
@@ -72,6 +98,7 @@ class Health(eqx.Module):
     - `energy`: the largest |h − h₀ − W|, in units of energy, W the work done by forces, by an explicit time and by
       moving constraints. `energy_allowed`: what the tolerances and round-off may add up to. `work_error`: how well W is
       known from the outputs alone, zero where nothing does work; an imbalance below it means nothing.
+      Where a force of a piecewise scene does work, that of a motion that has met borders is not judged.
       `outputs_needed`: about how many outputs would tell whether the power is balanced; the number of outputs where
       these do. Where a transition lies between two outputs, what it takes is left out, and
       so is the time from it to the next output.
@@ -89,6 +116,11 @@ class Health(eqx.Module):
       M does not.
     - `gradients_finite`: whether all that the acceleration is solved from has finite derivatives by the state, the time
       and every parameter, at every output; `gradients_time`: the first where not.
+    - `borders`: how often the motion `crossed` a border of a piecewise force or L, began to slide along one (`slid`, as
+      dry friction does that sticks), and `grazed` one, first at the time `t` (NaN: never). There a change within the
+      tolerance decides whether the border is crossed: derivatives that do not exist are NaN. None where that is not
+      known: in a hybrid motion, under `jax.jit`, and where `borders_located` is False, for a solver of diffrax took its
+      steps across the borders.
     - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
       largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
     """
@@ -116,6 +148,8 @@ class Health(eqx.Module):
     gradients_finite: Bool[Array, "*batch"]
     gradients_time: Float[Array, "*batch"]
     global_error: Extreme | None
+    borders: Met | None
+    borders_located: bool = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
     works: bool = eqx.field(static=True)
     momentum_names: tuple[str, ...] | None = eqx.field(static=True)
@@ -150,6 +184,12 @@ class Health(eqx.Module):
                 "gradients": ~of.gradients_finite,
                 "steps": of.rejected_steps > xp.maximum(UNSTEADY * tries, 20),
             }
+            if of.borders is not None:
+                flags["grazed"] = of.borders.grazed > 0
+                if of.works:  # what a force that jumps between two outputs does there is not known
+                    flags["energy"] &= (of.borders.crossed == 0) & (of.borders.slid == 0)
+            elif not of.borders_located:
+                flags["borders"] = of.accepted_steps >= 0
             if of.global_error is not None:
                 flags["global_error"] = _exceeds(xp, of.global_error, VISIBLE)
         return flags, xp
@@ -158,7 +198,8 @@ class Health(eqx.Module):
         """What is suspicious or cannot be told, as sentences that say what to do; none where all is well."""
         flags = self._flags()[0]
         raised = {name: np.asarray(flags[name]) for name in _SENTENCES if name in flags and np.any(flags[name])}
-        sentences = {name: _SENTENCES[name].format(_who(members)) for name, members in raised.items()}
+        sides = "" if self.borders_located else "make it an event or a mode, or "
+        sentences = {name: _SENTENCES[name].format(_who(members), sides) for name, members in raised.items()}
         if "result" in raised:
             sentences["result"] += " " + self._advice()
         if "amplitude" in raised:
@@ -191,6 +232,7 @@ class Health(eqx.Module):
         rows.append((law, f"off by {_worst(self.energy, self.energy_allowed)}{known}"))
         if self.momentum_names is None:
             rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
+        rows += [("borders", text) for text in self._met()]
         rows += _by_name("momenta", self.momentum_names or (), self.momentum, self.momentum_allowed)
         for k, (what, off) in enumerate((("q", self.constraint_distance), ("qdot", self.constraint_rate))):
             allowed = np.broadcast_to(np.asarray(self.constraint_allowed)[..., k, None], off.value.shape)
@@ -208,6 +250,21 @@ class Health(eqx.Module):
         lines = [line for text in verdict for line in textwrap.wrap(text, 100)]
         rows += [("" if k else "verdict", line) for k, line in enumerate(lines)]
         return "\n".join(f"{name:17s} {text}" for name, text in rows)
+
+    def _met(self) -> list[str]:
+        """How the motion met borders, where it did."""
+        if self.borders is None:
+            return [] if self.borders_located else ["not located"]
+        crossed, slid, grazed = (np.asarray(x) for x in self.borders[:3])
+        if not (crossed.any() or slid.any() or grazed.any()):
+            return []
+        most = "" if crossed.ndim == 0 else "at most "
+        parts = [f"{most}{crossed.max()} crossed"]
+        parts += [f"{most}{slid.max()} slid along"] if slid.any() else []
+        if grazed.any():
+            t = np.asarray(self.borders.t)
+            parts.append(f"{most}{grazed.max()} grazed, the first at t = {np.nanmin(t):.6g}")
+        return ["; ".join(parts)]
 
     def _results(self) -> str:
         codes, counts = np.unique(np.asarray(self.result._value), return_counts=True)
@@ -295,8 +352,18 @@ _SENTENCES = {
         "for a norm or a square root at zero, or a branch of `where` that is not taken."
     ),
     "steps": (
-        "Steps: most were rejected{0}. The motion meets something that is not smooth, or is stiff: make it an event or "
-        "a mode, or use an implicit solver."
+        "Steps: most were rejected{0}. The motion meets something that is not smooth, or is stiff: {1}use an implicit "
+        "solver."
+    ),
+    "grazed": (
+        "Borders: one was grazed{0}, so that a change within the tolerance decides whether it is crossed. Derivatives "
+        "of what comes after do not exist there, and are NaN where the acceleration jumps, second ones also where its "
+        "slope does."
+    ),
+    "borders": (
+        "Borders: this engine does not locate them, its steps go across what is pieced together in the scene{0}. A "
+        "narrow piece may be missed, and derivatives lack what the border adds: `System.explain` says why the motion "
+        "is not in machine code, where steps end at borders."
     ),
     "global_error": (
         "Global error: the motion parts from its reference by a hundredth of its size or more{0}. If its steps are "

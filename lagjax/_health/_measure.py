@@ -80,7 +80,7 @@ def measured(trajectory) -> tuple[dict[str, Any], Names]:
     """The fields of `Health` that are measured along the path, and names for them."""
     steps = trajectory.stats["num_accepted_steps"]
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
-        members = _Members(trajectory)
+        members = Members(trajectory)
         laws = _laws(trajectory, members.layout, members.params)
         if all(law.lowered() for law in laws):
             return members.report(laws), _names(laws, members.layout)
@@ -118,7 +118,7 @@ def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
 _SHARED = "shared"  # stands for the batch axis of what all members share
 
 
-class _Members:
+class Members:
     """The members of a trajectory of numbers along one axis."""
 
     def __init__(self, trajectory):
@@ -161,7 +161,7 @@ class _Members:
         parts = [x.reshape(self.count, *x.shape[len(self.batch) : lead], -1) for x in parts]
         return np.concatenate(parts, axis=-1)
 
-    def _shared(self, x, dimensions: int) -> np.ndarray:
+    def shared(self, x, dimensions: int) -> np.ndarray:
         """Times or tolerances, arrays of so many dimensions, for every member: (N, …), also where all share them."""
         x = np.asarray(x)
         if x.ndim < len(self.batch) + dimensions:
@@ -173,7 +173,7 @@ class _Members:
     def path(self) -> Path:
         """The states of all members."""
         run = self._trajectory
-        ts = self._shared(run.ts, 1)
+        ts = self.shared(run.ts, 1)
         q, qdot = self._flat(run.q), self._flat(run.qdot)
         mode = np.zeros(ts.shape, int) if run.mode is None else np.asarray(run.mode).reshape(ts.shape)
         t, ends = ts, np.broadcast_to(np.arange(1, ts.shape[1]), (self.count, ts.shape[1] - 1))
@@ -186,7 +186,7 @@ class _Members:
             q, qdot, t, mode = (np.concatenate(pair, axis=1) for pair in zip((q, qdot, t, mode), more, strict=True))
         tolerances = run.tolerances
         if tolerances is not None:
-            tolerances = tuple(self._shared(x, 0).astype(q.dtype) for x in tolerances)
+            tolerances = tuple(self.shared(x, 0).astype(q.dtype) for x in tolerances)
         steps = np.asarray(run.stats["num_accepted_steps"], q.dtype).reshape(self.count)
         return Path(q, qdot, t, mode, ts, ends, steps, tolerances)
 

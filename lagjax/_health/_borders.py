@@ -1,0 +1,107 @@
+"""How a motion met the borders of its scene (`_program._borders`), from its steps taken once more.
+
+What a step ends at is written down for derivatives, and for them alone. So the motion is followed again as for one,
+over the time that it took. That costs as much as the motion did; scenes without borders pay nothing.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._blame import pieces_of
+from lagjax._derivation import derivation_of
+from lagjax._layout import Layout
+from lagjax._machine_code import flow_of
+from lagjax._machine_code._flow import Flow, Tolerances
+from lagjax._machine_code._steps import StepStore
+from lagjax._problem import Problem
+from lagjax._program import Unlowerable
+from lagjax._system import System
+
+LARGEST_PORTION = 2**22  # numbers of steps that are written down at once
+
+
+class Met(NamedTuple):
+    """How often each of N members crossed a border, began to slide along one, and grazed one; (N,) each.
+
+    `t` is when it first grazed one, NaN where it did not.
+    """
+
+    crossed: np.ndarray
+    slid: np.ndarray
+    grazed: np.ndarray
+    t: np.ndarray
+
+
+def met(trajectory, members) -> tuple[bool, Met | None]:
+    """Whether steps ended at the borders of the scene; and how the motion met them, None where that is not known.
+
+    `members` has the states and the parameters of all members (`_measure.Members`).
+    """
+    if not isinstance(trajectory.system, System):  # modes have transitions for that
+        return True, None
+    counts = [np.zeros(members.count, int) for _ in range(3)]
+    nothing = Met(*counts, np.full(members.count, np.nan))
+    if not is_piecewise(trajectory.system, members.layout, members.params):
+        return True, nothing
+    if trajectory.engine != "MachineCode" or trajectory.tolerances is None:
+        return False, None
+    path = members.path()
+    start = np.concatenate([path.q[:, 0], path.qdot[:, 0]], axis=1)
+    ts = np.stack([path.ts[:, 0], members.shared(trajectory.end.t, 0)], axis=1)
+    steps = sum(members.shared(trajectory.stats[f"num_{kind}_steps"], 0) for kind in ("accepted", "rejected"))
+    rtol, atol = (float(np.max(x)) for x in trajectory.tolerances)
+    flow = flow_of(Problem.about(trajectory.system, members.layout, members.params, ts=ts[0], rtol=rtol, atol=atol))
+    columns = [np.broadcast_to(x, members.count) for x in members.numbers]
+    params = np.stack(columns, axis=1) if columns else np.zeros((members.count, 0))
+    moved = np.flatnonzero(np.isfinite(start).all(axis=1) & (ts[:, 1] != ts[:, 0]) & (steps > 0))
+    for some in _portions(moved, steps * (flow.states + 5 + len(flow.borders.switches))):
+        tolerances = Tolerances(rtol, atol, 2 * int(steps[some].max()) + 100)
+        _count(flow, (ts[some], start[some], params[some]), tolerances, steps[some], some, nothing)
+    return True, nothing
+
+
+def is_piecewise(system: System, layout: Layout, params) -> bool:
+    """Whether the accelerations of a scene decide on something along a motion."""
+    derivation = derivation_of(system, layout, params)
+    try:
+        return derivation.borders is not None and bool(derivation.borders.switches)
+    except Unlowerable:  # arrays; as `_explain` asks
+        motion, rest = derivation.motion, np.zeros(layout.size, layout.dtype)
+        functions = [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
+        return any(pieces_of(f, rest, rest, rest.sum(), params) for f in functions)
+
+
+def _portions(places: np.ndarray, numbers: np.ndarray) -> list[np.ndarray]:
+    """The places in portions that need no more than `LARGEST_PORTION` numbers together, or just one place."""
+    if not len(places):
+        return []
+    portion = np.cumsum(numbers[places]) // LARGEST_PORTION
+    return np.split(places, np.flatnonzero(np.diff(portion)) + 1)
+
+
+def _count(flow: Flow, motions: tuple, tolerances: Tolerances, steps, places: np.ndarray, into: Met) -> None:
+    """Follow some motions, and add what they met `into` the counts at their places."""
+    store = StepStore()
+    again = flow.follow(*motions, tolerances, store, 2 * int(steps.sum()) + len(places))
+    guards, pieces = flow.borders.guards, len(flow.borders.switches)
+    enters = np.array([guard.slide >= 0 for guard in guards])
+    leaves = np.array([guard.on >= 0 for guard in guards])
+    slides = sorted({guard.slide for guard in guards if guard.slide >= 0})
+    for run, rows, members in store.runs(again.ticket):
+        for row, member in zip(rows, members, strict=True):
+            table = run.table[run.first[member] : run.first[member] + run.counts[member]]
+            place, crossed = places[row], table[:, -1]
+            along = table[:, flow.states + 4 : flow.states + 4 + pieces][:, slides] > 0.5
+            begins = along & ~np.vstack([np.zeros((1, len(slides)), bool), along[:-1]])
+            number = np.maximum(np.floor(crossed).astype(int) - 1, 0)
+            at_border = (crossed > 0) & ~leaves[number]
+            # A border that the motion slides along from there on has not been crossed.
+            to_slide = np.append(begins.any(axis=1)[1:], False) & enters[number]
+            grazes = (crossed > 0) & (crossed % 1 > 0)
+            into.slid[place] += int(begins.sum())
+            into.crossed[place] += int((at_border & ~to_slide).sum())
+            into.grazed[place] += int(grazes.sum())
+            if grazes.any():
+                first = table[np.argmax(grazes)]
+                into.t[place] = first[0] + first[1]
