@@ -161,3 +161,40 @@ def test_output_times_of_a_motion_that_slides():
     for derivative in (jax.grad, jax.jacfwd):
         np.testing.assert_allclose(derivative(speed)(2.0), -v, rtol=1e-9)
     np.testing.assert_allclose(jax.grad(jax.grad(speed))(2.0), v, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_fit_through_stick_and_slip():
+    # A block on a belt, held by a spring: the coefficient of friction and the speed of the belt, from where it was.
+    belt = lagjax.System(
+        lambda q, v: 0.5 * (v * v - q * q),
+        forces=lambda q, v, params: -params[0] * jnp.sign(v - params[1]) / (1 + jnp.abs(v - params[1])),
+    )
+    ts = jnp.linspace(0.0, 12.0, 25)
+
+    def places(params):
+        return lagjax.simulate(belt, 0.5, 0.0, ts, params).q
+
+    truth, params = jnp.array([1.1, 0.2]), jnp.array([0.9, 0.26])
+    observed = places(truth)
+    assert lagjax.simulate(belt, 0.5, 0.0, ts, truth).health().borders.slid > 1
+
+    @jax.jit
+    def loss_and_slope(params):
+        return jax.value_and_grad(lambda params: jnp.mean((places(params) - observed) ** 2))(params)
+
+    rate, (value, slope) = 0.05, loss_and_slope(params)
+    for _ in range(200):  # downhill, by steps that shrink where they lead up
+        trial = params - rate * slope
+        new, of_new = loss_and_slope(trial)
+        rate = rate * 1.5 if new < value else rate / 3
+        params, value, slope = (trial, new, of_new) if new < value else (params, value, slope)
+    np.testing.assert_allclose(params, truth, atol=1e-4)
+
+    # And by Newton's method, with second derivatives through the same borders.
+    params = truth + jnp.array([-0.02, 0.01])
+    for _ in range(4):
+        _, slope = loss_and_slope(params)
+        bend = jax.hessian(lambda params: jnp.mean((places(params) - observed) ** 2))(params)
+        params = params - jnp.linalg.solve(bend, slope)
+    np.testing.assert_allclose(params, truth, atol=1e-8)
