@@ -109,6 +109,26 @@ def test_second_derivatives_on_a_constraint_are_those_of_the_angle():
 
 
 @pytest.mark.slow
+def test_second_derivatives_by_a_start_that_moves_along_a_curved_constraint():
+    circle = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], constraints=lambda q: q @ q - 1.0)
+    pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + 9.81 * jnp.cos(q))
+    ts = jnp.array([0.0, 1.3, 2.0])
+
+    def on_circle(angle):
+        start = jnp.array([jnp.sin(angle), -jnp.cos(angle)])
+        return jnp.sum(lagjax.simulate(circle, start, jnp.zeros(2), ts, rtol=1e-11).q ** 3)
+
+    def by_angle(angle):
+        angles = lagjax.simulate(pendulum, angle, 0.0, ts, rtol=1e-11).q
+        return jnp.sum(jnp.stack([jnp.sin(angles), -jnp.cos(angles)]) ** 3)
+
+    exact = jax.grad(jax.grad(by_angle))(0.65)
+    for inner in (jax.grad, jax.jacfwd):
+        for outer in (jax.grad, jax.jacfwd):
+            np.testing.assert_allclose(outer(inner(on_circle))(0.65), exact, rtol=1e-8)
+
+
+@pytest.mark.slow
 def test_second_derivatives_of_the_cartesian_double_pendulum_are_those_of_its_angles():
     cartesian, angles = scenes.cartesian_double_pendulum(), scenes.double_pendulum()
     ts, start = jnp.linspace(0, 0.7, 4), jnp.array([1.0, 1.2])

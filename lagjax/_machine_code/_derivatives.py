@@ -35,6 +35,8 @@ def jvp(flow: Flow, ts, y0, params, solution, dy0, dparams, tolerances: Toleranc
     """
     path, result, accepted, ticket = solution
     members, m = dy0.shape[:2]
+    if flow.projection is not None:
+        dy0 = _projected_start(flow.projection, ts[:, :1], y0, params, dy0, dparams)
     groups = max(1, min(_native.cores() // members, math.ceil(m / _native.lanes())))  # of directions: one a thread
     directions = math.ceil(m / groups)
     padding = ((0, 0), (0, groups * directions - m), (0, 0))
@@ -111,13 +113,16 @@ def vjp(flow: Flow, ts, y0, params, solution, path_ct, end_ct, tolerances: Toler
     end_ct = end_ct + np.where(done, path_ct[:, :, -1], 0.0)
     path_ct[:, :, -1] = 0.0
 
-    rows = np.repeat(np.arange(members), m)
+    first, rows = ts[:, :1], np.repeat(np.arange(members), m)
     ts = ts if len(ts) == 1 else ts[rows]
     y_ct, more = _vjp_over_steps(
         flow, ts, y0[rows], params[rows], accepted[rows], ticket[rows], path_ct.reshape(members * m, *path.shape[1:]),
         end_ct.reshape(members * m, -1), tolerances,
     )  # fmt: skip
     y_ct, more = y_ct.reshape(members, m, -1), more.reshape(members, m, -1) + params_ct
+    if flow.projection is not None:
+        y_ct, of_projection = _through_projected_start(flow.projection, first, y0, params, y_ct)
+        more = more + of_projection
     y_ct[lost], more[lost] = np.nan, np.nan
     return y_ct, more
 
@@ -180,6 +185,32 @@ def _vjp_by_jacobian(
     lost = ((path_ct != 0) & path_lost).any(axis=(2, 3)) | ((end_ct != 0) & end_lost).any(axis=2)
     used[lost] = np.nan
     return used[..., : flow.states], used[..., flow.states :]
+
+
+# Off the constraints a motion depends on where its steps end, for there it is projected; and a motion with tangents
+# takes other steps. In its second derivative a start that moves on the constraints leaves them. So the motion is
+# differentiated as if it began at the projection of its start, which is that start.
+
+
+def _projected_start(projection: Projection, t, y0, params, dy0, dparams) -> np.ndarray:
+    """The tangents (N, m, 2n) of the projection of the starts."""
+    inputs = _at_start(t, y0, params, dy0, dparams)
+    return evaluate(_moved(projection.state, y0.shape[1]), inputs).T.reshape(dy0.shape)
+
+
+def _through_projected_start(projection: Projection, t, y0, params, y_ct) -> tuple[np.ndarray, np.ndarray]:
+    """The transpose of `_projected_start`: cotangents (N, m, 2n) of the starts, and (N, m, P) of the parameters."""
+    back = evaluate(_transposed(projection.state, y0.shape[1]), _at_start(t, y0, params, y_ct)).T
+    back = back.reshape(*y_ct.shape[:2], -1)
+    return back[..., : y0.shape[1]], back[..., y0.shape[1] :]
+
+
+def _at_start(t, y0, params, *moving) -> list:
+    """The inputs of a projection's derivatives at N starts, in m directions each: columns of N m numbers."""
+    members, m = moving[0].shape[:2]
+    parts = y0, t, params, *moving
+    parts = [np.broadcast_to(x if x.ndim == 3 else x[:, None], (members, m, x.shape[-1])) for x in parts]
+    return list(np.concatenate([x.reshape(members * m, x.shape[-1]).T for x in parts]))
 
 
 def _through_projection(flow: Flow, projection: Projection, ts, path, params, path_ct, params_ct) -> None:
