@@ -52,6 +52,8 @@ def met(trajectory, members) -> tuple[bool, Met | None]:
     steps = sum(members.shared(trajectory.stats[f"num_{kind}_steps"], 0) for kind in ("accepted", "rejected"))
     rtol, atol = (float(np.max(x)) for x in trajectory.tolerances)
     flow = flow_of(Problem.about(trajectory.system, members.layout, members.params, ts=ts[0], rtol=rtol, atol=atol))
+    if flow.borders is None:  # one without a series
+        return False, None
     columns = [np.broadcast_to(x, members.count) for x in members.numbers]
     params = np.stack(columns, axis=1) if columns else np.zeros((members.count, 0))
     moved = np.flatnonzero(np.isfinite(start).all(axis=1) & (ts[:, 1] != ts[:, 0]) & (steps > 0))
@@ -85,8 +87,8 @@ def _count(flow: Flow, motions: tuple, tolerances: Tolerances, steps, places: np
     store = StepStore()
     again = flow.follow(*motions, tolerances, store, 2 * int(steps.sum()) + len(places))
     guards, pieces = flow.borders.guards, len(flow.borders.switches)
-    enters = np.array([guard.slide >= 0 for guard in guards])
-    leaves = np.array([guard.on >= 0 for guard in guards])
+    # Numbers beyond those of guards are entries of tables that the time comes to, which are no borders.
+    enters, leaves = (np.array([getattr(guard, name) >= 0 for guard in guards] + [False]) for name in ("slide", "on"))
     slides = sorted({guard.slide for guard in guards if guard.slide >= 0})
     for run, rows, members in store.runs(again.ticket):
         for row, member in zip(rows, members, strict=True):
@@ -94,8 +96,8 @@ def _count(flow: Flow, motions: tuple, tolerances: Tolerances, steps, places: np
             place, crossed = places[row], table[:, -1]
             along = table[:, flow.states + 4 : flow.states + 4 + pieces][:, slides] > 0.5
             begins = along & ~np.vstack([np.zeros((1, len(slides)), bool), along[:-1]])
-            number = np.maximum(np.floor(crossed).astype(int) - 1, 0)
-            at_border = (crossed > 0) & ~leaves[number]
+            number = np.clip(np.floor(crossed).astype(int) - 1, 0, len(guards))
+            at_border = (crossed > 0) & (number < len(guards)) & ~leaves[number]
             # A border that the motion slides along from there on has not been crossed.
             to_slide = np.append(begins.any(axis=1)[1:], False) & enters[number]
             grazes = (crossed > 0) & (crossed % 1 > 0)
