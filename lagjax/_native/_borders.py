@@ -68,6 +68,8 @@ class Borders:
         self.note, self.jump = None, None
         if jump is not None:
             saltation = Saltation(motion, borders, levels[0], jump)
+            for name, count in saltation.fields_along().items():
+                motion.layout.extend(name, count)
             self.note, self.jump = saltation.note(), saltation.apply()
         elif len(levels) > 1:
             first = FirstSaltation(motion, borders, levels)
@@ -116,7 +118,7 @@ class Borders:
         lane["approach"] = 0.0
         if not self.pieces:
             return
-        for name in ("crossed", "idle_crossings", "stepped", "at_knots"):
+        for name in ("crossed", "idle_crossings", "stepped", "at_knots", "is_hit", "grazes"):
             lane[name] = 0.0
         lane["undecided"] = 1.0
         with frame.code.loop(len(self.guards)) as g:
@@ -456,7 +458,8 @@ class Borders:
         frame["stepped"] = code.select(code.compare("!=", frame["h"], 0.0), frame.constant(1), 0.0)
         at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > float(len(self.guards)))
         frame["at_knots"] = frame["at_knots"] + code.select(at_knot, frame.constant(1), 0.0)
-        frame["grazes"] = 0.0
+        for name in ("is_hit", "grazes"):
+            frame[name] = code.select(frame["stepped"] > 0.0, 0.0, frame[name])
         if self.graze is not None:
             frame.call(self.graze)
 
@@ -469,9 +472,9 @@ class Borders:
         frame, motion, n = self.motion.function("graze"), self.motion, self.motion.n
         code, order, by = frame.code, frame.job("order"), [*range(base), *range(n, n + base)]
         line, _ = _borders.gradient(self.borders, by)
-        frame["grazes"] = 0.0
-        with code.only_if(code.any_lane(frame["crossed"] > 0.0)):
-            self.table.note_hit(frame)
+        ends = (frame["crossed"] > 0.0) & (frame["stepped"] > 0.0)
+        with code.only_if(code.any_lane(ends)):
+            self.table.note_hit(frame, ends)
             state = motion.moved(frame, motion.increments(frame, order, frame["h"])[0])
             inputs = state, [frame["t"] + frame["h"]], frame.vectors("params", motion.numbers)
             slopes = motion.form.run(frame, line, *inputs, frame.vectors("hit", self.pieces))
@@ -483,7 +486,8 @@ class Borders:
                     code.store(code.load(error, frame.vector) + moved, error)
             rate, bend = self._rates(frame, order)
             near = rate * rate <= 2.0 * (code.intrinsic("fabs", bend) * code.load(error, frame.vector))
-            frame["grazes"] = code.select(near & (frame["is_hit"] > 0.0), frame.constant(1), 0.0)
+            near = near & ends & (frame["is_hit"] > 0.0)
+            frame["grazes"] = code.select(near, frame.constant(1), frame["grazes"])
         return frame.finish()
 
     def _rates(self, frame: Frame, order: Value) -> tuple[Value, Value]:

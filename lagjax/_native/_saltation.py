@@ -45,17 +45,22 @@ class GuardTable:
         place = g * len(PLACES) + PLACES.index(name)
         return code.load(code.element(Value(code, self._places), place, INTEGER), INTEGER)
 
-    def note_hit(self, frame: Frame) -> None:
-        """The pieces, and which switching number the guard `crossed` has; none where a motion begins on the border."""
+    def note_hit(self, frame: Frame, where: Value | None = None) -> None:
+        """The pieces, and which switching number the guard `crossed` has; none where a motion begins on the border.
+
+        In the lanes `where` a step ends at one, which are all of them by default.
+        """
         motion, code, crossed = self.motion, frame.code, frame.code.intrinsic("floor", frame["crossed"])
-        frame["is_hit"] = 0.0
+        where = frame.constant(0.0) <= 0.0 if where is None else where
+        frame["is_hit"] = code.select(where, 0.0, frame["is_hit"])
         with code.loop(motion.pieces) as j:
-            frame["hit", j] = 0.0
-            frame["pieces_before", j] = frame["params", j + motion.parameters]
+            frame["hit", j] = code.select(where, 0.0, frame["hit", j])
+            piece = frame["params", j + motion.parameters]
+            frame["pieces_before", j] = code.select(where, piece, frame["pieces_before", j])
         with code.loop(self.guards) as g:
             j = self.place(code, g, "piece")
             side = frame["pieces_before", j] * self.number(code, g, "a") + self.number(code, g, "b")
-            hit = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
+            hit = where & code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
             hit = hit & code.compare("!=", side, 0.0)
             frame["hit", j] = code.select(hit, frame.constant(1), frame["hit", j])
             frame["is_hit"] = code.select(hit, frame.constant(1), frame["is_hit"])
@@ -126,31 +131,35 @@ class Saltation:
     # ---- in a run: the motion with its tangents ----
 
     def note(self) -> Code:
-        """`()`: the pieces before the border, and which switching number is zero there."""
+        """`()`: the state at the border that a step ends at. Several may be crossed there, one after the other."""
         frame = self.motion.function("note_before")
-        self.table.note_hit(frame)
+        stepped = frame["stepped"] > 0.0
+        for i in self.motion.form.each(frame.code, self.motion.states):
+            frame["edge", i] = frame.code.select(stepped, frame["y", i], frame["edge", i])
         return frame.finish()
 
     def apply(self) -> Code:
-        """`()`: the tangents beyond the border that is `hit`, on the pieces there."""
+        """`()`: the tangents beyond the border that is `hit`, on the pieces behind all that are crossed there."""
         frame = self.motion.function("jump_of_tangents")
         motion, code, n, base = self.motion, frame.code, self.motion.n, self.base
-        with code.only_if(code.any_lane(frame["is_hit"] > 0.0)):
+        is_hit = frame["is_hit"] > 0.0
+        with code.only_if(code.any_lane(is_hit)):
             lower, numbers = self.jump.lower * base, self.jump.lower * self.parameters
             parts = [
-                _field(frame, "y", lower, 0, True), _field(frame, "y", lower, n, True), frame.vectors("t", 1),
+                _field(frame, "edge", lower), _field(frame, "edge", lower, n), frame.vectors("t", 1),
                 _field(frame, "params", numbers), frame.vectors("pieces_before", self.pieces),
                 _field(frame, "params", self.pieces, motion.parameters), frame.vectors("hit", self.pieces),
-                _field(frame, "y", n - lower, lower, True), _field(frame, "y", n - lower, n + lower, True),
+                _field(frame, "edge", n - lower, lower), _field(frame, "edge", n - lower, n + lower),
                 _field(frame, "params", motion.parameters - numbers, numbers),
             ]  # fmt: skip
             out = motion.form.run(frame, self.jump.line, *parts)
-            added = self.jumped(frame, out, frame["is_hit"] > 0.0, frame["grazes"] > 0.0)
+            added = self.jumped(frame, out, is_hit, frame["grazes"] > 0.0)
             for row in range(1, len(self.jump.orders)):
                 for part in range(2):
                     for i in motion.form.each(code, base):
                         place = i + (part * n + row * base)
-                        frame["y", place] = frame["y", place] + added(row, i, part)
+                        beyond = frame["edge", place] + added(row, i, part)
+                        frame["y", place] = code.select(is_hit, beyond, frame["y", place])
         return frame.finish()
 
     # ---- over steps that have been taken ----
@@ -222,6 +231,6 @@ def _some(numbers: Numbers, first: int, count: int) -> Numbers:
     return numbers[first : first + count]
 
 
-def _field(frame: Frame, name: str, count: int, first: int = 0, of_series: bool = False) -> Vectors:
-    """So many vectors of a field from one on; of a series, the zeroth coefficients."""
-    return frame.vectors(name, count, (lambda i: (i + first, 0)) if of_series else (lambda i: (i + first,)))
+def _field(frame: Frame, name: str, count: int, first: int = 0) -> Vectors:
+    """So many vectors of a field from one on."""
+    return frame.vectors(name, count, lambda i: (i + first,))
