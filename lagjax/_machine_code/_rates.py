@@ -58,11 +58,13 @@ def _pieces(borders, scalars, n: int) -> list[Any]:
     """The pieces at a state; 1 for those that say that the motion slides."""
     count, zero, decide = len(borders.switches), jnp.zeros_like(scalars[0]), borders.decide
     pieces = list(emit(*decide, (*scalars, *[zero] * (2 * count))))
-    sliding = {guard.piece: guard.slide for guard in borders.guards if guard.slide >= 0}
+    # Along a border in position a motion slides at rest, which `decide` knows.
+    sliding = {guard.piece: guard.slide for guard in borders.guards if guard.slide >= 0 and guard.order < 2}
 
     def rates(side: float):
         """Of the switching numbers, where all pieces that may slide are on one side of their border."""
         there = [jnp.full_like(zero, side) if j in sliding else piece for j, piece in enumerate(pieces)]
+        there = [zero if j in sliding.values() else piece for j, piece in enumerate(there)]
         out, _ = _on_pieces(borders, scalars, there)
         moving = [*scalars[n : 2 * n], *out[:n], jnp.ones_like(zero)]
         moving += [jnp.zeros_like(zero)] * (len(scalars) - 2 * n - 1)
