@@ -152,6 +152,17 @@ def test_beyond_the_last_sample_a_motion_fails_there():
         lagjax.simulate(driven("linear"), 0.3, 0.1, END + jnp.array([0.0, 1.0]), {"t": KNOTS, "u": VALUES})
 
 
+def test_knots_among_params_that_do_not_increase():
+    knots = np.delete(np.insert(KNOTS, 3, KNOTS[5]), 6)
+
+    def run(t, values=VALUES):
+        return lagjax.simulate(driven("zero"), 0.3, 0.1, END, {"t": t, "u": values}, throw=False).q[-1]
+
+    with pytest.raises(ValueError, match="knots of samples must increase"):
+        run(knots)
+    assert np.isnan(jax.jit(run)(knots)) and np.isfinite(jax.jit(run)(KNOTS))
+
+
 def test_samples_are_no_inputs_of_a_program():
     count = 25_000
     knots = np.arange(count) * 1e-3

@@ -20,7 +20,7 @@ from lagjax._machine_code._surfaces import Surfaces, moved_with, require_one_num
 from lagjax._native import Guards, watched
 from lagjax._platform import default_platform
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
-from lagjax._program import Unlowerable
+from lagjax._program import Program, Unlowerable
 from lagjax._validate import is_concrete
 
 __all__ = [
@@ -79,6 +79,7 @@ class MachineCode(AbstractEngine):
         """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
         flow, tolerances = flow_of(problem), _tolerances(problem)
         if problem.is_known:
+            _require_increasing(flow.program, problem.vector)
             ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
             return Solution._make([*(x[0] for x in flow.run(ts, y0, params, tolerances)[:-1]), None])
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
@@ -153,6 +154,20 @@ def _made(derivation: Derivation, path: str, guards: Guards | None) -> Flow | st
     except Unlowerable as reason:
         return f"of a guard, {reason}"
     return Flow.of(program, n, projection, guards)
+
+
+def _require_increasing(program: Program, vector) -> None:
+    """Raise `ValueError` where the instants of samples, among the parameters, do not increase."""
+    for op, _, attribute in program.nodes if program.looks_up else ():
+        if op == "locate" and attribute.table.numbers is None:
+            knots = np.asarray(vector)[np.array(attribute.table.positions) - (program.size - len(vector))]
+            wrong = np.flatnonzero(~(np.diff(knots) > 0))
+            if wrong.size:
+                i = int(wrong[0])
+                raise ValueError(
+                    f"The knots of samples must increase, but in params one that is {knots[i + 1]:g} comes after one "
+                    f"that is {knots[i]:g}. Sort the samples by time, and keep one of those at the same time."
+                )
 
 
 def _tolerances(problem: Problem) -> Tolerances:

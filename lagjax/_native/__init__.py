@@ -9,6 +9,7 @@ one Taylor series, of the order that the tolerance asks for.
     _ir          LLVM's instructions, written like arithmetic;  _objects: machine code kept on disk
     _lanes       the operations of a program on vectors, one by one: the form of small kernels
     _tables      the form of large ones: operations are data that one loop walks along;  _schedule: in which order
+    _look_ups    entries of tables, read from where the numbers of a member lie
     _constants   every numerical choice, with its reason
     _frame       what a function of a kernel sees: the memory of its thread, the lanes, the job
     _series      the coefficients of a motion, and what is read off them along a step
@@ -16,6 +17,7 @@ one Taylor series, of the order that the tolerance asks for.
     _step        step control
     _guards      functions of the state that are watched;  _events: where they change sign
     _roots       where a polynomial is zero: borders and guards have series
+    _clocks      derivatives by the instants at which a table goes on
     _output      what is written down
     _integrator  all of these, round by round;  _tangent, _adjoint: its derivatives, forward and back
     _kernel      both as functions of arrays;  _threads: on several cores, interruptible;  _handler: as a call of XLA

@@ -118,6 +118,10 @@ class Borders:
         lane["approach"] = 0.0
         if not self.pieces:
             return
+        for _, _, table in self.clocks.tables:  # of entries that do not increase nothing can be made
+            first = frame.code.as_integer(lane["first_number"])
+            with frame.code.only_if(~self.motion.look_up.increases(frame, table, first)):
+                lane["y", 0] = float("nan")
         for name in ("crossed", "idle_crossings", "stepped", "at_knots", "is_hit", "grazes"):
             lane[name] = 0.0
         lane["undecided"] = 1.0

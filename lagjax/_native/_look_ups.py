@@ -61,6 +61,13 @@ class LookUps:
             found = _with_lane(code, found, lane, code.load(code.element(base, place), DOUBLE))
         return found
 
+    def increases(self, frame: Frame, table: Table, first: Value) -> Value:
+        """Whether the entries of a table of the member whose numbers begin at `first` increase."""
+        code = frame.code
+        begin = code.element(frame.job("params"), first + (table.first - BESIDE))
+        constants = (code.as_value(n, INTEGER) for n in (table.stride, table.count))
+        return code.call(self._increases, begin, *constants) > 0
+
     def places(self, frame: Frame, table: Table, x: Value) -> list[Value]:
         """Where the entries with these numbers lie among the numbers of a member, lane by lane."""
         x = self._clipped(frame.code, table, x) * float(table.stride) + float(table.first - BESIDE)
@@ -89,6 +96,17 @@ class LookUps:
         place = ir.GlobalVariable(self.module, POINTER, "address_of_numbers")
         place.linkage, place.align, place.initializer = "internal", 8, ir.Constant(POINTER, None)
         return place
+
+    @functools.cached_property
+    def _increases(self) -> Code:
+        """`(base, stride, count)`: 1 where every entry is larger than the one before it, else 0."""
+        code = Code(self.module, "increases", [POINTER, INTEGER, INTEGER], 1, result=INTEGER)
+        base, stride, count = code.arguments
+        found = code.variable(code.as_value(1, INTEGER))
+        with code.loop(count - 1) as i:
+            before, after = (code.load(code.element(base, k * stride), DOUBLE) for k in (i, i + 1))
+            code.store(code.select(before < after, code.load(found, INTEGER), 0), found)
+        return code.finish(code.load(found, INTEGER))
 
     @functools.cached_property
     def _locate(self) -> Code:

@@ -104,7 +104,7 @@ def _looked_up(op: str, attribute, entries: Callable, precision, x) -> jax.Array
     values = jnp.asarray(table.known if known else entries(table)).astype(precision)
     if op == "take":
         x = jnp.clip(jnp.where(jnp.isnan(x), 0, x), 0, table.count - 1).astype(int)
-        return jnp.vectorize(lambda of, i: of[i], signature="(k),()->()")(values, x)
+        return jnp.vectorize(lambda of, i: jnp.asarray(of)[i], signature="(k),()->()")(values, x)
 
     def piece(of, x):
         found = jnp.searchsorted(of, x, side="right") - 1
