@@ -23,7 +23,7 @@ from lagjax._arguments import Function, accept
 from lagjax._custom import differentiated_as
 from lagjax._derivation import Derivation
 from lagjax._layout import Layout, halves
-from lagjax._machine_code import MachineCode, Surfaces, flow_of, moved_with, require_one_number, scalars_of
+from lagjax._machine_code import MachineCode, Surfaces, flow_of, moved_with, require_one_number, vector_of
 from lagjax._problem import Problem, Solution
 from lagjax._program import Unlowerable
 from lagjax._system import System
@@ -127,7 +127,7 @@ class Mode(NamedTuple):
     def guards_at(self, t, y) -> tuple:
         """The guards, their rates along the motion and their sizes at a state, without derivatives."""
         t, y, numbers = jax.lax.stop_gradient((t, y, self.vector))
-        out, count = self._surfaces.complete(*y, t, *numbers), len(self.leaving)
+        out, count = self._surfaces.complete.at(jnp.append(y, t), numbers), len(self.leaving)
         return out[:count], out[count : 2 * count], out[2 * count : 3 * count]
 
     def crossing(self, k: int) -> Callable:
@@ -164,7 +164,7 @@ def _surfaces(
     def extras(y, params):
         if multipliers is None:
             return {}
-        flat = jnp.stack(multipliers(*y, *scalars_of(eqx.filter(params, eqx.is_array_like))))
+        flat = jnp.stack(multipliers.at(y, vector_of(eqx.filter(params, eqx.is_array_like))))
         return {"multipliers": system.by_constraint(flat, layout, params)}
 
     def value(guard):

@@ -176,7 +176,7 @@ class _Rounds(NamedTuple):
             return exit
         kinds = [(changes >> (2 * k)) & 3 for k in range(len(mode.leaving))]
         y_here, numbers = _constant_unless(changes > 0, (y, mode.vector))
-        values = mode.surfaces.values(*y_here, t, *numbers)
+        values = mode.surfaces.values.at(jnp.append(y_here, t), numbers)
         _, rates, sizes = mode.guards_at(t, y)
         earlier = jnp.asarray(False)
         for k, (number, transition) in enumerate(mode.leaving):

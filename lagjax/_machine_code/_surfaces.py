@@ -52,7 +52,7 @@ class Surfaces(NamedTuple):
             return jnp.stack([function(y, params) for function in functions])
 
         def complete(y, numbers):
-            acceleration = jnp.stack(program.complete(*y, *scalars_of(numbers))[:n])
+            acceleration = jnp.stack(program.complete.at(y, vector_of(numbers))[:n])
             rate = jnp.concatenate([y[n:-1], acceleration, jnp.ones(1)])
             by_y = jax.jacfwd(values)(y, numbers)
             terms, moving = by_y * y, by_y * rate
@@ -63,9 +63,10 @@ class Surfaces(NamedTuple):
         return cls(lower(values, y, numbers), lower(complete, y, numbers), directions)
 
 
-def scalars_of(numbers: PyTree) -> list[jax.Array]:
-    """Every number of a pytree, one by one."""
-    return [x for leaf in jax.tree.leaves(numbers) for x in jnp.ravel(leaf)]
+def vector_of(numbers: PyTree) -> jax.Array:
+    """Every number of a pytree, (P,)."""
+    leaves = [jnp.ravel(leaf) for leaf in jax.tree.leaves(numbers)]
+    return jnp.concatenate(leaves) if leaves else jnp.zeros(0)
 
 
 def require_one_number(value, what: str) -> jax.Array:
@@ -93,11 +94,11 @@ def moved_with(surfaces: Surfaces, program: Program, k: int) -> Callable:
 
     def rates(t, y, numbers):
         n = y.shape[0] // 2
-        acceleration = jnp.stack(program(*y, t, *numbers)[:n])
-        return surfaces.complete(*y, t, *numbers)[count + k], jnp.concatenate([y[n:], acceleration])
+        acceleration = jnp.stack(program.at(jnp.append(y, t), numbers)[:n])
+        return surfaces.complete.at(jnp.append(y, t), numbers)[count + k], jnp.concatenate([y[n:], acceleration])
 
     def moved(taken, t, y, numbers):
-        value, (rate, slope) = surfaces.values(*y, t, *numbers)[k], rates(t, y, numbers)
+        value, (rate, slope) = surfaces.values.at(jnp.append(y, t), numbers)[k], rates(t, y, numbers)
         direction = jnp.ones_like(t), slope
         bend, turn = map(still, jax.jvp(lambda t, y: rates(t, y, numbers), (t, y), direction)[1])
         rate = jnp.where(taken & (rate != 0), rate, 1.0)

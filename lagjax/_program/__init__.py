@@ -46,7 +46,7 @@ from lagjax._program._memory import machine_memory, operations_that_fit, without
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
 from lagjax._program._pushforward import pushforward, with_tangents
-from lagjax._program._rules import Expansion, inputs_of
+from lagjax._program._rules import LARGEST_UNFOLDED, Expansion, inputs_of
 from lagjax._program._scalars import Scalars, stacked
 from lagjax._program._series import LinearSystem, Series, StraightLine, series
 from lagjax._program._transpose import copied, pullback
@@ -265,6 +265,12 @@ class Program:
     def looks_up(self) -> bool:
         """Whether it reads tables (see `_look_ups`)."""
         return any(op in LOOK_UPS for op, _, _ in self.nodes)
+
+    def at(self, first, numbers) -> tuple:
+        """The outputs for the first inputs, a vector, and the others (P,), which are not taken apart where many are."""
+        if self.looks_up or self.size > LARGEST_UNFOLDED:
+            return self.of_rows(first, numbers)
+        return self(*first, *numbers)
 
     def of_rows(self, first, numbers) -> tuple:
         """The outputs for the first inputs, an array (…, m), and the others (…, P), where most are only looked up.
