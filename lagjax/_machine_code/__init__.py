@@ -16,7 +16,7 @@ from lagjax._derivation import Derivation
 from lagjax._machine_code import _transforms
 from lagjax._machine_code._events import MOST_GUARDS, Noted, along_crossings, surfaces_of, surfaces_of_event, to_event
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
-from lagjax._machine_code._surfaces import Surfaces, moved_with, require_one_number, scalars_of
+from lagjax._machine_code._surfaces import Surfaces, moved_with, require_one_number, vector_of
 from lagjax._native import Guards, watched
 from lagjax._platform import default_platform
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
@@ -24,8 +24,16 @@ from lagjax._program import Program, Unlowerable
 from lagjax._validate import is_concrete
 
 __all__ = [
-    "MOST_GUARDS", "Flow", "MachineCode", "Noted", "Surfaces", "flow_of", "moved_with", "require_one_number",
-    "scalars_of", "surfaces_of",
+    "MOST_GUARDS",
+    "Flow",
+    "MachineCode",
+    "Noted",
+    "Surfaces",
+    "flow_of",
+    "moved_with",
+    "require_one_number",
+    "surfaces_of",
+    "vector_of",
 ]  # fmt: skip
 
 
