@@ -51,7 +51,8 @@ def samples(
     where it is needed, and a gradient by all samples costs as much as one by a single number; so long as knots and
     values reach `samples` as they are in `params`, or are known numbers: compute with u(t) instead of with the values.
     Where u jumps, with "zero", derivatives of the motion by the values are exact, and those by the knots contain what a
-    later jump changes. Engines of diffrax do not see the knots, and integrate over them.
+    later jump changes. Second derivatives that do not exist here are NaN: by knots at which the acceleration jumps, and
+    across other borders at which it does. Engines of diffrax do not see the knots, and integrate over them.
 
     **Raises** `TypeError` or `ValueError` for knots that do not increase, shapes that do not fit, samples that are not
     finite, and an unknown `hold`; of what is traced, only the shapes can be looked at.
