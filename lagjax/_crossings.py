@@ -3,6 +3,7 @@
 The motion is one run of machine code, which goes on over every crossing and writes it down (`_native._events`).
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -102,29 +103,50 @@ def crossings(
         require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
     surfaces = _surfaces(problem, functions, directions, names)
     solution, noted = MachineCode().crossings(problem, surfaces, count)
-    result = jnp.where(jnp.any(noted.count > count), _TOO_MANY, solution.result)
-    result = jnp.where(solution.result == SUCCESSFUL, result, solution.result)
+    how = _how_it_ended if isinstance(solution.y_end, np.ndarray) else _how_it_ended_traced
+    result, t_end, ok = how(noted, solution, count)
     if throw:
-        noted = _raise_unless_ok(problem, solution, noted, result, count)
-    ok = (solution.result == SUCCESSFUL) & (noted.count <= count)
-    q, qdot = map(layout.restore, map(jnp.asarray, halves(noted.y)))
-    found = Crossings(jnp.asarray(noted.t), q, qdot, jnp.asarray(noted.count).astype(int), jnp.asarray(ok))
-    of_each = [jax.tree.map(lambda x, k=k: x[k], found) for k in range(len(functions))]
-    return of_each[0] if names is None else dict(zip(names, of_each, strict=True))
+        noted = _raise_unless_ok(problem, (t_end, solution.y_end), noted, result)
+    return _dressed(problem.layout, names, noted, ok)
 
 
-def _raise_unless_ok(problem: Problem, solution: Solution, noted: Noted, result, count: int) -> Noted:
+def _how_it_ended(noted: Noted, solution: Solution, count: int, library: Any = np) -> tuple:
+    """The result of the whole, the time up to which all is there, and whether each section has all of its crossings."""
+    well, many = solution.result == SUCCESSFUL, noted.count > count
+    too_many = well & library.any(many)
+    # The last crossing that there was room for, of the first section to run out of it.
+    last = library.where(many, noted.t[:, -1], solution.t_end)
+    first = library.argmax(library.abs(last - solution.t_end))
+    result = library.where(too_many, _TOO_MANY, solution.result)
+    return result, library.where(too_many, last[first], solution.t_end), well & ~many
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _how_it_ended_traced(noted: Noted, solution: Solution, count: int) -> tuple:
+    return _how_it_ended(noted, solution, count, jnp)
+
+
+def _raise_unless_ok(problem: Problem, end: tuple, noted: Noted, result) -> Noted:
     """What was noted, where all went well; else `SimulationError`, at run time where it is being traced."""
-    latest = jnp.nanmax(jnp.where(jnp.any(noted.count > count), noted.t, jnp.nan), initial=-jnp.inf)
-    forward = problem.ts[-1] > problem.ts[0]
-    t_end = jnp.where((result == _TOO_MANY) & forward, latest, solution.t_end)
-    end, names = (t_end, solution.y_end), problem.layout.names
+    names = problem.layout.names
     if not all(map(is_concrete, (result, *end, problem.ts))):
         t, y = raise_where_failed((noted.t, noted.y), result, end, problem.ts[-1], names)
         return noted._replace(t=t, y=y)
-    if text := sentence(result, *end[:1], np.asarray(problem.ts)[-1], end[1], names):
+    if text := sentence(result, end[0], np.asarray(problem.ts)[-1], end[1], names):
         raise SimulationError(text, None)
     return noted
+
+
+def _dressed(layout: Layout, names: tuple[str, ...] | None, noted: Noted, ok) -> Crossings | dict[str, Crossings]:
+    """What was noted in the pytree of the user, and by the names of the sections."""
+
+    def of_section(k: int) -> Crossings:
+        q, qdot = map(layout.restore, halves(jnp.asarray(noted.y[k])))
+        return Crossings(jnp.asarray(noted.t[k]), q, qdot, jnp.asarray(noted.count[k]).astype(int), jnp.asarray(ok[k]))
+
+    if names is None:
+        return of_section(0)
+    return {name: of_section(k) for k, name in enumerate(names)}
 
 
 # ---- what can be wrong -----------------------------------------------------------------------------------------------

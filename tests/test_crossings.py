@@ -129,6 +129,19 @@ def test_a_section_on_a_border_of_the_force():
     assert found["size"].count == 0
 
 
+def test_borders_of_the_force_and_of_the_section_at_one_place():
+    # V = |q| from rest at a: q falls through 0 at √(2a) and rises at 3 √(2a). The section jumps there, and beyond.
+    corner = lagjax.System(lambda q, v: 0.5 * v**2 - abs(q))
+    run = lambda a: lagjax.crossings(corner, lambda q, v: jnp.mod(q, 1.0) - 0.25, a, 0.0, jnp.array([0.0, 2.8]))
+    starts = jnp.linspace(0.3, 0.9, 13)
+    found = jax.vmap(run)(starts)
+    first = np.sqrt(2 * starts)
+    before, after = np.sqrt(2 * (starts - 0.25)), np.sqrt(2 * starts) - np.sqrt(2 * (starts - 0.25))
+    for k, t in enumerate((before, first)):  # to 1/4, and to 0, where it jumps from −1/4 to 3/4
+        np.testing.assert_allclose(found.t[:, k], t if k else after, rtol=1e-12)
+    assert found.ok.all()
+
+
 def test_a_start_on_the_section():
     run = lambda q, v: lagjax.crossings(OSCILLATOR, lambda q, v: q - 0.1, q, v, jnp.array([0.0, 6.2]), 1.0)
     found = jax.vmap(run)(jnp.array([0.1, 0.1, 0.1 + 1e-17, 0.1]), jnp.array([1.0, -1.0, -1.0, 0.0]))

@@ -93,7 +93,7 @@ class MachineCode(AbstractEngine):
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
         if problem.event is None:
             return _transforms.run(flow, tolerances, ts, y0, params)
-        return to_event(flow, _without_guards(problem), _surfaces_of(problem), tolerances, ts, y0, params)
+        return to_event(flow, _without_guards(problem), _surfaces_of(problem), tolerances)(ts, y0, params)
 
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
         """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""
@@ -109,7 +109,7 @@ class MachineCode(AbstractEngine):
             solution = Solution._make([*(x[0] for x in solution[:-1]), None])
             return solution, Noted.read(solution.path, len(surfaces.directions))
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
-        return along_crossings(flow, _without_guards(problem), surfaces, tolerances, ts, y0, params)
+        return along_crossings(flow, _without_guards(problem), surfaces, tolerances)(ts, y0, params)
 
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, in the lanes of vectors and on all cores."""

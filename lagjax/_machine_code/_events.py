@@ -9,6 +9,7 @@ surface itself, the state, its rate and its derivatives are then all those befor
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -101,8 +102,16 @@ def _lowered(derivation: Derivation, functions, directions, code, structure, wha
 # ---- to the first event ----------------------------------------------------------------------------------------------
 
 
-def to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params) -> Solution:
-    """The motion to its event, or to the last of `ts` (T,), with derivatives of all orders up to the second."""
+@functools.lru_cache(maxsize=64)
+def to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances) -> Callable[..., Solution]:
+    """`(ts, y0, params)` → the motion to its event, or to the last of `ts` (T,), with first and second derivatives.
+
+    As one program of XLA: a derivative outside of `jit` then compiles as one, not operation by operation.
+    """
+    return jax.jit(functools.partial(_to_event, guarded, flow, surfaces, tolerances))
+
+
+def _to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params) -> Solution:
     still = jax.lax.stop_gradient
     solution = jax.tree.map(still, _transforms.run(guarded, tolerances, still(ts), still(y0), still(params)))
     reached = jnp.isfinite(solution.path).all(axis=1)
@@ -143,10 +152,17 @@ def _varied_to_event(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
 # ---- all crossings ---------------------------------------------------------------------------------------------------
 
 
+@functools.lru_cache(maxsize=64)
 def along_crossings(
+    noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances
+) -> Callable[..., tuple[Solution, Noted]]:
+    """`(ts, y0, params)` → the motion to the last of `ts`, and its crossings, with first and second derivatives."""
+    return jax.jit(functools.partial(_along_crossings, noting, flow, surfaces, tolerances))
+
+
+def _along_crossings(
     noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params
 ) -> tuple[Solution, Noted]:
-    """The motion to the last of `ts`, and the crossings of its surfaces, with derivatives up to the second."""
     still = jax.lax.stop_gradient
     solution = jax.tree.map(still, _transforms.run(noting, tolerances, still(ts), still(y0), still(params)))
     noted = Noted.read(solution.path, len(surfaces.directions))

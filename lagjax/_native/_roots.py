@@ -21,8 +21,9 @@ from lagjax._native._series import Motion, integer
 class Roots:
     """Functions of the polynomial in `poly`, of which `degree + 1` coefficients are there.
 
-    `first_root(degree)` finds the first root, into `root`; 2 without any. Where P(0) is negative beyond rounding the
-    root is 0. `is_root` is 0 where only a part of the way was looked at: up to `root`, where there is none.
+    `first_root(degree)` finds the first root, into `root`; 2 without any. P is known to the rounding of its largest
+    value; where P(0) is negative beyond that the root is 0. `is_root` is 0 where only a part of the way was looked at:
+    up to `root`, where there is none.
 
     `next_root(degree)` begins at `begin`, where P may be zero, with the sums of `sum_up`. P is known to rounding,
     `unsure`, and `doubt` times the power after its last one; what is closer than `instant` is one place. It leaves the
@@ -85,10 +86,10 @@ class Roots:
 
     def _first_root(self) -> Code:
         frame = self.motion.function("first_root", INTEGER)
-        for name in ("begin", "unsure", "doubt"):
-            frame[name] = 0.0
-        frame["instant"] = EPS
+        frame["begin"], frame["doubt"], frame["instant"] = 0.0, 0.0, EPS
         self.sum_up(frame, *frame.arguments)
+        size = frame.code.intrinsic("fabs", frame["poly", 0]) + frame["falls"] + frame["rises"]
+        frame["unsure"] = (ROOT_NOISE * EPS) * size
         frame.call(self.next_root, *frame.arguments)
         return frame.finish()
 
