@@ -74,14 +74,17 @@ def simulate(
     - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient by diffrax records that many
       times for every member: lower it for the gradient of a large batch.
     - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued one stops the motion where it
-      changes sign, a Boolean one after the step on which it becomes true. `diffrax.Event` around such functions sets
-      the direction and the root finder. Where the motion starts on the zero itself, give a direction.
+      changes sign; machine code finds that on its series, without sampling, so that none is stepped over, and a motion
+      that starts on the zero has to leave it first. A Boolean one stops it after the step on which it becomes true,
+      and is for diffrax, as is an event with a root finder of its own; there give a direction where the motion starts
+      on the zero. `diffrax.Event` around such functions sets the direction and the root finder.
     - `adjoint`: how derivatives are taken. By default machine code goes back over its own steps in reverse mode
       (`jax.grad`, `jax.vjp`), at the cost of a few motions however many parameters there are, and forward over them
       along all directions together (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist.
       What diffrax integrates is differentiated over the recorded steps, in reverse mode only. Pass
-      `diffrax.ForwardMode()` for forward mode there, or any other diffrax adjoint. With an event the default is
-      `diffrax.RecursiveCheckpointAdjoint()`.
+      `diffrax.ForwardMode()` for forward mode there, or any other diffrax adjoint. With an event the default there is
+      `diffrax.RecursiveCheckpointAdjoint()`; in machine code the end of a motion by an event has first and second
+      derivatives.
     - `throw`: raise when the motion does not reach its end. With `throw=False` look at `trajectory.ok`.
     - `progress`: print how far the integration has come; or any diffrax progress meter.
 

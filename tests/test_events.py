@@ -55,6 +55,7 @@ def test_batches_are_one_run():
     np.testing.assert_array_equal(mapped.q, runs.q)
 
 
+@pytest.mark.slow
 def test_how_the_end_varies():
     def outcome(x):
         run = fall(x[0], x[1], rtol=1e-12)
