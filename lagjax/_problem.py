@@ -10,6 +10,7 @@ vector (q, q̇), and the programs of a scene take the parameters as one vector t
 
 import abc
 import functools
+import types
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -104,6 +105,11 @@ class Problem:
     def derivation(self) -> Derivation:
         """What is derived from the scene: made once for all problems whose scene and structure are equal."""
         return derivation_of(self.system, self.layout, self.params)
+
+    @functools.cached_property
+    def made(self) -> dict:
+        """What engines have made of it, by name: they ask for the same more than once."""
+        return {}
 
     @property
     def numbers(self) -> PyTree:
@@ -355,6 +361,15 @@ def _event(event, dtype) -> diffrax.Event | None:
     """The event with its functions' signatures checked, and with a root finder that uses the dtype's digits."""
     if event is None:
         return None
+    return _known_event(event, dtype) if isinstance(event, types.FunctionType) else _made_event(event, dtype)
+
+
+@functools.lru_cache(maxsize=64)  # a signature takes as long to read as a short motion
+def _known_event(event: Callable, dtype) -> diffrax.Event:
+    return _made_event(event, dtype)
+
+
+def _made_event(event, dtype) -> diffrax.Event:
     condition = event.cond_fn if isinstance(event, diffrax.Event) else event
     _, functions, _ = taken_apart(condition, "event", is_leaf=lambda leaf: leaf is None or callable(leaf))
     if not functions or not all(map(callable, functions)):

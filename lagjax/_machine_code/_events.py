@@ -55,6 +55,12 @@ class Noted(NamedTuple):
 
 def surfaces_of_event(problem: Problem) -> Surfaces | str:
     """The functions of an event as surfaces, or why they are not for machine code, as the end of a sentence."""
+    if "surfaces" not in problem.made:
+        problem.made["surfaces"] = _surfaces_of_event(problem)
+    return problem.made["surfaces"]
+
+
+def _surfaces_of_event(problem: Problem) -> Surfaces | str:
     event = problem.event
     assert event is not None
     if has_own_root_finder(event):
