@@ -150,3 +150,14 @@ def test_a_belt_that_changes_its_speed():
     run = lagjax.simulate(scene, 0.0, 0.5, np.array([0.0, 1.0, 1.5, 1.75, 2.0, 2.25, 3.0]))
     np.testing.assert_allclose(run.q, [0.0, 0.5, 0.625, 0.59375, 0.53125, 0.5, 0.5], atol=1e-12)
     np.testing.assert_allclose(run.qdot, [0.5, 0.5, 0.0, -0.25, -0.25, 0.0, 0.0], atol=1e-12)
+
+
+def test_three_contacts_of_two_blocks_share_what_they_hold():
+    # Two blocks on the ground and against each other, all with friction of 0.3: one that is pulled holds up to 0.6.
+    def force(q, v, t):
+        between = -0.3 * jnp.sign(v[0] - v[1]) * jnp.array([1.0, -1.0])
+        return between - 0.3 * jnp.sign(v) + jnp.array([0.1 * t, 0.0])
+
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v, forces=force)
+    run = lagjax.simulate(scene, jnp.zeros(2), jnp.zeros(2), np.array([0.0, 5.9, 7.0, 12.0]))
+    np.testing.assert_allclose(run.qdot[1:], [[0.0, 0.0], [0.05, 0.0], [1.8, 0.0]], atol=1e-12)

@@ -25,6 +25,7 @@ from lagjax._native._constants import (
     MOST_HALVINGS,
     MOST_LOOKS,
     NEARBY,
+    NEGLIGIBLE,
     NO_TIME,
     PAST,
     RISE,
@@ -204,6 +205,9 @@ class Borders:
         self._polynomial(frame, j, degree, h, code.select(undecided, frame.constant(1.0), side), level)
         leads = self._leads(frame, degree)
         self._divide(frame, g, degree)
+        # A border that it touches is not left, or gone back over, by less than what nobody asks for.
+        nothing = self._size(frame, degree) <= NEGLIGIBLE * code.lanes_of(frame.job("atol"))
+        idle = idle | (nothing & (frame["touching", g] > 0.0) & ~undecided)
         self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), frame.job("atol"))
         frame.call(self.roots.first_root, degree)
         self._look_closer(frame, degree)

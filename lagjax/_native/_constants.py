@@ -107,6 +107,8 @@ EARLY, MOST_LOOKS = 0.25, 8
 AT_ONCE = 2.0**-36
 # Borders of one guard that are crossed at one instant, before the motion is said not to get on.
 MOST_CROSSINGS = 4
+# Of atol: by what a motion along a border may leave it in a step, which rounding of what holds it there does.
+NEGLIGIBLE = 1e-3
 # A border that is reached within this part of the smallest step from another one is bounced off without end: the
 # motion rests on it. What is left of its velocity is as small as that.
 NO_TIME = 0.25

@@ -456,13 +456,15 @@ class _Rewriting:
             else:
                 nodes.append(graph.apply(op, *(nodes[i] for i in operands), attribute=attribute))
         goes_on, zero, one = [], graph.constant(0.0, "float"), graph.constant(1.0, "float")
+        pieces = [nodes[i] for i in self.pieces]
         for k, slide in enumerate(slides):
             begins = graph.apply("eq", nodes[self.pieces[slide.piece]], zero)
             if slide.order > 1:
                 begins = graph.apply("and", begins, graph.apply("eq", self._rate(graph, nodes, slide), zero))
             flag = graph.input(first + len(self.pieces) + k, "float")
             goes_on.append(graph.apply("select", begins, flag, one))
-        return StraightLine(*eliminate_dead_code(graph, [nodes[i] for i in self.pieces] + goes_on))
+            pieces[slide.piece] = graph.apply("select", begins, pieces[slide.piece], one)  # shares count from a side
+        return StraightLine(*eliminate_dead_code(graph, pieces + goes_on))
 
 
 def _raw(graph: Graph, kind: int, x: int, table: Located | None) -> int:

@@ -10,8 +10,10 @@ p + μ instead of p, with A z − Σ μₖ ∂r/∂pₖ = r, and one row more fo
 Its series needs no series of an elimination. Else the program is copied for each of them, a few at most.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from lagjax._program._graph import Graph
 from lagjax._program._series import LinearSystem, StraightLine
@@ -19,9 +21,10 @@ from lagjax._program._transpose import copied, gradient_in
 
 MOST_SLIDING = 64  # pieces that are unknowns of the linear system: their own elimination takes a third of the cube
 MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for each of which a program is copied, and its operations
-# Of ∂u̇/∂p: what is left of it where other borders hold the motion is nothing, but for rounding.
-DEPENDENT = 1e-9
-NEARLY_NOTHING = 1e-200  # an effect on u̇ whose share is beyond 0 and 1, and finite
+# Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
+# mended so many times. The share of what no border holds alone is as exact as rounding, divided by it.
+SOFT, MENDED = 1e-9, 2
+FAR = 1e200  # of a rate: a share that is beyond 0 and 1, and finite
 _LARGEST = 10_000_000  # operations: a bound for errors
 
 
@@ -90,43 +93,82 @@ class _Unknowns:
         acts = self._acts()
         if acts is None:
             return None
-        f, n, system, count = self.f, self.n, self.linear, len(self.slides)
-        slopes, rates = zip(*map(self._rate, range(count)), strict=True)
-        solve = system.solve()
-
-        def solved(right):
-            nodes = copied(self.graph, solve.line, [*system.factors, *right])
-            return [nodes[i] for i in solve.line.outputs]
-
-        rows = []
-        responses = [solved([act.get(i, self.zero) for i in range(len(system.right))])[:n] for act in acts]
-        for k in range(count):
-            row = [dot(self.graph, slopes[k], response) for response in responses]
-            row[k] = f("select", self.flags[k], self.one, row[k])
-            rows.append(row)
-        lower = eliminate(self.graph, rows, self._safe)
-        missing = [f("sub", rate, dot(self.graph, d, system.z[:n])) for d, rate in zip(slopes, rates, strict=True)]
-        unknown = substitute(self.graph, rows, lower, missing)
-        z = solved(self._pushed(system.right, acts, unknown))
-        half = self.number(0.5)
-        shares = [
-            f("mul", half, f("add", self.one, f("add", p, mu))) for p, mu in zip(self.pieces, unknown, strict=True)
+        slopes, rates = zip(*map(self._rate, range(len(self.slides))), strict=True)
+        effects = self._effects(acts, slopes)
+        pushed = [self.f("lt", row[k], self.zero) for k, row in enumerate(effects)]
+        # Borders that are not pushed onto are left, and act on nothing until then.
+        acts = [
+            {i: self.f("select", p, self.zero, c) for i, c in act.items()} for p, act in zip(pushed, acts, strict=True)
         ]
-        linear = self._system(z, unknown, acts, slopes, rates, rows, lower)
-        outputs = (*z[:n], *self.line.outputs[n:])
+        normals = [[self.f("select", p, self.zero, d) for d in of] for p, of in zip(pushed, slopes, strict=True)]
+        equations = self._equations(effects, pushed, slopes)
+        missing = [
+            self.f("sub", self.f("select", p, self.zero, rate), dot(self.graph, d, self.linear.z[: self.n]))
+            for p, d, rate in zip(pushed, normals, rates, strict=True)
+        ]
+        unknown = self._unknown(equations, missing)
+        z = self._solved(self._pushed(self.linear.right, acts, unknown))
+        shares = [self._share(k, pushed[k], unknown[k], slopes[k], rates[k], z) for k in range(len(acts))]
+        ends = [self.f("select", p, self.zero, rate) for p, rate in zip(pushed, rates, strict=True)]
+        linear = self._system(z, unknown, acts, normals, ends, equations)
+        outputs = (*z[: self.n], *self.line.outputs[self.n :])
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), outputs)
         return Sliding(line, range(len(self.line.nodes)), shares, linear)
 
-    def _safe(self, k: int, own: int, pivot: int) -> int:
-        """∂u̇/∂p, `own`, of a border that both sides push onto is negative; of any other one the share is far away.
+    def _solved(self, right: Sequence[int]) -> list[int]:
+        """z of A z = r."""
+        line = self.linear.solve().line
+        nodes = copied(self.graph, line, [*self.linear.factors, *right])
+        return [nodes[i] for i in line.outputs]
 
-        Where others do what it would do, it does nothing.
-        """
-        f = self.f
-        alone = f("lt", pivot, f("mul", self.number(DEPENDENT), own))
-        pushes = f("select", alone, self.number(-1 / NEARLY_NOTHING), pivot)
-        pushes = f("select", f("lt", own, self.zero), self.number(-NEARLY_NOTHING), pushes)
-        return f("select", self.flags[k], self.one, pushes)
+    def _effects(self, acts: Sequence[dict[int, int]], slopes: Sequence[list[int]]) -> list[list[int]]:
+        """What each piece does to the rate of each border, ∂u̇/∂p; zeros where nothing slides."""
+        size = len(self.linear.right)
+        responses = [self._solved([act.get(i, self.zero) for i in range(size)])[: self.n] for act in acts]
+        return [[dot(self.graph, d, response) for response in responses] for d in slopes]
+
+    def _equations(self, effects: list[list[int]], pushed: Sequence[int], slopes: Sequence[list[int]]) -> "_Equations":
+        """The linear equations of μ; μ = 0 where there is nothing to do."""
+        f, rows = self.f, []
+        for k, row in enumerate(effects):
+            both = [
+                f("select", pushed[k], self.zero, f("select", p, self.zero, x))
+                for p, x in zip(pushed, row, strict=True)
+            ]
+            both[k] = f("select", pushed[k], self.one, row[k])
+            rows.append(both)
+        soft = self._are_dependent(slopes)
+        whole = [list(row) for row in rows]
+        if soft:
+            for k, row in enumerate(rows):
+                row[k] = f("mul", self.number(1 + SOFT), row[k])
+        lower = eliminate(self.graph, rows)
+        return _Equations(rows, lower, whole if soft else [])
+
+    def _unknown(self, equations: "_Equations", missing: list[int]) -> list[int]:
+        """μ; where borders share what they hold, the pieces p + μ are to be small, and not how far they are from p."""
+        if not equations.whole:
+            return equations.solved(self.graph, missing)
+        f, rows = self.f, equations.whole
+        there = [f("add", x, dot(self.graph, row, self.pieces)) for x, row in zip(missing, rows, strict=True)]
+        return [f("sub", x, p) for x, p in zip(equations.solved(self.graph, there), self.pieces, strict=True)]
+
+    def _are_dependent(self, slopes: Sequence[list[int]]) -> bool:
+        """Whether the rates of some borders are combinations of others, so that these can share what they hold."""
+        numbers = np.random.default_rng(0).uniform(0.5, 1.5, (len(slopes), self.n))
+        for k, of_one in enumerate(slopes):
+            for i, d in enumerate(of_one):
+                branch = self.graph.nodes[d][1][2] if self.graph.nodes[d][0] == "select" else d
+                value = self.graph.value(branch)
+                numbers[k, i] = numbers[k, i] if value is None else value
+        return bool(np.linalg.matrix_rank(numbers) < len(slopes))
+
+    def _share(self, k: int, pushed: int, mu: int, slopes: list[int], rate: int, z: Sequence[int]) -> int:
+        """The share of the upper side: (1 + p + μ)/2, and far beyond 0 or 1 where both sides do not push."""
+        f, half = self.f, self.number(0.5)
+        own = f("mul", half, f("add", self.one, f("add", self.pieces[k], mu)))
+        moves = f("sub", dot(self.graph, slopes, z[: self.n]), rate)
+        return f("select", pushed, f("add", half, f("mul", self.number(FAR), moves)), own)
 
     def _pushed(self, right: Sequence[int], acts: Sequence[dict[int, int]], unknown: Sequence[int]) -> list[int]:
         """r + Σ μₖ ∂r/∂pₖ."""
@@ -190,7 +232,7 @@ class _Unknowns:
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), ())
         return gradient_in(self.graph, line, list(range(len(line.nodes))), node, range(2 * self.n + 1))
 
-    def _system(self, z, unknown, acts, slopes, rates, rows, lower) -> LinearSystem:
+    def _system(self, z, unknown, acts, slopes, rates, equations) -> LinearSystem:
         system, count = self.linear, len(self.linear.right)
         others = {(i, count + k): self.f("neg", c) for k, act in enumerate(acts) for i, c in act.items()}
         others |= {
@@ -200,7 +242,7 @@ class _Unknowns:
             if self.graph.value(d) != 0
         }
         # What `solve` needs besides: the entries, and the elimination of the unknowns.
-        own = [*others.values(), *(x for row in rows for x in row), *(x for row in lower for x in row)]
+        own = [*others.values(), *(x for table in equations for row in table for x in row)]
         known = {x: self.graph.value(x) for x in own}
         read = list(dict.fromkeys(x for x in own if known[x] is None))
         factors = (*system.factors, *read)
@@ -221,8 +263,7 @@ class _Unknowns:
             for (row, column), d in others.items():
                 if row >= count:
                     ends[row - count] = graph.apply("sub", ends[row - count], graph.apply("mul", at[d], y[column]))
-            upper, factors_below = ([[at[x] for x in row] for row in table] for table in (rows, lower))
-            mu = substitute(graph, upper, factors_below, ends)
+            mu = _Equations(*([[at[x] for x in row] for row in table] for table in equations)).solved(graph, ends)
             for (row, column), c in others.items():
                 if column >= count:
                     right[row] = graph.apply("sub", right[row], graph.apply("mul", at[c], mu[column - count]))
@@ -295,6 +336,23 @@ def _with_copies(
 # ---- a few linear equations ------------------------------------------------------------------------------------------
 
 
+class _Equations(NamedTuple):
+    """Linear equations after `eliminate`, and as they are where they are solved softly (`SOFT`)."""
+
+    upper: list[list[int]]
+    lower: list[list[int]]
+    whole: list[list[int]]
+
+    def solved(self, graph: Graph, right: Sequence[int]) -> list[int]:
+        """Their solution."""
+        x = substitute(graph, self.upper, self.lower, right)
+        for _ in range(MENDED if self.whole else 0):
+            left = [graph.apply("sub", b, dot(graph, row, x)) for b, row in zip(right, self.whole, strict=True)]
+            more = substitute(graph, self.upper, self.lower, left)
+            x = [graph.apply("add", a, b) for a, b in zip(x, more, strict=True)]
+        return x
+
+
 def dot(graph: Graph, xs: Sequence[int], ys: Sequence[int]) -> int:
     """Σ xᵢ yᵢ."""
     total = graph.constant(0.0, "float")
@@ -303,15 +361,10 @@ def dot(graph: Graph, xs: Sequence[int], ys: Sequence[int]) -> int:
     return total
 
 
-def eliminate(graph: Graph, rows: list[list[int]], safe: Callable = lambda k, own, pivot: pivot) -> list[list[int]]:
-    """Eliminate in place, so that `rows` become upper triangular; returns the factors, those of row i to 0 … i − 1.
-
-    `safe(k, own, pivot)` takes the place of pivot k, which is `own` before the elimination.
-    """
+def eliminate(graph: Graph, rows: list[list[int]]) -> list[list[int]]:
+    """Eliminate in place, so that `rows` become upper triangular; returns the factors, those of row i to 0 … i − 1."""
     f, n, lower = graph.apply, len(rows), [[] for _ in rows]
-    own = [row[k] for k, row in enumerate(rows)]
     for k in range(n):
-        rows[k][k] = safe(k, own[k], rows[k][k])
         for i in range(k + 1, n):
             factor = f("div", rows[i][k], rows[k][k])
             lower[i].append(factor)
