@@ -202,8 +202,13 @@ class Borders:
         undecided = code.compare("==", side, 0.0)
         # Nothing is looked for along the border that the motion slides on, or in the share of one that does not.
         idle = (frame["touching", g] >= SLIDING) | (undecided & is_share)
-        self._polynomial(frame, j, degree, h, code.select(undecided, frame.constant(1.0), side), level)
-        leads = self._leads(frame, degree)
+        with code.only_if(code.any_lane(~idle)):
+            self._polynomial(frame, j, degree, h, code.select(undecided, frame.constant(1.0), side), level)
+            self._look_along(frame, g, degree, h, undecided, beyond, idle)
+
+    def _look_along(self, frame: Frame, g: Value, degree: Value, h: Value, undecided: Value, beyond, idle) -> None:
+        """The first root of guard g, whose polynomial is in `poly`; `beyond` it is that piece."""
+        code, leads = frame.code, self._leads(frame, degree)
         self._divide(frame, g, degree)
         # A border that it touches is not left, or gone back over, by less than what nobody asks for.
         nothing = self._size(frame, degree) <= NEGLIGIBLE * code.lanes_of(frame.job("atol"))
