@@ -347,6 +347,8 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
         steps.append(taken)
         if name != "right":
             print(f"{seed} {name}: error {error:.1e}, growth {growth:.0e}, {taken} steps: {text}", flush=True)
+        if sum(counts.values()) % 50 == 0:
+            print(f"up to {seed}: {dict(counts)}", file=sys.stderr, flush=True)
     print(f"{dict(counts)}; steps: median {np.median(steps):.0f}, most {max(steps)}", file=sys.stderr)
     return counts
 
