@@ -8,6 +8,7 @@ from lagjax._check import Finding, Findings, check
 from lagjax._crossings import Crossings, crossings
 from lagjax._diffrax._solvers import FineOutput
 from lagjax._explain import Explanation
+from lagjax._fit import Fit, Gaussian, Guess, Record, StudentT, between, fit, positive
 from lagjax._health import Health
 from lagjax._hybrid import Transition, simulate_hybrid
 from lagjax._machine_code import MachineCode
@@ -26,19 +27,27 @@ __all__ = [
     "Finding",
     "Findings",
     "FineOutput",
+    "Fit",
+    "Gaussian",
+    "Guess",
     "Health",
     "MachineCode",
+    "Record",
     "SimulationError",
     "State",
+    "StudentT",
     "System",
     "Trajectory",
     "Transition",
     "Transitions",
     "WorkPrecision",
     "WorkPrecisionRow",
+    "between",
     "check",
     "crossings",
+    "fit",
     "plot",
+    "positive",
     "samples",
     "scenes",
     "simulate",

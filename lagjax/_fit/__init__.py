@@ -1,0 +1,257 @@
+"""`fit`: the parameters of a scene, and of its forces, from recordings of its motion.
+
+    Record ─► Question ─► segments ─► Descent ─► Information ─► Fit
+    measured  flat, one   where the   the least   covariance,    in the user's
+    checked   batch       search      squares     null           pytree, in words
+                          begins                  directions
+
+Files: `_records`, `_parameters` and `_transforms` take what the user gives; `_motions` and `_signals` follow motions
+and sensors with their derivatives; `_residuals` and `_noise` say how far off a trial is; `_segments` says where to
+begin, `_solve` goes down from there; `_uncertainty`, `_unseen` and `_result` say what that means.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._consistent import has_constraints
+from lagjax._fit._motions import motions_of
+from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
+from lagjax._fit._parameters import Parameters
+from lagjax._fit._records import Guess, Record, in_structure, known_start, require_alike
+from lagjax._fit._residuals import Failure, Question
+from lagjax._fit._result import Covariance, Fit, SignalNoise
+from lagjax._fit._segments import Reader, glimpses, levels, shortest, time_scale, whole
+from lagjax._fit._signals import Signals, looks_like_positions
+from lagjax._fit._solve import Anchor, Descent, minimise
+from lagjax._fit._transforms import between, positive
+from lagjax._fit._uncertainty import Information, information
+from lagjax._fit._unseen import sentences
+from lagjax._layout import Layout
+from lagjax._problem import DEFAULT_RTOL
+from lagjax._system import System, require_system
+
+__all__ = ["Fit", "Gaussian", "Guess", "Record", "StudentT", "between", "fit", "positive"]
+PyTree = Any
+
+METHODS = ("auto", "segments", "whole")
+# In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
+# independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.
+_ENOUGH, _ENOUGH_OF_LEVEL = 1e-3, 1e-3
+_LOOSE = 3.0  # standard deviations of u about its first value on these levels, where u is a logarithm or the like
+_TRIALS, _TRIALS_OF_LEVEL = 60, 20
+
+
+def fit(
+    system: System,
+    records: Record | list[Record],
+    params0: PyTree,
+    *,
+    observe: Callable | None = None,
+    free: PyTree = None,
+    transforms: PyTree = None,
+    noise: AbstractNoise | None = None,
+    method: str = "auto",
+) -> Fit:
+    r"""The parameters of a scene that make recordings of its motion likeliest, with what is known about them.
+
+    Minimises Σ w (observe(q(t), q̇(t)) − value)²/σ² over all samples, with one σ per signal, which is estimated too,
+    by the free numbers of the parameters and by the start of every record whose start is not known.
+
+    **Arguments**
+
+    - `records`: one `Record` or several, of any lengths.
+    - `params0`: where the search for the parameters begins, in the structure that the scene's functions ask for.
+    - `observe`: a function of (q, qdot), and of `t`, `params` by name, that returns what the sensors show in the
+      structure of a record's `values`; by default q.
+    - `free`: True or False for every parameter, or for whole branches of `params0`; by default all floats are free.
+    - `transforms`: `lagjax.positive`, `lagjax.between(a, b)` or None for every parameter or branch. A parameter that
+      is known to be positive should say so: its search and its interval are then relative.
+    - `noise`: `lagjax.Gaussian()`, the default, or `lagjax.StudentT()` where some samples are far off.
+    - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
+      its own read off the data, and lets these grow together: for that the signals must have the structure of q. "auto"
+      does that where the signals allow it and records are longer than the motion's time scale, so that long and chaotic
+      records, and parameters that are far off, find their minimum.
+
+    Intervals count correlated residuals for what they are worth (`Fit.noise`); what cannot be seen in the data is said
+    in words (`Fit.unseen`) and has infinite intervals.
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, and where the motion from the first
+    trial cannot be followed, with the record and the time.
+
+    Source: Schittkowski, *Numerical Data Fitting in Dynamical Systems* (2002); Seber & Wild, *Nonlinear Regression*
+    (1989), for intervals.
+
+    ```python
+    import jax, jax.numpy as jnp, lagjax
+    jax.config.update("jax_enable_x64", True)
+
+    scene = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
+    ts = jnp.linspace(0.0, 5.0, 101)
+    record = lagjax.Record(ts, jnp.cos(1.5 * ts) + 1e-3 * jax.random.normal(jax.random.key(0), ts.shape))
+    print(lagjax.fit(scene, record, {"k": 1.0}, transforms=lagjax.positive))
+    ```
+    """
+    require_system(system)
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}; got {method!r}.")
+    noise = Gaussian() if noise is None else noise
+    if not isinstance(noise, AbstractNoise):
+        raise TypeError(f"noise must be lagjax.Gaussian() or lagjax.StudentT(); got {noise!r}.")
+    records = require_alike(records)
+    layout = _layout(records)
+    parameters = Parameters.of(params0, free, transforms, layout.dtype)
+    question = _question(system, records, layout, parameters, observe)
+    readers = [Reader.of(record) for record in records] if looks_like_positions(observe, records[0], layout) else None
+    starts = np.stack([_start(record, readers, layout, k) for k, record in enumerate(records)])
+    descent = _search(question, parameters.moved(parameters.first), starts, noise, method, readers)
+    return _told(system, observe, question, descent)
+
+
+def _layout(records: list[Record]) -> Layout:
+    """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
+    for record in records:
+        if record.start is not None:
+            return Layout.of(*record.start)
+    one_time = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values)
+    return Layout.of(one_time, one_time)
+
+
+def _question(system, records, layout, parameters, observe) -> Question:
+    """The question about whole records."""
+    rtol = DEFAULT_RTOL[layout.dtype]
+    motions = motions_of(system, layout, parameters, rtol, None)
+    signals = Signals(observe, layout, parameters, records[0])
+    size = np.sqrt(np.nanmean(np.concatenate([record.matrix for record in records]) ** 2, axis=0))
+    fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
+    if fitted.any() and has_constraints(system):
+        raise ValueError(
+            f"records[{int(np.argmax(fitted))}] has no known start: a start on constraints cannot be fitted yet. Give "
+            "start=(q0, qdot0), or use coordinates without constraints."
+        )
+    least = rtol * np.where(size > 0, size, 1.0)
+    return Question(records, whole(records), fitted, motions, signals, parameters, least)
+
+
+def _start(record: Record, readers: list[Reader] | None, layout: Layout, place: int) -> np.ndarray:
+    """Where the search for the start of one record begins, (2n,)."""
+    state = known_start(record, layout, place)
+    if state is not None:
+        return state
+    if readers is None:
+        raise ValueError(
+            f"records[{place}] needs a start, because its values do not have the structure of q: give "
+            "start=(q0, qdot0) if it is known, else start=lagjax.Guess(q0, qdot0)."
+        )
+    return readers[place].states(np.array([0]))[0]
+
+
+def _search(question: Question, u, starts, noise, method: str, readers) -> Descent:
+    """The search of whole records, after that of growing segments where the method asks for it."""
+    if method == "segments" and readers is None:
+        raise ValueError('method="segments" reads starts off the data: for that values must have the structure of q.')
+    if method != "whole" and readers is not None:
+        u, starts = _grown(question, u, starts, noise, readers)
+    done = minimise(question, u, starts, noise, _ENOUGH, _TRIALS)
+    if isinstance(done, Failure):
+        raise ValueError(question.where(done) + " Begin nearer: other params0, or starts that are known.")
+    return done
+
+
+def _grown(question: Question, u, starts, noise, readers: list[Reader]) -> tuple[np.ndarray, np.ndarray]:
+    """Better first values of u and of the starts, from segments that grow together to whole records."""
+    records = question.records
+    scale = time_scale(readers, question.motions, question.parameters.numbers(u))
+    anchor = Anchor(u, np.where(np.isfinite(question.parameters.reach), 1.0 / _LOOSE, 0.0))
+    if scale < shortest(records):
+        u = _glimpsed(question, u, noise, readers, scale, anchor)
+        scale = time_scale(readers, question.motions, question.parameters.numbers(u))
+    best: dict[tuple[int, int], np.ndarray] = {(k, 0): start for k, start in enumerate(starts)}
+    for pieces in levels(records, scale):
+        firsts = [(piece.record, int(piece.places[0])) for piece in pieces]
+        for k, reader in enumerate(readers):
+            new = [place for record, place in firsts if record == k and (k, place) not in best]
+            if new:
+                best |= {(k, place): y for place, y in zip(new, reader.states(np.array(new)), strict=True)}
+        part = question.of(pieces, np.array([question.fitted[k] or place > 0 for k, place in firsts]))
+        y0 = np.stack([best[first] for first in firsts])
+        done = minimise(part, u, y0, noise, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
+        if isinstance(done, Failure):
+            break  # whole records then begin from the best so far, and say so if they fail as well
+        u = done.point.u
+        best |= dict(zip(firsts, done.point.starts, strict=True))
+    return u, np.stack([best[k, 0] for k in range(len(records))])
+
+
+def _glimpsed(question: Question, u, noise, readers: list[Reader], scale: float, anchor: Anchor) -> np.ndarray:
+    """Better first values of u where the scene moves faster than the samples follow each other."""
+    short, states = glimpses(readers, scale)
+    part = Question(
+        short, whole(short), np.ones(len(short), bool), question.motions, question.signals, question.parameters,
+        question.least,
+    )  # fmt: skip
+    done = minimise(part, u, states, noise, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
+    return u if isinstance(done, Failure) else done.point.u
+
+
+# ---- what came out ---------------------------------------------------------------------------------------------------
+
+
+def _told(system, observe, question: Question, descent: Descent) -> Fit:
+    """The result in the user's structures and in words."""
+    point, widths, parameters, n = descent.point, descent.widths, question.parameters, question.layout.size
+    known = information(question, point, widths)
+    unseen = sentences(question, point, widths, known.null)
+    restore = question.layout.restore
+    slopes = parameters.slopes(point.u)
+    return Fit(
+        params=parameters.restore(parameters.numbers(point.u)),
+        starts=tuple((restore(y[:n]), restore(y[n:])) for y in point.starts),
+        covariance=Covariance(parameters.names, known.covariance * np.outer(slopes, slopes)),
+        noise=_noise_by_name(question, widths, known),
+        residuals=_by_record(question, point),
+        unseen=unseen,
+        ok=descent.converged and not unseen,
+        message=_message(descent, unseen, known),
+        log_likelihood=log_likelihood(widths, point.flat(), question.weights),
+        trials=descent.trials,
+        records=tuple(question.records),
+        parameters=parameters,
+        u=point.u,
+        information=known,
+        widths=widths,
+        question=question,
+        system=system,
+        observe=observe,
+    )
+
+
+def _noise_by_name(question: Question, widths, known: Information) -> dict[str, SignalNoise]:
+    samples = (question.weights > 0).sum(axis=0)
+    columns = zip(widths.sigma, widths.dof, samples, known.effective, 2 * (1 - known.correlation), strict=True)
+    return {
+        name: SignalNoise(float(sigma), float(dof), int(count), float(effective), float(watson))
+        for name, (sigma, dof, count, effective, watson) in zip(question.signals.names, columns, strict=True)
+    }
+
+
+def _by_record(question: Question, point) -> tuple[PyTree, ...]:
+    found: dict[int, PyTree] = {}
+    for batch, residuals in zip(question.batches, point.residuals, strict=True):
+        for row, left, weights in zip(batch.rows.tolist(), residuals, batch.weights, strict=True):
+            record = question.records[row]
+            matrix = np.where(weights > 0, left, np.nan)[: len(record)]
+            found[row] = in_structure(matrix, record)
+    return tuple(found[row] for row in range(len(question.records)))
+
+
+def _message(descent: Descent, unseen, known: Information) -> str:
+    parts = [descent.message]
+    if unseen:
+        parts.append("Not everything that is free is seen: fix it, or measure more.")
+    if np.nanmax(known.correlation) > 0.5:
+        parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
+    return " ".join(parts)

@@ -1,0 +1,254 @@
+"""`Record`: one recording of a motion; `Samples`: pieces of records side by side, as rows of one batch."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from lagjax._layout import Layout, taken_apart
+
+PyTree = Any
+
+
+class Guess(NamedTuple):
+    """A start (q, qdot) that is fitted: where the search for it begins. `Record(..., start=lagjax.Guess(q, v))`."""
+
+    q: PyTree
+    qdot: PyTree
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One recording: what was measured at which times.
+
+    - `ts` (T,): the times, strictly increasing, T ≥ 2. Records need not be equally long, nor equally spaced.
+    - `values`: the measured signals in the structure that `observe` returns, with the times as first axis of every
+      leaf; by default that of q. NaN where a sample is missing.
+    - `start`: the state at `ts[0]`. A pair (q0, qdot0) is known and kept. `lagjax.Guess(q0, qdot0)` is where the search
+      for it begins. With None it is fitted, from local polynomials through the values.
+    - `weights`: how much each sample counts, one number or a prefix of the structure of `values`: the variance of a
+      sample is that of its signal over its weight. Zero leaves a sample out.
+    - `inputs`: not there yet. An input that was sampled goes into `forces` as a function of `t`.
+
+    **Raises** `TypeError` or `ValueError` where these cannot be right.
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    ts = jnp.linspace(0.0, 1.0, 101)
+    record = lagjax.Record(ts, jnp.cos(3.0 * ts))
+    ```
+    """
+
+    ts: np.ndarray
+    values: PyTree
+    inputs: None = None
+    start: tuple[PyTree, PyTree] | Guess | None = None
+    weights: PyTree = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "ts", _times(self.ts))
+        labels, leaves, tree = taken_apart(self.values, "values")
+        leaves = [_signal(leaf, label, len(self.ts)) for label, leaf in zip(labels, leaves, strict=True)]
+        if not any(leaf.size for leaf in leaves):
+            raise ValueError("values holds no signal: give an array with the times as first axis.")
+        object.__setattr__(self, "values", tree.unflatten(leaves))
+        if self.inputs is not None:
+            raise NotImplementedError(
+                "Sampled inputs are not there yet: let `forces` compute the input as a function of `t`."
+            )
+        if self.start is not None and not (isinstance(self.start, tuple) and len(self.start) == 2):
+            raise TypeError(f"start must be (q0, qdot0), lagjax.Guess(q0, qdot0) or None; got {self.start!r}.")
+        _matrix_of_weights(self)
+
+    def __len__(self) -> int:
+        return len(self.ts)
+
+    def __repr__(self) -> str:
+        signals = self.matrix.shape[1]
+        missing = int(np.isnan(self.matrix).sum())
+        gaps = f", {missing} values missing" if missing else ""
+        return f"Record(t from {self.ts[0]:g} to {self.ts[-1]:g}, {len(self)} samples of {signals} signals{gaps})"
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """All signals side by side, (T, S); NaN where missing."""
+        return np.concatenate([leaf.reshape(len(self), -1) for leaf in jax.tree.leaves(self.values)], axis=1)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the signals are called, (S,): `['x'][0]` or empty for the only one."""
+        labels, leaves, _ = taken_apart(self.values, "")
+        return tuple(
+            label + (f"[{', '.join(map(str, index))}]" if leaf.ndim > 1 else "")
+            for label, leaf in zip(labels, leaves, strict=True)
+            for index in np.ndindex(leaf.shape[1:])
+        )
+
+    @property
+    def structure(self) -> tuple:
+        """What must be the same for records of one fit: the tree of the signals and their shapes."""
+        leaves, tree = jax.tree.flatten(self.values)
+        return tree, tuple(leaf.shape[1:] for leaf in leaves)
+
+    @property
+    def weight_matrix(self) -> np.ndarray:
+        """The weight of every sample (T, S), zero where it is missing."""
+        return _matrix_of_weights(self)
+
+
+def _times(ts) -> np.ndarray:
+    try:
+        times = np.asarray(ts, np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"ts must be an array of times; got {type(ts).__name__}.") from None
+    if times.ndim != 1 or len(times) < 2:
+        raise ValueError(f"ts must hold at least two times, in one dimension; got shape {times.shape}.")
+    if not np.isfinite(times).all():
+        raise ValueError(f"ts[{int(np.argmin(np.isfinite(times)))}] is not finite: every time must be.")
+    if not (np.diff(times) > 0).all():
+        place = int(np.argmax(np.diff(times) <= 0))
+        raise ValueError(
+            f"ts must increase strictly; ts[{place}] = {times[place]:g} is followed by {times[place + 1]:g}. "
+            "Sort the samples, and keep one of each time."
+        )
+    return times
+
+
+def _signal(leaf, label: str, times: int) -> np.ndarray:
+    try:
+        values = np.asarray(leaf, np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"{label} must be an array of real numbers; got {type(leaf).__name__}.") from None
+    if values.ndim == 0 or len(values) != times:
+        raise ValueError(f"{label} must have the {times} times as its first axis; got shape {values.shape}.")
+    if np.isinf(values).any():
+        place = np.argwhere(np.isinf(values))[0].tolist()
+        raise ValueError(f"{label}{place} is infinite: write NaN for a sample that is missing.")
+    return values
+
+
+def _matrix_of_weights(record: Record) -> np.ndarray:
+    """The weights (T, S) of a record. Raises `ValueError` for what fits no structure, or is negative."""
+    leaves, tree = jax.tree.flatten(record.values)
+    weights = 1.0 if record.weights is None else record.weights
+    try:
+        spread = tree.flatten_up_to(jax.tree.broadcast(weights, record.values))
+        columns = []
+        for weight, leaf in zip(spread, leaves, strict=True):
+            weight = np.asarray(weight, np.float64)
+            weight = weight.reshape(weight.shape + (1,) * (leaf.ndim - weight.ndim)) if weight.ndim else weight
+            columns.append(np.broadcast_to(weight, leaf.shape).reshape(len(leaf), -1))
+    except ValueError:
+        raise ValueError("weights must be one number, or a prefix of the structure and shapes of values.") from None
+    matrix = np.concatenate(columns, axis=1)
+    if not (np.isfinite(matrix).all() and (matrix >= 0).all()):
+        raise ValueError("weights must be finite and not negative.")
+    return np.where(np.isnan(record.matrix), 0.0, matrix)
+
+
+def in_structure(matrix: np.ndarray, record: Record) -> PyTree:
+    """Signals (T, S) in the structure of a record's values."""
+    tree, shapes = record.structure
+    sizes = [int(np.prod(shape)) for shape in shapes]
+    columns = np.split(matrix, np.cumsum(sizes)[:-1], axis=1)
+    return tree.unflatten(
+        [column.reshape(len(matrix), *shape) for column, shape in zip(columns, shapes, strict=True)]
+    )  # fmt: skip
+
+
+# ---- pieces of records -----------------------------------------------------------------------------------------------
+
+
+class Piece(NamedTuple):
+    """The samples `places` of the record `record`, followed as a motion of its own from the first of them."""
+
+    record: int
+    places: np.ndarray
+
+
+class Samples(NamedTuple):
+    """N pieces of records as rows of one batch, with room for the T samples of the longest.
+
+    - `rows` (N,): the place of each piece among all.
+    - `ts` (N, T): times, and after the last one of a piece times so close to it that following them costs nothing.
+    - `values` (N, T, S), `weights` (N, T, S): signals and how much they count, zero where there is none.
+    """
+
+    rows: np.ndarray
+    ts: np.ndarray
+    values: np.ndarray
+    weights: np.ndarray
+
+
+def batches(records: list[Record], pieces: list[Piece], eps: float = 2.3e-16) -> list[Samples]:
+    """The pieces in batches, none of which is longer than twice its shortest piece: at most half of the room is empty.
+
+    `eps` is the round-off of the numbers that the motion is computed in.
+    """
+    lengths = np.array([len(piece.places) for piece in pieces])
+    order, groups = np.argsort(-lengths, kind="stable"), []
+    for row in order.tolist():
+        if not groups or 2 * lengths[row] < lengths[groups[-1][0]]:
+            groups.append([])
+        groups[-1].append(row)
+    return [_side_by_side(records, pieces, np.sort(rows), eps) for rows in groups]
+
+
+def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, eps: float) -> Samples:
+    longest, signals = max(len(pieces[row].places) for row in rows), records[0].matrix.shape[1]
+    ts = np.zeros((len(rows), longest))
+    values, weights = np.zeros((2, len(rows), longest, signals))
+    matrices = {pieces[row].record: None for row in rows}
+    matrices = {k: (records[k].matrix, records[k].weight_matrix) for k in matrices}
+    for i, row in enumerate(rows):
+        record, places = pieces[row]
+        measured, weight = (matrix[places] for matrix in matrices[record])
+        times, count = records[record].ts[places], len(places)
+        # Eight units of round-off apart: times that still increase.
+        gap = 8 * eps * max(abs(times[0]), abs(times[-1]), times[-1] - times[0])
+        ts[i] = np.concatenate([times, times[-1] + gap * np.arange(1, longest - count + 1)])
+        values[i, :count], weights[i, :count] = np.where(weight > 0, measured, 0.0), weight
+    return Samples(rows, ts, values, weights)
+
+
+def require_alike(records) -> list[Record]:
+    """The records as a list. Raises where there is none, or where they differ in the structure of their signals."""
+    listed = [records] if isinstance(records, Record) else list(records)
+    if not listed:
+        raise ValueError("records is empty: a fit needs at least one lagjax.Record.")
+    for place, record in enumerate(listed):
+        if not isinstance(record, Record):
+            raise TypeError(f"records[{place}] must be a lagjax.Record; got {type(record).__name__}.")
+        if record.structure != listed[0].structure:
+            raise ValueError(
+                f"records[{place}] has other signals than records[0]: {record.structure} and {listed[0].structure}."
+            )
+    measured = np.any([(record.weight_matrix > 0).any(axis=0) for record in listed], axis=0)
+    if not measured.all():
+        which = int(np.argmin(measured))
+        raise ValueError(
+            f"The signal values{listed[0].names[which]} is NaN, or has no weight, at all times of all records: leave "
+            "it out of `values` and of what `observe` returns."
+        )
+    for place, record in enumerate(listed):
+        if not (record.weight_matrix > 0).any():
+            raise ValueError(f"records[{place}] holds no sample: all its values are NaN or have no weight.")
+    return listed
+
+
+def known_start(record: Record, layout: Layout, place: int) -> np.ndarray | None:
+    """The state (2n,) that a record says it starts from, known or guessed; None where it says nothing."""
+    if record.start is None:
+        return None
+    q, qdot = record.start
+    own = Layout.of(q, qdot)
+    if (own.tree, own.shapes) != (layout.tree, layout.shapes):
+        raise ValueError(
+            f"The start of records[{place}] has coordinates {list(own.names)}, not {list(layout.names)} as the others."
+        )
+    state = np.concatenate([np.ravel(np.asarray(leaf, np.float64)) for leaf in jax.tree.leaves((q, qdot))])
+    if not np.isfinite(state).all():
+        raise ValueError(f"The start of records[{place}] is not finite.")
+    return state

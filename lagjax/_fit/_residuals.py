@@ -1,0 +1,158 @@
+"""`Question` and `Point`: what is to be fitted to what, and the residuals of one trial with their derivatives.
+
+The unknowns are u (F,), the free parameters as their transforms move them, and the starts (N, 2n) of the N pieces of
+records. A residual of piece k depends on u and on start k alone: the rows of a piece, D = 2n + F columns and the
+residual, are compressed to a triangle of D + 1 rows (QR), in which all sums of squares are the same.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._fit._motions import AbstractMotions, Motion
+from lagjax._fit._noise import AbstractNoise, Widths, counts
+from lagjax._fit._parameters import Parameters
+from lagjax._fit._records import Piece, Record, Samples, batches
+from lagjax._fit._signals import Signals
+from lagjax._layout import Layout
+
+
+class Point(NamedTuple):
+    """One trial: the unknowns, and for each batch the residuals (N, T, S) and their derivatives (N, T, S, D)."""
+
+    u: np.ndarray
+    starts: np.ndarray
+    residuals: list[np.ndarray]
+    slopes: list[np.ndarray]
+
+    def flat(self) -> np.ndarray:
+        """All residuals, (M, S)."""
+        return np.concatenate([r.reshape(-1, r.shape[-1]) for r in self.residuals])
+
+
+class Failure(NamedTuple):
+    """A trial whose motion could not be followed: the piece, and what became of it."""
+
+    piece: int
+    text: str
+
+
+class Question:
+    """Pieces of records, the scene and its sensors, and what is free.
+
+    `fitted` (N,) says of each piece whether its start is free; `least` (S,) is the smallest width of noise that the
+    tolerances of the motion allow to tell.
+    """
+
+    def __init__(
+        self,
+        records: list[Record],
+        pieces: list[Piece],
+        fitted: np.ndarray,
+        motions: AbstractMotions,
+        signals: Signals,
+        parameters: Parameters,
+        least: np.ndarray,
+    ):
+        self.records, self.pieces, self.fitted, self.least = records, pieces, fitted, least
+        self.motions, self.signals, self.parameters = motions, signals, parameters
+        self.layout: Layout = signals.layout
+        self.batches: list[Samples] = batches(records, pieces, float(np.finfo(self.layout.dtype).eps))
+        self.weights = np.concatenate([b.weights.reshape(-1, len(least)) for b in self.batches])
+        self.measured = int((self.weights > 0).sum())
+
+    @property
+    def states(self) -> int:
+        """2n, the numbers of a start."""
+        return 2 * self.layout.size
+
+    def of(self, pieces: list[Piece], fitted: np.ndarray) -> "Question":
+        """The same question about other pieces of the records."""
+        return Question(
+            self.records, pieces, fitted, self.motions, self.signals, self.parameters, self.least
+        )  # fmt: skip
+
+    def at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
+        """The residuals of one trial, or the first piece whose motion failed."""
+        numbers, directions = self.parameters.numbers(u), self.parameters.directions(u)
+        if not (np.isfinite(numbers).all() and np.isfinite(directions).all() and np.isfinite(starts).all()):
+            return Failure(0, "A parameter is not finite.")
+        residuals, slopes = [], []
+        for batch in self.batches:
+            motion = self.motions.follow(batch.ts, starts[batch.rows], numbers, directions)
+            if not motion.ok:
+                row, text = motion.why_not(batch.ts, self.layout)
+                return Failure(int(batch.rows[row]), text)
+            failure = self._collect(batch, motion, numbers, directions, residuals, slopes)
+            if failure is not None:
+                return failure
+        return Point(u, starts, residuals, slopes)
+
+    def _collect(self, batch: Samples, motion: Motion, numbers, directions, residuals, slopes) -> Failure | None:
+        """Append the residuals of one batch and their derivatives; the first that is not finite as a failure."""
+        values, by_unknowns = self.signals.of(motion, batch.ts, numbers, directions)
+        counted = batch.weights > 0
+        bad = counted & ~(np.isfinite(values) & np.isfinite(by_unknowns).all(axis=-1))
+        if bad.any():
+            row, place, signal = np.argwhere(bad)[0]
+            sample = self.pieces[batch.rows[row]].places[place]
+            return Failure(
+                int(batch.rows[row]),
+                f"What `observe` returns for {self.signals.names[signal]}, or its derivative, is not finite at sample "
+                f"{sample}, t = {batch.ts[row, place]:g}.",
+            )
+        by_unknowns[~self.fitted[batch.rows], ..., : self.states] = 0.0
+        residuals.append(np.where(counted, values - batch.values, 0.0))
+        slopes.append(np.where(counted[..., None], by_unknowns, 0.0))
+        return None
+
+    def widths(self, point: Point, noise: AbstractNoise) -> Widths:
+        """The noise of the signals that makes the residuals of a trial likeliest."""
+        return noise.widths(point.flat(), self.weights, self.least)
+
+    def factors(self, point: Point, widths: Widths) -> list[np.ndarray]:
+        """√count/σ of every sample, by which its residual enters the sum of squares."""
+        return [
+            np.sqrt(counts(widths, r, batch.weights)) / widths.sigma
+            for r, batch in zip(point.residuals, self.batches, strict=True)
+        ]
+
+    def cost(self, point: Point, factors: list[np.ndarray]) -> float:
+        """Half the weighted sum of squares."""
+        return 0.5 * sum(float(np.sum((f * r) ** 2)) for f, r in zip(factors, point.residuals, strict=True))
+
+    def triangles(self, point: Point, factors: list[np.ndarray]) -> np.ndarray:
+        """The weighted rows of each piece, compressed: (N, D + 1, D + 1), the residual as last column."""
+        columns = point.slopes[0].shape[-1] + 1
+        found = np.zeros((len(self.pieces), columns, columns))
+        for batch, factor, r, slopes in zip(self.batches, factors, point.residuals, point.slopes, strict=True):
+            rows = np.concatenate([slopes, r[..., None]], axis=-1)
+            rows *= factor[..., None]
+            found[batch.rows] = compressed(rows.reshape(len(r), -1, columns))
+        return found
+
+    def where(self, failure: Failure) -> str:
+        """A sentence for a failure, with the record's number."""
+        piece = self.pieces[failure.piece]
+        begin = self.records[piece.record].ts[piece.places[0]]
+        return f"The motion of records[{piece.record}] from t = {begin:g} failed. {failure.text}"
+
+
+_BLOCK = 8  # times as many rows as columns in one factorisation
+
+
+def compressed(rows: np.ndarray) -> np.ndarray:
+    """The triangles (N, D, D) of N tall matrices (N, M, D), block by block.
+
+    Blocks stay in the cache, and are too small for a BLAS to start threads that wait for each other.
+    """
+    pieces, _, columns = rows.shape
+    while rows.shape[1] > columns:
+        height = min(_BLOCK * columns, rows.shape[1])
+        missing = -rows.shape[1] % height
+        rows = np.concatenate([rows, np.zeros((pieces, missing, columns))], axis=1) if missing else rows
+        blocks = np.linalg.qr(rows.reshape(-1, height, columns), mode="r")
+        rows = blocks.reshape(pieces, -1, columns)
+    found = np.zeros((pieces, columns, columns))
+    found[:, : rows.shape[1]] = rows
+    return found

@@ -1,0 +1,161 @@
+"""`minimise`: Gauss–Newton with Levenberg's and Marquardt's damping, the starts of the pieces eliminated one by one.
+
+The damped step (δu, δs₁ … δs_N) minimises Σₖ |Aₖ δsₖ + Bₖ δu + rₖ|² + λ |scale · step|². One QR of the small triangle
+of piece k takes out δsₖ: its first 2n rows say what δsₖ follows from δu, the rest says what piece k wants of δu. Below
+each other these rests are a problem of F columns. That is the Schur complement of the normal equations without ever
+forming them, which would square the condition; the cost is linear in the number of pieces.
+
+Which library: none, for this step. `scipy.optimize.least_squares` (trf) factors one dense Jacobian of F + 2nN columns,
+which is cubic in the number of pieces, or takes inexact steps by LSMR on a sparse one; optimistix has neither blocks
+nor bounds and compiles its loop anew for every shape. What is kept of them is the rest: bounds are transforms, robust
+losses are weights (`_noise`), and the tests hold the end point to that of `scipy.optimize.least_squares`.
+
+Source: Moré, *The Levenberg–Marquardt algorithm: implementation and theory* (1978), for scaling by columns; Madsen,
+Nielsen & Tingleff, *Methods for non-linear least squares problems* (2004), §3.2, for λ; Bock (1987) for elimination.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._fit._noise import AbstractNoise, Widths
+from lagjax._fit._residuals import Failure, Point, Question, compressed
+
+# Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
+# least one, damping is below the round-off of derivatives and only keeps columns that nothing depends on from moving.
+_FIRST, _LEAST, _MOST = 1e-4, 1e-14, 1e12
+
+
+class Descent(NamedTuple):
+    """Where a search ended: the last trial, its noise, whether it converged, how many trials, and a sentence."""
+
+    point: Point
+    widths: Widths
+    converged: bool
+    trials: int
+    message: str
+
+
+class Step(NamedTuple):
+    """δu (F,), δs (N, 2n), and by how much half the sum of squares falls if all is linear."""
+
+    u: np.ndarray
+    starts: np.ndarray
+    gain: float
+
+
+class Anchor(NamedTuple):
+    """Σ (weight · (u − centre))²/2 beside half the sum of squares: what data say little about stays where it was."""
+
+    centre: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def none(cls, u: np.ndarray) -> "Anchor":
+        """No weight at all."""
+        return cls(u, np.zeros_like(u))
+
+    def pull(self, u: np.ndarray) -> np.ndarray:
+        """The residuals of the anchor (F,)."""
+        return self.weight * (u - self.centre)
+
+    def cost(self, u: np.ndarray) -> float:
+        """Half their sum of squares."""
+        return 0.5 * float(np.sum(self.pull(u) ** 2))
+
+
+def minimise(
+    question: Question,
+    u: np.ndarray,
+    starts: np.ndarray,
+    noise: AbstractNoise,
+    enough: float,
+    limit: int = 60,
+    anchor: Anchor | None = None,
+) -> Descent | Failure:
+    """The unknowns that make the measurements likeliest, by a search from (u, starts).
+
+    It ends when a step without damping promises to lower half the sum of squares, in units of the noise, by less than
+    `enough`: then no parameter is further than √(2 enough) standard deviations (of independent noise) from the minimum.
+    A `Failure` is returned where the motion from the first trial cannot be followed.
+    """
+    point = question.at(u, starts)
+    if isinstance(point, Failure):
+        return point
+    damping, growth, trials = _FIRST, 2.0, 1
+    anchor, reach = Anchor.none(u) if anchor is None else anchor, question.parameters.reach
+    while True:
+        widths = question.widths(point, noise)
+        factors = question.factors(point, widths)
+        triangles, cost = question.triangles(point, factors), question.cost(point, factors) + anchor.cost(point.u)
+        scale = _scales(triangles, question.states)
+        pull = anchor.weight, anchor.pull(point.u)
+        left = eliminate(triangles, question.states, scale, _LEAST, pull).gain
+        if left <= enough:
+            return Descent(point, widths, True, trials, f"The search converged after {trials} trials.")
+        better = None
+        while better is None:
+            if trials >= limit:
+                text = f"The search was stopped after {trials} trials: half the sum of squares may fall by {left:.2g}."
+                return Descent(point, widths, False, trials, text)
+            step = eliminate(triangles, question.states, scale, damping, pull, reach)
+            trial = question.at(point.u + step.u, point.starts + step.starts)
+            trials += 1
+            fall = -np.inf
+            if not isinstance(trial, Failure):
+                fall = cost - question.cost(trial, factors) - anchor.cost(trial.u)
+            if (not fall > 0.0 and damping >= _MOST) or step.gain <= _FLAT * cost:
+                text = f"The search stopped where rounding hides what is left, after {trials} trials."
+                return Descent(point, widths, True, trials, text)
+            if fall > 0.0:
+                better = trial
+                damping = max(_LEAST, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3))
+                growth = 2.0
+            else:
+                damping, growth = damping * growth, 2.0 * growth
+        point = better
+
+
+_FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
+
+
+def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, reach=np.inf) -> Step:
+    """The damped step for the triangles (N, D + 1, D + 1) of all pieces, whose first `states` columns are starts.
+
+    `scale` holds the norms of the columns (`_scales`), and `pull` is (weight, residuals), (F,) each, of an anchor of
+    the parameters. A parameter that would go beyond its `reach` (F,) is damped more than the others.
+    """
+    of_starts, of_u = scale
+    (pieces, columns, _), free = triangles.shape, len(of_u)
+    damped = np.zeros((pieces, states, columns))
+    damped[:, np.arange(states), np.arange(states)] = np.sqrt(damping) * of_starts
+    r = np.linalg.qr(np.concatenate([triangles, damped], axis=1), mode="r")
+    anchored = np.concatenate([np.diag(pull[0]), pull[1][:, None]], axis=1)
+    rest = compressed(np.concatenate([r[:, states:, states:].reshape(-1, free + 1), anchored])[None])[0]
+    du = _within_reach(rest, of_u, damping, reach)
+    right = r[:, :states, -1] + r[:, :states, states:-1] @ du
+    ds = np.linalg.solve(r[:, :states, :states], -right[..., None])[..., 0]
+    whole = np.concatenate([ds, np.broadcast_to(du, (pieces, free)), np.ones((pieces, 1))], axis=1)
+    after = np.sum((triangles @ whole[..., None]) ** 2)
+    gain = np.sum(triangles[..., -1] ** 2) - after + np.sum(pull[1] ** 2) - np.sum((pull[1] + pull[0] * du) ** 2)
+    return Step(du, ds, float(0.5 * gain))
+
+
+def _within_reach(rest: np.ndarray, of_u: np.ndarray, damping: float, reach) -> np.ndarray:
+    """δu (F,) that minimises |rest (δu, 1)|² + Σ damping (scale δu)², with more damping where that is beyond reach."""
+    free, each = len(of_u), np.full(len(of_u), damping)
+    while True:
+        rows = np.concatenate([rest, np.diag(np.append(np.sqrt(each) * of_u, 0.0))[:free]])
+        triangle = np.linalg.qr(rows, mode="r")
+        du = np.linalg.solve(triangle[:free, :free], -triangle[:free, free])
+        beyond = np.abs(du) > reach
+        if not beyond.any() or each[beyond].min() > _MOST:
+            return du
+        each[beyond] *= 10.0
+
+
+def _scales(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
+    """The norms of the columns of starts (N, 2n) and of parameters (F,); one where nothing depends on a column."""
+    of_starts = np.linalg.norm(triangles[..., :states], axis=1)
+    of_u = np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
+    return np.where(of_starts > 0, of_starts, 1.0), np.where(of_u > 0, of_u, 1.0)

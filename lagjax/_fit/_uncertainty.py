@@ -1,0 +1,164 @@
+"""How well the parameters are known: their covariance where residuals are correlated, and what is not seen at all.
+
+With the starts eliminated, a small change of the measurements by ε moves the free parameters by H⁻¹ Gᵀ ε: G has the
+rows of the parameters, made orthogonal to those of the starts, in units of the noise, and H = GᵀG. So
+
+    covariance = H⁻¹ (Gᵀ C G) H⁻¹,      C the correlation of the residuals, from the residuals themselves
+
+For white noise C = 1. At 1 kHz residuals are not white: they hold what the model lacks, and H⁻¹ alone would give
+intervals many times too small. Source: Newey & West, Econometrica 55 (1987) 703; Geyer, Stat. Sci. 7 (1992) 473, for
+where correlations end.
+
+Directions that nothing depends on have no variance: they are found as null directions of G (`seen`), their parameters
+have infinite variance, and nothing is inverted there.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._fit._noise import Widths
+from lagjax._fit._residuals import Point, Question, compressed
+
+# Singular values below this fraction of the largest, of columns of length one, are null: derivatives are as accurate
+# as the motion, to 1e-9, and a direction that is really seen so little would need a million times the data.
+NULL = 1e-7
+
+
+class Information(NamedTuple):
+    """What the data say about F free parameters.
+
+    - `covariance` (F, F) of u; infinite variance and NaN beside it where a parameter is not seen.
+    - `null` (F, K): the K directions of u that nothing depends on.
+    - `effective` (S,): the number of samples of each signal that independent ones would need to say as much.
+    - `correlation` (S,): the correlation of neighbouring residuals.
+    """
+
+    covariance: np.ndarray
+    null: np.ndarray
+    effective: np.ndarray
+    correlation: np.ndarray
+
+
+def information(question: Question, point: Point, widths: Widths) -> Information:
+    """What the data say about the parameters, at the end of a search."""
+    factors = [np.sqrt(b.weights) / widths.sigma for b in question.batches]
+    triangles = question.triangles(point, factors)
+    null, basis = seen(triangles, question.states)
+    laws = [_correlation(question, point, widths, s) for s in range(len(widths.sigma))]
+    lags = [law.lags for law in laws]
+    effective = np.array([law.count / law.time for law in laws])
+    free = len(point.u)
+    middle = np.zeros((free, free))
+    for batch, factor, slopes in zip(question.batches, factors, point.slopes, strict=True):
+        own = _orthogonal(triangles[batch.rows], factor[..., None] * slopes, question.states)
+        middle += sum(_correlated_square(own[:, :, s], lags[s]) for s in range(len(lags)))
+    # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
+    used = free - null.shape[1] + question.states * int(question.fitted.sum())
+    lost = question.measured / max(question.measured - used, 1)
+    robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in widths.dof])
+    half = basis @ np.linalg.solve(basis.T @ _square(triangles, question.states) @ basis, basis.T)
+    covariance = lost * robust * half @ middle @ half.T
+    unseen = np.linalg.norm(null, axis=1) > 1e-6 if null.size else np.zeros(free, bool)
+    covariance[unseen] = np.nan
+    covariance[:, unseen] = np.nan
+    covariance[unseen, unseen] = np.inf
+    return Information(covariance, null, effective, np.array([law.neighbour for law in laws]))
+
+
+def seen(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
+    rows = _eliminated(triangles, states)
+    before = np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
+    unit = np.where(before > 0, before, 1.0)
+    # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
+    _, values, directions = np.linalg.svd(rows / unit)
+    values = np.append(values, np.zeros(len(unit) - len(values)))
+    small = values <= NULL * max(values.max(initial=0.0), 1.0)
+    null = directions[small].T / unit[:, None]
+    null = null / np.where(small.any(), np.linalg.norm(null, axis=0), 1.0)
+    return null, directions[~small].T / unit[:, None]
+
+
+def _eliminated(triangles: np.ndarray, states: int) -> np.ndarray:
+    """The rows of the parameters, orthogonal to those of the starts: a triangle with F columns."""
+    own = _orthogonal(triangles, triangles[..., :-1], states)
+    return compressed(own.reshape(1, -1, own.shape[-1]))[0]
+
+
+def _square(triangles: np.ndarray, states: int) -> np.ndarray:
+    rows = _eliminated(triangles, states)
+    return rows.T @ rows
+
+
+def _orthogonal(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.ndarray:
+    """Columns of parameters less what the starts can do instead: `slopes` (N, ..., D) → (N, ..., F).
+
+    Directions of a start that nothing depends on can do nothing: they are left out.
+    """
+    of_starts, of_u = triangles[..., :states], triangles[..., states:-1]
+    u, values, v = np.linalg.svd(of_starts, full_matrices=False)
+    keep = values > 1e-10 * np.maximum(values.max(axis=1, keepdims=True), np.finfo(float).tiny)
+    inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
+    instead = np.matmul(v.swapaxes(1, 2) * inverse[:, None], np.matmul(u.swapaxes(1, 2), of_u))
+    shape = (len(slopes), *[1] * (slopes.ndim - 3), *instead.shape[1:])
+    return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))
+
+
+# ---- correlation of residuals ----------------------------------------------------------------------------------------
+
+
+class Correlation(NamedTuple):
+    """Of one signal: correlations at lags 0, 1, …, tapered to zero; their sum over all lags; how many samples."""
+
+    lags: np.ndarray
+    time: float
+    count: int
+    neighbour: float
+
+
+def _correlation(question: Question, point: Point, widths: Widths, signal: int) -> Correlation:
+    """The correlation of the residuals of one signal, over all pieces.
+
+    It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
+    length: then its spectrum is nowhere negative.
+    """
+    dof = widths.dof[signal]
+    sums, count = np.zeros(1), 0
+    for batch, residuals in zip(question.batches, point.residuals, strict=True):
+        z = np.sqrt(batch.weights[..., signal]) * residuals[..., signal] / widths.sigma[signal]
+        if not np.isinf(dof):
+            z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
+        count += int((batch.weights[..., signal] > 0).sum())
+        spectrum = np.abs(np.fft.rfft(z, 2 * z.shape[1])) ** 2
+        own = np.fft.irfft(spectrum.sum(axis=0), 2 * z.shape[1])[: z.shape[1]]
+        longer = np.zeros(max(len(sums), len(own)))
+        longer[: len(sums)] += sums
+        longer[: len(own)] += own
+        sums = longer
+    law = sums / sums[0] if sums[0] > 0 else np.eye(1, len(sums))[0]
+    insignificant = np.flatnonzero(law <= 2.0 / np.sqrt(count))
+    cut = int(insignificant[0]) if len(insignificant) else len(law)
+    if cut <= 1:
+        return Correlation(np.ones(1), 1.0, count, float(law[1]) if len(law) > 1 else 0.0)
+    lags = law[: 3 * cut] * _parzen(np.arange(min(3 * cut, len(law))) / (3 * cut))
+    return Correlation(lags, float(max(1.0, lags[0] + 2 * lags[1:].sum())), count, float(law[1]))
+
+
+def _parzen(x: np.ndarray) -> np.ndarray:
+    return np.where(x < 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3)
+
+
+def _correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """Σ Gᵀ C G over N pieces `rows` (N, T, F), where C has the correlations `lags`."""
+    if len(lags) == 1:
+        flat = rows.reshape(-1, rows.shape[-1])
+        return flat.T @ flat
+    lags = lags[: rows.shape[1]]
+    size = rows.shape[1] + len(lags)
+    kernel = np.zeros(size)
+    kernel[: len(lags)] += lags
+    kernel[-np.arange(1, len(lags))] += lags[1:]
+    spectrum = np.fft.rfft(kernel).real
+    smooth = np.fft.irfft(np.fft.rfft(rows, size, axis=1) * spectrum[:, None], size, axis=1)[:, : rows.shape[1]]
+    return np.einsum("ntf,ntg->fg", rows, smooth)

@@ -1,0 +1,153 @@
+"""What the data cannot see, in words: null directions of the information as sentences with the parameters' names.
+
+A null direction v of the parameters says that measurements do not change along v, at one point. In logarithms, with
+the relative changes dxᵢ/xᵢ as coordinates, what is seen is orthogonal to it: if that has small whole exponents, here
+and at another point, then only a product of powers enters, such as m·l. The same with the changes dxᵢ themselves finds
+sums. Everything else is told as the direction that it is.
+"""
+
+from fractions import Fraction
+
+import numpy as np
+
+from lagjax._fit._noise import Widths
+from lagjax._fit._parameters import Parameters
+from lagjax._fit._residuals import Failure, Point, Question
+from lagjax._fit._uncertainty import seen
+
+_LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
+
+
+def sentences(question: Question, point: Point, widths: Widths, null: np.ndarray) -> tuple[str, ...]:
+    """A sentence for every set of parameters of which something is not seen, given the null directions (F, K) of u."""
+    if not null.shape[1]:
+        return ()
+    parameters = question.parameters
+    elsewhere = _null_elsewhere(question, point, widths)
+    spaces = [(parameters.slopes(point.u)[:, None] * null, parameters.values(point.u))]
+    if elsewhere is not None:
+        u, other = elsewhere
+        spaces.append((parameters.slopes(u)[:, None] * other, parameters.values(u)))
+    found = [_sentence(parameters, block, spaces) for block in _blocks(null)]
+    return tuple(found)
+
+
+def _null_elsewhere(question: Question, point: Point, widths: Widths):
+    """Other values u of the free parameters, a few per cent away, and the null directions there."""
+    u = point.u
+    x, slope = question.parameters.values(u), question.parameters.slopes(u)
+    size = np.minimum(np.where(x != 0, np.abs(x), 1.0) / slope, question.parameters.reach)
+    near = u + size * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
+    other = question.at(near, point.starts)
+    if isinstance(other, Failure):
+        return None
+    factors = [np.sqrt(batch.weights) / widths.sigma for batch in question.batches]
+    return near, seen(question.triangles(other, factors), question.states)[0]
+
+
+def _blocks(null: np.ndarray) -> list[np.ndarray]:
+    """The parameters of the null directions in sets, of which each is free by itself: rows that are not zero."""
+    reduced = _reduced(null.T)
+    sets: list[set[int]] = []
+    for row in reduced:
+        own = set(np.flatnonzero(np.abs(row) > 1e-5 * np.abs(row).max()).tolist())
+        for other in [s for s in sets if s & own]:
+            sets.remove(other)
+            own |= other
+        sets.append(own)
+    return [np.array(sorted(s)) for s in sets]
+
+
+def _reduced(rows: np.ndarray) -> np.ndarray:
+    """The reduced row echelon form of independent rows, with the largest pivots."""
+    rows = np.array(rows, float)
+    for i in range(len(rows)):
+        rest = np.abs(rows[i:])
+        k, column = np.unravel_index(np.argmax(rest), rest.shape)
+        rows[[i, i + k]] = rows[[i + k, i]]
+        rows[i] /= rows[i, column]
+        others = np.arange(len(rows)) != i
+        rows[others] -= np.outer(rows[others, column], rows[i])
+    return np.where(np.abs(rows) > 1e-9, rows, 0.0)
+
+
+def _sentence(parameters: Parameters, block: np.ndarray, spaces) -> str:
+    """The sentence for one set of parameters, from the null directions of x and the values x at one or two points."""
+    names = [parameters.names[i] for i in block]
+    if len(block) == 1:
+        return f"Nothing that was measured depends on {names[0]}."
+    relative = [_within(direction / np.where(x != 0, x, 1.0)[:, None], block) for direction, x in spaces]
+    absolute = [_within(direction, block) for direction, _ in spaces]
+    if all(np.all(x[block] != 0) for _, x in spaces) and (rows := _whole_numbers(relative)) is not None:
+        if relative[0].shape[1] == 1 and np.ptp(relative[0]) < _EXACT * np.abs(relative[0]).max():
+            return f"A common factor of {_listed(names)} is not seen, only their ratios: keep one of them fixed."
+        return f"Of {_listed(names)} only {_listed([_product(row, names) for row in rows])} {_is(rows)} seen."
+    if (rows := _whole_numbers(absolute)) is not None:
+        return f"Of {_listed(names)} only {_listed([_sum(row, names) for row in rows])} {_is(rows)} seen."
+    if (count := absolute[0].shape[1]) > 1:
+        return f"{count} combinations of {_listed(names)} are not seen: keep {count} of them fixed."
+    changes = absolute[0][:, 0] / np.abs(absolute[0][:, 0]).max()
+    together = ", ".join(f"{name} by {change:+.3g}" for name, change in zip(names, changes, strict=True))
+    return (
+        f"A combination of {_listed(names)} is not seen: to change {together}, in proportion, changes nothing measured."
+    )
+
+
+def _within(directions: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """The directions that move only the parameters of one set, (len(block), K)."""
+    outside = np.delete(directions, block, axis=0)
+    if not outside.size:
+        return directions[block]
+    size = np.linalg.norm(directions, axis=0)
+    _, values, right = np.linalg.svd(outside / size)
+    values = np.append(values, np.zeros(directions.shape[1] - len(values)))
+    inside = right[values < 1e-5].T
+    return (directions / size @ inside)[block]
+
+
+def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
+    """The rows orthogonal to a space of directions as small whole numbers, the same at all points; None if not so."""
+    first = spaces[0]
+    if len(spaces) < 2 or any(space.shape != first.shape or not space.size for space in spaces):
+        return None
+    _, values, right = np.linalg.svd(first.T)
+    rank = int((values > 1e-6 * values.max()).sum())
+    if rank == len(first):
+        return None
+    rows = []
+    for row in _reduced(right[rank:]):
+        fractions = [Fraction(float(x)).limit_denominator(_LARGEST_EXPONENT) for x in row]
+        common = np.lcm.reduce([f.denominator for f in fractions])
+        whole = [int(f * int(common)) for f in fractions]
+        if max(map(abs, whole)) > _LARGEST_EXPONENT or np.abs(np.array(whole) / common - row).max() > _EXACT:
+            return None
+        rows.append(whole if next(x for x in whole if x) > 0 else [-x for x in whole])
+    for space in spaces[1:]:
+        left = np.array(rows, float) @ space
+        if np.abs(left).max() > _EXACT * np.abs(space).max():
+            return None
+    return rows
+
+
+def _product(row: list[int], names: list[str]) -> str:
+    above = [_power(name, x) for name, x in zip(names, row, strict=True) if x > 0]
+    below = [_power(name, -x) for name, x in zip(names, row, strict=True) if x < 0]
+    return "·".join(above) + (f"/({'·'.join(below)})" if len(below) > 1 else f"/{below[0]}" if below else "")
+
+
+def _power(name: str, exponent: int) -> str:
+    return name if exponent == 1 else f"{name}^{exponent}"
+
+
+def _sum(row: list[int], names: list[str]) -> str:
+    parts = [(x, name if abs(x) == 1 else f"{abs(x)} {name}") for x, name in zip(row, names, strict=True) if x]
+    text = "".join(f" {'+' if x > 0 else '−'} {part}" for x, part in parts)
+    return text.removeprefix(" + ")
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _is(rows: list) -> str:
+    return "is" if len(rows) == 1 else "are"
