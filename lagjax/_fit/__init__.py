@@ -7,7 +7,7 @@
 
 Files: `_records`, `_parameters` and `_transforms` take what the user gives; `_motions` and `_signals` follow motions
 and sensors with their derivatives; `_residuals` and `_noise` say how far off a trial is; `_segments` says where to
-begin, `_solve` goes down from there; `_uncertainty`, `_unseen` and `_result` say what that means.
+begin, `_solve` goes down from there; `_correlation`, `_uncertainty`, `_unseen` and `_result` say what that means.
 """
 
 from collections.abc import Callable
@@ -102,7 +102,7 @@ def fit(
     if not isinstance(noise, AbstractNoise):
         raise TypeError(f"noise must be lagjax.Gaussian() or lagjax.StudentT(); got {noise!r}.")
     records = require_alike(records)
-    layout = _layout(records)
+    layout = _layout(system, records, params0)
     parameters = Parameters.of(params0, free, transforms, layout.dtype)
     question = _question(system, records, layout, parameters, observe)
     readers = [Reader.of(record) for record in records] if looks_like_positions(observe, records[0], layout) else None
@@ -111,12 +111,20 @@ def fit(
     return _told(system, observe, question, descent)
 
 
-def _layout(records: list[Record]) -> Layout:
+def _layout(system: System, records: list[Record], params0) -> Layout:
     """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
     for record in records:
         if record.start is not None:
             return Layout.of(*record.start)
     one_time = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values)
+    try:
+        jax.eval_shape(lambda q: system.energy(q, q, 0.0, params0), one_time)
+    except Exception as reason:
+        raise ValueError(
+            "The scene's functions cannot be called with coordinates of the structure of `values`, which q is taken to "
+            f"have where no record has a start ({type(reason).__name__}: {str(reason).splitlines()[0]}). If the values "
+            "are something else, give every record start=(q0, qdot0), or lagjax.Guess(q0, qdot0) to fit it."
+        ) from reason
     return Layout.of(one_time, one_time)
 
 

@@ -49,7 +49,10 @@ class Record:
 
     def __post_init__(self):
         object.__setattr__(self, "ts", _times(self.ts))
-        labels, leaves, tree = taken_apart(self.values, "values")
+        values = self.values
+        if isinstance(values, list | tuple) and values and all(np.ndim(value) == 0 for value in values):
+            values = np.asarray(values)  # a list of numbers is one signal, not one signal for each
+        labels, leaves, tree = taken_apart(values, "values")
         leaves = [_signal(leaf, label, len(self.ts)) for label, leaf in zip(labels, leaves, strict=True)]
         if not any(leaf.size for leaf in leaves):
             raise ValueError("values holds no signal: give an array with the times as first axis.")

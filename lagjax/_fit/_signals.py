@@ -67,7 +67,7 @@ class Signals:
         shape = rows, times, values.shape[1]
         by_state = by_state.reshape(*shape, states)
         slopes = np.matmul(by_state, np.moveaxis(tangents, 1, -1))
-        slopes[..., -free:] += (by_numbers @ directions.T).reshape(*shape, free)
+        slopes[..., states:] += (by_numbers @ directions.T).reshape(*shape, free)
         return values.reshape(shape), slopes
 
     def _in_portions(self, y, t, numbers):

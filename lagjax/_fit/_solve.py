@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._fit._correlation import share
 from lagjax._fit._noise import AbstractNoise, Widths
 from lagjax._fit._residuals import Failure, Point, Question, compressed
 
@@ -76,7 +77,8 @@ def minimise(
     """The unknowns that make the measurements likeliest, by a search from (u, starts).
 
     It ends when a step without damping promises to lower half the sum of squares, in units of the noise, by less than
-    `enough`: then no parameter is further than √(2 enough) standard deviations (of independent noise) from the minimum.
+    `enough`, correlated residuals counted for what they are worth: then no parameter is further than √(2 enough)
+    standard deviations from the minimum.
     A `Failure` is returned where the motion from the first trial cannot be followed.
     """
     point = question.at(u, starts)
@@ -91,7 +93,7 @@ def minimise(
         scale = _scales(triangles, question.states)
         pull = anchor.weight, anchor.pull(point.u)
         left = eliminate(triangles, question.states, scale, _LEAST, pull).gain
-        if left <= enough:
+        if left <= enough or (left <= _NEAR * question.measured and left * share(question, point, widths) <= enough):
             return Descent(point, widths, True, trials, f"The search converged after {trials} trials.")
         better = None
         while better is None:
@@ -116,6 +118,7 @@ def minimise(
         point = better
 
 
+_NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
 _FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
 
 

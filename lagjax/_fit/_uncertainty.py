@@ -6,8 +6,7 @@ rows of the parameters, made orthogonal to those of the starts, in units of the 
     covariance = H⁻¹ (Gᵀ C G) H⁻¹,      C the correlation of the residuals, from the residuals themselves
 
 For white noise C = 1. At 1 kHz residuals are not white: they hold what the model lacks, and H⁻¹ alone would give
-intervals many times too small. Source: Newey & West, Econometrica 55 (1987) 703; Geyer, Stat. Sci. 7 (1992) 473, for
-where correlations end.
+intervals many times too small. Source: Newey & West, Econometrica 55 (1987) 703.
 
 Directions that nothing depends on have no variance: they are found as null directions of G (`seen`), their parameters
 have infinite variance, and nothing is inverted there.
@@ -17,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._fit._correlation import correlated_square, correlation
 from lagjax._fit._noise import Widths
 from lagjax._fit._residuals import Point, Question, compressed
 
@@ -45,14 +45,14 @@ def information(question: Question, point: Point, widths: Widths) -> Information
     factors = [np.sqrt(b.weights) / widths.sigma for b in question.batches]
     triangles = question.triangles(point, factors)
     null, basis = seen(triangles, question.states)
-    laws = [_correlation(question, point, widths, s) for s in range(len(widths.sigma))]
+    laws = [correlation(question, point, widths, s) for s in range(len(widths.sigma))]
     lags = [law.lags for law in laws]
     effective = np.array([law.count / law.time for law in laws])
     free = len(point.u)
     middle = np.zeros((free, free))
     for batch, factor, slopes in zip(question.batches, factors, point.slopes, strict=True):
         own = _orthogonal(triangles[batch.rows], factor[..., None] * slopes, question.states)
-        middle += sum(_correlated_square(own[:, :, s], lags[s]) for s in range(len(lags)))
+        middle += sum(correlated_square(own[:, :, s], lags[s]) for s in range(len(lags)))
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + question.states * int(question.fitted.sum())
     lost = question.measured / max(question.measured - used, 1)
@@ -103,62 +103,3 @@ def _orthogonal(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.nd
     instead = np.matmul(v.swapaxes(1, 2) * inverse[:, None], np.matmul(u.swapaxes(1, 2), of_u))
     shape = (len(slopes), *[1] * (slopes.ndim - 3), *instead.shape[1:])
     return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))
-
-
-# ---- correlation of residuals ----------------------------------------------------------------------------------------
-
-
-class Correlation(NamedTuple):
-    """Of one signal: correlations at lags 0, 1, …, tapered to zero; their sum over all lags; how many samples."""
-
-    lags: np.ndarray
-    time: float
-    count: int
-    neighbour: float
-
-
-def _correlation(question: Question, point: Point, widths: Widths, signal: int) -> Correlation:
-    """The correlation of the residuals of one signal, over all pieces.
-
-    It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
-    length: then its spectrum is nowhere negative.
-    """
-    dof = widths.dof[signal]
-    sums, count = np.zeros(1), 0
-    for batch, residuals in zip(question.batches, point.residuals, strict=True):
-        z = np.sqrt(batch.weights[..., signal]) * residuals[..., signal] / widths.sigma[signal]
-        if not np.isinf(dof):
-            z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
-        count += int((batch.weights[..., signal] > 0).sum())
-        spectrum = np.abs(np.fft.rfft(z, 2 * z.shape[1])) ** 2
-        own = np.fft.irfft(spectrum.sum(axis=0), 2 * z.shape[1])[: z.shape[1]]
-        longer = np.zeros(max(len(sums), len(own)))
-        longer[: len(sums)] += sums
-        longer[: len(own)] += own
-        sums = longer
-    law = sums / sums[0] if sums[0] > 0 else np.eye(1, len(sums))[0]
-    insignificant = np.flatnonzero(law <= 2.0 / np.sqrt(count))
-    cut = int(insignificant[0]) if len(insignificant) else len(law)
-    if cut <= 1:
-        return Correlation(np.ones(1), 1.0, count, float(law[1]) if len(law) > 1 else 0.0)
-    lags = law[: 3 * cut] * _parzen(np.arange(min(3 * cut, len(law))) / (3 * cut))
-    return Correlation(lags, float(max(1.0, lags[0] + 2 * lags[1:].sum())), count, float(law[1]))
-
-
-def _parzen(x: np.ndarray) -> np.ndarray:
-    return np.where(x < 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3)
-
-
-def _correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    """Σ Gᵀ C G over N pieces `rows` (N, T, F), where C has the correlations `lags`."""
-    if len(lags) == 1:
-        flat = rows.reshape(-1, rows.shape[-1])
-        return flat.T @ flat
-    lags = lags[: rows.shape[1]]
-    size = rows.shape[1] + len(lags)
-    kernel = np.zeros(size)
-    kernel[: len(lags)] += lags
-    kernel[-np.arange(1, len(lags))] += lags[1:]
-    spectrum = np.fft.rfft(kernel).real
-    smooth = np.fft.irfft(np.fft.rfft(rows, size, axis=1) * spectrum[:, None], size, axis=1)[:, : rows.shape[1]]
-    return np.einsum("ntf,ntg->fg", rows, smooth)

@@ -1,0 +1,75 @@
+"""How far the residuals of one sample say the same as those of its neighbours.
+
+At 1 kHz residuals hold what the scene lacks, and neighbours agree: n samples are worth n/τ independent ones, with τ the
+sum of the correlations over all lags. Source: Geyer, *Practical Markov chain Monte Carlo*, Stat. Sci. 7 (1992) 473, for
+where correlations end; Newey & West, Econometrica 55 (1987) 703, for tapers that leave a spectrum without negative parts.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._fit._noise import Widths
+from lagjax._fit._residuals import Point, Question
+
+
+class Correlation(NamedTuple):
+    """Of one signal: correlations at lags 0, 1, …, tapered to zero; their sum over all lags; how many samples."""
+
+    lags: np.ndarray
+    time: float
+    count: int
+    neighbour: float
+
+
+def correlation(question: Question, point: Point, widths: Widths, signal: int) -> Correlation:
+    """The correlation of the residuals of one signal, over all pieces.
+
+    It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
+    length: then its spectrum is nowhere negative.
+    """
+    dof = widths.dof[signal]
+    sums, count = np.zeros(1), 0
+    for batch, residuals in zip(question.batches, point.residuals, strict=True):
+        z = np.sqrt(batch.weights[..., signal]) * residuals[..., signal] / widths.sigma[signal]
+        if not np.isinf(dof):
+            z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
+        count += int((batch.weights[..., signal] > 0).sum())
+        spectrum = np.abs(np.fft.rfft(z, 2 * z.shape[1])) ** 2
+        own = np.fft.irfft(spectrum.sum(axis=0), 2 * z.shape[1])[: z.shape[1]]
+        longer = np.zeros(max(len(sums), len(own)))
+        longer[: len(sums)] += sums
+        longer[: len(own)] += own
+        sums = longer
+    law = sums / sums[0] if sums[0] > 0 else np.eye(1, len(sums))[0]
+    insignificant = np.flatnonzero(law <= 2.0 / np.sqrt(count))
+    cut = int(insignificant[0]) if len(insignificant) else len(law)
+    if cut <= 1:
+        return Correlation(np.ones(1), 1.0, count, float(law[1]) if len(law) > 1 else 0.0)
+    lags = law[: 3 * cut] * _parzen(np.arange(min(3 * cut, len(law))) / (3 * cut))
+    return Correlation(lags, float(max(1.0, lags[0] + 2 * lags[1:].sum())), count, float(law[1]))
+
+
+def _parzen(x: np.ndarray) -> np.ndarray:
+    return np.where(x < 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3)
+
+
+def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """Σ Gᵀ C G over N pieces `rows` (N, T, F), where C has the correlations `lags`."""
+    if len(lags) == 1:
+        flat = rows.reshape(-1, rows.shape[-1])
+        return flat.T @ flat
+    lags = lags[: rows.shape[1]]
+    size = rows.shape[1] + len(lags)
+    kernel = np.zeros(size)
+    kernel[: len(lags)] += lags
+    kernel[-np.arange(1, len(lags))] += lags[1:]
+    spectrum = np.fft.rfft(kernel).real
+    smooth = np.fft.irfft(np.fft.rfft(rows, size, axis=1) * spectrum[:, None], size, axis=1)[:, : rows.shape[1]]
+    return np.einsum("ntf,ntg->fg", rows, smooth)
+
+
+def share(question: Question, point: Point, widths: Widths) -> float:
+    """How many independent samples one sample is worth, over all signals: at most 1."""
+    laws = [correlation(question, point, widths, signal) for signal in range(len(widths.sigma))]
+    return sum(law.count / law.time for law in laws) / max(sum(law.count for law in laws), 1)

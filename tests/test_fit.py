@@ -1,0 +1,397 @@
+"""`fit`: parameters from recordings whose truth is known, what the data do not see, and sentences for what is wrong.
+
+One scene, a damped pendulum, serves most tests, so that one kernel does.
+"""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import lagjax
+from lagjax._fit import _correlation, _residuals, _solve, _transforms
+from lagjax._fit._motions import _ByDiffrax, motions_of
+from lagjax._fit._parameters import Parameters
+from lagjax._fit._segments import Reader
+from lagjax._layout import Layout
+
+SIGMA = 5e-3
+
+
+def lagrangian(q, qdot, params):
+    return 0.5 * params["m"] * params["l"] ** 2 * qdot**2 + params["m"] * 9.81 * params["l"] * jnp.cos(q)
+
+
+def dissipation(q, qdot, params):
+    return 0.5 * params["c"] * qdot**2
+
+
+SCENE = lagjax.System(lagrangian, dissipation=dissipation)
+TRUTH = {"m": 1.0, "l": 0.7, "c": 0.1}
+FREE = {"m": False, "l": True, "c": True}
+TS = np.linspace(0.0, 4.0, 201)
+
+
+def records(count=3, ts=TS, sigma=SIGMA, seed=0, params=TRUTH, known=False):
+    rng = np.random.default_rng(seed)
+    q0, qdot0 = rng.uniform(-2.0, 2.0, count), rng.normal(size=count)
+    exact = np.asarray(lagjax.simulate_batch(SCENE, q0, qdot0, ts, params).q)
+    values = exact + sigma * rng.normal(size=exact.shape)
+    starts = zip(q0, qdot0, strict=True) if known else itertools.repeat(None)
+    return [lagjax.Record(ts, y, start=start) for y, start in zip(values, starts, strict=False)]
+
+
+@pytest.fixture(scope="module")
+def done():
+    return lagjax.fit(SCENE, records(), {"m": 1.0, "l": 1.0, "c": 0.03}, free=FREE, transforms=lagjax.positive)
+
+
+def deviations(fit, truth=TRUTH):
+    """How far the free parameters are from the truth, in their standard deviations."""
+    errors = [float(fit.params[name]) - truth[name] for name in ("c", "l")]
+    return np.array(errors) / np.sqrt(np.diag(fit.covariance.matrix))
+
+
+# ---- what comes out --------------------------------------------------------------------------------------------------
+
+
+def test_parameters_come_out_within_their_intervals(done):
+    assert done.ok and done.unseen == () and done.params["m"] == 1.0
+    assert (np.abs(deviations(done)) < 3).all()
+    low, high = done.intervals(0.999)
+    assert low["l"] < 0.7 < high["l"] and low["m"] == high["m"] == 1.0
+    # 603 samples of a signal of size one with noise of 5 mrad tell a length to a few 1e-4.
+    assert high["l"] - low["l"] < 5e-3
+    assert done.noise["q"].sigma == pytest.approx(SIGMA, rel=0.1)
+    assert done.covariance["params['l']", "params['l']"] == done.covariance.matrix[1, 1]
+
+
+def test_intervals_are_those_of_scipy(done):
+    # The same minimum and H⁻¹, from one dense Jacobian by differences of the whole problem. Residuals are white here.
+    rows = records()
+
+    def residuals(x):
+        run = lagjax.simulate_batch(SCENE, x[2::2], x[3::2], TS, {"m": 1.0, "l": x[1], "c": x[0]})
+        return (np.asarray(run.q) - np.stack([r.values for r in rows])).ravel() / SIGMA
+
+    start = np.concatenate([[0.11, 0.71], np.array(done.starts).ravel()])
+    found = least_squares(residuals, start, x_scale="jac", jac="3-point", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    values = [float(done.params[name]) for name in ("c", "l")]
+    deviation = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))[:2]
+    np.testing.assert_allclose((values - found.x[:2]) / deviation, 0.0, atol=0.05)
+    mine = np.sqrt(np.diag(done.covariance.matrix))
+    np.testing.assert_allclose(mine, deviation * done.noise["q"].sigma / SIGMA, rtol=0.05)
+
+
+def test_noiseless_data_give_the_parameters_to_the_tolerance_of_the_motion():
+    fit = lagjax.fit(SCENE, records(1, sigma=0.0), {"m": 1.0, "l": 1.0, "c": 0.03}, free=FREE)
+    assert abs(fit.params["l"] - 0.7) < 1e-7 and abs(fit.params["c"] - 0.1) < 1e-7
+
+
+def test_report_reads_like_a_lab_book(done):
+    text = str(done)
+    for part in ("params['l']", "95 % interval", "RMS", "Durbin–Watson", "verdict     The search converged"):
+        assert part in text
+    assert "params['m']" not in text
+
+
+# ---- records ---------------------------------------------------------------------------------------------------------
+
+
+def test_records_of_different_lengths_with_gaps_and_weights(done):
+    short, *others = records()
+    values = short.values.copy()
+    values[10:30] = np.nan
+    spoiled = others[0].values.copy()
+    spoiled[100] = 50.0
+    weights = np.ones(len(TS))
+    weights[100] = 0.0
+    rows = [
+        lagjax.Record(TS[:80], values[:80]),
+        lagjax.Record(TS, spoiled, weights=weights),
+        lagjax.Record(TS[::2], others[1].values[::2]),
+    ]
+    fit = lagjax.fit(SCENE, rows, TRUTH, free=FREE, transforms=lagjax.positive)
+    assert (np.abs(deviations(fit)) < 3.5).all()
+    assert np.isnan(fit.residuals[0][10:30]).all() and np.isnan(fit.residuals[1][100])
+    assert [len(r) for r in fit.residuals] == [80, 201, 101] and fit.noise["q"].samples == 60 + 200 + 101
+
+
+def test_a_start_that_is_known_is_kept_and_narrows_the_intervals(done):
+    fit = lagjax.fit(SCENE, records(known=True), TRUTH, free=FREE, transforms=lagjax.positive)
+    for record, start in zip(fit.records, fit.starts, strict=True):
+        np.testing.assert_array_equal(start, record.start)
+    assert (np.diag(fit.covariance.matrix) < np.diag(done.covariance.matrix)).all()
+    assert (np.abs(deviations(fit)) < 3).all()
+
+
+def test_sensors_with_gain_and_bias_are_fitted_with_the_scene():
+    observe = lambda q, qdot, params: {"volts": params["gain"] * jnp.sin(q) + params["bias"]}
+    rng = np.random.default_rng(1)
+    rows = [
+        lagjax.Record(
+            r.ts,
+            {"volts": 2.0 * np.sin(r.values) + 0.3 + 1e-3 * rng.normal(size=len(TS))},
+            start=lagjax.Guess(0.9 * r.start[0], r.start[1]),
+        )
+        for r in records(sigma=0.0, known=True)
+    ]
+    start = TRUTH | {"l": 0.75, "gain": 1.8, "bias": 0.0}
+    free = FREE | {"gain": True, "bias": True}
+    fit = lagjax.fit(SCENE, rows, start, free=free, observe=observe)
+    assert fit.ok, fit
+    low, high = fit.intervals(0.999)
+    for name, value in (TRUTH | {"gain": 2.0, "bias": 0.3}).items():
+        assert low[name] <= value <= high[name]
+    assert set(fit.noise) == {"values['volts']"}
+
+
+def test_prediction_of_a_record_that_was_held_out(done):
+    [*_, held] = records(5, seed=4)
+    start = done.predict(lagjax.Record(TS[:50], held.values[:50])).start
+    prediction = done.predict(lagjax.Record(TS, held.values, start=start))
+    assert np.sqrt(np.mean(prediction.residuals**2)) < 2 * SIGMA
+    np.testing.assert_allclose(prediction.values - held.values, prediction.residuals, atol=1e-12)
+    np.testing.assert_allclose(prediction.trajectory.q, prediction.values, atol=1e-9)
+
+
+def test_comparison_prefers_the_law_that_made_the_data(done):
+    frictionless = lagjax.fit(SCENE, records(), TRUTH | {"c": 0.0}, free=FREE | {"c": False})
+    comparison = done.compare(frictionless)
+    assert comparison.bic[0] < comparison.bic[1] and "prefer this fit" in str(comparison)
+    with pytest.raises(ValueError, match="same records"):
+        done.compare(lagjax.fit(SCENE, records(1), TRUTH, free=FREE))
+
+
+# ---- noise -----------------------------------------------------------------------------------------------------------
+
+
+def test_outliers_move_a_gaussian_fit_and_not_a_student_one(done):
+    rng = np.random.default_rng(3)
+    rows = [
+        lagjax.Record(TS, r.values + np.where(rng.random(len(TS)) < 0.05, 1.0, 0.0) * rng.normal(size=len(TS)))
+        for r in records()
+    ]
+    gaussian, student = (
+        lagjax.fit(SCENE, rows, TRUTH, free=FREE, transforms=lagjax.positive, noise=noise)
+        for noise in (lagjax.Gaussian(), lagjax.StudentT())
+    )
+    assert student.noise["q"].dof < 3 and student.noise["q"].sigma < 2 * SIGMA < 20 * SIGMA < gaussian.noise["q"].sigma
+    assert (np.abs(deviations(student)) < 3).all()
+    errors = [np.abs([f.params[k] - TRUTH[k] for k in ("l", "c")]) for f in (gaussian, student)]
+    assert (errors[1] < 0.3 * errors[0]).all()
+
+
+def test_correlated_residuals_count_for_what_they_are_worth():
+    # An autoregression of correlation φ: n samples are worth n (1 − φ)/(1 + φ), and intervals grow by its root.
+    phi, ts, rng = 0.9, np.linspace(0.0, 4.0, 2001), np.random.default_rng(0)
+    [exact] = records(1, ts, sigma=0.0, known=True)
+    white = rng.normal(size=len(ts))
+    noise = np.zeros(len(ts))
+    for i in range(1, len(ts)):
+        noise[i] = phi * noise[i - 1] + np.sqrt(1 - phi**2) * white[i]
+    fits = [
+        lagjax.fit(SCENE, lagjax.Record(ts, exact.values + SIGMA * e, start=exact.start), TRUTH, free=FREE)
+        for e in (white, noise)
+    ]
+    assert fits[0].noise["q"].effective == len(ts)
+    assert fits[1].noise["q"].effective / len(ts) == pytest.approx((1 - phi) / (1 + phi), rel=0.5)
+    assert fits[1].noise["q"].durbin_watson == pytest.approx(2 * (1 - phi), rel=0.3)
+    growth = np.sqrt(np.diag(fits[1].covariance.matrix) / np.diag(fits[0].covariance.matrix))
+    np.testing.assert_allclose(growth, np.sqrt((1 + phi) / (1 - phi)), rtol=0.4)
+    assert "correlated" in fits[1].message and "correlated" not in fits[0].message
+
+
+# ---- what is not seen ------------------------------------------------------------------------------------------------
+
+
+def test_parameters_that_are_not_seen_are_named():
+    # m and c enter as c/m alone; nothing depends on `colour`.
+    start = TRUTH | {"colour": 3.0}
+    fit = lagjax.fit(SCENE, records(), start, transforms={"m": lagjax.positive, "l": None, "c": None, "colour": None})
+    assert not fit.ok and sorted(fit.unseen) == [
+        "A common factor of params['c'] and params['m'] is not seen, only their ratios: keep one of them fixed.",
+        "Nothing that was measured depends on params['colour'].",
+    ]
+    matrix, names = fit.covariance.matrix, fit.covariance.names
+    seen = np.array([name == "params['l']" for name in names])
+    assert np.isinf(np.diag(matrix)[~seen]).all() and np.isfinite(matrix[seen][:, seen]).all()
+    assert fit.params["l"] == pytest.approx(0.7, rel=1e-2) and fit.params["colour"] == 3.0
+    assert fit.params["c"] / fit.params["m"] == pytest.approx(0.1, rel=0.1)
+    assert "not seen" in str(fit)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "energies, params, sentence",
+    [
+        (lambda v, p: 0.5 * p["a"] * p["b"] * v**2 - v, {"a": 2.0, "b": 3.0}, None),
+        (lambda v, p: p["a"] * p["b"], {"a": 2.0, "b": 3.0}, "only params['a']·params['b'] is seen"),
+        (lambda v, p: p["a"] * p["b"] ** 2, {"a": 2.0, "b": 1.0}, "only params['a']·params['b']^2 is seen"),
+        (lambda v, p: p["a"] + p["b"], {"a": 2.0, "b": 2.0}, "only params['a'] + params['b'] is seen"),
+        (lambda v, p: p["a"] - 2 * p["b"], {"a": 9.0, "b": 1.5}, "only params['a'] − 2 params['b'] is seen"),
+        (lambda v, p: p["a"] / p["b"], {"a": 6.0, "b": 1.0}, "A common factor of params['a'] and params['b']"),
+        (lambda v, p: p["a"] * p["b"] / p["c"], {"a": 6.0, "b": 2.0, "c": 2.0}, "Of params['a'], params['b']"),
+        (lambda v, p: jnp.sinh(p["a"]) + p["b"] ** 3, {"a": 1.0, "b": 1.5}, "A combination of params['a']"),
+        (lambda v, p: p["a"], {"a": 6.0}, None),
+    ],
+)
+def test_known_freedoms_are_named_and_no_others(energies, params, sentence):
+    stiffness = energies if sentence or len(params) == 1 else (lambda v, p: p["a"] + p["b"] * v**2)
+    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * stiffness(q, params) * q**2)
+    q = np.asarray(lagjax.simulate(scene, 1.0, 0.0, TS, params).q)
+    values = q + SIGMA * np.random.default_rng(0).normal(size=q.shape)
+    fit = lagjax.fit(scene, lagjax.Record(TS, values), params)
+    assert len(fit.unseen) == (sentence is not None)
+    assert sentence is None or sentence in fit.unseen[0], fit.unseen
+
+
+# ---- from far away ---------------------------------------------------------------------------------------------------
+
+
+def test_a_long_record_is_found_from_any_frequency_where_whole_records_fail():
+    ts = np.linspace(0.0, 50.0, 2501)
+    [record] = records(1, ts, params=TRUTH | {"c": 0.0}, known=True)
+    record = lagjax.Record(ts, record.values)
+    free = FREE | {"c": False}
+    for first in (0.01, 0.1, 30.0, 1000.0):  # of a length of 0.7: frequencies from 0.1 to 30 rad per unit of time
+        start = TRUTH | {"c": 0.0, "l": first}
+        fit = lagjax.fit(SCENE, record, start, free=free, transforms=lagjax.positive)
+        assert fit.rms["q"] < 1.1 * SIGMA and abs(fit.params["l"] - 0.7) < 1e-3, first
+        whole = lagjax.fit(SCENE, record, start, free=free, transforms=lagjax.positive, method="whole")
+        assert whole.rms["q"] > 50 * SIGMA
+
+
+# ---- parts against plain ones ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_motions_of_machine_code_and_of_diffrax_agree():
+    layout = Layout.of(0.0, 0.0)
+    parameters = Parameters.of(TRUTH, FREE, lagjax.positive)
+    ts, y0 = np.stack([TS[:5], TS[3:8]]), np.array([[1.0, 0.0], [0.3, -1.0]])
+    u = parameters.moved(parameters.first)
+    numbers, directions = parameters.numbers(u), parameters.directions(u)
+    fast = motions_of(SCENE, layout, parameters, 1e-11, None).follow(ts, y0, numbers, directions)
+    plain = _ByDiffrax(SCENE, layout, parameters, 1e-11, None).follow(ts, y0, numbers, directions)
+    np.testing.assert_allclose(fast.path, plain.path, atol=1e-8)
+    np.testing.assert_allclose(fast.tangents, plain.tangents, atol=1e-7)
+    assert fast.tangents.shape == (2, 4, 5, 2)
+
+
+def test_elimination_is_the_solution_of_the_whole_problem():
+    rng = np.random.default_rng(0)
+    pieces, states, free, damping = 5, 4, 3, 0.3
+    rows = rng.normal(size=(pieces, 30, states + free + 1))
+    triangles = _residuals.compressed(rows)
+    scale = _solve._scales(triangles, states)
+    pull = np.array([0.5, 0.0, 2.0]), np.array([0.1, 0.0, -0.3])
+    step = _solve.eliminate(triangles, states, scale, damping, pull)
+    whole = np.zeros((pieces * 30 + pieces * states + 2 * free, pieces * states + free))
+    right = np.zeros(len(whole))
+    for k in range(pieces):
+        here = slice(30 * k, 30 * k + 30)
+        whole[here, states * k : states * (k + 1)], whole[here, -free:] = rows[k, :, :states], rows[k, :, states:-1]
+        right[here] = -rows[k, :, -1]
+    norms = np.sqrt(damping) * np.concatenate([scale[0].ravel(), scale[1]])
+    whole[30 * pieces : -free] = np.diag(norms)
+    whole[-free:, -free:], right[-free:] = np.diag(pull[0]), -pull[1]
+    expected, *_ = np.linalg.lstsq(whole, right, rcond=None)
+    np.testing.assert_allclose(np.concatenate([step.starts.ravel(), step.u]), expected, atol=1e-12)
+    bounded = _solve.eliminate(triangles, states, scale, damping, pull, np.full(free, 1e-3))
+    assert (np.abs(bounded.u) <= 1e-3).all()
+
+
+def test_transforms_are_inverses_with_the_slopes_of_differences():
+    u = np.array([-3.0, 0.2, 2.0])
+    for transform in (lagjax.positive, lagjax.between(-1.0, 4.0), _transforms.Unbounded()):
+        x = transform.value(u)
+        np.testing.assert_allclose(transform.inverse(x), u, rtol=1e-12)
+        slope = (transform.value(u + 1e-6) - transform.value(u - 1e-6)) / 2e-6
+        np.testing.assert_allclose(transform.slope(u), slope, rtol=1e-8)
+
+
+def test_states_are_read_off_noisy_data():
+    ts = np.linspace(0.0, 2.0, 1001)
+    values = np.sin(3 * ts) + 1e-2 * np.random.default_rng(0).normal(size=ts.shape)
+    values[100:120] = np.nan
+    states = Reader.of(lagjax.Record(ts, values)).states(np.arange(0, 1001, 50))
+    np.testing.assert_allclose(states[1:-1, 0], np.sin(3 * ts[50:-50:50]), atol=1e-2)
+    np.testing.assert_allclose(states[1:-1, 1], 3 * np.cos(3 * ts[50:-50:50]), atol=0.3)
+
+
+def test_a_correlated_square_is_that_of_the_whole_matrix():
+    rows, lags = np.random.default_rng(0).normal(size=(2, 20, 3)), np.array([1.0, 0.6, 0.2])
+    law = np.zeros(20)
+    law[:3] = lags
+    matrix = law[np.abs(np.subtract.outer(np.arange(20), np.arange(20)))]
+    expected = np.einsum("ntf,ts,nsg->fg", rows, matrix, rows)
+    np.testing.assert_allclose(_correlation.correlated_square(rows, lags), expected, atol=1e-12)
+
+
+# ---- what is wrong, in a sentence ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (dict(ts=[], values=[]), "at least two times"),
+        (dict(ts=[0.0, 1.0, 1.0], values=[1.0, 2.0, 3.0]), r"ts\[1\] = 1 is followed by 1"),
+        (dict(ts=[0.0, np.nan], values=[1.0, 2.0]), r"ts\[1\] is not finite"),
+        (dict(ts=[0.0, 1.0], values=[1.0, 2.0, 3.0]), "2 times as its first axis"),
+        (dict(ts=[0.0, 1.0], values={"x": [1.0, np.inf]}), r"values\['x'\]\[1\] is infinite"),
+        (dict(ts=[0.0, 1.0], values=[1.0, 2.0], weights=-1.0), "not negative"),
+        (dict(ts=[0.0, 1.0], values=[1.0, 2.0], weights=[1.0, 2.0, 3.0]), "weights must be one number, or"),
+        (dict(ts=[0.0, 1.0], values=[1.0, 2.0], start=1.0), r"start must be \(q0, qdot0\)"),
+        (dict(ts=[0.0, 1.0], values=[1.0, 2.0], inputs=[1.0, 2.0]), "Sampled inputs are not there yet"),
+    ],
+)
+def test_a_record_that_cannot_be_is_refused(arguments, message):
+    with pytest.raises((TypeError, ValueError, NotImplementedError), match=message):
+        lagjax.Record(**arguments)
+
+
+def bead(values, **more):
+    return lagjax.Record([0.0, 0.1, 0.2, 0.3, 0.4, 0.5], values, **more)
+
+
+@pytest.mark.parametrize(
+    "rows, arguments, message",
+    [
+        ([], {}, "at least one lagjax.Record"),
+        ([bead(np.full(6, np.nan))], {}, "is NaN, or has no weight, at all times of all records"),
+        ([bead(np.zeros(6)), bead(np.full(6, np.nan))], {}, r"records\[1\] holds no sample"),
+        ([bead(np.zeros(6)), bead(np.zeros((6, 2)))], {}, r"records\[1\] has other signals"),
+        ([bead(np.zeros(6))], dict(free=False), "No parameter is free"),
+        ([bead(np.zeros(6))], dict(free={"l": True}), "free must be one value for all parameters"),
+        ([bead(np.zeros(6))], dict(free=1), "True or False"),
+        ([bead(np.zeros(6))], dict(transforms=3), "transforms must hold lagjax.positive"),
+        ([bead(np.zeros(6))], dict(transforms=lagjax.between(0.5, 2.0)), r"params\['c'\] must start between 0.5 and 2"),
+        ([bead(np.zeros(6))], dict(method="best"), "method must be one of"),
+        ([bead(np.zeros(6))], dict(noise=3), "noise must be"),
+        ([bead(np.zeros(6))], dict(observe=lambda q, v: {"x": q}), "observe returns"),
+        ([bead({"x": np.zeros(6)})], dict(observe=lambda q, v: {"x": q}), "cannot be called with coordinates"),
+        ([bead(np.zeros(6), start=(np.nan, 0.0))], {}, r"start of records\[0\] is not finite"),
+        ([bead(np.zeros(6), start=(1.0, 0.0))], dict(method="segments", observe=lambda q, v: jnp.log(q - 2)),
+         r"records\[0\] from t = 0 failed. What `observe` returns for values, or its derivative, is not finite at s"),
+    ],
+)  # fmt: skip
+def test_a_fit_that_cannot_be_is_refused(rows, arguments, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        lagjax.fit(SCENE, rows, TRUTH, **arguments)
+
+
+def test_a_motion_that_fails_names_its_record_and_time():
+    fall = lagjax.System(lambda q, v, params: 0.5 * v**2 + params / q)  # into the centre at t = 1.11
+    rows = [lagjax.Record(TS, 1.0 + 0 * TS, start=start) for start in ((9.0, 0.0), (1.0, 0.0))]
+    with pytest.raises(ValueError, match=r"records\[1\] from t = 0 failed\. .* beyond t = 1\.1"):
+        lagjax.fit(fall, rows, 1.0, method="whole")
+
+
+def test_between_needs_an_interval():
+    with pytest.raises(ValueError, match="a < b"):
+        lagjax.between(2.0, 1.0)
+    with pytest.raises(ValueError, match="at least 1"):
+        lagjax.StudentT(0.5)
