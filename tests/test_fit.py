@@ -341,7 +341,7 @@ def test_a_correlated_square_is_that_of_the_whole_matrix():
         (dict(ts=[0.0, 1.0, 1.0], values=[1.0, 2.0, 3.0]), r"ts\[1\] = 1 is followed by 1"),
         (dict(ts=[0.0, np.nan], values=[1.0, 2.0]), r"ts\[1\] is not finite"),
         (dict(ts=[0.0, 1.0], values=[1.0, 2.0, 3.0]), "2 times as its first axis"),
-        (dict(ts=[0.0, 1.0], values={"x": [1.0, np.inf]}), r"values\['x'\]\[1\] is infinite"),
+        (dict(ts=[0.0, 1.0], values={"x": np.array([1.0, np.inf])}), r"values\['x'\]\[1\] is infinite"),
         (dict(ts=[0.0, 1.0], values=[1.0, 2.0], weights=-1.0), "not negative"),
         (dict(ts=[0.0, 1.0], values=[1.0, 2.0], weights=[1.0, 2.0, 3.0]), "weights must be one number, or"),
         (dict(ts=[0.0, 1.0], values=[1.0, 2.0], start=1.0), r"start must be \(q0, qdot0\)"),

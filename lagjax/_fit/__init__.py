@@ -10,8 +10,9 @@ and sensors with their derivatives; `_residuals` and `_noise` say how far off a 
 begin, `_solve` goes down from there; `_correlation`, `_uncertainty`, `_unseen` and `_result` say what that means.
 """
 
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +22,10 @@ from lagjax._consistent import has_constraints
 from lagjax._fit._motions import motions_of
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Guess, Record, in_structure, known_start, require_alike
+from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike
 from lagjax._fit._residuals import Failure, Question
 from lagjax._fit._result import Covariance, Fit, SignalNoise
-from lagjax._fit._segments import Reader, glimpses, levels, shortest, time_scale, whole
+from lagjax._fit._segments import Reader, glimpses, levels, time_scale, whole
 from lagjax._fit._signals import Signals, looks_like_positions
 from lagjax._fit._solve import Anchor, Descent, minimise
 from lagjax._fit._transforms import between, positive
@@ -41,6 +42,8 @@ METHODS = ("auto", "segments", "whole")
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
 # independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.
 _ENOUGH, _ENOUGH_OF_LEVEL = 1e-3, 1e-3
+_ENOUGH_OF_GLIMPSES = 0.1
+_POOR = 2.0  # times the scatter of the data: beyond, the shortest segments were not fitted
 _LOOSE = 3.0  # standard deviations of u about its first value on these levels, where u is a logarithm or the like
 _TRIALS, _TRIALS_OF_LEVEL = 60, 20
 
@@ -169,39 +172,70 @@ def _search(question: Question, u, starts, noise, method: str, readers) -> Desce
     return done
 
 
+class _Begun(NamedTuple):
+    """Where growing segments begin: u, the cuts, the states at the first samples, and how far off that is."""
+
+    u: np.ndarray
+    cuts: list[list[Piece]]
+    best: dict[tuple[int, int], np.ndarray]
+    misfit: float
+
+
 def _grown(question: Question, u, starts, noise, readers: list[Reader]) -> tuple[np.ndarray, np.ndarray]:
     """Better first values of u and of the starts, from segments that grow together to whole records."""
-    records = question.records
-    scale = time_scale(readers, question.motions, question.parameters.numbers(u))
     anchor = Anchor(u, np.where(np.isfinite(question.parameters.reach), 1.0 / _LOOSE, 0.0))
-    if scale < shortest(records):
-        u = _glimpsed(question, u, noise, readers, scale, anchor)
-        scale = time_scale(readers, question.motions, question.parameters.numbers(u))
-    best: dict[tuple[int, int], np.ndarray] = {(k, 0): start for k, start in enumerate(starts)}
-    for pieces in levels(records, scale):
-        firsts = [(piece.record, int(piece.places[0])) for piece in pieces]
-        for k, reader in enumerate(readers):
-            new = [place for record, place in firsts if record == k and (k, place) not in best]
-            if new:
-                best |= {(k, place): y for place, y in zip(new, reader.states(np.array(new)), strict=True)}
-        part = question.of(pieces, np.array([question.fitted[k] or place > 0 for k, place in firsts]))
-        y0 = np.stack([best[first] for first in firsts])
-        done = minimise(part, u, y0, noise, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
+    search = functools.partial(_level, question, noise=noise, readers=readers, anchor=anchor)
+    begun = _begun(question, u, starts, readers, search)
+    if begun.misfit > np.log(_POOR):
+        other = _glimpsed(question, u, noise, readers, anchor)
+        begun = min(begun, _begun(question, other, starts, readers, search), key=lambda one: one.misfit)
+    u, best = begun.u, begun.best
+    for pieces in begun.cuts[1:]:
+        done = search(pieces, u, best)
         if isinstance(done, Failure):
             break  # whole records then begin from the best so far, and say so if they fail as well
         u = done.point.u
+    return u, np.stack([best[k, 0] for k in range(len(question.records))])
+
+
+def _begun(question: Question, u, starts, readers: list[Reader], search) -> _Begun:
+    """The search on the shortest segments, from u: its misfit is the mean of log σ over the scatter of the data."""
+    cuts = levels(question.records, time_scale(readers, question.motions, question.parameters.numbers(u)))
+    best = {(k, 0): start for k, start in enumerate(starts)}
+    if not cuts:
+        return _Begun(u, cuts, best, -np.inf)
+    done = search(cuts[0], u, best)
+    if isinstance(done, Failure):
+        return _Begun(u, cuts, best, np.inf)
+    scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in readers], axis=0))
+    ratio = done.widths.sigma / np.maximum(scatter, question.least)
+    return _Begun(done.point.u, cuts, best, float(np.mean(np.log(ratio))))
+
+
+def _level(question: Question, pieces: list[Piece], u, best, noise, readers, anchor) -> Descent | Failure:
+    """The search on one cut of the records. The states in `best`, by record and sample, begin it and take its end."""
+    firsts = [(piece.record, int(piece.places[0])) for piece in pieces]
+    for k, reader in enumerate(readers):
+        new = [place for record, place in firsts if record == k and (k, place) not in best]
+        if new:
+            best |= {(k, place): y for place, y in zip(new, reader.states(np.array(new)), strict=True)}
+    part = question.of(pieces, np.array([question.fitted[k] or place > 0 for k, place in firsts]))
+    y0 = np.stack([best[first] for first in firsts])
+    done = minimise(part, u, y0, noise, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
+    if not isinstance(done, Failure):
         best |= dict(zip(firsts, done.point.starts, strict=True))
-    return u, np.stack([best[k, 0] for k in range(len(records))])
+    return done
 
 
-def _glimpsed(question: Question, u, noise, readers: list[Reader], scale: float, anchor: Anchor) -> np.ndarray:
-    """Better first values of u where the scene moves faster than the samples follow each other."""
-    short, states = glimpses(readers, scale)
+def _glimpsed(question: Question, u, noise, readers: list[Reader], anchor: Anchor) -> np.ndarray:
+    """The u that suits the accelerations of local cubics: these have one minimum where segments are too long for u."""
+    scale = time_scale(readers, question.motions, question.parameters.numbers(u))
+    short, states = glimpses(readers, 0.25 * scale)
     part = Question(
         short, whole(short), np.ones(len(short), bool), question.motions, question.signals, question.parameters,
         question.least,
     )  # fmt: skip
-    done = minimise(part, u, states, noise, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
+    done = minimise(part, u, states, noise, _ENOUGH_OF_GLIMPSES, _TRIALS_OF_LEVEL, anchor)
     return u if isinstance(done, Failure) else done.point.u
 
 

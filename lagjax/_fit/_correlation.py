@@ -2,7 +2,7 @@
 
 At 1 kHz residuals hold what the scene lacks, and neighbours agree: n samples are worth n/τ independent ones, with τ the
 sum of the correlations over all lags. Source: Geyer, *Practical Markov chain Monte Carlo*, Stat. Sci. 7 (1992) 473, for
-where correlations end; Newey & West, Econometrica 55 (1987) 703, for tapers that leave a spectrum without negative parts.
+where correlations end; Newey & West, Econometrica 55 (1987) 703, for tapers whose spectrum has no negative parts.
 """
 
 from typing import NamedTuple

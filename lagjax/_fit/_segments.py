@@ -27,15 +27,19 @@ _WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them
 _PROBES = 32  # places of a record where windows and time scales are tried
 _WORSE = 1.2  # what a window may leave, in units of what the shortest leaves
 _PER_SCALE = 24  # samples per time scale that early levels look at: more cost time and find the same
-_GLIMPSES = 64  # places of a record where its curvature is looked at
+_GLIMPSES = 256  # places of all records where curvature is looked at
 _FEWEST = 8  # samples in a segment
 
 
 class Reader(NamedTuple):
-    """Positions and velocities of one record from local cubics: each signal is a coordinate, with a window (S,)."""
+    """Positions and velocities of one record from local cubics: each signal is a coordinate.
+
+    `windows` (S,) are the samples in one cubic, `scatter` (S,) what the shortest leave.
+    """
 
     record: Record
     windows: tuple[int, ...]
+    scatter: tuple[float, ...]
 
     @classmethod
     def of(cls, record: Record) -> "Reader":
@@ -43,8 +47,9 @@ class Reader(NamedTuple):
 
         Beyond these they no longer follow the motion.
         """
-        places = some_of(record, _PROBES)
-        return cls(record, tuple(_window(record.ts[places], *signal) for signal in _signals(record)))
+        places = some_of(record, _PROBES // 2)
+        windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
+        return cls(record, windows, scatter)
 
     def states(self, places) -> np.ndarray:
         """(q, q̇) at the samples `places` (M,) of the record, (M, 2n)."""
@@ -79,14 +84,15 @@ def _read(ts: np.ndarray, t: np.ndarray, y: np.ndarray, window: int):
     return _local_cubics(ts, t, y, min(window, len(t)))
 
 
-def _window(ts: np.ndarray, t: np.ndarray, y: np.ndarray) -> int:
-    """The number of samples in the window for one signal."""
-    best, most = _WINDOWS[0], _WORSE * _read(ts, t, y, _WINDOWS[0])[2]
+def _window(ts: np.ndarray, t: np.ndarray, y: np.ndarray) -> tuple[int, float]:
+    """The number of samples in the window for one signal, and the scatter about the shortest."""
+    scatter = _read(ts, t, y, _WINDOWS[0])[2]
+    best, most = _WINDOWS[0], _WORSE * scatter
     for window in _WINDOWS[1:]:
         if window > len(t) or _read(ts, t, y, window)[2] > most:
             break
         best = window
-    return best
+    return best, scatter
 
 
 def _local_cubics(ts, t, y, window: int):
@@ -116,7 +122,7 @@ def glimpses(readers: list[Reader], length: float) -> tuple[list[Record], np.nda
     """
     found, states = [], []
     for reader in readers:
-        places = some_of(reader.record, _GLIMPSES)
+        places = some_of(reader.record, max(4, _GLIMPSES // len(readers)))
         offsets = np.linspace(0.0, length, 4)
         cubics = [
             _read(reader.record.ts[places], *s, w)[3]
@@ -147,11 +153,6 @@ def time_scale(readers: list[Reader], motions: AbstractMotions, numbers: np.ndar
         both = np.concatenate([spread / rate, np.sqrt(spread / pulled)])
     both = both[np.isfinite(both) & (both > 0)]
     return float(both.min()) if len(both) else np.inf
-
-
-def shortest(records: list[Record]) -> float:
-    """The time scale below which segments of a few samples are too long."""
-    return 0.5 * _FEWEST * float(np.median(np.concatenate([np.diff(record.ts) for record in records])))
 
 
 def levels(records: list[Record], scale: float) -> list[list[Piece]]:
