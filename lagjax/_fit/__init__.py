@@ -43,7 +43,7 @@ METHODS = ("auto", "segments", "whole")
 # independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.
 _ENOUGH, _ENOUGH_OF_LEVEL = 1e-3, 1e-3
 _ENOUGH_OF_GLIMPSES = 0.1
-_POOR = 2.0  # times the scatter of the data: beyond, the shortest segments were not fitted
+_POOR, _COARSE = 2.0, 0.02  # times scatter or size of signals: beyond, the shortest segments were not fitted
 _LOOSE = 3.0  # standard deviations of u about its first value on these levels, where u is a logarithm or the like
 _TRIALS, _TRIALS_OF_LEVEL = 60, 20
 
@@ -143,8 +143,7 @@ def _question(system, records, layout, parameters, observe) -> Question:
             f"records[{int(np.argmax(fitted))}] has no known start: a start on constraints cannot be fitted yet. Give "
             "start=(q0, qdot0), or use coordinates without constraints."
         )
-    least = rtol * np.where(size > 0, size, 1.0)
-    return Question(records, whole(records), fitted, motions, signals, parameters, least)
+    return Question(records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol)
 
 
 def _start(record: Record, readers: list[Reader] | None, layout: Layout, place: int) -> np.ndarray:
@@ -186,7 +185,7 @@ def _grown(question: Question, u, starts, noise, readers: list[Reader]) -> tuple
     anchor = Anchor(u, np.where(np.isfinite(question.parameters.reach), 1.0 / _LOOSE, 0.0))
     search = functools.partial(_level, question, noise=noise, readers=readers, anchor=anchor)
     begun = _begun(question, u, starts, readers, search)
-    if begun.misfit > np.log(_POOR):
+    if begun.misfit > 0.0:
         other = _glimpsed(question, u, noise, readers, anchor)
         begun = min(begun, _begun(question, other, starts, readers, search), key=lambda one: one.misfit)
     u, best = begun.u, begun.best
@@ -199,7 +198,11 @@ def _grown(question: Question, u, starts, noise, readers: list[Reader]) -> tuple
 
 
 def _begun(question: Question, u, starts, readers: list[Reader], search) -> _Begun:
-    """The search on the shortest segments, from u: its misfit is the mean of log σ over the scatter of the data."""
+    """The search on the shortest segments, from u, whose misfit is positive where they were not fitted.
+
+    It is the mean logarithm of the noise σ of the signals, over `_POOR` times the scatter of the data or a share
+    `_COARSE` of the signals' size, whichever is larger.
+    """
     cuts = levels(question.records, time_scale(readers, question.motions, question.parameters.numbers(u)))
     best = {(k, 0): start for k, start in enumerate(starts)}
     if not cuts:
@@ -208,7 +211,7 @@ def _begun(question: Question, u, starts, readers: list[Reader], search) -> _Beg
     if isinstance(done, Failure):
         return _Begun(u, cuts, best, np.inf)
     scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in readers], axis=0))
-    ratio = done.widths.sigma / np.maximum(scatter, question.least)
+    ratio = done.widths.sigma / np.maximum(_POOR * scatter, _COARSE * question.size)
     return _Begun(done.point.u, cuts, best, float(np.mean(np.log(ratio))))
 
 
@@ -233,7 +236,7 @@ def _glimpsed(question: Question, u, noise, readers: list[Reader], anchor: Ancho
     short, states = glimpses(readers, 0.25 * scale)
     part = Question(
         short, whole(short), np.ones(len(short), bool), question.motions, question.signals, question.parameters,
-        question.least,
+        question.size, question.rtol,
     )  # fmt: skip
     done = minimise(part, u, states, noise, _ENOUGH_OF_GLIMPSES, _TRIALS_OF_LEVEL, anchor)
     return u if isinstance(done, Failure) else done.point.u
@@ -257,7 +260,7 @@ def _told(system, observe, question: Question, descent: Descent) -> Fit:
         residuals=_by_record(question, point),
         unseen=unseen,
         ok=descent.converged and not unseen,
-        message=_message(descent, unseen, known),
+        message=_message(descent, unseen, known, parameters),
         log_likelihood=log_likelihood(widths, point.flat(), question.weights),
         trials=descent.trials,
         records=tuple(question.records),
@@ -290,10 +293,15 @@ def _by_record(question: Question, point) -> tuple[PyTree, ...]:
     return tuple(found[row] for row in range(len(question.records)))
 
 
-def _message(descent: Descent, unseen, known: Information) -> str:
+def _message(descent: Descent, unseen, known: Information, parameters: Parameters) -> str:
     parts = [descent.message]
     if unseen:
         parts.append("Not everything that is free is seen: fix it, or measure more.")
+    # Half a step of the search is one standard deviation: the interval then spans more than a factor of fifty.
+    vague = np.flatnonzero(2 * np.sqrt(np.nan_to_num(np.diag(known.covariance), posinf=0.0)) > parameters.reach)
+    if len(vague):
+        names = ", ".join(parameters.names[i] for i in vague)
+        parts.append(f"Hardly seen, or at the end of what its transform allows: {names}.")
     if np.nanmax(known.correlation) > 0.5:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
     return " ".join(parts)

@@ -40,8 +40,8 @@ class Failure(NamedTuple):
 class Question:
     """Pieces of records, the scene and its sensors, and what is free.
 
-    `fitted` (N,) says of each piece whether its start is free; `least` (S,) is the smallest width of noise that the
-    tolerances of the motion allow to tell.
+    `fitted` (N,) says of each piece whether its start is free; `size` (S,) is the root mean square
+    of the signals, and that times `rtol`, the tolerance of the motion, the smallest noise that can be told.
     """
 
     def __init__(
@@ -52,13 +52,15 @@ class Question:
         motions: AbstractMotions,
         signals: Signals,
         parameters: Parameters,
-        least: np.ndarray,
+        size: np.ndarray,
+        rtol: float,
     ):
-        self.records, self.pieces, self.fitted, self.least = records, pieces, fitted, least
+        self.records, self.pieces, self.fitted = records, pieces, fitted
+        self.size, self.rtol, self.least = size, rtol, rtol * size
         self.motions, self.signals, self.parameters = motions, signals, parameters
         self.layout: Layout = signals.layout
         self.batches: list[Samples] = batches(records, pieces, float(np.finfo(self.layout.dtype).eps))
-        self.weights = np.concatenate([b.weights.reshape(-1, len(least)) for b in self.batches])
+        self.weights = np.concatenate([b.weights.reshape(-1, len(size)) for b in self.batches])
         self.measured = int((self.weights > 0).sum())
 
     @property
@@ -69,7 +71,7 @@ class Question:
     def of(self, pieces: list[Piece], fitted: np.ndarray) -> "Question":
         """The same question about other pieces of the records."""
         return Question(
-            self.records, pieces, fitted, self.motions, self.signals, self.parameters, self.least
+            self.records, pieces, fitted, self.motions, self.signals, self.parameters, self.size, self.rtol
         )  # fmt: skip
 
     def at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:

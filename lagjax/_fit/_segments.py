@@ -25,7 +25,7 @@ from lagjax._fit._records import Piece, Record, in_structure
 _DEGREE = 3  # of local polynomials: velocities without the bias that curvature gives to lines
 _WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them
 _PROBES = 32  # places of a record where windows and time scales are tried
-_WORSE = 1.2  # what a window may leave, in units of what the shortest leaves
+_WORSE = 1.3  # what a window may leave, in units of what the shortest leaves
 _PER_SCALE = 24  # samples per time scale that early levels look at: more cost time and find the same
 _GLIMPSES = 256  # places of all records where curvature is looked at
 _FEWEST = 8  # samples in a segment
@@ -47,7 +47,7 @@ class Reader(NamedTuple):
 
         Beyond these they no longer follow the motion.
         """
-        places = some_of(record, _PROBES // 2)
+        places = some_of(record, _PROBES)
         windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
         return cls(record, windows, scatter)
 

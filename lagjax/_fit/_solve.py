@@ -76,9 +76,9 @@ def minimise(
 ) -> Descent | Failure:
     """The unknowns that make the measurements likeliest, by a search from (u, starts).
 
-    It ends when a step without damping promises to lower half the sum of squares, in units of the noise, by less than
-    `enough`, correlated residuals counted for what they are worth: then no parameter is further than √(2 enough)
-    standard deviations from the minimum.
+    It ends when a step without damping, within the reach of the transforms, promises to lower half the sum of squares,
+    in units of the noise, by less than `enough`, correlated residuals counted for what they are worth: then no
+    parameter is further than √(2 enough) standard deviations from the minimum.
     A `Failure` is returned where the motion from the first trial cannot be followed.
     """
     point = question.at(u, starts)
@@ -92,7 +92,7 @@ def minimise(
         triangles, cost = question.triangles(point, factors), question.cost(point, factors) + anchor.cost(point.u)
         scale = _scales(triangles, question.states)
         pull = anchor.weight, anchor.pull(point.u)
-        left = eliminate(triangles, question.states, scale, _LEAST, pull).gain
+        left = eliminate(triangles, question.states, scale, _LEAST, pull, reach).gain
         if left <= enough or (left <= _NEAR * question.measured and left * share(question, point, widths) <= enough):
             return Descent(point, widths, True, trials, f"The search converged after {trials} trials.")
         better = None
