@@ -41,7 +41,7 @@ PyTree = Any
 METHODS = ("auto", "segments", "whole")
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
 # independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.
-_ENOUGH, _ENOUGH_OF_LEVEL = 1e-3, 1e-3
+_ENOUGH, _ENOUGH_OF_LEVEL = 1e-3, 1e-2
 _ENOUGH_OF_GLIMPSES = 0.1
 _POOR, _COARSE = 2.0, 0.02  # times scatter or size of signals: beyond, the shortest segments were not fitted
 _LOOSE = 3.0  # standard deviations of u about its first value on these levels, where u is a logarithm or the like
@@ -108,7 +108,7 @@ def fit(
     layout = _layout(system, records, params0)
     parameters = Parameters.of(params0, free, transforms, layout.dtype)
     question = _question(system, records, layout, parameters, observe)
-    readers = [Reader.of(record) for record in records] if looks_like_positions(observe, records[0], layout) else None
+    readers = _readers(records) if looks_like_positions(observe, records[0], layout) else None
     starts = np.stack([_start(record, readers, layout, k) for k, record in enumerate(records)])
     descent = _search(question, parameters.moved(parameters.first), starts, noise, method, readers)
     return _told(system, observe, question, descent)
@@ -144,6 +144,11 @@ def _question(system, records, layout, parameters, observe) -> Question:
             "start=(q0, qdot0), or use coordinates without constraints."
         )
     return Question(records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol)
+
+
+def _readers(records: list[Record]) -> list[Reader]:
+    """What reads states off the data, for each record; all together try windows at a few hundred places."""
+    return [Reader.of(record, max(8, 256 // len(records))) for record in records]
 
 
 def _start(record: Record, readers: list[Reader] | None, layout: Layout, place: int) -> np.ndarray:

@@ -24,7 +24,7 @@ from lagjax._fit._records import Piece, Record, in_structure
 
 _DEGREE = 3  # of local polynomials: velocities without the bias that curvature gives to lines
 _WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them
-_PROBES = 32  # places of a record where windows and time scales are tried
+_PROBES = 32  # places of a record where its time scale is looked at
 _WORSE = 1.3  # what a window may leave, in units of what the shortest leaves
 _PER_SCALE = 24  # samples per time scale that early levels look at: more cost time and find the same
 _GLIMPSES = 256  # places of all records where curvature is looked at
@@ -42,12 +42,12 @@ class Reader(NamedTuple):
     scatter: tuple[float, ...]
 
     @classmethod
-    def of(cls, record: Record) -> "Reader":
+    def of(cls, record: Record, probes: int = 256) -> "Reader":
         """A reader with the longest windows whose cubics leave no more than `_WORSE` times what the shortest leave.
 
-        Beyond these they no longer follow the motion.
+        Beyond these they no longer follow the motion. They are tried at `probes` places.
         """
-        places = some_of(record, _PROBES)
+        places = some_of(record, probes)
         windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
         return cls(record, windows, scatter)
 
