@@ -275,18 +275,18 @@ def test_a_long_record_is_found_from_any_frequency_where_whole_records_fail():
 
 @pytest.mark.slow
 def test_a_chaotic_record_is_found_where_whole_records_fail():
-    # Two seconds of a double pendulum, over which neighbouring states part by e⁸ and more.
+    # Over it neighbouring starts part by more than e⁸.
     example = importlib.import_module("double_pendulum_fit")
     rng = np.random.default_rng(2)
-    q0, qdot0 = np.pi + rng.uniform(-3.0, 3.0, (1, 2)), rng.normal(0.0, 3.0, (1, 2))
+    q0, qdot0 = np.array([[1.0, -0.5]]), np.zeros((1, 2))
     law = example.LAWS["viscous"]
-    truth, ts = example.START | law, np.linspace(0.0, 2.0, 2001)
+    truth, ts = example.START | law, np.linspace(0.0, 1.6, 1601)
     exact = np.asarray(lagjax.simulate_batch(example.SCENE, q0, qdot0, ts, truth).q[0])
 
     def end(q):
         return lagjax.simulate(example.SCENE, q, qdot0[0], ts, truth).q[-1]
 
-    assert np.log(np.linalg.norm(jax.jacfwd(end)(q0[0]), 2)) > 5
+    assert np.log(np.linalg.norm(jax.jacfwd(end)(q0[0]), 2)) > 8
     record = lagjax.Record(ts, exact + SIGMA * rng.normal(size=exact.shape))
     far = {name: 1.3 * value if name in example.START else value for name, value in truth.items()}
     free = {name: name in example.START for name in truth}
@@ -334,7 +334,7 @@ def test_the_real_double_pendulum(capsys):
 @pytest.mark.slow
 def test_derivatives_of_motions_and_sensors_are_those_of_differences():
     parameters = Parameters.of(TRUTH, FREE, lagjax.positive)
-    observe = lambda q, v, t, params: jnp.stack([jnp.sin(q) * params["l"], v * t])  # noqa: E731
+    observe = lambda q, v, t, params: jnp.stack([jnp.sin(q) * params["l"], v * t])
     signals = _signals.Signals(
         observe, Layout.of(0.0, 0.0), parameters, lagjax.Record(TS, np.zeros((len(TS), 2)), start=(0.0, 0.0))
     )
@@ -434,7 +434,7 @@ def test_a_correlated_square_is_that_of_the_whole_matrix():
         (dict(ts=[0.0, 1.0], values=[1.0, 2.0], weights=-1.0), "not negative"),
         (dict(ts=[0.0, 1.0], values=[1.0, 2.0], weights=[1.0, 2.0, 3.0]), "weights must be one number, or"),
         (dict(ts=[0.0, 1.0], values=[1.0, 2.0], start=1.0), r"start must be \(q0, qdot0\)"),
-        (dict(ts=[0.0, 1.0], values=[1.0, 2.0], inputs=[1.0, 2.0]), "Sampled inputs are not there yet"),
+        (dict(ts=[0.0, 1.0], values=[1.0, 2.0], inputs=[1.0, 2.0]), "Sampled inputs of a record are not there yet"),
     ],
 )
 def test_a_record_that_cannot_be_is_refused(arguments, message):

@@ -29,7 +29,7 @@ class Record:
       for it begins. With None it is fitted, from local polynomials through the values.
     - `weights`: how much each sample counts, one number or a prefix of the structure of `values`: the variance of a
       sample is that of its signal over its weight. Zero leaves a sample out.
-    - `inputs`: not there yet. An input that was sampled goes into `forces` as a function of `t`.
+    - `inputs`: not there yet. An input that all records share goes into `forces`, by `lagjax.samples`.
 
     **Raises** `TypeError` or `ValueError` where these cannot be right.
 
@@ -59,7 +59,8 @@ class Record:
         object.__setattr__(self, "values", tree.unflatten(leaves))
         if self.inputs is not None:
             raise NotImplementedError(
-                "Sampled inputs are not there yet: let `forces` compute the input as a function of `t`."
+                "Sampled inputs of a record are not there yet. Where all records have the same input, let `forces` ask "
+                "for `t` and call lagjax.samples(knots, values)(t)."
             )
         if self.start is not None and not (isinstance(self.start, tuple) and len(self.start) == 2):
             raise TypeError(f"start must be (q0, qdot0), lagjax.Guess(q0, qdot0) or None; got {self.start!r}.")

@@ -55,7 +55,7 @@ def information(question: Question, point: Point, widths: Widths) -> Information
         middle += sum(correlated_square(own[:, :, s], lags[s]) for s in range(len(lags)))
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + question.states * int(question.fitted.sum())
-    lost = question.measured / max(question.measured - used, 1)
+    lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in widths.dof])
     half = basis @ np.linalg.solve(basis.T @ _square(triangles, question.states) @ basis, basis.T)
     covariance = lost * robust * half @ middle @ half.T
