@@ -36,7 +36,9 @@ class Parameters:
     transforms: tuple[AbstractTransform, ...]
 
     @classmethod
-    def of(cls, params: PyTree, free: PyTree = None, transforms: PyTree = None, dtype=np.float64) -> "Parameters":
+    def of(
+        cls, params: PyTree, free: PyTree = None, transforms: PyTree = None, dtype: Any = np.float64
+    ) -> "Parameters":
         """The parameters as the user gives them; `free` and `transforms` are prefixes of the same structure.
 
         Raises `TypeError` or `ValueError` with the name of the parameter that cannot be right.

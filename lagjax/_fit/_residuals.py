@@ -140,6 +140,11 @@ class Question:
         return f"The motion of records[{piece.record}] from t = {begin:g} failed. {failure.text}"
 
 
+def triangle_of(rows: np.ndarray) -> np.ndarray:
+    """R of the factorisation QR of matrices (..., M, D)."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
 _BLOCK = 8  # times as many rows as columns in one factorisation
 
 
@@ -153,7 +158,7 @@ def compressed(rows: np.ndarray) -> np.ndarray:
         height = min(_BLOCK * columns, rows.shape[1])
         missing = -rows.shape[1] % height
         rows = np.concatenate([rows, np.zeros((pieces, missing, columns))], axis=1) if missing else rows
-        blocks = np.linalg.qr(rows.reshape(-1, height, columns), mode="r")
+        blocks = triangle_of(rows.reshape(-1, height, columns))
         rows = blocks.reshape(pieces, -1, columns)
     found = np.zeros((pieces, columns, columns))
     found[:, : rows.shape[1]] = rows

@@ -71,6 +71,7 @@ class Signals:
         return values.reshape(shape), slopes
 
     def _in_portions(self, y, t, numbers):
+        assert self._at is not None
         parts = []
         for begin in range(0, len(y), _AT_ONCE):
             some, times = y[begin : begin + _AT_ONCE], t[begin : begin + _AT_ONCE]

@@ -20,11 +20,15 @@ import numpy as np
 
 from lagjax._fit._correlation import share
 from lagjax._fit._noise import AbstractNoise, Widths
-from lagjax._fit._residuals import Failure, Point, Question, compressed
+from lagjax._fit._residuals import Failure, Point, Question, compressed, triangle_of
 
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
 # least one, damping is below the round-off of derivatives and only keeps columns that nothing depends on from moving.
 _FIRST, _LEAST, _MOST = 1e-4, 1e-14, 1e12
+
+
+_NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
+_FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
 
 
 class Descent(NamedTuple):
@@ -84,45 +88,74 @@ def minimise(
     point = question.at(u, starts)
     if isinstance(point, Failure):
         return point
-    damping, growth, trials = _FIRST, 2.0, 1
-    anchor, reach = Anchor.none(u) if anchor is None else anchor, question.parameters.reach
+    anchor = Anchor.none(u) if anchor is None else anchor
+    damping, trials = _FIRST, 1
     while True:
-        widths = question.widths(point, noise)
-        factors = question.factors(point, widths)
-        triangles, cost = question.triangles(point, factors), question.cost(point, factors) + anchor.cost(point.u)
-        scale = _scales(triangles, question.states)
-        pull = anchor.weight, anchor.pull(point.u)
-        left = eliminate(triangles, question.states, scale, _LEAST, pull, reach).gain
-        if left <= enough or (left <= _NEAR * question.measured and left * share(question, point, widths) <= enough):
-            return Descent(point, widths, True, trials, f"The search converged after {trials} trials.")
-        better = None
-        while better is None:
-            if trials >= limit:
-                text = f"The search was stopped after {trials} trials: half the sum of squares may fall by {left:.2g}."
-                return Descent(point, widths, False, trials, text)
-            step = eliminate(triangles, question.states, scale, damping, pull, reach)
-            trial = question.at(point.u + step.u, point.starts + step.starts)
-            trials += 1
-            fall = -np.inf
-            if not isinstance(trial, Failure):
-                fall = cost - question.cost(trial, factors) - anchor.cost(trial.u)
-            if (not fall > 0.0 and damping >= _MOST) or step.gain <= _FLAT * cost:
-                text = f"The search stopped where rounding hides what is left, after {trials} trials."
-                return Descent(point, widths, True, trials, text)
-            if fall > 0.0:
-                better = trial
-                damping = max(_LEAST, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3))
-                growth = 2.0
-            else:
-                damping, growth = damping * growth, 2.0 * growth
+        model = _model(question, point, noise, anchor)
+        left = model.step(_LEAST).gain
+        near = left <= _NEAR * question.measured
+        if left <= enough or (near and left * share(question, point, model.widths) <= enough):
+            return Descent(point, model.widths, True, trials, f"The search converged after {trials} trials.")
+        better, damping, trials = _descended(question, point, model, anchor, damping, trials, limit)
+        if better is None and trials < limit:
+            text = f"The search stopped where rounding hides what is left, after {trials} trials."
+            return Descent(point, model.widths, True, trials, text)
+        if better is None:
+            text = f"The search was stopped after {trials} trials: half the sum of squares may fall by {left:.2g}."
+            return Descent(point, model.widths, False, trials, text)
         point = better
 
 
-_NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
-_FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
+class _Model(NamedTuple):
+    """The least squares about one trial: what it is made of, and half its sum of squares."""
+
+    widths: Widths
+    factors: list[np.ndarray]
+    triangles: np.ndarray
+    states: int
+    pull: tuple[np.ndarray, np.ndarray]
+    reach: np.ndarray
+    cost: float
+
+    def step(self, damping: float) -> Step:
+        """The damped step from the trial."""
+        scale = _scales(self.triangles, self.states)
+        return eliminate(self.triangles, self.states, scale, damping, self.pull, self.reach)
 
 
-def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, reach=np.inf) -> Step:
+def _model(question: Question, point: Point, noise: AbstractNoise, anchor: Anchor) -> _Model:
+    widths = question.widths(point, noise)
+    factors = question.factors(point, widths)
+    triangles, cost = question.triangles(point, factors), question.cost(point, factors) + anchor.cost(point.u)
+    pull = anchor.weight, anchor.pull(point.u)
+    return _Model(widths, factors, triangles, question.states, pull, question.parameters.reach, cost)
+
+
+def _descended(
+    question: Question, point: Point, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
+) -> tuple[Point | None, float, int]:
+    """The first trial that is better, the damping to go on with, and the count of trials.
+
+    There is none, but None, after `limit` trials, or where steps promise no more than sums of squares are rounded to.
+    """
+    growth = 2.0
+    while trials < limit:
+        step = model.step(damping)
+        if step.gain <= _FLAT * model.cost or damping > _MOST:
+            break
+        trial = question.at(point.u + step.u, point.starts + step.starts)
+        trials += 1
+        if not isinstance(trial, Failure):
+            fall = model.cost - question.cost(trial, model.factors) - anchor.cost(trial.u)
+            if fall > 0.0:
+                return trial, max(_LEAST, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3)), trials
+        damping, growth = damping * growth, 2.0 * growth
+    return None, damping, trials
+
+
+def eliminate(
+    triangles: np.ndarray, states: int, scale, damping: float, pull, reach: float | np.ndarray = np.inf
+) -> Step:
     """The damped step for the triangles (N, D + 1, D + 1) of all pieces, whose first `states` columns are starts.
 
     `scale` holds the norms of the columns (`_scales`), and `pull` is (weight, residuals), (F,) each, of an anchor of
@@ -132,7 +165,7 @@ def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, r
     (pieces, columns, _), free = triangles.shape, len(of_u)
     damped = np.zeros((pieces, states, columns))
     damped[:, np.arange(states), np.arange(states)] = np.sqrt(damping) * of_starts
-    r = np.linalg.qr(np.concatenate([triangles, damped], axis=1), mode="r")
+    r = triangle_of(np.concatenate([triangles, damped], axis=1))
     anchored = np.concatenate([np.diag(pull[0]), pull[1][:, None]], axis=1)
     rest = compressed(np.concatenate([r[:, states:, states:].reshape(-1, free + 1), anchored])[None])[0]
     du = _within_reach(rest, of_u, damping, reach)
@@ -149,7 +182,7 @@ def _within_reach(rest: np.ndarray, of_u: np.ndarray, damping: float, reach) -> 
     free, each = len(of_u), np.full(len(of_u), damping)
     while True:
         rows = np.concatenate([rest, np.diag(np.append(np.sqrt(each) * of_u, 0.0))[:free]])
-        triangle = np.linalg.qr(rows, mode="r")
+        triangle = triangle_of(rows)
         du = np.linalg.solve(triangle[:free, :free], -triangle[:free, free])
         beyond = np.abs(du) > reach
         if not beyond.any() or each[beyond].min() > _MOST:
