@@ -239,7 +239,7 @@ def _lab_book(fit: Fit) -> str:
     plural = "s" if len(fit.records) > 1 else ""
     of_records = f"{len(fit.records)} record{plural}, {sum(spans):g} long, {samples} values"
     lines = [
-        f"Fit of {len(fit.u)} parameters to {of_records}",
+        f"Fit of {len(fit.u)} parameter{'s' * (len(fit.u) != 1)} to {of_records}",
         "",
         *_table_of_parameters(fit),
         "",
