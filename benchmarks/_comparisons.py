@@ -118,7 +118,7 @@ def _in_machine_code(case: Case) -> Callable[[], None] | None:
     with code.loop(EVALUATIONS), code.loop(groups) as group:
         places = [code.element(states, (group * (2 * n) + i) * width) for i in range(2 * n)]
         y = [code.load(place, vector) for place in places]
-        for place, x, slope in zip(places, y, [*y[n:], *emit(code, line, y.__getitem__, sincos)], strict=True):
+        for place, x, slope in zip(places, y, [*y[n:], *emit(code, line, y.__getitem__, sincos, None)], strict=True):
             code.store(slope * 1e-30 + x, place)
     code.finish()
     engine, at = compiled(module, ("evaluate",))

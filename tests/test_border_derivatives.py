@@ -67,6 +67,7 @@ def test_first_derivatives():
     np.testing.assert_allclose(jax.jacfwd(value)(X), expected, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_products_with_the_hessian():
     along = jnp.linspace(1.0, -1.0, X.size)
     product = jax.jvp(jax.grad(value), (X,), (along,))[1]

@@ -712,6 +712,7 @@ def bow(q):
     return {"bow": q[1] - q[0] ** 2}
 
 
+@pytest.mark.slow
 def test_projection_goes_to_the_nearest_state_in_the_metric_of_the_masses():
     system, M = lagjax.System(two_masses, constraints=bow), np.diag([1.0, 9.0])
     q0, v0 = np.array([0.8, -0.5]), np.array([1.0, 2.0])

@@ -88,6 +88,7 @@ def test_energy_of_members_that_an_event_ends():
     assert lagjax.plot.energy_error(ended).lines[0].get_xdata().max() < 2.0
 
 
+@pytest.mark.slow
 def test_work_precision():
     start, solvers = (jnp.array([1.0, 0.0]), jnp.array([0.0, 0.5])), {"default": None, "fifth order": diffrax.Tsit5()}
     result = lagjax.work_precision(SCENE, *start, TS, solvers=solvers, tolerances=[1e-5, 1e-8], repeats=1)

@@ -97,6 +97,7 @@ def test_single_precision_is_measured_against_double():
     assert result.rows[0].error == pytest.approx(exact, rel=1e-2) and result.reference_error < 1e-9
 
 
+@pytest.mark.slow
 def test_tolerances_never_recompile():
     traced = []
 

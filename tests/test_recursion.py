@@ -80,6 +80,7 @@ def test_operations_grow_as_the_number_of_links():
     assert counts[2] - counts[1] == counts[1] - counts[0]
 
 
+@pytest.mark.slow
 def test_motions_and_derivatives_are_those_of_a_small_scene_without_recursion():
     # In other words, without what L computes twice, the same Lagrangian has no recursion.
     n, system = 7, chain(7)[0]

@@ -42,7 +42,7 @@ ORDERS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("solver", "order"), sweep(ORDERS, kept=lambda case: case[1] in (1, 5)))
+@pytest.mark.parametrize(("solver", "order"), sweep(ORDERS, kept=lambda case: case[1] == 5))
 def test_fixed_steps_converge_at_the_order_of_the_solver(solver, order):
     dt = 0.25 if order == 8 else 0.02
     coarse, fine = (
@@ -51,6 +51,7 @@ def test_fixed_steps_converge_at_the_order_of_the_solver(solver, order):
     assert coarse / fine > 0.8 * 2**order
 
 
+@pytest.mark.slow
 def test_backward_time_returns_to_the_start():
     there = run(rtol=1e-12)
     back = lagjax.simulate(SCENE, there.q[-1], there.qdot[-1], TS[::-1], PARAMS, rtol=1e-12)
