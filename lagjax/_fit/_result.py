@@ -1,7 +1,7 @@
 """`Fit`: what came out of a search, with intervals and in words."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -177,7 +177,7 @@ class Fit:
         start = layout.restore(point.starts[0, :n]), layout.restore(point.starts[0, n:])
         ts = np.asarray(record.ts, layout.dtype)
         q0, qdot0 = (jax.tree.map(lambda x: np.asarray(x, layout.dtype), half) for half in start)
-        trajectory = simulate(self.system, q0, qdot0, ts, self.params)
+        trajectory = simulate(self.system, q0, qdot0, cast(jax.Array, ts), self.params)  # NumPy's is as good
         left = np.where(record.weight_matrix > 0, point.residuals[0][0], np.nan)
         values = in_structure(left + record.matrix, record)
         return Prediction(trajectory, values, in_structure(left, record), start)

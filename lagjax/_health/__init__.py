@@ -68,7 +68,7 @@ def examine(trajectory, reference=None) -> "Health":
     )
 
 
-def _borders(trajectory) -> tuple[bool, Met | None]:
+def _borders(trajectory) -> tuple[bool, Met[Array] | None]:
     """`met`, with the batch axes of the trajectory; of a piecewise scene not known where something is traced."""
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         members = Members(trajectory)
@@ -148,7 +148,7 @@ class Health(eqx.Module):
     gradients_finite: Bool[Array, "*batch"]
     gradients_time: Float[Array, "*batch"]
     global_error: Extreme | None
-    borders: Met | None
+    borders: Met[Array] | None
     borders_located: bool = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
     works: bool = eqx.field(static=True)

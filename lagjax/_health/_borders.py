@@ -4,8 +4,9 @@ What a step ends at is written down for derivatives, and for them alone. So the 
 over the time that it took. That costs as much as the motion did; scenes without borders pay nothing.
 """
 
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
 from lagjax._blame import pieces_of
@@ -20,28 +21,30 @@ from lagjax._system import System
 
 LARGEST_PORTION = 2**22  # numbers of steps that are written down at once
 
+Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
 
-class Met(NamedTuple):
+
+class Met(NamedTuple, Generic[Numbers]):
     """How often each of N members crossed a border, began to slide along one, and grazed one; (N,) each.
 
     `t` is when it first grazed one, NaN where it did not.
     """
 
-    crossed: np.ndarray
-    slid: np.ndarray
-    grazed: np.ndarray
-    t: np.ndarray
+    crossed: Numbers
+    slid: Numbers
+    grazed: Numbers
+    t: Numbers
 
 
-def met(trajectory, members) -> tuple[bool, Met | None]:
+def met(trajectory, members) -> tuple[bool, Met[np.ndarray] | None]:
     """Whether steps ended at the borders of the scene; and how the motion met them, None where that is not known.
 
     `members` has the states and the parameters of all members (`_measure.Members`).
     """
     if not isinstance(trajectory.system, System):  # modes have transitions for that
         return True, None
-    counts = [np.zeros(members.count, int) for _ in range(3)]
-    nothing = Met(*counts, np.full(members.count, np.nan))
+    crossed, slid, grazed = (np.zeros(members.count, int) for _ in range(3))
+    nothing = Met(crossed, slid, grazed, np.full(members.count, np.nan))
     if not is_piecewise(trajectory.system, members.layout, members.params):
         return True, nothing
     if trajectory.engine != "MachineCode" or trajectory.tolerances is None:
@@ -49,7 +52,8 @@ def met(trajectory, members) -> tuple[bool, Met | None]:
     path = members.path()
     start = np.concatenate([path.q[:, 0], path.qdot[:, 0]], axis=1)
     ts = np.stack([path.ts[:, 0], members.shared(trajectory.end.t, 0)], axis=1)
-    steps = sum(members.shared(trajectory.stats[f"num_{kind}_steps"], 0) for kind in ("accepted", "rejected"))
+    accepted, rejected = (members.shared(trajectory.stats[f"num_{kind}_steps"], 0) for kind in ("accepted", "rejected"))
+    steps = accepted + rejected
     rtol, atol = (float(np.max(x)) for x in trajectory.tolerances)
     flow = flow_of(Problem.about(trajectory.system, members.layout, members.params, ts=ts[0], rtol=rtol, atol=atol))
     if flow.borders is None:  # one without a series
@@ -82,11 +86,19 @@ def _portions(places: np.ndarray, numbers: np.ndarray) -> list[np.ndarray]:
     return np.split(places, np.flatnonzero(np.diff(portion)) + 1)
 
 
-def _count(flow: Flow, motions: tuple, tolerances: Tolerances, steps, places: np.ndarray, into: Met) -> None:
+def _count(
+    flow: Flow,
+    motions: tuple[np.ndarray, np.ndarray, np.ndarray],
+    tolerances: Tolerances,
+    steps: np.ndarray,
+    places: np.ndarray,
+    into: Met[np.ndarray],
+) -> None:
     """Follow some motions, and add what they met `into` the counts at their places."""
-    store = StepStore()
+    store, borders = StepStore(), flow.borders
+    assert borders is not None  # without a series there are none, and nobody asks
     again = flow.follow(*motions, tolerances, store, 2 * int(steps.sum()) + len(places))
-    guards, pieces = flow.borders.guards, len(flow.borders.switches)
+    guards, pieces = borders.guards, len(borders.switches)
     # Numbers beyond those of guards are entries of tables that the time comes to, which are no borders.
     enters, leaves = (np.array([getattr(guard, name) >= 0 for guard in guards] + [False]) for name in ("slide", "on"))
     slides = sorted({guard.slide for guard in guards if guard.slide >= 0})
@@ -99,7 +111,7 @@ def _count(flow: Flow, motions: tuple, tolerances: Tolerances, steps, places: np
             number = np.clip(np.floor(crossed).astype(int) - 1, 0, len(guards))
             at_border = (crossed > 0) & (number < len(guards)) & ~leaves[number]
             # A border that the motion slides along from there on has not been crossed.
-            to_slide = np.append(begins.any(axis=1)[1:], False) & enters[number]
+            to_slide = np.append(np.any(begins, axis=1)[1:], False) & enters[number]
             grazes = (crossed > 0) & (crossed % 1 > 0)
             into.slid[place] += int(begins.sum())
             into.crossed[place] += int((at_border & ~to_slide).sum())

@@ -169,7 +169,7 @@ def _surfaces(
 
     def value(guard):
         return lambda y, params: _value(
-            guard, *map(layout.restore, (y[:n], y[n:-1])), {"t": y[-1], "params": params} | extras(y, params)
+            guard, layout.restore(y[:n]), layout.restore(y[n:-1]), {"t": y[-1], "params": params} | extras(y, params)
         )
 
     functions = [value(transition.guard) for transition in leaving]

@@ -57,7 +57,7 @@ def _on_pieces(borders, scalars, pieces) -> tuple[tuple, tuple]:
 def _pieces(borders, scalars, n: int) -> list[Any]:
     """The pieces at a state; 1 for those that say that the motion slides."""
     count, zero, decide = len(borders.switches), jnp.zeros_like(scalars[0]), borders.decide
-    pieces = list(emit(*decide, (*scalars, *[zero] * (2 * count))))
+    pieces = list(emit(decide.nodes, decide.kinds, decide.outputs, (*scalars, *[zero] * (2 * count))))
     # Along a border in position a motion slides at rest, which `decide` knows.
     sliding = {guard.piece: guard.slide for guard in borders.guards if guard.slide >= 0 and guard.order < 2}
 

@@ -57,7 +57,7 @@ class Borders:
     def __init__(
         self, motion: Motion, borders: _borders.Borders, levels: tuple[int, ...], returns: bool, jump: Jump | None
     ):
-        self.returns = returns
+        self.returns, base = returns, levels[0]
         self.motion, self.borders, self.guards = motion, borders, borders.guards
         self.pieces, self.roots = motion.pieces, Roots(motion)
         if not self.pieces:
@@ -68,14 +68,14 @@ class Borders:
         self.decide, self.stop = self._decide(), self._stop()
         self.note, self.jump = None, None
         if jump is not None:
-            saltation = Saltation(motion, borders, levels[0], jump)
+            saltation = Saltation(motion, borders, base, jump)
             for name, count in saltation.fields_along().items():
                 motion.layout.extend(name, count)
             self.note, self.jump = saltation.note(), saltation.apply()
         elif len(levels) > 1:
             first = FirstSaltation(motion, borders, levels)
             self.note, self.jump = first.note(self.table), first.apply()
-        self.graze = None if looks_up(borders.program) else self._graze(levels[0])
+        self.graze = None if looks_up(borders.program) else self._graze(base)
         self.jump_at_knot = None
         if self.clocks.exist and len(levels) > 1:
             for name, count in self.clocks.fields().items():

@@ -16,7 +16,7 @@ from lagjax._native._frame import Frame, Numbers
 from lagjax._native._ir import Code, Value
 from lagjax._native._series import Motion
 from lagjax._program._borders import Borders
-from lagjax._program._look_ups import Table, shifted, table_of
+from lagjax._program._look_ups import Table, shifted
 
 
 class Clocks:
@@ -24,7 +24,11 @@ class Clocks:
 
     def __init__(self, motion: Motion, borders: Borders):
         self.motion, self.first = motion, len(borders.guards) + 1
-        of_pieces = [(c, j, table_of(borders.tables[j])) for c, j in enumerate(borders.clocks)]
+        of_pieces = []
+        for c, j in enumerate(borders.clocks):
+            located = borders.tables[j]
+            assert located is not None
+            of_pieces.append((c, j, located.table))
         self.tables = [(c, j, table) for c, j, table in of_pieces if table.numbers is None]
         self.coincide = float(self.first + len(of_pieces))  # what is `crossed` where entries of two tables do
 

@@ -334,6 +334,7 @@ class Events:
         direction = code.lanes_of(code.as_double(direction))
         counts = changes & ~(side * direction > 0.0)
         if self.notes:
+            assert self.note is not None
             frame["is_due"] = code.select(counts, frame.constant(1), 0.0)
             with code.only_if(code.any_lane(counts)):
                 frame.call(self.note, order, g, s)

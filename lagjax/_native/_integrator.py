@@ -82,8 +82,9 @@ class Integrator:
         large = is_large(program, projection, guards, more=() if jump is None else [jump.line])
         alone = large and width == 1 and borders is None and chosen is None
         kind = MotionAlone if alone and fills_lanes(series) else Motion
-        options = dict(pieces=pieces, chosen=chosen, kept=self.guards)
-        self.motion = motion = kind("motion", program, series, JOB, fields, large, width, **options)
+        self.motion = motion = kind(
+            "motion", program, series, JOB, fields, large, width, pieces=pieces, chosen=chosen, kept=self.guards
+        )  # fmt: skip
         self.projector = projection and Projector(
             motion, projection.state, projection.velocity_scale, self.base_size
         )  # fmt: skip

@@ -8,6 +8,7 @@ they are part of no text that LLVM reads.
 """
 
 import functools
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
@@ -93,7 +94,7 @@ class LookUps:
 
     @functools.cached_property
     def _address_of_numbers(self) -> ir.GlobalVariable:
-        place = ir.GlobalVariable(self.module, POINTER, "address_of_numbers")
+        place: Any = ir.GlobalVariable(self.module, POINTER, "address_of_numbers")
         place.linkage, place.align, place.initializer = "internal", 8, ir.Constant(POINTER, None)
         return place
 

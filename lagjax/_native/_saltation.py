@@ -80,9 +80,10 @@ def jump_over(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
 
 def jump_along(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
     """`jump_over` for tangents of the motion at hand, whose own `levels` these are."""
-    if borders is None or (len(levels) > 1 and borders.motion is None):
+    if borders is None:
         return None
-    return jump_over(borders, (*levels, 2 * levels[-1]))
+    onwards = *levels, 2 * levels[-1]
+    return None if len(levels) > 1 and borders.motion is None else jump_over(borders, onwards)
 
 
 class Saltation:

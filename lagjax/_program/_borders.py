@@ -90,7 +90,7 @@ class Pieced(NamedTuple):
 
     line: StraightLine
     size: int
-    dtypes: tuple
+    dtypes: Sequence[np.dtype]
     linear: Any
     budget: int
 

@@ -47,7 +47,7 @@ def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ..
     return _emitted(nodes, kinds, outputs, scalars, shape, entries)
 
 
-def _emitted(nodes, kinds, outputs, scalars, shape: tuple[int, ...], entries: Callable) -> tuple:
+def _emitted(nodes, kinds, outputs, scalars, shape: tuple[Any, ...], entries: Callable) -> tuple:
     """The outputs, of this shape."""
     fast = frozenset() if getattr(_state, "plain", False) else _elementary.FAST.keys()
     precision = _precision(nodes, kinds, scalars)

@@ -102,7 +102,8 @@ def _values(steps, columns) -> list:
         if function is None:
             values[k] = columns[attribute] if is_input else attribute
         elif function is _LOOK_UP:
-            values[k] = look_up(*attribute, columns, values[operands[0]])
+            op, table = attribute
+            values[k] = look_up(op, table, columns, values[operands[0]])
         elif attribute is None:
             values[k] = function(*[values[i] for i in operands])
         else:

@@ -63,6 +63,7 @@ def _place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) ->
             index = f("min", f("max", index, number(0.0)), number(float(top)))
             index = f("mul", index, number(float(stride)))
         place = index if place is None else f("add", place, index)
+    assert place is not None and inside is not None  # there is an index to begin with
     return place, inside
 
 

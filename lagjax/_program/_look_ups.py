@@ -10,7 +10,7 @@ passes its tangent on from the same place of a table of tangents, and its cotang
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
@@ -58,6 +58,10 @@ def table_of(attribute: "Table | Located") -> Table:
     return attribute.table if isinstance(attribute, Located) else attribute
 
 
+@overload
+def shifted(attribute: Table, by: int) -> Table: ...
+@overload
+def shifted(attribute: Located, by: int) -> Located: ...
 def shifted(attribute: "Table | Located", by: int) -> "Table | Located":
     """A look-up in a program whose inputs come so much later."""
     table = table_of(attribute)

@@ -68,14 +68,13 @@ def copied(graph: Graph, line: StraightLine, inputs: Sequence[int], places: Sequ
     """The nodes of the line in the graph; tables begin at other inputs where `places` says what input i has become."""
     nodes: list[int] = []
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
-        if op in LOOK_UPS and places is not None:
-            attribute = moved(attribute, places)
         if op == "input":
             nodes.append(graph.real(inputs[attribute]))
         elif op == "constant":
             nodes.append(graph.constant(attribute, kind))
         else:
-            nodes.append(graph.apply(op, *(nodes[i] for i in operands), attribute=attribute))
+            here = moved(attribute, places) if op in LOOK_UPS and places is not None else attribute
+            nodes.append(graph.apply(op, *(nodes[i] for i in operands), attribute=here))
     return nodes
 
 
@@ -109,6 +108,7 @@ def _back(
         if op == "take":
             index = nodes[operands[0]]
             if attribute.first not in inputs:
+                assert tables is not None  # else the entry does not vary
                 tables.append((attribute, index, g))
             for i, position in enumerate(attribute.positions if attribute.first in inputs else ()):
                 at = graph.apply("eq", index, number(float(i)))
