@@ -54,9 +54,9 @@ class MachineCode(AbstractEngine):
     with the coefficients (q̈)ₖ by recurrences through the scalar operations of the acceleration. Four or eight members
     of a batch stand side by side in the vector registers of every core.
 
-    It is for float64 on CPUs, scenes whose acceleration is a scalar program of at most a million smooth or
-    piecewise smooth operations, adaptive steps, events that are real numbers, and derivatives by its own adjoint.
-    `System.explain` says whether a scene is one of these.
+    It is for float64 on CPUs, scenes whose acceleration is a scalar program of smooth or piecewise smooth operations
+    that fits into half of the machine's memory, adaptive steps, events that are real numbers, and derivatives by its
+    own adjoint. `System.explain` says whether a scene is one of these.
 
     **Raises** nothing itself; the run raises `ValueError`, before anything is integrated, where it has no machine code.
 
