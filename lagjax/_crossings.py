@@ -104,21 +104,22 @@ def crossings(
     surfaces = _surfaces(problem, functions, directions, names)
     solution, noted = MachineCode().crossings(problem, surfaces, count)
     how = _how_it_ended if isinstance(solution.y_end, np.ndarray) else _how_it_ended_traced
-    result, t_end, ok = how(noted, solution, count)
+    result, end, ok = how(noted, solution, count)
     if throw:
-        noted = _raise_unless_ok(problem, (t_end, solution.y_end), noted, result)
+        noted = _raise_unless_ok(problem, end, noted, result)
     return _dressed(problem.layout, names, noted, ok)
 
 
 def _how_it_ended(noted: Noted, solution: Solution, count: int, library: Any = np) -> tuple:
-    """The result of the whole, the time up to which all is there, and whether each section has all of its crossings."""
+    """The result of the whole, the time and state up to which all is there, and which sections have all crossings."""
     well, many = solution.result == SUCCESSFUL, noted.count > count
     too_many = well & library.any(many)
     # The last crossing that there was room for, of the first section to run out of it.
     last = library.where(many, noted.t[:, -1], solution.t_end)
     first = library.argmax(library.abs(last - solution.t_end))
     result = library.where(too_many, _TOO_MANY, solution.result)
-    return result, library.where(too_many, last[first], solution.t_end), well & ~many
+    t_end = library.where(too_many, last[first], solution.t_end)
+    return result, (t_end, library.where(too_many, noted.y[first, -1], solution.y_end)), well & ~many
 
 
 @functools.partial(jax.jit, static_argnums=2)

@@ -271,8 +271,9 @@ def test_a_poincare_section_against_a_tight_run():
 
 def test_more_crossings_than_room():
     ts = jnp.array([0.0, 20.0])
-    with pytest.raises(lagjax.SimulationError, match=r"more crossings.*Raise `count`"):
-        lagjax.crossings(OSCILLATOR, height, 1.0, 0.0, ts, 1.0, count=3)
+    with pytest.raises(lagjax.SimulationError, match=r"more crossings.*Raise `count`") as raised:
+        lagjax.crossings(OSCILLATOR, lambda q, v: q - 0.25, 1.0, 0.0, ts, 1.0, count=3)
+    assert "The last state was q = 0.25;" in str(raised.value)  # that of the last crossing with room
     found = lagjax.crossings(OSCILLATOR, height, 1.0, 0.0, ts, 1.0, count=3, throw=False)
     assert not found.ok and found.count == 6 and np.isfinite(found.t).all() and found.t.shape == (3,)
     with pytest.raises(Exception, match="more crossings"):
