@@ -169,10 +169,11 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
         return _listed(tuple(inputs[i] for i in sorted(borders.read_by(node)) if i < len(inputs)))
 
     kinds = zip(borders.switches, borders.kinds, strict=True)
+    in_machine_code = choose(problem).refusal is None and pieces_of(derivation.acceleration, (n,)) is not None
     return {
         "borders": tuple(f"{_PIECES[kind]} {read_by(node)}" for node, kind in kinds if kind in _PIECES),
         "narrow": tuple(f"a function of {read_by(node)}" for node in borders.arguments),
-        "borders_located": choose(problem).refusal is None and pieces_of(derivation.acceleration, (n,)) is not None,
+        "borders_located": in_machine_code or set(borders.kinds) <= {CLOCK},  # known times are diffrax's as well
     }
 
 

@@ -52,7 +52,7 @@ def samples(
     values reach `samples` as they are in `params`, or are known numbers: compute with u(t) instead of with the values.
     Where u jumps, with "zero", derivatives of the motion by the values are exact, and those by the knots contain what a
     later jump changes. Second derivatives that do not exist here are NaN: by knots at which the acceleration jumps, and
-    across other borders at which it does. Engines of diffrax do not see the knots, and integrate over them.
+    across other borders at which it does. Adaptive steps of diffrax end at the knots of a scalar program, too.
 
     **Raises** `TypeError` or `ValueError` for knots that do not increase, shapes that do not fit, samples that are not
     finite, and an unknown `hold`; of what is traced, only the shapes can be looked at.

@@ -258,6 +258,22 @@ def test_engines_agree():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("backward", [False, True])
+def test_steps_of_diffrax_end_at_knots(backward):
+    """The held input jumps at twelve instants, both ends included. Compiles two runs of diffrax and a gradient."""
+    ts, params = END[::-1] if backward else END, {"t": jnp.asarray(KNOTS), "u": jnp.asarray(VALUES)}
+
+    def end(u, solver):
+        return lagjax.simulate(driven("zero"), 0.3, 0.1, ts, params | {"u": u}, solver=solver)
+
+    run, closed = end(params["u"], diffrax.Dopri8()), end(params["u"], MACHINE)
+    np.testing.assert_allclose(run.q[-1], closed.q[-1], atol=1e-9)
+    assert run.stats["num_rejected_steps"] == 0 and run.stats["num_accepted_steps"] < 30
+    slopes = [jax.grad(lambda u, s=s: end(u, s).q[-1])(params["u"]) for s in (diffrax.Dopri8(), MACHINE)]
+    np.testing.assert_allclose(*slopes, atol=1e-9)
+
+
+@pytest.mark.slow
 def test_interpolation_of_jax_is_known():
     scene = lagjax.System(oscillator, forces=lambda q, qdot, t, params: jnp.interp(t, KNOTS, params))
 

@@ -13,11 +13,13 @@ import optimistix as optx
 
 from lagjax._constraints import rank_lost
 from lagjax._diffrax._equations import Equations, form_of
-from lagjax._diffrax._integrate import Method, integrate
+from lagjax._diffrax._integrate import Jumps, Method, WithJumps, integrate
 from lagjax._diffrax._solvers import FineOutput, Projected
 from lagjax._failures import differentiable_where, lost_unless
 from lagjax._layout import Layout, halves
 from lagjax._problem import LEAST_RTOL_OF_DIFFRAX, AbstractEngine, Batch, Problem, PyTree, Solution, too_tight
+from lagjax._program import Unlowerable
+from lagjax._program._borders import CLOCK
 from lagjax._results import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, result_from
 from lagjax._stopped import End, what_stopped
 from lagjax._validate import is_concrete, require_number
@@ -88,7 +90,36 @@ class Diffrax(AbstractEngine, eqx.Module):
         # Below this a step no longer moves the time reliably.
         smallest = 4 * jnp.finfo(dtype).eps * jnp.maximum(abs(ts[0]), abs(ts[-1]))
         controller = diffrax.PIDController(rtol, atol, norm=_norm_or_inf, dtmin=smallest, force_dtmin=False)
-        return Method(solver, controller, None, problem.max_steps, self.progress)
+        if (jumps := _jumps(problem)) is not None:
+            controller = WithJumps(controller, jumps)
+        return Method(solver, controller, None, problem.max_steps, self.progress, jumps)
+
+
+_AT_END = 256  # diffrax lets a step that ends up to 100 roundings before the end of the motion end there
+
+
+def _jumps(problem: Problem) -> Jumps | None:
+    """The times inside the motion at which its program looks up another entry of a table; None without any.
+
+    One at an end of the motion is moved inside by some roundings, so that only one tiny step sees it.
+    """
+    try:
+        borders = problem.derivation.borders
+    except Unlowerable:
+        return None
+    if borders is None or CLOCK not in borders.kinds:
+        return None
+    numbers, first = jnp.asarray(problem.vector), 2 * problem.layout.size + 1
+    tables = {located.table for kind, located in zip(borders.kinds, borders.tables, strict=True) if kind == CLOCK}
+    knots = jnp.concatenate([
+        jnp.asarray(table.known, numbers.dtype) if table.numbers is not None
+        else numbers[table.first - first :: table.stride][: table.count]
+        for table in sorted(tables)
+    ])  # fmt: skip
+    ends = jnp.asarray(problem.ts)[jnp.array([0, -1])]
+    low, high, shift = ends.min(), ends.max(), _AT_END * jnp.finfo(knots.dtype).eps * jnp.abs(knots)
+    inside = (knots >= low) & (knots <= high)
+    return Jumps.at(jnp.where(inside, jnp.clip(knots, low + shift, high - shift), jnp.inf))
 
 
 def _norm_or_inf(error: PyTree) -> jax.Array:

@@ -28,13 +28,17 @@ PyTree = Any
 
 
 class Method(eqx.Module):
-    """How diffrax steps: its solver, what sizes the steps, their fixed size (None where adaptive), and their budget."""
+    """How diffrax steps: its solver, what sizes the steps, their fixed size (None where adaptive), and their budget.
+
+    `jumps` are where adaptive steps end and begin anew, None without any.
+    """
 
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController
     dt0: jax.Array | None
     max_steps: int = eqx.field(static=True)
     progress: diffrax.AbstractProgressMeter
+    jumps: "Jumps | None" = None
 
 
 def integrate(
@@ -148,7 +152,7 @@ def _backward(residuals, cotangents, perturbed, moving, method):
         reached = jnp.where(ahead, jnp.minimum(ts, t_end), jnp.maximum(ts, t_end))
         ts = jnp.where(result == SUCCESSFUL, ts, reached)
         # The last step ends at ts[-1] itself, which may be differentiated, not at its recorded value.
-        controller = _Replay(jnp.where(times == t_end, jnp.inf, times))
+        controller = _Replay(jnp.where(times == t_end, jnp.inf, times), method.jumps)
         again = Method(method.solver, controller, None, method.max_steps, diffrax.NoProgressMeter())
         solution = _solve((field, project, ts, y0, params), again, diffrax.RecursiveCheckpointAdjoint())
         return solution[:3]
@@ -162,10 +166,15 @@ class _Replay(diffrax.AbstractStepSizeController):
     """Steps that end at given times, padded with inf (after which the end of the integration is the next)."""
 
     times: jax.Array
+    jumps: "Jumps | None"
 
     def wrap(self, direction):
         """diffrax integrates backward motion with its time reversed."""
-        return _Replay(jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction))
+        times = jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction)
+        if self.jumps is None:
+            return _Replay(times, None)
+        jumps = self.jumps.reversed(direction)
+        return _Replay(jumps.ends(times), jumps)  # what is recorded of a step is where the next one begins
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The first time; the state counts the steps."""
@@ -174,4 +183,85 @@ class _Replay(diffrax.AbstractStepSizeController):
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         """Accept, and go on to the next time."""
         next_ = self.times.at[controller_state].get(mode="fill", fill_value=jnp.inf)
-        return True, t1, next_, False, controller_state + 1, diffrax.RESULTS.successful
+        begin, jumps = (t1, False) if self.jumps is None else self.jumps.beyond(t1)
+        return True, begin, next_, jumps, controller_state + 1, diffrax.RESULTS.successful
+
+
+# ---- where the field jumps at known times ----------------------------------------------------------------------------
+
+
+class Jumps(eqx.Module):
+    """Times at which the field jumps, (K,) in increasing order: a step ends at `before`, the next begins at `behind`.
+
+    That is a few roundings off, because a stage at the end of a step, t₀ + h, may be rounded onto the jump; to leave
+    out so little of the time changes less than rounding does. Infinite times are none.
+    """
+
+    before: jax.Array
+    behind: jax.Array
+
+    @classmethod
+    def at(cls, times: jax.Array) -> "Jumps":
+        times = jnp.sort(times)
+        gap = 4 * jnp.finfo(times.dtype).eps * jnp.where(jnp.isfinite(times), jnp.abs(times), 0.0)
+        return cls(times - gap, times + gap)
+
+    def reversed(self, direction) -> "Jumps":
+        """The same in time that runs in this direction, 1 or −1; none at infinity then."""
+        one, other = self.before * direction, self.behind * direction
+        low, high = jnp.minimum(one, other), jnp.maximum(one, other)
+        return Jumps(*(jnp.sort(jnp.where(jnp.isfinite(x), x, jnp.inf)) for x in (low, high)))
+
+    def beyond(self, t):
+        """Where the next step begins after one that ended at t, and whether that is behind a jump."""
+        begin = _exchanged(t, self.before, self.behind)
+        return begin, begin != t
+
+    def ends(self, times):
+        """Where the steps end behind which others begin at these times."""
+        return _exchanged(times, self.behind, self.before)
+
+    def first(self, begin, end):
+        """`end`, or the first jump on the way from `begin` to it."""
+        ahead = jnp.searchsorted(self.before, begin, side="right")
+        return jnp.minimum(end, self.before.at[ahead].get(mode="fill", fill_value=jnp.inf))
+
+
+def _exchanged(t, old, new):
+    """Times t; where one is in `old`, which increases, what stands at that place of `new`."""
+    place = jnp.minimum(jnp.searchsorted(old, t), len(old) - 1)
+    return jnp.where(jnp.isfinite(t) & (old[place] == t), new[place], t)
+
+
+class WithJumps(diffrax.AbstractAdaptiveStepSizeController):
+    """The steps of a controller, which end before every jump and go on behind it."""
+
+    controller: diffrax.AbstractAdaptiveStepSizeController
+    jumps: Jumps
+
+    @property
+    def rtol(self):
+        return self.controller.rtol
+
+    @property
+    def atol(self):
+        return self.controller.atol
+
+    @property
+    def norm(self):
+        return self.controller.norm
+
+    def wrap(self, direction):
+        """diffrax integrates backward motion with its time reversed."""
+        return WithJumps(self.controller.wrap(direction), self.jumps.reversed(direction))
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The end of the first step, and the state of the controller."""
+        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return self.jumps.first(t0, end), state
+
+    def adapt_step_size(self, *arguments):
+        """What the controller says of a step; the next one ends at the first jump."""
+        keep, begin, end, made_jump, state, result = self.controller.adapt_step_size(*arguments)
+        behind, jumps = self.jumps.beyond(begin)
+        return keep, behind, self.jumps.first(behind, end + (behind - begin)), made_jump | jumps, state, result
