@@ -239,6 +239,9 @@ class WithJumps(diffrax.AbstractAdaptiveStepSizeController):
     controller: diffrax.AbstractAdaptiveStepSizeController
     jumps: Jumps
 
+    def __init__(self, controller: diffrax.AbstractAdaptiveStepSizeController, jumps: Jumps):
+        self.controller, self.jumps = controller, jumps
+
     @property
     def rtol(self):
         return self.controller.rtol
