@@ -236,10 +236,10 @@ def _exchanged(t, old, new):
 class WithJumps(diffrax.AbstractAdaptiveStepSizeController):
     """The steps of a controller, which end before every jump and go on behind it."""
 
-    controller: diffrax.AbstractAdaptiveStepSizeController
+    controller: Any  # an adaptive one: `wrap` of diffrax does not say so of what it returns
     jumps: Jumps
 
-    def __init__(self, controller: diffrax.AbstractAdaptiveStepSizeController, jumps: Jumps):
+    def __init__(self, controller: Any, jumps: Jumps):
         self.controller, self.jumps = controller, jumps
 
     @property
