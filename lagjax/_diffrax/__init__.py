@@ -20,6 +20,7 @@ from lagjax._layout import Layout, halves
 from lagjax._problem import LEAST_RTOL_OF_DIFFRAX, AbstractEngine, Batch, Problem, PyTree, Solution, too_tight
 from lagjax._program import Unlowerable
 from lagjax._program._borders import CLOCK
+from lagjax._program._look_ups import table_of
 from lagjax._results import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, result_from
 from lagjax._stopped import End, what_stopped
 from lagjax._validate import is_concrete, require_number
@@ -110,11 +111,11 @@ def _jumps(problem: Problem) -> Jumps | None:
     if borders is None or CLOCK not in borders.kinds:
         return None
     numbers, first = jnp.asarray(problem.vector), 2 * problem.layout.size + 1
-    tables = {located.table for kind, located in zip(borders.kinds, borders.tables, strict=True) if kind == CLOCK}
+    located = (table for kind, table in zip(borders.kinds, borders.tables, strict=True) if kind == CLOCK)
     knots = jnp.concatenate([
         jnp.asarray(table.known, numbers.dtype) if table.numbers is not None
         else numbers[table.first - first :: table.stride][: table.count]
-        for table in sorted(tables)
+        for table in dict.fromkeys(table_of(of) for of in located if of is not None)
     ])  # fmt: skip
     ends = jnp.asarray(problem.ts)[jnp.array([0, -1])]
     low, high, shift = ends.min(), ends.max(), _AT_END * jnp.finfo(knots.dtype).eps * jnp.abs(knots)
