@@ -22,7 +22,6 @@ from lagjax._native._constants import (
     GROWTH,
     MAX_ORDER,
     MOST_CROSSINGS,
-    MOST_HALVINGS,
     MOST_LOOKS,
     NEARBY,
     NEGLIGIBLE,
@@ -211,7 +210,7 @@ class Borders:
         code, leads = frame.code, self._leads(frame, degree)
         self._divide(frame, g, degree)
         # A border that it touches is not left, or gone back over, by less than what nobody asks for.
-        nothing = self._size(frame, degree) <= NEGLIGIBLE * code.lanes_of(frame.job("atol"))
+        nothing = self.roots.size(frame, degree) <= NEGLIGIBLE * code.lanes_of(frame.job("atol"))
         idle = idle | (nothing & (frame["touching", g] > 0.0) & ~undecided)
         self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), frame.job("atol"))
         frame.call(self.roots.first_root, degree)
@@ -397,29 +396,14 @@ class Borders:
             code.store(code.select(code.compare("!=", c, 0.0), sign, code.load(leads, frame.vector)), leads)
         return code.load(leads, frame.vector)
 
-    def _size(self, frame: Frame, degree: Value) -> Value:
-        """Σ |cₖ|."""
-        code, size = frame.code, frame.code.variable(frame.constant(0.0))
-        with code.loop(degree + 1) as k:
-            code.store(code.load(size, frame.vector) + code.intrinsic("fabs", frame["poly", k]), size)
-        return code.load(size, frame.vector)
-
     def _shorten(self, frame: Frame, degree: Value, rtol: Value, atol: Value) -> None:
-        """Halve the interval until the last terms are below atol + rtol Σ |cₖ|; `part` of it is left.
+        """Halve the interval until the last terms are below atol + rtol Σ |cₖ|."""
 
-        They are three: one may have been divided away, and one be zero by symmetry.
-        """
-        code = frame.code
-        frame["part"] = 1.0
-        again, left = code.variable(integer(code, 1)), code.variable(integer(code, MOST_HALVINGS))
-        with code.repeat_while(lambda: (code.load(again, INTEGER) > 0) & (code.load(left, INTEGER) > 0)):
-            code.store(code.load(left, INTEGER) - 1, left)
-            code.store(integer(code, 0), again)
-            last = [code.intrinsic("fabs", frame["poly", degree - k]) for k in range(3)]
-            long = last[0] + last[1] + last[2] > self._size(frame, degree) * rtol + code.lanes_of(atol)
-            with code.only_if(code.any_lane(long)):
-                code.store(integer(code, 1), again)
-                self._stretch(frame, degree, code.select(long, frame.constant(0.5), 1.0))
+        def is_long():
+            allowed = self.roots.size(frame, degree) * rtol + frame.code.lanes_of(atol)
+            return self.roots.last_terms(frame, degree) > allowed
+
+        self.roots.shorten(frame, degree, is_long)
 
     def _look_closer(self, frame: Frame, degree: Value) -> None:
         """A root that comes early is as exact as what lies before it allows, and not the whole step."""
@@ -433,17 +417,8 @@ class Borders:
             code.store(code.load(left, INTEGER) - 1, left)
             straight = 0.0 - 4.0 * frame["poly", 0] / frame["poly", 1]  # for a root that is zero to rounding
             reach = code.select(frame["root"] > 0.0, 2.0 * frame["root"], straight)
-            self._stretch(frame, degree, code.select(early() & (reach > 0.0) & (reach < 1.0), reach, 1.0))
+            self.roots.stretch(frame, degree, code.select(early() & (reach > 0.0) & (reach < 1.0), reach, 1.0))
             frame.call(self.roots.first_root, degree)
-
-    def _stretch(self, frame: Frame, degree: Value, part: Value) -> None:
-        """The polynomial over a part of its interval."""
-        code = frame.code
-        frame["part"] = frame["part"] * part
-        power = code.variable(frame.constant(1.0))
-        with code.loop(degree + 1) as k:
-            frame["poly", k] = frame["poly", k] * code.load(power, frame.vector)
-            code.store(code.load(power, frame.vector) * part, power)
 
     def _place(self, frame: Frame) -> Value:
         """The first root in parts of the step; or how far was looked, or 2 where there is none in all of it."""

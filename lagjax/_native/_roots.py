@@ -76,11 +76,16 @@ class Roots:
             long = is_long()
             with code.only_if(code.any_lane(long)):
                 code.store(integer(code, 1), again)
-                half, power = code.select(long, frame.constant(0.5), 1.0), code.variable(frame.constant(1.0))
-                frame["part"] = frame["part"] * half
-                with code.loop(degree + 1) as k:
-                    frame["poly", k] = frame["poly", k] * code.load(power, frame.vector)
-                    code.store(code.load(power, frame.vector) * half, power)
+                self.stretch(frame, degree, code.select(long, frame.constant(0.5), 1.0))
+
+    def stretch(self, frame: Frame, degree: Value, part: Value) -> None:
+        """The polynomial over a part of its interval."""
+        code = frame.code
+        frame["part"] = frame["part"] * part
+        power = code.variable(frame.constant(1.0))
+        with code.loop(degree + 1) as k:
+            frame["poly", k] = frame["poly", k] * code.load(power, frame.vector)
+            code.store(code.load(power, frame.vector) * part, power)
 
     # ---- its roots ----
 
