@@ -161,8 +161,7 @@ class Borders:
         """`(order)`: the step ends at the first border."""
         frame = self.motion.function("stop_at_border", INTEGER)
         code, (order,), h = frame.code, frame.arguments, frame["h"]
-        # Borders have the last order too; see `Motion.coefficients`.
-        degree = code.select(order < MAX_ORDER - 1, order, MAX_ORDER - 1) if self.pieces else order - 1
+        degree = self.motion.followed_degree(code, order)
         frame["planned_h"], frame["nearest"] = h, 1.0
         frame["crossed"] = frame["beyond"] = 0.0
         if self.pieces:
@@ -202,7 +201,7 @@ class Borders:
         # Nothing is looked for along the border that the motion slides on, or in the share of one that does not.
         idle = (frame["touching", g] >= SLIDING) | (undecided & is_share)
         with code.only_if(code.any_lane(~idle)):
-            self._polynomial(frame, j, degree, h, code.select(undecided, frame.constant(1.0), side), level)
+            self.roots.polynomial(frame, j, degree, h, code.select(undecided, frame.constant(1.0), side), level)
             self._look_along(frame, g, degree, h, undecided, beyond, idle)
 
     def _look_along(self, frame: Frame, g: Value, degree: Value, h: Value, undecided: Value, beyond, idle) -> None:
@@ -359,7 +358,7 @@ class Borders:
             level = code.maximum(rise - slope * u, -FAINT)
             matters = level < (float("inf") if feature.kind == BELOW else 0.0)
             start = level + slope * u
-        self._polynomial(frame, j, degree, h, slope, u - start / slope)
+        self.roots.polynomial(frame, j, degree, h, slope, u - start / slope)
         of_size, absolute = (ABRUPT, 0.0) if feature.kind == UP_TO else (0.0, ARGUMENT)
         self._shorten(frame, degree, double(code, of_size), double(code, absolute))
         frame.call(self.roots.first_root, degree)
@@ -375,17 +374,6 @@ class Borders:
         sooner = matters & (root > 0.0) & (root < frame["nearest"]) & code.compare("!=", h, 0.0)
         frame["nearest"] = code.select(sooner, root, frame["nearest"])
         frame["crossed"] = code.select(sooner, 0.0, frame["crossed"])
-
-    def _polynomial(self, frame: Frame, j: Value, degree: Value, h: Value, side: Value, level: Value) -> None:
-        """σ (u − level) over the step as a polynomial on [0, 1], into `poly`."""
-        code, series = frame.code, self.motion.series
-        first_row, first_value = series.rows - series.followed, series.values - series.followed
-        frame["poly", 0] = side * (frame["values", j + first_value] - level)
-        power = code.variable(side * h)
-        with code.loop(degree + 1, start=1) as k:
-            frame["poly", k] = frame["rows", j + first_row, k] * code.load(power, frame.vector)
-            code.store(code.load(power, frame.vector) * h, power)
-        frame["poly", degree + 1] = 0.0
 
     def _leads(self, frame: Frame, degree: Value) -> Value:
         """The sign of the first coefficient behind c₀ that is not zero."""
