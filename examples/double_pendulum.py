@@ -44,7 +44,7 @@ def crowd(members, duration):
     """Pendulums released from rest at any two angles."""
     q0 = np.random.default_rng(0).uniform(-np.pi, np.pi, (members, 2))
     ts = jnp.linspace(0.0, duration, 61)
-    return lagjax.simulate_batch(SCENE.system, q0, np.zeros_like(q0), ts, SCENE.params, progress=True)
+    return lagjax.simulate_batch(SCENE.system, q0, np.zeros_like(q0), ts, SCENE.params)
 
 
 def flip_times(resolution, duration):
@@ -64,7 +64,6 @@ def flip_times(resolution, duration):
         SCENE.params,
         rtol=1e-6,
         event=diffrax.Event(before_flip, direction=False),
-        progress=True,
     )
     flipped = np.asarray(trajectory.result == lagjax.RESULTS.event_occurred)
     half = np.where(flipped, trajectory.end.t, np.nan).reshape(len(upper), resolution)
@@ -118,7 +117,7 @@ def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--members", type=int, default=2000, help="how many pendulums (default: %(default)s)")
     parser.add_argument("--duration", type=float, default=15.0, help="in seconds (default: %(default)s)")
-    parser.add_argument("--resolution", type=int, default=240, help="cells along the flip map (default: %(default)s)")
+    parser.add_argument("--resolution", type=int, default=500, help="cells along the flip map (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the pictures (default: %(default)s)")
     options = parser.parse_args(argv)
     options.out.mkdir(parents=True, exist_ok=True)

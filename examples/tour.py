@@ -12,7 +12,7 @@ import solar_system
 jax.config.update("jax_enable_x64", True)
 
 
-def main(out=Path("out"), sizes=("--members", "1000", "--duration", "15", "--resolution", "200")):
+def main(out=Path("out"), sizes=("--members", "1000", "--duration", "15", "--resolution", "500")):
     pictures, _, _ = solar_system.main(["--out", str(out)])
     print()
     pictures += double_pendulum.main(["--out", str(out), *sizes])
