@@ -1,7 +1,8 @@
 """How a user's function is called: roles by position, extras by name.
 
 Every function a user hands to lagjax takes its main arguments by position, so that they may have any name, and asks
-for the time and the parameters by writing `t` and `params` in its signature:
+for the time and the parameters by writing `t` and `params` in its signature, functions of a scene that is fitted to
+records (`lagjax.fit`) also for their sampled `inputs`:
 
     def pendulum(q, qdot): ...
     def driven(q, qdot, t, params): ...
@@ -44,6 +45,11 @@ class Function(eqx.Module):
     def __call__(self, *roles: Any, **extras: Any) -> Any:
         """The function's result for the roles, by position, and for those of the extras that it asks for, by name."""
         function = eqx.combine(self.arrays, self.code)
+        if "inputs" in self.extras and "inputs" not in extras:
+            raise TypeError(
+                f"{self.name} asks for `inputs`, which only the records of lagjax.fit have. To follow a motion with "
+                "sampled inputs, let it ask for `t` instead, and call lagjax.samples(knots, values)(t)."
+            )
         return function(*roles, **{name: extras[name] for name in self.extras})
 
 

@@ -52,7 +52,8 @@ class System(eqx.Module):
     - `constraints(q)`: what must stay zero, f(q, t) = 0: a number, an array, or a dict of named ones.
     - `velocity_constraints(q, qdot)`: a(q, q̇, t) = 0 that cannot be integrated to such an f: rolling, skates.
 
-    Each may also ask, by name, for the time `t` and the parameters `params` (any pytree).
+    Each may also ask, by name, for the time `t` and the parameters `params` (any pytree), and in a scene that is fitted
+    to records for their sampled `inputs` (`lagjax.Record`).
 
     - `path`: how the equations are evaluated. A small scene is reduced to a scalar program that holds only the
       arithmetic it needs, a large one keeps arrays; "auto" chooses, "scalar" and "array" insist. The motion is the
@@ -98,12 +99,12 @@ class System(eqx.Module):
         if not isinstance(path, str) or path not in ("auto", "scalar", "array"):
             raise ValueError(f"path must be 'auto', 'scalar' or 'array'; got {path!r}.")
         self.path = path
-        self.lagrangian = accept(lagrangian, "lagrangian")
-        self.forces = None if forces is None else accept(forces, "forces")
-        self.dissipation = None if dissipation is None else accept(dissipation, "dissipation")
-        self.constraints = None if constraints is None else accept(constraints, "constraints", ("q",))
+        self.lagrangian = _accept(lagrangian, "lagrangian")
+        self.forces = None if forces is None else _accept(forces, "forces")
+        self.dissipation = None if dissipation is None else _accept(dissipation, "dissipation")
+        self.constraints = None if constraints is None else _accept(constraints, "constraints", ("q",))
         self.velocity_constraints = (
-            None if velocity_constraints is None else accept(velocity_constraints, "velocity_constraints")
+            None if velocity_constraints is None else _accept(velocity_constraints, "velocity_constraints")
         )
 
     def __repr__(self) -> str:
@@ -342,6 +343,11 @@ def require_system(system: Any) -> None:
     """Raise `TypeError` for anything else in its place, a bare Lagrangian most often."""
     if not isinstance(system, System):
         raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {system!r}.")
+
+
+def _accept(function: Callable, role: str, roles: tuple[str, ...] = ("q", "qdot")) -> Function:
+    """A function of a scene, which may ask for inputs, too."""
+    return accept(function, role, roles, ("t", "params", "inputs"))
 
 
 _SADDLE = ("mass_matrix", "force", "jacobian", "gamma")

@@ -331,6 +331,13 @@ def test_the_real_double_pendulum(capsys):
     assert fits["dry"].compare(fits["dry, and air on the second arm"]).text.count("prefer the other fit") == 1
 
 
+def along(directions, rows=1, states=2):
+    """Directions of every number of the starts, and then of the parameters."""
+    y0_dot = np.zeros((rows, states + len(directions), states))
+    y0_dot[:, :states] = np.eye(states)
+    return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
+
+
 @pytest.mark.slow
 def test_derivatives_of_motions_and_sensors_are_those_of_differences():
     parameters = Parameters.of(TRUTH, FREE, lagjax.positive)
@@ -342,9 +349,9 @@ def test_derivatives_of_motions_and_sensors_are_those_of_differences():
     u, ts = parameters.moved(parameters.first), TS[None, ::20]
 
     def values(x):
-        numbers, directions = parameters.numbers(x[2:]), parameters.directions(x[2:])
-        motion = motions.follow(ts, x[None, :2], numbers, directions)
-        return signals.of(motion, ts, numbers, directions)
+        numbers, (y0_dot, numbers_dot) = parameters.numbers(x[2:]), along(parameters.directions(x[2:]))
+        motion = motions.follow(ts, x[None, :2], numbers, y0_dot, numbers_dot)
+        return signals.of(motion, ts, np.zeros((*ts.shape, 0)), numbers, numbers_dot)
 
     x = np.concatenate([[1.0, -0.4], u])
     slopes = values(x)[1]
@@ -362,9 +369,9 @@ def test_motions_of_machine_code_and_of_diffrax_agree():
     parameters = Parameters.of(TRUTH, FREE, lagjax.positive)
     ts, y0 = np.stack([TS[:5], TS[3:8]]), np.array([[1.0, 0.0], [0.3, -1.0]])
     u = parameters.moved(parameters.first)
-    numbers, directions = parameters.numbers(u), parameters.directions(u)
-    fast = motions_of(SCENE, layout, parameters, 1e-11, None).follow(ts, y0, numbers, directions)
-    plain = _ByDiffrax(SCENE, layout, parameters, 1e-11, None).follow(ts, y0, numbers, directions)
+    numbers, (y0_dot, numbers_dot) = parameters.numbers(u), along(parameters.directions(u), 2)
+    fast = motions_of(SCENE, layout, parameters, 1e-11, None).follow(ts, y0, numbers, y0_dot, numbers_dot)
+    plain = _ByDiffrax(SCENE, layout, parameters, 1e-11, None).follow(ts, y0, numbers, y0_dot, numbers_dot)
     np.testing.assert_allclose(fast.path, plain.path, atol=1e-8)
     np.testing.assert_allclose(fast.tangents, plain.tangents, atol=1e-7)
     assert fast.tangents.shape == (2, 4, 5, 2)
@@ -434,7 +441,8 @@ def test_a_correlated_square_is_that_of_the_whole_matrix():
         (dict(ts=[0.0, 1.0], values=[1.0, 2.0], weights=-1.0), "not negative"),
         (dict(ts=[0.0, 1.0], values=[1.0, 2.0], weights=[1.0, 2.0, 3.0]), "weights must be one number, or"),
         (dict(ts=[0.0, 1.0], values=[1.0, 2.0], start=1.0), r"start must be \(q0, qdot0\)"),
-        (dict(ts=[0.0, 1.0], values=[1.0, 2.0], inputs=[1.0, 2.0]), "Sampled inputs of a record are not there yet"),
+        (dict(ts=[0.0, 1.0], values=[1.0, 2.0], inputs=[1.0, np.nan]), "inputs.1. is NaN, but what drives a scene"),
+        (dict(ts=[0.0, 1.0], values=[1.0, 2.0], inputs=[1.0]), "inputs must have the 2 times as its first axis"),
     ],
 )
 def test_a_record_that_cannot_be_is_refused(arguments, message):

@@ -19,10 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._consistent import has_constraints
+from lagjax._fit._inputs import HOLDS, Form, asks
 from lagjax._fit._motions import motions_of
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike
+from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike, started
 from lagjax._fit._residuals import Failure, Question
 from lagjax._fit._result import Covariance, Fit, SignalNoise
 from lagjax._fit._segments import Reader, glimpses, levels, time_scale, whole
@@ -57,6 +58,7 @@ def fit(
     free: PyTree = None,
     transforms: PyTree = None,
     noise: AbstractNoise | None = None,
+    hold: str = "zero",
     method: str = "auto",
 ) -> Fit:
     r"""The parameters of a scene that make recordings of its motion likeliest, with what is known about them.
@@ -68,12 +70,14 @@ def fit(
 
     - `records`: one `Record` or several, of any lengths.
     - `params0`: where the search for the parameters begins, in the structure that the scene's functions ask for.
-    - `observe`: a function of (q, qdot), and of `t`, `params` by name, that returns what the sensors show in the
-      structure of a record's `values`; by default q.
+    - `observe`: a function of (q, qdot), and of `t`, `params`, `inputs` by name, that returns what the sensors show in
+      the structure of a record's `values`; by default q.
     - `free`: True or False for every parameter, or for whole branches of `params0`; by default all floats are free.
     - `transforms`: `lagjax.positive`, `lagjax.between(a, b)` or None for every parameter or branch. A parameter that
       is known to be positive should say so: its search and its interval are then relative.
     - `noise`: `lagjax.Gaussian()`, the default, or `lagjax.StudentT()` where some samples are far off.
+    - `hold`: how the `inputs` of records go on between samples: with "zero" the last one stays, as behind a D/A
+      converter; "linear" joins them by lines. Functions of the scene ask for `inputs` by name.
     - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
       its own read off the data, and lets these grow together: for that the signals must have the structure of q. "auto"
       does that where the signals allow it and records are longer than the motion's time scale, so that long and chaotic
@@ -101,27 +105,42 @@ def fit(
     require_system(system)
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}; got {method!r}.")
+    if hold not in HOLDS:
+        raise ValueError(f"hold must be 'zero' or 'linear'; got {hold!r}.")
     noise = Gaussian() if noise is None else noise
     if not isinstance(noise, AbstractNoise):
         raise TypeError(f"noise must be lagjax.Gaussian() or lagjax.StudentT(); got {noise!r}.")
     records = require_alike(records)
-    layout = _layout(system, records, params0)
+    form = _form(system, records, hold)
+    layout = _layout(system, records, params0, form)
     parameters = Parameters.of(params0, free, transforms, layout.dtype)
-    question = _question(system, records, layout, parameters, observe)
+    question = _question(system, records, layout, parameters, observe, form)
     readers = _readers(records) if looks_like_positions(observe, records[0], layout) else None
-    starts = np.stack([_start(record, readers, layout, k) for k, record in enumerate(records)])
+    starts = np.stack([_start(record, readers, layout, k, params0) for k, record in enumerate(records)])
     descent = _search(question, parameters.moved(parameters.first), starts, noise, method, readers)
     return _told(system, observe, question, descent)
 
 
-def _layout(system: System, records: list[Record], params0) -> Layout:
+def _form(system: System, records: list[Record], hold: str) -> Form | None:
+    """The structure of the inputs. Raises `ValueError` where the scene asks for some, and there are none."""
+    structure = records[0].input_structure
+    if structure is not None:
+        tree, shapes = structure
+        return Form(tree, shapes, hold)
+    if asking := asks(system):
+        raise ValueError(f"{asking[0]} asks for `inputs`, which records[0] has none of: give Record(..., inputs=...).")
+    return None
+
+
+def _layout(system: System, records: list[Record], params0, form: Form | None) -> Layout:
     """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
     for record in records:
         if record.start is not None:
-            return Layout.of(*record.start)
+            return Layout.of(*started(record.start, params0))
     one_time = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values)
+    scene, params = (system, params0) if form is None else (form.driven(system), form.params(params0, 2))
     try:
-        jax.eval_shape(lambda q: system.energy(q, q, 0.0, params0), one_time)
+        jax.eval_shape(lambda q: scene.energy(q, q, 0.0, params), one_time)
     except Exception as reason:
         raise ValueError(
             "The scene's functions cannot be called with coordinates of the structure of `values`, which q is taken to "
@@ -131,11 +150,11 @@ def _layout(system: System, records: list[Record], params0) -> Layout:
     return Layout.of(one_time, one_time)
 
 
-def _question(system, records, layout, parameters, observe) -> Question:
+def _question(system, records, layout, parameters, observe, form) -> Question:
     """The question about whole records."""
     rtol = DEFAULT_RTOL[layout.dtype]
-    motions = motions_of(system, layout, parameters, rtol, None)
-    signals = Signals(observe, layout, parameters, records[0])
+    motions = motions_of(system, layout, parameters, rtol, None, form)
+    signals = Signals(observe, layout, parameters, records[0], form)
     size = np.sqrt(np.nanmean(np.concatenate([record.matrix for record in records]) ** 2, axis=0))
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
     if fitted.any() and has_constraints(system):
@@ -151,9 +170,9 @@ def _readers(records: list[Record]) -> list[Reader]:
     return [Reader.of(record, max(8, 256 // len(records))) for record in records]
 
 
-def _start(record: Record, readers: list[Reader] | None, layout: Layout, place: int) -> np.ndarray:
+def _start(record: Record, readers: list[Reader] | None, layout: Layout, place: int, params0) -> np.ndarray:
     """Where the search for the start of one record begins, (2n,)."""
-    state = known_start(record, layout, place)
+    state = known_start(record, layout, place, params0)
     if state is not None:
         return state
     if readers is None:

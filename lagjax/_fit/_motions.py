@@ -1,13 +1,14 @@
 """`Motions`: the motions of many starts together with their derivatives by start and by parameters.
 
-What a fit asks of an engine: rows of starts (N, 2n), each with times of its own (N, T), and one vector of parameters
-(P,). It gives the states (N, T, 2n) and how they move along D = 2n + F directions (N, D, T, 2n): the 2n components of
-the row's start, and F directions of the parameters. Machine code follows all directions over the steps of the motion,
-without a program of XLA, so that another number of rows or times compiles nothing; other engines go through
-`jax.jacfwd` of `simulate`, the plain path that this one is tested against.
+What a fit asks of an engine: rows of starts (N, 2n), each with times of its own (N, T), one vector of parameters (P,),
+and for each row a table of inputs where the scene has some. It gives the states (N, T, 2n) and how they move along D
+directions (N, D, T, 2n) of the starts and the parameters together. Machine code follows all directions over the steps
+of the motion, without a program of XLA, so that another number of rows or times compiles nothing; other engines go
+through `jax.jvp` of `simulate`, the plain path that this one is tested against.
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -17,9 +18,10 @@ import numpy as np
 
 from lagjax._engine import choose
 from lagjax._failures import sentence
+from lagjax._fit._inputs import Driven, Form, Table, asks
 from lagjax._fit._parameters import Parameters
 from lagjax._layout import Layout, halves
-from lagjax._machine_code import MachineCode, _derivatives, _tolerances, flow_of
+from lagjax._machine_code import Flow, MachineCode, _derivatives, _tolerances, flow_of
 from lagjax._machine_code._steps import KEPT
 from lagjax._problem import Problem
 from lagjax._results import ENDED_WELL
@@ -58,89 +60,108 @@ class AbstractMotions(abc.ABC):
     """What follows motions and their tangents."""
 
     @abc.abstractmethod
-    def follow(self, ts: np.ndarray, y0: np.ndarray, numbers: np.ndarray, directions: np.ndarray) -> Motion:
-        """The motions from `y0` (N, 2n) at `ts` (N, T) for all parameters `numbers` (P,), along `directions` (F, P)."""
+    def follow(
+        self, ts: np.ndarray, y0: np.ndarray, numbers: np.ndarray, y0_dot: np.ndarray, numbers_dot: np.ndarray,
+        table: Table | None = None,
+    ) -> Motion:  # fmt: skip
+        """The motions from `y0` (N, 2n) at `ts` (N, T) for all parameters `numbers` (P,) and a table of inputs a row.
+
+        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (D, P).
+        """
 
     @abc.abstractmethod
-    def rate(self, t: np.ndarray, y: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """q̈ (M, n) at M states `y` (M, 2n) and times `t` (M,)."""
+    def rate(self, t: np.ndarray, y: np.ndarray, numbers: np.ndarray, table: Table | None = None) -> np.ndarray:
+        """q̈ (M, n) at M states `y` (M, 2n) and times `t` (M,), with a table of inputs for each."""
 
 
-def motions_of(system: System, layout: Layout, parameters: Parameters, rtol, atol) -> AbstractMotions:
-    """What follows the motions of this scene: machine code where it has that, else diffrax."""
-    params = parameters.restore(parameters.first)
-    problem = Problem.about(system, layout, params, rtol=rtol, atol=atol)
-    if isinstance(choose(problem).engine, MachineCode):
-        return _ByMachineCode(problem)
-    return _ByDiffrax(system, layout, parameters, rtol, atol)
+def motions_of(
+    system: System, layout: Layout, parameters: Parameters, rtol, atol, form: Form | None = None
+) -> AbstractMotions:
+    """What follows the motions of this scene: machine code where it has that, else diffrax. `form` is of its inputs."""
+    form = form if asks(system) else None  # inputs that only sensors ask for, or nothing
+    scene = system if form is None else form.driven(system)
+
+    def problem(room: int) -> Problem:
+        params = parameters.restore(parameters.first)
+        params = params if form is None else form.params(params, room)
+        return Problem.about(scene, layout, params, rtol=rtol, atol=atol)
+
+    if isinstance(choose(problem(2)).engine, MachineCode):
+        return _ByMachineCode(problem, form is not None)
+    return _ByDiffrax(scene, layout, parameters, rtol, atol, form is not None)
 
 
 class _ByMachineCode(AbstractMotions):
-    def __init__(self, problem: Problem):
-        self.flow, self.tolerances = flow_of(problem), _tolerances(problem)
+    def __init__(self, problem: Callable[[int], Problem], is_driven: bool):
+        """`problem(room)` is about the scene with tables of inputs of so many instants."""
+        self.problem, self.tolerances, self.is_driven = problem, _tolerances(problem(2)), is_driven
 
-    def follow(self, ts, y0, numbers, directions):
-        (rows, states), count = y0.shape, len(directions)
-        params = numbers[None]
-        run = self.flow.run(ts, y0, params, self.tolerances, KEPT)
-        dy0 = np.zeros((rows, states + count, states))
-        dy0[:, :states] = np.eye(states)
-        dparams = np.zeros((rows, states + count, len(numbers)))
-        dparams[:, states:] = directions
+    def _flow(self, numbers: np.ndarray, table: Table | None) -> tuple[Flow, np.ndarray]:
+        """The flow of the scene with inputs of this room, made once for all that are equal, and its parameters."""
+        if table is None or not self.is_driven:
+            return flow_of(self.problem(2)), numbers[None]
+        return flow_of(self.problem(table.room)), table.rows(numbers)
+
+    def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
+        flow, params = self._flow(numbers, table)
+        run = flow.run(ts, y0, params, self.tolerances, KEPT)
+        if not y0_dot.shape[1]:
+            return Motion(run.path, np.zeros((len(y0), 0, *run.path.shape[1:])), run.result, run.t_end, run.y_end)
+        params_dot = np.zeros((*y0_dot.shape[:2], params.shape[1]))
+        params_dot[..., : len(numbers)] = numbers_dot
         steps = run.path, run.result, run.accepted, run.ticket
-        tangents, _ = _derivatives.jvp(self.flow, ts, y0, params, steps, dy0, dparams, self.tolerances)
+        tangents, _ = _derivatives.jvp(flow, ts, y0, params, steps, y0_dot, params_dot, self.tolerances)
         return Motion(run.path, tangents, run.result, run.t_end, run.y_end)
 
-    def rate(self, t, y, numbers):
-        values = self.flow.anywhere.evaluate(*y.T, t, *numbers)[: self.flow.size]
+    def rate(self, t, y, numbers, table=None):
+        flow, params = self._flow(numbers, table)
+        values = flow.anywhere.evaluate(*y.T, t, *params.T)[: flow.size]
         return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
 
 
 class _ByDiffrax(AbstractMotions):
-    def __init__(self, system: System, layout: Layout, parameters: Parameters, rtol, atol):
+    def __init__(self, system: System, layout: Layout, parameters: Parameters, rtol, atol, is_driven: bool = False):
         unfree = [leaf for leaf in parameters.leaves if not hasattr(leaf, "shape")]
         if unfree:
             raise TypeError(f"params0 may only hold numbers where the scene has no machine code; got {unfree[0]!r}.")
 
-        def run(state, ts):
+        def of(numbers, table):
+            params = parameters.restore(numbers)
+            return Driven(params, *table) if is_driven else params
+
+        def run(state, ts, table):
             y0, numbers = state
             q, qdot = map(layout.restore, halves(y0))
-            params, begin = [], 0
-            for leaf in parameters.leaves:
-                params.append(numbers[begin : begin + leaf.size].reshape(leaf.shape).astype(leaf.dtype))
-                begin += leaf.size
             trajectory = simulate(
-                system, q, qdot, ts, jax.tree.unflatten(parameters.tree, params), rtol=rtol, atol=atol,
-                adjoint=diffrax.ForwardMode(), throw=False,
+                system, q, qdot, ts, of(numbers, table), rtol=rtol, atol=atol, adjoint=diffrax.ForwardMode(),
+                throw=False,
             )  # fmt: skip
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))
             end = jnp.concatenate([layout.flatten(trajectory.end.q), layout.flatten(trajectory.end.qdot)])
             path = rows(trajectory.q, trajectory.qdot)
             return path, (path, trajectory.result._value, trajectory.end.t, end)
 
-        def with_tangents(ts, y0, numbers, directions):
-            def along(dy0, dnumbers):
-                return jax.jvp(lambda state: run(state, ts)[0], ((y0, numbers),), ((dy0, dnumbers),))[1]
+        def with_tangents(ts, y0, numbers, y0_dot, numbers_dot, table):
+            def along(*dot):
+                return jax.jvp(lambda state: run(state, ts, table)[0], ((y0, numbers),), (dot,))[1]
 
-            size = len(y0)
-            dy0 = jnp.concatenate([jnp.eye(size, dtype=y0.dtype), jnp.zeros((len(directions), size), y0.dtype)])
-            dnumbers = jnp.concatenate([jnp.zeros((size, directions.shape[1]), y0.dtype), directions])
-            return run((y0, numbers), ts)[1], jax.vmap(along)(dy0, dnumbers)
+            return run((y0, numbers), ts, table)[1], jax.vmap(along)(y0_dot, numbers_dot)
 
-        self._follow = jax.jit(jax.vmap(with_tangents, in_axes=(0, 0, None, None)))
-        self._rate = jax.jit(jax.vmap(lambda t, y, p: _acceleration(system, layout, t, y, p), in_axes=(0, 0, None)))
-        self.dtype, self.parameters = layout.dtype, parameters
+        def rate(t, y, numbers, table):
+            q, qdot = map(layout.restore, halves(y))
+            return layout.flatten(system.acceleration(q, qdot, t, of(numbers, table)))
 
-    def follow(self, ts, y0, numbers, directions):
-        arrays = [np.asarray(x, self.dtype) for x in (ts, y0, numbers, directions)]
+        self._follow = jax.jit(jax.vmap(with_tangents, in_axes=(0, 0, None, 0, None, 0)))
+        self._rate = jax.jit(jax.vmap(rate, in_axes=(0, 0, None, 0)))
+        self.dtype = layout.dtype
+
+    def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
+        arrays = jax.tree.map(self._array, (ts, y0, numbers, y0_dot, numbers_dot, table))
         (path, result, t_end, y_end), tangents = jax.tree.map(np.asarray, self._follow(*arrays))
         return Motion(path.astype(float), tangents.astype(float), result, t_end, y_end)
 
-    def rate(self, t, y, numbers):
-        params = self.parameters.restore(numbers)
-        return np.asarray(self._rate(np.asarray(t, self.dtype), np.asarray(y, self.dtype), params), float)
+    def rate(self, t, y, numbers, table=None):
+        return np.asarray(self._rate(*jax.tree.map(self._array, (t, y, numbers, table))), float)
 
-
-def _acceleration(system: System, layout: Layout, t, y, params):
-    q, qdot = map(layout.restore, halves(y))
-    return layout.flatten(system.acceleration(q, qdot, t, params))
+    def _array(self, x) -> np.ndarray:
+        return np.asarray(x, self.dtype)

@@ -1,11 +1,13 @@
 """`Record`: one recording of a motion; `Samples`: pieces of records side by side, as rows of one batch."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from lagjax._fit._inputs import Table, looked_up, table_of
 from lagjax._layout import Layout, taken_apart
 
 PyTree = Any
@@ -25,11 +27,14 @@ class Record:
     - `ts` (T,): the times, strictly increasing, T ≥ 2. Records need not be equally long, nor equally spaced.
     - `values`: the measured signals in the structure that `observe` returns, with the times as first axis of every
       leaf; by default that of q. NaN where a sample is missing.
+    - `inputs`: what drove the scene and was sampled at the same times, in any structure, with the times as first axis
+      of every leaf: a voltage, the motion of a support. Functions of the scene, and `observe`, ask for it as `inputs`
+      and get its value at their time; between samples it goes on as `fit(..., hold=)` says. None of it may be missing.
     - `start`: the state at `ts[0]`. A pair (q0, qdot0) is known and kept. `lagjax.Guess(q0, qdot0)` is where the search
-      for it begins. With None it is fitted, from local polynomials through the values.
+      for it begins. With None it is fitted, from local polynomials through the values. A function of the parameters
+      that returns (q0, qdot0) makes it follow from them, as positions of planets do from orbital elements.
     - `weights`: how much each sample counts, one number or a prefix of the structure of `values`: the variance of a
       sample is that of its signal over its weight. Zero leaves a sample out.
-    - `inputs`: not there yet. An input that all records share goes into `forces`, by `lagjax.samples`.
 
     **Raises** `TypeError` or `ValueError` where these cannot be right.
 
@@ -43,27 +48,22 @@ class Record:
 
     ts: np.ndarray
     values: PyTree
-    inputs: None = None
-    start: tuple[PyTree, PyTree] | Guess | None = None
+    inputs: PyTree = None
+    start: tuple[PyTree, PyTree] | Guess | Callable | None = None
     weights: PyTree = None
 
     def __post_init__(self):
         object.__setattr__(self, "ts", _times(self.ts))
-        values = self.values
-        if isinstance(values, list | tuple) and values and all(np.ndim(value) == 0 for value in values):
-            values = np.asarray(values)  # a list of numbers is one signal, not one signal for each
-        labels, leaves, tree = taken_apart(values, "values")
+        labels, leaves, tree = taken_apart(one_signal(self.values), "values")
         leaves = [_signal(leaf, label, len(self.ts)) for label, leaf in zip(labels, leaves, strict=True)]
         if not any(leaf.size for leaf in leaves):
             raise ValueError("values holds no signal: give an array with the times as first axis.")
         object.__setattr__(self, "values", tree.unflatten(leaves))
         if self.inputs is not None:
-            raise NotImplementedError(
-                "Sampled inputs of a record are not there yet. Where all records have the same input, let `forces` ask "
-                "for `t` and call lagjax.samples(knots, values)(t)."
-            )
-        if self.start is not None and not (isinstance(self.start, tuple) and len(self.start) == 2):
-            raise TypeError(f"start must be (q0, qdot0), lagjax.Guess(q0, qdot0) or None; got {self.start!r}.")
+            labels, leaves, tree = taken_apart(one_signal(self.inputs), "inputs")
+            leaves = [_input(leaf, label, len(self.ts)) for label, leaf in zip(labels, leaves, strict=True)]
+            object.__setattr__(self, "inputs", tree.unflatten(leaves))
+        require_start(self.start)
         _matrix_of_weights(self)
 
     def __len__(self) -> int:
@@ -79,6 +79,18 @@ class Record:
     def matrix(self) -> np.ndarray:
         """All signals side by side, (T, S); NaN where missing."""
         return np.concatenate([leaf.reshape(len(self), -1) for leaf in jax.tree.leaves(self.values)], axis=1)
+
+    @property
+    def input_matrix(self) -> np.ndarray:
+        """All inputs side by side, (T, I)."""
+        leaves = jax.tree.leaves(self.inputs)
+        return np.concatenate([np.zeros((len(self), 0)), *(x.reshape(len(self), -1) for x in leaves)], axis=1)
+
+    @property
+    def input_structure(self) -> tuple | None:
+        """What must be the same for the inputs of records of one fit; None without inputs."""
+        leaves, tree = jax.tree.flatten(self.inputs)
+        return (tree, tuple(leaf.shape[1:] for leaf in leaves)) if leaves else None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -120,6 +132,12 @@ def _times(ts) -> np.ndarray:
     return times
 
 
+def one_signal(values: PyTree) -> PyTree:
+    """A list of numbers as an array: it is one signal, not one signal for each."""
+    is_list = isinstance(values, list | tuple) and values and all(np.ndim(value) == 0 for value in values)
+    return np.asarray(values) if is_list else values
+
+
 def _signal(leaf, label: str, times: int) -> np.ndarray:
     try:
         values = np.asarray(leaf, np.float64)
@@ -131,6 +149,23 @@ def _signal(leaf, label: str, times: int) -> np.ndarray:
         place = np.argwhere(np.isinf(values))[0].tolist()
         raise ValueError(f"{label}{place} is infinite: write NaN for a sample that is missing.")
     return values
+
+
+def _input(leaf, label: str, times: int) -> np.ndarray:
+    values = _signal(leaf, label, times)
+    if np.isnan(values).any():
+        place = np.argwhere(np.isnan(values))[0].tolist()
+        raise ValueError(f"{label}{place} is NaN, but what drives a scene must be known at all times: fill it first.")
+    return values
+
+
+def require_start(start) -> None:
+    """Raise `TypeError` for what is neither a start, nor a function of the parameters that gives one."""
+    if start is not None and not callable(start) and not (isinstance(start, tuple) and len(start) == 2):
+        raise TypeError(
+            "start must be (q0, qdot0), lagjax.Guess(q0, qdot0), a function of the parameters that returns "
+            f"(q0, qdot0), or None; got {start!r}."
+        )
 
 
 def _matrix_of_weights(record: Record) -> np.ndarray:
@@ -154,7 +189,18 @@ def _matrix_of_weights(record: Record) -> np.ndarray:
 
 def in_structure(matrix: np.ndarray, record: Record) -> PyTree:
     """Signals (T, S) in the structure of a record's values."""
-    tree, shapes = record.structure
+    return _taken_apart(matrix, record.structure)
+
+
+def inputs_between(record: Record, ts: np.ndarray) -> PyTree:
+    """The inputs of a record at other times, on lines between the samples; None where it has none."""
+    if record.input_structure is None:
+        return None
+    return _taken_apart(looked_up(record.ts, record.input_matrix, ts), record.input_structure)
+
+
+def _taken_apart(matrix: np.ndarray, structure: tuple) -> PyTree:
+    tree, shapes = structure
     sizes = [int(np.prod(shape)) for shape in shapes]
     columns = np.split(matrix, np.cumsum(sizes)[:-1], axis=1)
     return tree.unflatten(
@@ -178,12 +224,15 @@ class Samples(NamedTuple):
     - `rows` (N,): the place of each piece among all.
     - `ts` (N, T): times, and after the last one of a piece times so close to it that following them costs nothing.
     - `values` (N, T, S), `weights` (N, T, S): signals and how much they count, zero where there is none.
+    - `inputs` (N, T, I), I = 0 where there are none: the inputs at these times. `table`: between them.
     """
 
     rows: np.ndarray
     ts: np.ndarray
     values: np.ndarray
     weights: np.ndarray
+    inputs: np.ndarray
+    table: Table | None
 
 
 def batches(records: list[Record], pieces: list[Piece], eps: float = 2.3e-16) -> list[Samples]:
@@ -205,16 +254,21 @@ def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, 
     ts = np.zeros((len(rows), longest))
     values, weights = np.zeros((2, len(rows), longest, signals))
     matrices = {pieces[row].record: None for row in rows}
-    matrices = {k: (records[k].matrix, records[k].weight_matrix) for k in matrices}
+    matrices = {k: (records[k].matrix, records[k].weight_matrix, records[k].input_matrix) for k in matrices}
+    driven = matrices[pieces[rows[0]].record][2]
+    inputs, sampled = np.zeros((len(rows), longest, driven.shape[1])), []
     for i, row in enumerate(rows):
         record, places = pieces[row]
-        measured, weight = (matrix[places] for matrix in matrices[record])
+        measured, weight = (matrix[places] for matrix in matrices[record][:2])
+        between, driven = slice(places[0], places[-1] + 1), matrices[record][2]
         times, count = records[record].ts[places], len(places)
         # Eight units of round-off apart: times that still increase.
         gap = 8 * eps * max(abs(times[0]), abs(times[-1]), times[-1] - times[0])
         ts[i] = np.concatenate([times, times[-1] + gap * np.arange(1, longest - count + 1)])
         values[i, :count], weights[i, :count] = np.where(weight > 0, measured, 0.0), weight
-    return Samples(rows, ts, values, weights)
+        inputs[i, :count], inputs[i, count:] = driven[places], driven[places[-1]]
+        sampled.append((records[record].ts[between], driven[between]))
+    return Samples(rows, ts, values, weights, inputs, table_of(sampled) if driven.shape[1] else None)
 
 
 def require_alike(records) -> list[Record]:
@@ -229,6 +283,11 @@ def require_alike(records) -> list[Record]:
             raise ValueError(
                 f"records[{place}] has other signals than records[0]: {record.structure} and {listed[0].structure}."
             )
+        if record.input_structure != listed[0].input_structure:
+            raise ValueError(
+                f"records[{place}] has other inputs than records[0]: {record.input_structure} and "
+                f"{listed[0].input_structure}."
+            )
     measured = np.any([(record.weight_matrix > 0).any(axis=0) for record in listed], axis=0)
     if not measured.all():
         which = int(np.argmin(measured))
@@ -242,11 +301,11 @@ def require_alike(records) -> list[Record]:
     return listed
 
 
-def known_start(record: Record, layout: Layout, place: int) -> np.ndarray | None:
-    """The state (2n,) that a record says it starts from, known or guessed; None where it says nothing."""
+def known_start(record: Record, layout: Layout, place: int, params: PyTree) -> np.ndarray | None:
+    """The state (2n,) that a record says it starts from, known, guessed or of `params`; None where it says nothing."""
     if record.start is None:
         return None
-    q, qdot = record.start
+    q, qdot = started(record.start, params)
     own = Layout.of(q, qdot)
     if (own.tree, own.shapes) != (layout.tree, layout.shapes):
         raise ValueError(
@@ -256,3 +315,11 @@ def known_start(record: Record, layout: Layout, place: int) -> np.ndarray | None
     if not np.isfinite(state).all():
         raise ValueError(f"The start of records[{place}] is not finite.")
     return state
+
+
+def started(start, params: PyTree) -> tuple[PyTree, PyTree]:
+    """The pair (q0, qdot0) of a start that is there. Raises `TypeError` where a function returns something else."""
+    pair = start(params) if callable(start) else start
+    if not (isinstance(pair, tuple) and len(pair) == 2):
+        raise TypeError(f"start, as a function of the parameters, must return (q0, qdot0); got {pair!r}.")
+    return pair

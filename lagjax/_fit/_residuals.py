@@ -14,6 +14,7 @@ from lagjax._fit._noise import AbstractNoise, Widths, counts
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Piece, Record, Samples, batches
 from lagjax._fit._signals import Signals
+from lagjax._fit._starts import Origins
 from lagjax._layout import Layout
 
 
@@ -60,6 +61,8 @@ class Question:
         self.motions, self.signals, self.parameters = motions, signals, parameters
         self.layout: Layout = signals.layout
         self.batches: list[Samples] = batches(records, pieces, float(np.finfo(self.layout.dtype).eps))
+        starts = [records[piece.record].start if piece.places[0] == 0 else None for piece in pieces]
+        self.origins = Origins(starts, self.layout, parameters)
         self.weights = np.concatenate([b.weights.reshape(-1, len(size)) for b in self.batches])
         self.measured = int((self.weights > 0).sum())
 
@@ -77,22 +80,32 @@ class Question:
     def at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
         """The residuals of one trial, or the first piece whose motion failed."""
         numbers, directions = self.parameters.numbers(u), self.parameters.directions(u)
+        starts, moved = self.origins.move(starts, numbers, directions)
         if not (np.isfinite(numbers).all() and np.isfinite(directions).all() and np.isfinite(starts).all()):
             return Failure(0, "A parameter is not finite.")
         residuals, slopes = [], []
         for batch in self.batches:
-            motion = self.motions.follow(batch.ts, starts[batch.rows], numbers, directions)
+            y0_dot, numbers_dot = self._along(batch, moved, directions)
+            motion = self.motions.follow(batch.ts, starts[batch.rows], numbers, y0_dot, numbers_dot, batch.table)
             if not motion.ok:
                 row, text = motion.why_not(batch.ts, self.layout)
                 return Failure(int(batch.rows[row]), text)
-            failure = self._collect(batch, motion, numbers, directions, residuals, slopes)
+            failure = self._collect(batch, motion, numbers, numbers_dot, residuals, slopes)
             if failure is not None:
                 return failure
         return Point(u, starts, residuals, slopes)
 
-    def _collect(self, batch: Samples, motion: Motion, numbers, directions, residuals, slopes) -> Failure | None:
+    def _along(self, batch: Samples, moved: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Directions of the starts (N, D, 2n) and of the parameters (D, P): D = 2n + F, or F where no start is free."""
+        states = self.states if self.fitted[batch.rows].any() else 0
+        y0_dot = np.zeros((len(batch.rows), states + len(directions), self.states))
+        y0_dot[:, :states] = np.eye(states, self.states)
+        y0_dot[:, states:] = moved[batch.rows]
+        return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
+
+    def _collect(self, batch: Samples, motion: Motion, numbers, numbers_dot, residuals, slopes) -> Failure | None:
         """Append the residuals of one batch and their derivatives; the first that is not finite as a failure."""
-        values, by_unknowns = self.signals.of(motion, batch.ts, numbers, directions)
+        values, by_unknowns = self.signals.of(motion, batch.ts, batch.inputs, numbers, numbers_dot)
         counted = batch.weights > 0
         bad = counted & ~(np.isfinite(values) & np.isfinite(by_unknowns).all(axis=-1))
         if bad.any():
@@ -103,6 +116,8 @@ class Question:
                 f"What `observe` returns for {self.signals.names[signal]}, or its derivative, is not finite at sample "
                 f"{sample}, t = {batch.ts[row, place]:g}.",
             )
+        missing = self.states + len(self.parameters) - by_unknowns.shape[-1]  # of starts, where none is free
+        by_unknowns = np.pad(by_unknowns, ((0, 0), (0, 0), (0, 0), (missing, 0)))
         by_unknowns[~self.fitted[batch.rows], ..., : self.states] = 0.0
         residuals.append(np.where(counted, values - batch.values, 0.0))
         slopes.append(np.where(counted[..., None], by_unknowns, 0.0))

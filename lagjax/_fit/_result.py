@@ -156,8 +156,10 @@ class Fit:
         [record] = require_alike([record])
         if record.structure != self.records[0].structure:
             raise ValueError("The record has other signals than those of the fit.")
+        if record.input_structure != self.records[0].input_structure:
+            raise ValueError("The record has other inputs than those of the fit.")
         layout, fixed = self.question.layout, _all_fixed(self.parameters, self.u)
-        state = known_start(record, layout, 0)
+        state = known_start(record, layout, 0, self.params)
         is_known = state is not None and not isinstance(record.start, Guess)
         if state is None:
             state = _start_read_off(record, self.observe, layout)
@@ -177,7 +179,9 @@ class Fit:
         start = layout.restore(point.starts[0, :n]), layout.restore(point.starts[0, n:])
         ts = np.asarray(record.ts, layout.dtype)
         q0, qdot0 = (jax.tree.map(lambda x: np.asarray(x, layout.dtype), half) for half in start)
-        trajectory = simulate(self.system, q0, qdot0, cast(jax.Array, ts), self.params)  # NumPy's is as good
+        form, driven = self.question.signals.form, (record.ts, record.input_matrix)
+        scene, params = (self.system, self.params) if form is None else form.along(self.system, self.params, *driven)
+        trajectory = simulate(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
         left = np.where(record.weight_matrix > 0, point.residuals[0][0], np.nan)
         values = in_structure(left + record.matrix, record)
         return Prediction(trajectory, values, in_structure(left, record), start)

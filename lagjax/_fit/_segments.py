@@ -19,8 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._fit._inputs import at_instants
 from lagjax._fit._motions import AbstractMotions
-from lagjax._fit._records import Piece, Record, in_structure
+from lagjax._fit._records import Piece, Record, in_structure, inputs_between
 
 _DEGREE = 3  # of local polynomials: velocities without the bias that curvature gives to lines
 _WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them
@@ -130,7 +131,10 @@ def glimpses(readers: list[Reader], length: float) -> tuple[list[Record], np.nda
         ]
         values = np.stack([np.polynomial.polynomial.polyval(offsets, c.T) for c in cubics], axis=-1)
         structured = [in_structure(v, reader.record) for v in values]
-        found += [Record(t + offsets, v) for t, v in zip(reader.record.ts[places], structured, strict=True)]
+        found += [
+            Record(t + offsets, v, inputs_between(reader.record, t + offsets))
+            for t, v in zip(reader.record.ts[places], structured, strict=True)
+        ]
         states.append(reader.states(places))
     return found, np.concatenate(states)
 
@@ -146,7 +150,8 @@ def time_scale(readers: list[Reader], motions: AbstractMotions, numbers: np.ndar
     t = np.concatenate([reader.record.ts[some] for reader, some in zip(readers, places, strict=True)])
     y, n = np.concatenate(states), states[0].shape[1] // 2
     within = np.concatenate([state[:, :n] - state[:, :n].mean(axis=0) for state in states])
-    pulled = motions.rate(t, y, numbers)
+    inputs = np.concatenate([reader.record.input_matrix[some] for reader, some in zip(readers, places, strict=True)])
+    pulled = motions.rate(t, y, numbers, at_instants(t, inputs))
     pulled = np.where(np.isfinite(pulled), pulled, 0.0)
     spread, rate, pulled = (np.sqrt(np.mean(x**2, axis=0)) for x in (within, y[:, n:], pulled))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,7 +1,7 @@
 """`Signals`: what the sensors show of a motion, with derivatives.
 
 `observe(q, qdot)` makes signals of a state, by default q itself. It may ask for `t` and `params`, so that a gain, a
-bias or a mounting position can be fitted, too.
+bias or a mounting position can be fitted, too, and for the sampled `inputs` of the record.
 """
 
 from collections.abc import Callable
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import accept
+from lagjax._fit._inputs import Form
 from lagjax._fit._motions import Motion
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Record
@@ -24,8 +25,10 @@ _AT_ONCE = 2048  # samples in one call of the compiled sensors: one program for 
 class Signals:
     """The sensors of a fit: `names` (S,), and the map from motions to signals and their derivatives."""
 
-    def __init__(self, observe: Callable | None, layout: Layout, parameters: Parameters, record: Record):
-        self.layout, self.parameters = layout, parameters
+    def __init__(
+        self, observe: Callable | None, layout: Layout, parameters: Parameters, record: Record, form: Form | None = None
+    ):
+        self.layout, self.parameters, self.form = layout, parameters, form
         if observe is None:
             self.names, self._at = layout.names, None
             if record.structure != (layout.tree, layout.shapes):
@@ -34,60 +37,58 @@ class Signals:
                     f"`observe`; records[0] has {record.structure[0]} of {record.structure[1]}."
                 )
             return
-        function = accept(observe, "observe")
+        function = accept(observe, "observe", extras=("t", "params", "inputs"))
+        if form is None and "inputs" in function.extras:
+            raise ValueError("observe asks for `inputs`, which records[0] has none of: give Record(..., inputs=...).")
         self.names = tuple("values" + name for name in record.names)
 
-        def observed(y, t, numbers):
+        def observed(y, t, numbers, inputs):
             q, qdot = map(layout.restore, halves(y))
-            leaves, begin = [], 0
-            for leaf in parameters.leaves:
-                if hasattr(leaf, "shape"):
-                    leaves.append(numbers[begin : begin + leaf.size].reshape(leaf.shape))
-                    begin += leaf.size
-                else:
-                    leaves.append(leaf)
-            return function(q, qdot, t=t, params=jax.tree.unflatten(parameters.tree, leaves))
+            extras = {} if form is None else {"inputs": form.restore(inputs)}
+            return function(q, qdot, t=t, params=parameters.restore(numbers), **extras)
 
-        _require_signals(observed, layout, parameters, record)
+        _require_signals(observed, layout, parameters, record, 0 if form is None else form.size)
         flat = lambda *state: jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(observed(*state))])  # noqa: E731
 
-        def with_derivatives(y, t, numbers):
-            return flat(y, t, numbers), *jax.jacfwd(flat, argnums=(0, 2))(y, t, numbers)
+        def with_derivatives(y, t, inputs, numbers):
+            state = y, t, numbers, inputs
+            return flat(*state), *jax.jacfwd(flat, argnums=(0, 2))(*state)
 
-        self._at = jax.jit(jax.vmap(with_derivatives, in_axes=(0, 0, None)))
+        self._at = jax.jit(jax.vmap(with_derivatives, in_axes=(0, 0, 0, None)))
 
-    def of(self, motion: Motion, ts: np.ndarray, numbers: np.ndarray, directions: np.ndarray):
-        """The signals (N, T, S) of motions at `ts` (N, T), and their derivatives (N, T, S, D) along all directions."""
+    def of(self, motion: Motion, ts: np.ndarray, inputs: np.ndarray, numbers: np.ndarray, numbers_dot: np.ndarray):
+        """The signals (N, T, S) of motions, and their derivatives (N, T, S, D) along the directions of these.
+
+        `ts` (N, T) and `inputs` (N, T, I) are times and inputs there, `numbers` (P,) the parameters and `numbers_dot`
+        (D, P) their directions.
+        """
         tangents = motion.tangents
         if self._at is None:
             n = self.layout.size
             return motion.path[..., :n], np.ascontiguousarray(np.moveaxis(tangents[..., :n], 1, -1))
-        (rows, times, states), free = motion.path.shape, len(directions)
-        values, by_state, by_numbers = self._in_portions(motion.path.reshape(-1, states), ts.ravel(), numbers)
+        rows, times, states = motion.path.shape
+        samples = motion.path.reshape(-1, states), ts.ravel(), inputs.reshape(rows * times, -1)
+        values, by_state, by_numbers = self._in_portions(samples, numbers)
         shape = rows, times, values.shape[1]
-        by_state = by_state.reshape(*shape, states)
-        slopes = np.matmul(by_state, np.moveaxis(tangents, 1, -1))
-        slopes[..., states:] += (by_numbers @ directions.T).reshape(*shape, free)
+        slopes = np.matmul(by_state.reshape(*shape, states), np.moveaxis(tangents, 1, -1))
+        slopes += (by_numbers @ numbers_dot.T).reshape(*shape, len(numbers_dot))
         return values.reshape(shape), slopes
 
-    def _in_portions(self, y, t, numbers):
+    def _in_portions(self, samples, numbers):
         assert self._at is not None
         parts = []
-        for begin in range(0, len(y), _AT_ONCE):
-            some, times = y[begin : begin + _AT_ONCE], t[begin : begin + _AT_ONCE]
-            count = len(some)
-            some, times = np.resize(some, (_AT_ONCE, y.shape[1])), np.resize(times, _AT_ONCE)
-            inputs = (np.asarray(x, self.layout.dtype) for x in (some, times, numbers))
-            parts.append([np.asarray(x, float)[:count] for x in self._at(*inputs)])
+        for begin in range(0, len(samples[0]), _AT_ONCE):
+            some = [x[begin : begin + _AT_ONCE] for x in samples]
+            filled = [np.resize(x, (_AT_ONCE, *x.shape[1:])) for x in some]
+            arrays = (np.asarray(x, self.layout.dtype) for x in (*filled, numbers))
+            parts.append([np.asarray(x, float)[: len(some[0])] for x in self._at(*arrays)])
         return [np.concatenate(columns) for columns in zip(*parts, strict=True)]
 
 
-def _require_signals(observed, layout: Layout, parameters: Parameters, record: Record) -> None:
+def _require_signals(observed, layout: Layout, parameters: Parameters, record: Record, inputs: int) -> None:
     """Raise `ValueError` where `observe` does not return what the records hold."""
-    of = jax.ShapeDtypeStruct
-    out = jax.eval_shape(
-        observed, of((2 * layout.size,), layout.dtype), of((), layout.dtype), of(parameters.first.shape, layout.dtype)
-    )
+    shapes = (2 * layout.size,), (), parameters.first.shape, (inputs,)
+    out = jax.eval_shape(observed, *(jax.ShapeDtypeStruct(shape, layout.dtype) for shape in shapes))
     leaves, tree = jax.tree.flatten(out)
     got = tree, tuple(getattr(leaf, "shape", ()) for leaf in leaves)
     if got != record.structure:

@@ -1,0 +1,137 @@
+"""`fit` with sampled inputs: an oscillator that is driven, whose motion has a closed form for both holds."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import lsim
+
+import lagjax
+from lagjax._fit import _inputs, _motions
+from lagjax._fit._parameters import Parameters
+from lagjax._layout import Layout
+
+TRUTH = {"k": 4.0, "c": 0.3, "gain": 1.5}
+TS = 0.02 * np.arange(200)
+
+
+def driven(q, qdot, params, inputs):
+    return params["gain"] * inputs["u"] - params["c"] * qdot
+
+
+SCENE = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2, forces=driven)
+
+
+def inputs_of(ts, seed=0):
+    return np.random.default_rng(seed).normal(size=len(ts))
+
+
+def exact(ts, u, hold, start=(0.3, -0.2), truth=TRUTH):
+    a = np.array([[0.0, 1.0], [-truth["k"], -truth["c"]]])
+    system = a, np.array([[0.0], [truth["gain"]]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
+    return lsim(system, u, ts - ts[0], np.array(start), interp=hold == "linear")[1]
+
+
+def record_of(ts, hold, seed=0, **more):
+    u = inputs_of(ts, seed)
+    return lagjax.Record(ts, exact(ts, u, hold), {"u": u}, **more)
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_a_driven_oscillator_is_followed_and_recovered_from_records_of_any_length(hold):
+    ends = [200, 90]
+    records = [record_of(1.0 + TS[:end], hold, end) for end in ends]
+    fit = lagjax.fit(SCENE, records, {"k": 3.0, "c": 0.1, "gain": 1.0}, transforms=lagjax.positive, hold=hold,
+                     method="whole")  # fmt: skip
+    # Motions are exact to rtol 1e-9, of size one.
+    for name, value in TRUTH.items():
+        assert fit.params[name] == pytest.approx(value, rel=1e-6)
+    assert np.allclose([start[0] for start in fit.starts], 0.3, atol=1e-7)
+    new = record_of(2.0 + TS[:150], hold, 7, start=(0.3, -0.2))
+    shown = fit.predict(new)
+    assert np.abs(shown.residuals).max() < 1e-6
+    np.testing.assert_allclose(shown.trajectory.q, shown.values, atol=1e-8)
+
+
+def test_pieces_of_a_record_have_tables_of_their_own_and_programs_are_made_for_few_lengths():
+    u = np.arange(30.0)[:, None]
+    table = _inputs.table_of([(TS[:30], u), (TS[10:14], u[10:14])])
+    assert table.knots.shape == (2, 64) and table.values.shape == (2, 64, 1)
+    assert (np.diff(table.knots) > 0).all() and (table.values[1, 4:] == 13.0).all()
+    assert {_inputs.room_for(count) for count in range(1, 25_000)} == {16, 64, 256, 1024, 4096, 16384, 65536}
+
+
+@pytest.mark.slow
+def test_segments_begin_where_whole_records_are_out_of_phase():
+    records = [record_of(0.02 * np.arange(end), "zero", end) for end in (1500, 900)]
+    fit = lagjax.fit(SCENE, records, {"k": 15.0, "c": 1.0, "gain": 1.0}, transforms=lagjax.positive)
+    assert all(fit.params[name] == pytest.approx(value, rel=1e-5) for name, value in TRUTH.items())
+
+
+@pytest.mark.slow
+def test_sensors_see_inputs_and_gain_and_bias_are_parameters():
+    u = inputs_of(TS)
+    values = {"a": 2.0 * exact(TS, u, "zero") + 0.1, "b": u + exact(TS, u, "zero")}
+
+    def observe(q, qdot, params, inputs):
+        return {"a": params["sensor"] * q + params["bias"], "b": inputs["u"] + q}
+
+    record = lagjax.Record(TS, values, {"u": u}, start=lagjax.Guess(0.0, 0.0))
+    first = {"k": 3.0, "c": 0.1, "gain": 1.0, "sensor": 1.0, "bias": 0.0}
+    fit = lagjax.fit(SCENE, record, first, observe=observe)
+    assert all(fit.params[name] == pytest.approx(value, rel=1e-5) for name, value in TRUTH.items())
+    assert fit.params["sensor"] == pytest.approx(2.0, rel=1e-6) and fit.params["bias"] == pytest.approx(0.1, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_machine_code_and_diffrax_agree_and_derivatives_are_those_of_differences():
+    hold = "zero"
+    layout, parameters = Layout.of(0.0, 0.0), Parameters.of(TRUTH)
+    form = _inputs.Form(*record_of(TS[:9], hold).input_structure, hold)
+    pieces = [(TS[:9], inputs_of(TS[:9])[:, None]), (TS[3:8], inputs_of(TS[:5], 1)[:, None])]
+    table, ts = _inputs.table_of(pieces), np.stack([TS[0:7:3], TS[3:8:2]])
+    y0, numbers = np.array([[1.0, 0.0], [0.3, -1.0]]), parameters.first
+    y0_dot = np.concatenate([np.broadcast_to(np.eye(2), (2, 2, 2)), np.zeros((2, 3, 2))], axis=1)
+    along = y0_dot, np.concatenate([np.zeros((2, 3)), np.eye(3)])
+    fast = _motions.motions_of(SCENE, layout, parameters, 1e-12, None, form)
+    plain = _motions._ByDiffrax(form.driven(SCENE), layout, parameters, 1e-12, None, True)
+    one, other = (motions.follow(ts, y0, numbers, *along, table) for motions in (fast, plain))
+    np.testing.assert_allclose(one.path, other.path, atol=1e-8)
+    np.testing.assert_allclose(one.tangents, other.tangents, atol=1e-7)
+    at = pieces[0][0], np.repeat(y0[:1], 9, axis=0), numbers, _inputs.at_instants(*pieces[0])
+    np.testing.assert_allclose(fast.rate(*at), plain.rate(*at), rtol=1e-12)
+    for k, step in enumerate(1e-5 * np.eye(3)):
+        after, before = (fast.follow(ts, y0, numbers + way * step, *along, table).path for way in (1, -1))
+        np.testing.assert_allclose(one.tangents[:, 2 + k], (after - before) / 2e-5, rtol=1e-6, atol=1e-8)
+
+
+def test_a_start_may_follow_from_the_parameters():
+    u = inputs_of(TS)
+    record = lagjax.Record(TS, exact(TS, u, "zero"), {"u": u}, start=lambda params: (params["at"], -0.2))
+    fit = lagjax.fit(SCENE, record, {**TRUTH, "at": 0.1}, method="whole")
+    assert fit.params["at"] == pytest.approx(0.3, abs=1e-7) and fit.starts[0][0] == fit.params["at"]
+    h = 1e-5
+    ends = [fit.question.at(fit.u + way * h * np.eye(4)[0], np.zeros((1, 2))).residuals[0] for way in (1, -1)]
+    slopes = fit.question.at(fit.u, np.zeros((1, 2))).slopes[0]
+    np.testing.assert_allclose(slopes[..., 2], (ends[0] - ends[1]) / (2 * h), atol=1e-7)
+
+
+# ---- what can be wrong -----------------------------------------------------------------------------------------------
+
+
+def test_what_is_wrong_with_inputs_is_a_sentence():
+    u = inputs_of(TS)
+    record, bare = lagjax.Record(TS, u, {"u": u}), lagjax.Record(TS, u)
+    with pytest.raises(ValueError, match=r"forces asks for `inputs`, which records.0. has none of"):
+        lagjax.fit(SCENE, bare, TRUTH)
+    with pytest.raises(ValueError, match=r"observe asks for `inputs`, which records.0. has none of"):
+        lagjax.fit(lagjax.System(SCENE.lagrangian.code), bare, TRUTH, observe=lambda q, qdot, inputs: q)
+    with pytest.raises(ValueError, match=r"records\[1\] has other inputs than records\[0\]"):
+        lagjax.fit(SCENE, [record, bare], TRUTH)
+    with pytest.raises(ValueError, match="hold must be 'zero' or 'linear'; got 'cubic'"):
+        lagjax.fit(SCENE, record, TRUTH, hold="cubic")
+    with pytest.raises(ValueError, match=r"inputs\['u'\]\[3\] is NaN, but what drives a scene must be known"):
+        lagjax.Record(TS, u, {"u": np.where(np.arange(len(u)) == 3, np.nan, u)})
+    with pytest.raises(TypeError, match=r"start must be .*a function of the parameters"):
+        lagjax.Record(TS, u, start=3.0)
+    with pytest.raises(TypeError, match=r"driven asks for `inputs`, which only the records of lagjax.fit have"):
+        lagjax.simulate(SCENE, 0.0, 0.0, jnp.array([0.0, 1.0]), TRUTH)
