@@ -32,12 +32,16 @@ class Information(NamedTuple):
     - `null` (F, K): the K directions of u that nothing depends on.
     - `effective` (S,): the number of samples of each signal that independent ones would need to say as much.
     - `correlation` (S,): the correlation of neighbouring residuals.
+    - `white` (F, F): the covariance if residuals were white, zero where nothing is seen; `lost`: by how much variances
+      are larger because unknowns were fitted.
     """
 
     covariance: np.ndarray
     null: np.ndarray
     effective: np.ndarray
     correlation: np.ndarray
+    white: np.ndarray
+    lost: float
 
 
 def information(question: Question, point: Point, widths: Widths) -> Information:
@@ -58,12 +62,13 @@ def information(question: Question, point: Point, widths: Widths) -> Information
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in widths.dof])
     half = basis @ np.linalg.solve(basis.T @ _square(triangles, question.states) @ basis, basis.T)
-    covariance = lost * robust * half @ middle @ half.T
+    white = robust * half
+    covariance = lost * white @ middle @ half.T
     unseen = np.linalg.norm(null, axis=1) > 1e-6 if null.size else np.zeros(free, bool)
     covariance[unseen] = np.nan
     covariance[:, unseen] = np.nan
     covariance[unseen, unseen] = np.inf
-    return Information(covariance, null, effective, np.array([law.neighbour for law in laws]))
+    return Information(covariance, null, effective, np.array([law.neighbour for law in laws]), white, float(lost))
 
 
 def seen(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:

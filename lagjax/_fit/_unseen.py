@@ -24,20 +24,18 @@ def sentences(question: Question, point: Point, widths: Widths, null: np.ndarray
         return ()
     parameters = question.parameters
     elsewhere = _null_elsewhere(question, point, widths)
-    spaces = [(parameters.slopes(point.u)[:, None] * null, parameters.values(point.u))]
+    spaces = [(parameters.jacobian(point.u) @ null, parameters.values(point.u))]
     if elsewhere is not None:
         u, other = elsewhere
-        spaces.append((parameters.slopes(u)[:, None] * other, parameters.values(u)))
-    found = [_sentence(parameters, block, spaces) for block in _blocks(null)]
+        spaces.append((parameters.jacobian(u) @ other, parameters.values(u)))
+    found = [_sentence(parameters, block, spaces) for block in _blocks(spaces[0][0])]
     return tuple(found)
 
 
 def _null_elsewhere(question: Question, point: Point, widths: Widths):
     """Other values u of the free parameters, a few per cent away, and the null directions there."""
     u = point.u
-    x, slope = question.parameters.values(u), question.parameters.slopes(u)
-    size = np.minimum(np.where(x != 0, np.abs(x), 1.0) / slope, question.parameters.reach)
-    near = u + size * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
+    near = u + question.parameters.sizes(u) * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
     other = question.at(near, point.starts)
     if isinstance(other, Failure):
         return None
