@@ -8,7 +8,19 @@ from lagjax._check import Finding, Findings, check
 from lagjax._crossings import Crossings, crossings
 from lagjax._diffrax._solvers import FineOutput
 from lagjax._explain import Explanation
-from lagjax._fit import Fit, Gaussian, Guess, Record, StudentT, between, fit, positive
+from lagjax._fit import (
+    Fit,
+    Gaussian,
+    Guess,
+    Record,
+    StudentT,
+    angle,
+    between,
+    fit,
+    inertia,
+    positive,
+    simplex,
+)
 from lagjax._health import Health
 from lagjax._hybrid import Transition, simulate_hybrid
 from lagjax._machine_code import MachineCode
@@ -42,14 +54,17 @@ __all__ = [
     "Transitions",
     "WorkPrecision",
     "WorkPrecisionRow",
+    "angle",
     "between",
     "check",
     "crossings",
     "fit",
+    "inertia",
     "plot",
     "positive",
     "samples",
     "scenes",
+    "simplex",
     "simulate",
     "simulate_batch",
     "simulate_hybrid",

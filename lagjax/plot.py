@@ -134,6 +134,30 @@ def work_precision(result: WorkPrecision, *, ax=None):
     return _legend(ax)
 
 
+def profile(profile, *, ax=None):
+    """The deviance of a `Profile` against its parameter: grey is what the level excludes, dashed lines are the ends.
+
+    Only what is within three times the threshold is shown, but for other minima.
+
+    >>> lagjax.plot.profile(fit.profile("params['friction']"))
+    """
+    ax = _axes(ax)
+    values, deviance = np.asarray(profile.values), np.asarray(profile.deviance)
+    near = deviance <= 3.0 * profile.threshold
+    first, last = (0, len(near) - 1) if not near.any() else np.flatnonzero(near)[[0, -1]]
+    shown = slice(max(first - 1, 0), last + 2)
+    ax.plot(values[shown], deviance[shown], color=COLORS[0], marker="o", markersize=3.5, linewidth=1.5)
+    for value, _ in profile.minima:
+        ax.axvline(value, color=GREY, linewidth=0.8)
+    for end in profile.interval:
+        if np.isfinite(end):
+            ax.axvline(end, color=COLORS[1], linewidth=1.2, linestyle="--")
+    top = 3.0 * profile.threshold
+    ax.axhspan(profile.threshold, top, color="0.92", linewidth=0, zorder=0, label=f"excluded at {profile.level:.0%}")
+    ax.set(xlabel=profile.name, ylabel="deviance", ylim=(min(0.0, float(deviance.min())) - 0.02 * top, top))
+    return _legend(ax)
+
+
 def state_map(x, y, values, *, label: str | None = None, cmap: str = "magma", norm=None, ax=None):
     """Values over a plane of initial states or parameters; NaN is left white.
 

@@ -7,7 +7,8 @@
 
 Files: `_records`, `_parameters` and `_transforms` take what the user gives; `_motions` and `_signals` follow motions
 and sensors with their derivatives; `_residuals` and `_noise` say how far off a trial is; `_segments` says where to
-begin, `_solve` goes down from there; `_correlation`, `_uncertainty`, `_unseen` and `_result` say what that means.
+begin, `_solve` goes down from there; `_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_profile` and `_result` say
+what that means.
 """
 
 import functools
@@ -29,14 +30,16 @@ from lagjax._fit._result import Covariance, Fit, SignalNoise
 from lagjax._fit._segments import Reader, glimpses, levels, time_scale, whole
 from lagjax._fit._signals import Signals, looks_like_positions
 from lagjax._fit._solve import Anchor, Descent, minimise
-from lagjax._fit._transforms import between, positive
+from lagjax._fit._transforms import angle, between, inertia, positive, simplex
 from lagjax._fit._uncertainty import Information, information
 from lagjax._fit._unseen import sentences
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
 
-__all__ = ["Fit", "Gaussian", "Guess", "Record", "StudentT", "between", "fit", "positive"]
+__all__ = [
+    "Fit", "Gaussian", "Guess", "Record", "StudentT", "angle", "between", "fit", "inertia", "positive", "simplex",
+]  # fmt: skip
 PyTree = Any
 
 METHODS = ("auto", "segments", "whole")
@@ -73,8 +76,9 @@ def fit(
     - `observe`: a function of (q, qdot), and of `t`, `params`, `inputs` by name, that returns what the sensors show in
       the structure of a record's `values`; by default q.
     - `free`: True or False for every parameter, or for whole branches of `params0`; by default all floats are free.
-    - `transforms`: `lagjax.positive`, `lagjax.between(a, b)` or None for every parameter or branch. A parameter that
-      is known to be positive should say so: its search and its interval are then relative.
+    - `transforms`: `lagjax.positive`, `lagjax.between(a, b)`, `lagjax.angle` or None for every parameter or branch;
+      `lagjax.simplex` and `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
+      its search and its interval are then relative.
     - `noise`: `lagjax.Gaussian()`, the default, or `lagjax.StudentT()` where some samples are far off.
     - `hold`: how the `inputs` of records go on between samples: with "zero" the last one stays, as behind a D/A
       converter; "linear" joins them by lines. Functions of the scene ask for `inputs` by name.
@@ -275,11 +279,10 @@ def _told(system, observe, question: Question, descent: Descent) -> Fit:
     known = information(question, point, widths)
     unseen = sentences(question, point, widths, known.null)
     restore = question.layout.restore
-    slopes = parameters.slopes(point.u)
     return Fit(
         params=parameters.restore(parameters.numbers(point.u)),
         starts=tuple((restore(y[:n]), restore(y[n:])) for y in point.starts),
-        covariance=Covariance(parameters.names, known.covariance * np.outer(slopes, slopes)),
+        covariance=Covariance(parameters.names, parameters.covariance(point.u, known.covariance)),
         noise=_noise_by_name(question, widths, known),
         residuals=_by_record(question, point),
         unseen=unseen,
@@ -290,6 +293,7 @@ def _told(system, observe, question: Question, descent: Descent) -> Fit:
         records=tuple(question.records),
         parameters=parameters,
         u=point.u,
+        states=point.starts,
         information=known,
         widths=widths,
         question=question,
@@ -324,7 +328,7 @@ def _message(descent: Descent, unseen, known: Information, parameters: Parameter
     # Half a step of the search is one standard deviation: the interval then spans more than a factor of fifty.
     vague = np.flatnonzero(2 * np.sqrt(np.nan_to_num(np.diag(known.covariance), posinf=0.0)) > parameters.reach)
     if len(vague):
-        names = ", ".join(parameters.names[i] for i in vague)
+        names = ", ".join(dict.fromkeys(parameters.labels[i] for i in vague))
         parts.append(f"Hardly seen, or at the end of what its transform allows: {names}.")
     if np.nanmax(known.correlation) > 0.5:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")

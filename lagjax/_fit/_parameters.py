@@ -4,8 +4,9 @@ The scene's parameters are a pytree of any structure. Its P numbers end to end a
 the search moves these through their transforms.
 """
 
-from dataclasses import dataclass
-from typing import Any
+import functools
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,22 +19,29 @@ from lagjax._validate import as_arrays, require_finite
 PyTree = Any
 
 
+class Part(NamedTuple):
+    """The numbers of one leaf that is free: where they stand among all numbers, and how they may move."""
+
+    label: str
+    places: np.ndarray
+    transform: AbstractTransform
+
+
 @dataclass(frozen=True)
 class Parameters:
     """The numbers of a pytree of parameters, and those among them that are free.
 
     - `leaves`, `tree`: the pytree with arrays for numbers; a leaf that is no number is a part of the program.
     - `first` (P,): all numbers at the start of the search.
-    - `places` (F,): where the free numbers stand among all; `names` (F,): what they are called, `params['m']`.
-    - `transforms` (F,): how each free number may move.
+    - `names` (X,): what the free numbers are called, `params['m']`.
+    - `parts`: the leaves among them, each with its transform. All of their u end to end are the F unknowns.
     """
 
     leaves: list
     tree: Any
     first: np.ndarray
-    places: np.ndarray
     names: tuple[str, ...]
-    transforms: tuple[AbstractTransform, ...]
+    parts: tuple[Part, ...]
 
     @classmethod
     def of(
@@ -47,57 +55,155 @@ class Parameters:
         labels, leaves, tree = taken_apart(as_arrays(params, dtype, "params0"), "params")
         is_free = _spread(True if free is None else free, tree, leaves, "free")
         moved_by = _spread(Unbounded() if transforms is None else transforms, tree, leaves, "transforms")
-        numbers, places, names, maps = [], [], [], []
+        numbers, names, parts = [], [], []
         count = 0
         for label, leaf, may_move, transform in zip(labels, leaves, is_free, moved_by, strict=True):
             if not eqx.is_array_like(leaf):
                 continue
             values = np.asarray(leaf, np.float64).ravel()
             numbers.append(values)
-            if _is_fitted(label, leaf, may_move, free):
-                transform = _transform_of(label, transform, values)
-                places += range(count, count + values.size)
+            if _is_fitted(label, leaf, may_move, free) and values.size:
+                transform = _transform_of(label, transform, values, np.shape(leaf))
+                parts.append(Part(label, np.arange(count, count + values.size), transform))
                 names += _names(label, np.shape(leaf))
-                maps += [transform] * values.size
             count += values.size
         if not names:
             raise ValueError("No parameter is free: give params0 at least one float for which `free` is True.")
-        return cls(leaves, tree, np.concatenate(numbers), np.array(places), tuple(names), tuple(maps))
+        return cls(leaves, tree, np.concatenate(numbers), tuple(names), tuple(parts))
+
+    @functools.cached_property
+    def _cuts(self) -> list[tuple[slice, slice, Part]]:
+        """Of every part which u and which free numbers are its own."""
+        cuts, begin, u_begin = [], 0, 0
+        for part in self.parts:
+            size = part.transform.unknowns(len(part.places))
+            cuts.append((slice(u_begin, u_begin + size), slice(begin, begin + len(part.places)), part))
+            begin, u_begin = begin + len(part.places), u_begin + size
+        return cuts
+
+    @functools.cached_property
+    def places(self) -> np.ndarray:
+        """Where the free numbers stand among all (X,)."""
+        return np.concatenate([np.zeros(0, int), *(part.places for part in self.parts)])
 
     def __len__(self) -> int:
-        return len(self.names)
+        """F, the number of unknowns."""
+        return self._cuts[-1][0].stop if self.parts else 0
 
     def moved(self, values: np.ndarray) -> np.ndarray:
         """u (F,) of the free numbers among all `values` (P,)."""
-        free = values[self.places]
-        return np.array([float(map_.inverse(x)) for map_, x in zip(self.transforms, free, strict=True)])
+        return np.concatenate([np.zeros(0), *(part.transform.inverse(values[part.places]) for part in self.parts)])
 
-    def numbers(self, u: np.ndarray) -> np.ndarray:
+    def numbers(self, u, xp: Any = np):
         """All numbers (P,) where the free ones stand at u (F,)."""
-        values = self.first.copy()
-        values[self.places] = self.values(u)
-        return values
+        if xp is np:
+            values = self.first.copy()
+            values[self.places] = self.values(u)
+            return values
+        return xp.asarray(self.first, u.dtype).at[self.places].set(self.values(u, xp))
 
-    def values(self, u: np.ndarray) -> np.ndarray:
-        """The free numbers (F,) at u (F,)."""
-        return np.array([float(map_.value(x)) for map_, x in zip(self.transforms, u, strict=True)])
+    def values(self, u, xp: Any = np):
+        """The free numbers (X,) at u (F,)."""
+        parts = [part.transform.value(u[own], xp) for own, _, part in self._cuts]
+        return xp.concatenate([u[:0], *parts])
 
-    def slopes(self, u: np.ndarray) -> np.ndarray:
-        """dx/du of each free number (F,)."""
-        return np.array([float(map_.slope(x)) for map_, x in zip(self.transforms, u, strict=True)])
+    def jacobian(self, u: np.ndarray) -> np.ndarray:
+        """The derivative of the free numbers by u, (X, F)."""
+        matrix = np.zeros((len(self.names), len(self)))
+        for own, rows, part in self._cuts:
+            matrix[rows, own] = part.transform.jacobian(u[own])
+        return matrix
 
     def directions(self, u: np.ndarray) -> np.ndarray:
-        """The derivative of all numbers by u, with a row for each free one, (F, P)."""
+        """The derivative of all numbers by u, with a row for each unknown, (F, P)."""
         rows = np.zeros((len(self), len(self.first)))
-        rows[np.arange(len(self)), self.places] = self.slopes(u)
+        rows[:, self.places] = self.jacobian(u).T
         return rows
+
+    def ends(self, u: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The ends (X,) of intervals of the free numbers at u (F,), of half widths `spread` (X,), inside their sets."""
+        x, low, high = self.values(u), np.empty(len(spread)), np.empty(len(spread))
+        for _, rows, part in self._cuts:
+            low[rows], high[rows] = part.transform.ends(x[rows], spread[rows])
+        return low, high
+
+    def covariance(self, u: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        """The covariance (X, X) of the free numbers from that of u (F, F).
+
+        What moves with an unknown of infinite variance has infinite variance, and NaN beside it.
+        """
+        jacobian, unseen = self.jacobian(u), ~np.isfinite(np.diag(matrix))
+        finite = np.where(unseen[:, None] | unseen, 0.0, matrix)
+        moved = jacobian @ finite @ jacobian.T
+        lost = (jacobian[:, unseen] != 0).any(axis=1)
+        moved[lost], moved[:, lost] = np.nan, np.nan
+        moved[lost, lost] = np.inf
+        return moved
+
+    def log_volume(self, u, xp: Any = np):
+        """log of the volume of the free numbers per volume of u, up to a constant."""
+        return sum(part.transform.log_volume(u[own], xp) for own, _, part in self._cuts)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What the unknowns are called (F,): as their numbers, or as the whole leaf that they move together."""
+        found = []
+        for own, rows, part in self._cuts:
+            together = [part.label] * (own.stop - own.start)
+            found += self.names[rows] if part.transform.separable else together
+        return tuple(found)
 
     @property
     def reach(self) -> np.ndarray:
         """How far one step may change each u (F,)."""
-        return np.array([map_.reach for map_ in self.transforms])
+        return self._of_each("reach")
 
-    def restore(self, numbers: np.ndarray) -> PyTree:
+    @property
+    def room(self) -> np.ndarray:
+        """How far from one value of each u (F,) others are told apart."""
+        return self._of_each("room")
+
+    def _of_each(self, name: str) -> np.ndarray:
+        rows = (np.full(own.stop - own.start, getattr(part.transform, name)) for own, _, part in self._cuts)
+        return np.concatenate([np.zeros(0), *rows])
+
+    def sizes(self, u: np.ndarray) -> np.ndarray:
+        """Changes of u (F,), each of which changes the free numbers by about their own size."""
+        x, jacobian = self.values(u), self.jacobian(u)
+        size = np.where(x != 0, np.abs(x), 1.0)
+        return np.minimum(1.0 / np.maximum(np.abs(jacobian) / size[:, None], 1e-300).max(axis=0), self.reach)
+
+    def unknown(self, name: str) -> int:
+        """The place of the unknown that moves the free number of this name alone.
+
+        Raises `ValueError` where there is no such number, or where it moves only together with others.
+        """
+        if name not in self.names:
+            raise ValueError(f"No free parameter is called {name!r}; there are {', '.join(self.names)}.")
+        row = self.names.index(name)
+        own, rows, part = next(cut for cut in self._cuts if cut[1].start <= row < cut[1].stop)
+        if not part.transform.separable:
+            raise ValueError(
+                f"{name} moves only together with the other numbers of {part.label}, whose transform is "
+                f"{part.transform!r}: one of them cannot be kept while the others move."
+            )
+        return own.start + row - rows.start
+
+    def kept(self, u: np.ndarray, which: int | None = None) -> "Parameters":
+        """The parameters at u (F,), where the unknown `which` of a number of its own is kept there; None: all are."""
+        at, parts, names = replace(self, first=self.numbers(u)), [], []
+        for own, rows, part in self._cuts:
+            if which is None:
+                continue
+            keep = np.ones(len(part.places), bool)
+            if own.start <= which < own.stop:
+                keep[which - own.start] = False
+            if keep.any():
+                parts.append(part._replace(places=part.places[keep]))
+            names += [name for name, stays in zip(self.names[rows], keep, strict=True) if stays]
+        return replace(at, parts=tuple(parts), names=tuple(names))
+
+    def restore(self, numbers) -> PyTree:
         """The user's pytree of all numbers (P,)."""
         leaves, begin = [], 0
         for leaf in self.leaves:
@@ -133,16 +239,17 @@ def _is_fitted(label: str, leaf, may_move, free) -> bool:
     return bool(may_move)
 
 
-def _transform_of(label: str, transform, values: np.ndarray) -> AbstractTransform:
+def _transform_of(label: str, transform, values: np.ndarray, shape: tuple[int, ...]) -> AbstractTransform:
     """The transform of a free leaf. Raises where it is none, or where the values start outside of its set."""
     transform = Unbounded() if transform is None else transform
     if not isinstance(transform, AbstractTransform):
         raise TypeError(
-            f"transforms must hold lagjax.positive, lagjax.between(a, b) or None; got {transform!r} for {label}."
+            "transforms must hold lagjax.positive, lagjax.between(a, b), lagjax.angle, lagjax.simplex, lagjax.inertia "
+            f"or None; got {transform!r} for {label}."
         )
     if reason := transform.refuses(values):
         raise ValueError(f"{label} {reason}; got {values if values.size > 1 else values[0]}.")
-    return transform
+    return transform.of(values, shape)
 
 
 def _names(label: str, shape: tuple[int, ...]) -> list[str]:

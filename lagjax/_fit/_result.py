@@ -1,16 +1,19 @@
 """`Fit`: what came out of a search, with intervals and in words."""
 
+import functools
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import ndtri, stdtrit
 
+from lagjax._fit._joint import deviations, of_starts, start_alone
 from lagjax._fit._noise import Known, Widths
 from lagjax._fit._parameters import Parameters
+from lagjax._fit._profile import Profile, profile
 from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike
-from lagjax._fit._residuals import Failure, Question
+from lagjax._fit._residuals import Failure, Point, Question
 from lagjax._fit._segments import Reader
 from lagjax._fit._signals import looks_like_positions
 from lagjax._fit._solve import minimise
@@ -57,12 +60,26 @@ class Prediction(NamedTuple):
 
     - `trajectory`: the motion from `start`, (q0, qdot0), at the record's times.
     - `values`: the signals that the sensors would show; `residuals`: those less the measured ones, NaN where missing.
+    - `deviation`: the standard deviation of `values`, because the parameters, and a start that was fitted, are known
+      only so well. It is infinite where the values depend on what is not seen. `widths`: the noise of a new sample.
     """
 
     trajectory: Trajectory
     values: PyTree
     residuals: PyTree
     start: tuple[PyTree, PyTree]
+    deviation: PyTree
+    widths: Widths
+
+    def bands(self, level: float = 0.95) -> tuple[PyTree, PyTree]:
+        """(low, high) between which a new sample of weight one falls with probability `level`, noise included.
+
+        Raises `ValueError` for a level that is not between 0 and 1.
+        """
+        _require_level(level)
+        columns = iter(range(len(self.widths.sigma)))
+        half = jax.tree.map(lambda leaf: _half_widths(leaf, self.widths, level, columns), self.deviation)
+        return jax.tree.map(np.subtract, self.values, half), jax.tree.map(np.add, self.values, half)
 
 
 class Comparison(NamedTuple):
@@ -104,6 +121,7 @@ class Fit:
     records: tuple[Record, ...]
     parameters: Parameters = field(repr=False)
     u: np.ndarray = field(repr=False)
+    states: np.ndarray = field(repr=False)
     information: Information = field(repr=False)
     widths: Widths = field(repr=False)
     question: Question = field(repr=False)
@@ -136,13 +154,53 @@ class Fit:
             ends.append(self.parameters.restore(numbers))
         return ends[0], ends[1]
 
-    def _ends(self, level: float) -> tuple[np.ndarray, np.ndarray]:
-        if not (np.ndim(level) == 0 and 0 < level < 1):
-            raise ValueError(f"level must be between 0 and 1, as 0.95 is; got {level!r}.")
+    def start_intervals(self, level: float = 0.95) -> tuple[tuple, tuple]:
+        """The ends (low, high) of the intervals of the starts, each in the structure of `starts`.
+
+        They hold every number of a start with probability `level`, the parameters being uncertain too. A start that is
+        known stands in both.
+
+        Raises `ValueError` for a level that is not between 0 and 1.
+        """
+        wide = self._quantile(level) * np.sqrt(
+            np.diagonal(
+                of_starts(self.question, self._point, self.widths, self.information).covariance, axis1=1, axis2=2
+            )
+        )
+        n, restore = self.question.layout.size, self.question.layout.restore
+        low, high = (tuple((restore(y[:n]), restore(y[n:])) for y in self.states + s * wide) for s in (-1, 1))
+        return low, high
+
+    def profile(self, name: str, level: float = 0.95) -> Profile:
+        """How much likelihood is lost where the parameter called `name` is kept away from its best value.
+
+        At every value all other free parameters and starts are fitted anew. The ends of the interval are found on the
+        profile itself, with the effective number of samples that `intervals` uses; `print` gives the verdict: bounded,
+        one-sided, flat, or two minima.
+
+        Raises `ValueError` for a name that no free parameter has, or that moves only together with others.
+
+        Source: Venzon & Moolgavkar, Applied Statistics 37 (1988) 87; Raue et al., Bioinformatics 25 (2009) 1923.
+        """
+        _require_level(level)
+        return profile(self.question, self.u, self.states, self.widths, self.information, name, level)
+
+    @functools.cached_property
+    def _point(self) -> Point:
+        """The trial that the search ended at, computed anew."""
+        point = self.question.at(self.u, self.states)
+        assert isinstance(point, Point)  # it was computed before
+        return point
+
+    def _quantile(self, level: float) -> float:
+        """Student's t of a level, for the effective number of samples less that of parameters."""
+        _require_level(level)
         dof = max(float(np.sum(self.information.effective)) - len(self.u), 1.0)
-        wide = stdtrit(dof, 0.5 + 0.5 * level) * np.sqrt(np.diag(self.information.covariance))
-        with np.errstate(over="ignore"):
-            return self.parameters.values(self.u - wide), self.parameters.values(self.u + wide)
+        return float(stdtrit(dof, 0.5 + 0.5 * level))
+
+    def _ends(self, level: float) -> tuple[np.ndarray, np.ndarray]:
+        wide = self._quantile(level) * np.sqrt(np.diag(self.covariance.matrix))
+        return self.parameters.ends(self.u, wide)
 
     def predict(self, record: Record) -> Prediction:
         """The motion of the fitted scene along a record, which may be another one than those of the fit.
@@ -158,7 +216,7 @@ class Fit:
             raise ValueError("The record has other signals than those of the fit.")
         if record.input_structure != self.records[0].input_structure:
             raise ValueError("The record has other inputs than those of the fit.")
-        layout, fixed = self.question.layout, _all_fixed(self.parameters, self.u)
+        layout, fixed = self.question.layout, self.parameters.kept(self.u)
         state = known_start(record, layout, 0, self.params)
         is_known = state is not None and not isinstance(record.start, Guess)
         if state is None:
@@ -182,9 +240,28 @@ class Fit:
         form, driven = self.question.signals.form, (record.ts, record.input_matrix)
         scene, params = (self.system, self.params) if form is None else form.along(self.system, self.params, *driven)
         trajectory = simulate(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
-        left = np.where(record.weight_matrix > 0, point.residuals[0][0], np.nan)
-        values = in_structure(left + record.matrix, record)
-        return Prediction(trajectory, values, in_structure(left, record), start)
+        values, deviation = self._shown(record, question, point)
+        left = np.where(record.weight_matrix > 0, values - record.matrix, np.nan)
+        noise = self.widths._replace(sigma=self.widths.sigma * np.sqrt(self.information.lost))
+        shown, missed, uncertain = (in_structure(matrix, record) for matrix in (values, left, deviation))
+        return Prediction(trajectory, shown, missed, start, uncertain, noise)
+
+    def _shown(self, record: Record, question: Question, point: Point) -> tuple[np.ndarray, np.ndarray]:
+        """The signals (T, S) of a record that was followed, at all its times, and their standard deviations."""
+        everywhere = replace(record, values=in_structure(np.zeros_like(record.matrix), record), weights=None)
+        about = Question(
+            [everywhere], question.pieces, np.array([True]), question.motions, question.signals, self.parameters,
+            question.size, question.rtol,
+        )  # fmt: skip
+        full = about.at(self.u, point.starts)
+        if isinstance(full, Failure):
+            raise ValueError(about.where(full))
+        known, states = self.information, question.states
+        own, follows = np.zeros((states, states)), np.zeros((states, len(self.u)))
+        if question.fitted[0]:
+            rows = np.sqrt(record.weight_matrix)[..., None] / self.widths.sigma[:, None] * full.slopes[0][0]
+            own, follows = start_alone(rows, states, known, _effective_share(self))
+        return full.residuals[0][0], deviations(full.slopes[0][0], states, own, follows, known)
 
     def compare(self, other: "Fit") -> Comparison:
         """Which of two fits of the same records the data prefer: by AIC and BIC, with effective counts of samples.
@@ -210,15 +287,22 @@ class Fit:
         return Comparison(logs, aic, bic, "\n".join(rows))
 
 
+def _require_level(level) -> None:
+    if not (np.ndim(level) == 0 and 0 < level < 1):
+        raise ValueError(f"level must be between 0 and 1, as 0.95 is; got {level!r}.")
+
+
+def _half_widths(deviation: np.ndarray, widths: Widths, level: float, columns) -> np.ndarray:
+    """Half of the band of one leaf of signals, whose places among all signals are the next of `columns`."""
+    flat = deviation.reshape(len(deviation), -1)
+    own = [next(columns) for _ in range(flat.shape[1])]
+    noise = widths.sigma[own] * stdtrit(np.minimum(widths.dof[own], 1e9), 0.5 + 0.5 * level)
+    return np.sqrt((ndtri(0.5 + 0.5 * level) * flat) ** 2 + noise**2).reshape(deviation.shape)
+
+
 def _effective_share(fit: Fit) -> float:
     samples = sum(noise.samples for noise in fit.noise.values())
     return sum(noise.effective for noise in fit.noise.values()) / samples
-
-
-def _all_fixed(parameters: Parameters, u: np.ndarray) -> Parameters:
-    """The parameters at u, with none free."""
-    none = np.zeros(0, int)
-    return replace(parameters, first=parameters.numbers(u), places=none, names=(), transforms=())
 
 
 def _start_read_off(record: Record, observe, layout: Layout) -> np.ndarray:

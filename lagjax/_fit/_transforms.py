@@ -1,59 +1,116 @@
 """Transforms: parameters that must stay in a set, as numbers that may be anything.
 
-The search moves a number u that may be any real, the scene gets x = x(u):
+The search moves numbers u that may be any real, the scene gets x = x(u):
 
     positive        x = eᵘ                               0 < x
     between(a, b)   x = a + (b − a) / (1 + e⁻ᵘ)          a < x < b
+    angle           x = u, less whole turns              −π < x ≤ π
+    simplex         x = c softmax(H u)                   0 < xᵢ, Σ xᵢ = c
+    inertia         J = U(u) U(u)ᵀ                       what a rigid body of positive density can have
 
 so that no step leaves the set and no bound is ever active: a parameter that the data push onto a bound comes near it,
-with an interval that says so. Intervals are made in u and carried to x, where they end inside the set.
+with an interval that says so. The first three move every number by itself. The others move all numbers of one leaf
+together, and there may be fewer u than x. Intervals end inside the set.
 """
 
 import abc
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 
 class AbstractTransform(abc.ABC):
-    """A smooth increasing map x(u) from all real numbers onto the values that a parameter may have.
+    """A smooth map x(u) from real numbers (m,) onto the values (n,) that the numbers of one leaf may have.
 
-    `reach` is how far a step of the search may change u: beyond it x(u) is nothing like its tangent.
+    `reach` is how far a step of the search may change u: beyond it x(u) is nothing like its tangent. `room` is how far
+    from one u another can be told from a bound of the set, or from itself. Functions that take `xp` compute with NumPy,
+    or with `jax.numpy` inside of a program of JAX.
     """
 
     reach: ClassVar[float] = 2.0
+    room: ClassVar[float] = 40.0
 
-    @abc.abstractmethod
-    def value(self, u: np.ndarray) -> np.ndarray:
-        """x(u)."""
+    def of(self, x: np.ndarray, shape: tuple[int, ...]) -> "AbstractTransform":
+        """The map for a leaf of this shape that starts at `x` (n,), where the map depends on that."""
+        return self
 
-    @abc.abstractmethod
-    def slope(self, u: np.ndarray) -> np.ndarray:
-        """dx/du."""
-
-    @abc.abstractmethod
-    def inverse(self, x: np.ndarray) -> np.ndarray:
-        """u(x), of values inside the set."""
+    def unknowns(self, count: int) -> int:
+        """m, how many u move a leaf of n = `count` numbers."""
+        return count
 
     @abc.abstractmethod
     def refuses(self, x: np.ndarray) -> str | None:
-        """What a value must be, as the end of a sentence, where one of `x` is outside the set; None where none is."""
+        """What the values must be, as the end of a sentence, where `x` is outside the set; None where it is not."""
+
+    @abc.abstractmethod
+    def value(self, u, xp: Any = np) -> Any:
+        """x(u), (m,) → (n,)."""
+
+    @abc.abstractmethod
+    def jacobian(self, u: np.ndarray) -> np.ndarray:
+        """∂x/∂u, (n, m)."""
+
+    @abc.abstractmethod
+    def inverse(self, x: np.ndarray) -> np.ndarray:
+        """u(x) of values inside the set, (n,) → (m,)."""
+
+    @abc.abstractmethod
+    def ends(self, x: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The ends of intervals about `x` (n,) whose half width is `spread` where the set does not bend them."""
+
+    @abc.abstractmethod
+    def log_volume(self, u, xp: Any = np) -> Any:
+        """log of the volume of x per volume of u, up to a constant: what makes a density of x one of u."""
+
+    @property
+    def separable(self) -> bool:
+        """Whether every number moves by itself, so that one can be kept and the others moved."""
+        return False
+
+
+class AbstractSeparable(AbstractTransform):
+    """A map that moves every number by itself, x_i = x(u_i), and increases."""
+
+    @abc.abstractmethod
+    def slope(self, u, xp: Any = np) -> Any:
+        """dx/du."""
+
+    @property
+    def separable(self) -> bool:
+        """True."""
+        return True
+
+    def jacobian(self, u):
+        """A diagonal of slopes."""
+        return np.diag(self.slope(u))
+
+    def ends(self, x, spread):
+        """x(u ± spread / slope): relative for logarithms, and inside of the bounds."""
+        u = self.inverse(x)
+        with np.errstate(over="ignore", divide="ignore"):
+            wide = spread / self.slope(u)
+            return self.value(u - wide), self.value(u + wide)
+
+    def log_volume(self, u, xp: Any = np):
+        """Σ log dx/du."""
+        return xp.sum(xp.log(self.slope(u, xp)))
 
 
 @dataclass(frozen=True)
-class Unbounded(AbstractTransform):
+class Unbounded(AbstractSeparable):
     """x = u: any real number."""
 
     reach: ClassVar[float] = np.inf
+    room: ClassVar[float] = np.inf
 
-    def value(self, u):
+    def value(self, u, xp: Any = np):
         """x(u)."""
         return u
 
-    def slope(self, u):
+    def slope(self, u, xp: Any = np):
         """dx/du."""
-        return np.ones_like(u)
+        return xp.ones_like(u)
 
     def inverse(self, x):
         """u(x)."""
@@ -65,16 +122,16 @@ class Unbounded(AbstractTransform):
 
 
 @dataclass(frozen=True)
-class Positive(AbstractTransform):
+class Positive(AbstractSeparable):
     """x = eᵘ: numbers above zero. The ready instance is `lagjax.positive`."""
 
-    def value(self, u):
+    def value(self, u, xp: Any = np):
         """x(u)."""
-        return np.exp(u)
+        return xp.exp(u)
 
-    def slope(self, u):
+    def slope(self, u, xp: Any = np):
         """dx/du."""
-        return np.exp(u)
+        return xp.exp(u)
 
     def inverse(self, x):
         """u(x), of positive x."""
@@ -84,21 +141,24 @@ class Positive(AbstractTransform):
         """That values must be positive, where one is not."""
         return None if np.all(x > 0) else "must start above zero, because its transform is lagjax.positive"
 
+    def __repr__(self) -> str:
+        return "lagjax.positive"
+
 
 @dataclass(frozen=True)
-class Between(AbstractTransform):
+class Between(AbstractSeparable):
     """x = a + (b − a)/(1 + e⁻ᵘ): numbers between a and b. `lagjax.between(a, b)` makes one."""
 
     lower: float
     upper: float
 
-    def value(self, u):
+    def value(self, u, xp: Any = np):
         """x(u)."""
-        return self.lower + (self.upper - self.lower) * _logistic(u)
+        return self.lower + (self.upper - self.lower) * _logistic(u, xp)
 
-    def slope(self, u):
+    def slope(self, u, xp: Any = np):
         """dx/du."""
-        return (self.upper - self.lower) * _logistic(u) * _logistic(-u)
+        return (self.upper - self.lower) * _logistic(u, xp) * _logistic(-u, xp)
 
     def inverse(self, x):
         """u(x), of x between the bounds."""
@@ -114,12 +174,215 @@ class Between(AbstractTransform):
         return f"lagjax.between({self.lower:g}, {self.upper:g})"
 
 
-def _logistic(u):
+@dataclass(frozen=True)
+class Angle(AbstractSeparable):
+    """x = u less whole turns, in (−π, π]: the search is free and the answer is one turn. It is `lagjax.angle`.
+
+    What depends on x must have the period 2π. An interval may end beyond ±π; one that is wider than a turn is
+    (x − π, x + π), and says nothing.
+    """
+
+    reach: ClassVar[float] = 0.5 * np.pi
+    room: ClassVar[float] = np.pi
+
+    def value(self, u, xp: Any = np):
+        """x(u)."""
+        return u - 2 * np.pi * xp.ceil((u - np.pi) / (2 * np.pi))
+
+    def slope(self, u, xp: Any = np):
+        """dx/du."""
+        return xp.ones_like(u)
+
+    def inverse(self, x):
+        """u(x)."""
+        return x
+
+    def ends(self, x, spread):
+        """x ± spread, at most a turn in all."""
+        half = np.minimum(spread, np.pi)
+        return x - half, x + half
+
+    def refuses(self, x):
+        """None: every number is an angle."""
+        return None
+
+    def __repr__(self) -> str:
+        return "lagjax.angle"
+
+
+@dataclass(frozen=True)
+class Simplex(AbstractTransform):
+    """x = c softmax(H u): n numbers above zero whose sum c is that of their start. It is `lagjax.simplex`.
+
+    H (n, n − 1) has orthonormal columns of sum zero (Helmert's), so that no number is treated unlike the others.
+    Source: Egozcue et al., *Isometric logratio transformations for compositional data*, Math. Geology 35 (2003) 279.
+    """
+
+    total: float = 1.0
+
+    def of(self, x, shape):
+        """The simplex with the sum of `x`."""
+        return Simplex(float(np.sum(x)))
+
+    def unknowns(self, count):
+        """n − 1."""
+        return count - 1
+
+    def refuses(self, x):
+        """That there must be several numbers, all positive."""
+        if len(x) < 2 or not np.all(x > 0):
+            return "must start as several numbers above zero in one array, because its transform is lagjax.simplex"
+        return None
+
+    def value(self, u, xp: Any = np):
+        """x(u)."""
+        logs = _helmert(u.shape[0] + 1) @ u
+        shares = xp.exp(logs - xp.max(logs))
+        return self.total * shares / xp.sum(shares)
+
+    def jacobian(self, u):
+        """c (diag p − p pᵀ) H with the shares p."""
+        shares = self.value(u) / self.total
+        return self.total * (np.diag(shares) - np.outer(shares, shares)) @ _helmert(len(u) + 1)
+
+    def inverse(self, x):
+        """u(x) = Hᵀ log x."""
+        return _helmert(len(x)).T @ np.log(x)
+
+    def ends(self, x, spread):
+        """Intervals of every share, made in its logit."""
+        return Between(0.0, self.total).ends(x, spread)
+
+    def log_volume(self, u, xp: Any = np):
+        """Σ log x, up to a constant."""
+        return xp.sum(xp.log(self.value(u, xp)))
+
+    def __repr__(self) -> str:
+        return "lagjax.simplex"
+
+
+@dataclass(frozen=True)
+class Inertia(AbstractTransform):
+    """What a rigid body of positive density can have: the log-Cholesky form of its pseudo-inertia. `lagjax.inertia`.
+
+    With the mass m, its first moments h = ∫ r dm and second ones Σ = ∫ r rᵀ dm = ½ tr(I) 1 − I, about any point,
+
+        J = [[Σ, h], [hᵀ, m]] = U Uᵀ,
+        U = e^α [[e^d₁, s₁₂, s₁₃, t₁], [0, e^d₂, s₂₃, t₂], [0, 0, e^d₃, t₃], [0, 0, 0, 1]]
+
+    is positive definite for every u = (α, d₁, d₂, d₃, s₁₂, s₂₃, s₁₃, t₁, t₂, t₃). The leaf is J itself, (4, 4), or
+    (m, h_x, h_y, h_z, I_xx, I_yy, I_zz, I_xy, I_xz, I_yz), where I_xy is the element of the matrix, −∫ x y dm.
+    Source: Rucker & Wensing, *Smooth parameterization of rigid-body inertia*, IEEE RA-L 7 (2022) 2771.
+    """
+
+    vector: bool = True
+
+    def of(self, x, shape):
+        """The form for ten numbers, or for a matrix."""
+        return Inertia(vector=shape != (4, 4))
+
+    def unknowns(self, count):
+        """Ten."""
+        return 10
+
+    def refuses(self, x):
+        """That the numbers must be those of a body."""
+        if len(x) not in (10, 16):
+            return "must have the shape (10,) or (4, 4), because its transform is lagjax.inertia"
+        matrix = self._pseudo(x) if len(x) == 10 else x.reshape(4, 4)
+        if not np.allclose(matrix, matrix.T, rtol=1e-9) or np.linalg.eigvalsh(matrix).min() <= 0:
+            return (
+                "must start as the inertia of a body whose density is positive everywhere, because its transform is "
+                "lagjax.inertia: its pseudo-inertia must be symmetric and positive definite"
+            )
+        return None
+
+    @staticmethod
+    def _pseudo(x) -> np.ndarray:
+        m, hx, hy, hz, xx, yy, zz, xy, xz, yz = x
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        moments = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+        return np.block([[moments, np.array([[hx], [hy], [hz]])], [np.array([[hx, hy, hz, m]])]])
+
+    def _numbers(self, pseudo, xp):
+        """The leaf of pseudo-inertias (..., 4, 4), (..., n)."""
+        if not self.vector:
+            return pseudo.reshape(*pseudo.shape[:-2], 16)
+        at = lambda i, j: pseudo[..., i, j]  # noqa: E731
+        return xp.stack(
+            [
+                at(3, 3), at(0, 3), at(1, 3), at(2, 3),
+                at(1, 1) + at(2, 2), at(0, 0) + at(2, 2), at(0, 0) + at(1, 1), -at(0, 1), -at(0, 2), -at(1, 2),
+            ],
+            axis=-1,
+        )  # fmt: skip
+
+    def _factor(self, u, xp):
+        """U, (4, 4)."""
+        alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = u
+        zero, one = xp.zeros_like(alpha), xp.ones_like(alpha)
+        rows = [[xp.exp(d1), s12, s13, t1], [zero, xp.exp(d2), s23, t2], [zero, zero, xp.exp(d3), t3],
+                [zero, zero, zero, one]]  # fmt: skip
+        return xp.exp(alpha) * xp.stack([xp.stack(row) for row in rows])
+
+    def value(self, u, xp: Any = np):
+        """x(u)."""
+        factor = self._factor(u, xp)
+        return self._numbers(factor @ factor.T, xp)
+
+    def jacobian(self, u):
+        """The derivatives of U Uᵀ, one for each u."""
+        factor, size = self._factor(u, np), np.exp(u[0])
+        moves = np.zeros((10, 4, 4))
+        moves[0] = factor
+        for k in range(3):
+            moves[1 + k, k, k] = factor[k, k]
+        for k, place in enumerate(((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))):
+            moves[(4 + k, *place)] = size
+        products = moves @ factor.T
+        return self._numbers(products + products.swapaxes(1, 2), np).T
+
+    def inverse(self, x):
+        """u(x), of the inertia of a body."""
+        pseudo = self._pseudo(x) if self.vector else x.reshape(4, 4)
+        flipped = np.linalg.cholesky(pseudo[::-1, ::-1])
+        factor = flipped[::-1, ::-1] / flipped[0, 0]
+        off = [factor[place] for place in ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))]
+        return np.array([np.log(flipped[0, 0]), *np.log(np.diag(factor)[:3]), *off])
+
+    def ends(self, x, spread):
+        """Relative intervals for what is positive, the mass and the diagonal; others are x ± spread."""
+        diagonal = [0, 4, 5, 6] if self.vector else [0, 5, 10, 15]
+        low, high = x - spread, x + spread
+        low[diagonal], high[diagonal] = positive.ends(x[diagonal], spread[diagonal])
+        return low, high
+
+    def log_volume(self, u, xp: Any = np):
+        """log |∂J/∂u| = 20 α + 2 d₁ + 3 d₂ + 4 d₃, up to a constant."""
+        return 20 * u[0] + 2 * u[1] + 3 * u[2] + 4 * u[3]
+
+    def __repr__(self) -> str:
+        return "lagjax.inertia"
+
+
+def _logistic(u, xp):
     """1 / (1 + e⁻ᵘ), without overflow."""
-    return 0.5 * (1.0 + np.tanh(0.5 * u))
+    return 0.5 * (1.0 + xp.tanh(0.5 * u))
+
+
+def _helmert(n: int) -> np.ndarray:
+    """Orthonormal columns (n, n − 1) of sum zero."""
+    matrix = np.zeros((n, n - 1))
+    for k in range(1, n):
+        matrix[:k, k - 1], matrix[k, k - 1] = 1.0 / k, -1.0
+        matrix[:, k - 1] *= np.sqrt(k / (k + 1))
+    return matrix
 
 
 positive = Positive()
+angle = Angle()
+simplex = Simplex()
+inertia = Inertia()
 
 
 def between(lower: float, upper: float) -> Between:

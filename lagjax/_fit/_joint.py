@@ -1,0 +1,85 @@
+"""How well starts are known, beside the parameters: the covariance of what was eliminated.
+
+A piece with rows A of its start and B of the parameters, in units of the noise ε, has the start
+
+    δs = A⁺ (ε − B δu),        δu = H⁻¹ Gᵀ ε,        G = B − A A⁺B over all pieces
+
+so its covariance is that of its own rows, that of the parameters through A⁺B, and what both share where residuals are
+correlated. Where A does not see a component of the start its variance is infinite.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._fit._correlation import correlated_square, correlation
+from lagjax._fit._noise import Widths
+from lagjax._fit._residuals import Point, Question
+from lagjax._fit._uncertainty import Information
+
+
+class OfStarts(NamedTuple):
+    """What is known of N starts: `covariance` (N, 2n, 2n), and A⁺B (N, 2n, F), how they follow the parameters."""
+
+    covariance: np.ndarray
+    follows: np.ndarray
+
+
+def of_starts(question: Question, point: Point, widths: Widths, known: Information) -> OfStarts:
+    """What is known of the starts of all pieces at the end of a search; zero for those that are not fitted."""
+    states, free, pieces = question.states, len(point.u), len(question.pieces)
+    lags = [correlation(question, point, widths, s).lags for s in range(len(widths.sigma))]
+    found = OfStarts(np.zeros((pieces, states, states)), np.zeros((pieces, states, free)))
+    for batch, slopes in zip(question.batches, point.slopes, strict=True):
+        rows = np.sqrt(batch.weights)[..., None] / widths.sigma[:, None] * slopes
+        for row, piece in zip(batch.rows.tolist(), rows, strict=True):
+            if question.fitted[row]:
+                found.covariance[row], found.follows[row] = _of_start(piece, states, lags, known)
+    return found
+
+
+def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Information):
+    """The covariance (2n, 2n) of one start, and A⁺B, from its weighted rows (T, S, 2n + F)."""
+    a, b = rows[..., :states], rows[..., states:]
+    u, values, v = np.linalg.svd(a.reshape(-1, states), full_matrices=False)
+    sees = values > 1e-10 * values.max()
+    into = (u[:, sees] / values[sees]) @ v[sees]  # (A⁺)ᵀ, (T S, 2n)
+    follows = into.T @ b.reshape(-1, b.shape[-1])
+    own = np.concatenate([into.reshape(a.shape), b - a @ follows], axis=-1)
+    square = np.sum([correlated_square(own[None, :, s], lags[s]) for s in range(len(lags))], axis=0)
+    unseen = ~np.isfinite(np.diag(known.covariance))
+    covariance = np.where(unseen[:, None] | unseen, 0.0, known.covariance)
+    shared = square[:states, states:] @ known.white @ follows.T
+    found = known.lost * (square[:states, :states] - shared - shared.T) + follows @ covariance @ follows.T
+    lost = (np.abs(v[~sees]) > 1e-6).any(axis=0) | (np.abs(follows[:, unseen]) > 1e-12).any(axis=1)
+    found[lost], found[:, lost] = np.nan, np.nan
+    found[lost, lost] = np.inf
+    return found, follows
+
+
+def start_alone(rows: np.ndarray, states: int, known: Information, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """What weighted rows (T, S, 2n + F) say of their start: covariance (2n, 2n) for parameters that are kept, and A⁺B.
+
+    Every sample is worth the `share` of an independent one.
+    """
+    flat = rows.reshape(-1, rows.shape[-1])
+    u, values, v = np.linalg.svd(flat[:, :states], full_matrices=False)
+    sees = values > 1e-10 * values.max()
+    into = (u[:, sees] / values[sees]) @ v[sees]
+    return known.lost / share * into.T @ into, into.T @ flat[:, states:]
+
+
+def deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.ndarray, known: Information):
+    """The standard deviations (T, S) of signals whose derivatives are `slopes` (T, S, 2n + F).
+
+    They come from the parameters as far as these are seen, and from a start of covariance `start` (2n, 2n) of its own
+    that `follows` (2n, F) the parameters.
+    """
+    a = slopes[..., :states]
+    along = slopes[..., states:] - a @ follows
+    covariance = known.covariance
+    unseen = ~np.isfinite(np.diag(covariance))
+    covariance = np.where(unseen[:, None] | unseen, 0.0, covariance)
+    variance = np.einsum("tsf,fg,tsg->ts", along, covariance, along) + np.einsum("tsi,ij,tsj->ts", a, start, a)
+    moved = (np.abs(along[..., unseen]) > 1e-9 * np.abs(along).max(initial=0.0)).any(axis=-1)
+    return np.where(moved, np.inf, np.sqrt(np.maximum(variance, 0.0)))

@@ -1,0 +1,233 @@
+"""`Profile`: how much likelihood is lost where one parameter is kept away from its best value.
+
+At every value of the parameter all others, and all starts, are fitted anew. The deviance there is
+
+    D = 2 κ (log L(best) − log L(value)),      κ = (variance for white residuals) / (variance that is reported)
+
+so that near the minimum D = ((value − best)/deviation)² with the deviation that the intervals have, correlated
+residuals counted for what they are worth, and the interval of a level ends where D is the square of Student's t. Where
+the model bends, these ends are better than those of the covariance: they need no linearity, and say when there is no
+end at all.
+Source: Chandler & Bate, *Inference for clustered data using the independence loglikelihood*, Biometrika 94 (2007) 167,
+for κ; Raue et al., Bioinformatics 25 (2009) 1923, for what profiles say about identifiability.
+"""
+
+import copy
+import itertools
+from typing import NamedTuple, cast
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.special import stdtrit
+
+from lagjax._fit._noise import Known, Widths, log_likelihood
+from lagjax._fit._residuals import Failure, Question
+from lagjax._fit._solve import minimise
+from lagjax._fit._uncertainty import Information
+
+_STEP, _MOST = 0.5, 14  # of the reported half width, doubling where little changes; values on one side
+_ENOUGH, _TRIALS = 1e-7, 25  # of the deviance, whose roots are wanted; of a search that begins nearby
+_FAR = 3.0  # times |value|, or units of u where that is a logarithm or the like: how far other minima are looked for
+_EXACT = 1e-4  # of the half width, to which an end is found
+
+
+class Profile(NamedTuple):
+    """The profile of one parameter. Print it for its verdict; `lagjax.plot.profile` draws it.
+
+    - `values`, `deviance` (K,): values of the parameter in order and what likelihood is lost there, which is infinite
+      where no motion could be followed; `threshold`: the deviance at the ends of the interval of `level`.
+    - `interval`: (low, high), infinite where the profile does not reach the threshold.
+    - `verdict`: "bounded", "one-sided", "flat" or "two minima".
+    - `minima`: (value, deviance) of every minimum that was found, the best first.
+    """
+
+    name: str
+    values: np.ndarray
+    deviance: np.ndarray
+    level: float
+    threshold: float
+    interval: tuple[float, float]
+    verdict: str
+    minima: tuple[tuple[float, float], ...]
+
+    def __repr__(self) -> str:
+        return f"{self.name}: {self.verdict}. {_sentence(self)}"
+
+
+class _Place(NamedTuple):
+    """One value of the unknown, the other unknowns and the starts that suit it best, and the deviance."""
+
+    at: float
+    others: np.ndarray
+    starts: np.ndarray
+    deviance: float
+
+
+class _Line:
+    """The values of one unknown, of which every one asked for begins from its neighbours."""
+
+    def __init__(self, question: Question, u, starts, widths: Widths, known: Information, which: int):
+        self.question, self.widths, self.which = question, widths, which
+        reported, white = known.covariance[which, which], known.white[which, which]
+        self.scale = white / reported if np.isfinite(reported) and reported > 0 else 1.0 / known.lost
+        self.wide = min(float(np.sqrt(reported)), float(question.parameters.reach[which]))
+        done = minimise(question, u, starts, Known(widths), _ENOUGH, _TRIALS)
+        if isinstance(done, Failure):
+            raise ValueError(question.where(done))
+        self.u, point = done.point.u, done.point
+        self.best = log_likelihood(widths, point.flat(), question.weights)
+        self.places = [_Place(float(self.u[which]), np.delete(self.u, which), point.starts, 0.0)]
+
+    def deviance(self, at: float) -> float:
+        """D where the unknown stands at a value; infinite where no motion could be followed."""
+        again = [place.deviance for place in self.places if place.at == at]
+        if again:
+            return again[0]
+        u = self.u.copy()
+        u[self.which] = at
+        question = copy.copy(self.question)
+        question.parameters = self.question.parameters.kept(u, self.which)
+        for others, starts in self._guesses(at):
+            done = minimise(question, others, starts, Known(self.widths), _ENOUGH, _TRIALS)
+            if not isinstance(done, Failure):
+                lost = self.best - log_likelihood(self.widths, done.point.flat(), question.weights)
+                self.places.append(_Place(at, done.point.u, done.point.starts, 2.0 * self.scale * lost))
+                return self.places[-1].deviance
+        return np.inf
+
+    def _guesses(self, at: float):
+        """The other unknowns and the starts, along the line through the two nearest places, and at the nearest."""
+        near = sorted(self.places, key=lambda place: abs(place.at - at))[:2]
+        if len(near) == 2 and abs(at - near[0].at) <= 2 * abs(near[0].at - near[1].at):
+            share = (at - near[0].at) / (near[0].at - near[1].at)
+            yield (
+                near[0].others + share * (near[0].others - near[1].others),
+                near[0].starts + share * (near[0].starts - near[1].starts),
+            )
+        yield near[0].others, near[0].starts
+
+    def minimum(self, place: _Place) -> tuple[float, float] | None:
+        """The minimum that a search from one place ends in: the unknown and D there."""
+        u = np.insert(place.others, self.which, place.at)
+        done = minimise(self.question, u, place.starts, Known(self.widths), _ENOUGH, 2 * _TRIALS)
+        if isinstance(done, Failure):
+            return None
+        lost = self.best - log_likelihood(self.widths, done.point.flat(), self.question.weights)
+        return float(done.point.u[self.which]), 2.0 * self.scale * lost
+
+
+def profile(question: Question, u, starts, widths: Widths, known: Information, name: str, level: float) -> Profile:
+    """The profile of the free number called `name`."""
+    parameters = question.parameters
+    line = _Line(question, u, starts, widths, known, parameters.unknown(name))
+    dof = max(float(known.effective.sum()) - len(u), 1.0)
+    threshold = float(stdtrit(dof, 0.5 + 0.5 * level) ** 2)
+    ends = [_end(line, side, threshold, parameters.room[line.which]) for side in (-1.0, 1.0)]
+    minima = _minima(line, threshold)
+    row = parameters.names.index(name)
+
+    def value(at: float) -> float:
+        moved = line.u.copy()
+        moved[line.which] = at
+        return float(parameters.values(moved)[row])
+
+    verdict = {0: "flat", 1: "one-sided", 2: "bounded"}[int(np.isfinite(ends).sum())]
+    if any(d < threshold for _, d in minima[1:]):
+        verdict = "two minima"
+    places = sorted(line.places, key=lambda place: place.at)
+    return Profile(
+        name, np.array([value(place.at) for place in places]), np.array([place.deviance for place in places]), level,
+        threshold, (_end_value(value, ends[0]), _end_value(value, ends[1])), verdict,
+        tuple((value(at), d) for at, d in minima),
+    )  # fmt: skip
+
+
+def _end_value(value, end: float) -> float:
+    return value(end) if np.isfinite(end) else end
+
+
+def _end(line: _Line, side: float, threshold: float, room: float) -> float:
+    """Where the profile passes the threshold first on one side, ±∞ where it does not within `room`.
+
+    Its places go on behind the end, as far as other minima are looked for.
+    """
+    best, wide = line.places[0].at, line.wide
+    look_out = _FAR * (max(abs(best), 8 * wide) if np.isinf(room) else 1.0 + wide)
+    step = _STEP * (wide * np.sqrt(threshold) if np.isfinite(wide) else max(abs(best), 1.0))
+    offset, last, end = min(step, room), 0.0, None
+    for _ in range(_MOST):
+        deviance = line.deviance(best + side * offset)
+        if end is None and deviance > threshold:
+            end = _root(line, best + side * last, best + side * offset, threshold)
+        if offset >= room or np.isinf(deviance) or (end is not None and offset >= look_out):
+            break
+        if end is not None or np.isinf(wide) or deviance < 0.3 * (offset / wide) ** 2:
+            step *= 2.0  # the profile is flatter than its parabola, or its end is known and what follows is a look-out
+        last, offset = offset, min(offset + step, room if end is None else min(look_out, room))
+        if offset <= last:
+            break
+    return side * np.inf if end is None else end
+
+
+def _root(line: _Line, below: float, above: float, threshold: float) -> float:
+    """The value where the root of D is that of the threshold: a nearly linear function of the value."""
+    if np.isinf(line.deviance(above)):
+        return _last_followed(line, below, above, threshold)
+    miss = lambda at: np.sqrt(max(line.deviance(at), 0.0)) - np.sqrt(threshold)  # noqa: E731
+    return float(cast(float, brentq(miss, below, above, xtol=_EXACT * abs(above - below))))
+
+
+def _last_followed(line: _Line, below: float, above: float, threshold: float) -> float:
+    """The end between a value below the threshold and one that no motion follows; the last followed, if there is none.
+
+    Bisection: what cannot be followed is as far off as can be.
+    """
+    for _ in range(12):
+        middle = 0.5 * (below + above)
+        if line.deviance(middle) > threshold:
+            above = middle
+        else:
+            below = middle
+    return below
+
+
+def _minima(line: _Line, threshold: float) -> list[tuple[float, float]]:
+    """Minima of the profile: the fit's own, and those that searches find from where it falls again."""
+    own, places = line.places[0], sorted(line.places, key=lambda place: place.at)
+    middle = places.index(own)
+    sides = [places[middle::-1], places[middle:]]
+    falls = [
+        after
+        for side in sides
+        for before, after in itertools.pairwise(side)
+        if after.deviance < before.deviance - 1e-3 * max(threshold, before.deviance)
+    ]
+    found, apart = [(own.at, 0.0)], max(1e-3 * abs(own.at), min(line.wide, 1.0))
+    for place in falls:
+        minimum = line.minimum(place)
+        if minimum is not None and all(abs(minimum[0] - at) > apart for at, _ in found):
+            found.append(minimum)
+    return sorted(found, key=lambda one: one[1])
+
+
+def _sentence(of: Profile) -> str:
+    low, high = of.interval
+    percent = f"{100 * of.level:g} %"
+    if of.verdict == "flat":
+        text = f"No value from {of.values.min():.6g} to {of.values.max():.6g} is excluded at {percent}."
+    elif of.verdict == "one-sided" and np.isfinite(low):
+        text = f"At {percent} it is above {low:.6g}; no value up to {of.values.max():.6g} is excluded."
+    elif of.verdict == "one-sided":
+        text = f"At {percent} it is below {high:.6g}; no value down to {of.values.min():.6g} is excluded."
+    else:
+        text = f"The {percent} interval about the best value is {low:.6g} … {high:.6g}."
+    for value, deviance in of.minima:
+        if deviance < -1e-3:
+            text += f" The likelihood is larger at {value:.6g}, by {-0.5 * deviance:.3g} in its logarithm: fit again."
+        elif deviance > 1e-3 and deviance <= of.threshold:
+            text += f" Another minimum at {value:.6g} is not excluded: its deviance is {deviance:.3g}."
+        elif deviance > of.threshold:
+            text += f" Another minimum at {value:.6g} has the deviance {deviance:.3g}, {of.threshold:.3g} excludes it."
+        elif value != of.minima[0][0]:
+            text += f" Another minimum at {value:.6g} is as good."
+    return text
