@@ -48,6 +48,8 @@ class _State:
         self.expansion, self.derivatives = expansion, Derivatives(expansion.graph)
         self.shapes: dict[str, Any] = dict(zip(names, shapes, strict=True))
         self.ids: dict[str, Any] = dict(zip(names, state, strict=True))
+        # Coordinates are differentiated by, one by one: those of a long array are nodes as well.
+        self.ids |= {name: expansion.real(self.ids[name]) for name in ("q", "qdot", "t")}
 
     def of(self, function: Callable, *arguments: str, at_rest: bool = False) -> Ids:
         """The value of a function of some of q, qdot, t, params; `at_rest` with qdot = 0."""
