@@ -4,6 +4,7 @@ System(L)  →  simulate(system, q0, qdot0, ts, params)  →  Trajectory
 """
 
 from lagjax import plot, scenes
+from lagjax._analysis import Equilibrium, Linearization, Modes, equilibrium, linearize, normal_modes
 from lagjax._check import Finding, Findings, check
 from lagjax._crossings import Crossings, crossings
 from lagjax._diffrax._solvers import FineOutput
@@ -35,6 +36,7 @@ __version__ = "0.1.0"
 __all__ = [
     "RESULTS",
     "Crossings",
+    "Equilibrium",
     "Explanation",
     "Finding",
     "Findings",
@@ -43,7 +45,9 @@ __all__ = [
     "Gaussian",
     "Guess",
     "Health",
+    "Linearization",
     "MachineCode",
+    "Modes",
     "Record",
     "SimulationError",
     "State",
@@ -58,8 +62,11 @@ __all__ = [
     "between",
     "check",
     "crossings",
+    "equilibrium",
     "fit",
     "inertia",
+    "linearize",
+    "normal_modes",
     "plot",
     "positive",
     "samples",

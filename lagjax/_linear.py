@@ -65,7 +65,7 @@ def factorize(matrix: Matrix) -> Factorization:
     """Scale and invert a symmetric matrix."""
     matrix = 0.5 * (matrix + matrix.T)
     scale = jax.lax.stop_gradient(diagonal_scale(matrix))
-    inverse, order, pivots = _inverted(jax.lax.stop_gradient(_scaled(matrix, scale)))
+    inverse, order, pivots = inverted(jax.lax.stop_gradient(_scaled(matrix, scale)))
     pivots, threshold = jnp.abs(pivots), singular_threshold(matrix.shape[0], matrix.dtype)
     return Factorization(matrix, scale, inverse, order, jnp.min(pivots) <= threshold * jnp.max(pivots))
 
@@ -132,9 +132,10 @@ def null_directions(matrix: np.ndarray, threshold: float | None = None) -> np.nd
 _PANEL = 16
 
 
-def _inverted(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
+def inverted(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
     """B, `order` and the pivots of A with A⁻¹ b = B b[order], by Gauss-Jordan elimination with partial pivoting.
 
+    A need not be symmetric.
     The pivots are those of LU. Where one of them is zero, B is meaningless. Source: Golub & Van Loan, *Matrix
     Computations*, §3.2 and §3.4.
     """

@@ -1,0 +1,188 @@
+"""Eigenvalues and eigenvectors with derivatives, also where eigenvalues meet.
+
+LAPACK is called on the host by NumPy and not by XLA, whose batched kernels may wait for each other for ever (see
+`_linear`). One call takes a whole batch.
+
+Where eigenvalues meet, their eigenvectors are any basis of a space, and neither the single eigenvalues nor the vectors
+have derivatives; what does not depend on the choice of basis has. The rules here leave out the part of a derivative
+that turns the basis within such a space, which is 0/0. First derivatives of all that does not depend on the choice are
+then right: symmetric functions of the eigenvalues that meet, projectors on their space. Of second derivatives that
+holds for the sum of the eigenvalues alone.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+from jaxtyping import Array, Float
+
+Matrix = Float[Array, "n n"]
+
+# Eigenvalues that differ by less than so many units of round-off of the largest count as equal. LAPACK's errors are a
+# few units times √n or so; with a closer bound a pair that rounding has split would have derivatives of 1/eps.
+_UNITS = 32
+
+
+# ---- the host --------------------------------------------------------------------------------------------------------
+
+
+def _on_host(function: Callable, shapes: tuple, *arrays) -> tuple:
+    """The arrays that a function of NumPy returns for arrays with any batch axes in front."""
+
+    def in_place(_, places, *buffers):
+        for place, value in zip(places, function(*map(np.asarray, buffers)), strict=True):
+            np.asarray(place)[...] = value
+
+    def by_copies(*x):
+        return tuple(function(*map(np.asarray, x)))
+
+    def cpu(*x):
+        return buffer_callback(in_place, shapes, vmap_method="broadcast_all")(*x)
+
+    def others(*x):
+        return jax.pure_callback(by_copies, shapes, *x, vmap_method="broadcast_all")
+
+    return tuple(jax.lax.platform_dependent(*arrays, cpu=cpu, default=others))
+
+
+def _each(function: Callable, *arrays: np.ndarray) -> list[np.ndarray]:
+    """`function` of every matrix of a batch (…, n, n); NaN where they are not finite or LAPACK gives up."""
+    batch = arrays[0].shape[:-2]
+    rows = [x.reshape(-1, *x.shape[-2:]) for x in arrays]
+    results = []
+    for members in zip(*rows, strict=True):
+        try:
+            finite = all(np.isfinite(x).all() for x in members)
+            results.append(function(*members) if finite else None)
+        except np.linalg.LinAlgError:
+            results.append(None)
+    shapes = next((r for r in results if r is not None), None)
+    if shapes is None:
+        shapes = function(*(np.eye(x.shape[-1], dtype=x.dtype) for x in arrays))
+    columns = zip(*(r or [np.full_like(x, np.nan) for x in shapes] for r in results), strict=True)
+    return [np.reshape(column, (*batch, *column[0].shape)) for column in columns]
+
+
+# ---- K x = λ M x -----------------------------------------------------------------------------------------------------
+
+
+@jax.custom_jvp
+def symmetric_modes(stiffness: Matrix, mass: Matrix) -> tuple[Float[Array, " n"], Matrix]:
+    """λ (n,), ascending, and X (n, n), a vector a column, with K X = M X Λ, Xᵀ M X = 1, of symmetric K and M.
+
+    NaN where M is not positive definite.
+    """
+    n = len(mass)
+    shapes = jax.ShapeDtypeStruct((n,), mass.dtype), jax.ShapeDtypeStruct((n, n), mass.dtype)
+    return _on_host(lambda *x: _each(_symmetric, *x), shapes, stiffness, mass)  # pyright: ignore[reportReturnType]
+
+
+def _symmetric(stiffness: np.ndarray, mass: np.ndarray) -> list[np.ndarray]:
+    """λ and X of one pair; the last step, a Rayleigh quotient each, makes small eigenvalues as exact as K allows."""
+    stiffness, mass = 0.5 * (stiffness + stiffness.T), 0.5 * (mass + mass.T)
+    lower = np.linalg.inv(np.linalg.cholesky(mass))
+    vectors = lower.T @ np.linalg.eigh(lower @ stiffness @ lower.T)[1]
+    vectors /= np.sqrt(np.einsum("ij,ij->j", vectors, mass @ vectors))
+    values = np.einsum("ij,ij->j", vectors, stiffness @ vectors)
+    order = np.argsort(values, kind="stable")
+    return [values[order], vectors[:, order]]
+
+
+@symmetric_modes.defjvp
+def _symmetric_jvp(primals, tangents):
+    values, vectors = symmetric_modes(*primals)
+    by_stiffness, by_mass = (vectors.T @ (0.5 * (x + x.T)) @ vectors for x in tangents)
+    change = by_stiffness - by_mass * values  # xᵢᵀ (dK − λⱼ dM) xⱼ
+    turns = change * _inverse_gaps(values) * (1 - jnp.eye(len(values), dtype=values.dtype))
+    same = _meet(values)
+    return (values, vectors), (jnp.diagonal(change), vectors @ jnp.where(same, -0.5 * by_mass, turns))
+
+
+def _meet(values) -> Array:
+    """Which pairs of eigenvalues count as equal, (n, n), each with itself."""
+    values = jax.lax.stop_gradient(values)
+    size = jnp.max(jnp.abs(values))
+    allowed = _UNITS * len(values) ** 0.5 * jnp.finfo(size.dtype).eps * size
+    return jnp.abs(values[:, None] - values) <= allowed
+
+
+def _inverse_gaps(values) -> Array:
+    """1/(λⱼ − λᵢ), (n, n), and zero where the two meet."""
+    same = _meet(values)
+    return jnp.where(same, 0, 1 / jnp.where(same, 1, values - values[:, None]))
+
+
+# ---- A x = s x -------------------------------------------------------------------------------------------------------
+
+
+def exponents_and_modes(matrix: Float[Array, "2n 2n"]) -> tuple[Array, Array]:
+    """Eigenvalues s (2n,) and vectors (2n, 2n), a vector a column, of a real matrix; complex.
+
+    The first n are the modes: of a complex pair the one with Im s > 0; real ones go in pairs, the largest with the
+    smallest and so on, of which the larger is among the first. Those are sorted by Im s, growing ones first; the last n
+    are their partners. Derivatives are NaN where there is no basis of eigenvectors.
+    """
+    parts = _eigen(matrix)
+    return jax.lax.complex(*parts[:2]), jax.lax.complex(*parts[2:4])
+
+
+@jax.custom_jvp
+def _eigen(matrix: Array) -> tuple[Array, ...]:
+    """Real and imaginary parts of s, X and X⁻¹."""
+    n = len(matrix)
+    vector, square = (jax.ShapeDtypeStruct(shape, matrix.dtype) for shape in ((n,), (n, n)))
+    return _on_host(lambda a: _each(_general, a), (vector, vector, square, square, square, square), matrix)
+
+
+# A basis of eigenvectors that has lost half of the digits is none: rounding splits a Jordan block of two by √eps.
+_WORST_BASIS = 1e7
+
+
+def _general(matrix: np.ndarray) -> list[np.ndarray]:
+    values, vectors = np.linalg.eig(matrix)
+    order = _in_pairs(values)
+    values, vectors = values[order].astype(complex), vectors[:, order].astype(complex)
+    if np.linalg.cond(vectors) > _WORST_BASIS:
+        inverse = np.full_like(vectors, np.nan)
+    else:
+        inverse = np.linalg.inv(vectors)
+    return [part for x in (values, vectors, inverse) for part in (np.real(x), np.imag(x))]
+
+
+def _in_pairs(values: np.ndarray) -> np.ndarray:
+    """The order of `exponents_and_modes`."""
+    reals, imaginary = np.real(values), np.imag(values)
+    real = np.flatnonzero(imaginary == 0)
+    real = real[np.argsort(-reals[real], kind="stable")]
+    half = len(real) // 2
+    upper = np.flatnonzero(imaginary > 0)
+    upper = upper[np.lexsort((-reals[upper], imaginary[upper]))]
+    # LAPACK lists the two of a pair side by side, Im s > 0 first.
+    return np.concatenate([real[:half], upper, real[::-1][:half], upper + 1])
+
+
+@_eigen.defjvp
+def _eigen_jvp(primals, tangents):
+    parts = _eigen(*primals)
+    values, vectors, inverse = (jax.lax.complex(*parts[i : i + 2]) for i in (0, 2, 4))
+    change = inverse @ tangents[0].astype(values.dtype) @ vectors
+    turns = change * _inverse_gaps(values)
+    moved = jnp.diagonal(change), vectors @ turns, -turns @ inverse
+    return parts, tuple(part for x in moved for part in (x.real, x.imag))
+
+
+# ---- spaces ----------------------------------------------------------------------------------------------------------
+
+
+def null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:
+    """An orthonormal basis, a vector a column, of what m rows of this rank send to zero; without derivatives."""
+    n = rows.shape[1]
+    shape = (jax.ShapeDtypeStruct((n, n - rank), rows.dtype),)
+    return _on_host(lambda g: _each(lambda a: [_null(a, rank)], g), shape, jax.lax.stop_gradient(rows))[0]
+
+
+def _null(rows: np.ndarray, rank: int) -> np.ndarray:
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.linalg.svd(rows / np.where(lengths > 0, lengths, 1))[2][rank:].T

@@ -1,0 +1,115 @@
+"""`linearize`: the motions next to a motion."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lagjax._analysis._scene import Scene
+from lagjax._linear import factorize, least_norm, saddle
+from lagjax._system import System
+
+PyTree = Any
+Vector = Float[Array, " n"]
+Matrix = Float[Array, "n n"]
+
+
+class Linearization(NamedTuple):
+    """The linear equations of small deviations from a state, in the order in which the leaves of q lie end to end.
+
+    - `A` (2n, 2n) and `B` (2n, n): d/dt (δq, δq̇) = A (δq, δq̇) + B u, where u (n,) are further generalised forces.
+    - `mass_matrix` M, `damping` C, `gyroscopic` G, `stiffness` K, (n, n) each: M δq̈ + (C + G) δq̇ + K δq = u + Jᵀδλ,
+      C symmetric and G skew. M is symmetric, K is where all forces have a potential.
+    - `constraint_jacobian` J (m, n): constraints allow δq̇ with J δq̇ = 0; no rows without constraints.
+    - `names` (n,): those of the coordinates.
+    """
+
+    A: Float[Array, "2n 2n"]
+    B: Float[Array, "2n n"]
+    mass_matrix: Matrix
+    damping: Matrix
+    gyroscopic: Matrix
+    stiffness: Matrix
+    constraint_jacobian: Float[Array, "m n"]
+    names: tuple[str, ...]
+
+
+def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = None) -> Linearization:
+    r"""The equations of motion of `system`, linear in small deviations from the state (q, q̇), at rest by default.
+
+        d/dt (δq, δq̇) = A (δq, δq̇) + B u,     A = ∂(q̇, q̈)/∂(q, q̇),   B = ∂(q̇, q̈)/∂u
+
+    u are generalised forces that are added. At an equilibrium A has constant entries and the motions are exponentials
+    (`normal_modes`); along a motion they are the variational equations at that instant. With constraints λ answers to a
+    deviation, and A and B keep deviations on the constraints that are on them. Works under `jit`, `vmap` and `grad`.
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, or a scene that depends on the time.
+
+    Source: Landau & Lifshitz, *Mechanics*, §23; Meirovitch, *Methods of Analytical Dynamics*, §9.
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q))
+    print(lagjax.linearize(pendulum, 0.0).A)  # [[0, 1], [-9.81, 0]]
+    ```
+    """
+    scene = Scene.of(system, q, qdot, params)
+    scene.require_autonomous("A linearization")
+    return Linearization(*_linearized(*scene.arguments), names=scene.layout.names)
+
+
+@eqx.filter_jit
+def _linearized(*arguments) -> tuple:
+    scene = Scene.flat(*arguments)
+    n, q, qdot = scene.layout.size, scene.q, scene.qdot
+    motion, t, numbers = scene.motion, jnp.zeros((), q.dtype), scene.numbers
+    zero, one = jnp.zeros((n, n), q.dtype), jnp.eye(n, dtype=q.dtype)
+    by_q, by_qdot = jax.jacfwd(motion.acceleration, argnums=(0, 1))(q, qdot, t, numbers)
+    mass, rates, stiffness, jacobian = matrices(scene, q)
+    gamma = jnp.zeros(len(jacobian), q.dtype)
+    if scene.constrained:
+        response = jax.vmap(lambda b: saddle(mass, b, jacobian, gamma)[0], in_axes=1, out_axes=1)(one)
+    else:
+        response = factorize(mass).solve_columns(one)
+    a, b = jnp.block([[zero, one], [by_q, by_qdot]]), jnp.concatenate([zero, response])
+    return a, b, mass, 0.5 * (rates + rates.T), 0.5 * (rates - rates.T), stiffness, jacobian
+
+
+def matrices(scene: Scene, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array]:
+    """M, C + G, K of small deviations from the motion through (q, q̇), (n, n) each, and the constraint Jacobian (m, n).
+
+    They are minus the derivatives of F + Gᵀλ − M q̈ at fixed q̈ and λ.
+    """
+    qdot, t = scene.qdot, jnp.zeros((), q.dtype)
+    mass, force = scene.motion.mass_matrix_and_force(q, qdot, t, scene.numbers)
+    jacobian, gamma = scene.motion.constraints.jacobian_and_gamma(q, qdot, t, scene.numbers)
+    acceleration, multipliers, _ = (
+        saddle(mass, force, jacobian, gamma)
+        if scene.constrained
+        else (factorize(mass).solve(force), jnp.zeros(0, q.dtype), None)
+    )
+
+    def balance(q, qdot):
+        of_constraints = scene.jacobian(q, qdot).T @ multipliers
+        return scene.force(q, qdot) + of_constraints - scene.mass_matrix(q, qdot) @ acceleration
+
+    stiffness, rates = jax.jacfwd(balance, argnums=(0, 1))(q, qdot)
+    return mass, -rates, -stiffness, jacobian
+
+
+def steady_matrices(scene: Scene, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array, Vector]:
+    """`matrices` at an equilibrium, where q̈ is zero whatever M is, and what is left of the forces there (n,)."""
+    jacobian = scene.jacobian(q, scene.qdot)
+    force = scene.force(q, scene.qdot)
+    multipliers = jnp.zeros(0, q.dtype)
+    if scene.constrained:
+        multipliers = -least_norm(jacobian @ jacobian.T, jacobian @ force)
+
+    def balance(q, qdot):
+        return scene.force(q, qdot) + scene.jacobian(q, qdot).T @ multipliers
+
+    stiffness, rates = jax.jacfwd(balance, argnums=(0, 1))(q, scene.qdot)
+    return scene.mass_matrix(q, scene.qdot), -rates, -stiffness, jacobian, force + jacobian.T @ multipliers

@@ -1,0 +1,259 @@
+"""`normal_modes`: small oscillations about an equilibrium, or about a steady motion.
+
+    deviations x e^{st}:  (s² M + s (C + G) + K) x = 0     on the tangent space of the constraints
+
+Cyclic coordinates are eliminated at constant momentum first (as Routh does): each is a mode of frequency zero. Where
+all forces have a potential and L is even in the velocities, s² = −ω² are the eigenvalues of symmetric matrices.
+Otherwise s are those of the first-order equations of motion.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from lagjax._analysis._eigen import exponents_and_modes, null_space, symmetric_modes
+from lagjax._analysis._equilibrium import require_steady
+from lagjax._analysis._linearize import steady_matrices
+from lagjax._analysis._scene import Scene
+from lagjax._failures import nan_unless
+from lagjax._linear import dependent_rows, factorize, least_norm, schur_complement
+from lagjax._system import System
+from lagjax._validate import is_concrete
+
+PyTree = Any
+Vector = Float[Array, " n"]
+Matrix = Float[Array, "n n"]
+
+# Eigenvalues below so many units of round-off of the largest, times n, are zero: ten times what LAPACK is off.
+_UNITS = 16
+
+
+class Modes(eqx.Module):
+    """Small oscillations of n degrees of freedom: n modes, in ascending order of frequency. Print them for a table.
+
+    - `frequencies` (n,): ω in radians per unit of time; zero for a mode that does not oscillate.
+    - `shapes`: the deviation of every coordinate, in the structure of q with the mode as first axis. Real, xᵀM x = 1
+      and the largest entry positive, where nothing turns or damps; else complex with xᴴM x = 1.
+    - `stable` (): whether no mode grows exponentially. A mode of frequency zero may still drift away.
+    - `exponents` (n, 2), complex: both s of e^{st}, iω and −iω of an oscillation, ±κ of an instability.
+    - `damping_ratios` (n,): −Re s/|s| of the first of them; zero without damping.
+    """
+
+    frequencies: Float[Array, " n"]
+    shapes: PyTree
+    stable: Bool[Array, ""]
+    exponents: Complex[Array, "n 2"]
+    damping_ratios: Float[Array, " n"]
+
+    def __str__(self) -> str:
+        if self.frequencies.ndim != 1 or not is_concrete(self.frequencies):
+            return repr(self)
+        frequencies, exponents = np.asarray(self.frequencies), np.asarray(self.exponents)
+        size = np.abs(exponents).max(initial=0)
+        rows = [f"{'mode':>4} {'frequency':>14} {'damping ratio':>14}  "]
+        for k, (frequency, pair) in enumerate(zip(frequencies, exponents, strict=True)):
+            ratio = float(np.asarray(self.damping_ratios)[k])
+            rows.append(f"{k:4d} {frequency:14.8g} {ratio:14.4g}  {_kind(pair, size)}")
+        rows.append("stable" if self.stable else "unstable")
+        return "\n".join(row.rstrip() for row in rows)
+
+
+def _kind(pair: np.ndarray, size: float) -> str:
+    """What a mode with these two exponents does, beside others of this size."""
+    small, real, imaginary = _grows_beyond(size), np.real(pair), np.imag(pair)
+    if np.abs(pair).max() <= small:
+        return "zero mode: neutral, may drift"
+    if real.max() > small:
+        return f"grows, e-fold in {1 / real.max():.4g}"
+    if np.abs(imaginary).max() > 0:
+        return "oscillates" if real.min() >= -small else "oscillates and decays"
+    return "decays" if real.max() < -small else "decays to a neutral position"
+
+
+def _grows_beyond(size):
+    """The real part that counts as growth: rounding splits a double zero by √eps of the largest exponent."""
+    return 1e-7 * size
+
+
+def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTree = None) -> Modes:
+    r"""The small oscillations of `system` about its equilibrium `q`.
+
+        (s² M + s (C + G) + K) x = 0,   q(t) = q + Re(x e^{st}),   s = ±iω where nothing damps and nothing turns
+
+    with M = ∂²L/∂q̇², the stiffness K = −∂F/∂q and the damping and gyroscopic terms C + G = −∂F/∂q̇ of the force F.
+
+    - `q`: an equilibrium, as `equilibrium` finds it.
+    - `qdot`: of a steady motion, with which cyclic coordinates turn (see there): the oscillations about it, at constant
+      momenta of cyclic coordinates, seen from coordinates that turn along.
+
+    With constraints the modes are those of the deviations they allow, as many as there are degrees of freedom; their
+    forces count (a pendulum is held by its rod). Works under `jit`, `vmap` and `grad`, also where frequencies are
+    equal: first derivatives of all that does not depend on which of the modes of equal frequency is which (their sum,
+    say) are right, single ones are those of the modes as they are numbered; of second derivatives that holds for the
+    sum of ω² alone. The frequency of a zero mode has the derivative zero, as is right where a symmetry makes it zero.
+    With friction or gyroscopic forces derivatives are NaN where modes coincide and have one shape between them
+    (critical damping).
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a scene that depends on the time, or a q
+    that is no equilibrium; inside `jit` the modes are NaN there. So they are where M is not positive definite.
+
+    Source: Landau & Lifshitz, *Mechanics*, §23–25; Routh, *Stability of a Given State of Motion*, ch. IV; derivatives:
+    Fox & Kapoor, AIAA J. 6 (1968) 2426.
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q))
+    print(lagjax.normal_modes(pendulum, 0.0))  # sqrt(9.81)
+    ```
+    """
+    scene = Scene.of(system, q, qdot, params)
+    scene.require_autonomous("A normal mode")
+    require_steady(scene)
+    cyclic, rank = scene.conserved, _rank(scene)
+    reversible = scene.reversible and qdot is None
+    exponents, shapes, residual = _modes(cyclic, rank, reversible, *scene.arguments)
+    if scene.concrete and residual > _BALANCED:
+        raise ValueError(
+            f"q is not an equilibrium: forces are left that a deviation of {float(residual):.2g} of q's size would "
+            "make. Find one first: q = lagjax.equilibrium(system, q, params).q."
+        )
+    size = jnp.max(jnp.abs(exponents), initial=0)
+    stable = jnp.all(exponents.real <= _grows_beyond(size)) & jnp.all(jnp.isfinite(exponents))
+    first = exponents[:, 0]
+    length = jnp.abs(jnp.where(first == 0, 1, first))
+    ratios = jnp.where(first.real == 0, 0, -first.real / length)
+    return Modes(first.imag, scene.layout.restore(shapes), stable, exponents, ratios)
+
+
+# How far from an equilibrium modes are still those of it, in units of 1 + max|q|. Linear in that are their errors.
+_BALANCED = 1e-6
+
+
+def _rank(scene: Scene) -> int:
+    """How many constraints are independent at q; all of them where there are no numbers to ask."""
+    if not scene.constrained:
+        return 0
+    jacobian = scene.jacobian(scene.q, scene.qdot)
+    if not scene.concrete:
+        return len(jacobian)
+    schur = schur_complement(scene.mass_matrix(scene.q, scene.qdot), jacobian)
+    return len(jacobian) - len(dependent_rows(np.asarray(schur)))
+
+
+@eqx.filter_jit
+def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> tuple:
+    """Exponents (k, 2) and shapes (k, n) of the k degrees of freedom, and how far q is from an equilibrium."""
+    scene = Scene.flat(*arguments)
+    q = scene.q
+    mass, rates, stiffness, jacobian, left = steady_matrices(scene, q)
+    residual = _distance(scene, q, left, stiffness)
+    keep = np.array([i for i in range(len(q)) if i not in cyclic], int)
+    gone = np.array(cyclic, int)
+    reduced, follow = _without_cyclic(mass, rates, stiffness, keep, gone)
+    basis = _tangent_basis(jacobian[:, keep], rank)
+    within = tuple(basis.T @ x @ basis for x in reduced)
+    solve = _of_reversible if reversible else _of_any
+    exponents, amplitudes = solve(*within) if basis.shape[1] else _none(q.dtype)
+    moved = (basis.astype(amplitudes.dtype) @ amplitudes).T  # (k, n without the cyclic ones)
+    shapes = jnp.zeros((len(moved), len(q)), moved.dtype).at[:, keep].set(moved)
+    shapes = shapes.at[:, gone].set(follow(moved, exponents[:, 0]))
+    if len(gone):
+        own = jnp.eye(len(q), dtype=shapes.dtype)[gone]
+        exponents = jnp.concatenate([jnp.zeros((len(gone), 2), exponents.dtype), exponents])
+        shapes = jnp.concatenate([own, shapes])
+    order = jnp.argsort(jax.lax.stop_gradient(exponents[:, 0].imag), stable=True)
+    shapes = _normalised(shapes[order], mass)
+    balanced = residual <= _BALANCED
+    exponents = jax.lax.complex(*(nan_unless(balanced, x) for x in (exponents.real, exponents.imag)))[order]
+    return exponents, jnp.where(balanced, shapes, jnp.nan), residual
+
+
+def _distance(scene: Scene, q: Vector, left: Vector, stiffness: Matrix) -> Float[Array, ""]:
+    """How far q is from an equilibrium, in units of 1 + max|q|: by the forces that are left, and by the constraints."""
+    jacobian = scene.jacobian(q, scene.qdot)
+    rows = scene.motion.constraints.residual(q, scene.qdot, jnp.zeros((), q.dtype), scene.numbers)
+    values, gradients = jnp.concatenate([left, rows]), jnp.concatenate([stiffness, jacobian])
+    sizes = jnp.sqrt(jnp.sum(gradients**2, axis=1)) * (1 + jnp.max(jnp.abs(q)))
+    # A row without any gradient may be left with the rounding of the others.
+    allowed = jnp.where(sizes > 0, sizes, jnp.max(sizes, initial=0) * 1e-6)
+    off = jnp.where(values == 0, 0, jnp.abs(values) / jnp.where(allowed > 0, allowed, 0))
+    return jax.lax.stop_gradient(jnp.max(off, initial=0))
+
+
+def _without_cyclic(mass: Matrix, rates: Matrix, stiffness: Matrix, keep: np.ndarray, gone: np.ndarray):
+    """M, C + G, K of all but the cyclic coordinates, at constant momenta of these; and how those follow a mode."""
+    if not len(gone):
+        return (mass, rates, stiffness), lambda moved, exponents: moved[:, :0]
+    within, across = np.ix_(keep, keep), np.ix_(keep, gone)
+    own = factorize(mass[np.ix_(gone, gone)])
+    by_mass = own.solve_columns(mass[np.ix_(gone, keep)])  # δq̇ of the cyclic ones is −(by_mass δq̇ + by_rates δq)
+    by_rates = own.solve_columns(rates[np.ix_(gone, keep)])
+    reduced = (
+        mass[within] - mass[across] @ by_mass,
+        rates[within] - mass[across] @ by_rates - rates[across] @ by_mass,
+        stiffness[within] - rates[across] @ by_rates,
+    )
+
+    def follow(moved, exponents):
+        shifted = -moved @ by_mass.T.astype(moved.dtype)
+        if not jnp.iscomplexobj(moved):  # nothing turns
+            return shifted
+        at_rest = exponents == 0
+        drift = moved @ by_rates.T.astype(moved.dtype) / jnp.where(at_rest, 1, exponents)[:, None]
+        return jnp.where(at_rest[:, None], 0, shifted - drift)
+
+    return reduced, follow
+
+
+def _tangent_basis(jacobian: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:
+    """A basis of the deviations that constraints allow; it moves with the point as little as it can."""
+    if not len(jacobian):
+        return jnp.eye(jacobian.shape[1], dtype=jacobian.dtype)
+    basis = null_space(jacobian, rank)
+    # Zero in value, as `jacobian @ basis` is; its derivative keeps the basis on the tangent space.
+    correct = jax.vmap(lambda b: jacobian.T @ least_norm(jacobian @ jacobian.T, b), in_axes=1, out_axes=1)
+    return basis - correct(jacobian @ basis)
+
+
+def _none(dtype) -> tuple[Array, Array]:
+    return jnp.zeros((0, 2), jnp.result_type(dtype, jnp.complex64)), jnp.zeros((0, 0), dtype)
+
+
+def _of_reversible(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
+    """Exponents (k, 2) and real amplitudes (k, k), a mode a column, of K x = ω² M x; NaN if velocities do matter."""
+    squares, shapes = symmetric_modes(stiffness, mass)
+    size = jnp.max(jnp.abs(squares))
+    zero = _UNITS * len(mass) * jnp.finfo(size.dtype).eps * jax.lax.stop_gradient(size)
+    rate = jnp.sqrt(jnp.where(jnp.abs(squares) > zero, jnp.abs(squares), 1))
+    frequency, growth = jnp.where(squares > zero, rate, 0), jnp.where(squares < -zero, rate, 0)
+    ignored = jnp.max(jnp.abs(shapes.T @ rates @ shapes)) <= 1e-9 * jnp.sqrt(size)
+    frequency, growth = nan_unless(ignored, frequency), nan_unless(ignored, growth)
+    return jnp.stack([jax.lax.complex(growth, frequency), jax.lax.complex(-growth, -frequency)], axis=1), shapes
+
+
+def _of_any(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
+    """Exponents (k, 2) and complex amplitudes (k, k), a mode a column."""
+    k = len(mass)
+    inverse = factorize(mass)
+    zero, one = jnp.zeros_like(mass), jnp.eye(k, dtype=mass.dtype)
+    lower = [-inverse.solve_columns(stiffness), -inverse.solve_columns(rates)]
+    values, vectors = exponents_and_modes(jnp.block([[zero, one], lower]))
+    return jnp.stack([values[:k], values[k:]], axis=1), vectors[:k, :k]
+
+
+def _normalised(shapes: Array, mass: Matrix) -> Array:
+    """Shapes (k, n) with xᴴM x = 1 and the largest entry positive."""
+    size = jnp.sum(shapes.conj() * (shapes @ mass.T.astype(shapes.dtype)), axis=1).real
+    shapes = shapes / jnp.sqrt(size)[:, None].astype(shapes.dtype)
+    sizes = jnp.abs(jax.lax.stop_gradient(shapes))
+    # The first of those that are equal but for rounding: a symmetric shape has its sign by no accident.
+    at = jnp.argmax(sizes > 0.999 * jnp.max(sizes, axis=1, keepdims=True), axis=1)
+    largest = jnp.take_along_axis(shapes, at[:, None], axis=1)
+    if not jnp.iscomplexobj(shapes):
+        return shapes * jnp.sign(jax.lax.stop_gradient(largest))
+    return shapes * (largest.conj() / jnp.abs(largest))

@@ -1,0 +1,143 @@
+"""The door of the analysis: a scene with its state and its parameters, flat."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lagjax._consistent import has_constraints
+from lagjax._derivation import Derivation, columns_of, derivation_of
+from lagjax._layout import Layout
+from lagjax._motion import Motion
+from lagjax._program import Unlowerable
+from lagjax._system import System, require_system
+from lagjax._validate import as_arrays, is_concrete, require_finite
+
+PyTree = Any
+Vector = Float[Array, " n"]
+
+
+class Scene(NamedTuple):
+    """A scene at one state: its functions on vectors, and the numbers they take."""
+
+    system: System
+    layout: Layout
+    motion: Motion
+    derivation: Derivation
+    q: Vector
+    qdot: Vector
+    params: PyTree  # as the user gave them, of arrays
+    numbers: PyTree  # the numbers among them
+
+    @classmethod
+    def of(cls, system: System, q: PyTree, qdot: PyTree | None, params: PyTree) -> "Scene":
+        """A scene at the state (q, qdot), at rest where `qdot` is None.
+
+        Raises `TypeError` or `ValueError`, with a sentence, for arguments that cannot be right.
+        """
+        require_system(system)
+        rest = jax.tree.map(lambda x: jnp.zeros_like(jnp.asarray(x, float)), q) if qdot is None else qdot
+        layout = Layout.of(q, rest)
+        require_finite(q, "q")
+        require_finite(rest, "qdot")
+        return cls.flat(system, layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype))
+
+    @classmethod
+    def flat(cls, system: System, layout: Layout, q: Vector, qdot: Vector, params: PyTree) -> "Scene":
+        """A scene at the flat state (q, qdot), with params of arrays: what a compiled function is given."""
+        motion, derivation = system.motion(layout, params), derivation_of(system, layout, params)
+        return cls(system, layout, motion, derivation, q, qdot, params, eqx.filter(params, eqx.is_array_like))
+
+    @property
+    def arguments(self) -> tuple:
+        """The arguments of `flat`."""
+        return self.system, self.layout, self.q, self.qdot, self.params
+
+    @property
+    def concrete(self) -> bool:
+        """Whether there are numbers, and nothing is being traced."""
+        return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.system, self.q, self.qdot, self.numbers)))
+
+    @property
+    def constrained(self) -> bool:
+        """Whether there are constraints."""
+        return has_constraints(self.system)
+
+    @property
+    def lowered(self) -> Derivation | None:
+        """The derivation, where the scene has scalar programs."""
+        try:
+            self.derivation.shape("lagrangian")
+        except Unlowerable:
+            return None
+        return self.derivation
+
+    def require_autonomous(self, what: str) -> None:
+        """Raise `ValueError` where a function of the scene depends on the time."""
+        roles = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
+        asking = [role for role in roles if (f := getattr(self.system, role)) is not None and "t" in f.extras]
+        if not asking:
+            return
+        derivation, time = self.lowered, 2 * self.layout.size
+        asked = ("lagrangian", "nonconservative_force", "residual", "rates")
+        if derivation is None or any(time in derivation.reads(name) for name in asked):
+            raise ValueError(
+                f"{what} is of a scene that does not depend on the time, but {', '.join(asking)} of this one asks for "
+                "t. Where a drive turns or moves uniformly, write L in coordinates that move with it."
+            )
+
+    @property
+    def conserved(self) -> tuple[int, ...]:
+        """The coordinates that nothing depends on and nothing acts on, read off the scene's programs."""
+        if self.lowered is None:
+            return ()
+        return tuple(i for i in self.derivation.conserved if not self._read(i))
+
+    def _read(self, coordinate: int) -> bool:
+        return any(
+            coordinate in self.derivation.reads(name) for name in ("lagrangian", "nonconservative_force", "residual")
+        )
+
+    @property
+    def reversible(self) -> bool:
+        """Whether nothing but L acts, and L is even in the velocities: the motion backwards is a motion.
+
+        Read off values of L at states that nothing speaks for. A wrong guess has to be caught by who relies on it.
+        """
+        motion, n = self.motion, self.layout.size
+        if motion.forces is not None or motion.dissipation is not None or self.system.velocity_constraints is not None:
+            return False
+        if self.lowered is None:
+            return False
+        draws = np.random.default_rng(1).uniform(0.3, 1.2, (3, len(self.derivation.scalar_shapes)))
+        draws = draws.astype(self.layout.dtype)
+        q, qdot, t, numbers = draws[:, :n], draws[:, n : 2 * n], draws[:, 2 * n], list(draws[:, 2 * n + 1 :].T)
+        with np.errstate(all="ignore"):
+            there, back = (
+                self.derivation.evaluate(("lagrangian",), columns_of(q, v, t, numbers))["lagrangian"]
+                for v in (qdot, -qdot)
+            )
+        well = np.isfinite(there) & np.isfinite(back)
+        size = np.max(np.abs(there), where=well, initial=0.0)
+        return bool(well.any() and np.abs(there - back)[well].max() <= 1e-12 * size)
+
+    # ---- quantities at a state (q, q̇) and the time zero ----
+
+    def force(self, q: Vector, qdot: Vector) -> Vector:
+        """F of M q̈ = F + Gᵀλ, (n,)."""
+        return self.motion.mass_matrix_and_force(q, qdot, jnp.zeros((), q.dtype), self.numbers)[1]
+
+    def mass_matrix(self, q: Vector, qdot: Vector) -> Float[Array, "n n"]:
+        """M, (n, n)."""
+        return self.motion.mass_matrix(q, qdot, jnp.zeros((), q.dtype), self.numbers)
+
+    def jacobian(self, q: Vector, qdot: Vector) -> Float[Array, "m n"]:
+        """G, (m, n), of m constraints or none."""
+        return self.motion.constraints.jacobian_and_gamma(q, qdot, jnp.zeros((), q.dtype), self.numbers)[0]
+
+    def holds(self, q: Vector) -> Float[Array, " k"]:
+        """f, the constraints on positions, (k,)."""
+        return self.motion.constraints.f(q, jnp.zeros((), q.dtype), self.numbers)

@@ -1,0 +1,59 @@
+"""Linear systems that need not be symmetric, nor regular: for Newton's method and its derivative. No LAPACK in XLA."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from lagjax._linear import inverted, least_norm, singular_threshold
+
+Matrix = Float[Array, "n n"]
+Vector = Float[Array, " n"]
+
+
+def shortest_solution(matrix: Matrix, b: Vector) -> Vector:
+    """x with A x = b, the shortest one where A is singular and b in its range.
+
+    Linear in b, with derivatives by both. A singular A is one whose pivots, of rows and columns of unit size, say so.
+    """
+    rows, columns = (jax.lax.stop_gradient(scale) for scale in _scales(matrix))
+    inverse, singular = _inverse(jax.lax.stop_gradient(rows[:, None] * matrix * columns))
+
+    def regular(matrix, b):
+        return columns * _regular(rows[:, None] * matrix * columns, rows * b, inverse)
+
+    return jax.lax.cond(singular, _shortest, regular, matrix, b)
+
+
+def _scales(matrix: Matrix) -> tuple[Vector, Vector]:
+    """Factors of the rows and of the columns that give each a largest entry of 1; 1 for those of zeros."""
+    rows = _reciprocal(jnp.max(jnp.abs(matrix), axis=1))
+    return rows, _reciprocal(jnp.max(jnp.abs(rows[:, None] * matrix), axis=0))
+
+
+def _reciprocal(size: Vector) -> Vector:
+    return jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
+
+
+def _inverse(matrix: Matrix) -> tuple[Matrix, Bool[Array, ""]]:
+    """The inverse, and whether there is none to working precision."""
+    inverse, order, pivots = inverted(matrix)
+    sizes, n = jnp.abs(pivots), len(matrix)
+    singular = jnp.min(sizes) <= singular_threshold(n, matrix.dtype) * jnp.max(sizes)
+    return jnp.zeros_like(matrix).at[:, order].set(inverse), singular
+
+
+def _regular(matrix: Matrix, b: Vector, inverse: Matrix) -> Vector:
+    def refined(a, inverse, b):
+        x = inverse @ b
+        return x + inverse @ (b - a @ x)
+
+    return jax.lax.custom_linear_solve(
+        lambda x: matrix @ x,
+        b,
+        lambda _, b: refined(matrix, inverse, b),
+        transpose_solve=lambda _, b: refined(matrix.T, inverse.T, b),
+    )
+
+
+def _shortest(matrix: Matrix, b: Vector) -> Vector:
+    return matrix.T @ least_norm(matrix @ matrix.T, b)
