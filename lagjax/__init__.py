@@ -29,6 +29,7 @@ from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._samples import samples
 from lagjax._simulate import simulate, simulate_batch
+from lagjax._sweep import Statistics, Status, Sweep, latin_hypercube, random, sobol, sweep
 from lagjax._system import System
 from lagjax._trajectory import State, Trajectory, Transitions
 
@@ -51,7 +52,10 @@ __all__ = [
     "Record",
     "SimulationError",
     "State",
+    "Statistics",
+    "Status",
     "StudentT",
+    "Sweep",
     "System",
     "Trajectory",
     "Transition",
@@ -67,13 +71,17 @@ __all__ = [
     "inertia",
     "linearize",
     "normal_modes",
+    "latin_hypercube",
     "plot",
     "positive",
+    "random",
     "samples",
     "scenes",
     "simplex",
     "simulate",
     "simulate_batch",
     "simulate_hybrid",
+    "sobol",
+    "sweep",
     "work_precision",
 ]

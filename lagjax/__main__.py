@@ -1,0 +1,64 @@
+"""The command line: `python -m lagjax --help`."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from lagjax._sweep import Store, run_store, status
+from lagjax._sweep._status import Progress
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; the exit status. A mistake is a sentence on stderr."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.command(options)
+    except (OSError, ValueError, TypeError, ImportError) as error:
+        print(f"lagjax: {error}", file=sys.stderr)
+        return 1
+
+
+def _run(options: argparse.Namespace) -> int:
+    store = Store(options.store.absolute())
+    show = Progress(store, store.spec(), not options.quiet)
+    count = run_store(store, show, options.units)
+    show.end()
+    print(f"{count} units done here\n{status(store)}")
+    return 0
+
+
+def _status(options: argparse.Namespace) -> int:
+    print(status(Store(options.store.absolute())))
+    return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    store = Store(options.store.absolute())
+    damaged = store.damaged(store.spec(), store.done(), whole=True)
+    for text in damaged.values():
+        print(text)
+    print(f"{len(store.done())} units are done, {len(damaged)} of them damaged.")
+    return 1 if damaged else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m lagjax", description="Work on stores of lagjax.")
+    commands = parser.add_subparsers(required=True, title="commands")
+    of_sweeps = commands.add_parser("sweep", help="a sweep that lagjax.sweep has begun")
+    actions = of_sweeps.add_subparsers(required=True, title="actions")
+    for name, command, about in (
+        ("run", _run, "work on units until all are done; in as many shells and on as many machines as you like"),
+        ("status", _status, "tell how far it is"),
+        ("check", _check, "read all that is done, and tell what is damaged"),
+    ):
+        action = actions.add_parser(name, help=about, description=about)
+        action.add_argument("store", type=Path, metavar="STORE", help="the folder")
+        action.set_defaults(command=command)
+        if name == "run":
+            action.add_argument("--units", type=int, help="end after so many units (default: when all are done)")
+            action.add_argument("--quiet", action="store_true", help="print no progress")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

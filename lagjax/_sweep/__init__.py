@@ -1,0 +1,210 @@
+"""`sweep`: one scene for many starts and parameters, a few numbers kept of each motion, in a store that is the job.
+
+over, q0, keep, … ──► Motions, Grid ──► Store ──► units, claimed and computed by any number of workers ──► xarray
+
+_designs, _members   what is swept: axes and rules, the grid of members, its units
+_statistics          what is said of all members without a list
+_scene               the user's functions: text, hash, the way to another process
+_store, _claims      the files; who has which unit
+_batch, _job, _unit  what computes a unit
+_run, _isolate       workers: here, in children, by executors
+_status              how far it is
+"""
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from lagjax._sweep._begin import begin, first_look, repair, require_same
+from lagjax._sweep._designs import Design, latin_hypercube, random, sobol
+from lagjax._sweep._isolate import Child
+from lagjax._sweep._job import Job
+from lagjax._sweep._members import axes_of
+from lagjax._sweep._run import run_store, submit, work
+from lagjax._sweep._scene import Motions
+from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merged, summary
+from lagjax._sweep._status import Failure, Progress, Status, status
+from lagjax._sweep._store import Store
+from lagjax._sweep._unit import compute
+from lagjax._system import System, require_system
+from lagjax._validate import require_flag
+
+__all__ = [
+    "Design", "Failure", "Statistics", "Status", "Store", "Summary", "Sweep", "latin_hypercube", "random", "run_store",
+    "sobol", "status", "sweep",
+]  # fmt: skip
+
+PyTree = Any
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep that has been run: the path of its `store`, and what can be asked of it.
+
+    `print` it for its status.
+    """
+
+    store: Path
+
+    def __repr__(self) -> str:
+        return str(self.status())
+
+    def open(self):
+        """The members as an `xarray.Dataset`, with the names of `over` as coordinates; read when it is looked at.
+
+        Raises `ImportError` when xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise ImportError("Sweep.open() needs the package xarray: pip install xarray.") from None
+        return xarray.open_zarr(self.store)
+
+    def status(self) -> Status:
+        """How far it has come, how members ended, which failed, and the worst change of energy."""
+        return status(Store(self.store))
+
+    def statistics(self) -> dict[str, Summary]:
+        """What `reduce` asked for, of all units that are done, by the names of the quantities."""
+        store = Store(self.store)
+        spec, totals = store.spec(), {}
+        for unit in sorted(store.done()) if spec["reduce"] else ():
+            for name, part in from_bytes(store.statistics(unit)).items():
+                totals[name] = merged(totals.get(name), part)
+        shapes = {q["name"]: tuple(q["shape"]) for q in spec["kept"]}
+        return {name: summary(Statistics(**spec["reduce"][name]), x, shapes[name]) for name, x in totals.items()}
+
+    def damaged(self) -> dict[int, str]:
+        """What is wrong with chunks of finished units, in words, by units; all of them are read."""
+        store = Store(self.store)
+        return store.damaged(store.spec(), store.done(), whole=True)
+
+
+def sweep(
+    system: System,
+    over: dict,
+    ts: jax.Array,
+    *,
+    q0: PyTree,
+    qdot0: PyTree,
+    params: PyTree = None,
+    keep: Callable,
+    store: str | Path,
+    reduce: dict[str, Statistics] | None = None,
+    unit: int | None = None,
+    executor: Any = None,
+    isolate: bool | float = False,
+    progress: bool = True,
+    rtol: float | None = None,
+    atol: float | None = None,
+    max_steps: int = 65_536,
+    event: Any = None,
+    solver: Any = None,
+) -> Sweep:
+    r"""Run `system` for every point of `over`, keep a few numbers of each motion, and store them in a folder.
+
+    The store is the job: called again with the same description, `sweep` goes on where it was stopped, by a failure of
+    the machine at any moment too; and `python -m lagjax sweep run STORE` in another shell, on another machine that
+    shares the disk, or in an array of batch jobs works on the same units, and may join or die at any time.
+
+    **Everyday arguments**
+
+    - `over`: a dict of axes, of which the product is swept. A 1-D array is an axis by its name; a design
+      (`lagjax.random`, `lagjax.sobol`, `lagjax.latin_hypercube`) draws its values by a rule; a tuple of names with a
+      tuple of arrays, or with a design, varies several together. There may be 10⁸ members: they are never listed.
+    - `ts`: output times, shape (T,), of every member.
+    - `q0`, `qdot0`, `params`: values for all, or functions of one member's point, which is a dict of numbers by the
+      names in `over`.
+    - `keep(trajectory)`: a dict of what remains of a member, numbers or arrays by names, from its `Trajectory`.
+    - `store`: a folder. `xarray.open_zarr(store)` reads it, with the names of `over` as dimensions and coordinates, the
+      kept quantities as variables, and `result`: how each member ended, −1 for those still to do. NaN, or the least
+      integer, stands where there is no value.
+
+    **Rarer ones**
+
+    - `reduce`: for quantities that are too many to keep, `lagjax.Statistics` by their names: count, mean, variance,
+      extremes with their members, histogram, quantiles. Those are merged in the order of the units, and stored instead
+      of the members' values. Read them by `Sweep.statistics()`.
+    - `unit`: members of a unit of work, which is a chunk of the store and what a worker that dies loses. By default as
+      many as take 20 s here, at most 64 MiB of what is kept.
+    - `executor`: any `concurrent.futures.Executor`, such as dask's `client.get_executor()`; a task is a unit. By
+      default this process works, with the machine code's threads on all cores, and writes a unit while it computes the
+      next.
+    - `isolate`: compute in a child process. A unit whose child dies, or takes longer over a batch than `isolate`
+      seconds (True: 600), is halved until the members are known that end it; these are labelled `crashed`.
+    - `progress`: a line on stderr.
+    - `rtol`, `atol`, `max_steps`, `event`, `solver`: as in `simulate_batch`.
+
+    Members that fail cost the others nothing: `result` says how each ended, `print(sweep)` names them. Functions
+    written in jax.numpy are compiled for all members at once; others are called member by member, which is told, and
+    where `keep` then raises or returns another shape for some member, that one is `keep_failed`. Numbers are the same,
+    bit for bit, whoever computes which unit, on machines of one kind of CPU.
+
+    Memory: beside Python and JAX two units of what is kept (128 MiB), and a few times the path of a batch (64 MiB).
+
+    **Raises** `TypeError` or `ValueError` for what cannot be right, before anything is computed, and for a store that
+    was begun with another description, saying what differs; `OSError` for a disk that is full or read-only,
+    `ImportError` without the packages zarr and cloudpickle.
+
+    Source: Salmon et al., SC 2011, for the counter-based draws.
+
+    ```python
+    import jax, jax.numpy as jnp, numpy as np, tempfile, lagjax
+    jax.config.update("jax_enable_x64", True)
+
+    pendulum = lagjax.System(lambda q, qdot, params: 0.5 * params**2 * qdot**2 + 9.81 * params * jnp.cos(q))
+    swept = lagjax.sweep(
+        pendulum,
+        {"length": np.linspace(0.5, 1.5, 11), "angle": np.linspace(0.0, 3.0, 16)},
+        jnp.linspace(0.0, 5.0, 51),
+        q0=lambda point: point["angle"],
+        qdot0=0.0,
+        params=lambda point: point["length"],
+        keep=lambda trajectory: {"fastest": jnp.abs(trajectory.qdot).max()},
+        store=tempfile.mkdtemp() + "/pendulums.zarr",
+        progress=False,
+    )
+    assert swept.open().fastest.dims == ("length", "angle")
+    ```
+    """
+    require_system(system)
+    require_flag(progress, "progress")
+    settings = dict(rtol=rtol, atol=atol, max_steps=max_steps, event=event, solver=solver)
+    motions = Motions(system, np.asarray(ts, float), q0, qdot0, params, _callable(keep), _reduce(reduce), settings)
+    axes, place = axes_of(over), Store(Path(store).absolute())
+    if place.unfinished_creation():
+        place.clear()
+    child = Child(place.path, isolate) if isolate else None
+    with child or nullcontext():
+        if not place.path.exists():
+            begin(place, axes, motions, unit, child.look if child else first_look)
+        spec = place.spec()
+        require_same(place, spec, axes, motions)
+        job = Job.of(place, spec, motions)
+        repair(job)
+        show = Progress(place, spec, progress)
+        if executor is not None:
+            submit(job, executor, show)
+        else:
+            work(job, show, child.compute if child else compute)
+    show.end()
+    return Sweep(place.path)
+
+
+def _callable(keep: Any) -> Callable:
+    if not callable(keep):
+        raise TypeError(f"keep must be a function of a trajectory that returns a dict; got {keep!r}.")
+    return keep
+
+
+def _reduce(reduce: Any) -> dict[str, Statistics]:
+    if reduce is None:
+        return {}
+    if not isinstance(reduce, dict) or not all(isinstance(how, Statistics) for how in reduce.values()):
+        raise TypeError("reduce must be a dict of lagjax.Statistics by the names that keep returns.")
+    return reduce

@@ -1,0 +1,87 @@
+"""`Job`: a store with the functions that belong to it, in a process that is to compute."""
+
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+
+import jax
+
+from lagjax._sweep._batch import Batches, Kept, batches_of
+from lagjax._sweep._members import Grid
+from lagjax._sweep._scene import Motions, difference, texts, unpacked
+from lagjax._sweep._store import RESULT, Store
+
+
+@dataclass(frozen=True)
+class Job:
+    """A store, its description, and what computes its members."""
+
+    store: Store
+    spec: dict
+    grid: Grid
+    motions: Motions
+    batches: Batches
+
+    @classmethod
+    def of(cls, store: Store, spec: dict, motions: Motions) -> "Job":
+        """The job of a store whose functions are at hand."""
+        batches = batches_of(motions, spec["conserves"])
+        batches.quantities = [q for q in store.quantities({**spec, "reduce": {}}) if q != RESULT]
+        return cls(store, spec, store.grid(spec), motions, batches)
+
+    def require_engine(self, kept: Kept) -> None:
+        """Raise `ValueError` where another engine integrates here than where the store was begun."""
+        if kept.engine != self.spec["engine"]:
+            raise ValueError(
+                f"{self.store.path} was begun with the engine {self.spec['engine']}, here {kept.engine} integrates: "
+                "the bits would differ. Choose the same device, by JAX_PLATFORMS=cpu for machine code."
+            )
+
+
+@contextmanager
+def precision(spec: dict) -> Iterator[None]:
+    """With numbers of the precision that the store was begun with, in this thread."""
+    with jax.enable_x64(bool(spec["x64"])):
+        yield
+
+
+@lru_cache(maxsize=4)
+def opened(path: str) -> Job:
+    """The job of a store in a process that knows nothing but its path. Raises where it is not what was begun."""
+    store = Store(Path(path))
+    spec = store.spec()
+    require_versions(store, spec)
+    with precision(spec):
+        motions = unpacked((store.job / "scene.pkl").read_bytes(), spec["path"])
+        names = [name for axis in spec["axes"] for name in axis["names"]]
+        if change := difference(spec["scene"], texts(motions, names)):
+            raise ValueError(f"{store.path}: the scene is not here what it was when the store was begun.\n{change}")
+        return Job.of(store, spec, motions)
+
+
+def versions() -> dict[str, str]:
+    """Of what the bits of a store depend on, and of Python, whose code travels."""
+    of_packages = {name: metadata.version(name) for name in ("jax", "jaxlib", "diffrax", "numpy")}
+    return {"lagjax": _own_version(), "python": ".".join(platform.python_version_tuple()[:2]), **of_packages}
+
+
+def _own_version() -> str:
+    try:
+        return metadata.version("lagjax")
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def require_versions(store: Store, spec: dict) -> None:
+    """Raise `ValueError` where this process would compute other bits, or cannot read the functions."""
+    here = versions()
+    other = [f"{name} {was}, here {here[name]}" for name, was in spec["versions"].items() if here.get(name) != was]
+    if other:
+        raise ValueError(
+            f"{store.path} was begun with {'; '.join(other)}: its numbers would not be of one program. Install that "
+            "version to go on, or begin another store. What is there can be read."
+        )

@@ -1,0 +1,164 @@
+"""The members of a sweep: the product of the axes of `over`, its points, and how units tile it.
+
+    over ──axes_of──► Axis, … ──► Grid: shape, units ──► the range of a unit ──► points of some of its members
+
+A member is a place in the grid; its number counts in the order of C, the last axis fastest. A unit is a box of members
+without gaps in that order, and one chunk of every array in the store.
+"""
+
+import hashlib
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lagjax._sweep._designs import Design
+
+RESERVED = ("result",)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis: the names that vary along it together, and their values (size, names), or the rule for them."""
+
+    names: tuple[str, ...]
+    size: int
+    source: Any  # a tuple of arrays (size,), or a Design
+
+    @property
+    def dimension(self) -> str:
+        """The name of the axis in the store."""
+        return "_".join(self.names)
+
+    def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
+        """(start, values (m, names)), one after the other."""
+        if isinstance(self.source, Design):
+            yield from self.source.pieces(self.names)
+        else:
+            yield 0, np.stack(self.source, axis=1)
+
+    def described(self) -> dict:
+        """The names, the size and the rule, or a hash of the values."""
+        about = {"names": list(self.names), "size": self.size}
+        if isinstance(self.source, Design):
+            return about | self.source.described()
+        values = hashlib.sha256(b"".join(np.ascontiguousarray(x).tobytes() for x in self.source)).hexdigest()
+        ends = [[float(x[0]), float(x[-1])] for x in self.source]
+        return about | {"rule": "values", "ends": ends, "sha256": values}
+
+
+def axes_of(over: Any) -> tuple[Axis, ...]:
+    """The axes of `over`. Raises `TypeError` or `ValueError`, with a sentence, where it is no description."""
+    if not isinstance(over, dict) or not over:
+        raise TypeError(
+            "over must be a dict that is not empty: names with 1-D arrays or designs, as in {'l': np.linspace(1, 2, "
+            f"50), ('a', 'b'): lagjax.random(1000, seed=1)}}; got {type(over).__name__}."
+        )
+    axes = tuple(_axis(key, value) for key, value in over.items())
+    names = [name for axis in axes for name in axis.names]
+    taken = [*names, *(axis.dimension for axis in axes if len(axis.names) > 1), *RESERVED]
+    for name in taken:
+        if taken.count(name) > 1:
+            raise ValueError(f"over uses the name {name!r} twice (`result` is taken, and so are joined names): rename.")
+    return axes
+
+
+def _axis(key: Any, value: Any) -> Axis:
+    names = key if isinstance(key, tuple) else (key,)
+    for name in names:
+        if not isinstance(name, str) or not name.isidentifier():
+            raise TypeError(f"Keys of over are names, or tuples of names, such as 'theta1'; got {key!r}.")
+    if isinstance(value, Design):
+        return Axis(names, value.count, value.about(names))
+    columns = value if isinstance(key, tuple) else (value,)
+    if not isinstance(columns, tuple | list) or len(columns) != len(names):
+        raise ValueError(f"over[{key!r}] must be a design, or a tuple of {len(names)} arrays of one length.")
+    arrays = tuple(_column(name, x) for name, x in zip(names, columns, strict=True))
+    if len({x.size for x in arrays}) > 1:
+        sizes = ", ".join(f"{name} {x.size}" for name, x in zip(names, arrays, strict=True))
+        raise ValueError(f"What over[{key!r}] steps through together must have one length; got {sizes}.")
+    return Axis(names, arrays[0].size, arrays)
+
+
+def _column(name: str, value: Any) -> np.ndarray:
+    array = np.asarray(value)
+    if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "fiu":
+        raise ValueError(
+            f"over[{name!r}] must be a 1-D array of real numbers that is not empty, or a design such as "
+            f"lagjax.random(1000, seed=1); got an array of shape {array.shape} and type {array.dtype}."
+        )
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError(f"over[{name!r}][{int(np.argmin(np.isfinite(array)))}] is not finite.")
+    return array
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The shape of all members and of the chunk that is a unit's."""
+
+    shape: tuple[int, ...]
+    chunk: tuple[int, ...]
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], members: int) -> "Grid":
+        """With units of about so many members: whole last axes, a part of one, single places of those before it."""
+        chunk, room = [1] * len(shape), max(1, members)
+        for place in reversed(range(len(shape))):
+            chunk[place] = min(shape[place], room)
+            if chunk[place] < shape[place]:
+                chunk[place] = math.ceil(shape[place] / math.ceil(shape[place] / chunk[place]))  # evenly
+                break
+            room = max(1, room // shape[place])
+        return cls(tuple(shape), tuple(chunk))
+
+    @property
+    def members(self) -> int:
+        """How many members there are."""
+        return math.prod(self.shape)
+
+    @property
+    def tiles(self) -> tuple[int, ...]:
+        """How many units there are along each axis."""
+        return tuple(math.ceil(size / part) for size, part in zip(self.shape, self.chunk, strict=True))
+
+    @property
+    def units(self) -> int:
+        """How many units there are."""
+        return math.prod(self.tiles)
+
+    def place(self, unit: int) -> tuple[int, ...]:
+        """Where a unit is among the units; the name of its chunk."""
+        return tuple(int(i) for i in np.unravel_index(unit, self.tiles))
+
+    def box(self, unit: int) -> tuple[slice, ...]:
+        """The range of a unit along each axis."""
+        parts = zip(self.place(unit), self.chunk, self.shape, strict=True)
+        return tuple(slice(i * part, min((i + 1) * part, size)) for i, part, size in parts)
+
+    def box_shape(self, unit: int) -> tuple[int, ...]:
+        """How many members a unit has along each axis."""
+        return tuple(s.stop - s.start for s in self.box(unit))
+
+    def size(self, unit: int) -> int:
+        """How many members a unit has."""
+        return math.prod(self.box_shape(unit))
+
+    def numbers(self, unit: int, which: np.ndarray) -> np.ndarray:
+        """The numbers in the whole sweep of members of a unit, `which` counts inside of it."""
+        inside = np.unravel_index(which, self.box_shape(unit))
+        places = [i + s.start for i, s in zip(inside, self.box(unit), strict=True)]
+        return np.asarray(np.ravel_multi_index(places, self.shape))
+
+
+def points_of(axes: list[dict[str, np.ndarray]], shape: tuple[int, ...], which: np.ndarray) -> dict[str, np.ndarray]:
+    """The points of members of a box of this `shape`: `axes` holds the values along each axis, by names."""
+    places = np.unravel_index(which, shape)
+    return {name: values[i] for i, axis in zip(places, axes, strict=True) for name, values in axis.items()}
+
+
+def text_of(point: dict[str, Any]) -> str:
+    """A point in words: 'l = 0.5, theta = 1.2'; all digits, so that it can be run again."""
+    return ", ".join(f"{name} = {float(value)!r}" for name, value in point.items())

@@ -1,0 +1,214 @@
+"""`Motions`: what is done with each member; its text and its hash, and the way of its functions to another process.
+
+A worker in another shell gets the functions by cloudpickle: those of the user's script by value, those of modules by
+name, found along the same `sys.path`. Whether they still are what the store was begun with is told by their programs,
+as JAX traces them, with every constant: a change of a global number changes those, though not the text of a function.
+"""
+
+import difflib
+import functools
+import hashlib
+import inspect
+import re
+import sys
+import textwrap
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._arguments import accept
+from lagjax._sweep._statistics import Statistics
+from lagjax._system import System
+
+PyTree = Any
+ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
+NOT_TRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
+_SHOWN = 40  # lines of a difference
+
+
+@dataclass(frozen=True)
+class Motions:
+    """What is done with each member: the scene, its start as values or functions of a point, and what is kept."""
+
+    system: System
+    ts: np.ndarray
+    q0: Any
+    qdot0: Any
+    params: Any
+    keep: Callable
+    reduce: dict[str, Statistics]
+    settings: dict[str, Any]  # of `simulate_batch`: rtol, atol, max_steps, event, solver
+
+    def start(self, point: dict[str, Any]) -> tuple[PyTree, PyTree, PyTree]:
+        """(q0, qdot0, params) of the member at a point."""
+        q0, qdot0, params = (x(point) if callable(x) else x for x in (self.q0, self.qdot0, self.params))
+        return q0, qdot0, params
+
+    def described(self) -> dict:
+        """The numbers among it, by name, for the store."""
+        shown = {name: _value_text(value) for name, value in self.settings.items() if name != "event"}
+        times = {"ends": [float(self.ts[0]), float(self.ts[-1])], "outputs": len(self.ts), "sha256": _hash(self.ts)}
+        return {"ts": times, **shown, "reduce": {name: how.described() for name, how in self.reduce.items()}}
+
+
+# ---- text and hash ---------------------------------------------------------------------------------------------------
+
+
+def texts(motions: Motions, names: list[str]) -> dict[str, dict[str, str]]:
+    """For every function and value: its text, and its program as JAX traces it (the text where it cannot)."""
+    point = {name: jnp.zeros(()) for name in names}
+    try:
+        state = jax.eval_shape(motions.start, point)
+    except NOT_TRACEABLE:
+        state = motions.start({name: 0.5 for name in names})
+    q, qdot, params = state
+    found = {}
+    for role in ROLES:
+        function = getattr(motions.system, role)
+        if function is not None:
+            arguments = (q,) if role == "constraints" else (q, qdot)
+            found[role] = _entry(function.code, _traced(function, arguments, params), function.arrays)
+    event = motions.settings.get("event")
+    if event is not None:
+        condition = getattr(event, "cond_fn", event)
+        of_event = _traced(accept(condition, "event"), (q, qdot), params) if callable(condition) else None
+        found["event"] = _entry(condition, of_event) if callable(condition) else _entry(repr(event), None)
+    for role in ("q0", "qdot0", "params"):
+        value = getattr(motions, role)
+        found[role] = _entry(value, (lambda f=value: jax.make_jaxpr(f)(point)) if callable(value) else None)
+    found["keep"] = _entry(motions.keep, None)
+    return found
+
+
+def _traced(function, arguments: tuple, params) -> Callable:
+    def program():
+        def of_all(*roles, t, params):
+            return function(*roles, t=t, params=params)
+
+        return jax.make_jaxpr(of_all)(*arguments, t=jnp.zeros(()), params=params)
+
+    return program
+
+
+def _entry(value: Any, program: Callable | None, *more: Any) -> dict[str, str]:
+    text = source(value) if callable(value) else _value_text(value)
+    used = _used(value) if callable(value) else text
+    if program is None:
+        return {"text": text, "program": used}
+    try:
+        closed = program()
+    except Exception:  # not written in jax.numpy, or it needs leaves that are no numbers: its code stands for it
+        return {"text": text, "program": used}
+    shown = re.sub(r"0x[0-9a-f]+", "0x", str(closed))
+    constants = [_value_text(x) for x in [*closed.consts, *jax.tree.leaves(more)]]
+    return {"text": text, "program": "\n".join([shown, *constants])}
+
+
+def source(function: Any) -> str:
+    """The lines of a function, or its name where there are none to be read."""
+    while hasattr(function, "func"):
+        function = function.func
+    try:
+        return textwrap.dedent(inspect.getsource(function)).strip()
+    except (OSError, TypeError):
+        return f"<{getattr(function, '__qualname__', type(function).__name__)}, whose text cannot be read>"
+
+
+def _used(function: Any, depth: int = 0) -> str:
+    """The byte code of a function, and the numbers and functions that it uses from outside; in words."""
+    if isinstance(function, functools.partial):
+        return "\n".join([_used(function.func, depth), _value_text((function.args, function.keywords))])
+    code = getattr(function, "__code__", None)
+    if code is None or depth > 8:
+        return getattr(function, "__qualname__", type(function).__name__)
+    outside = inspect.getclosurevars(function)
+    values = {**outside.globals, **outside.nonlocals}
+    lines = [f"{name} = {_used_text(value, depth + 1)}" for name, value in sorted(values.items())]
+    return "\n".join([_code_text(code), _value_text(function.__defaults__), *lines])
+
+
+def _code_text(code: types.CodeType) -> str:
+    """A hash of what a function does, its numbers and names included; not of where it stands."""
+    inner = [_code_text(x) if isinstance(x, types.CodeType) else repr(x) for x in code.co_consts]
+    text = "\n".join([code.co_code.hex(), repr(code.co_names), repr(code.co_varnames), *inner])
+    return "code " + hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _used_text(value: Any, depth: int) -> str:
+    if inspect.ismodule(value) or inspect.isclass(value):
+        return getattr(value, "__name__", "")
+    if getattr(value, "__module__", "").split(".")[0] in ("jax", "numpy", "lagjax", "equinox", "diffrax"):
+        return f"{value.__module__}.{getattr(value, '__qualname__', '')}"  # the versions tell of these
+    return _used(value, depth) if callable(value) else _value_text(value)
+
+
+def _value_text(value: PyTree) -> str:
+    """A pytree of numbers in words, large arrays by their hash."""
+    lines = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(value):
+        if isinstance(leaf, jax.Array | np.ndarray) and np.size(leaf) > 16:
+            leaf = f"{leaf.dtype}{np.shape(leaf)} {_hash(np.asarray(leaf))}"
+        elif isinstance(leaf, jax.Array | np.ndarray):
+            leaf = f"{leaf.dtype} {np.asarray(leaf).tolist()}"
+        lines.append(re.sub(r"0x[0-9a-f]+", "0x", f"{jax.tree_util.keystr(path)} {leaf!r}".strip()))
+    return "\n".join(lines) or "None"
+
+
+def _hash(array: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
+
+
+def difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]) -> str | None:
+    """What differs between the texts in a store and those of a call, line by line; None where nothing does."""
+    parts = []
+    for role in dict.fromkeys([*before, *now]):
+        old, new = (x.get(role, {"text": "", "program": ""}) for x in (before, now))
+        if old["program"] == new["program"]:
+            continue
+        kind = "text" if old["text"] != new["text"] else "program"
+        why = "" if kind == "text" else " (its text is the same; a value that it uses is not)"
+        lines = list(difflib.unified_diff(old[kind].split("\n"), new[kind].split("\n"), "store", "now", "", "", 1, ""))
+        parts.append("\n".join([f"{role}{why}:", *lines[2 : 2 + _SHOWN]]))
+    return "\n".join(parts) or None
+
+
+# ---- to another process ----------------------------------------------------------------------------------------------
+
+
+def packed(motions: Motions) -> bytes:
+    """The motions as bytes. Raises `ImportError` without cloudpickle, `TypeError` where a function cannot be packed."""
+    try:
+        import cloudpickle
+    except ImportError:
+        raise ImportError("sweep() needs the package cloudpickle: pip install cloudpickle.") from None
+    try:
+        return cloudpickle.dumps(motions)
+    except Exception as why:
+        raise TypeError(f"A function of this sweep cannot be sent to another process: {why}") from why
+
+
+def unpacked(data: bytes, path: list[str]) -> Motions:
+    """The motions again, modules of the user found along his `path`. Raises `ImportError` where one is not."""
+    import pickle
+
+    sys.path += [place for place in path if place not in sys.path]
+    try:
+        return pickle.loads(data)
+    except (ImportError, AttributeError) as why:
+        raise ImportError(
+            f"The functions of this sweep cannot be rebuilt here: {why}. They were defined in a module that this "
+            f"process does not find; put its folder on PYTHONPATH."
+        ) from why
+
+
+def users_path() -> list[str]:
+    """The places of `sys.path` that are not Python's own or of installed packages."""
+    own = {str(Path(sys.prefix).resolve()), str(Path(sys.base_prefix).resolve())}
+    places = [str(Path(place or ".").resolve()) for place in sys.path]
+    return [place for place in dict.fromkeys(places) if not any(place.startswith(prefix + "/") for prefix in own)]

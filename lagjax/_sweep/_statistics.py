@@ -1,0 +1,214 @@
+"""`Statistics`: what is said of a quantity over all members, without a list of them.
+
+Each unit has one `Partial`, which stands in the store; they are merged in the order of the units, so that the bits of
+the result do not depend on who computed what, and when. Counts, histograms and quantiles are whole numbers; mean and
+variance are merged as Chan, Golub & LeVeque do (*Algorithms for computing the sample variance*, Am. Stat. 37 (1983)
+242). Quantiles are read off a histogram in log|x|, whose bins are `RELATIVE` wide: DDSketch (Masson, Rim & Lee,
+*DDSketch: a fast and fully-mergeable quantile sketch*, VLDB 12 (2019) 2195).
+"""
+
+import io
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+RELATIVE = 1e-3  # of a quantile: its error, as a part of it; bins of a sketch, and its bytes, go as one over it
+_LOG_GAMMA = np.log((1 + RELATIVE) / (1 - RELATIVE))
+_OFFSET = 2**20  # more than |log x| / log γ of any double
+
+
+class Statistics:
+    """What `reduce` asks of a quantity: count, mean, variance, least and greatest with their members, always.
+
+    - `edges` (B + 1,): a histogram between these edges, in increasing order; the last bin includes its upper edge.
+    - `quantiles`: levels between 0 and 1, such as (0.05, 0.5, 0.95); read off to a thousandth of the value.
+
+    Members that failed, and values that are not finite, are left out and counted. Raises `ValueError` for edges that do
+    not increase and levels that are none.
+
+    ```python
+    import numpy as np, lagjax
+
+    reduce = {"height": lagjax.Statistics(edges=np.linspace(0.0, 2.0, 41), quantiles=(0.5, 0.99))}
+    ```
+    """
+
+    def __init__(self, edges=None, quantiles: Iterable[float] = ()):
+        self.edges = None if edges is None else np.asarray(edges, float)
+        self.quantiles = tuple(float(level) for level in quantiles)
+        if self.edges is not None and not (
+            self.edges.ndim == 1 and self.edges.size > 1 and np.all(np.diff(self.edges) > 0)
+        ):
+            raise ValueError("edges must be two numbers or more that increase.")
+        if any(not 0 <= level <= 1 for level in self.quantiles):
+            raise ValueError(f"quantiles must lie between 0 and 1; got {self.quantiles}.")
+
+    def described(self) -> dict:
+        """The description for the store."""
+        edges = None if self.edges is None else self.edges.tolist()
+        return {"edges": edges, "quantiles": list(self.quantiles)}
+
+
+class Partial(NamedTuple):
+    """The statistics of a unit or of several, for C columns of a quantity.
+
+    - `count`, `missing` (C,): values that are finite, and those that are not or are of members that failed.
+    - `mean`, `square` (C,): Σ x / n and Σ (x − mean)².
+    - `least`, `greatest` (C,), and the numbers of their members.
+    - `histogram` (C, B); `outside` (C, 2): below the first and above the last edge.
+    - `sketch` (K, 3): column, bin and count of what is in it, in the order of columns and bins.
+    """
+
+    count: np.ndarray
+    missing: np.ndarray
+    mean: np.ndarray
+    square: np.ndarray
+    least: np.ndarray
+    least_member: np.ndarray
+    greatest: np.ndarray
+    greatest_member: np.ndarray
+    histogram: np.ndarray
+    outside: np.ndarray
+    sketch: np.ndarray
+
+
+class Summary(NamedTuple):
+    """The statistics of a quantity over all members; every field has the shape of the quantity, some one axis more.
+
+    - `count`, `missing`: values that entered, and that did not: not finite, or of members that failed.
+    - `mean`, `variance`: of what entered, the variance with n − 1.
+    - `min`, `max`, and `min_member`, `max_member`: the numbers of the members that have them, −1 without any.
+    - `histogram` (…, B), `outside` (…, 2): counts, and those below and above; None without edges.
+    - `quantiles` (…, Q): of the levels that were asked for; None without.
+    """
+
+    count: np.ndarray
+    missing: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
+    min: np.ndarray
+    min_member: np.ndarray
+    max: np.ndarray
+    max_member: np.ndarray
+    histogram: np.ndarray | None
+    outside: np.ndarray | None
+    quantiles: np.ndarray | None
+
+
+def partial_of(how: Statistics, values: np.ndarray, ok: np.ndarray, members: np.ndarray) -> Partial:
+    """The statistics of a unit: `values` (m, …) of its members, whether they ended well, and their numbers (m,)."""
+    columns = values.reshape(len(values), -1).astype(float).T
+    rows = [_of_column(how, c, x, ok & np.isfinite(x), members) for c, x in enumerate(np.ascontiguousarray(columns))]
+    *fields, sketches = zip(*rows, strict=True)
+    return Partial._make([*map(np.array, fields), np.concatenate(sketches)])
+
+
+def _of_column(how: Statistics, c: int, x: np.ndarray, use: np.ndarray, members: np.ndarray) -> tuple:
+    missing, x, members = int(np.sum(~use)), x[use], members[use]
+    bins = 0 if how.edges is None else len(how.edges) - 1
+    if not x.size:
+        none = (0, missing, 0.0, 0.0, np.inf, -1, -np.inf, -1)
+        return *none, np.zeros(bins, int), np.zeros(2, int), np.zeros((0, 3), int)
+    mean = np.sum(x) / len(x)
+    least, greatest = int(np.argmin(x)), int(np.argmax(x))
+    histogram, outside = np.zeros(0, int), np.zeros(2, int)
+    if how.edges is not None:
+        histogram = np.histogram(x, how.edges)[0]
+        outside = np.array([np.sum(x < how.edges[0]), np.sum(x > how.edges[-1])])
+    sketch = np.zeros((0, 3), int)
+    if how.quantiles:
+        keys, counts = np.unique(_bin_of(x), return_counts=True)
+        sketch = np.stack([np.full(len(keys), c), keys, counts], axis=1)
+    ends = x[least], members[least], x[greatest], members[greatest]
+    return len(x), missing, mean, np.sum((x - mean) ** 2), *ends, histogram, outside, sketch
+
+
+def _bin_of(x: np.ndarray) -> np.ndarray:
+    """The bins of numbers, in increasing order of these; 0 is zero's."""
+    with np.errstate(divide="ignore"):
+        size = np.ceil(np.log(np.abs(x)) / _LOG_GAMMA)
+    return np.where(x == 0, 0, np.sign(x) * (np.where(x == 0, 0.0, size) + _OFFSET)).astype(np.int64)
+
+
+def _middle_of(bins: np.ndarray) -> np.ndarray:
+    """The numbers at most `RELATIVE` from all that are in these bins."""
+    size = np.exp((np.abs(bins) - _OFFSET) * _LOG_GAMMA) * 2 / (1 + np.exp(_LOG_GAMMA))
+    return np.where(bins == 0, 0.0, np.sign(bins) * size)
+
+
+def merged(one: Partial | None, two: Partial) -> Partial:
+    """The statistics of two sets of members, those of `one` before those of `two`."""
+    if one is None:
+        return two
+    count = one.count + two.count
+    share = two.count / np.maximum(count, 1)
+    step = two.mean - one.mean
+    lower, higher = two.least < one.least, two.greatest > one.greatest
+    keys, where = np.unique(np.concatenate([one.sketch[:, :2], two.sketch[:, :2]]), axis=0, return_inverse=True)
+    counts = np.zeros(len(keys), int)
+    np.add.at(counts, where.ravel(), np.concatenate([one.sketch[:, 2], two.sketch[:, 2]]))
+    return Partial(
+        count=count,
+        missing=one.missing + two.missing,
+        mean=np.where(one.count > 0, one.mean + step * share, two.mean),
+        square=one.square + two.square + step**2 * one.count * share,
+        least=np.where(lower, two.least, one.least),
+        least_member=np.where(lower, two.least_member, one.least_member),
+        greatest=np.where(higher, two.greatest, one.greatest),
+        greatest_member=np.where(higher, two.greatest_member, one.greatest_member),
+        histogram=one.histogram + two.histogram,
+        outside=one.outside + two.outside,
+        sketch=np.concatenate([keys, counts[:, None]], axis=1),
+    )
+
+
+def summary(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
+    """What is told of a quantity of this shape."""
+    empty = total.count == 0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        variance = np.where(total.count > 1, total.square / (total.count - 1), np.nan)
+    ends = [np.where(empty, np.nan, x) for x in (total.least, total.greatest)]
+    quantiles = None
+    if how.quantiles:
+        rows = [_quantiles(how, total.sketch[total.sketch[:, 0] == c, 1:]) for c in range(len(total.count))]
+        quantiles = np.array(rows).reshape(*shape, len(how.quantiles))
+    return Summary(
+        count=total.count.reshape(shape),
+        missing=total.missing.reshape(shape),
+        mean=np.where(empty, np.nan, total.mean).reshape(shape),
+        variance=variance.reshape(shape),
+        min=ends[0].reshape(shape),
+        min_member=total.least_member.reshape(shape),
+        max=ends[1].reshape(shape),
+        max_member=total.greatest_member.reshape(shape),
+        histogram=None if how.edges is None else total.histogram.reshape(*shape, -1),
+        outside=None if how.edges is None else total.outside.reshape(*shape, 2),
+        quantiles=quantiles,
+    )
+
+
+def _quantiles(how: Statistics, sketch: np.ndarray) -> list[float]:
+    if not len(sketch):
+        return [np.nan] * len(how.quantiles)
+    below = np.cumsum(sketch[:, 1])
+    ranks = [level * (below[-1] - 1) for level in how.quantiles]
+    return [float(_middle_of(sketch[np.searchsorted(below, rank, side="right"), 0])) for rank in ranks]
+
+
+# ---- as bytes --------------------------------------------------------------------------------------------------------
+
+
+def to_bytes(partials: dict[str, Partial]) -> bytes:
+    """Statistics of a unit by the names of quantities, as one file."""
+    arrays = {f"{name}/{field}": x for name, part in partials.items() for field, x in part._asdict().items()}
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+def from_bytes(data: bytes) -> dict[str, Partial]:
+    """What `to_bytes` was given."""
+    with np.load(io.BytesIO(data)) as file:
+        names = dict.fromkeys(key.rsplit("/", 1)[0] for key in file)
+        return {name: Partial(*(file[f"{name}/{field}"] for field in Partial._fields)) for name in names}

@@ -1,0 +1,164 @@
+"""`Status`: how far a sweep has come, read from the store by anybody at any time."""
+
+import sys
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._sweep._claims import claimed
+from lagjax._sweep._members import text_of
+from lagjax._sweep._store import Store
+
+WELL = ("successful", "event_occurred")
+_RECENT = 32  # units from which the rate is told
+_NAMED = 5  # failures that are printed
+_LISTED = 100  # failures that are listed; the array `result` has all
+
+
+class Failure(NamedTuple):
+    """A member that did not end well: its number, its point, its result, and what is known of why."""
+
+    member: int
+    point: dict[str, float]
+    result: str
+    why: str
+
+
+class Status(NamedTuple):
+    """How far a sweep has come; print it, or read its fields.
+
+    - `done`, `members`: how many members are done, of how many; `units_done`, `units`, `claimed` alike.
+    - `rate`: members per second of late, None before it is known; `left`: seconds until the end at that rate.
+    - `results`: how many members ended how, by the names of `lagjax.RESULTS`, `crashed` and `keep_failed`.
+    - `failures`: the first hundred of those that did not end well; the array `result` of the store has all.
+    - `drift`: the largest change of the energy of a member that ended well, as (change, member, point); None where
+      energy is not conserved, or none is known.
+    - `slow`: functions that are called member by member, since they are not written in jax.numpy, and why.
+    """
+
+    store: str
+    done: int
+    members: int
+    units_done: int
+    units: int
+    claimed: int
+    rate: float | None
+    left: float | None
+    results: dict[str, int]
+    failures: tuple[Failure, ...]
+    drift: tuple[float, int, dict[str, float]] | None
+    slow: dict[str, str]
+
+    def __str__(self) -> str:
+        lines = [f"{self.store}", f"done       {self.done:,} of {self.members:,} members, {self.units_done} of "
+                 f"{self.units} units ({self.claimed} claimed)"]  # fmt: skip
+        if self.rate is not None and self.left is not None:
+            end = f", {duration(self.left)} left" if self.done < self.members else ""
+            lines.append(f"rate       {self.rate:,.0f} members per second{end}")
+        lines += [f"{'results' if not k else '':10} {name} {n:,}" for k, (name, n) in enumerate(self.results.items())]
+        for k, f in enumerate(self.failures[:_NAMED]):
+            why = f": {f.why}" if f.why else ""
+            lines.append(f"{'failed' if not k else '':10} member {f.member}, {f.result}, at {text_of(f.point)}{why}")
+        failed = sum(count for name, count in self.results.items() if name not in WELL)
+        if failed > _NAMED:
+            lines.append(f"{'':10} and {failed - _NAMED} more")
+        if self.drift is not None:
+            change, member, point = self.drift
+            lines.append(f"energy     changes by at most {change:.1e}, of member {member}, at {text_of(point)}")
+        lines += [f"slow       {name} is called member by member: {why}" for name, why in self.slow.items()]
+        return "\n".join(lines)
+
+
+def status(store: Store) -> Status:
+    """How far a store has come."""
+    spec = store.spec()
+    grid, done = store.grid(spec), sorted(store.done())
+    records = [store.record(unit) for unit in done]
+    results: dict[str, int] = {}
+    for record in records:
+        for name, count in record["results"].items():
+            results[name] = results.get(name, 0) + count
+    failed = [row for record in records for row in record["failed"]]
+    failures = tuple(Failure(number, point(store, spec, number), name, why) for number, name, why in failed[:_LISTED])
+    drifts = [tuple(record["drift"]) for record in records if "drift" in record]
+    worst = max(drifts, key=lambda pair: pair[0], default=None)
+    members, rate = sum(r["members"] for r in records), _rate(store, done, records)
+    slow = {name: why for record in records for name, why in record["slow"].items()}
+    return Status(
+        store=str(store.path), done=members, members=grid.members, units_done=len(done), units=grid.units,
+        claimed=len(set(claimed(store)) - set(done)), rate=rate,
+        left=None if rate is None else (grid.members - members) / rate, results=results, failures=failures,
+        drift=None if worst is None else (worst[0], worst[1], point(store, spec, worst[1])), slow=slow,
+    )  # fmt: skip
+
+
+def point(store: Store, spec: dict, member: int) -> dict[str, float]:
+    """The point of a member, by its number."""
+    places = np.unravel_index(member, tuple(spec["shape"]))
+    return {
+        name: float(np.asarray(store.array(name)[int(i)]))
+        for i, axis in zip(places, spec["axes"], strict=True)
+        for name in axis["names"]
+    }
+
+
+def _rate(store: Store, done: list[int], records: list[dict]) -> float | None:
+    """Members per second, from the times of the last files; the disk's clock is one for all workers."""
+    if not records:
+        return None
+    times = {unit: (store.job / "done" / f"{unit}.json").stat().st_mtime for unit in done}
+    recent = sorted(zip(done, records, strict=True), key=lambda pair: times[pair[0]])[-_RECENT:]
+    span = times[recent[-1][0]] - times[recent[0][0]]
+    first = recent[0][1]
+    if len(recent) < 2 or span <= 0:
+        return first["members"] / max(first["seconds"], 1e-9)
+    return sum(record["members"] for _, record in recent[1:]) / span
+
+
+def duration(seconds: float) -> str:
+    """A span of time in words: '1 h 23 min'."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
+
+
+class Progress:
+    """A line on stderr that is written again and again: done, rate, what failed, what is left."""
+
+    def __init__(self, store: Store, spec: dict, shown: bool):
+        self.store, self.shown, self.members = store, shown, store.grid(spec).members
+        self._begun, self._known, self._last = None, {}, 0.0
+
+    def __call__(self) -> None:
+        """Look at the store, and print."""
+        now = time.monotonic()
+        if not self.shown or now - self._last < 0.2:
+            return
+        self._last = now
+        for unit in self.store.done() - set(self._known):
+            record = self.store.record(unit)
+            self._known[unit] = record["members"], record["results"]
+        done = sum(members for members, _ in self._known.values())
+        if self._begun is None:
+            self._begun = (now, done)
+        line = f"{done:,} of {self.members:,} members"
+        since, before = self._begun
+        if done > before and now > since:
+            rate = (done - before) / (now - since)
+            line += f", {rate:,.0f} per second, {duration((self.members - done) / rate)} left"
+        failed: dict[str, int] = {}
+        for _, results in self._known.values():
+            for name, count in results.items():
+                if name not in WELL:
+                    failed[name] = failed.get(name, 0) + count
+        line += "".join(f", {count} {name}" for name, count in failed.items())
+        print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """End the line."""
+        self._last = 0.0
+        self()
+        if self.shown:
+            print(file=sys.stderr, flush=True)

@@ -1,0 +1,290 @@
+"""`Store`: a folder that is a zarr group for readers, and the job for workers.
+
+    STORE/zarr.json, <name>/zarr.json, <name>/c/…    arrays, one chunk a unit, no compression: chunks are plain numbers
+    STORE/.sweep/spec.json, scene.pkl                what is swept
+    STORE/.sweep/done/UNIT.json, UNIT.npz            a unit that is finished: counts, hashes, statistics
+    STORE/.sweep/claims/, workers/, crashed/         who works on what; members that end their process
+    STORE/.sweep/aside/                              files that are being written
+
+A file appears under its name when all of it is on the disk (written aside, then renamed), and a unit is done when the
+last of its files is. To write a unit again changes nothing, so that it does no harm if two workers do.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lagjax._sweep._designs import SLICE
+from lagjax._sweep._members import Axis, Grid
+
+FORMAT = 1
+JOB = ".sweep"
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A kept quantity: its name, shape and type for one member."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def nothing(self) -> Any:
+        """What stands where there is no value: NaN; of whole numbers the least, or greatest, of their type."""
+        kind = self.dtype.kind
+        if kind in "fc":
+            return self.dtype.type(np.nan)
+        if kind == "b":
+            return False
+        return np.iinfo(self.dtype).min if kind == "i" else np.iinfo(self.dtype).max
+
+
+RESULT = Quantity("result", (), np.dtype("int16"))
+
+
+@dataclass(frozen=True)
+class Store:
+    """The files of one sweep."""
+
+    path: Path
+
+    @property
+    def job(self) -> Path:
+        """The folder of what is for workers alone."""
+        return self.path / JOB
+
+    # ---- the description ----
+
+    def spec(self) -> dict:
+        """The description. Raises `FileNotFoundError` or `ValueError` where this is no store that can be read."""
+        file = self.job / "spec.json"
+        if not file.exists():
+            raise FileNotFoundError(errno.ENOENT, f"{self.path} is no store of a sweep: it has no {JOB}/spec.json")
+        try:
+            spec = json.loads(file.read_text())
+        except ValueError as why:
+            raise ValueError(
+                f"{file} cannot be read ({why}): the store is damaged. Its arrays are untouched."
+            ) from None
+        if spec.get("format") != FORMAT:
+            raise ValueError(
+                f"{self.path} is a store of format {spec.get('format')}, written by lagjax "
+                f"{spec.get('versions', {}).get('lagjax')}; this lagjax writes format {FORMAT}. xarray can read it as "
+                "it is; to go on with it, use that version."
+            )
+        return spec
+
+    def grid(self, spec: dict) -> Grid:
+        """The members and units."""
+        return Grid(tuple(spec["shape"]), tuple(spec["chunk"]))
+
+    def quantities(self, spec: dict) -> list[Quantity]:
+        """What is stored of each member, `result` last."""
+        kept = [Quantity(x["name"], tuple(x["shape"]), np.dtype(x["dtype"])) for x in spec["kept"]]
+        return [*(q for q in kept if q.name not in spec["reduce"]), RESULT]
+
+    def create(self, spec: dict, scene: bytes, axes: tuple[Axis, ...], title: str, codes: dict[int, str]) -> None:
+        """Make the store with empty arrays and the coordinates; it is there when its spec is, which is written last."""
+        zarr = require_zarr()
+        with self._explained("made"):
+            self.job.mkdir(parents=True, exist_ok=True)
+            for folder in ("done", "claims", "workers", "crashed", "aside"):
+                (self.job / folder).mkdir(exist_ok=True)
+            names = [name for axis in axes for name in axis.names]
+            group = zarr.create_group(str(self.path), overwrite=False, attributes={"title": title})
+            group.attrs["coordinates"] = " ".join(names)
+            for axis in axes:
+                _write_axis(group, axis)
+            grid, dimensions = self.grid(spec), tuple(axis.dimension for axis in axes)
+            for q in self.quantities(spec):
+                inner = tuple(f"{q.name}_{k}" for k in range(len(q.shape)))
+                about: dict = {}
+                if q == RESULT:
+                    about = {"flag_values": list(codes), "flag_meanings": " ".join(codes.values())}
+                group.create_array(
+                    q.name, shape=grid.shape + q.shape, chunks=grid.chunk + q.shape, dtype=q.dtype, compressors=None,
+                    filters=None, fill_value=-1 if q == RESULT else q.nothing, dimension_names=dimensions + inner,
+                    attributes=about,
+                )  # fmt: skip
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that it is no part of the format yet; readers then list no folders
+                zarr.consolidate_metadata(str(self.path))
+            self.write(self.job / "scene.pkl", scene, "spec")
+            self.write(self.job / "spec.json", json.dumps(spec, indent=1, ensure_ascii=False).encode(), "spec")
+
+    def coordinates(self, axes: list[dict], box: tuple[slice, ...]) -> list[dict[str, np.ndarray]]:
+        """The values along each axis of a box of members, by names."""
+        return [
+            {name: np.asarray(self.array(name)[part]) for name in axis["names"]}
+            for axis, part in zip(axes, box, strict=True)
+        ]
+
+    def array(self, name: str):
+        """An array of the store, to be read from."""
+        return require_zarr().open_array(str(self.path / name), mode="r")
+
+    def unfinished_creation(self) -> bool:
+        """Whether there is a folder in which a store was begun to be made, and was not."""
+        return self.job.exists() and not (self.job / "spec.json").exists()
+
+    def clear(self) -> None:
+        """Remove what an interrupted `create` has left."""
+        shutil.rmtree(self.path)
+
+    # ---- units ----
+
+    def done(self) -> set[int]:
+        """The units that are finished."""
+        return {int(name.split(".")[0]) for name in os.listdir(self.job / "done") if name.endswith(".json")}
+
+    def record(self, unit: int) -> dict:
+        """What was noted when a unit was finished."""
+        return json.loads((self.job / "done" / f"{unit}.json").read_text())
+
+    def statistics(self, unit: int) -> bytes:
+        """The statistics of a unit, as bytes."""
+        return (self.job / "done" / f"{unit}.npz").read_bytes()
+
+    def write_unit(self, spec: dict, unit: int, values: dict[str, np.ndarray], record: dict, statistics: bytes) -> None:
+        """Write the chunks of a unit (values (members, …) by name), and then that it is done."""
+        grid, hashes = self.grid(spec), {}
+        with self._explained(f"unit {unit} was not written"):
+            for q in self.quantities(spec):
+                data = self._chunk(grid, unit, q, values[q.name])
+                hashes[q.name] = hashlib.sha256(data.data).hexdigest()
+                self.write(self.chunk_file(grid, unit, q.name, q.shape), data, f"{unit}-{q.name}")
+            if statistics:
+                self.write(self.job / "done" / f"{unit}.npz", statistics, f"{unit}-statistics")
+            text = json.dumps(record | {"sha256": hashes})
+            self.write(self.job / "done" / f"{unit}.json", text.encode(), f"{unit}-done")
+
+    def _chunk(self, grid: Grid, unit: int, q: Quantity, values: np.ndarray) -> np.ndarray:
+        """The bytes of a chunk: the values of a box in their place, what lies beyond the grid filled."""
+        shape = grid.box_shape(unit)
+        values = np.ascontiguousarray(values, q.dtype).reshape(shape + q.shape)
+        if shape != grid.chunk:
+            whole = np.full(grid.chunk + q.shape, -1 if q == RESULT else q.nothing, q.dtype)
+            whole[tuple(map(slice, shape))] = values
+            values = whole
+        little = values.astype(values.dtype.newbyteorder("<"), copy=False)
+        return np.ascontiguousarray(little).reshape(-1).view(np.uint8)
+
+    def chunk_file(self, grid: Grid, unit: int, name: str, inner: tuple[int, ...]) -> Path:
+        """Where zarr looks for the chunk of a unit."""
+        return self.path / name / "c" / "/".join(map(str, grid.place(unit) + (0,) * len(inner)))
+
+    def undo(self, unit: int) -> None:
+        """Make a unit one that is still to be done."""
+        (self.job / "done" / f"{unit}.json").unlink(missing_ok=True)
+
+    def damaged(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
+        """What is wrong with finished units, in words: chunks that lack or have another size or, `whole`, hash."""
+        grid, found = self.grid(spec), {}
+        for unit in sorted(units):
+            try:
+                hashes = self.record(unit)["sha256"]
+            except (ValueError, KeyError, OSError):
+                found[unit] = f"unit {unit}: its record cannot be read"
+                continue
+            for q in self.quantities(spec):
+                file, size = self.chunk_file(grid, unit, q.name, q.shape), q.dtype.itemsize
+                size *= int(np.prod(grid.chunk + q.shape, dtype=np.int64))
+                there = file.stat().st_size if file.exists() else None
+                if there != size:
+                    have = "is not there" if there is None else f"has {there} bytes"
+                    found[unit] = f"unit {unit}: its chunk of {q.name!r} {have}, where it should have {size}"
+                elif whole and hashlib.sha256(file.read_bytes()).hexdigest() != hashes[q.name]:
+                    found[unit] = f"unit {unit}: its chunk of {q.name!r} is not what was written"
+        return found
+
+    # ---- files ----
+
+    def write(self, file: Path, data, name: str) -> None:
+        """Write a file aside, have it on the disk, and rename it."""
+        aside = self.job / "aside" / f"{os.getpid()}-{os.urandom(4).hex()}-{name}"
+        try:
+            write_through(aside, data)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(aside, file)
+        finally:
+            try:
+                aside.unlink(missing_ok=True)
+            except OSError:  # read-only: there is nothing to remove
+                pass
+
+    def require_writable(self) -> None:
+        """Raise `OSError`, with a sentence, where nothing can be written here."""
+        with self._explained("nothing was computed"):
+            self.write(self.job / "aside" / "probe", b"", "probe")
+            (self.job / "aside" / "probe").unlink(missing_ok=True)
+
+    def _explained(self, what: str) -> "_Explained":
+        return _Explained(self, what)
+
+
+class _Explained:
+    """Raises an error of the disk again, as a sentence."""
+
+    def __init__(self, store: Store, what: str):
+        self.store, self.what = store, what
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, trace):
+        if not isinstance(error, OSError):
+            return
+        if error.errno in _FULL:
+            text = "the disk is full. Make room and run the sweep again"
+        elif error.errno in _REFUSED:
+            text = f"the store is read-only for this process ({os.strerror(error.errno)})"
+        else:
+            return
+        raise OSError(
+            error.errno,
+            f"{self.store.path}: {self.what}: {text}; all units that are done are kept, and nothing is lost",
+        ) from error
+
+
+def write_through(file: Path, data) -> None:
+    """Write a file and wait until the disk has it."""
+    with open(file, "wb") as opened:
+        opened.write(data)
+        opened.flush()
+        os.fsync(opened.fileno())
+
+
+def _write_axis(group, axis: Axis) -> None:
+    """The values along an axis as coordinates, some at a time."""
+    arrays = [
+        group.create_array(
+            name, shape=(axis.size,), chunks=(min(axis.size, SLICE),), dtype="float64", compressors=None, filters=None,
+            fill_value=np.nan, dimension_names=(axis.dimension,),
+        )
+        for name in axis.names
+    ]  # fmt: skip
+    for start, values in axis.pieces():
+        for column, array in zip(values.T, arrays, strict=True):
+            for begin in range(0, len(column), SLICE):
+                array[start + begin : start + begin + SLICE] = column[begin : begin + SLICE]
+
+
+def require_zarr():
+    """The package zarr. Raises `ImportError`, with a sentence, where it is not installed."""
+    try:
+        import zarr
+    except ImportError:
+        raise ImportError('sweep() needs the package zarr, version 3: pip install "zarr>=3".') from None
+    return zarr

@@ -1,0 +1,107 @@
+"""A unit of work: a box of members, computed in batches, and what is noted of it.
+
+The batches of a unit follow from its size alone, all of one size; the last is filled up with copies of its last
+member, which are thrown away. So a member stands at the same place of the same batch whoever computes it.
+"""
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._results import ENDED_WELL
+from lagjax._sweep._batch import CRASHED, KEEP_FAILED, label
+from lagjax._sweep._job import Job
+from lagjax._sweep._members import points_of
+from lagjax._sweep._statistics import partial_of, to_bytes
+from lagjax._sweep._store import RESULT
+
+_NAMED = 100  # failures of a unit that are named in its record; the array `result` has them all
+
+
+class Unit(NamedTuple):
+    """A unit that was computed: values (m, …) by name, what is noted of it, and its statistics as bytes."""
+
+    values: dict[str, np.ndarray]
+    record: dict
+    statistics: bytes
+
+
+def parts(size: int, most: int) -> list[tuple[int, int]]:
+    """The batches of a unit of so many members: where each begins, and the size of all of them."""
+    batch = math.ceil(size / math.ceil(size / most))
+    return [(start, batch) for start in range(0, size, batch)]
+
+
+def _nobody(batch: int) -> None:
+    pass
+
+
+def compute(
+    job: Job, unit: int, crashed: Mapping[int, str] = MappingProxyType({}), tell: Callable[[int], None] = _nobody
+) -> Unit:
+    """Compute a unit without members that are known to end their process, and how; `tell(k)` before the k-th batch."""
+    began, spent = time.monotonic(), time.process_time()
+    shape, size = job.grid.box_shape(unit), job.grid.size(unit)
+    axes = job.store.coordinates(job.spec["axes"], job.grid.box(unit))
+    values, drifts, complaints = {}, np.full(size, np.nan), {}
+    for k, (start, batch) in enumerate(parts(size, job.spec["batch"])):
+        tell(k)
+        which = np.minimum(np.arange(start, start + batch), size - 1)
+        count = min(batch, size - start)
+        kept = job.batches(points_of(axes, shape, _without(which, crashed)))
+        job.require_engine(kept)
+        for name, x in {**kept.values, RESULT.name: kept.result}.items():
+            values.setdefault(name, np.empty((size, *x.shape[1:]), x.dtype))[start : start + count] = x[:count]
+        if kept.drift is not None:
+            drifts[start : start + count] = kept.drift[:count]
+        complaints |= {start + j: text for j, text in kept.complaints.items() if j < count}
+    for j in crashed:
+        _blank(job, values, drifts, j)
+    complaints |= crashed
+    record = _record(job, unit, values[RESULT.name], drifts, complaints)
+    record |= {"seconds": time.monotonic() - began, "cpu_seconds": time.process_time() - spent}
+    return Unit(values, record, _statistics(job, unit, values))
+
+
+def _without(which: np.ndarray, crashed: Mapping[int, str]) -> np.ndarray:
+    """Members of a batch with another one of them in the place of those that `crashed`."""
+    bad = np.isin(which, list(crashed))
+    if bad.all():
+        raise ValueError("All members of a batch end their process: look at one of them alone, with `simulate`.")
+    return np.where(bad, which[~bad][0], which)
+
+
+def _blank(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, j: int) -> None:
+    """A member of which nothing is known but that it ended its process."""
+    for q in job.batches.quantities:
+        values[q.name][j] = q.nothing
+    values[RESULT.name][j], drifts[j] = CRASHED, np.nan
+
+
+def _record(job: Job, unit: int, result: np.ndarray, drifts: np.ndarray, complaints: dict[int, str]) -> dict:
+    """What is noted of a unit: how members ended, the largest change of energy, and what failed."""
+    codes, counts = np.unique(result, return_counts=True)
+    record = {"unit": unit, "members": len(result), "engine": job.spec["engine"], "slow": job.batches.slow}
+    record["results"] = {label(int(code)): int(count) for code, count in zip(codes, counts, strict=True)}
+    failed = np.flatnonzero(~np.isin(result, ENDED_WELL))[:_NAMED]
+    record["failed"] = [
+        [int(number), label(int(result[j])), complaints.get(int(j), "")]
+        for j, number in zip(failed, job.grid.numbers(unit, failed), strict=True)
+    ]
+    drifts = np.where(np.isin(result, (*ENDED_WELL, KEEP_FAILED)), drifts, np.nan)
+    if np.isfinite(drifts).any():
+        worst = int(np.nanargmax(drifts))
+        record["drift"] = [float(drifts[worst]), int(job.grid.numbers(unit, np.array([worst]))[0])]
+    return record
+
+
+def _statistics(job: Job, unit: int, values: dict[str, np.ndarray]) -> bytes:
+    if not job.motions.reduce:
+        return b""
+    ok = np.isin(values[RESULT.name], ENDED_WELL)
+    numbers = job.grid.numbers(unit, np.arange(len(ok)))
+    return to_bytes({name: partial_of(how, values[name], ok, numbers) for name, how in job.motions.reduce.items()})

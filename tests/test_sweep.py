@@ -1,0 +1,392 @@
+"""Sweeps: what is stored is what `simulate_batch` gives, whoever computed it, and whatever happened meanwhile."""
+
+import errno
+import hashlib
+import json
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+from lagjax import __main__ as command_line
+from lagjax._sweep import _claims, _job, _run, _statistics, _store
+from lagjax._sweep._members import Grid, axes_of
+from lagjax._sweep._store import Store
+
+GRAVITY = 9.81
+
+
+def lagrangian(q, qdot, params):
+    return 0.5 * params**2 * qdot**2 + GRAVITY * params * jnp.cos(q)
+
+
+def keep(trajectory):
+    return {"end": trajectory.q[-1], "fastest": jnp.abs(trajectory.qdot).max(), "steps": trajectory.stats["num_steps"]}
+
+
+def angle_of(point):
+    return point["angle"]
+
+
+def length_of(point):
+    return point["length"]
+
+
+PENDULUM = lagjax.System(lagrangian)
+TS = jnp.linspace(0.0, 2.0, 5)
+OVER = {"length": np.linspace(0.5, 1.5, 6), "angle": np.linspace(0.0, 3.0, 7)}
+RULE = dict(q0=angle_of, qdot0=0.0, params=length_of, keep=keep, unit=10, progress=False)  # units of one length
+
+
+def swept(folder, over=OVER, **changes):
+    return lagjax.sweep(PENDULUM, over, TS, **{**RULE, "store": folder / "store", **changes})
+
+
+def digests(folder, store="store"):
+    """The hashes of all chunks of a store, by file."""
+    chunks = (folder / store).glob("*/c/**/*")
+    return {
+        str(file.relative_to(folder / store)): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in chunks
+        if file.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("undisturbed")
+    swept(folder)
+    return digests(folder)
+
+
+# ---- what is stored --------------------------------------------------------------------------------------------------
+
+
+def test_store_has_names_and_the_bits_of_a_batch(tmp_path):
+    data = swept(tmp_path).open()
+    assert data.end.dims == ("length", "angle") and set(data.data_vars) == {"end", "fastest", "steps", "result"}
+    np.testing.assert_array_equal(data.length, OVER["length"])
+    length, angle = (x.ravel() for x in np.meshgrid(*OVER.values(), indexing="ij"))
+    bare = lagjax.simulate_batch(PENDULUM, angle, np.zeros_like(angle), TS, length, batch_axes=(0, 0, 0))
+    np.testing.assert_array_equal(data.end.values.ravel(), bare.q[:, -1])
+    np.testing.assert_array_equal(data.steps.values.ravel(), bare.stats["num_steps"])
+    assert data.result.dtype == np.int16 and (data.result == 0).all()
+
+
+@pytest.mark.slow
+def test_status_tells_results_and_the_worst_energy(tmp_path):
+    told = swept(tmp_path).status()
+    assert told.done == told.members == 42 and told.results == {"successful": 42} and not told.failures
+    change, member, point = told.drift
+    assert 0 < change < 1e-6 and point == {"length": OVER["length"][member // 7], "angle": OVER["angle"][member % 7]}
+    assert "42 of 42 members" in str(told) and f"length = {point['length']}" in str(told)
+
+
+@pytest.mark.slow
+def test_designs_and_names_that_vary_together(tmp_path):
+    over = {("length", "mass"): ([0.5, 1.0], [1.0, 3.0]), "angle": lagjax.random(5, seed=1, low=0.0, high=2.0)}
+    data = swept(tmp_path, over, unit=None).open()
+    assert data.end.dims == ("length_mass", "angle") and data.end.shape == (2, 5)
+    np.testing.assert_array_equal(data.mass, [1.0, 3.0])
+    bare = lagjax.simulate(PENDULUM, float(data.angle[3]), 0.0, TS, 1.0)
+    assert float(data.end[1, 3]) == float(bare.q[-1])
+
+
+def test_statistics_are_those_of_the_members(tmp_path):
+    how = lagjax.Statistics(edges=np.linspace(-3, 3, 7), quantiles=(0.0, 0.3, 1.0))
+    twice = lambda trajectory: {"end": trajectory.q[-1], "also": trajectory.q[-1]}
+    run = swept(tmp_path, keep=twice, reduce={"also": how}, unit=5)
+    (got,) = run.statistics().values()
+    x = run.open().end.values.ravel()
+    assert set(run.open().data_vars) == {"end", "result"} and got.count == 42 and got.missing == 0
+    np.testing.assert_allclose([got.mean, got.variance], [x.mean(), x.var(ddof=1)], rtol=1e-13)
+    assert (got.min, got.min_member, got.max, got.max_member) == (x.min(), x.argmin(), x.max(), x.argmax())
+    np.testing.assert_array_equal(got.histogram, np.histogram(x, how.edges)[0])
+    exact = np.quantile(x, how.quantiles, method="lower")
+    np.testing.assert_allclose(got.quantiles, exact, rtol=1.1 * _statistics.RELATIVE)
+
+
+def test_statistics_leave_out_what_is_not_finite():
+    values, ok = np.array([[1.0], [np.nan], [5.0], [-2.0]]), np.array([True, True, False, True])
+    how = lagjax.Statistics(quantiles=(0.5,))
+    part = _statistics.partial_of(how, values, ok, np.arange(10, 14))
+    nothing = _statistics.partial_of(how, values[1:3], ok[1:3], np.arange(2))
+    for total in (part, _statistics.merged(part, nothing), _statistics.merged(nothing, part)):
+        got = _statistics.summary(how, total, ())
+        assert got.count == 2 and got.mean == -0.5 and got.variance == 4.5 and got.min_member == 13
+    assert np.isnan(_statistics.summary(how, nothing, ()).mean)
+
+
+# ---- members and units -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(1,), (1000,), (7, 11, 13), (3, 1, 50), (2, 2, 2, 2)])
+@pytest.mark.parametrize("size", [1, 4, 60, 10**6])
+def test_units_tile_the_members_in_order(shape, size):
+    grid = Grid.of(shape, size)
+    numbers = [grid.numbers(unit, np.arange(grid.size(unit))) for unit in range(grid.units)]
+    np.testing.assert_array_equal(np.concatenate(numbers), np.arange(np.prod(shape)))
+    assert max(map(len, numbers)) <= size
+
+
+def test_a_hundred_million_members_are_no_list():
+    over = {"a": np.linspace(0, 1, 10_000), "b": lagjax.random(10_000)}
+    grid = Grid.of(tuple(axis.size for axis in axes_of(over)), 10**6)
+    assert grid.members == 10**8 and grid.units == 100 and grid.box(99)[0] == slice(9900, 10_000)
+    (axis,) = axes_of({("x", "y"): lagjax.random(10**8, seed=3)})
+    start, first = next(axis.pieces())
+    assert start == 0 and len(first) == _store.SLICE
+
+
+@pytest.mark.parametrize("design", [lagjax.random, pytest.param(lagjax.sobol, marks=pytest.mark.slow)])
+def test_more_members_begin_with_the_same_ones(design, monkeypatch):
+    def all_of(count, seed=4):
+        (axis,) = axes_of({("x", "y", "z"): design(count, seed, low=(0, 1, 2), high=(1, 3, 9))})
+        return np.concatenate([values for _, values in axis.pieces()])
+
+    few, many, others = all_of(100), all_of(1000), all_of(100, seed=5)
+    np.testing.assert_array_equal(few, many[:100])
+    assert ((many >= [0, 1, 2]) & (many < [1, 3, 9])).all() and not np.isin(few, others).any()
+    monkeypatch.setattr("lagjax._sweep._designs.SLICE", 32)  # member k is a function of (seed, k)
+    np.testing.assert_array_equal(all_of(1000), many)
+
+
+def test_latin_hypercube_has_one_point_in_each_part():
+    (axis,) = axes_of({("x", "y"): lagjax.latin_hypercube(50, seed=1)})
+    ((_, values),) = axis.pieces()
+    np.testing.assert_array_equal(np.sort(np.floor(50 * values), axis=0).T, [np.arange(50)] * 2)
+
+
+# ---- to go on --------------------------------------------------------------------------------------------------------
+
+
+def begun(folder, units=0, **changes):
+    """A store of which so many units are done."""
+    with pytest.MonkeyPatch.context() as patch:
+        run = _run.work
+        patch.setattr("lagjax._sweep.work", lambda job, tell: run(job, tell, most=units) if units else None)
+        swept(folder, **changes)
+    return Store(folder / "store")
+
+
+def test_goes_on_where_it_stopped(tmp_path, undisturbed):
+    store = begun(tmp_path, 2)
+    assert len(store.done()) == 2
+    times = {unit: (store.job / "done" / f"{unit}.json").stat().st_mtime_ns for unit in store.done()}
+    swept(tmp_path)
+    assert all((store.job / "done" / f"{unit}.json").stat().st_mtime_ns == t for unit, t in times.items())
+    assert digests(tmp_path) == undisturbed and not os.listdir(store.job / "claims")
+
+
+def test_another_process_goes_on(tmp_path, undisturbed, capsys):
+    begun(tmp_path, 1)
+    _job.opened.cache_clear()
+    assert command_line.main(["sweep", "run", str(tmp_path / "store"), "--quiet"]) == 0
+    assert digests(tmp_path) == undisturbed and "42 of 42" in capsys.readouterr().out
+    assert command_line.main(["sweep", "check", str(tmp_path / "store")]) == 0
+    assert command_line.main(["sweep", "status", str(tmp_path / "nothing")]) == 1
+    assert "is no store of a sweep" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [1, 7, 42, None])
+def test_members_do_not_depend_on_their_neighbours(tmp_path, undisturbed, unit):
+    run, whole = swept(tmp_path, unit=unit), tmp_path / "other"
+    np.testing.assert_array_equal(run.open().fastest, swept(whole).open().fastest)
+
+
+def test_changed_descriptions_are_refused_with_the_difference(tmp_path, undisturbed):
+    swept(tmp_path)
+
+    def heavier(q, qdot, params):
+        return 0.5 * params**2 * qdot**2 + 2 * GRAVITY * params * jnp.cos(q)
+
+    def by_constant(gravity):
+        return lagjax.System(lambda q, qdot, params: 0.5 * params**2 * qdot**2 + gravity * params * jnp.cos(q))
+
+    common = {**RULE, "store": tmp_path / "store"}
+    with pytest.raises(ValueError, match=r"(?s)another description.*\+.*2 \* GRAVITY \* params"):
+        lagjax.sweep(lagjax.System(heavier), OVER, TS, **common)
+    with pytest.raises(ValueError, match=r"length.*angle.*in the store, now"):
+        swept(tmp_path, OVER | {"angle": np.linspace(0.0, 3.0, 8)})
+    with pytest.raises(ValueError, match="rtol: None in the store, now 1e-06"):
+        swept(tmp_path, rtol=1e-6)
+    with pytest.raises(ValueError, match="keep"):
+        swept(tmp_path, keep=lambda trajectory: {"end": trajectory.q[-2]})
+    lagjax.sweep(by_constant(1.0), OVER, TS, **{**common, "store": tmp_path / "constant"})
+    with pytest.raises(ValueError, match="its text is the same; a value that it uses is not"):
+        lagjax.sweep(by_constant(2.0), OVER, TS, **{**common, "store": tmp_path / "constant"})
+    assert digests(tmp_path) == undisturbed
+
+
+# ---- what goes wrong -------------------------------------------------------------------------------------------------
+
+
+def outwards(q, qdot, params):  # q¨ = 1 where nothing pulls; a collision where something does, stiff where k is large
+    return 0.5 * qdot**2 + q + params["pull"] / q - 0.5 * params["k"] * q**2
+
+
+def test_failures_cost_the_others_nothing(tmp_path):
+    start, pull, k = 1.0 + np.arange(300) / 300, np.zeros(300), np.zeros(300)
+    start[5], pull[[20, 150]], k[77] = -1.0, 9.0, 1e12
+    over = {("start", "pull", "k"): (start, pull, k)}
+    system, of = lagjax.System(outwards), lambda point: {"pull": point["pull"], "k": point["k"]}
+    q0 = lambda point: jnp.where(point["start"] < 0, jnp.nan, point["start"])
+    rule = {**RULE, "store": tmp_path / "store", "q0": q0, "params": of, "unit": 70, "max_steps": 300}
+    told = lagjax.sweep(system, over, TS, **rule).status()
+    assert {f.member for f in told.failures} == {5, 20, 77, 150} and told.results["successful"] == 296
+    assert {f.result for f in told.failures} == {"nonfinite_state", "dt_min_reached", "max_steps_reached"}
+    ends, well = lagjax.Sweep(tmp_path / "store").open().end.values, (start > 0) & (pull == 0) & (k == 0)
+    np.testing.assert_allclose(ends[well], start[well] + 0.5 * TS[-1] ** 2, rtol=1e-12)
+    params = {"pull": pull[well], "k": k[well]}
+    bare = lagjax.simulate_batch(system, start[well], 0 * start[well], TS, params, batch_axes=(0, 0, 0), max_steps=300)
+    np.testing.assert_array_equal(ends[well], bare.q[:, -1])
+    assert np.isnan(ends[~well]).all()
+
+
+def test_keep_in_numpy_may_fail_for_a_member(tmp_path):
+    def uneven(trajectory):
+        if trajectory.params == 0.7:
+            raise OverflowError("too short")
+        return {"late": np.asarray(trajectory.q)[np.asarray(trajectory.ts) > (1.0 if trajectory.params < 1 else 0.2)]}
+
+    run = swept(tmp_path, {"length": np.array([0.5, 0.7, 0.9, 1.1])}, q0=1.0, keep=uneven, unit=2)
+    told = run.status()
+    assert told.results == {"successful": 2, "keep_failed": 2} and "keep" in told.slow
+    assert "OverflowError: too short" in told.failures[0].why and "shape (4,), of other members (2,)" in str(told)
+    np.testing.assert_array_equal(np.isnan(run.open().late).all(axis=1), [False, True, False, True])
+
+
+@pytest.mark.parametrize("number, words", [(errno.ENOSPC, "disk is full"), (errno.EROFS, "read-only")])
+def test_disks_that_refuse(tmp_path, undisturbed, monkeypatch, number, words):
+    write, count = _store.write_through, []
+
+    def refuse(file, data):
+        count.append(file)
+        if len(count) > 30:
+            raise OSError(number, os.strerror(number))
+        write(file, data)
+
+    monkeypatch.setattr(_store, "write_through", refuse)
+    with pytest.raises(OSError, match=words) as error:
+        swept(tmp_path)
+    assert error.value.errno == number and "unit" in str(error.value)
+    store = Store(tmp_path / "store")
+    done = store.done()
+    assert 0 < len(done) < 6 and not store.damaged(store.spec(), done, whole=True)
+    monkeypatch.undo()
+    swept(tmp_path)
+    assert digests(tmp_path) == undisturbed
+
+
+def test_damaged_chunks_are_found_and_computed_again(tmp_path, undisturbed):
+    swept(tmp_path)
+    chunk = sorted((tmp_path / "store" / "end" / "c").glob("*/*"))[2]
+    data = chunk.read_bytes()
+    chunk.write_bytes(data[:-1] + b"x")  # of the right size: found by its hash
+    run = lagjax.Sweep(tmp_path / "store")
+    assert "is not what was written" in run.damaged()[2]
+    chunk.write_bytes(data[: len(data) // 2])
+    with pytest.warns(UserWarning, match=r"unit 2: its chunk of 'end' has 28 bytes, where it should have 56"):
+        swept(tmp_path)
+    assert digests(tmp_path) == undisturbed and not run.damaged()
+
+
+@pytest.mark.slow
+def test_stores_of_another_version_are_left_alone(tmp_path, undisturbed):
+    swept(tmp_path)
+    file = tmp_path / "store" / ".sweep" / "spec.json"
+    spec = json.loads(file.read_text())
+    for change, words in (
+        ({"format": 7}, "store of format 7"),
+        ({"versions": spec["versions"] | {"jax": "0.1"}}, "0.1"),
+    ):
+        file.write_text(json.dumps(spec | change))
+        with pytest.raises(ValueError, match=words):
+            swept(tmp_path)
+    file.write_text("{")
+    with pytest.raises(ValueError, match="cannot be read"):
+        swept(tmp_path)
+    assert digests(tmp_path) == undisturbed
+
+
+@pytest.mark.slow
+def test_a_store_whose_creation_was_interrupted_is_made_anew(tmp_path, undisturbed):
+    swept(tmp_path)
+    (tmp_path / "store" / ".sweep" / "spec.json").unlink()
+    swept(tmp_path)
+    assert digests(tmp_path) == undisturbed
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        (dict(over={}), "must be a dict"),
+        (dict(over={"angle": np.zeros((2, 2))}), "1-D array"),
+        (dict(over={"result": [1.0]}), "twice"),
+        (dict(over={("a", "b"): ([1.0], [1.0, 2.0])}), "one length"),
+        (dict(over={"angle": [np.nan]}), "not finite"),
+        (dict(q0=0.0, params=1.0), "None of q0, qdot0 and params"),
+        (dict(keep=lambda trajectory: trajectory.q), "must return a dict"),
+        (dict(keep=lambda trajectory: {"angle": trajectory.q}), "another name"),
+        (dict(reduce={"nothing": lagjax.Statistics()}), "does not return"),
+        (dict(unit=0), "positive whole number"),
+        (dict(isolate="yes"), "isolate must be"),
+    ],
+)
+def test_mistakes_are_sentences(tmp_path, changes, words):
+    with pytest.raises((TypeError, ValueError), match=words):
+        swept(tmp_path, **changes)
+
+
+# ---- claims ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def store(tmp_path):
+    for folder in ("claims", "workers", "done", "aside"):
+        (tmp_path / ".sweep" / folder).mkdir(parents=True)
+    return Store(tmp_path)
+
+
+def test_one_of_many_gets_a_claim(store):
+    with _claims.Worker(store) as one, _claims.Worker(store) as two:
+        for unit in range(20):
+            with ThreadPoolExecutor(8) as pool:
+                assert sum(pool.map(lambda k, u=unit: (one, two)[k % 2].claim(u), range(8))) == 1
+        one.release(3)
+        assert two.claim(3) and not one.claim(3)
+
+
+@pytest.mark.slow
+def test_claims_of_the_dead_are_taken_whatever_the_clocks(store, monkeypatch):
+    monkeypatch.setattr(_claims, "STALE", 0.2)
+    dead = _claims.Worker(store)
+    dead._identity["place"] = "another machine"
+    dead._beat()
+    os.utime(dead._file, (2**33, 2**33))  # its clock is of another century
+    assert dead.claim(0)
+    with _claims.Worker(store) as other:
+        assert not other.claim(0)  # seen for the first time
+        dead._beat()
+        time.sleep(0.3)
+        assert not other.claim(0)  # it has moved
+        time.sleep(0.3)
+        assert other.claim(0) and not other.claim(0)
+        (store.job / "claims" / "1.0").touch()  # who died between making a claim and writing it
+        assert not other.claim(1)
+        time.sleep(0.3)
+        assert other.claim(1)
+
+
+def test_a_process_that_has_ended_is_dead_at_once(store):
+    gone = _claims.Worker(store)
+    gone._identity["began"] = "0"  # as of a process whose number another one has by now
+    gone._beat()
+    assert gone.claim(0)
+    with _claims.Worker(store) as other:
+        assert other.claim(0)
