@@ -168,7 +168,7 @@ def begun(folder, units=0, **changes):
     """A store of which so many units are done."""
     with pytest.MonkeyPatch.context() as patch:
         run = _run.work
-        patch.setattr("lagjax._sweep.work", lambda job, tell: run(job, tell, most=units) if units else None)
+        patch.setattr("lagjax._sweep.work", lambda job, tell, how: run(job, tell, how, units) if units else None)
         swept(folder, **changes)
     return Store(folder / "store")
 
