@@ -106,6 +106,7 @@ def falls_to(v, params, **options):
     return lagjax.simulate(THROWN, 0.0, v, jnp.array([0.0, 2.5]), params, **options).q[-1]
 
 
+@pytest.mark.slow
 def test_where_a_border_is_grazed_there_is_no_derivative():
     slopes = jax.vmap(jax.grad(falls_to), (0, None))
     v = GRAZING + jnp.array([0.0, 1e-2, -1e-2])

@@ -109,6 +109,7 @@ def eagerly(function, monkeypatch):
         return function()
 
 
+@pytest.mark.slow
 def test_derivatives_of_short_runs_take_no_python(on_host, monkeypatch):
     both = (0, 1)
     forms = {
@@ -129,6 +130,7 @@ def test_derivatives_of_short_runs_take_no_python(on_host, monkeypatch):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_derivative_inside_of_loops_takes_no_python(on_host):
     def walk(q, m):
         def step(q, _):
@@ -303,6 +305,7 @@ def in_many_programs():
     np.testing.assert_array_equal(kept(Q[0]), expected)
 
 
+@pytest.mark.slow
 def test_on_devices_threads_and_after_a_fork():
     start = "import jax; jax.config.update('jax_enable_x64', True); import test_call as t; "
     call = "t.on_two_devices(); t.on_many_threads(); t.in_many_programs(); t.after_a_fork()"

@@ -442,6 +442,7 @@ def test_findings_are_frozen_sorted_and_fit_a_screen():
         findings.found = ()
 
 
+@pytest.mark.slow
 def test_many_coordinates_are_compared_along_random_directions_first():
     n = 100
     q, v = np.linspace(0.2, 1.0, n), np.linspace(1.0, 0.3, n)

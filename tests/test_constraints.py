@@ -265,6 +265,7 @@ def test_a_pendulum_on_a_shaken_support(path):
     assert np.max(np.abs(run.q - expected)) < 1e-10 and drift(run) < DRIFT
 
 
+@pytest.mark.slow
 def test_a_coordinate_without_mass_that_a_constraint_holds():
     # The spring acts on z, which has no kinetic energy; z = x² ties it to the mass: ½ ẋ² − ½ (x²)².
     system = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - 0.5 * q[1] ** 2, constraints=lambda q: q[1] - q[0] ** 2)
@@ -388,6 +389,7 @@ def test_derivatives_through_steps_that_are_taken_again():
         np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_reverse_mode_through_constraints_needs_no_parameters():
     system, ts, angle, step = lagjax.System(weight, constraints=rod), np.linspace(0, 1, 3), 1.0, 1e-4
 
@@ -764,7 +766,8 @@ def derivatives_of(function):
     return orders, jax.value_and_grad(orders, has_aux=True)
 
 
-@pytest.mark.parametrize("reverse", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("reverse", [False, True])
 def test_projection_has_the_derivatives_of_its_closed_form(reverse):
     system = lagjax.System(free, constraints=circle)
     found, exact = (

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from sweeps import sweep
 
 from lagjax._custom import differentiated_as
 
@@ -33,7 +32,8 @@ def step(t, y):
     return differentiated_as(moved, (t, y), t, y)
 
 
-@pytest.mark.parametrize("scan", sweep([False, True], kept=[True]))
+@pytest.mark.slow
+@pytest.mark.parametrize("scan", [False, True])
 def test_derivatives_are_those_of_the_expression_in_every_order_of_modes(scan):
     x = jnp.array([0.7, 1.1])
     exact = jax.jit(jax.jacfwd(jax.jacfwd(lambda x: repeated(x, False, moved))))(x)

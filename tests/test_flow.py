@@ -152,6 +152,7 @@ def test_reverse_is_forward_for_members_of_a_batch():
     np.testing.assert_allclose(shared, alone + rest, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_directions_side_by_side_are_those_one_by_one():
     system, ts = lagjax.System(chain), jnp.array([0.0, 0.6, 1.0])
     params = {"g": 9.81, "l": jnp.array([1.0, 0.8]), "m": jnp.array([1.0, 2.0])}

@@ -301,6 +301,7 @@ def test_members_that_failed_do_not_spoil_the_others():
     assert len(report.splitlines()) < 24 and max(map(len, report.splitlines())) < 121
 
 
+@pytest.mark.slow
 def test_batch_vmap_and_jit_agree():
     k = jnp.array([0.7, 1.3, 2.0])
 
@@ -380,6 +381,7 @@ def test_energy_between_bounces():
     assert flagged(spoilt) == {"energy"}
 
 
+@pytest.mark.slow
 def test_constraints_of_one_mode_and_not_of_another():
     # Down the inside of a circle to its lowest place, then straight on.
     held = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * q[1], constraints=lambda q: {"rail": q @ q - 1.0})

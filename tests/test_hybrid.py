@@ -166,7 +166,8 @@ def test_every_bounce_of_a_ball():
         np.testing.assert_allclose(runs.q[i], height, atol=1e-11)
 
 
-@pytest.mark.parametrize("direction", sweep([-1, 0], kept=[-1]))
+@pytest.mark.slow
+@pytest.mark.parametrize("direction", [-1, 0])
 def test_bounces_that_pile_up_are_reported_and_never_fall_through(direction):
     # Heights shrink beyond the digits that a position at 0.37 has, times beyond those that a time has.
     bounce = lagjax.Transition(
@@ -191,6 +192,7 @@ def test_bounces_that_pile_up_are_reported_and_never_fall_through(direction):
     assert np.nanmin(runs.q - floor[:, None]) > -1e-9
 
 
+@pytest.mark.slow
 def test_the_budget_of_transitions():
     with pytest.raises(lagjax.SimulationError, match="max_transitions") as caught:
         bouncing(1.0, 0.9, max_transitions=2)
@@ -204,7 +206,8 @@ def test_the_budget_of_transitions():
         jax.block_until_ready(jax.jit(lambda h: bouncing(h, 0.9, max_transitions=2).q)(1.0))
 
 
-@pytest.mark.parametrize("mode", sweep([jax.jacrev, jax.jacfwd, jax.hessian], kept=[jax.jacrev]))
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd, jax.hessian])
 def test_what_was_not_reached_has_no_derivative_and_never_zero(mode):
     # The second bounce, at 1.264, is not allowed: outputs after it are not reached.
     def outcome(h):
@@ -684,6 +687,7 @@ def test_a_reset_that_leaves_the_constraints_of_the_mode_is_not_repaired():
     assert runs.result._value[1] == lagjax.RESULTS.inconsistent_start._value
 
 
+@pytest.mark.slow
 def test_a_failure_names_the_mode():
     with pytest.raises(lagjax.SimulationError, match=r"does not satisfy the constraints[^$]*mode 'rod'"):
         stuck = lagjax.Transition("flight", "rod", lambda q, v: q[1], -1)
@@ -703,6 +707,7 @@ def test_a_failure_names_the_coordinate_without_mass_and_the_mode():
         hybrid({"a": PLANE, "b": massless}, [pass_on], jnp.zeros(2), jnp.array([1.0, 0.0]))
 
 
+@pytest.mark.slow
 def test_guards_and_resets_that_are_nan():
     blind = lagjax.Transition("a", "a", lambda q, v: jnp.sqrt(-1.0 - q) + q - 0.5)
     broken = lagjax.Transition("a", "a", lambda q, v: q - 0.5, reset=lambda q, v: (q, jnp.sqrt(-q)))

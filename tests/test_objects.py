@@ -43,6 +43,7 @@ def cache(monkeypatch, tmp_path):
     return tmp_path / "cache"
 
 
+@pytest.mark.slow
 def test_another_process_finds_what_one_has_made(cache, made, monkeypatch):
     code = "import jax; jax.config.update('jax_enable_x64', True); import test_objects as t; t.run()"
     hashes = {"PYTHONHASHSEED": "12345"}  # in whose order sets of names are gone through

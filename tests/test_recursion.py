@@ -74,6 +74,7 @@ def test_accelerations_are_those_of_the_whole_mass_matrix(make):
     assert error <= 10 * condition * np.finfo(float).eps * np.abs(exact).max()
 
 
+@pytest.mark.slow
 def test_operations_grow_as_the_number_of_links():
     counts = [of(system, np.ones(n), np.ones(n), params).acceleration.operations
               for n in (16, 32, 48) for system, params in [chain(n)]]  # fmt: skip
@@ -107,6 +108,7 @@ def test_motions_and_derivatives_are_those_of_a_small_scene_without_recursion():
     np.testing.assert_allclose(*slopes, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_link_without_mass_is_singular_and_says_so():
     system, params = chain(8)
     params = params | {"m": np.where(np.arange(8) < 7, 0.1, 0.0)}
@@ -117,6 +119,7 @@ def test_a_link_without_mass_is_singular_and_says_so():
         lagjax.simulate(system, np.linspace(0.1, 1.0, 8), np.ones(8), np.linspace(0.0, 0.1, 3), params)
 
 
+@pytest.mark.slow
 def test_a_motion_that_fails_does_not_wait_for_the_elimination_of_the_whole_mass_matrix(monkeypatch):
     """Which takes n³/3 operations: for a hundred links a minute, to fail once more."""
 

@@ -32,6 +32,7 @@ def solved(matrix, rows, b, c, zeros=None, **kind):
     return z[: len(b)], -z[len(b) :], bool(singular)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("augmented", [False, True])
 def test_a_chain_is_solved_as_by_dense_algebra(augmented):
     rng = np.random.default_rng(0)

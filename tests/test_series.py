@@ -433,6 +433,7 @@ def test_an_operation_without_a_series_is_named(monkeypatch):
         recurrences(harmless, [0.3], [0.4], 0.1)
 
 
+@pytest.mark.slow
 def test_all_moving_inputs_may_be_any_mixture():
     # Each of q, v, t alone, in pairs, and all: what does not move has no coefficients, and the rest stays right.
     for which in itertools.chain.from_iterable(itertools.combinations("qvt", r) for r in range(4)):

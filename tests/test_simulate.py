@@ -195,6 +195,7 @@ def test_gradient_with_more_steps_than_checkpoints():
     np.testing.assert_allclose(reverse, forward, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_reverse_mode_backward_in_time_by_the_output_times_and_beside_a_failure():
     # q(T) = q0 cos ωT + q̇0/ω sin ωT and dq(T)/dT = q̇(T), in either direction of time.
     final = lambda k, t1: run(params={"m": 2.0, "k": k}, ts=jnp.array([0.0, 1.0]) * t1, rtol=1e-11)
@@ -279,6 +280,7 @@ def test_a_wall_in_the_domain_ends_in_a_sentence():
     assert reached[0] and not reached[-1] and trajectory.end.t < 1.0
 
 
+@pytest.mark.slow
 def test_nan_with_fixed_steps_is_reported():
     message, trajectory = failing(lambda q, v: 0.5 * v**2 - jnp.sqrt(q), 1.0, -1.0, dt=0.01, solver=diffrax.Tsit5())
     assert "NaN" in message

@@ -84,6 +84,7 @@ def test_twenty_joints_of_a_thousand_chains():
     np.testing.assert_allclose(run.q[500, -1], alone.q[-1], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_derivatives_through_many_that_stick():
     q0 = np.linspace(-1.9, 2.3, 6)
 

@@ -39,7 +39,8 @@ def test_the_steps_are_those_of_the_solver(kind):
     np.testing.assert_allclose(*errors, atol=1e-15)  # a difference of numbers of order one
 
 
-@pytest.mark.parametrize("tolerance", sweep([1e-7, 1e-10, 1e-12], kept=[1e-10]))
+@pytest.mark.slow
+@pytest.mark.parametrize("tolerance", [1e-7, 1e-10, 1e-12])
 def test_fine_output_between_steps(tolerance):
     # Local errors of the interpolant are about ten times those of a step; the error at the end of a step is a sum of
     # local ones that partly cancel.

@@ -58,7 +58,7 @@ def assert_same(kernels, ts, y0, params):
 
 
 # Constraints with a projection, a motion that depends on time; the others in the slow part.
-QUICK = ("double_pendulum", "slider_crank", "driven_pendulum")
+QUICK = ("double_pendulum", "driven_pendulum")
 
 
 @pytest.mark.parametrize(
@@ -80,6 +80,7 @@ def test_ready_scenes(scene):
     assert_same(in_all_forms(*parts), np.linspace(0.0, duration, 4), np.tile(y0, (MEMBERS, 1)), params)
 
 
+@pytest.mark.slow
 def test_piecewise_operations_parameters_that_are_integers_and_guards():
     def acceleration(q, v, t, k, n):
         wall = jnp.maximum(-q[0], 0) ** 1.5 - jnp.minimum(q[0], 1) * jnp.where((q[1] > 0.3) | ~(v[0] < 0), k, 0.5)
