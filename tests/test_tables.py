@@ -57,14 +57,15 @@ def assert_same(kernels, ts, y0, params):
             np.testing.assert_allclose(tabled, expected, rtol=0, atol=ROUND_OFF * np.nanmax(abs(expected)))
 
 
-# Constraints with a projection, a motion that depends on time; the others in the slow part.
+# Two by default; the others in the slow part. Written down, the solar system takes LLVM six minutes, which nobody runs:
+# as a table it is held to JPL's ephemeris.
 QUICK = ("double_pendulum", "driven_pendulum")
 
 
 @pytest.mark.parametrize(
     "scene",
     [pytest.param(scene, id=scene.__name__, marks=() if scene.__name__ in QUICK else pytest.mark.slow)
-     for scene in lagjax.scenes.ALL],
+     for scene in lagjax.scenes.ALL if scene is not lagjax.scenes.solar_system],
 )  # fmt: skip
 def test_ready_scenes(scene):
     made = scene()
@@ -76,8 +77,7 @@ def test_ready_scenes(scene):
         pytest.skip(str(reason))
     params = np.array([numbers_of(made.params)], float)
     y0 = np.concatenate([layout.flatten(made.q0), layout.flatten(made.qdot0)])
-    duration = {"solar_system": 10.0}.get(scene.__name__, 1.0)
-    assert_same(in_all_forms(*parts), np.linspace(0.0, duration, 4), np.tile(y0, (MEMBERS, 1)), params)
+    assert_same(in_all_forms(*parts), np.linspace(0.0, 1.0, 4), np.tile(y0, (MEMBERS, 1)), params)
 
 
 @pytest.mark.slow
