@@ -1,5 +1,6 @@
 """Transforms of whole leaves, many starts, sampling, reports and other methods of a fit."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -121,3 +122,112 @@ def test_a_leaf_that_starts_outside_of_its_set_is_refused(start, transform, mess
 def test_the_sum_of_a_simplex_is_that_of_its_start():
     own = _transforms.simplex.of(np.array([1.0, 2.0, 4.0]), (3,))
     assert np.sum(own.value(np.array([0.3, -2.0]))) == pytest.approx(7.0)
+
+
+# ---- the density and its draws ---------------------------------------------------------------------------------------
+
+
+def spring(q, qdot, params):
+    return 0.5 * qdot**2 - 0.5 * params["k"] * q**2
+
+
+SPRING = lagjax.System(spring, forces=lambda q, v, params: -params["c"] * v)
+SHORT = np.linspace(0.0, 3.0, 61)
+
+
+def spring_records(noise=lambda rng, shape: rng.normal(size=shape), count=2, seed=0):
+    rng = np.random.default_rng(seed)
+    values = np.asarray(
+        lagjax.simulate_batch(SPRING, np.linspace(1.0, 2.0, count), np.zeros(count), SHORT, {"k": 4.0, "c": 0.3}).q
+    )
+    return [lagjax.Record(SHORT, y + 0.02 * noise(rng, y.shape)) for y in values]
+
+
+def spring_fit(noise=None, **more):
+    return lagjax.fit(SPRING, spring_records(**more), {"k": 3.0, "c": 0.2}, transforms=lagjax.positive, noise=noise)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [lagjax.Gaussian(), lagjax.StudentT(4.0), lagjax.StudentT()])
+def test_the_density_has_the_gradient_of_differences_and_the_curvature_of_the_fit(noise):
+    fit = spring_fit(noise)
+    density = fit.log_density(prior=lambda params: -0.1 * params["k"])
+    value, gradient = (jax.jit(f) for f in (density, jax.grad(density)))
+    x = density.first + 0.01 * np.random.default_rng(0).normal(size=len(density))
+    steps = 1e-5 * np.eye(len(x))
+    central = [(value(x + step) - value(x - step)) / 2e-5 for step in steps]
+    np.testing.assert_allclose(gradient(x), central, rtol=1e-5, atol=1e-4)
+    # Expected and observed information differ like the inverse root of the samples.
+    curvature = -np.stack([(gradient(density.first + s) - gradient(density.first - s)) / 2e-5 for s in steps])
+    known = 2 + 2 * 2
+    ratio = np.sqrt(np.diag(np.linalg.inv(curvature)) / np.diag(density.covariance()))[:known]
+    np.testing.assert_allclose(ratio, 1.0, atol=0.05 if isinstance(noise, lagjax.Gaussian) else 0.2)
+    assert density.names[:3] == ("params['c']", "params['k']", "starts[0].q") and len(density) == len(density.names)
+    assert density(jnp.full(len(x), 500.0)) == -jnp.inf
+
+
+@pytest.mark.slow
+def test_draws_have_the_means_and_widths_of_the_fit():
+    # Nearly linear and Gaussian: with 2000 draws a mean is known to 2 % of a width, a width to 2 %.
+    fit = spring_fit()
+    drawn = fit.sample(500, seed=1)
+    names = fit.covariance.names
+    posterior = np.stack([drawn.posterior[name].values.ravel() for name in names])
+    deviation = np.sqrt(np.diag(fit.covariance.matrix))
+    values = np.array([fit.params["c"], fit.params["k"]])
+    np.testing.assert_allclose((posterior.mean(axis=1) - values) / deviation, 0.0, atol=0.15)
+    np.testing.assert_allclose(posterior.std(axis=1) / deviation, 1.0, atol=0.1)
+    assert set(drawn.posterior) == {*names, "q0", "qdot0", "sigma"} and not drawn.sample_stats.diverging.any()
+    assert drawn.posterior["q0"].shape == (4, 500, 2, 1)
+    again = fit.sample(500, seed=1)
+    np.testing.assert_array_equal(again.posterior["q0"], drawn.posterior["q0"])
+
+
+def test_what_is_not_seen_has_no_draws():
+    params = {"k": 3.0, "c": 0.2, "colour": 1.0}
+    fit = lagjax.fit(SPRING, spring_records(), params)
+    with pytest.raises(ValueError, match=r"no density of what is not seen. .* params\['colour'\]"):
+        fit.sample(10)
+    with pytest.raises(ValueError, match="draws must be a positive whole number"):
+        fit.sample(0)
+
+
+# ---- many starts -----------------------------------------------------------------------------------------------------
+
+
+def many(**more):
+    # Sensors of no structure that a start could be read off: whole records from the first trial on.
+    ts = np.linspace(0.0, 20.0, 201)
+    q = np.asarray(lagjax.simulate(SPRING, 1.0, 0.0, ts, {"k": 36.0, "c": 0.02}).q)
+    values = {"seen": q + 0.02 * np.random.default_rng(0).normal(size=q.shape)}
+    one = lagjax.Record(ts, values, start=lagjax.Guess(1.0, 0.0))
+    return lagjax.fit(
+        SPRING, one, {"k": 1.0, "c": 0.02}, transforms=lagjax.positive, observe=lambda q, v: {"seen": q}, **more
+    )
+
+
+def test_many_starts_find_a_frequency_that_one_does_not(capfd):
+    one, fit = many(), many(starts=256, progress=True)
+    assert abs(one.params["k"] - 36.0) > 1.0 and one.waterfall is None
+    assert abs(fit.params["k"] - 36.0) < 0.05 and max(fit.rms.values()) < 0.025
+    falls = fit.waterfall.misfits
+    assert len(falls) == 256 and (np.diff(falls) >= 0).all() and falls[-1] > 10 * falls[0]
+    assert "starts      256, of which" in str(fit)
+    assert "motions, residuals" in capfd.readouterr().err
+    again = many(starts=256)
+    np.testing.assert_array_equal(again.u, fit.u)
+    np.testing.assert_array_equal(again.waterfall.misfits, falls)
+
+
+def test_many_starts_find_the_deeper_of_two_minima():
+    # A stiffness that rises and falls with x: from 1.0 the way down ends at the bound.
+    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * (2 + jnp.cos(3 * params) + 0.1 * params) * q**2)
+    q = np.asarray(lagjax.simulate(scene, 1.0, 0.0, TS, 2.2).q)
+    one = lagjax.Record(TS, q + 0.01 * np.random.default_rng(0).normal(size=q.shape))
+    stuck, fit = (lagjax.fit(scene, one, 1.0, transforms=lagjax.between(0.8, 4.0), starts=k) for k in (1, 16))
+    assert stuck.rms["q"] > 0.3 and fit.rms["q"] < 0.012
+
+
+def test_starts_are_a_whole_number():
+    with pytest.raises(ValueError, match="starts must be a positive whole number"):
+        many(starts=0)

@@ -7,11 +7,12 @@
 
 Files: `_records`, `_parameters` and `_transforms` take what the user gives; `_motions` and `_signals` follow motions
 and sensors with their derivatives; `_residuals` and `_noise` say how far off a trial is; `_segments` says where to
-begin, `_solve` goes down from there; `_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_profile` and `_result` say
-what that means.
+begin, `_solve` goes down from there; `_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_profile`, `_density`,
+`_sample` and `_result` say what that means.
 """
 
 import functools
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ import numpy as np
 
 from lagjax._consistent import has_constraints
 from lagjax._fit._inputs import HOLDS, Form, asks
+from lagjax._fit._many import Waterfall, distinct, drawn, misfit, short_search
 from lagjax._fit._motions import motions_of
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
 from lagjax._fit._parameters import Parameters
@@ -50,6 +52,7 @@ _ENOUGH_OF_GLIMPSES = 0.1
 _POOR, _COARSE = 2.0, 0.02  # times scatter or size of signals: beyond, the shortest segments were not fitted
 _LOOSE = 3.0  # standard deviations of u about its first value on these levels, where u is a logarithm or the like
 _TRIALS, _TRIALS_OF_LEVEL = 60, 20
+_BEST = 4  # of many starts go through the whole search
 
 
 def fit(
@@ -62,7 +65,10 @@ def fit(
     transforms: PyTree = None,
     noise: AbstractNoise | None = None,
     hold: str = "zero",
+    starts: int = 1,
     method: str = "auto",
+    seed: int = 0,
+    progress: bool = False,
 ) -> Fit:
     r"""The parameters of a scene that make recordings of its motion likeliest, with what is known about them.
 
@@ -82,6 +88,11 @@ def fit(
     - `noise`: `lagjax.Gaussian()`, the default, or `lagjax.StudentT()` where some samples are far off.
     - `hold`: how the `inputs` of records go on between samples: with "zero" the last one stays, as behind a D/A
       converter; "linear" joins them by lines. Functions of the scene ask for `inputs` by name.
+    - `starts`: from how many values of the parameters to search, in one batch: from `params0`, and from random ones by
+      `seed`: a decade about a positive number, anywhere between bounds, on a circle or a simplex, and about other
+      numbers as far as they are large. The best few go through the whole search, and `params0` always does;
+      `Fit.waterfall` has what all of them came to.
+    - `progress`: print a line for every trial to stderr.
     - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
       its own read off the data, and lets these grow together: for that the signals must have the structure of q. "auto"
       does that where the signals allow it and records are longer than the motion's time scale, so that long and chaotic
@@ -107,6 +118,8 @@ def fit(
     ```
     """
     require_system(system)
+    if not (isinstance(starts, int | np.integer) and starts > 0):
+        raise ValueError(f"starts must be a positive whole number; got {starts!r}.")
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}; got {method!r}.")
     if hold not in HOLDS:
@@ -120,9 +133,13 @@ def fit(
     parameters = Parameters.of(params0, free, transforms, layout.dtype)
     question = _question(system, records, layout, parameters, observe, form)
     readers = _readers(records) if looks_like_positions(observe, records[0], layout) else None
-    starts = np.stack([_start(record, readers, layout, k, params0) for k, record in enumerate(records)])
-    descent = _search(question, parameters.moved(parameters.first), starts, noise, method, readers)
-    return _told(system, observe, question, descent)
+    if progress:
+        question.watch = _Printer(question.size)
+    y0 = np.stack([_start(record, readers, layout, k, params0) for k, record in enumerate(records)])
+    search = functools.partial(_search, question, noise=noise, method=method, readers=readers)
+    descent, waterfall = _searches(question, search, parameters.moved(parameters.first), y0, starts, seed)
+    question.watch = None
+    return _told(system, observe, question, descent, noise, waterfall)
 
 
 def _form(system: System, records: list[Record], hold: str) -> Form | None:
@@ -185,6 +202,44 @@ def _start(record: Record, readers: list[Reader] | None, layout: Layout, place: 
             "start=(q0, qdot0) if it is known, else start=lagjax.Guess(q0, qdot0)."
         )
     return readers[place].states(np.array([0]))[0]
+
+
+def _searches(question: Question, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
+    """The best of the searches from u and from `starts` − 1 random values, and what all of them came to."""
+    if starts == 1:
+        return search(u, y0), None
+    trials = short_search(question, drawn(question.parameters, u, starts, seed), y0)
+    misfits, done = trials.misfits.copy(), []
+    chosen = distinct(trials, _BEST)
+    for place, at in [*((k, (trials.u[k], trials.starts[k])) for k in chosen), (None, (u, y0))]:
+        try:
+            done.append(search(*at))
+        except ValueError:
+            if not done and place is None:
+                raise  # not one start could be followed
+            continue
+        if place is not None:
+            misfits[place] = misfit(done[-1].widths, question)
+    best = max(done, key=lambda one: log_likelihood(one.widths, one.point.flat(), question.weights))
+    misfits = np.sort(misfits)
+    misfits[0] = min(misfits[0], misfit(best.widths, question))
+    return best, Waterfall(misfits)
+
+
+class _Printer:
+    """Prints a line for every trial."""
+
+    def __init__(self, size: np.ndarray):
+        self.size, self.trials = size, 0
+
+    def __call__(self, trial) -> None:
+        self.trials += 1
+        if isinstance(trial, Failure):
+            text = f"the motion failed. {trial.text.splitlines()[0]}"
+        else:
+            rms = np.sqrt(np.mean(trial.flat() ** 2, axis=0)) / self.size
+            text = f"{len(trial.starts)} motions, residuals {np.exp(np.mean(np.log(rms))):.4g} of the signals"
+        print(f"trial {self.trials}: {text}", file=sys.stderr, flush=True)
 
 
 def _search(question: Question, u, starts, noise, method: str, readers) -> Descent:
@@ -273,7 +328,9 @@ def _glimpsed(question: Question, u, noise, readers: list[Reader], anchor: Ancho
 # ---- what came out ---------------------------------------------------------------------------------------------------
 
 
-def _told(system, observe, question: Question, descent: Descent) -> Fit:
+def _told(
+    system, observe, question: Question, descent: Descent, law: AbstractNoise, waterfall: Waterfall | None
+) -> Fit:
     """The result in the user's structures and in words."""
     point, widths, parameters, n = descent.point, descent.widths, question.parameters, question.layout.size
     known = information(question, point, widths)
@@ -290,10 +347,12 @@ def _told(system, observe, question: Question, descent: Descent) -> Fit:
         message=_message(descent, unseen, known, parameters),
         log_likelihood=log_likelihood(widths, point.flat(), question.weights),
         trials=descent.trials,
+        waterfall=waterfall,
         records=tuple(question.records),
         parameters=parameters,
         u=point.u,
         states=point.starts,
+        law=law,
         information=known,
         widths=widths,
         question=question,

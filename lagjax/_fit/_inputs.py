@@ -39,9 +39,9 @@ class Table(NamedTuple):
         return self.knots.shape[1]
 
     def rows(self, numbers: np.ndarray) -> np.ndarray:
-        """The parameters `numbers` (P,) of the user and then the table, (N, P + K + K I)."""
+        """The parameters `numbers` (P,) or (N, P) of the user and then the table, (N, P + K + K I)."""
         count = len(self.knots)
-        parts = np.broadcast_to(numbers, (count, len(numbers))), self.knots, self.values.reshape(count, -1)
+        parts = np.broadcast_to(numbers, (count, numbers.shape[-1])), self.knots, self.values.reshape(count, -1)
         return np.concatenate(parts, axis=1)
 
     def select(self, rows) -> "Table":

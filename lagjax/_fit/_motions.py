@@ -66,7 +66,8 @@ class AbstractMotions(abc.ABC):
     ) -> Motion:  # fmt: skip
         """The motions from `y0` (N, 2n) at `ts` (N, T) for all parameters `numbers` (P,) and a table of inputs a row.
 
-        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (D, P).
+        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (D, P). Rows may have parameters of their own, (N, P)
+        and (N, D, P).
         """
 
     @abc.abstractmethod
@@ -99,7 +100,7 @@ class _ByMachineCode(AbstractMotions):
     def _flow(self, numbers: np.ndarray, table: Table | None) -> tuple[Flow, np.ndarray]:
         """The flow of the scene with inputs of this room, made once for all that are equal, and its parameters."""
         if table is None or not self.is_driven:
-            return flow_of(self.problem(2)), numbers[None]
+            return flow_of(self.problem(2)), np.atleast_2d(numbers)
         return flow_of(self.problem(table.room)), table.rows(numbers)
 
     def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
@@ -108,7 +109,7 @@ class _ByMachineCode(AbstractMotions):
         if not y0_dot.shape[1]:
             return Motion(run.path, np.zeros((len(y0), 0, *run.path.shape[1:])), run.result, run.t_end, run.y_end)
         params_dot = np.zeros((*y0_dot.shape[:2], params.shape[1]))
-        params_dot[..., : len(numbers)] = numbers_dot
+        params_dot[..., : numbers.shape[-1]] = numbers_dot
         steps = run.path, run.result, run.accepted, run.ticket
         tangents, _ = _derivatives.jvp(flow, ts, y0, params, steps, y0_dot, params_dot, self.tolerances)
         return Motion(run.path, tangents, run.result, run.t_end, run.y_end)
@@ -151,11 +152,13 @@ class _ByDiffrax(AbstractMotions):
             q, qdot = map(layout.restore, halves(y))
             return layout.flatten(system.acceleration(q, qdot, t, of(numbers, table)))
 
-        self._follow = jax.jit(jax.vmap(with_tangents, in_axes=(0, 0, None, 0, None, 0)))
+        self._follow = jax.jit(jax.vmap(with_tangents, in_axes=(0, 0, 0, 0, 0, 0)))
         self._rate = jax.jit(jax.vmap(rate, in_axes=(0, 0, None, 0)))
         self.dtype = layout.dtype
 
     def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
+        numbers = np.broadcast_to(numbers, (len(y0), numbers.shape[-1]))
+        numbers_dot = np.broadcast_to(numbers_dot, (*y0_dot.shape[:2], numbers.shape[-1]))
         arrays = jax.tree.map(self._array, (ts, y0, numbers, y0_dot, numbers_dot, table))
         (path, result, t_end, y_end), tangents = jax.tree.map(np.asarray, self._follow(*arrays))
         return Motion(path.astype(float), tangents.astype(float), result, t_end, y_end)

@@ -23,6 +23,7 @@ class Part(NamedTuple):
     """The numbers of one leaf that is free: where they stand among all numbers, and how they may move."""
 
     label: str
+    shape: tuple[int, ...]
     places: np.ndarray
     transform: AbstractTransform
 
@@ -64,7 +65,7 @@ class Parameters:
             numbers.append(values)
             if _is_fitted(label, leaf, may_move, free) and values.size:
                 transform = _transform_of(label, transform, values, np.shape(leaf))
-                parts.append(Part(label, np.arange(count, count + values.size), transform))
+                parts.append(Part(label, np.shape(leaf), np.arange(count, count + values.size), transform))
                 names += _names(label, np.shape(leaf))
             count += values.size
         if not names:
@@ -143,6 +144,10 @@ class Parameters:
     def log_volume(self, u, xp: Any = np):
         """log of the volume of the free numbers per volume of u, up to a constant."""
         return sum(part.transform.log_volume(u[own], xp) for own, _, part in self._cuts)
+
+    def drawn(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Another u (F,) to begin a search from."""
+        return np.concatenate([part.transform.drawn(u[own], rng) for own, _, part in self._cuts])
 
     @property
     def labels(self) -> tuple[str, ...]:

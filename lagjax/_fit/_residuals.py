@@ -5,6 +5,7 @@ records. A residual of piece k depends on u and on start k alone: the rows of a 
 residual, are compressed to a triangle of D + 1 rows (QR), in which all sums of squares are the same.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -57,6 +58,7 @@ class Question:
         rtol: float,
     ):
         self.records, self.pieces, self.fitted = records, pieces, fitted
+        self.watch: Callable[[Point | Failure], None] | None = None  # is told of every trial
         self.size, self.rtol, self.least = size, rtol, rtol * size
         self.motions, self.signals, self.parameters = motions, signals, parameters
         self.layout: Layout = signals.layout
@@ -73,12 +75,20 @@ class Question:
 
     def of(self, pieces: list[Piece], fitted: np.ndarray) -> "Question":
         """The same question about other pieces of the records."""
-        return Question(
+        part = Question(
             self.records, pieces, fitted, self.motions, self.signals, self.parameters, self.size, self.rtol
         )  # fmt: skip
+        part.watch = self.watch
+        return part
 
     def at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
         """The residuals of one trial, or the first piece whose motion failed."""
+        trial = self._at(u, starts)
+        if self.watch is not None:
+            self.watch(trial)
+        return trial
+
+    def _at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
         numbers, directions = self.parameters.numbers(u), self.parameters.directions(u)
         starts, moved = self.origins.move(starts, numbers, directions)
         if not (np.isfinite(numbers).all() and np.isfinite(directions).all() and np.isfinite(starts).all()):

@@ -1,6 +1,7 @@
 """`Fit`: what came out of a search, with intervals and in words."""
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, cast
 
@@ -8,12 +9,15 @@ import jax
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
+from lagjax._fit._density import Density
 from lagjax._fit._joint import deviations, of_starts, start_alone
-from lagjax._fit._noise import Known, Widths
+from lagjax._fit._many import Waterfall
+from lagjax._fit._noise import AbstractNoise, Known, Widths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._profile import Profile, profile
 from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike
 from lagjax._fit._residuals import Failure, Point, Question
+from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._segments import Reader
 from lagjax._fit._signals import looks_like_positions
 from lagjax._fit._solve import minimise
@@ -106,6 +110,7 @@ class Fit:
     - `unseen`: a sentence for everything that the data do not tell about the free parameters.
     - `ok`, `message`: whether the search converged and everything free is seen; what happened, in words.
     - `log_likelihood`, `trials`: of independent samples; how often the motions were computed.
+    - `waterfall`: what all starts came to (`Waterfall`), where there were several; else None.
     """
 
     params: PyTree
@@ -118,10 +123,12 @@ class Fit:
     message: str
     log_likelihood: float
     trials: int
+    waterfall: Waterfall | None
     records: tuple[Record, ...]
     parameters: Parameters = field(repr=False)
     u: np.ndarray = field(repr=False)
     states: np.ndarray = field(repr=False)
+    law: AbstractNoise = field(repr=False)
     information: Information = field(repr=False)
     widths: Widths = field(repr=False)
     question: Question = field(repr=False)
@@ -184,6 +191,34 @@ class Fit:
         """
         _require_level(level)
         return profile(self.question, self.u, self.states, self.widths, self.information, name, level)
+
+    def log_density(self, prior: Callable | None = None) -> Density:
+        """The logarithm of the posterior density of all unknowns: a function of one vector for `jax.jit`, `jax.grad`.
+
+        It is flat in the free parameters within their sets, in the starts and in log σ, unless `prior(params)` returns
+        the logarithm of another density of the parameters. Correlated samples count for what they are worth. `first`
+        is the fit, `names` what the numbers are called, `covariance()` that of least squares, and `params(u)` turns the
+        first numbers into the user's pytree.
+        """
+        shares = np.array([noise.effective / noise.samples for noise in self.noise.values()])
+        return Density(self.question, self.system, self.law, self._point, self.widths, shares, prior)
+
+    def sample(self, draws: int = 1000, seed: int = 0, *, chains: int = 4, prior: Callable | None = None) -> Any:
+        """Draws of the posterior by the No-U-Turn sampler, `draws` of each chain, as `arviz.InferenceData`.
+
+        The density is that of `log_density(prior)`. The sampler's metric is the fit's covariance, and all chains go in
+        one batch of motions. The variables are the free parameters by their names, `q0` and `qdot0` of the records
+        whose starts are fitted, and `sigma`, `dof` of the signals. `arviz.summary` tells whether chains agree.
+
+        Raises `ImportError` without blackjax and arviz, and `ValueError` where something free is not seen.
+        """
+        for name, count in (("draws", draws), ("chains", chains)):
+            if not (isinstance(count, int | np.integer) and count > 0):
+                raise ValueError(f"{name} must be a positive whole number; got {count!r}.")
+        if self.unseen:
+            raise ValueError(f"There is no density of what is not seen. {self.unseen[0]}")
+        density = self.log_density(prior)
+        return inference_data(density, draw(density, draws, chains, seed))
 
     @functools.cached_property
     def _point(self) -> Point:
@@ -335,6 +370,8 @@ def _lab_book(fit: Fit) -> str:
         "",
     ]
     lines += [f"not seen    {sentence}" for sentence in fit.unseen]
+    if fit.waterfall is not None:
+        lines.append(f"starts      {fit.waterfall}")
     lines.append(f"verdict     {fit.message}")
     return "\n".join(lines)
 

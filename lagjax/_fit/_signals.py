@@ -23,14 +23,17 @@ _AT_ONCE = 2048  # samples in one call of the compiled sensors: one program for 
 
 
 class Signals:
-    """The sensors of a fit: `names` (S,), and the map from motions to signals and their derivatives."""
+    """The sensors of a fit: `names` (S,), and the map from motions to signals and their derivatives.
+
+    `at_one_time` is the map (y, t, numbers, inputs) → signals (S,) of one state, for JAX.
+    """
 
     def __init__(
         self, observe: Callable | None, layout: Layout, parameters: Parameters, record: Record, form: Form | None = None
     ):
         self.layout, self.parameters, self.form = layout, parameters, form
         if observe is None:
-            self.names, self._at = layout.names, None
+            self.names, self._at, self.at_one_time = layout.names, None, lambda y, *_: y[: layout.size]
             if record.structure != (layout.tree, layout.shapes):
                 raise ValueError(
                     f"values must have the structure of q, {layout.tree} of shapes {layout.shapes}, where there is no "
@@ -54,6 +57,7 @@ class Signals:
             state = y, t, numbers, inputs
             return flat(*state), *jax.jacfwd(flat, argnums=(0, 2))(*state)
 
+        self.at_one_time = flat
         self._at = jax.jit(jax.vmap(with_derivatives, in_axes=(0, 0, 0, None)))
 
     def of(self, motion: Motion, ts: np.ndarray, inputs: np.ndarray, numbers: np.ndarray, numbers_dot: np.ndarray):

@@ -60,6 +60,10 @@ class AbstractTransform(abc.ABC):
         """The ends of intervals about `x` (n,) whose half width is `spread` where the set does not bend them."""
 
     @abc.abstractmethod
+    def drawn(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Another u (m,) to begin a search from, anywhere in the set if that is bounded, else about `u`."""
+
+    @abc.abstractmethod
     def log_volume(self, u, xp: Any = np) -> Any:
         """log of the volume of x per volume of u, up to a constant: what makes a density of x one of u."""
 
@@ -116,6 +120,10 @@ class Unbounded(AbstractSeparable):
         """u(x)."""
         return x
 
+    def drawn(self, u, rng):
+        """Normal about u, as wide as it is large; as wide as one about zero."""
+        return u + np.where(u != 0, np.abs(u), 1.0) * rng.normal(size=len(u))
+
     def refuses(self, x):
         """None: every number is allowed."""
         return None
@@ -136,6 +144,10 @@ class Positive(AbstractSeparable):
     def inverse(self, x):
         """u(x), of positive x."""
         return np.log(x)
+
+    def drawn(self, u, rng):
+        """Normal in the logarithm, with the standard deviation of a decade."""
+        return u + np.log(10.0) * rng.normal(size=len(u))
 
     def refuses(self, x):
         """That values must be positive, where one is not."""
@@ -163,6 +175,11 @@ class Between(AbstractSeparable):
     def inverse(self, x):
         """u(x), of x between the bounds."""
         return np.log((x - self.lower) / (self.upper - x))
+
+    def drawn(self, u, rng):
+        """Uniform between the bounds."""
+        share = rng.uniform(size=len(u))
+        return np.log(share / (1.0 - share))
 
     def refuses(self, x):
         """That values must lie between the bounds, where one does not."""
@@ -196,6 +213,10 @@ class Angle(AbstractSeparable):
     def inverse(self, x):
         """u(x)."""
         return x
+
+    def drawn(self, u, rng):
+        """Uniform on the circle."""
+        return rng.uniform(-np.pi, np.pi, len(u))
 
     def ends(self, x, spread):
         """x ± spread, at most a turn in all."""
@@ -248,6 +269,10 @@ class Simplex(AbstractTransform):
     def inverse(self, x):
         """u(x) = Hᵀ log x."""
         return _helmert(len(x)).T @ np.log(x)
+
+    def drawn(self, u, rng):
+        """Uniform on the simplex."""
+        return self.inverse(rng.dirichlet(np.ones(len(u) + 1)))
 
     def ends(self, x, spread):
         """Intervals of every share, made in its logit."""
@@ -349,6 +374,10 @@ class Inertia(AbstractTransform):
         factor = flipped[::-1, ::-1] / flipped[0, 0]
         off = [factor[place] for place in ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))]
         return np.array([np.log(flipped[0, 0]), *np.log(np.diag(factor)[:3]), *off])
+
+    def drawn(self, u, rng):
+        """Normal about u with the standard deviation of a factor 1.65 in masses and lengths."""
+        return u + 0.5 * rng.normal(size=len(u))
 
     def ends(self, x, spread):
         """Relative intervals for what is positive, the mass and the diagonal; others are x ± spread."""

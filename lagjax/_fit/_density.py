@@ -1,0 +1,177 @@
+"""`Density`: the logarithm of the posterior density of a fit's unknowns, a function of one vector for JAX.
+
+    log p(x) = Σ_s (effective_s/samples_s) log L_s + log prior(params) + log |∂params/∂u|
+
+x holds u, which moves the free parameters, the starts that are fitted, and of every signal log σ and, for Student's t,
+a number that moves ν. All records go in one batch of motions, and the gradient comes back over their steps: about five
+motions, however many unknowns there are. Without a `prior` the density is flat in the parameters within their sets, in
+the starts and in log σ and log ν. A motion that cannot be followed has the density zero.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import gammaln
+
+from lagjax._fit._inputs import Driven, asks
+from lagjax._fit._noise import AbstractNoise, StudentT, Widths
+from lagjax._fit._records import Samples, started
+from lagjax._fit._residuals import Point, Question
+from lagjax._layout import halves
+from lagjax._simulate import simulate
+from lagjax._system import System
+
+_LEAST_DOF, _MOST_DOF = 1.0, 200.0  # ν is between these, with a flat density of its logarithm
+
+
+class Unknowns(NamedTuple):
+    """One vector x taken apart: u (F,), the starts of all records (N, 2n), and the noise σ (S,), ν (S,)."""
+
+    u: Any
+    starts: Any
+    sigma: Any
+    dof: Any
+
+
+class Density:
+    """log p(x), called with x (D,), for records whose residuals are those of `question` at `point`.
+
+    - `first` (D,): the fit; `names` (D,): what the numbers are called.
+    - `shares` (S,): how many independent samples one sample of each signal is worth.
+    """
+
+    def __init__(
+        self, question: Question, system: System, noise: AbstractNoise, point: Point, widths: Widths,
+        shares: np.ndarray, prior: Callable | None = None,
+    ):  # fmt: skip
+        self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths
+        form = question.signals.form
+        self._form = form if form is not None and asks(system) else None
+        self._scene = system if self._form is None else self._form.driven(system)
+        self._tails = np.isfinite(widths.dof)
+        self._moves_dof = isinstance(noise, StudentT) and noise.dof is None
+        share = np.log(np.clip(widths.dof, 1.01 * _LEAST_DOF, 0.99 * _MOST_DOF) / _LEAST_DOF)
+        share = share / math.log(_MOST_DOF / _LEAST_DOF)
+        dof = np.log(share / (1 - share)) if self._moves_dof else np.zeros(0)
+        starts = point.starts[question.fitted].ravel()
+        self.first = np.concatenate([point.u, starts, np.log(widths.sigma), dof])
+        self.names = (*question.parameters.labels, *self._names_of_starts(), *self._names_of_noise())
+
+    def _names_of_starts(self) -> list[str]:
+        names, places = self.question.layout.names, np.flatnonzero(self.question.fitted)
+        return [f"starts[{k}].{half}{name[1:]}" for k in places for half in ("q", "qdot") for name in names]
+
+    def _names_of_noise(self) -> list[str]:
+        names = self.question.signals.names
+        return [f"log σ of {name}" for name in names] + [f"ν of {name}" for name in names] * self._moves_dof
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def unknowns(self, x) -> Unknowns:
+        """A vector (D,) taken apart."""
+        parameters, fitted, count = self.question.parameters, self.question.fitted, len(self.widths.sigma)
+        u, rest = x[: len(parameters)], x[len(parameters) :]
+        states = int(fitted.sum()) * self.question.states
+        starts = (
+            jnp.asarray(self.point.starts, x.dtype)
+            .at[np.flatnonzero(fitted)]
+            .set(rest[:states].reshape(-1, self.question.states))
+        )
+        sigma, moved = jnp.exp(rest[states : states + count]), rest[states + count :]
+        dof = self._dof(moved) if self._moves_dof else jnp.asarray(self.widths.dof, x.dtype)
+        return Unknowns(u, self._begun(starts, u), sigma, dof)
+
+    @staticmethod
+    def _dof(moved):
+        return _LEAST_DOF * jnp.exp(math.log(_MOST_DOF / _LEAST_DOF) * jax.nn.sigmoid(moved))
+
+    def _begun(self, starts, u):
+        """The starts, of which some are functions of the parameters."""
+        layout = self.question.layout
+        for k, piece in enumerate(self.question.pieces):
+            start = self.question.records[piece.record].start
+            if callable(start):
+                pair = started(start, self.params(u))
+                starts = starts.at[k].set(jnp.concatenate([layout.flatten(half) for half in pair]))
+        return starts
+
+    def params(self, u):
+        """The user's pytree of parameters at u (F,)."""
+        return self.question.parameters.restore(self.question.parameters.numbers(u, jnp))
+
+    def __call__(self, x):
+        """log p(x), up to a constant; −∞ where a motion could not be followed."""
+        at = self.unknowns(jnp.asarray(x, self.question.layout.dtype))
+        total = self.question.parameters.log_volume(at.u, jnp)
+        if self.prior is not None:
+            total = total + self.prior(self.params(at.u))
+        if self._moves_dof:
+            moved = x[-len(self.widths.sigma) :]
+            total = total + jnp.sum(jax.nn.log_sigmoid(moved) + jax.nn.log_sigmoid(-moved))
+        for batch in self.question.batches:
+            total = total + self._likelihood(self.residuals(batch, at), batch, at)
+        return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+    def residuals(self, batch: Samples, at: Unknowns):
+        """What the sensors show less what was measured, (N, T, S), of the records of one batch."""
+        layout, signals = self.question.layout, self.question.signals
+        numbers = self.question.parameters.numbers(at.u, jnp)
+        params = self.question.parameters.restore(numbers)
+
+        def follow(ts, y0, inputs, table):
+            q, qdot = map(layout.restore, halves(y0))
+            own = params if self._form is None else Driven(params, *table)
+            motion = simulate(self._scene, q, qdot, ts, own, rtol=self.question.rtol, throw=False)
+            rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))(motion.q, motion.qdot)
+            return jax.vmap(lambda y, t, i: signals.at_one_time(y, t, numbers, i))(rows, ts, inputs)
+
+        ts, values, inputs = (jnp.asarray(x, at.u.dtype) for x in (batch.ts, batch.values, batch.inputs))
+        table = None if batch.table is None else tuple(jnp.asarray(x, at.u.dtype) for x in batch.table)
+        shown = jax.vmap(follow)(ts, at.starts[batch.rows], inputs, table)
+        return jnp.where(batch.weights > 0, shown - values, 0.0)
+
+    def _likelihood(self, residuals, batch: Samples, at: Unknowns):
+        """Σ_s shares_s log L_s of the samples of one batch, up to a constant."""
+        squares = batch.weights * (residuals / at.sigma) ** 2
+        dof = jnp.where(self._tails, at.dof, 1.0)
+        tails = (
+            gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * jnp.log(dof) - (dof + 1) / 2 * jnp.log1p(squares / dof)
+        )
+        each = jnp.where(self._tails, tails, -0.5 * squares) - jnp.log(at.sigma)
+        return jnp.sum(jnp.where(batch.weights > 0, each * self.shares, 0.0))
+
+    def covariance(self) -> np.ndarray:
+        """The covariance (D, D) of x in the approximation of least squares, about the fit.
+
+        Raises `ValueError` where something is not seen: there is no density then without a prior.
+        """
+        question, point, states = self.question, self.point, self.question.states
+        robust = np.array([(d + 1) / (d + 3) if np.isfinite(d) else 1.0 for d in self.widths.dof])
+        weight = np.sqrt(self.shares * robust) / self.widths.sigma
+        triangles = question.triangles(point, [np.sqrt(batch.weights) * weight for batch in question.batches])
+        free, places = len(point.u), np.flatnonzero(question.fitted)
+        size = free + states * len(places)
+        precision = np.zeros((size, size))
+        for k, triangle in enumerate(triangles):
+            own = list(range(free))
+            if question.fitted[k]:
+                begin = free + states * int(np.searchsorted(places, k))
+                own = list(range(begin, begin + states)) + own
+            columns = triangle[:, :-1] if question.fitted[k] else triangle[:, states:-1]
+            precision[np.ix_(own, own)] += columns.T @ columns
+        scale = np.sqrt(np.diag(precision))
+        if not (scale > 0).all():
+            raise ValueError(f"Nothing that was measured depends on {self.names[int(np.argmin(scale))]}.")
+        unit = precision / np.outer(scale, scale)
+        if np.linalg.eigvalsh(unit).min() < 1e-13:
+            raise ValueError("Some combination of the parameters and starts is not seen: keep it fixed.")
+        samples = (question.weights > 0).sum(axis=0) * self.shares
+        rest = [*0.5 / samples, *np.full(len(self) - size - len(samples), 0.25)]
+        found = np.diag(np.concatenate([np.zeros(size), rest]))
+        found[:size, :size] = np.linalg.inv(unit) / np.outer(scale, scale)
+        return found
