@@ -94,8 +94,8 @@ def crossings(
     require_system(system)
     require_flag(throw, "throw")
     require_budget(count, "count")
-    names, functions = _sections(section)
-    directions = _directions(direction, names)
+    names, functions = sections_of(section)
+    directions = directions_of(direction, names)
     layout = Layout.of(q0, qdot0)
     problem = Problem.of(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
     if has_constraints(system):
@@ -153,7 +153,7 @@ def _dressed(layout: Layout, names: tuple[str, ...] | None, noted: Noted, ok) ->
 # ---- what can be wrong -----------------------------------------------------------------------------------------------
 
 
-def _sections(section) -> tuple[tuple[str, ...] | None, tuple]:
+def sections_of(section) -> tuple[tuple[str, ...] | None, tuple]:
     """The names of a dict of sections, or None, and the functions."""
     if not isinstance(section, dict):
         return None, (accept(section, "section"),)
@@ -164,7 +164,7 @@ def _sections(section) -> tuple[tuple[str, ...] | None, tuple]:
     return tuple(section), tuple(accept(function, f"section[{name!r}]") for name, function in section.items())
 
 
-def _directions(direction, names) -> tuple[int, ...]:
+def directions_of(direction, names) -> tuple[int, ...]:
     if isinstance(direction, dict):
         if names is None or set(direction) != set(names):
             raise ValueError("direction is a dict: give the same names as in the dict of sections.")

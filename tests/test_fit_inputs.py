@@ -36,7 +36,7 @@ def record_of(ts, hold, seed=0, **more):
     return lagjax.Record(ts, exact(ts, u, hold), {"u": u}, **more)
 
 
-@pytest.mark.parametrize("hold", ["zero", "linear"])
+@pytest.mark.parametrize("hold", ["zero", pytest.param("linear", marks=pytest.mark.slow)])
 def test_a_driven_oscillator_is_followed_and_recovered_from_records_of_any_length(hold):
     ends = [200, 90]
     records = [record_of(1.0 + TS[:end], hold, end) for end in ends]

@@ -26,12 +26,13 @@ from lagjax._fit._many import Waterfall, distinct, drawn, misfit, short_search
 from lagjax._fit._motions import motions_of
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike, started
+from lagjax._fit._records import Guess, Measured, Piece, Record, in_structure, known_start, require_alike, started
 from lagjax._fit._residuals import Failure, Question
 from lagjax._fit._result import Covariance, Fit, SignalNoise
 from lagjax._fit._segments import Reader, glimpses, levels, time_scale, whole
 from lagjax._fit._signals import Signals, looks_like_positions
 from lagjax._fit._solve import Anchor, Descent, minimise
+from lagjax._fit._timings import Clock, Timings
 from lagjax._fit._transforms import angle, between, inertia, positive, simplex
 from lagjax._fit._uncertainty import Information, information
 from lagjax._fit._unseen import sentences
@@ -40,7 +41,18 @@ from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
 
 __all__ = [
-    "Fit", "Gaussian", "Guess", "Record", "StudentT", "angle", "between", "fit", "inertia", "positive", "simplex",
+    "Fit",
+    "Gaussian",
+    "Guess",
+    "Record",
+    "StudentT",
+    "Timings",
+    "angle",
+    "between",
+    "fit",
+    "inertia",
+    "positive",
+    "simplex",
 ]  # fmt: skip
 PyTree = Any
 
@@ -57,7 +69,7 @@ _BEST = 4  # of many starts go through the whole search
 
 def fit(
     system: System,
-    records: Record | list[Record],
+    records: Record | Timings | list,
     params0: PyTree,
     *,
     observe: Callable | None = None,
@@ -77,7 +89,7 @@ def fit(
 
     **Arguments**
 
-    - `records`: one `Record` or several, of any lengths.
+    - `records`: one `Record` or several, of any lengths; and `lagjax.Timings`, beside them or alone.
     - `params0`: where the search for the parameters begins, in the structure that the scene's functions ask for.
     - `observe`: a function of (q, qdot), and of `t`, `params`, `inputs` by name, that returns what the sensors show in
       the structure of a record's `values`; by default q.
@@ -132,7 +144,10 @@ def fit(
     layout = _layout(system, records, params0, form)
     parameters = Parameters.of(params0, free, transforms, layout.dtype)
     question = _question(system, records, layout, parameters, observe, form)
-    readers = _readers(records) if looks_like_positions(observe, records[0], layout) else None
+    if starts > 1 and question.clocks:
+        raise ValueError("starts must be 1 where there are lagjax.Timings: their search has one beginning.")
+    first = next((record for record in records if isinstance(record, Record)), None)
+    readers = _readers(records) if first is not None and looks_like_positions(observe, first, layout) else None
     if progress:
         question.watch = _Printer(question.size)
     y0 = np.stack([_start(record, readers, layout, k, params0) for k, record in enumerate(records)])
@@ -144,13 +159,17 @@ def fit(
 
 def _form(system: System, records: list[Record], hold: str) -> Form | None:
     """The structure of the inputs. Raises `ValueError` where the scene asks for some, and there are none."""
-    structure = records[0].input_structure
-    if structure is not None:
-        tree, shapes = structure
-        return Form(tree, shapes, hold)
-    if asking := asks(system):
-        raise ValueError(f"{asking[0]} asks for `inputs`, which records[0] has none of: give Record(..., inputs=...).")
-    return None
+    asking = asks(system)
+    for place, record in enumerate(records):
+        if asking and (not isinstance(record, Record) or record.input_structure is None):
+            raise ValueError(
+                f"{asking[0]} asks for `inputs`, which records[{place}] has none of: give Record(..., inputs=...)."
+            )
+    structures = [record.input_structure for record in records if isinstance(record, Record)]
+    if not structures or structures[0] is None:
+        return None
+    tree, shapes = structures[0]
+    return Form(tree, shapes, hold)
 
 
 def _layout(system: System, records: list[Record], params0, form: Form | None) -> Layout:
@@ -175,33 +194,49 @@ def _question(system, records, layout, parameters, observe, form) -> Question:
     """The question about whole records."""
     rtol = DEFAULT_RTOL[layout.dtype]
     motions = motions_of(system, layout, parameters, rtol, None, form)
-    signals = Signals(observe, layout, parameters, records[0], form)
-    size = np.sqrt(np.nanmean(np.concatenate([record.matrix for record in records]) ** 2, axis=0))
+    recordings = [record for record in records if isinstance(record, Record)]
+    signals = Signals(observe, layout, parameters, recordings[0] if recordings else None, form)
+    size = _sizes(recordings)
+    timings = {k: record for k, record in enumerate(records) if isinstance(record, Timings)}
+    clocks = {k: Clock(system, layout, parameters, record, rtol) for k, record in timings.items()}
+    if timings:
+        size = np.append(size, max(np.ptp(record.ts) for record in timings.values()))
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
     if fitted.any() and has_constraints(system):
         raise ValueError(
             f"records[{int(np.argmax(fitted))}] has no known start: a start on constraints cannot be fitted yet. Give "
             "start=(q0, qdot0), or use coordinates without constraints."
         )
-    return Question(records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol)
+    return Question(
+        records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol, clocks
+    )
 
 
-def _readers(records: list[Record]) -> list[Reader]:
+def _sizes(recordings: list[Record]) -> np.ndarray:
+    """The root mean square of each signal; of none without recordings."""
+    if not recordings:
+        return np.zeros(0)
+    return np.sqrt(np.nanmean(np.concatenate([record.matrix for record in recordings]) ** 2, axis=0))
+
+
+def _readers(records: list) -> list[Reader | None]:
     """What reads states off the data, for each record; all together try windows at a few hundred places."""
-    return [Reader.of(record, max(8, 256 // len(records))) for record in records]
+    probes = max(8, 256 // len(records))
+    return [Reader.of(record, probes) if isinstance(record, Record) else None for record in records]
 
 
-def _start(record: Record, readers: list[Reader] | None, layout: Layout, place: int, params0) -> np.ndarray:
+def _start(record: Measured, readers: list[Reader | None] | None, layout: Layout, place: int, params0) -> np.ndarray:
     """Where the search for the start of one record begins, (2n,)."""
     state = known_start(record, layout, place, params0)
     if state is not None:
         return state
-    if readers is None:
+    reader = None if readers is None else readers[place]
+    if reader is None:
         raise ValueError(
             f"records[{place}] needs a start, because its values do not have the structure of q: give "
             "start=(q0, qdot0) if it is known, else start=lagjax.Guess(q0, qdot0)."
         )
-    return readers[place].states(np.array([0]))[0]
+    return reader.states(np.array([0]))[0]
 
 
 def _searches(question: Question, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
@@ -263,7 +298,7 @@ class _Begun(NamedTuple):
     misfit: float
 
 
-def _grown(question: Question, u, starts, noise, readers: list[Reader]) -> tuple[np.ndarray, np.ndarray]:
+def _grown(question: Question, u, starts, noise, readers: list[Reader | None]) -> tuple[np.ndarray, np.ndarray]:
     """Better first values of u and of the starts, from segments that grow together to whole records."""
     anchor = Anchor(u, np.where(np.isfinite(question.parameters.reach), 1.0 / _LOOSE, 0.0))
     search = functools.partial(_level, question, noise=noise, readers=readers, anchor=anchor)
@@ -280,21 +315,23 @@ def _grown(question: Question, u, starts, noise, readers: list[Reader]) -> tuple
     return u, np.stack([best[k, 0] for k in range(len(question.records))])
 
 
-def _begun(question: Question, u, starts, readers: list[Reader], search) -> _Begun:
+def _begun(question: Question, u, starts, readers: list[Reader | None], search) -> _Begun:
     """The search on the shortest segments, from u, whose misfit is positive where they were not fitted.
 
     It is the mean logarithm of the noise σ of the signals, over `_POOR` times the scatter of the data or a share
     `_COARSE` of the signals' size, whichever is larger.
     """
-    cuts = levels(question.records, time_scale(readers, question.motions, question.parameters.numbers(u)))
+    reading = [reader for reader in readers if reader is not None]
+    recordings = [None if reader is None else reader.record for reader in readers]
+    cuts = levels(recordings, time_scale(reading, question.motions, question.parameters.numbers(u)))
     best = {(k, 0): start for k, start in enumerate(starts)}
     if not cuts:
         return _Begun(u, cuts, best, -np.inf)
     done = search(cuts[0], u, best)
     if isinstance(done, Failure):
         return _Begun(u, cuts, best, np.inf)
-    scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in readers], axis=0))
-    ratio = done.widths.sigma / np.maximum(_POOR * scatter, _COARSE * question.size)
+    scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in reading], axis=0))
+    ratio = done.widths.sigma / np.maximum(_POOR * scatter, _COARSE * question.size[: len(scatter)])
     return _Begun(done.point.u, cuts, best, float(np.mean(np.log(ratio))))
 
 
@@ -303,7 +340,7 @@ def _level(question: Question, pieces: list[Piece], u, best, noise, readers, anc
     firsts = [(piece.record, int(piece.places[0])) for piece in pieces]
     for k, reader in enumerate(readers):
         new = [place for record, place in firsts if record == k and (k, place) not in best]
-        if new:
+        if new and reader is not None:
             best |= {(k, place): y for place, y in zip(new, reader.states(np.array(new)), strict=True)}
     part = question.of(pieces, np.array([question.fitted[k] or place > 0 for k, place in firsts]))
     y0 = np.stack([best[first] for first in firsts])
@@ -313,10 +350,11 @@ def _level(question: Question, pieces: list[Piece], u, best, noise, readers, anc
     return done
 
 
-def _glimpsed(question: Question, u, noise, readers: list[Reader], anchor: Anchor) -> np.ndarray:
+def _glimpsed(question: Question, u, noise, readers: list[Reader | None], anchor: Anchor) -> np.ndarray:
     """The u that suits the accelerations of local cubics: these have one minimum where segments are too long for u."""
-    scale = time_scale(readers, question.motions, question.parameters.numbers(u))
-    short, states = glimpses(readers, 0.25 * scale)
+    reading = [reader for reader in readers if reader is not None]
+    scale = time_scale(reading, question.motions, question.parameters.numbers(u))
+    short, states = glimpses(reading, 0.25 * scale)
     part = Question(
         short, whole(short), np.ones(len(short), bool), question.motions, question.signals, question.parameters,
         question.size, question.rtol,
@@ -366,7 +404,7 @@ def _noise_by_name(question: Question, widths, known: Information) -> dict[str, 
     columns = zip(widths.sigma, widths.dof, samples, known.effective, 2 * (1 - known.correlation), strict=True)
     return {
         name: SignalNoise(float(sigma), float(dof), int(count), float(effective), float(watson))
-        for name, (sigma, dof, count, effective, watson) in zip(question.signals.names, columns, strict=True)
+        for name, (sigma, dof, count, effective, watson) in zip(question.names, columns, strict=True)
     }
 
 
@@ -375,7 +413,7 @@ def _by_record(question: Question, point) -> tuple[PyTree, ...]:
     for batch, residuals in zip(question.batches, point.residuals, strict=True):
         for row, left, weights in zip(batch.rows.tolist(), residuals, batch.weights, strict=True):
             record = question.records[row]
-            matrix = np.where(weights > 0, left, np.nan)[: len(record)]
+            matrix = np.where(weights > 0, left, np.nan)[: len(record), question.columns(row)]
             found[row] = in_structure(matrix, record)
     return tuple(found[row] for row in range(len(question.records)))
 

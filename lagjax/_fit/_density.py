@@ -66,7 +66,7 @@ class Density:
         return [f"starts[{k}].{half}{name[1:]}" for k in places for half in ("q", "qdot") for name in names]
 
     def _names_of_noise(self) -> list[str]:
-        names = self.question.signals.names
+        names = self.question.names
         return [f"log σ of {name}" for name in names] + [f"ν of {name}" for name in names] * self._moves_dof
 
     def __len__(self) -> int:

@@ -20,8 +20,20 @@ class Guess(NamedTuple):
     qdot: PyTree
 
 
+class Measured:
+    """What was measured of one motion: a `Record`, or `Timings`."""
+
+    ts: np.ndarray
+    start: Any
+    matrix: np.ndarray
+    weight_matrix: np.ndarray
+
+    def __len__(self) -> int:
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, eq=False)
-class Record:
+class Record(Measured):
     """One recording: what was measured at which times.
 
     - `ts` (T,): the times, strictly increasing, T ≥ 2. Records need not be equally long, nor equally spaced.
@@ -187,8 +199,10 @@ def _matrix_of_weights(record: Record) -> np.ndarray:
     return np.where(np.isnan(record.matrix), 0.0, matrix)
 
 
-def in_structure(matrix: np.ndarray, record: Record) -> PyTree:
-    """Signals (T, S) in the structure of a record's values."""
+def in_structure(matrix: np.ndarray, record) -> PyTree:
+    """Signals (T, S) in the structure of a record's values, or times (M, 1) in that of its times."""
+    if not isinstance(record, Record):
+        return record.restore(matrix)
     return _taken_apart(matrix, record.structure)
 
 
@@ -235,7 +249,7 @@ class Samples(NamedTuple):
     table: Table | None
 
 
-def batches(records: list[Record], pieces: list[Piece], eps: float = 2.3e-16) -> list[Samples]:
+def batches(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16) -> list[Samples]:
     """The pieces in batches, none of which is longer than twice its shortest piece: at most half of the room is empty.
 
     `eps` is the round-off of the numbers that the motion is computed in.
@@ -250,7 +264,7 @@ def batches(records: list[Record], pieces: list[Piece], eps: float = 2.3e-16) ->
 
 
 def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, eps: float) -> Samples:
-    longest, signals = max(len(pieces[row].places) for row in rows), records[0].matrix.shape[1]
+    longest, signals = max(len(pieces[row].places) for row in rows), records[pieces[rows[0]].record].matrix.shape[1]
     ts = np.zeros((len(rows), longest))
     values, weights = np.zeros((2, len(rows), longest, signals))
     matrices = {pieces[row].record: None for row in rows}
@@ -271,37 +285,48 @@ def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, 
     return Samples(rows, ts, values, weights, inputs, table_of(sampled) if driven.shape[1] else None)
 
 
-def require_alike(records) -> list[Record]:
-    """The records as a list. Raises where there is none, or where they differ in the structure of their signals."""
-    listed = [records] if isinstance(records, Record) else list(records)
+def require_alike(records) -> list[Any]:
+    """The records and timings as a list. Raises where there is none, or where records differ in their signals."""
+    listed = [records] if isinstance(records, Measured) else list(records)
     if not listed:
         raise ValueError("records is empty: a fit needs at least one lagjax.Record.")
     for place, record in enumerate(listed):
-        if not isinstance(record, Record):
-            raise TypeError(f"records[{place}] must be a lagjax.Record; got {type(record).__name__}.")
-        if record.structure != listed[0].structure:
-            raise ValueError(
-                f"records[{place}] has other signals than records[0]: {record.structure} and {listed[0].structure}."
+        if not isinstance(record, Measured):
+            raise TypeError(
+                f"records[{place}] must be a lagjax.Record, or lagjax.Timings; got {type(record).__name__}."
             )
-        if record.input_structure != listed[0].input_structure:
-            raise ValueError(
-                f"records[{place}] has other inputs than records[0]: {record.input_structure} and "
-                f"{listed[0].input_structure}."
-            )
-    measured = np.any([(record.weight_matrix > 0).any(axis=0) for record in listed], axis=0)
-    if not measured.all():
-        which = int(np.argmin(measured))
-        raise ValueError(
-            f"The signal values{listed[0].names[which]} is NaN, or has no weight, at all times of all records: leave "
-            "it out of `values` and of what `observe` returns."
-        )
+    _require_alike([(place, record) for place, record in enumerate(listed) if isinstance(record, Record)])
     for place, record in enumerate(listed):
         if not (record.weight_matrix > 0).any():
             raise ValueError(f"records[{place}] holds no sample: all its values are NaN or have no weight.")
     return listed
 
 
-def known_start(record: Record, layout: Layout, place: int, params: PyTree) -> np.ndarray | None:
+def _require_alike(placed: list[tuple[int, Record]]) -> None:
+    """Raise `ValueError` where records, with their places, differ in structure, or a signal is in none of them."""
+    if not placed:
+        return
+    begin, first = placed[0]
+    for place, record in placed:
+        if record.structure != first.structure:
+            raise ValueError(
+                f"records[{place}] has other signals than records[{begin}]: {record.structure} and {first.structure}."
+            )
+        if record.input_structure != first.input_structure:
+            raise ValueError(
+                f"records[{place}] has other inputs than records[{begin}]: {record.input_structure} and "
+                f"{first.input_structure}."
+            )
+    measured = np.any([(record.weight_matrix > 0).any(axis=0) for _, record in placed], axis=0)
+    if not measured.all():
+        which = int(np.argmin(measured))
+        raise ValueError(
+            f"The signal values{first.names[which]} is NaN, or has no weight, at all times of all records: leave "
+            "it out of `values` and of what `observe` returns."
+        )
+
+
+def known_start(record: Measured, layout: Layout, place: int, params: PyTree) -> np.ndarray | None:
     """The state (2n,) that a record says it starts from, known, guessed or of `params`; None where it says nothing."""
     if record.start is None:
         return None

@@ -5,17 +5,19 @@ records. A residual of piece k depends on u and on start k alone: the rows of a 
 residual, are compressed to a triangle of D + 1 rows (QR), in which all sums of squares are the same.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._fit._motions import AbstractMotions, Motion
+from lagjax._fit._motions import AbstractMotions
 from lagjax._fit._noise import AbstractNoise, Widths, counts
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Piece, Record, Samples, batches
 from lagjax._fit._signals import Signals
 from lagjax._fit._starts import Origins
+from lagjax._fit._timings import Clock
 from lagjax._layout import Layout
 
 
@@ -43,7 +45,8 @@ class Question:
     """Pieces of records, the scene and its sensors, and what is free.
 
     `fitted` (N,) says of each piece whether its start is free; `size` (S,) is the root mean square
-    of the signals, and that times `rtol`, the tolerance of the motion, the smallest noise that can be told.
+    of the signals, and that times `rtol`, the tolerance of the motion, the smallest noise that can be told. Where some
+    pieces are `Timings`, with `clocks` by the number of the record, crossing times are one more signal, the last.
     """
 
     def __init__(
@@ -56,16 +59,20 @@ class Question:
         parameters: Parameters,
         size: np.ndarray,
         rtol: float,
+        clocks: dict[int, Clock] | None = None,
     ):
         self.records, self.pieces, self.fitted = records, pieces, fitted
         self.watch: Callable[[Point | Failure], None] | None = None  # is told of every trial
-        self.size, self.rtol, self.least = size, rtol, rtol * size
+        self.clocks = {} if clocks is None else clocks
+        timed = any(piece.record in self.clocks for piece in pieces)
+        self.names = (*signals.names, *(("times",) if timed else ()))
+        self.size, self.rtol, self.least = size[: len(self.names)], rtol, rtol * size[: len(self.names)]
         self.motions, self.signals, self.parameters = motions, signals, parameters
         self.layout: Layout = signals.layout
-        self.batches: list[Samples] = batches(records, pieces, float(np.finfo(self.layout.dtype).eps))
+        self.batches: list[Samples] = self._in_batches()
         starts = [records[piece.record].start if piece.places[0] == 0 else None for piece in pieces]
         self.origins = Origins(starts, self.layout, parameters)
-        self.weights = np.concatenate([b.weights.reshape(-1, len(size)) for b in self.batches])
+        self.weights = np.concatenate([b.weights.reshape(-1, len(self.names)) for b in self.batches])
         self.measured = int((self.weights > 0).sum())
 
     @property
@@ -76,10 +83,35 @@ class Question:
     def of(self, pieces: list[Piece], fitted: np.ndarray) -> "Question":
         """The same question about other pieces of the records."""
         part = Question(
-            self.records, pieces, fitted, self.motions, self.signals, self.parameters, self.size, self.rtol
+            self.records, pieces, fitted, self.motions, self.signals, self.parameters, self.size, self.rtol, self.clocks
         )  # fmt: skip
         part.watch = self.watch
         return part
+
+    def columns(self, record: int) -> slice:
+        """Which of the signals a record has."""
+        last = len(self.signals.names)
+        return slice(last, last + 1) if record in self.clocks else slice(0, last)
+
+    def _in_batches(self) -> list[Samples]:
+        """The records in batches, then each of the timings as a batch of its own, all with a column for each signal."""
+        sensed = [row for row, piece in enumerate(self.pieces) if piece.record not in self.clocks]
+        some = batches(self.records, [self.pieces[row] for row in sensed], float(np.finfo(self.layout.dtype).eps))
+        found = [batch._replace(rows=np.array(sensed)[batch.rows]) for batch in some]
+        for row, (k, _) in enumerate(self.pieces):
+            if k in self.clocks:
+                record = self.records[k]
+                weights, values = record.weight_matrix[None], np.nan_to_num(record.matrix)[None]
+                found.append(
+                    Samples(np.array([row]), values[..., 0], values, weights, np.zeros((1, len(record), 0)), None)
+                )
+        return [self._widened(batch) for batch in found]
+
+    def _widened(self, batch: Samples) -> Samples:
+        columns = self.columns(self.pieces[batch.rows[0]].record)
+        values, weights = np.zeros((2, *batch.ts.shape, len(self.names)))
+        values[..., columns], weights[..., columns] = batch.values, batch.weights
+        return batch._replace(values=values, weights=weights)
 
     def at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
         """The residuals of one trial, or the first piece whose motion failed."""
@@ -95,14 +127,13 @@ class Question:
             return Failure(0, "A parameter is not finite.")
         residuals, slopes = [], []
         for batch in self.batches:
-            y0_dot, numbers_dot = self._along(batch, moved, directions)
-            motion = self.motions.follow(batch.ts, starts[batch.rows], numbers, y0_dot, numbers_dot, batch.table)
-            if not motion.ok:
-                row, text = motion.why_not(batch.ts, self.layout)
-                return Failure(int(batch.rows[row]), text)
-            failure = self._collect(batch, motion, numbers, numbers_dot, residuals, slopes)
-            if failure is not None:
-                return failure
+            along = self._along(batch, moved, directions)
+            clock = self.clocks.get(self.pieces[batch.rows[0]].record)
+            follow = self._sense if clock is None else functools.partial(self._time, clock)
+            shown = follow(batch, starts[batch.rows], numbers, *along)
+            if isinstance(shown, Failure):
+                return shown
+            self._collect(batch, *shown, residuals, slopes)
         return Point(u, starts, residuals, slopes)
 
     def _along(self, batch: Samples, moved: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,10 +144,14 @@ class Question:
         y0_dot[:, states:] = moved[batch.rows]
         return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
 
-    def _collect(self, batch: Samples, motion: Motion, numbers, numbers_dot, residuals, slopes) -> Failure | None:
-        """Append the residuals of one batch and their derivatives; the first that is not finite as a failure."""
+    def _sense(self, batch: Samples, y0, numbers, y0_dot, numbers_dot) -> tuple[np.ndarray, np.ndarray] | Failure:
+        """What the sensors show of a batch (N, T, S), and how that moves (N, T, S, D)."""
+        motion = self.motions.follow(batch.ts, y0, numbers, y0_dot, numbers_dot, batch.table)
+        if not motion.ok:
+            row, text = motion.why_not(batch.ts, self.layout)
+            return Failure(int(batch.rows[row]), text)
         values, by_unknowns = self.signals.of(motion, batch.ts, batch.inputs, numbers, numbers_dot)
-        counted = batch.weights > 0
+        counted = batch.weights[..., : len(self.signals.names)] > 0
         bad = counted & ~(np.isfinite(values) & np.isfinite(by_unknowns).all(axis=-1))
         if bad.any():
             row, place, signal = np.argwhere(bad)[0]
@@ -126,12 +161,28 @@ class Question:
                 f"What `observe` returns for {self.signals.names[signal]}, or its derivative, is not finite at sample "
                 f"{sample}, t = {batch.ts[row, place]:g}.",
             )
+        return values, by_unknowns
+
+    def _time(self, clock: Clock, batch: Samples, y0, numbers, y0_dot, numbers_dot):
+        """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D); or a failure."""
+        crossed = clock.crossed(y0[0], numbers)
+        if isinstance(crossed, str):
+            return Failure(int(batch.rows[0]), crossed)
+        slopes = clock.forward(crossed, y0_dot[0], numbers_dot)
+        if not np.isfinite(slopes).all():
+            return Failure(int(batch.rows[0]), "The derivatives of its crossing times are not finite.")
+        return crossed.t[None, :, None], slopes[None, :, None]
+
+    def _collect(self, batch: Samples, values, by_unknowns, residuals, slopes) -> None:
+        """Append the residuals of one batch and their derivatives, with a column for every signal."""
+        counted, columns = batch.weights > 0, self.columns(self.pieces[batch.rows[0]].record)
         missing = self.states + len(self.parameters) - by_unknowns.shape[-1]  # of starts, where none is free
         by_unknowns = np.pad(by_unknowns, ((0, 0), (0, 0), (0, 0), (missing, 0)))
         by_unknowns[~self.fitted[batch.rows], ..., : self.states] = 0.0
-        residuals.append(np.where(counted, values - batch.values, 0.0))
-        slopes.append(np.where(counted[..., None], by_unknowns, 0.0))
-        return None
+        left, moved = np.zeros(counted.shape), np.zeros(counted.shape + by_unknowns.shape[3:])
+        left[..., columns], moved[..., columns, :] = values, by_unknowns
+        residuals.append(np.where(counted, left - batch.values, 0.0))
+        slopes.append(np.where(counted[..., None], moved, 0.0))
 
     def widths(self, point: Point, noise: AbstractNoise) -> Widths:
         """The noise of the signals that makes the residuals of a trial likeliest."""

@@ -124,7 +124,7 @@ class Fit:
     log_likelihood: float
     trials: int
     waterfall: Waterfall | None
-    records: tuple[Record, ...]
+    records: tuple[Any, ...]
     parameters: Parameters = field(repr=False)
     u: np.ndarray = field(repr=False)
     states: np.ndarray = field(repr=False)
@@ -141,9 +141,12 @@ class Fit:
     @property
     def rms(self) -> dict[str, float]:
         """The root mean square of the residuals of each signal, in its own unit."""
-        matrices = [record_matrix(r, record) for r, record in zip(self.residuals, self.records, strict=True)]
-        squares = np.nanmean(np.concatenate(matrices) ** 2, axis=0)
-        return dict(zip(self.question.signals.names, np.sqrt(squares).tolist(), strict=True))
+        squares, count = np.zeros((2, len(self.question.names)))
+        for k, (residuals, record) in enumerate(zip(self.residuals, self.records, strict=True)):
+            matrix, columns = record_matrix(residuals, record), self.question.columns(k)
+            squares[columns] += np.nansum(matrix**2, axis=0)
+            count[columns] += np.isfinite(matrix).sum(axis=0)
+        return dict(zip(self.question.names, np.sqrt(squares / count).tolist(), strict=True))
 
     def intervals(self, level: float = 0.95) -> tuple[PyTree, PyTree]:
         """The ends (low, high) of the intervals that hold each free number with probability `level`, as two pytrees.
@@ -227,6 +230,12 @@ class Fit:
         assert isinstance(point, Point)  # it was computed before
         return point
 
+    @property
+    def _of_sensors(self) -> Widths:
+        """The noise of the signals of records, without that of crossing times."""
+        count = len(self.question.signals.names)
+        return Widths(self.widths.sigma[:count], self.widths.dof[:count])
+
     def _quantile(self, level: float) -> float:
         """Student's t of a level, for the effective number of samples less that of parameters."""
         _require_level(level)
@@ -247,9 +256,12 @@ class Fit:
         Raises `ValueError` where the record has other signals than those of the fit, or its motion fails.
         """
         [record] = require_alike([record])
-        if record.structure != self.records[0].structure:
+        first = next((one for one in self.records if isinstance(one, Record)), None)
+        if not isinstance(record, Record) or first is None:
+            raise TypeError("Only a lagjax.Record is predicted, after a fit of some: for times ask lagjax.crossings.")
+        if record.structure != first.structure:
             raise ValueError("The record has other signals than those of the fit.")
-        if record.input_structure != self.records[0].input_structure:
+        if record.input_structure != first.input_structure:
             raise ValueError("The record has other inputs than those of the fit.")
         layout, fixed = self.question.layout, self.parameters.kept(self.u)
         state = known_start(record, layout, 0, self.params)
@@ -264,7 +276,7 @@ class Fit:
         if is_known:
             point = question.at(np.zeros(0), state[None])
         else:
-            done = minimise(question, np.zeros(0), state[None], Known(self.widths), enough=1e-3)
+            done = minimise(question, np.zeros(0), state[None], Known(self._of_sensors), enough=1e-3)
             point = done if isinstance(done, Failure) else done.point
         if isinstance(point, Failure):
             raise ValueError(question.where(point))
@@ -277,7 +289,7 @@ class Fit:
         trajectory = simulate(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
         values, deviation = self._shown(record, question, point)
         left = np.where(record.weight_matrix > 0, values - record.matrix, np.nan)
-        noise = self.widths._replace(sigma=self.widths.sigma * np.sqrt(self.information.lost))
+        noise = self._of_sensors._replace(sigma=self._of_sensors.sigma * np.sqrt(self.information.lost))
         shown, missed, uncertain = (in_structure(matrix, record) for matrix in (values, left, deviation))
         return Prediction(trajectory, shown, missed, start, uncertain, noise)
 
@@ -294,7 +306,7 @@ class Fit:
         known, states = self.information, question.states
         own, follows = np.zeros((states, states)), np.zeros((states, len(self.u)))
         if question.fitted[0]:
-            rows = np.sqrt(record.weight_matrix)[..., None] / self.widths.sigma[:, None] * full.slopes[0][0]
+            rows = np.sqrt(record.weight_matrix)[..., None] / self._of_sensors.sigma[:, None] * full.slopes[0][0]
             own, follows = start_alone(rows, states, known, _effective_share(self))
         return full.residuals[0][0], deviations(full.slopes[0][0], states, own, follows, known)
 
@@ -347,8 +359,10 @@ def _start_read_off(record: Record, observe, layout: Layout) -> np.ndarray:
     return Reader.of(record).states(np.array([0]))[0]
 
 
-def record_matrix(values: PyTree, record: Record) -> np.ndarray:
-    """Signals in the structure of a record's values, side by side (T, S)."""
+def record_matrix(values: PyTree, record) -> np.ndarray:
+    """Signals in the structure of a record's values, side by side (T, S); times end to end (M, 1)."""
+    if not isinstance(record, Record):
+        return record.columns(values)
     return np.concatenate([np.reshape(leaf, (len(record), -1)) for leaf in jax.tree.leaves(values)], axis=1)
 
 

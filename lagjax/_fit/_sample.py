@@ -84,7 +84,7 @@ def inference_data(density: Density, drawn: Draws) -> Any:
         coords |= {"record": np.flatnonzero(question.fitted), "coordinate": list(question.layout.names)}
         posterior |= {"q0": starts[..., question.fitted, :n], "qdot0": starts[..., question.fitted, n:]}
         dims |= {"q0": ["record", "coordinate"], "qdot0": ["record", "coordinate"]}
-    coords["signal"] = list(question.signals.names)
+    coords["signal"] = list(question.names)
     posterior["sigma"], dims["sigma"] = sigma, ["signal"]
     if np.isfinite(density.widths.dof).any():
         posterior["dof"], dims["dof"] = dof, ["signal"]

@@ -29,9 +29,17 @@ class Signals:
     """
 
     def __init__(
-        self, observe: Callable | None, layout: Layout, parameters: Parameters, record: Record, form: Form | None = None
+        self,
+        observe: Callable | None,
+        layout: Layout,
+        parameters: Parameters,
+        record: Record | None,
+        form: Form | None = None,
     ):
         self.layout, self.parameters, self.form = layout, parameters, form
+        if record is None:
+            self.names, self._at = (), None
+            return
         if observe is None:
             self.names, self._at, self.at_one_time = layout.names, None, lambda y, *_: y[: layout.size]
             if record.structure != (layout.tree, layout.shapes):

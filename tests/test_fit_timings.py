@@ -1,0 +1,131 @@
+"""`fit` of crossing times: when a pendulum passes a gate, alone and beside records, and sentences for what is wrong."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+TRUTH = {"g": 9.81, "c": 0.05}
+START = (1.0, 0.0)
+
+
+def bottom(q, qdot):
+    return q
+
+
+def gate(q, qdot, params):
+    return q - 0.3
+
+
+SCENE = lagjax.System(
+    lambda q, qdot, params: 0.5 * qdot**2 + params["g"] * jnp.cos(q),
+    dissipation=lambda q, qdot, params: 0.5 * params["c"] * qdot**2,
+)
+SECTIONS = {"bottom": bottom, "gate": gate}
+DIRECTIONS = {"bottom": 0, "gate": 1}
+FIRST = {"g": 9.0, "c": 0.02}
+
+
+def measured(sigma=0.0, params=TRUTH):
+    """Times of both sections within ten units of time, and which of them are missing."""
+    found = lagjax.crossings(SCENE, SECTIONS, *START, jnp.array([0.0, 10.0]), params, direction=DIRECTIONS)
+    rng = np.random.default_rng(0)
+    times = {name: np.asarray(x.t)[: int(x.count)] for name, x in found.items()}
+    return {name: t + sigma * rng.normal(size=len(t)) for name, t in times.items()}
+
+
+def timings(times, start=START, **more):
+    return lagjax.Timings(SECTIONS, times, t0=0.0, start=start, direction=DIRECTIONS, **more)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return measured()
+
+
+def test_parameters_and_start_come_out_of_crossing_times(exact):
+    times = {name: t.copy() for name, t in exact.items()}
+    times["gate"][1] = np.nan
+    fit = lagjax.fit(SCENE, timings(times, lagjax.Guess(0.9, 0.1)), FIRST)
+    # Times are exact to rtol 1e-9 of a motion of ten units of time.
+    assert fit.params["g"] == pytest.approx(9.81, rel=1e-6) and fit.params["c"] == pytest.approx(0.05, rel=1e-4)
+    assert np.allclose(fit.starts[0], START, atol=1e-5) and np.isnan(fit.residuals[0]["gate"][1])
+    assert list(fit.noise) == ["times"] and fit.noise["times"].samples == sum(map(len, times.values())) - 1
+    assert "times" in repr(fit) and np.abs(fit.residuals[0]["bottom"]).max() < 1e-8
+
+
+@pytest.mark.slow
+def test_times_have_the_derivatives_of_differences_forward_and_in_reverse(exact):
+    fit = lagjax.fit(SCENE, timings(exact, lagjax.Guess(*START)), TRUTH)
+    question, starts = fit.question, np.array([START])
+    point, h = question.at(fit.u, starts), 1e-5
+    for k, step in enumerate(h * np.eye(4)):
+        ends = [question.at(fit.u + way * step[2:], starts + way * step[:2]).residuals[0] for way in (1, -1)]
+        np.testing.assert_allclose(point.slopes[0][..., k], (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-8)
+    [clock] = question.clocks.values()
+    crossed = clock.crossed(starts[0], fit.parameters.numbers(fit.u))
+    weights = np.linspace(-1.0, 2.0, len(crossed.t))
+    of_start, of_numbers = clock.reverse(crossed, weights)
+    np.testing.assert_allclose(
+        np.append(of_start, of_numbers), weights @ point.slopes[0][0, :, 0], rtol=1e-8, atol=1e-11
+    )
+
+
+def test_records_and_timings_of_one_motion_are_fitted_together(exact):
+    ts = np.linspace(0.0, 4.0, 81)
+    shown = np.asarray(lagjax.simulate(SCENE, *START, ts, TRUTH).q)
+    noisy = shown + 5e-3 * np.random.default_rng(1).normal(size=len(ts))
+    times = measured(1e-4)
+    both = lagjax.fit(SCENE, [timings(times), lagjax.Record(ts, noisy)], FIRST)
+    alone = lagjax.fit(SCENE, timings(times), FIRST)
+    assert list(both.noise) == ["q", "times"] and [len(record) for record in both.records] == [len(both.records[0]), 81]
+    assert both.noise["times"].sigma == pytest.approx(1e-4, rel=0.5)
+    assert both.noise["q"].sigma == pytest.approx(5e-3, rel=0.3)
+    deviation = np.sqrt(np.diag(both.covariance.matrix))
+    assert (np.abs([both.params["c"] - 0.05, both.params["g"] - 9.81]) < 4 * deviation).all()
+    assert abs(both.params["g"] - alone.params["g"]) < 3 * deviation[1]
+    assert both.predict(both.records[1]).residuals.std() == pytest.approx(both.rms["q"], rel=0.1)
+
+
+@pytest.mark.slow
+def test_given_errors_are_weights_and_their_common_factor_is_found():
+    rng = np.random.default_rng(3)
+    errors = {name: rng.uniform(1e-4, 1e-3, len(t)) for name, t in measured().items()}
+    noisy = {name: t + 2.0 * errors[name] * rng.normal(size=len(t)) for name, t in measured().items()}
+    fit = lagjax.fit(SCENE, timings(noisy, weights={name: e**-2 for name, e in errors.items()}), FIRST)
+    # Of some thirty times: to one part in √60 of its standard deviation.
+    assert fit.noise["times"].sigma == pytest.approx(2.0, rel=0.4)
+
+
+# ---- what can be wrong -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(times=[1.0]), "times must be a dict with the names of the sections, 'bottom', 'gate'"),
+        (dict(times={"bottom": [1.0], "gate": [[1.0]]}), r"times must be of one dimension.*got shape \(1, 1\)"),
+        (dict(times={"bottom": [np.nan], "gate": []}), "times holds no time"),
+        (dict(times={"bottom": [-1.0], "gate": []}), "The time -1 is not after t0 = 0"),
+        (dict(times={"bottom": [2.0, 1.0], "gate": []}), "a later time must have a larger number"),
+        (dict(numbers={"bottom": [0, 1.5], "gate": [0]}), "numbers must be whole numbers from 0 on"),
+        (dict(numbers={"bottom": [0], "gate": [0]}), "numbers must have the shape of times"),
+        (dict(weights=-1.0), "weights must be finite and not negative"),
+        (dict(start=None), "needs a start"),
+        (dict(start=1.0), "start must be"),
+        (dict(t0=np.nan), "t0 must be a finite number"),
+        (dict(section={}), "section is an empty dict"),
+    ],
+)
+def test_timings_that_cannot_be_are_refused(change, message):
+    arguments = dict(section=SECTIONS, times={"bottom": [1.0, 2.0], "gate": [1.5]}, t0=0.0, start=START)
+    with pytest.raises((TypeError, ValueError), match=message):
+        lagjax.Timings(**{**arguments, **change})
+
+
+def test_a_crossing_that_does_not_happen_is_named(exact):
+    few = {"bottom": exact["bottom"][:3], "gate": exact["gate"][:1]}
+    numbers = {"bottom": [0, 1, 2], "gate": [40]}
+    with pytest.raises(ValueError, match=r"There are \d+ crossings of section\['gate'\] up to t = .*, but number 40"):
+        lagjax.fit(SCENE, timings(few, numbers=numbers), TRUTH)
