@@ -17,6 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._fit import Fit
+from lagjax._fit._figures import draw_record
+from lagjax._fit._result import record_matrix
 from lagjax._layout import Layout
 from lagjax._precision import WorkPrecision
 from lagjax._trajectory import Trajectory
@@ -134,6 +137,23 @@ def work_precision(result: WorkPrecision, *, ax=None):
     return _legend(ax)
 
 
+def fit(fit: Fit, record: int = 0, *, figure=None):
+    """Data over fit of one record of a `Fit`, and the residuals with ±2σ below, a column for each signal.
+
+    Draws into `figure`, or a new one, and returns the Axes (2, S).
+
+    >>> lagjax.plot.fit(fit, record=3)
+    """
+    matplotlib = _matplotlib()
+    names = fit.question.signals.names
+    if figure is None:
+        figure = matplotlib.pyplot.figure(figsize=(max(6.4, 3.6 * len(names)), 4.6), layout="constrained")
+    axes = figure.subplots(2, len(names), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
+    one = fit.records[record]
+    draw_record(axes, one, record_matrix(fit.residuals[record], one), names, fit.widths.sigma)
+    return axes
+
+
 def profile(profile, *, ax=None):
     """The deviance of a `Profile` against its parameter: grey is what the level excludes, dashed lines are the ends.
 
@@ -155,6 +175,7 @@ def profile(profile, *, ax=None):
     top = 3.0 * profile.threshold
     ax.axhspan(profile.threshold, top, color="0.92", linewidth=0, zorder=0, label=f"excluded at {profile.level:.0%}")
     ax.set(xlabel=profile.name, ylabel="deviance", ylim=(min(0.0, float(deviance.min())) - 0.02 * top, top))
+    ax.locator_params(axis="x", nbins=6)
     return _legend(ax)
 
 

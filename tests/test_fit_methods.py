@@ -231,3 +231,70 @@ def test_many_starts_find_the_deeper_of_two_minima():
 def test_starts_are_a_whole_number():
     with pytest.raises(ValueError, match="starts must be a positive whole number"):
         many(starts=0)
+
+
+# ---- what to measure next, and the report ----------------------------------------------------------------------------
+
+
+def plan(duration, start=(1.0, 0.0), **more):
+    ts = np.linspace(0.0, duration, 61)
+    return lagjax.Record(ts, np.full(len(ts), np.nan), start=start, **more)
+
+
+def test_the_gain_of_an_experiment_is_that_of_the_fit_with_its_data():
+    fit = spring_fit()
+    plans = {"rest": plan(3.0, (0.0, 0.0)), "long": plan(9.0), "unknown start": plan(9.0, lagjax.Guess(1.0, 0.0))}
+    table = fit.next_experiment(plans)
+    assert table.names == ("long", "unknown start", "rest") and table.gain[2] == pytest.approx(0.0, abs=1e-9)
+    assert (table.deviations[0] < table.deviations[1]).all() and (table.deviations <= 1 + 1e-9).all()
+    assert "long" in str(table).splitlines()[1]
+    # Measured: noise of the size that the fit estimated, at the fitted parameters.
+    exact = fit.predict(lagjax.Record(plans["long"].ts, np.zeros(61), start=(1.0, 0.0))).values
+    values = exact + fit.noise["q"].sigma * np.random.default_rng(5).normal(size=61)
+    more = [*spring_records(), lagjax.Record(plans["long"].ts, values, start=(1.0, 0.0))]
+    after = lagjax.fit(SPRING, more, fit.params, transforms=lagjax.positive)
+    logs = [np.linalg.slogdet(f.information.covariance)[1] for f in (fit, after)]
+    assert logs[0] - logs[1] == pytest.approx(table.gain[0], rel=0.2)
+
+
+def test_an_experiment_that_sees_what_is_not_seen_comes_first():
+    # Free motion tells k/m alone; the force of a magnet at large q tells m.
+    def magnet(q, v, params):
+        return 0.5 * params["m"] * v**2 - 0.5 * params["k"] * q**2 - jnp.exp(5.0 * (q - 8.0))
+
+    scene = lagjax.System(magnet)
+    values = np.asarray(lagjax.simulate(scene, 1.0, 0.0, SHORT, {"m": 1.0, "k": 4.0}).q)
+    one = lagjax.Record(SHORT, values + 0.02 * np.random.default_rng(0).normal(size=values.shape))
+    fit = lagjax.fit(scene, one, {"m": 1.0, "k": 3.0}, transforms=lagjax.positive)
+    assert len(fit.unseen) == 1
+    table = fit.next_experiment([plan(9.0), plan(1.0, (7.0, 0.0))])
+    assert table.names == ("[1]", "[0]") and table.newly_seen.tolist() == [1, 0]
+
+
+def test_a_planned_record_needs_a_start_and_there_must_be_one():
+    fit = spring_fit()
+    with pytest.raises(ValueError, match=r"planned record \[0\] needs a start"):
+        fit.next_experiment([plan(1.0, None)])
+    with pytest.raises(ValueError, match="candidates is empty"):
+        fit.next_experiment([])
+
+
+@pytest.mark.slow
+def test_a_report_is_one_file_with_everything(tmp_path):
+    file = tmp_path / "fit.html"
+    fit = lagjax.fit(SPRING, spring_records(), {"k": 3.0, "c": 0.2}, transforms=lagjax.positive, starts=4)
+    fit.report(file, experiments={"a long one": plan(9.0)})
+    text = file.read_text()
+    for part in (
+        "params[&#x27;k&#x27;]",
+        "converged",
+        "Noise",
+        "Data over fit",
+        "Waterfall",
+        "Correlations",
+        "a long one",
+    ):
+        assert part in text
+    assert text.count("data:image/png;base64,") == 2 + 3 and "http" not in text
+    axes = lagjax.plot.fit(fit, record=1)
+    assert axes.shape == (2, 1) and axes[1][0].get_ylabel() == "residual"

@@ -8,7 +8,7 @@
 Files: `_records`, `_parameters` and `_transforms` take what the user gives; `_motions` and `_signals` follow motions
 and sensors with their derivatives; `_residuals` and `_noise` say how far off a trial is; `_segments` says where to
 begin, `_solve` goes down from there; `_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_profile`, `_density`,
-`_sample` and `_result` say what that means.
+`_sample`, `_next`, `_report` and `_result` say what that means.
 """
 
 import functools

@@ -1,7 +1,8 @@
 """`Fit`: what came out of a search, with intervals and in words."""
 
 import functools
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, cast
 
@@ -12,10 +13,12 @@ from scipy.special import ndtri, stdtrit
 from lagjax._fit._density import Density
 from lagjax._fit._joint import deviations, of_starts, start_alone
 from lagjax._fit._many import Waterfall
+from lagjax._fit._next import Experiments, ranked
 from lagjax._fit._noise import AbstractNoise, Known, Widths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._profile import Profile, profile
 from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike
+from lagjax._fit._report import page, pictures_of
 from lagjax._fit._residuals import Failure, Point, Question
 from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._segments import Reader
@@ -295,20 +298,75 @@ class Fit:
 
     def _shown(self, record: Record, question: Question, point: Point) -> tuple[np.ndarray, np.ndarray]:
         """The signals (T, S) of a record that was followed, at all its times, and their standard deviations."""
-        everywhere = replace(record, values=in_structure(np.zeros_like(record.matrix), record), weights=None)
-        about = Question(
-            [everywhere], question.pieces, np.array([True]), question.motions, question.signals, self.parameters,
-            question.size, question.rtol,
-        )  # fmt: skip
-        full = about.at(self.u, point.starts)
-        if isinstance(full, Failure):
-            raise ValueError(about.where(full))
+        planned, slopes = self._followed(record, point.starts[0])
         known, states = self.information, question.states
         own, follows = np.zeros((states, states)), np.zeros((states, len(self.u)))
         if question.fitted[0]:
-            rows = np.sqrt(record.weight_matrix)[..., None] / self._of_sensors.sigma[:, None] * full.slopes[0][0]
+            rows = np.sqrt(record.weight_matrix)[..., None] / self._of_sensors.sigma[:, None] * slopes
             own, follows = start_alone(rows, states, known, _effective_share(self))
-        return full.residuals[0][0], deviations(full.slopes[0][0], states, own, follows, known)
+        return planned.matrix, deviations(slopes, states, own, follows, known)
+
+    def _followed(self, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
+        """A record with what sensors would show for its values, from a state (2n,), and their derivatives (T, S, D)."""
+        everywhere = replace(record, values=in_structure(np.zeros_like(record.matrix), record), weights=None)
+        about = Question(
+            [everywhere], [Piece(0, np.arange(len(record)))], np.array([True]), self.question.motions,
+            self.question.signals, self.parameters, self.question.size, self.question.rtol,
+        )  # fmt: skip
+        full = about.at(self.u, state[None])
+        if isinstance(full, Failure):
+            raise ValueError(about.where(full))
+        return replace(record, values=in_structure(full.residuals[0][0], record)), full.slopes[0][0]
+
+    def next_experiment(self, candidates: Sequence[Record] | dict[str, Record]) -> Experiments:
+        """Which of several planned records would tell most about the free parameters: the gain in log det (D-optimal).
+
+        `candidates`: records, or a dict of them by name, with times, weights, inputs and a start as they are planned.
+        Their values are not looked at and may be NaN; a start that is not known, `lagjax.Guess(q0, qdot0)`, counts as
+        one that has to be fitted. Print what comes back for a table.
+
+        Raises `ValueError` where a planned record has no start, or its motion fails.
+
+        Source: Atkinson, Donev & Tobias, *Optimum Experimental Designs* (2007).
+        """
+        named = candidates if isinstance(candidates, dict) else {f"[{k}]": one for k, one in enumerate(candidates)}
+        if not named:
+            raise ValueError("candidates is empty: give at least one lagjax.Record.")
+        rows = [self._rows_of(name, record) for name, record in named.items()]
+        return ranked(list(named), rows, self.parameters.labels, self.information)
+
+    def _rows_of(self, name: str, record: Record) -> np.ndarray:
+        """The rows (M, F) of a planned record in units of the noise, its start eliminated where it is not known."""
+        if not isinstance(record, Record) or record.start is None:
+            raise ValueError(
+                f"The planned record {name} needs a start: (q0, qdot0), or lagjax.Guess(q0, qdot0) if that is to be "
+                "fitted."
+            )
+        state = known_start(record, self.question.layout, 0, self.params)
+        assert state is not None
+        planned, slopes = self._followed(record, state)
+        weights = planned.weight_matrix[..., None] * (_effective_share(self) / self._of_sensors.sigma[:, None] ** 2)
+        rows, states = np.sqrt(weights) * slopes, self.question.states
+        own = rows[..., states:]
+        if isinstance(record.start, Guess):
+            own = own - rows[..., :states] @ start_alone(rows, states, self.information, 1.0)[1]
+        return own.reshape(-1, own.shape[-1])
+
+    def report(self, path: str | os.PathLike, experiments: Sequence[Record] | dict[str, Record] = ()) -> None:
+        """Write one file of HTML: parameters, noise, what is not seen, data over fit, residuals, correlations, waterfall.
+
+        With `experiments`, planned records, also what to measure next (`next_experiment`). Needs matplotlib.
+        """
+        tables = {"Parameters": _cells_of_parameters(self), "Noise": _cells_of_noise(self)}
+        texts = {"What to measure next": str(self.next_experiment(experiments))} if experiments else {}
+        residuals = [record_matrix(r, record) for r, record in zip(self.residuals, self.records, strict=True)]
+        signals = self.question.signals.names
+        pictures = pictures_of(
+            self.records, residuals, signals, self.widths.sigma, self.covariance, self.waterfall
+        )  # fmt: skip
+        text = page(_title(self), self.message, self.ok, self.unseen, tables, pictures, texts)
+        with open(path, "w", encoding="utf-8") as file:
+            file.write(text)
 
     def compare(self, other: "Fit") -> Comparison:
         """Which of two fits of the same records the data prefer: by AIC and BIC, with effective counts of samples.
@@ -371,12 +429,8 @@ def record_matrix(values: PyTree, record) -> np.ndarray:
 
 def _lab_book(fit: Fit) -> str:
     """The table of parameters, the noise of the signals, what is not seen, and the verdict."""
-    samples = sum(noise.samples for noise in fit.noise.values())
-    spans = [record.ts[-1] - record.ts[0] for record in fit.records]
-    plural = "s" if len(fit.records) > 1 else ""
-    of_records = f"{len(fit.records)} record{plural}, {sum(spans):g} long, {samples} values"
     lines = [
-        f"Fit of {len(fit.u)} parameter{'s' * (len(fit.u) != 1)} to {of_records}",
+        _title(fit),
         "",
         *_table_of_parameters(fit),
         "",
@@ -388,6 +442,31 @@ def _lab_book(fit: Fit) -> str:
         lines.append(f"starts      {fit.waterfall}")
     lines.append(f"verdict     {fit.message}")
     return "\n".join(lines)
+
+
+def _title(fit: Fit) -> str:
+    samples = sum(noise.samples for noise in fit.noise.values())
+    spans = [record.ts[-1] - record.ts[0] for record in fit.records]
+    plural = "s" if len(fit.records) > 1 else ""
+    of_records = f"{len(fit.records)} record{plural}, {sum(spans):g} long, {samples} values"
+    return f"Fit of {len(fit.u)} parameter{'s' * (len(fit.u) != 1)} to {of_records}"
+
+
+def _cells_of_parameters(fit: Fit) -> list[list[str]]:
+    low, high = fit._ends(0.95)
+    rows = [["parameter", "value", "from", "to (95 %)", "± relative"]]
+    for name, x, a, b in zip(fit.parameters.names, fit.parameters.values(fit.u), low, high, strict=True):
+        half = 50 * (b - a) / abs(x) if x else np.inf
+        rows.append([name, f"{x:.6g}", f"{a:.6g}", f"{b:.6g}", f"{half:.2g} %" if np.isfinite(half) else "not seen"])
+    return rows
+
+
+def _cells_of_noise(fit: Fit) -> list[list[str]]:
+    rows = [["signal", "RMS", "σ", "ν", "samples", "effective", "Durbin–Watson"]]
+    for (name, noise), rms in zip(fit.noise.items(), fit.rms.values(), strict=True):
+        numbers = f"{rms:.3g}", f"{noise.sigma:.3g}", f"{noise.dof:.3g}", f"{noise.samples}", f"{noise.effective:.0f}"
+        rows.append([name, *numbers, f"{noise.durbin_watson:.2f}"])
+    return rows
 
 
 def _table_of_parameters(fit: Fit) -> list[str]:

@@ -1,0 +1,82 @@
+"""`page`: a fit as one file of HTML, with its pictures inside."""
+
+import base64
+import html
+import io
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from lagjax._fit._figures import draw_correlations, draw_record, draw_residuals, draw_waterfall, matplotlib_or_refuse
+
+_RECORDS, _SIGNALS = 6, 6  # that are drawn
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2.2rem }
+table { border-collapse: collapse } td, th { padding: .2rem .9rem .2rem 0; text-align: right; font-weight: normal }
+th { border-bottom: 1px solid #999; color: #555 } td:first-child, th:first-child { text-align: left }
+img { max-width: 100% } pre { background: #f4f4f4; padding: .7rem; overflow-x: auto } .no { color: #a33 }
+"""
+
+
+def page(
+    title: str, message: str, ok: bool, unseen: Sequence[str], tables: dict[str, list[list[str]]],
+    figures: dict[str, list[str]], texts: dict[str, str],
+) -> str:  # fmt: skip
+    """The file: a verdict, what is not seen, tables by their headings, pictures, and texts as they are printed."""
+    told = html.escape
+    parts = [f"<h1>{told(title)}</h1>", f"<p{'' if ok else ' class=no'}>{told(message)}</p>"]
+    parts += [f'<p class="no">Not seen: {told(sentence)}</p>' for sentence in unseen]
+    for heading, (head, *rows) in tables.items():
+        cells = "".join(f"<th>{told(cell)}</th>" for cell in head)
+        body = "".join("<tr>" + "".join(f"<td>{told(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        parts.append(f"<h2>{told(heading)}</h2><table><tr>{cells}</tr>{body}</table>")
+    for heading, text in texts.items():
+        parts.append(f"<h2>{told(heading)}</h2><pre>{told(text)}</pre>")
+    for heading, pictures in figures.items():
+        images = "".join(f'<p><img alt="{told(heading)}" src="data:image/png;base64,{one}"></p>' for one in pictures)
+        parts.append(f"<h2>{told(heading)}</h2>{images}")
+    head = f'<meta charset="utf-8"><title>{told(title)}</title><style>{_STYLE}</style>'
+    return f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(parts)}</body></html>\n"
+
+
+def _picture(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
+    """A figure of a size in inches as PNG in base64."""
+    matplotlib = matplotlib_or_refuse("Fit.report")
+    figure = matplotlib.figure.Figure(figsize=size, layout="constrained", dpi=110)
+    draw(figure)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", metadata={"Software": None})
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def pictures_of(records, residuals: list[np.ndarray], names, sigma, covariance, waterfall) -> dict[str, list[str]]:
+    """The pictures of a fit, whose residuals are (T, S) for each record, by their headings."""
+    count = min(len(names), _SIGNALS)
+
+    def one(record, left):
+        def draw(figure):
+            axes = figure.subplots(2, count, squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
+            draw_record(axes, record, left, names[:count], sigma)
+
+        return _picture((max(6.4, 3.6 * count), 4.2), draw)
+
+    shown = np.unique(np.linspace(0, len(records) - 1, min(len(records), _RECORDS)).astype(int))
+    heading = "Data over fit, and residuals"
+    if len(shown) < len(records) or count < len(names):
+        heading += f" (records {', '.join(map(str, shown))} of {len(records)}; {count} of {len(names)} signals)"
+    figures = {heading: [one(records[k], residuals[k]) for k in shown]}
+    every = np.concatenate(residuals)
+    figures["Residuals against the normal distribution"] = [
+        _picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))
+    ]
+    side = min(3.2 + 0.45 * len(covariance.names), 12.0)
+    figures["Correlations of the parameters"] = [
+        _picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), covariance.matrix, covariance.names))
+    ]
+    if waterfall is not None:
+        figures["Waterfall of the starts"] = [
+            _picture((6.4, 3.2), lambda figure: draw_waterfall(figure.subplots(), waterfall.misfits))
+        ]
+    return figures
