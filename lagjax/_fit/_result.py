@@ -353,7 +353,7 @@ class Fit:
         return own.reshape(-1, own.shape[-1])
 
     def report(self, path: str | os.PathLike, experiments: Sequence[Record] | dict[str, Record] = ()) -> None:
-        """Write one file of HTML: parameters, noise, what is not seen, data over fit, residuals, correlations, waterfall.
+        """Write one file of HTML: parameters, noise, what is not seen, data over fit, residuals, correlations, costs.
 
         With `experiments`, planned records, also what to measure next (`next_experiment`). Needs matplotlib.
         """
