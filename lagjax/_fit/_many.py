@@ -18,9 +18,8 @@ import numpy as np
 from lagjax._fit._noise import Widths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Piece
-from lagjax._fit._residuals import Question, compressed
+from lagjax._fit._residuals import Failure, Question, compressed
 from lagjax._fit._solve import eliminate
-from lagjax._results import ENDED_WELL
 
 _STEPS = 8  # of the short search
 _SAMPLES = 200  # of each record, in it
@@ -108,7 +107,9 @@ class _Tried(NamedTuple):
 def _sampled(question: Question) -> Question:
     """The question with at most `_SAMPLES` samples of each record."""
     pieces = [
-        Piece(piece.record, piece.places[np.unique(np.linspace(0, len(piece.places) - 1, _SAMPLES).astype(int))])
+        piece
+        if piece.record in question.clocks
+        else Piece(piece.record, piece.places[np.unique(np.linspace(0, len(piece.places) - 1, _SAMPLES).astype(int))])
         for piece in question.pieces
     ]
     return question.of(pieces, question.fitted)
@@ -155,27 +156,43 @@ def _residuals(question: Question, batch, starts, numbers, directions, moved) ->
 
     NaN where a motion failed, zero where nothing was measured.
     """
-    count, members = len(starts), len(batch.rows)
     along = [question._along(batch, m, d) for m, d in zip(moved, directions, strict=True)]
-    missing = question.states + directions.shape[1] - along[0][1].shape[0]
+    record = question.pieces[batch.rows[0]].record
+    shown = _timed if record in question.clocks else _sensed
+    columns, free = question.columns(record), directions.shape[1]
+    missing = question.states + free - along[0][1].shape[0]
+    found = np.zeros((len(starts), *batch.values.shape, question.states + free + 1))
+    for k, both in enumerate(shown(question, batch, starts[:, batch.rows], numbers, along)):
+        if both is None:
+            found[k] = np.nan
+            continue
+        values, slopes = both
+        slopes = np.pad(slopes, ((0, 0), (0, 0), (0, 0), (missing, 0)))
+        slopes[~question.fitted[batch.rows], ..., : question.states] = 0.0
+        found[k, ..., columns, :-1], found[k, ..., columns, -1] = slopes, values - batch.values[..., columns]
+    return np.where((batch.weights > 0)[..., None] | np.isnan(found), found, 0.0)
+
+
+def _timed(question: Question, batch, starts, numbers, along):
+    """Of each start the crossing times and their derivatives, or None."""
+    clock = question.clocks[question.pieces[batch.rows[0]].record]
+    for y0, some, directions in zip(starts, numbers, along, strict=True):
+        shown = question._time(clock, batch, y0, some, *directions)
+        yield None if isinstance(shown, Failure) else shown
+
+
+def _sensed(question: Question, batch, starts, numbers, along):
+    """Of each start the signals and their derivatives, or None where a motion failed; all in one run."""
+    count, members = len(starts), len(batch.rows)
     tile = lambda x: np.tile(x, (count, *[1] * (x.ndim - 1)))  # noqa: E731
     table = None if batch.table is None else type(batch.table)(*map(tile, batch.table))
     motion = question.motions.follow(
-        tile(batch.ts), starts[:, batch.rows].reshape(count * members, -1), np.repeat(numbers, members, axis=0),
+        tile(batch.ts), starts.reshape(count * members, -1), np.repeat(numbers, members, axis=0),
         np.concatenate([y0_dot for y0_dot, _ in along]), np.repeat([d for _, d in along], members, axis=0), table,
     )  # fmt: skip
-    failed = ~np.isin(motion.result, ENDED_WELL).reshape(count, members)
-    found = np.zeros((count, members, *batch.values.shape[1:], question.states + directions.shape[1] + 1))
     for k in range(count):
-        own = slice(k * members, (k + 1) * members)
-        part = type(motion)(*(x[own] for x in motion))
-        values, slopes = question.signals.of(part, batch.ts, batch.inputs, numbers[k], along[k][1])
-        slopes = np.pad(slopes, ((0, 0), (0, 0), (0, 0), (missing, 0)))
-        slopes[~question.fitted[batch.rows], ..., : question.states] = 0.0
-        found[k] = np.concatenate([slopes, (values - batch.values)[..., None]], axis=-1)
-    found = np.where(batch.weights[..., None] > 0, found, 0.0)
-    found[failed] = np.nan
-    return found
+        part = type(motion)(*(x[k * members : (k + 1) * members] for x in motion))
+        yield question.signals.of(part, batch.ts, batch.inputs, numbers[k], along[k][1]) if part.ok else None
 
 
 def _step(question: Question, at: _Tried, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:

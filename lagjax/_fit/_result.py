@@ -353,17 +353,16 @@ class Fit:
         return own.reshape(-1, own.shape[-1])
 
     def report(self, path: str | os.PathLike, experiments: Sequence[Record] | dict[str, Record] = ()) -> None:
-        """Write one file of HTML: parameters, noise, what is not seen, data over fit, residuals, correlations, costs.
+        """Write one file of HTML: parameters, noise, what is not seen, data over fit, residuals, correlations, starts.
 
         With `experiments`, planned records, also what to measure next (`next_experiment`). Needs matplotlib.
         """
         tables = {"Parameters": _cells_of_parameters(self), "Noise": _cells_of_noise(self)}
         texts = {"What to measure next": str(self.next_experiment(experiments))} if experiments else {}
-        residuals = [record_matrix(r, record) for r, record in zip(self.residuals, self.records, strict=True)]
-        signals = self.question.signals.names
-        pictures = pictures_of(
-            self.records, residuals, signals, self.widths.sigma, self.covariance, self.waterfall
-        )  # fmt: skip
+        pairs = [pair for pair in zip(self.residuals, self.records, strict=True) if isinstance(pair[1], Record)]
+        drawn = [record for _, record in pairs], [record_matrix(r, record) for r, record in pairs]
+        sensors = self.question.signals.names, self._of_sensors.sigma
+        pictures = pictures_of(*drawn, *sensors, self.covariance, self.waterfall)
         text = page(_title(self), self.message, self.ok, self.unseen, tables, pictures, texts)
         with open(path, "w", encoding="utf-8") as file:
             file.write(text)
