@@ -18,6 +18,7 @@ from lagjax._fit import _correlation, _residuals, _signals, _solve, _transforms
 from lagjax._fit._motions import _ByDiffrax, motions_of
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._segments import Reader
+from lagjax._fit._verdict import shifts_without
 from lagjax._layout import Layout
 
 SIGMA = 5e-3
@@ -213,6 +214,51 @@ def test_correlated_residuals_count_for_what_they_are_worth():
     assert "correlated" in fits[1].message and "correlated" not in fits[0].message
 
 
+# ---- at the end of a set, and records that disagree ------------------------------------------------------------------
+
+
+def drag_of(power):
+    """Records of a pendulum whose drag grows as the square of the rate, with this coefficient."""
+    rng = np.random.default_rng(0)
+    q0, qdot0 = rng.uniform(-2, 2, 3), rng.normal(size=3)
+    exact = np.asarray(lagjax.simulate_batch(DRAGGED, q0, qdot0, TS, TRUTH | {"d": power}).q)
+    return [lagjax.Record(TS, y + SIGMA * rng.normal(size=y.shape)) for y in exact]
+
+
+DRAGGED = lagjax.System(lagrangian, dissipation=lambda q, v, params: dissipation(q, v, params) + params["d"] * v**4 / 4)
+
+
+def test_a_parameter_that_belongs_at_the_end_of_its_set_is_said_to():
+    start, maps = TRUTH | {"d": 0.1}, {"c": None, "l": None, "m": None}
+    fits = [
+        lagjax.fit(DRAGGED, drag_of(power), start, free=FREE | {"d": True}, transforms=maps | {"d": transforms})
+        for power, transforms in ((-1e-4, lagjax.positive), (-2e-3, lagjax.positive), (0.4, lagjax.between(0.0, 0.2)))
+    ]
+    assert all(fit.trials < 30 for fit in fits)
+    assert "params['d'] goes to zero" in fits[0].message and "the data do not need it" in fits[0].message
+    assert "params['d'] stands at" in fits[1].message and "held by the bound 0" in fits[1].message
+    assert "held by the bound 0.2" in fits[2].message and "doubt the scene" in fits[2].message
+
+
+def test_a_record_that_disagrees_is_named(done):
+    [other] = records(1, seed=5, params=TRUTH | {"l": 0.71})
+    fit = lagjax.fit(SCENE, [*records(), other], TRUTH, free=FREE, transforms=lagjax.positive)
+    assert "records[3] disagrees with the others: without it params['l'] would move" in fit.message
+    assert "disagrees" not in done.message
+
+
+def test_a_shift_without_a_record_is_that_of_the_fit_without_it(done):
+    rows = records(4, seed=8)
+    fits = [lagjax.fit(SCENE, some, TRUTH, free=FREE, transforms=lagjax.positive) for some in (rows, rows[1:])]
+    whole, triangles = fits[0], fits[0].question.triangles(
+        fits[0]._point, [np.sqrt(b.weights) / fits[0].widths.sigma for b in fits[0].question.batches]
+    )  # fmt: skip
+    variances = np.diag(whole.information.covariance), np.diag(whole.information.white)
+    shift = shifts_without(2, triangles, np.arange(4), *variances)[0]
+    chance = np.sqrt(np.diag(fits[1].information.white) - np.diag(whole.information.white))
+    np.testing.assert_allclose(shift, (fits[1].u - fits[0].u) / chance, atol=0.2)
+
+
 # ---- what is not seen ------------------------------------------------------------------------------------------------
 
 
@@ -396,7 +442,7 @@ def test_elimination_is_the_solution_of_the_whole_problem():
     whole[-free:, -free:], right[-free:] = np.diag(pull[0]), -pull[1]
     expected, *_ = np.linalg.lstsq(whole, right, rcond=None)
     np.testing.assert_allclose(np.concatenate([step.starts.ravel(), step.u]), expected, atol=1e-12)
-    bounded = _solve.eliminate(triangles, states, scale, damping, pull, np.full(free, 1e-3))
+    bounded = _solve.eliminate(triangles, states, scale, damping, pull, (np.full(free, -1e-3), np.full(free, 1e-3)))
     assert (np.abs(bounded.u) <= 1e-3).all()
 
 
@@ -470,6 +516,9 @@ def bead(values, **more):
         ([bead(np.zeros(6))], dict(noise=3), "noise must be"),
         ([bead(np.zeros(6))], dict(observe=lambda q, v: {"x": q}), "observe returns"),
         ([bead({"x": np.zeros(6)})], dict(observe=lambda q, v: {"x": q}), "cannot be called with coordinates"),
+        ([bead(np.zeros(6))], dict(params0={"m": 1.0, "c": 0.1}), r'ask for `params\["l"\]`, which params0 does not'),
+        ([bead(np.zeros(6))], dict(params0=2.0), r'ask for `params\["m"\]`, which params0 does not'),
+        ([bead(np.zeros(6), start=(0.0, 0.0))], dict(params0=2.0), r'ask for `params\["m"\]`, which params0 does not'),
         ([bead(np.zeros(6), start=(np.nan, 0.0))], {}, r"start of records\[0\] is not finite"),
         ([bead(np.zeros(6), start=(1.0, 0.0))], dict(method="segments", observe=lambda q, v: jnp.log(q - 2)),
          r"records\[0\] from t = 0 failed. What `observe` returns for values, or its derivative, is not finite at s"),
@@ -477,7 +526,7 @@ def bead(values, **more):
 )  # fmt: skip
 def test_a_fit_that_cannot_be_is_refused(rows, arguments, message):
     with pytest.raises((TypeError, ValueError), match=message):
-        lagjax.fit(SCENE, rows, TRUTH, **arguments)
+        lagjax.fit(SCENE, rows, arguments.pop("params0", TRUTH), **arguments)
 
 
 def test_a_motion_that_fails_names_its_record_and_time():

@@ -202,7 +202,7 @@ def many(**more):
     values = {"seen": q + 0.02 * np.random.default_rng(0).normal(size=q.shape)}
     one = lagjax.Record(ts, values, start=lagjax.Guess(1.0, 0.0))
     return lagjax.fit(
-        SPRING, one, {"k": 1.0, "c": 0.02}, transforms=lagjax.positive, observe=lambda q, v: {"seen": q}, **more
+        SPRING, one, {"k": 900.0, "c": 0.02}, transforms=lagjax.positive, observe=lambda q, v: {"seen": q}, **more
     )
 
 

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._consistent import has_constraints
+from lagjax._fit._blame import reading_params
 from lagjax._fit._inputs import HOLDS, Form, asks
 from lagjax._fit._many import Waterfall, distinct, drawn, misfit, short_search
 from lagjax._fit._motions import motions_of
@@ -36,6 +37,7 @@ from lagjax._fit._timings import Clock, Timings
 from lagjax._fit._transforms import angle, between, inertia, positive, simplex
 from lagjax._fit._uncertainty import Information, information
 from lagjax._fit._unseen import sentences
+from lagjax._fit._verdict import verdict
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
@@ -174,20 +176,26 @@ def _form(system: System, records: list[Record], hold: str) -> Form | None:
 
 def _layout(system: System, records: list[Record], params0, form: Form | None) -> Layout:
     """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
-    for record in records:
-        if record.start is not None:
-            return Layout.of(*started(record.start, params0))
+    begun = next((started(record.start, params0) for record in records if record.start is not None), None)
     one_time = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values)
+    q, qdot = (one_time, one_time) if begun is None else jax.tree.map(jnp.asarray, begun)
     scene, params = (system, params0) if form is None else (form.driven(system), form.params(params0, 2))
     try:
-        jax.eval_shape(lambda q: scene.energy(q, q, 0.0, params), one_time)
+        jax.eval_shape(lambda q, qdot: scene.energy(q, qdot, 0.0, params), q, qdot)
     except Exception as reason:
+        if where := reading_params(reason):
+            raise ValueError(
+                f"The scene's functions ask for `{where}`, which params0 does not have ({type(reason).__name__}: "
+                f"{str(reason).splitlines()[0]}): params0 is {jax.tree.structure(params0)}."
+            ) from reason
+        if begun is not None:
+            raise
         raise ValueError(
             "The scene's functions cannot be called with coordinates of the structure of `values`, which q is taken to "
             f"have where no record has a start ({type(reason).__name__}: {str(reason).splitlines()[0]}). If the values "
             "are something else, give every record start=(q0, qdot0), or lagjax.Guess(q0, qdot0) to fit it."
         ) from reason
-    return Layout.of(one_time, one_time)
+    return Layout.of(q, qdot)
 
 
 def _question(system, records, layout, parameters, observe, form) -> Question:
@@ -382,7 +390,7 @@ def _told(
         residuals=_by_record(question, point),
         unseen=unseen,
         ok=descent.converged and not unseen,
-        message=_message(descent, unseen, known, parameters),
+        message=verdict(descent, unseen, known, question),
         log_likelihood=log_likelihood(widths, point.flat(), question.weights),
         trials=descent.trials,
         waterfall=waterfall,
@@ -416,17 +424,3 @@ def _by_record(question: Question, point) -> tuple[PyTree, ...]:
             matrix = np.where(weights > 0, left, np.nan)[: len(record), question.columns(row)]
             found[row] = in_structure(matrix, record)
     return tuple(found[row] for row in range(len(question.records)))
-
-
-def _message(descent: Descent, unseen, known: Information, parameters: Parameters) -> str:
-    parts = [descent.message]
-    if unseen:
-        parts.append("Not everything that is free is seen: fix it, or measure more.")
-    # Half a step of the search is one standard deviation: the interval then spans more than a factor of fifty.
-    vague = np.flatnonzero(2 * np.sqrt(np.nan_to_num(np.diag(known.covariance), posinf=0.0)) > parameters.reach)
-    if len(vague):
-        names = ", ".join(dict.fromkeys(parameters.labels[i] for i in vague))
-        parts.append(f"Hardly seen, or at the end of what its transform allows: {names}.")
-    if np.nanmax(known.correlation) > 0.5:
-        parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
-    return " ".join(parts)

@@ -198,7 +198,8 @@ def _sensed(question: Question, batch, starts, numbers, along):
 def _step(question: Question, at: _Tried, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """Where the damped step of one start leads."""
     triangles, states, none = at.triangles[k], question.states, np.zeros(at.u.shape[1])
+    limits = question.parameters.limits(at.u[k])
     norms = np.linalg.norm(triangles[..., :states], axis=1), np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
     scale = tuple(np.where(norm > 0, norm, 1.0) for norm in norms)
-    step = eliminate(triangles, states, scale, damping, (none, none), question.parameters.reach)
-    return at.u[k] + step.u, at.starts[k] + step.starts
+    step = eliminate(triangles, states, scale, damping, (none, none), limits)
+    return question.parameters.stepped(at.u[k], step.u), at.starts[k] + step.starts

@@ -158,6 +158,22 @@ class Parameters:
             found += self.names[rows] if part.transform.separable else together
         return tuple(found)
 
+    def limits(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(low, high) between which one step of the search from u (F,) may lie."""
+        pairs = [part.transform.limits(u[own]) for own, _, part in self._cuts]
+        low, high = (np.concatenate([np.zeros(0), *ends]) for ends in zip(*pairs, strict=True)) if pairs else (u, u)
+        return low, high
+
+    def stepped(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Where a step (F,) leads from u (F,): along the tangent of x(u), where every number moves by itself."""
+        parts = [part.transform.stepped(u[own], step[own]) for own, _, part in self._cuts]
+        return np.concatenate([np.zeros(0), *parts])
+
+    @property
+    def maps(self) -> tuple[AbstractTransform, ...]:
+        """The transform of each unknown (F,)."""
+        return tuple(part.transform for own, _, part in self._cuts for _ in range(own.stop - own.start))
+
     @property
     def reach(self) -> np.ndarray:
         """How far one step may change each u (F,)."""

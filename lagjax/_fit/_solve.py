@@ -27,8 +27,18 @@ from lagjax._fit._residuals import Failure, Point, Question, compressed, triangl
 _FIRST, _LEAST, _MOST = 1e-4, 1e-14, 1e12
 
 
+_PATIENCE = (
+    12  # trials that lowered the sum of squares by less than what ends a search, while derivatives promised more
+)
 _NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
 _FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
+
+
+_KINK = (
+    "The search stopped at a kink of the sum of squares after {} trials: derivatives promise to lower half of it by "
+    "{:.2g}, the last {} trials lowered it by {:.2g}. Motion that sticks, or strikes, has such kinks; friction that "
+    "changes sign over a small velocity, tanh(v/width), has none."
+)
 
 
 class Descent(NamedTuple):
@@ -89,14 +99,19 @@ def minimise(
     if isinstance(point, Failure):
         return point
     anchor = Anchor.none(u) if anchor is None else anchor
-    damping, trials = _FIRST, 1
+    damping, trials, falls = _FIRST, 1, [(1, np.inf)]
     while True:
         model = _model(question, point, noise, anchor)
         left = model.step(_LEAST).gain
         near = left <= _NEAR * question.measured
         if left <= enough or (near and left * share(question, point, model.widths) <= enough):
             return Descent(point, model.widths, True, trials, f"The search converged after {trials} trials.")
+        recent = sum(fall for trial, fall in falls if trial > trials - _PATIENCE)
+        if trials > _PATIENCE and recent * share(question, point, model.widths) <= enough:
+            return Descent(point, model.widths, False, trials, _KINK.format(trials, left, _PATIENCE, recent))
         better, damping, trials = _descended(question, point, model, anchor, damping, trials, limit)
+        if better is not None:
+            falls.append((trials, model.cost - question.cost(better, model.factors) - anchor.cost(better.u)))
         if better is None and trials < limit:
             text = f"The search stopped where rounding hides what is left, after {trials} trials."
             return Descent(point, model.widths, True, trials, text)
@@ -114,13 +129,13 @@ class _Model(NamedTuple):
     triangles: np.ndarray
     states: int
     pull: tuple[np.ndarray, np.ndarray]
-    reach: np.ndarray
+    limits: tuple[np.ndarray, np.ndarray]
     cost: float
 
     def step(self, damping: float) -> Step:
         """The damped step from the trial."""
         scale = _scales(self.triangles, self.states)
-        return eliminate(self.triangles, self.states, scale, damping, self.pull, self.reach)
+        return eliminate(self.triangles, self.states, scale, damping, self.pull, self.limits)
 
 
 def _model(question: Question, point: Point, noise: AbstractNoise, anchor: Anchor) -> _Model:
@@ -128,7 +143,7 @@ def _model(question: Question, point: Point, noise: AbstractNoise, anchor: Ancho
     factors = question.factors(point, widths)
     triangles, cost = question.triangles(point, factors), question.cost(point, factors) + anchor.cost(point.u)
     pull = anchor.weight, anchor.pull(point.u)
-    return _Model(widths, factors, triangles, question.states, pull, question.parameters.reach, cost)
+    return _Model(widths, factors, triangles, question.states, pull, question.parameters.limits(point.u), cost)
 
 
 def _descended(
@@ -143,7 +158,7 @@ def _descended(
         step = model.step(damping)
         if step.gain <= _FLAT * model.cost or damping > _MOST:
             break
-        trial = question.at(point.u + step.u, point.starts + step.starts)
+        trial = question.at(question.parameters.stepped(point.u, step.u), point.starts + step.starts)
         trials += 1
         if not isinstance(trial, Failure):
             fall = model.cost - question.cost(trial, model.factors) - anchor.cost(trial.u)
@@ -153,13 +168,11 @@ def _descended(
     return None, damping, trials
 
 
-def eliminate(
-    triangles: np.ndarray, states: int, scale, damping: float, pull, reach: float | np.ndarray = np.inf
-) -> Step:
+def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, limits=(-np.inf, np.inf)) -> Step:
     """The damped step for the triangles (N, D + 1, D + 1) of all pieces, whose first `states` columns are starts.
 
     `scale` holds the norms of the columns (`_scales`), and `pull` is (weight, residuals), (F,) each, of an anchor of
-    the parameters. A parameter that would go beyond its `reach` (F,) is damped more than the others.
+    the parameters. A parameter that would step beyond its `limits`, (low, high), is damped more than the others.
     """
     of_starts, of_u = scale
     (pieces, columns, _), free = triangles.shape, len(of_u)
@@ -168,7 +181,7 @@ def eliminate(
     r = triangle_of(np.concatenate([triangles, damped], axis=1))
     anchored = np.concatenate([np.diag(pull[0]), pull[1][:, None]], axis=1)
     rest = compressed(np.concatenate([r[:, states:, states:].reshape(-1, free + 1), anchored])[None])[0]
-    du = _within_reach(rest, of_u, damping, reach)
+    du = _within_limits(rest, of_u, damping, limits)
     right = r[:, :states, -1] + r[:, :states, states:-1] @ du
     ds = np.linalg.solve(r[:, :states, :states], -right[..., None])[..., 0]
     whole = np.concatenate([ds, np.broadcast_to(du, (pieces, free)), np.ones((pieces, 1))], axis=1)
@@ -177,14 +190,14 @@ def eliminate(
     return Step(du, ds, float(0.5 * gain))
 
 
-def _within_reach(rest: np.ndarray, of_u: np.ndarray, damping: float, reach) -> np.ndarray:
-    """δu (F,) that minimises |rest (δu, 1)|² + Σ damping (scale δu)², with more damping where that is beyond reach."""
+def _within_limits(rest: np.ndarray, of_u: np.ndarray, damping: float, limits) -> np.ndarray:
+    """δu (F,) that minimises |rest (δu, 1)|² + Σ damping (scale δu)², with more damping of what is beyond limits."""
     free, each = len(of_u), np.full(len(of_u), damping)
     while True:
         rows = np.concatenate([rest, np.diag(np.append(np.sqrt(each) * of_u, 0.0))[:free]])
         triangle = triangle_of(rows)
         du = np.linalg.solve(triangle[:free, :free], -triangle[:free, free])
-        beyond = np.abs(du) > reach
+        beyond = (du < limits[0]) | (du > limits[1])
         if not beyond.any() or each[beyond].min() > _MOST:
             return du
         each[beyond] *= 10.0

@@ -67,6 +67,14 @@ class AbstractTransform(abc.ABC):
     def log_volume(self, u, xp: Any = np) -> Any:
         """log of the volume of x per volume of u, up to a constant: what makes a density of x one of u."""
 
+    def limits(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(low, high) between which one step of the search may lie, (m,) each."""
+        return np.full(len(u), -self.reach), np.full(len(u), self.reach)
+
+    def stepped(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Where a step (m,) leads from u (m,)."""
+        return u + step
+
     @property
     def separable(self) -> bool:
         """Whether every number moves by itself, so that one can be kept and the others moved."""
@@ -145,6 +153,15 @@ class Positive(AbstractSeparable):
         """u(x), of positive x."""
         return np.log(x)
 
+    def limits(self, u):
+        """What lowers or raises x by the factor e to the power of `reach`."""
+        return np.full(len(u), np.expm1(-self.reach)), np.full(len(u), np.expm1(self.reach))
+
+    def stepped(self, u, step):
+        """u of x + dx/du · step: signals are more nearly linear in a coefficient than in its logarithm."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return u + np.log1p(step)
+
     def drawn(self, u, rng):
         """Normal in the logarithm, with the standard deviation of a decade."""
         return u + np.log(10.0) * rng.normal(size=len(u))
@@ -175,6 +192,20 @@ class Between(AbstractSeparable):
     def inverse(self, x):
         """u(x), of x between the bounds."""
         return np.log((x - self.lower) / (self.upper - x))
+
+    def limits(self, u):
+        """The steps to where u is `reach` less or more."""
+        each = _logistic(u) * _logistic(-u)
+        low, high = (
+            np.where(u < 0, _logistic(u + by) - _logistic(u), _logistic(-u) - _logistic(-u - by)) / each
+            for by in (-self.reach, self.reach)
+        )
+        return low, high
+
+    def stepped(self, u, step):
+        """u of x + dx/du · step, as for `Positive`."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return u + np.log1p(_logistic(-u) * step) - np.log1p(-_logistic(u) * step)
 
     def drawn(self, u, rng):
         """Uniform between the bounds."""
@@ -394,7 +425,7 @@ class Inertia(AbstractTransform):
         return "lagjax.inertia"
 
 
-def _logistic(u, xp):
+def _logistic(u, xp: Any = np):
     """1 / (1 + e⁻ᵘ), without overflow."""
     return 0.5 * (1.0 + xp.tanh(0.5 * u))
 

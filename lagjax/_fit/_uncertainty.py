@@ -55,7 +55,7 @@ def information(question: Question, point: Point, widths: Widths) -> Information
     free = len(point.u)
     middle = np.zeros((free, free))
     for batch, factor, slopes in zip(question.batches, factors, point.slopes, strict=True):
-        own = _orthogonal(triangles[batch.rows], factor[..., None] * slopes, question.states)
+        own = orthogonal(triangles[batch.rows], factor[..., None] * slopes, question.states)
         middle += sum(correlated_square(own[:, :, s], lags[s]) for s in range(len(lags)))
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + question.states * int(question.fitted.sum())
@@ -87,7 +87,7 @@ def seen(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _eliminated(triangles: np.ndarray, states: int) -> np.ndarray:
     """The rows of the parameters, orthogonal to those of the starts: a triangle with F columns."""
-    own = _orthogonal(triangles, triangles[..., :-1], states)
+    own = orthogonal(triangles, triangles[..., :-1], states)
     return compressed(own.reshape(1, -1, own.shape[-1]))[0]
 
 
@@ -96,7 +96,7 @@ def _square(triangles: np.ndarray, states: int) -> np.ndarray:
     return rows.T @ rows
 
 
-def _orthogonal(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.ndarray:
+def orthogonal(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.ndarray:
     """Columns of parameters less what the starts can do instead: `slopes` (N, ..., D) → (N, ..., F).
 
     Directions of a start that nothing depends on can do nothing: they are left out.

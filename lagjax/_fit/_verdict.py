@@ -1,0 +1,137 @@
+"""What a search came to, in words: how it ended, parameters at the end of their sets, records that disagree.
+
+At the end of a search every number is asked where it would go on a straight line: x + δx, the full step of Gauss and
+Newton without bounds. A positive number that is smaller than its standard error is one that the data do not need; one
+whose step leads beyond a bound by more than two standard errors is held there by the bound alone.
+
+Whether records agree is told without another search. With Hₖ and gₖ what record k adds to the matrix H and the gradient
+of the parameters, starts eliminated, the fit without record k is near u + (H − Hₖ)⁻¹ gₖ, since all gradients together
+are zero. If the records agree, that shift has the covariance (H − Hₖ)⁻¹ − H⁻¹. Source: Cook & Weisberg, *Residuals and
+Influence in Regression* (1982), §3.4, for one observation.
+"""
+
+import numpy as np
+
+from lagjax._fit._parameters import Parameters
+from lagjax._fit._residuals import Point, Question, compressed
+from lagjax._fit._solve import Descent, eliminate
+from lagjax._fit._transforms import Between, Positive
+from lagjax._fit._uncertainty import Information, orthogonal
+
+_BEYOND = 2.0  # standard errors that a step must lead beyond a bound: of sound fits at a bound one in forty does
+_DISAGREE = (
+    5.0  # standard deviations of a shift: twenty records of ten parameters that agree show it in one of 1e4 fits
+)
+_MOST_NAMED = 3
+_CORRELATED = 0.5
+
+
+def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, question: Question) -> str:
+    """Sentences about a search that ended, and about what it found."""
+    parts = [descent.message]
+    if unseen:
+        parts.append("Not everything that is free is seen: fix it, or measure more.")
+    factors = [np.sqrt(batch.weights) / descent.widths.sigma for batch in question.batches]
+    triangles = question.triangles(descent.point, factors)
+    at_ends, named = _at_ends(question.parameters, descent.point, triangles, question.states, known)
+    parts += at_ends
+    # Half a step of the search is one standard deviation: the interval then spans more than a factor of fifty.
+    wide = 2 * _deviations(known) > question.parameters.reach
+    labels = dict.fromkeys(question.parameters.labels[i] for i in np.flatnonzero(wide & ~named))
+    if labels:
+        parts.append(f"Hardly seen, or at the end of what its transform allows: {', '.join(labels)}.")
+    parts += _disagreements(question, triangles, known, ~named)
+    if np.nanmax(known.correlation) > _CORRELATED:
+        parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
+    return " ".join(parts)
+
+
+def _deviations(known: Information) -> np.ndarray:
+    """The standard deviations of u (F,), zero where something is not seen: that is told elsewhere."""
+    return np.sqrt(np.nan_to_num(np.diag(known.covariance), posinf=0.0))
+
+
+def _at_ends(parameters: Parameters, point: Point, triangles, states: int, known: Information):
+    """Sentences for the numbers at the end of their sets, and for each unknown whether there is one (F,)."""
+    found, named = [], np.zeros(len(parameters), bool)
+    if known.null.shape[1] or not len(parameters):
+        return found, named
+    norms = np.linalg.norm(triangles[..., :states], axis=1), np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
+    scale = tuple(np.where(norm > 0, norm, 1.0) for norm in norms)
+    none = np.zeros(len(parameters))
+    step = eliminate(triangles, states, scale, 1e-14, (none, none)).u
+    deviations = _deviations(known)
+    for unknown, (label, transform) in enumerate(zip(parameters.labels, parameters.maps, strict=True)):
+        if not isinstance(transform, Positive | Between):
+            continue
+        u = point.u[unknown : unknown + 1]
+        slope = float(transform.slope(u)[0])
+        text = _at_end(
+            label, transform, float(transform.value(u)[0]), slope * step[unknown], slope * deviations[unknown]
+        )
+        if text is not None:
+            found.append(text)
+            named[unknown] = True
+    return found, named
+
+
+def _at_end(name: str, transform: Positive | Between, x: float, step: float, error: float) -> str | None:
+    """The sentence for one number x whose step on a straight line, and whose standard error there, are given."""
+    ends = [(0.0, -1)] if isinstance(transform, Positive) else [(transform.lower, -1), (transform.upper, 1)]
+    for end, side in ends:
+        if side * (x + step - end) > _BEYOND * error:
+            return (
+                f"{name} stands at {x:.3g}, held by the bound {end:g} of its transform: the data want it near "
+                f"{x + step:.3g} ± {error:.2g}. Widen the bound, or doubt the scene."
+            )
+        if abs(x - end) < error and side * (x - end) <= 0 and side * step >= -error:
+            if end == 0.0:
+                return f"{name} goes to zero, {x:.2g} ± {error:.2g}: the data do not need it."
+            return f"{name} goes to its bound {end:g}, which is within its standard error {error:.2g}."
+    return None
+
+
+def _disagreements(question: Question, triangles: np.ndarray, known: Information, inside: np.ndarray) -> list[str]:
+    """Sentences for the records without which a parameter would move by more than they can have by chance.
+
+    Only of parameters `inside` (F,) of their sets: at a bound the sum of squares has a slope.
+    """
+    records = np.array([piece.record for piece in question.pieces])
+    if known.null.shape[1] or len(np.unique(records)) < 3 or not inside.any():
+        return []
+    columns = np.concatenate([np.ones(question.states, bool), inside, [True]])
+    variances = np.diag(known.covariance)[inside], np.diag(known.white)[inside]
+    shifts = shifts_without(question.states, triangles[..., columns], records, *variances)
+    labels = [label for label, keep in zip(question.parameters.labels, inside, strict=True) if keep]
+    worst = [(k, int(np.argmax(np.abs(z)))) for k, z in shifts.items()]
+    worst = sorted((-abs(shifts[k][i]), k, i) for k, i in worst if abs(shifts[k][i]) > _DISAGREE)
+    return [
+        f"records[{k}] disagrees with the others: without it {labels[i]} would move by "
+        f"{-size:.1f} of the standard deviations that chance gives it."
+        for size, k, i in worst[:_MOST_NAMED]
+    ]
+
+
+def shifts_without(states: int, triangles, records: np.ndarray, variances, white) -> dict[int, np.ndarray]:
+    """By how much each u (F,) moves without one record, in the standard deviations of that for records that agree.
+
+    `triangles` (N, …, 2n + F + 1) are those of the pieces, `records` (N,) says whose they are; `variances` (F,) are
+    those of u, and `white` (F,) what they were if residuals were white. A record without which something is not
+    seen is left out, since there is nothing that it could disagree with.
+    """
+    # The residual is one more column of the parameters, so that the starts are taken out of it as well.
+    own = orthogonal(np.concatenate([triangles, triangles[..., -1:]], axis=-1), triangles, states)
+    size, growth = 1.0 / np.sqrt(white), np.sqrt(np.maximum(variances / white, 1.0))
+    whole, found = compressed(own.reshape(1, -1, own.shape[-1]))[0][:, :-1] / size, {}
+    for k in np.unique(records):
+        rows = own[records != k].reshape(-1, own.shape[-1])
+        rest = compressed(rows[None])[0][:, :-1] / size
+        values = np.linalg.svd(rest, compute_uv=False)
+        if values[-1] < 1e-5 * values[0]:
+            continue
+        mine = own[records == k].reshape(-1, own.shape[-1])
+        without, beside = np.linalg.inv(rest.T @ rest), np.linalg.inv(whole.T @ whole)
+        shift = without @ (mine[:, :-1] / size).T @ mine[:, -1]
+        chance = np.sqrt(np.maximum(np.diag(without) - np.diag(beside), 1e-12 * np.diag(without)))
+        found[int(k)] = shift / (chance * growth)
+    return found
