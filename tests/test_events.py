@@ -145,3 +145,17 @@ def test_guards_of_a_large_scene():
         assert plain.ts[changes[0]] <= ended.end.t <= plain.ts[changes[0] + 1]
     else:
         assert ended.result == lagjax.RESULTS.successful
+
+
+@pytest.mark.slow
+def test_bits_of_events_do_not_depend_on_neighbours():
+    # The search for an instant goes on in the lanes that need it, and in no other.
+    scene, rng = lagjax.scenes.double_pendulum(), np.random.default_rng(0)
+    q0, ts = rng.uniform(-np.pi, np.pi, (3000, 2)), jnp.array([0.0, 5.0])
+    over = lambda q, qdot: jnp.pi**2 - jnp.max(q**2)
+    runs = []
+    for order in (np.arange(3000), rng.permutation(3000)):
+        run = lagjax.simulate_batch(scene.system, q0[order], 0 * q0, ts, scene.params, event=over, rtol=1e-8)
+        runs.append(np.column_stack([run.end.t, run.end.q, run.end.qdot])[np.argsort(order)])
+    assert (runs[0][:, 0] < 5.0).sum() > 1000
+    np.testing.assert_array_equal(*runs)

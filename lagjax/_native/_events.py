@@ -310,19 +310,22 @@ class Events:
         code, root = frame.code, frame["root"]
         scale = frame["part"] * frame["h"]
         start, rate = root * scale, frame["slope"] / scale
-        at, again, left = (code.variable(x) for x in (start, integer(code, 1), integer(code, MOST_CORRECTIONS)))
-        moves = where & (root > 0.0)
-        with code.repeat_while(lambda: (code.load(again, INTEGER) > 0) & (code.load(left, INTEGER) > 0)):
+        moving = code.select(where & (root > 0.0), frame.constant(1), 0.0)
+        at, going, left = (code.variable(x) for x in (start, moving, integer(code, MOST_CORRECTIONS)))
+
+        def moves():  # each lane as long as it needs, so that its neighbours do not change its last digit
+            return code.load(going, frame.vector) > 0.0
+
+        with code.repeat_while(lambda: code.any_lane(moves()) & (code.load(left, INTEGER) > 0)):
             code.store(code.load(left, INTEGER) - 1, left)
             here = code.load(at, frame.vector)
             after = here - side * self._at(frame, order, g, here) / rate
             near = code.intrinsic("fabs", after - start) <= 0.1 * code.intrinsic("fabs", scale)
-            after = code.select(moves & near, after, here)
+            after = code.select(moves() & near, after, here)
             after = code.select(after * frame["forward"] > 0.0, after, 0.0)
             code.store(after, at)
-            moved = code.intrinsic("fabs", after - here)
-            far = moved > INSTANT * frame["smallest"]
-            code.store(code.select(code.any_lane(far & moves), integer(code, 1), 0), again)
+            far = code.intrinsic("fabs", after - here) > INSTANT * frame["smallest"]
+            code.store(code.select(far & moves(), frame.constant(1), 0.0), going)
         at = code.load(at, frame.vector)
         lost = (frame["resting", g] > 0.0) & (code.intrinsic("fabs", at) <= 0.25 * INSTANT * frame["smallest"])
         return code.select(lost, 0.0, at)  # time does not move
