@@ -1,0 +1,367 @@
+"""What a sweep costs beside the motions, and what it survives: 10⁷ double pendulums, kills, crowds of workers.
+
+    python -m benchmarks.sweep rate --members 1000000      # against bare batches; resident memory; hours for 10⁸
+    python -m benchmarks.sweep map --side 2048             # the map of first flips, as a picture
+    python -m benchmarks.sweep kills --count 100           # kill -9 at random moments: the bits of an undisturbed run
+    python -m benchmarks.sweep workers                     # 1, 2 and 7 workers, processes, dask, two shells: one SHA-256
+    python -m benchmarks.sweep poison --members 1000000    # ten members that fail, one of which aborts its process
+    python -m benchmarks.sweep plan                        # 10⁸ members described: seconds and memory
+
+Members start from rest at all pairs of angles, run over T = 5 with a median error of 1e-8, and keep the last state and
+the time of the first flip, at which their motion ends. The record goes to `benchmarks/results/sweep.json`, with commit,
+versions and machine.
+"""
+
+import argparse
+import hashlib
+import json
+import math
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lagjax
+from benchmarks import _report
+
+SCENE = lagjax.scenes.double_pendulum()
+DURATION, RTOL = 5.0, 5e-9  # of which the median error is 1e-8
+BARE = 4096
+ROOT = Path(__file__).parent.parent
+
+
+def before_flip(q, qdot):
+    """Positive as long as neither arm has gone over the top."""
+    return jnp.pi**2 - jnp.max(q**2)
+
+
+FLIP = diffrax.Event(before_flip, direction=False)
+
+
+def keep(trajectory):
+    flipped = trajectory.result == lagjax.RESULTS.event_occurred
+    time_of_flip = jnp.where(flipped, trajectory.end.t, jnp.nan)
+    return {"q": trajectory.end.q, "qdot": trajectory.end.qdot, "flip": time_of_flip}
+
+
+def start(point):
+    return jnp.stack([point["theta1"], point["theta2"]])
+
+
+def grid(members: int) -> dict[str, np.ndarray]:
+    """All pairs of angles, about so many."""
+    side = math.isqrt(members)
+    angles = -np.pi + 2 * np.pi * (np.arange(side) + 0.5) / side
+    return {"theta1": angles, "theta2": angles}
+
+
+RULE = dict(
+    q0=start, qdot0=jnp.zeros(2), params=SCENE.params, keep=keep, event=FLIP, rtol=RTOL,
+)  # fmt: skip
+
+
+def run(store: Path, over: dict, **more) -> lagjax.Sweep:
+    """The sweep of this file."""
+    return lagjax.sweep(SCENE.system, over, jnp.array([0.0, DURATION]), store=store, **{**RULE, **more})
+
+
+# ---- rate ------------------------------------------------------------------------------------------------------------
+
+
+def rate(options: argparse.Namespace) -> dict[str, Any]:
+    """Seconds and CPU seconds of a member, bare and in a sweep, taken in turns; the memory of the sweep."""
+    over = grid(options.members)
+    members = math.prod(len(x) for x in over.values())
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        _bare(over, 1)
+        before, memory = _bare(over, options.bare), _Memory()
+        wall, cpu = time.perf_counter(), time.process_time()
+        with memory:
+            swept = run(Path(folder) / "store", over, progress=options.progress)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        after = _bare(over, options.bare)
+        told = swept.status()
+        size = sum(file.stat().st_size for file in Path(folder).rglob("*") if file.is_file())
+    bare = [0.5 * (x + y) for x, y in zip(before, after, strict=True)]
+    record = {
+        "members": members, "units": told.units, "results": told.results,
+        "bare µs (wall)": 1e6 * bare[0], "bare µs (CPU)": 1e6 * bare[1],
+        "sweep µs (wall)": 1e6 * wall / members, "sweep µs (CPU)": 1e6 * cpu / members,
+        "overhead (wall)": wall / members / bare[0] - 1, "overhead (CPU)": cpu / members / bare[1] - 1,
+        "resident MiB": memory.most, "resident MiB before": memory.before, "stored bytes": size,
+        "hours for 1e8": 1e8 * wall / members / 3600,
+        "worst energy change": told.drift and told.drift[0],
+    }  # fmt: skip
+    return record
+
+
+def _bare(over: dict, batches: int) -> tuple[float, float]:
+    """Seconds and CPU seconds of a member in batches of 4096 drawn from the grid."""
+    rng = np.random.default_rng(0)
+    wall, cpu = time.perf_counter(), time.process_time()
+    for _ in range(batches):
+        q0 = np.stack([rng.choice(angles, BARE) for angles in over.values()], axis=1)
+        one = lagjax.simulate_batch(
+            SCENE.system, q0, np.zeros_like(q0), jnp.array([0.0, DURATION]), SCENE.params, event=FLIP, rtol=RTOL
+        )
+        jax.block_until_ready(one.q)
+    count = batches * BARE
+    return (time.perf_counter() - wall) / count, (time.process_time() - cpu) / count
+
+
+class _Memory:
+    """The largest resident memory of this process within a `with`, in MiB."""
+
+    def __enter__(self):
+        self.before = self.most = self._now()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._ended.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(0.05):
+            self.most = max(self.most, self._now())
+
+    @staticmethod
+    def _now() -> float:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+# ---- the map ---------------------------------------------------------------------------------------------------------
+
+
+def flip_map(options: argparse.Namespace) -> dict[str, Any]:
+    """The map of first flips, drawn a pixel a member."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    store = Path(options.folder or tempfile.mkdtemp()) / f"flips_{options.side}.zarr"
+    wall = time.perf_counter()
+    swept = run(store, grid(options.side**2), progress=options.progress)
+    wall = time.perf_counter() - wall
+    picture = options.output / "flip_map.png"
+    flip = swept.open().flip.values
+    colors = matplotlib.colormaps["magma_r"](matplotlib.colors.LogNorm(0.5, DURATION, clip=True)(flip))
+    colors[np.isnan(flip)] = (1.0, 1.0, 1.0, 1.0)
+    plt.imsave(picture, colors[::-1])
+    print(swept, picture, sep="\n")
+    return {"side": options.side, "seconds": wall, "flipped": float(np.isfinite(flip).mean())}
+
+
+# ---- what it survives ------------------------------------------------------------------------------------------------
+
+
+def digest(store: Path) -> str:
+    """One SHA-256 of all chunks of a store."""
+    total = hashlib.sha256()
+    for file in sorted(file for file in store.glob("*/c/**/*") if file.is_file()):
+        total.update(str(file.relative_to(store)).encode() + file.read_bytes())
+    return total.hexdigest()
+
+
+def kills(options: argparse.Namespace) -> dict[str, Any]:
+    """`kill -9` at random moments of workers in another process, until the store is done; and the bits."""
+    over, unit, rng = grid(options.members), max(1, options.members // 40), np.random.default_rng(options.seed)
+    killed, lost = 0, 0
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        expected = digest(run(Path(folder) / "undisturbed", over, unit=unit, progress=False).store)
+        round_ = 0
+        while killed < options.count:
+            store = Path(folder) / f"store_{round_}"
+            _begin(store, over, unit)
+            while _left(store):
+                worker = _worker(store)
+                done = _done(store)
+                try:
+                    worker.wait(rng.uniform(0.0, options.longest))
+                except subprocess.TimeoutExpired:
+                    os.kill(worker.pid, signal.SIGKILL)
+                    worker.wait()
+                    killed += 1
+                    lost += not done <= _done(store)  # a unit that was done and is not any more
+                if killed >= options.count:  # the rest undisturbed
+                    _worker(store).wait()
+            assert digest(store) == expected, f"after {killed} kills the bits are others"
+            shutil.rmtree(store)
+            round_ += 1
+            print(f"{killed} kills, {round_} sweeps with the bits of an undisturbed run", flush=True)
+    return {
+        "members": options.members,
+        "kills": killed,
+        "sweeps": round_,
+        "finished units lost": lost,
+        "sha256": expected,
+    }
+
+
+def _begin(store: Path, over: dict, unit: int) -> None:
+    """A store of which nothing is done."""
+    from lagjax import _sweep
+
+    work, _sweep.work = _sweep.work, lambda *_: 0
+    try:
+        run(store, over, unit=unit, progress=False)
+    finally:
+        _sweep.work = work
+
+
+def _worker(store: Path, **more) -> subprocess.Popen:
+    command = [sys.executable, "-m", "lagjax", "sweep", "run", str(store), "--quiet"]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, **more)
+
+
+def _done(store: Path) -> set[str]:
+    return {name for name in os.listdir(store / ".sweep" / "done") if name.endswith(".json")}
+
+
+def _left(store: Path) -> int:
+    spec = json.loads((store / ".sweep" / "spec.json").read_text())
+    units = math.prod(math.ceil(a / b) for a, b in zip(spec["shape"], spec["chunk"], strict=True))
+    return units - len(_done(store))
+
+
+def workers(options: argparse.Namespace) -> dict[str, Any]:
+    """One SHA-256 of the arrays, whoever computes them."""
+    over, unit, found = grid(options.members), max(1, options.members // 40), {}
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        places = iter(Path(folder) / f"store_{k}" for k in range(100))
+        found["this process"] = digest(run(next(places), over, unit=unit, progress=False).store)
+        for count in (1, 2, 7):
+            context = multiprocessing.get_context("spawn")
+            with ProcessPoolExecutor(count, mp_context=context) as pool:
+                found[f"{count} processes"] = digest(
+                    run(next(places), over, unit=unit, executor=pool, progress=False).store
+                )
+            print(found, flush=True)
+        found["two shells"] = _two_shells(next(places), over, unit)
+        found |= _by_dask(next(places), over, unit)
+        found["isolated"] = digest(run(next(places), over, unit=unit, isolate=True, progress=False).store)
+    print("\n".join(f"{sha}  {who}" for who, sha in found.items()))
+    return {"members": options.members, "sha256": found, "one": len(set(found.values())) == 1}
+
+
+def _two_shells(store: Path, over: dict, unit: int) -> str:
+    _begin(store, over, unit)
+    shells = [_worker(store), _worker(store)]
+    assert [shell.wait() for shell in shells] == [0, 0]
+    return digest(store)
+
+
+def _by_dask(store: Path, over: dict, unit: int) -> dict[str, str]:
+    """By a scheduler and workers that are processes; nothing where dask is not installed."""
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError:
+        return {}
+    cluster = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None)
+    with cluster, Client(cluster) as client:
+        return {"dask": digest(run(store, over, unit=unit, executor=client.get_executor(), progress=False).store)}
+
+
+def poison(options: argparse.Namespace) -> dict[str, Any]:
+    """Ten members that fail among many; the others are what they are without them, bit for bit."""
+    rng = np.random.default_rng(options.seed)
+    over, bad = _poisoned(options.members, rng)
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        rule = dict(q0=poisoned_start, keep=poisoned_keep, max_steps=2000, progress=options.progress)
+        swept = run(Path(folder) / "poisoned", over, isolate=True, **rule)
+        print(swept)
+        told, data = swept.status(), swept.open()
+        names = {int(member): label for member, _, label, _ in told.failures}
+        clean = dict(over)
+        clean[KEY] = (*over[KEY][:2], np.zeros(options.members))
+        other = run(Path(folder) / "clean", clean, **rule).open()
+        well = np.setdiff1d(np.arange(options.members), bad)
+        same = all(
+            np.array_equal(data[name].values[well], other[name].values[well], equal_nan=True)
+            for name in ("q", "qdot", "flip")
+        )
+    return {"members": options.members, "named": names, "expected": bad.tolist(), "others the same": same}
+
+
+KEY = ("theta1", "theta2", "poison")
+NAN, ENDLESS, ABORTS = 1.0, 2.0, 3.0
+
+
+def _poisoned(members: int, rng: np.random.Generator) -> tuple[dict, np.ndarray]:
+    kinds, bad = np.zeros(members), np.sort(rng.choice(members, 10, replace=False))
+    kinds[bad] = [NAN, NAN, NAN, NAN, ENDLESS, ENDLESS, ENDLESS, ENDLESS, ENDLESS, ABORTS]
+    angles = rng.uniform(-np.pi, np.pi, (2, members))
+    return {KEY: (*angles, kinds)}, bad
+
+
+def poisoned_start(point):
+    fast = jnp.where(point["poison"] == ENDLESS, 1e8, 0.0)  # so fast that no budget of steps suffices
+    return jnp.where(point["poison"] == NAN, jnp.nan, start(point)) + fast * 0
+
+
+def poisoned_keep(trajectory):
+    return keep(trajectory)
+
+
+def plan(options: argparse.Namespace) -> dict[str, Any]:
+    """10⁸ members described, and their store made: seconds, and memory beside that of Python and JAX."""
+    found = {}
+    over = {"a grid": grid(10**8), "random": {("theta1", "theta2"): lagjax.random(10**8, 1, -math.pi, math.pi)}}
+    for name, axes in over.items():
+        with tempfile.TemporaryDirectory(dir=options.folder) as folder, _Memory() as memory:
+            began = time.perf_counter()
+            _begin(Path(folder) / "store", axes, 10**6)
+            seconds, left = time.perf_counter() - began, _left(Path(folder) / "store")
+        found[name] = {"seconds": seconds, "units": left, "MiB more": memory.most - memory.before}
+    return found
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    """Run one part, print it, and store it beside the others."""
+    options = _options().parse_args(arguments)
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_platforms", "cpu")
+    options.output.mkdir(parents=True, exist_ok=True)
+    part = {"rate": rate, "map": flip_map, "kills": kills, "workers": workers, "poison": poison, "plan": plan}
+    found = part[options.part](options)
+    path = options.output / "sweep.json"
+    record = json.loads(path.read_text()) if path.exists() else {}
+    record[options.part] = {"circumstances": _report.circumstances(), **found}
+    _report.write_json(path, record)
+    print(json.dumps(found, indent=1, ensure_ascii=False, default=float))
+    return found
+
+
+def _options() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=["rate", "map", "kills", "workers", "poison", "plan"])
+    parser.add_argument("--members", type=int, default=100_000)
+    parser.add_argument("--bare", type=int, default=20, help="bare batches before and after (default: %(default)s)")
+    parser.add_argument("--side", type=int, default=2048, help="of the map (default: %(default)s)")
+    parser.add_argument("--count", type=int, default=100, help="kills (default: %(default)s)")
+    parser.add_argument("--longest", type=float, default=8.0, help="seconds until a kill (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--folder", type=Path, help="where stores are made (default: the system's temporary folder)")
+    parser.add_argument("--progress", action="store_true")
+    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
