@@ -26,6 +26,7 @@ from lagjax._fit import (
 from lagjax._health import Health
 from lagjax._hybrid import Transition, simulate_hybrid
 from lagjax._machine_code import MachineCode
+from lagjax._orbits import Orbit, periodic_orbit
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._samples import samples
@@ -50,6 +51,7 @@ __all__ = [
     "Linearization",
     "MachineCode",
     "Modes",
+    "Orbit",
     "Record",
     "SimulationError",
     "State",
@@ -74,6 +76,7 @@ __all__ = [
     "latin_hypercube",
     "linearize",
     "normal_modes",
+    "periodic_orbit",
     "plot",
     "positive",
     "random",

@@ -1,0 +1,103 @@
+"""Floquet multipliers: the eigenvalues of the monodromy matrix, from the derivatives of K arcs.
+
+The multipliers that are 1 because an orbit may begin anywhere along itself, and because momenta are conserved, are
+known from the null space of monodromy − 1, and eigenvalues of such Jordan blocks would come out with half the digits.
+They are split off at every state of the chain: with W the null vectors and ℓ those of the transpose, the arcs map
+ker ℓ ⊃ W into each other, and the quotient ker ℓ / W holds the others. These are eigenvalues of a cyclic matrix of the
+arcs, whose K-th powers they are: none drowns in the rounding of a larger one.
+
+Source: Meyer & Offin, *Introduction to Hamiltonian Dynamical Systems*, §8.5; Bojanczyk, Golub & Van Dooren, *The
+periodic Schur decomposition* (1992), for products of matrices.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+# |multiplier| − 1 above this makes an orbit unstable. Multipliers on the unit circle come out within 1e-9 of it, where
+# two of them meet within the square root of their accuracy, 1e-6.
+UNSTABLE = 1e-5
+
+
+class Reduced(NamedTuple):
+    """The arcs without the known ones: `growth` (K, m, m), and how many multipliers are 1 by symmetry."""
+
+    growth: np.ndarray
+    known: int
+
+
+def reduce(growth: np.ndarray, null: np.ndarray, of_transpose: np.ndarray) -> Reduced:
+    """The arcs (K, 2n, 2n) of one closed chain on ker ℓ / W, from W = `null` and ℓ = `of_transpose` (K, 2n, k)."""
+    count, states, _ = growth.shape
+    if not null.shape[2]:
+        return Reduced(growth, 0)
+    bases = [_quotient(w, ell) for w, ell in zip(null, of_transpose, strict=True)]
+    width = min(basis.shape[1] for basis in bases)
+    if any(basis.shape[1] != width for basis in bases):
+        return Reduced(growth, 0)
+    moved = [bases[(k + 1) % count].T @ growth[k] @ bases[k] for k in range(count)]
+    return Reduced(np.stack(moved), states - width)
+
+
+def _quotient(null: np.ndarray, of_transpose: np.ndarray) -> np.ndarray:
+    """An orthonormal basis (2n, m) of the part of ker ℓ that is orthogonal to W ∩ ker ℓ."""
+    w, ell = np.linalg.qr(null)[0], np.linalg.qr(of_transpose)[0]
+    # Directions of W that ℓ does not see; those it sees are simple multipliers, outside of ker ℓ.
+    _, seen, right = np.linalg.svd(ell.T @ w)
+    inside = w @ right.T[:, int((seen > _SEEN).sum()) :]
+    away = np.concatenate([ell, inside], axis=1)
+    return np.linalg.svd(away, full_matrices=True)[0][:, away.shape[1] :]
+
+
+_SEEN = 1e-5  # the cosine of W and ℓ that tells a simple multiplier 1 from a Jordan block
+
+
+def multipliers_of(reduced: Reduced, paired: bool) -> np.ndarray:
+    """All 2n multipliers, the largest first; `paired` puts each beside its reciprocal."""
+    m = reduced.growth.shape[1]
+    values = _of_product(reduced.growth) if m else np.zeros(0, complex)
+    values = values[np.argsort(-np.abs(values), kind="stable")]
+    if paired:
+        values = _in_pairs(values)
+    return np.concatenate([values, np.ones(reduced.known, complex)])
+
+
+def _of_product(growth: np.ndarray) -> np.ndarray:
+    """The eigenvalues of G_(K−1) … G_0, as K-th powers of those of the cyclic matrix that has them as its blocks."""
+    count, m, _ = growth.shape
+    if count == 1:
+        return np.linalg.eigvals(growth[0]).astype(complex)
+    cyclic = np.zeros((count, m, count, m))
+    for k in range(count):
+        cyclic[(k + 1) % count, :, k, :] = growth[k]
+    roots = np.linalg.eigvals(cyclic.reshape(count * m, count * m)).astype(complex)
+    # The roots of one multiplier stand on a circle, a turn divided by K apart: one of each comes of sorting by power.
+    powers = np.exp(count * np.log(np.where(roots == 0, 1e-300, roots)))
+    return _one_of_each(powers, count)
+
+
+def _one_of_each(powers: np.ndarray, count: int) -> np.ndarray:
+    """Means of the groups of `count` values that belong to one multiplier each."""
+    left, chosen = list(range(len(powers))), []
+    order = sorted(left, key=lambda i: -abs(powers[i]))
+    waiting = dict.fromkeys(order)
+    while waiting:
+        first = next(iter(waiting))
+        distance = sorted(waiting, key=lambda i: abs(powers[i] - powers[first]))
+        group = distance[:count]
+        chosen.append(np.mean(powers[group]))
+        for i in group:
+            del waiting[i]
+    return np.array(chosen)
+
+
+def _in_pairs(values: np.ndarray) -> np.ndarray:
+    """The values with each one's reciprocal behind it."""
+    left, ordered = list(values), []
+    while left:
+        first = left.pop(0)
+        ordered.append(first)
+        if left:
+            other = min(range(len(left)), key=lambda i: abs(left[i] * first - 1))
+            ordered.append(left.pop(other))
+    return np.array(ordered)

@@ -1,0 +1,263 @@
+"""`periodic_orbit`: motions that return to where they began, from guesses of their start and period."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._layout import Layout, halves
+from lagjax._orbits import _shooting
+from lagjax._orbits._arcs import Arcs
+from lagjax._orbits._floquet import UNSTABLE, multipliers_of, reduce
+from lagjax._orbits._shooting import Chain, Closing
+from lagjax._problem import end_to_end, rows
+from lagjax._results import SUCCESSFUL, SimulationError
+from lagjax._system import System
+from lagjax._validate import as_arrays, require_finite, require_flag, require_number
+
+PyTree = Any
+
+# The tolerance of the arcs: their truncation is then below round-off, which is what an orbit closes to.
+RTOL = 2.3e-16
+# The largest defect of an orbit that counts as closed, in units of its largest number: a thousand roundings of arcs
+# along which errors grow a thousandfold. Beyond, Newton's method came to rest at something that is no orbit.
+CLOSED = 1e-10
+# Where more arcs are not tried: in the units of the state, whose rounding a hundred steps magnify so far.
+WELL_CLOSED = 1e-12
+# Steps of one arc: with a series of order twenty some hundred of them make errors grow a thousandfold at most.
+_STEPS_OF_ARC, _MOST_ARCS, _MORE = 400, 128, 8
+_PORTION = 2**13  # arcs that are followed together
+
+
+class Orbit(NamedTuple):
+    """A periodic orbit, or a batch of them with the members as first axis of everything.
+
+    - `q0`, `qdot0`: a state of it, in the user's structure; `period` ().
+    - `multipliers` (2n,): the eigenvalues of the monodromy matrix, complex, each beside its reciprocal where the energy
+      is conserved, the largest first, and last of all those that are 1 by the time shift and by conserved momenta.
+    - `closure` (): the largest defect of its arcs, in the units of the state; of a single arc |φ(y; T) − y|.
+    - `stable`: whether no multiplier is larger than 1, so that errors do not grow exponentially.
+    - `ok`: whether it closes; `message`: a sentence that says why not, where all numbers are those of the best trial.
+    """
+
+    q0: PyTree
+    qdot0: PyTree
+    period: jax.Array
+    multipliers: jax.Array
+    closure: jax.Array
+    stable: jax.Array
+    ok: jax.Array
+    message: str | tuple[str, ...]
+
+
+def periodic_orbit(
+    system: System,
+    q0: PyTree,
+    qdot0: PyTree,
+    period: jax.Array | float,
+    params: PyTree = None,
+    *,
+    energy: float | None = None,
+    image: Callable | None = None,
+    throw: bool = True,
+) -> Orbit:
+    r"""The periodic orbit of `system` nearest to a guess (q0, qdot0) of a state of it and `period` of its period.
+
+    Solves φ_T(y) = y, with φ_T the motion over the time T, by Newton's method on states at equal parts of the period
+    and on T; of a scene that is driven, in which anything reads `t`, the period is what it is. Derivatives of the arcs
+    are exact. Where the orbit is one of many (begun elsewhere on itself; at another energy; moved or turned, where
+    momenta are conserved), the correction is the shortest one, in the units of (q, qdot, T), that closes it. Which
+    directions are such is decided by the singular values of the equations: zero are those below 1e-8 of the largest.
+
+    - `period`: a number; or an array (N,) for N guesses at once, with the members as first axis of every leaf of `q0`
+      and `qdot0`. All guesses share `params`.
+    - `energy`: find the orbit with this energy h = p·q̇ − L; by default the nearest one, with whatever energy it has.
+    - `image`: an affine function of (q, qdot) that returns (q, qdot), such as an exchange of bodies or a full turn of
+      an angle: the motion then has to return to the image of its start, φ_T(y) = image(y), and the multipliers are
+      those of image⁻¹ φ_T. It should be a symmetry of the scene.
+    - `throw`: raise when a single guess leads to no orbit. A batch never raises: look at `ok` and `message`.
+
+    Multipliers that are 1 by symmetry are split off before the others are computed, as
+    K-th roots over K arcs, so that 1e-9 beside 1e9 is as good as any.
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene with constraints, and for
+    one that has no machine code; `SimulationError` where there is no orbit near the guess.
+
+    Source: Stoer & Bulirsch, *Introduction to Numerical Analysis*, §7.3.5 (multiple shooting); Muñoz-Almaraz et al.,
+    *Continuation of periodic orbits in conservative and Hamiltonian systems*, Physica D 181 (2003) 1, for the rank.
+
+    ```python
+    import jax, jax.numpy as jnp, lagjax
+    jax.config.update("jax_enable_x64", True)
+
+    pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + jnp.cos(q))
+    orbit = lagjax.periodic_orbit(pendulum, 1.0, 0.0, 6.5)  # 6.6997 at this amplitude
+    ```
+    """
+    require_flag(throw, "throw")
+    periods = _periods(period)
+    layout, y0 = _starts(q0, qdot0, periods)
+    arcs = Arcs.of(system, *map(layout.restore, halves(y0[0])), params, RTOL, "Periodic orbits")
+    found = find(_closing(arcs, energy, image), y0, periods.ravel())
+    if periods.ndim == 0:
+        if throw and not found.ok[0]:
+            raise SimulationError(found.message[0], None)
+        found = Found._make(x[0] for x in found)
+    q, qdot = map(layout.restore, halves(found.y))
+    arrays = jax.tree.map(jnp.asarray, (q, qdot, *found[1:6]))
+    return Orbit._make([*arrays, found.message])
+
+
+def _periods(period) -> np.ndarray:
+    """The periods, () or (N,)."""
+    require_finite(period, "period")
+    periods = np.asarray(period, float)
+    if periods.ndim > 1 or not periods.size:
+        raise ValueError(f"period must be one number, or an array (N,) of a batch; got shape {periods.shape}.")
+    if not (periods > 0).all():
+        raise ValueError(f"period must be positive; got {periods.min()}.")
+    return periods
+
+
+def _closing(arcs: Arcs, energy, image) -> Closing:
+    """What an orbit has to meet. Raises for an energy that is no number, and an image that is not affine."""
+    if energy is not None:
+        require_number(energy, "energy")
+        require_finite(energy, "energy")
+        energy = float(energy)
+        if not arcs.conserves:
+            raise ValueError("energy=... asks for an energy, but that of this scene is not conserved: leave it out.")
+    plain = Closing.plain(arcs, energy)
+    if image is None:
+        return plain
+    layout, states = arcs.layout, 2 * arcs.size
+
+    def flat(y):
+        moved = image(*map(layout.restore, halves(y)))
+        return np.concatenate([np.asarray(layout.flatten(part), float) for part in moved])
+
+    shift = flat(np.zeros(states))
+    matrix = np.stack([flat(row) - shift for row in np.eye(states)], axis=1)
+    somewhere = np.cos(np.arange(1.0, states + 1.0))
+    if not np.allclose(flat(somewhere), matrix @ somewhere + shift, rtol=1e-12, atol=1e-12):
+        raise ValueError("image must be affine in (q, qdot): a linear map and a shift. Use coordinates in which it is.")
+    if np.linalg.matrix_rank(matrix) < states:
+        raise ValueError("image must be invertible: it sends different states to the same one.")
+    return plain._replace(matrix=matrix, shift=shift)
+
+
+def _starts(q0, qdot0, periods: np.ndarray) -> tuple[Layout, np.ndarray]:
+    """The layout of one state, and all states (N, 2n)."""
+    for name, value in (("q0", q0), ("qdot0", qdot0)):
+        require_finite(value, name)
+    if periods.ndim == 0:
+        layout = Layout.of(q0, qdot0)
+        leaves = jax.tree.leaves(as_arrays((q0, qdot0), layout.dtype, "state"))
+        return layout, np.asarray(end_to_end(leaves, np.dtype(float)))[None]
+    leaves = jax.tree.leaves((q0, qdot0))
+    if any(np.shape(leaf)[:1] != periods.shape for leaf in leaves):
+        shapes = sorted({np.shape(leaf) for leaf in leaves})
+        raise ValueError(
+            f"period has shape {periods.shape}, a batch: every leaf of q0 and qdot0 must have that many members as its "
+            f"first axis; got shapes {shapes}."
+        )
+    layout = Layout.of(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], (q0, qdot0)))
+    leaves = jax.tree.leaves(as_arrays((q0, qdot0), layout.dtype, "state"))
+    return layout, np.asarray(rows(leaves, [0] * len(leaves), len(periods), np.dtype(float)))
+
+
+class Found(NamedTuple):
+    """`Orbit`s, flat: `y` (B, 2n), and the others with the members as first axis."""
+
+    y: np.ndarray
+    period: np.ndarray
+    multipliers: np.ndarray
+    closure: np.ndarray
+    stable: np.ndarray
+    ok: np.ndarray
+    message: tuple[str, ...]
+
+
+def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> Found:
+    """The orbits near these guesses; what does not close well is tried with ever more arcs, and the best counts."""
+    arcs = closing.arcs
+    counts = _arcs_each(arcs, y0, period)
+    most = np.minimum(_MOST_ARCS, _MORE * counts)
+    found = _nothing(len(y0), y0.shape[1])
+    waiting = np.arange(len(y0))
+    while len(waiting):
+        for count in np.unique(counts[waiting]).tolist():
+            members = waiting[counts[waiting] == count]
+            for some in np.array_split(members, -(-len(members) * count // _PORTION)):
+                parts, y = _shooting.guesses(closing, y0[some], period[some], count)
+                trial = told(closing, _shooting.close(closing, y, period[some], parts))
+                better = ~(found.closure[some] <= trial.closure)
+                found = _put(found, some[better], Found._make(np.array(x)[better] for x in trial))
+        waiting = waiting[~(found.closure[waiting] <= WELL_CLOSED) & (counts[waiting] < most[waiting])]
+        counts[waiting] = np.minimum(_MOST_ARCS, 2 * counts[waiting])
+    return found
+
+
+def _arcs_each(arcs: Arcs, y0, period) -> np.ndarray:
+    """How many arcs each orbit is divided into, powers of two: from the steps that its guess takes."""
+    run = arcs.ends(np.stack([np.zeros(len(period)), period], axis=1), y0)
+    share = np.where(run.result == SUCCESSFUL, 1.0, np.clip(run.t_end / period, 1e-3, 1.0))
+    count = np.maximum(1.0, run.accepted / share / _STEPS_OF_ARC)
+    return np.minimum(_MOST_ARCS, 2 ** np.ceil(np.log2(count))).astype(int)
+
+
+def _nothing(size: int, states: int) -> Found:
+    blank = np.full(size, np.nan)
+    multipliers = np.full((size, states), np.nan, complex)
+    return Found(
+        np.full((size, states), np.nan), blank, multipliers, blank.copy(), np.zeros(size, bool), np.zeros(size, bool),
+        ("",) * size,
+    )  # fmt: skip
+
+
+def _put(found: Found, places: np.ndarray, others: Found) -> Found:
+    """The same with others in these places."""
+    arrays = [np.array(x) for x in found[:6]]
+    for mine, new in zip(arrays, others[:6], strict=True):
+        mine[places] = new
+    message = list(found.message)
+    for place, text in zip(places.tolist(), list(others.message), strict=True):
+        message[place] = text
+    return Found._make([*arrays, tuple(message)])
+
+
+def told(closing: Closing, chain: Chain) -> Found:
+    """What the search came to: multipliers, stability, and a sentence where it is no orbit."""
+    closure = chain.closure()
+    message = [_sentence(chain, k) for k in range(len(closure))]
+    ok = np.array([not text for text in message])
+    multipliers = np.full((len(ok), chain.y.shape[2]), np.nan, complex)
+    places = np.flatnonzero(ok)
+    if len(places):
+        closed = chain.at(places)
+        known = _shooting.symmetries(closed)
+        for k, place in enumerate(places.tolist()):
+            multipliers[place] = multipliers_of(reduce(closed.growth[k], *known[k]), closing.arcs.conserves)
+    stable = np.abs(np.where(np.isnan(multipliers), np.inf, multipliers)).max(axis=1) < 1 + UNSTABLE
+    return Found(chain.y[:, 0], chain.period, multipliers, closure, stable & ok, ok, tuple(message))
+
+
+def _sentence(chain: Chain, k: int) -> str:
+    """Why a chain is no orbit; "" where it is one."""
+    if not chain.ok[k]:
+        return f"The motion from the guess cannot be followed for a period of {chain.period[k]:.6g}. {chain.why[k]}"
+    size, closure = chain.size()[k], chain.merit()[k]
+    if not closure <= CLOSED * max(size, 1e-300):
+        return (
+            f"No periodic orbit was found near the guess: after {chain.y.shape[1]} arcs per period and a period of "
+            f"{chain.period[k]:.6g} the largest defect is {closure:.2g}, where the state is as large as {size:.2g}. "
+            "Begin nearer: another state or period."
+        )
+    if _shooting.stopped(chain.at(np.array([k])))[0]:
+        return (
+            "The search ended at an equilibrium, which closes after any time: begin at a larger amplitude, or with a "
+            "period nearer to that of the orbit."
+        )
+    return ""

@@ -1,0 +1,253 @@
+"""Multiple shooting for closed orbits: Newton's method on states along the orbit and the period, for many at once.
+
+    φ(y_k; a_k T, a_(k+1) T) − y_(k+1) = 0,  k = 0 … K−1,  y_K = S y_0
+
+S is the identity, or a symmetry of the scene up to which the motion returns; the parts 0 = a_0 < … < a_K = 1 of the
+period are those in which the guess takes equally many steps, so that violent moments make short arcs.
+
+Short arcs keep what one error becomes small, so that orbits close whose errors grow a millionfold in a period. Arcs of
+all orbits are rows of one run. Of the alternatives, single shooting loses as many digits as an error grows, and
+collocation needs as many unknowns as there are steps. The first states come from both sides: forward from the start for
+half the period and backward for the other half, so that errors of the guess grow only half as long.
+
+Source: Stoer & Bulirsch, *Introduction to Numerical Analysis*, §7.3.5; Deuflhard, *Newton Methods for Nonlinear
+Problems* (2004), §3.3 and §7.1, for the damping and the rank.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._orbits._arcs import Arc, Arcs
+from lagjax._orbits._condense import condense
+from lagjax._orbits._rank import Decided, decide
+
+# Relative to the largest singular value: below, a direction counts as degenerate. Measured on the 695 planar orbits,
+# true ones are above 1e-6 and degenerate ones of a closed orbit below 1e-11. Twice as much changes no rank there.
+RANK = 1e-8
+_PER_DEFECT, _LARGEST_RANK = 30.0, 1e-3  # before it is closed, an orbit's degenerate directions are so by its defect
+TRIALS, _HALVINGS = 40, 8
+_ENOUGH = 8e-15  # of the size of the state: round-off, below which trials cannot be told from each other
+
+
+class Closing(NamedTuple):
+    """What closes an orbit: arcs of this scene, S y = `matrix` y + `shift`, and an energy, if one is asked for."""
+
+    arcs: Arcs
+    matrix: np.ndarray
+    shift: np.ndarray
+    energy: float | None = None
+
+    @classmethod
+    def plain(cls, arcs: Arcs, energy: float | None = None) -> "Closing":
+        """Orbits that return to where they began."""
+        return cls(arcs, np.eye(2 * arcs.size), np.zeros(2 * arcs.size), energy)
+
+    def images(self, y: np.ndarray) -> np.ndarray:
+        """S y for rows (R, 2n)."""
+        return y @ self.matrix.T + self.shift
+
+    def taken_back(self, y: np.ndarray) -> np.ndarray:
+        """S⁻¹ y for rows (R, 2n)."""
+        return np.linalg.solve(self.matrix, (y - self.shift).T).T
+
+    def conditions(self, y0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far off the energy of first states (B, 2n) is, (B, m), and its slopes (B, m, 2n); m is 0 or 1."""
+        if self.energy is None:
+            return np.zeros((len(y0), 0)), np.zeros((len(y0), 0, y0.shape[1]))
+        off = self.arcs.energy(0.0, y0) - self.energy
+        return off[:, None], self.arcs.energy_slope(0.0, y0)[:, None]
+
+
+class Chain(NamedTuple):
+    """B closed chains of K arcs: states `y` (B, K, 2n) at `parts` (B, K + 1) of the periods `period` (B,).
+
+    `defect` (B, K, 2n) is end of an arc minus the next state, `growth` (B, K, 2n, 2n) the derivatives of the arcs,
+    `rate` (B, K, 2n) that of the ends in time; those of the last arc are taken back by S. `off` (B, m) and `slope`
+    (B, m, 2n) are conditions on the first state. `ok` (B,) tells whether all arcs could be followed.
+    """
+
+    y: np.ndarray
+    period: np.ndarray
+    parts: np.ndarray
+    defect: np.ndarray
+    growth: np.ndarray
+    rate: np.ndarray
+    off: np.ndarray
+    slope: np.ndarray
+    ok: np.ndarray
+    why: tuple[str, ...]
+
+    def size(self) -> np.ndarray:
+        """The largest number of a state, (B,)."""
+        return np.abs(self.y).max(axis=(1, 2))
+
+    def closure(self) -> np.ndarray:
+        """The largest defect of each chain, (B,)."""
+        return np.where(self.ok, np.abs(self.defect).max(axis=(1, 2)), np.inf)
+
+    def merit(self) -> np.ndarray:
+        """The closure together with how far the first state is from its conditions, (B,)."""
+        steep = np.maximum(np.abs(self.slope).max(axis=2, initial=0.0), 1e-300)
+        return np.maximum(self.closure(), np.max(np.abs(self.off) / steep, axis=1, initial=0.0))
+
+    def at(self, chosen: np.ndarray) -> "Chain":
+        """Some of them."""
+        places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
+        return Chain._make([*(x[places] for x in self[:_ARRAYS]), tuple(self.why[k] for k in places.tolist())])
+
+    def with_rows(self, places: np.ndarray, others: "Chain") -> "Chain":
+        """The same with others in these places."""
+        arrays = [np.array(x) for x in self[:_ARRAYS]]
+        for mine, new in zip(arrays, others[:_ARRAYS], strict=True):
+            mine[places] = new
+        why = list(self.why)
+        for place, text in zip(places.tolist(), others.why, strict=True):
+            why[place] = text
+        return Chain._make([*arrays, tuple(why)])
+
+
+_ARRAYS = 9  # of the fields of a chain
+
+
+def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Parts (B, K + 1) of the period and states (B, K, 2n) there, from starts (B, 2n): from both sides to the middle.
+
+    K is a power of two. A driven motion that does not close has no past: it is followed forward only.
+    """
+    arcs = closing.arcs
+    if count == 1:
+        return np.broadcast_to([0.0, 1.0], (len(y0), 2)), y0[:, None].copy()
+    if arcs.driven:
+        parts = arcs.equal_shares(period, y0, count)
+        return parts, arcs.ends(period[:, None] * parts, y0).path[:, :count]
+    half, images = count // 2, closing.images(y0)
+    ahead, back = arcs.equal_shares(period / 2, y0, half), arcs.equal_shares(-period / 2, images, half)
+    first = arcs.ends(period[:, None] / 2 * ahead, y0).path
+    second = arcs.ends(-period[:, None] / 2 * back, images).path
+    parts = np.concatenate([ahead / 2, 1 - back[:, -2::-1] / 2], axis=1)
+    return parts, np.concatenate([first, second[:, -2:0:-1]], axis=1)
+
+
+def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray) -> Chain:
+    """The chains through these states, (B, K, 2n)."""
+    arcs, (chains, count, states) = closing.arcs, y.shape
+    times, rows = (
+        (period[:, None, None] * np.stack([parts[:, :-1], parts[:, 1:]], axis=2)).reshape(-1, 2),
+        y.reshape(-1, states),
+    )
+    if not arcs.driven:  # each begins at zero, where times have the most digits
+        times = (period[:, None] * np.diff(parts)).reshape(-1, 1) * np.array([0.0, 1.0])
+    arc = arcs.follow(times, rows)
+    rate = arcs.rate(times[:, 1], arc.end).reshape(y.shape)
+    ok = np.asarray(arc.ok.reshape(chains, count).all(axis=1))
+    end, growth = arc.end.reshape(y.shape), arc.by_start.reshape(*y.shape, states)
+    inverse = np.linalg.inv(closing.matrix)
+    end[:, -1], rate[:, -1] = closing.taken_back(end[:, -1]), rate[:, -1] @ inverse.T
+    growth[:, -1] = inverse @ growth[:, -1]
+    defect = end - np.roll(y, -1, axis=1)
+    off, slope = closing.conditions(y[:, 0])
+    return Chain(y, period, parts, defect, growth, rate, off, slope, ok, _why(arcs, arc, rows, times, ok))
+
+
+def _why(arcs: Arcs, arc: Arc, rows, times, ok) -> tuple[str, ...]:
+    """What stopped each chain, "" where nothing did."""
+    count = len(arc.ok) // len(ok)
+    texts = [""] * len(ok)
+    for k in np.flatnonzero(~ok).tolist():
+        row = k * count + int(np.argmin(arc.ok[k * count : (k + 1) * count]))
+        texts[k] = arcs.why_not(row, arc, rows, times[row, 1])
+    return tuple(texts)
+
+
+def threshold_of(chain: Chain) -> np.ndarray:
+    """Below which share of the largest a singular value counts as zero, (B,)."""
+    loose = _PER_DEFECT * chain.merit() / np.maximum(chain.size(), 1e-300)
+    return np.clip(loose, RANK, _LARGEST_RANK)
+
+
+def correction(chain: Chain, driven: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The step of Newton's method, shortest in the first state and the period: dy (B, K, 2n) and dT (B,)."""
+    chains, _, states = chain.y.shape
+    condensed = condense(chain.growth, np.stack([chain.rate * np.diff(chain.parts)[..., None], chain.defect], axis=3))
+    regular, of_period, right = condensed.first + condensed.last, condensed.more[..., :1], condensed.more[..., 1]
+    # A condition in units of the state, as the defects are.
+    unit = 1 / np.maximum(np.abs(chain.slope).max(axis=2), 1e-300)
+    matrix = np.concatenate([regular, unit[:, :, None] * chain.slope], axis=1)
+    right = np.concatenate([right, unit * chain.off], axis=1)
+    if not driven:
+        of_period = np.concatenate([of_period, np.zeros((chains, matrix.shape[1] - states, 1))], axis=1)
+        matrix = np.concatenate([matrix, of_period], axis=2)
+    step = -decide(matrix, threshold_of(chain)).least_norm(right)
+    first, period = step[:, :states, None], np.zeros(chains) if driven else step[:, -1]
+    z = np.stack([period, np.ones(chains)], axis=1)[:, :, None]
+    return condensed.inner(first, first, z)[..., 0], period
+
+
+def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray) -> Chain:
+    """The closed chains near these states, as far as they are found: look at `Chain.closure`."""
+    chain = follow(closing, y, period, parts)
+    active = chain.ok.copy()
+    for _ in range(TRIALS):
+        active &= chain.merit() > _ENOUGH * chain.size()
+        if not active.any():
+            break
+        places = np.flatnonzero(active)
+        better = _improved(closing, chain.at(places))
+        gained = better.merit() < 0.9 * chain.merit()[places]
+        lower = better.merit() < chain.merit()[places]
+        chain = chain.with_rows(places[lower], better.at(lower))
+        active[places[~gained]] = False
+    return chain
+
+
+def _improved(closing: Closing, chain: Chain) -> Chain:
+    """Each chain after one step, halved until its defect falls."""
+    dy, dperiod = correction(chain, closing.arcs.driven)
+    scale = np.minimum(1.0, 0.25 * chain.period / np.maximum(np.abs(dperiod), 1e-300))
+    best, waiting = chain, np.arange(len(chain.period))
+    for _ in range(_HALVINGS):
+        y = chain.y[waiting] + scale[waiting, None, None] * dy[waiting]
+        period = chain.period[waiting] + scale[waiting] * dperiod[waiting]
+        trial = follow(closing, y, period, chain.parts[waiting])
+        lower = trial.merit() < (1 - 0.25 * scale[waiting]) * chain.merit()[waiting]
+        near = chain.merit()[waiting] < 1e3 * _ENOUGH * chain.size()[waiting]  # where rounding decides
+        best = best.with_rows(waiting[lower], trial.at(lower))
+        waiting = waiting[~lower & ~near]
+        if not len(waiting):
+            break
+        scale[waiting] /= 4
+    return best
+
+
+class Symmetries(NamedTuple):
+    """What monodromy − 1 of a closed chain sends to zero, and its transpose: (K, 2n, k) at every state."""
+
+    null: np.ndarray
+    of_transpose: np.ndarray
+
+
+def symmetries(chain: Chain) -> list[Symmetries]:
+    """The rank decision about closed chains."""
+    forward, null = _null(chain.growth)
+    # ℓ_k = G_kᵀ ℓ_(k+1): the same chain, walked back from the end.
+    back, of_transpose = _null(np.swapaxes(chain.growth[:, ::-1], 2, 3))
+    found = []
+    for k in range(len(chain.period)):
+        count = chain.y.shape[2] - max(forward.rank[k], back.rank[k])
+        right, left = null[k][..., null.shape[3] - count :], of_transpose[k][..., null.shape[3] - count :]
+        found.append(Symmetries(right, np.roll(left[::-1], 1, axis=0)))
+    return found
+
+
+def _null(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
+    """The decision about A + B of chains that are closed, and the right vectors at all states, (B, K, 2n, 2n)."""
+    chains, count, states, _ = growth.shape
+    condensed = condense(growth, np.zeros((chains, count, states, 0)))
+    rank = decide(condensed.first + condensed.last, np.full(chains, RANK))
+    return rank, condensed.inner(rank.right, rank.right, np.zeros((chains, 0, states)))
+
+
+def stopped(chain: Chain) -> np.ndarray:
+    """Whether nothing moves along a chain: an equilibrium closes after any time, (B,)."""
+    return np.abs(chain.rate).max(axis=(1, 2)) * chain.period <= 1e-6 * np.maximum(chain.size(), 1e-300)

@@ -1,0 +1,96 @@
+"""Periodic orbits and their families: closed forms, published digits, pairs of multipliers, what cannot be found."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+import lagjax
+
+PENDULUM = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+
+
+def _henon_heiles(q, v):
+    return 0.5 * v @ v - 0.5 * q @ q - q[0] ** 2 * q[1] + q[1] ** 3 / 3
+
+
+HENON_HEILES = lagjax.System(_henon_heiles)
+
+
+def _bodies(q, v):
+    a, b, c = q
+    distances = [jnp.sqrt(jnp.sum((x - y) ** 2)) for x, y in ((a, b), (a, c), (b, c))]
+    return 0.5 * jnp.sum(v**2) + sum(1 / d for d in distances)
+
+
+BODIES = lagjax.System(_bodies)
+
+
+def eight():
+    v = np.array([0.3471168881, 0.5327249454])  # ten published digits
+    return np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, 0.0]]), np.stack([v, v, -2 * v]), 6.3259139829
+
+
+def test_the_period_of_a_pendulum():
+    orbit = lagjax.periodic_orbit(PENDULUM, 1.0, 0.0, 6.5)
+    modulus = (PENDULUM.energy(orbit.q0, orbit.qdot0) + 1) / 2  # sin² of half the amplitude
+    assert orbit.ok and orbit.stable and orbit.closure < 1e-14
+    np.testing.assert_allclose(orbit.period, 4 * ellipk(modulus), rtol=1e-14)
+    np.testing.assert_array_equal(orbit.multipliers, 1.0)  # one degree of freedom: all are known
+
+
+@pytest.mark.slow
+def test_a_batch_at_an_energy_and_its_failures():
+    q0, qdot0 = np.array([1.0, 0.1, 2.0]), np.array([0.0, 0.0, 0.0])
+    orbits = lagjax.periodic_orbit(PENDULUM, q0, qdot0, np.array([6.5, 2.0, 7.0]), energy=-0.5)
+    # By energy the middle one becomes as large as the others, or says that it does not.
+    assert orbits.ok[0] and orbits.ok[2] and orbits.q0.shape == (3,)
+    np.testing.assert_allclose(np.asarray(orbits.period)[np.asarray(orbits.ok)], 4 * ellipk(0.25), rtol=1e-13)
+    assert all((text == "") == bool(ok) for text, ok in zip(orbits.message, orbits.ok, strict=True))
+
+
+def test_up_to_an_image():
+    # Once around: the angle returns one turn ahead.
+    orbit = lagjax.periodic_orbit(PENDULUM, 0.0, 3.0, 2.5, image=lambda q, v: (q + 2 * jnp.pi, v), energy=3.5)
+    modulus = 2 / (3.5 + 1)
+    np.testing.assert_allclose(orbit.period, 2 * np.sqrt(modulus) * ellipk(modulus), rtol=1e-13)
+
+
+def test_an_equilibrium_is_no_orbit():
+    with pytest.raises(lagjax.SimulationError, match="ended at an equilibrium"):
+        lagjax.periodic_orbit(PENDULUM, 0.1, 0.0, 3.5)
+
+
+def test_what_cannot_be_asked():
+    with pytest.raises(ValueError, match="period must be positive"):
+        lagjax.periodic_orbit(PENDULUM, 0.1, 0.0, -1.0)
+    with pytest.raises(ValueError, match="members as its first axis"):
+        lagjax.periodic_orbit(PENDULUM, 0.1, 0.0, np.ones(3))
+    with pytest.raises(ValueError, match="must be affine"):
+        lagjax.periodic_orbit(PENDULUM, 0.1, 0.0, 6.0, image=lambda q, v: (q**2, v))
+
+
+def test_multipliers_of_henon_heiles():
+    # By symmetry x = 0 is a plane of motions; their multipliers are those of Hill's equation ẍ = −(1 + 2y) x.
+    orbit = lagjax.periodic_orbit(HENON_HEILES, np.array([0.0, 0.3]), np.zeros(2), 6.6)
+    first, second, *known = np.asarray(orbit.multipliers)
+    assert orbit.ok and known == [1.0, 1.0] and abs(orbit.q0[0]) < 1e-15
+    ts = jnp.array([0.0, float(orbit.period)])
+    step = 1e-6  # a difference in x, whose square the motion feels
+    shift = jnp.array([step, 0.0])
+    displaced = lagjax.simulate(HENON_HEILES, orbit.q0 + shift, orbit.qdot0, ts, rtol=1e-14)
+    pushed = lagjax.simulate(HENON_HEILES, orbit.q0, orbit.qdot0 + shift, ts, rtol=1e-14)
+    trace = (displaced.q[-1, 0] + pushed.qdot[-1, 0]) / step
+    assert abs(first * second - 1) < 1e-12
+    np.testing.assert_allclose((first + second).real, trace, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_the_figure_of_eight():
+    q0, qdot0, period = eight()
+    orbit = lagjax.periodic_orbit(BODIES, q0, qdot0, period)
+    # Simó, Contemporary Mathematics 292 (2002) 209: exp(±2πi·0.00842272), exp(±2πi·0.29809253).
+    turns = np.sort(np.abs(np.angle(np.asarray(orbit.multipliers)[:4])) / (2 * np.pi))
+    np.testing.assert_allclose(turns, [0.00842272, 0.00842272, 0.29809253, 0.29809253], atol=1e-8)
+    assert orbit.stable and orbit.closure < 1e-13
+    np.testing.assert_array_equal(orbit.multipliers[4:], 1.0)  # of time, two shifts with their boosts, and turns
