@@ -99,7 +99,8 @@ def periodic_orbit(
     require_flag(throw, "throw")
     periods = _periods(period)
     layout, y0 = _starts(q0, qdot0, periods)
-    arcs = Arcs.of(system, *map(layout.restore, halves(y0[0])), params, RTOL, "Periodic orbits")
+    q, qdot = map(layout.restore, halves(y0[0]))
+    arcs = Arcs.of(system, q, qdot, params, RTOL, "Periodic orbits")
     found = find(_closing(arcs, energy, image), y0, periods.ravel())
     if periods.ndim == 0:
         if throw and not found.ok[0]:
