@@ -3,7 +3,7 @@
     python -m benchmarks.sweep rate --members 1000000      # against bare batches; resident memory; hours for 10⁸
     python -m benchmarks.sweep map --side 2048             # the map of first flips, as a picture
     python -m benchmarks.sweep kills --count 100           # kill -9 at random moments: the bits of an undisturbed run
-    python -m benchmarks.sweep workers                     # 1, 2 and 7 workers, processes, dask, two shells: one SHA-256
+    python -m benchmarks.sweep workers                     # 1, 2, 7 workers, processes, dask, two shells: one SHA-256
     python -m benchmarks.sweep poison --members 1000000    # ten members that fail, one of which aborts its process
     python -m benchmarks.sweep plan                        # 10⁸ members described: seconds and memory
 

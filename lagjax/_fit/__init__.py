@@ -177,8 +177,10 @@ def _form(system: System, records: list[Record], hold: str) -> Form | None:
 def _layout(system: System, records: list[Record], params0, form: Form | None) -> Layout:
     """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
     begun = next((started(record.start, params0) for record in records if record.start is not None), None)
-    one_time = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values)
-    q, qdot = (one_time, one_time) if begun is None else jax.tree.map(jnp.asarray, begun)
+    read_off = begun is None
+    if read_off:  # no record is of crossing times: those have starts
+        begun = 2 * (jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values),)
+    q, qdot = jax.tree.map(jnp.asarray, begun)
     scene, params = (system, params0) if form is None else (form.driven(system), form.params(params0, 2))
     try:
         jax.eval_shape(lambda q, qdot: scene.energy(q, qdot, 0.0, params), q, qdot)
@@ -188,7 +190,7 @@ def _layout(system: System, records: list[Record], params0, form: Form | None) -
                 f"The scene's functions ask for `{where}`, which params0 does not have ({type(reason).__name__}: "
                 f"{str(reason).splitlines()[0]}): params0 is {jax.tree.structure(params0)}."
             ) from reason
-        if begun is not None:
+        if not read_off:
             raise
         raise ValueError(
             "The scene's functions cannot be called with coordinates of the structure of `values`, which q is taken to "
