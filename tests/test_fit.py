@@ -171,6 +171,13 @@ def test_comparison_prefers_the_law_that_made_the_data(done):
     frictionless = lagjax.fit(SCENE, records(), TRUTH | {"c": 0.0}, free=FREE | {"c": False})
     comparison = done.compare(frictionless)
     assert comparison.bic[0] < comparison.bic[1] and "prefer this fit" in str(comparison)
+    table = done.compare({"no friction": frictionless}, folds=3)
+    assert table.best == "this" and table.names == ("this", "no friction") and table.bic == comparison.bic
+    # Starts are fitted to the records left out, and parameters to the others: the law that is true leaves the noise.
+    assert table.left_out[0]["q"] == pytest.approx(SIGMA, rel=0.1) and table.left_out[1]["q"] > 5 * SIGMA
+    assert "no record is followed better than by this fit" in str(table) and "no friction" in str(table)
+    with pytest.raises(ValueError, match="folds must be 0, or from 2 to the number of records, 3; got 4"):
+        done.compare(frictionless, folds=4)
     with pytest.raises(ValueError, match="same records"):
         done.compare(lagjax.fit(SCENE, records(1), TRUTH, free=FREE))
 
@@ -212,6 +219,11 @@ def test_correlated_residuals_count_for_what_they_are_worth():
     growth = np.sqrt(np.diag(fits[1].covariance.matrix) / np.diag(fits[0].covariance.matrix))
     np.testing.assert_allclose(growth, np.sqrt((1 + phi) / (1 - phi)), rtol=0.4)
     assert "correlated" in fits[1].message and "correlated" not in fits[0].message
+    # Every second sample measured: neighbours are two apart, and what there is to know is nearly the same.
+    sparse = np.where(np.arange(len(ts)) % 2, np.nan, exact.values + SIGMA * noise)
+    half = lagjax.fit(SCENE, lagjax.Record(ts, sparse, start=exact.start), TRUTH, free=FREE)
+    assert half.noise["q"].effective == pytest.approx(1000 * (1 - phi**2) / (1 + phi**2), rel=0.5)
+    np.testing.assert_allclose(np.diag(half.covariance.matrix), np.diag(fits[1].covariance.matrix), rtol=0.5)
 
 
 # ---- at the end of a set, and records that disagree ------------------------------------------------------------------
@@ -382,6 +394,18 @@ def along(directions, rows=1, states=2):
     y0_dot = np.zeros((rows, states + len(directions), states))
     y0_dot[:, :states] = np.eye(states)
     return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
+
+
+@pytest.mark.slow
+def test_the_real_axis_with_dry_friction(capsys):
+    file = Path(__file__).parents[2] / "shared" / "data" / "emps_identification.npz"
+    if not file.exists():
+        pytest.skip(f"the record is not at {file}")
+    fits, whole = importlib.import_module("emps").main([str(file)])
+    # The published reference parameters give 6.75 mm from q(0), plain least squares 2.55.
+    assert whole.ok and whole.rms["q"] < 2.0e-3 and len(whole.u) <= 12
+    assert "no record is followed better than by the 'viscous, each way its own' fit" in capsys.readouterr().out
+    assert fits["dry and viscous"].rms["q"] > 2 * fits["viscous, each way its own"].rms["q"]
 
 
 @pytest.mark.slow

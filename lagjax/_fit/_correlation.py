@@ -34,7 +34,8 @@ def correlation(question: Question, point: Point, widths: Widths, signal: int) -
         z = np.sqrt(batch.weights[..., signal]) * residuals[..., signal] / widths.sigma[signal]
         if not np.isinf(dof):
             z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
-        count += int((batch.weights[..., signal] > 0).sum())
+        counted = batch.weights[..., signal] > 0
+        z, count = together(z, counted), count + int(counted.sum())
         spectrum = np.abs(np.fft.rfft(z, 2 * z.shape[1])) ** 2
         own = np.fft.irfft(spectrum.sum(axis=0), 2 * z.shape[1])[: z.shape[1]]
         longer = np.zeros(max(len(sums), len(own)))
@@ -48,6 +49,17 @@ def correlation(question: Question, point: Point, widths: Widths, signal: int) -
         return Correlation(np.ones(1), 1.0, count, float(law[1]) if len(law) > 1 else 0.0)
     lags = law[: 3 * cut] * _parzen(np.arange(min(3 * cut, len(law))) / (3 * cut))
     return Correlation(lags, float(max(1.0, lags[0] + 2 * lags[1:].sum())), count, float(law[1]))
+
+
+def together(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """The rows (N, T, ...) with what `counted` (N, T) in front, so that lags count samples that are there.
+
+    Where every tenth sample is measured, or some are missing, the neighbour of one is the next that was measured.
+    """
+    if counted.all():
+        return rows
+    order = np.argsort(~counted, axis=1, kind="stable")
+    return np.take_along_axis(rows, order.reshape(*order.shape, *[1] * (rows.ndim - 2)), axis=1)
 
 
 def _parzen(x: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
+from lagjax._fit._compare import Comparison, comparison, effective_share
 from lagjax._fit._density import Density
 from lagjax._fit._joint import deviations, of_starts, start_alone
 from lagjax._fit._many import Waterfall
@@ -87,18 +88,6 @@ class Prediction(NamedTuple):
         columns = iter(range(len(self.widths.sigma)))
         half = jax.tree.map(lambda leaf: _half_widths(leaf, self.widths, level, columns), self.deviation)
         return jax.tree.map(np.subtract, self.values, half), jax.tree.map(np.add, self.values, half)
-
-
-class Comparison(NamedTuple):
-    """Two fits of the same records: for each the log likelihood per effective sample count, AIC and BIC; and a text."""
-
-    log_likelihood: tuple[float, float]
-    aic: tuple[float, float]
-    bic: tuple[float, float]
-    text: str
-
-    def __repr__(self) -> str:
-        return self.text
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -303,7 +292,7 @@ class Fit:
         own, follows = np.zeros((states, states)), np.zeros((states, len(self.u)))
         if question.fitted[0]:
             rows = np.sqrt(record.weight_matrix)[..., None] / self._of_sensors.sigma[:, None] * slopes
-            own, follows = start_alone(rows, states, known, _effective_share(self))
+            own, follows = start_alone(rows, states, known, effective_share(self))
         return planned.matrix, deviations(slopes, states, own, follows, known)
 
     def _followed(self, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
@@ -345,7 +334,7 @@ class Fit:
         state = known_start(record, self.question.layout, 0, self.params)
         assert state is not None
         planned, slopes = self._followed(record, state)
-        weights = planned.weight_matrix[..., None] * (_effective_share(self) / self._of_sensors.sigma[:, None] ** 2)
+        weights = planned.weight_matrix[..., None] * (effective_share(self) / self._of_sensors.sigma[:, None] ** 2)
         rows, states = np.sqrt(weights) * slopes, self.question.states
         own = rows[..., states:]
         if isinstance(record.start, Guess):
@@ -367,28 +356,19 @@ class Fit:
         with open(path, "w", encoding="utf-8") as file:
             file.write(text)
 
-    def compare(self, other: "Fit") -> Comparison:
-        """Which of two fits of the same records the data prefer: by AIC and BIC, with effective counts of samples.
+    def compare(self, other: "Fit | dict[str, Fit]", *, folds: int = 0) -> Comparison:
+        """Which of several fits of the same records the data prefer: this one against another, or a dict of others.
 
-        Raises `ValueError` where the two are not about the same measurements.
+        By AIC and BIC, with effective counts of samples, and with `folds` also by cross-validation: the records are
+        dealt into so many groups, each is left out of all fits in turn, and followed with what the rest says about the
+        parameters; only its starts are fitted to it. Print what comes back for a table; in that of a dict this fit is
+        called "this".
+
+        Raises `ValueError` where the fits are not about the same measurements, or folds are not 0 or 2 to the number of
+        records.
         """
-        if len(self.records) != len(other.records) or not all(
-            np.array_equal(a.matrix, b.matrix, equal_nan=True) for a, b in zip(self.records, other.records, strict=True)
-        ):
-            raise ValueError("Only fits of the same records can be compared.")
-        share = min(_effective_share(self), _effective_share(other))
-        logs = share * self.log_likelihood, share * other.log_likelihood
-        free = len(self.u) - self.information.null.shape[1], len(other.u) - other.information.null.shape[1]
-        count = share * self.question.measured
-        aic = tuple(2 * k - 2 * log for k, log in zip(free, logs, strict=True))
-        bic = tuple(np.log(count) * k - 2 * log for k, log in zip(free, logs, strict=True))
-        better = "this" if bic[0] < bic[1] else "the other"
-        rows = [f"{'fit':<8}{'free':>6}{'log likelihood':>18}{'AIC':>14}{'BIC':>14}"]
-        for name, *numbers in zip(("this", "other"), free, logs, aic, bic, strict=True):
-            rows.append(f"{name:<8}{numbers[0]:>6}{numbers[1]:>18.2f}{numbers[2]:>14.2f}{numbers[3]:>14.2f}")
-        margin = abs(bic[0] - bic[1])
-        rows.append(f"The data prefer {better} fit, by {margin:.1f} in BIC ({count:.0f} effective samples).")
-        return Comparison(logs, aic, bic, "\n".join(rows))
+        others = other if isinstance(other, dict) else {"the other": other}
+        return comparison({"this": self, **others}, folds)
 
 
 def _require_level(level) -> None:
@@ -402,11 +382,6 @@ def _half_widths(deviation: np.ndarray, widths: Widths, level: float, columns) -
     own = [next(columns) for _ in range(flat.shape[1])]
     noise = widths.sigma[own] * stdtrit(np.minimum(widths.dof[own], 1e9), 0.5 + 0.5 * level)
     return np.sqrt((ndtri(0.5 + 0.5 * level) * flat) ** 2 + noise**2).reshape(deviation.shape)
-
-
-def _effective_share(fit: Fit) -> float:
-    samples = sum(noise.samples for noise in fit.noise.values())
-    return sum(noise.effective for noise in fit.noise.values()) / samples
 
 
 def _start_read_off(record: Record, observe, layout: Layout) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._fit._correlation import correlated_square, correlation
+from lagjax._fit._correlation import correlated_square, correlation, together
 from lagjax._fit._noise import Widths
 from lagjax._fit._residuals import Point, Question, compressed
 
@@ -56,7 +56,8 @@ def information(question: Question, point: Point, widths: Widths) -> Information
     middle = np.zeros((free, free))
     for batch, factor, slopes in zip(question.batches, factors, point.slopes, strict=True):
         own = orthogonal(triangles[batch.rows], factor[..., None] * slopes, question.states)
-        middle += sum(correlated_square(own[:, :, s], lags[s]) for s in range(len(lags)))
+        for s, law in enumerate(lags):
+            middle += correlated_square(together(own[:, :, s], batch.weights[..., s] > 0), law)
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + question.states * int(question.fitted.sum())
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
