@@ -1,5 +1,6 @@
 """`fit` of crossing times: when a pendulum passes a gate, alone and beside records, and sentences for what is wrong."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -64,9 +65,9 @@ def test_times_have_the_derivatives_of_differences_forward_and_in_reverse(exact)
         ends = [question.at(fit.u + way * step[2:], starts + way * step[:2]).residuals[0] for way in (1, -1)]
         np.testing.assert_allclose(point.slopes[0][..., k], (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-8)
     [clock] = question.clocks.values()
-    crossed = clock.crossed(starts[0], fit.parameters.numbers(fit.u))
-    weights = np.linspace(-1.0, 2.0, len(crossed.t))
-    of_start, of_numbers = clock.reverse(crossed, weights)
+    crossed = clock.crossed(starts, fit.parameters.numbers(fit.u)[None])
+    weights = np.linspace(-1.0, 2.0, crossed.t.shape[1])
+    of_start, of_numbers = (x[0] for x in clock.reverse(crossed, weights[None]))
     np.testing.assert_allclose(
         np.append(of_start, of_numbers), weights @ point.slopes[0][0, :, 0], rtol=1e-8, atol=1e-11
     )
@@ -96,6 +97,23 @@ def test_given_errors_are_weights_and_their_common_factor_is_found():
     fit = lagjax.fit(SCENE, timings(noisy, weights={name: e**-2 for name, e in errors.items()}), FIRST)
     # Of some thirty times: to one part in √60 of its standard deviation.
     assert fit.noise["times"].sigma == pytest.approx(2.0, rel=0.4)
+
+
+@pytest.mark.slow
+def test_the_density_of_timings_and_records_has_the_gradient_of_differences_also_in_a_batch():
+    ts = np.linspace(0.0, 4.0, 41)
+    shown = np.asarray(lagjax.simulate(SCENE, *START, ts, TRUTH).q)
+    noisy = shown + 5e-3 * np.random.default_rng(1).normal(size=len(ts))
+    fit = lagjax.fit(SCENE, [timings(measured(1e-3)), lagjax.Record(ts, noisy)], FIRST)
+    density = fit.log_density()
+    off = density.first + 0.5 * np.sqrt(np.diag(density.covariance())) * np.array([[1.0], [-1.0]])
+    value, slope = jax.jit(jax.vmap(jax.value_and_grad(density)))(off)
+    assert value[0] == pytest.approx(float(density(off[0])), rel=1e-12)
+    for k in range(len(density)):
+        h = 1e-4 * np.sqrt(density.covariance()[k, k]) * np.eye(len(density))[k]
+        ends = [float(density(off[1] + way * h)) for way in (1, -1)]
+        central = (ends[0] - ends[1]) / (2 * h[k])
+        assert float(slope[1, k]) == pytest.approx(central, rel=1e-5, abs=1e-6 * float(abs(slope[1]).max()))
 
 
 # ---- what can be wrong -----------------------------------------------------------------------------------------------

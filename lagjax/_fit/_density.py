@@ -124,6 +124,11 @@ class Density:
         layout, signals = self.question.layout, self.question.signals
         numbers = self.question.parameters.numbers(at.u, jnp)
         params = self.question.parameters.restore(numbers)
+        record = self.question.pieces[batch.rows[0]].record
+        if record in self.question.clocks:
+            times = self.question.clocks[record].times(at.starts[batch.rows[0]], numbers)
+            shown = jnp.zeros(batch.values.shape).at[0, :, -1].set(times)
+            return jnp.where(batch.weights > 0, shown - batch.values, 0.0)
 
         def follow(ts, y0, inputs, table):
             q, qdot = map(layout.restore, halves(y0))
@@ -135,6 +140,7 @@ class Density:
         ts, values, inputs = (jnp.asarray(x, at.u.dtype) for x in (batch.ts, batch.values, batch.inputs))
         table = None if batch.table is None else tuple(jnp.asarray(x, at.u.dtype) for x in batch.table)
         shown = jax.vmap(follow)(ts, at.starts[batch.rows], inputs, table)
+        shown = jnp.zeros(values.shape, values.dtype).at[..., : shown.shape[-1]].set(shown)
         return jnp.where(batch.weights > 0, shown - values, 0.0)
 
     def _likelihood(self, residuals, batch: Samples, at: Unknowns):

@@ -165,13 +165,13 @@ class Question:
 
     def _time(self, clock: Clock, batch: Samples, y0, numbers, y0_dot, numbers_dot):
         """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D); or a failure."""
-        crossed = clock.crossed(y0[0], numbers)
-        if isinstance(crossed, str):
-            return Failure(int(batch.rows[0]), crossed)
-        slopes = clock.forward(crossed, y0_dot[0], numbers_dot)
+        crossed = clock.crossed(y0, numbers[None])
+        if not crossed.ok.all():
+            return Failure(int(batch.rows[0]), clock.why_not(y0[0], numbers))
+        slopes = clock.forward(crossed, y0_dot, numbers_dot[None])
         if not np.isfinite(slopes).all():
             return Failure(int(batch.rows[0]), "The derivatives of its crossing times are not finite.")
-        return crossed.t[None, :, None], slopes[None, :, None]
+        return crossed.t[..., None], slopes[:, :, None]
 
     def _collect(self, batch: Samples, values, by_unknowns, residuals, slopes) -> None:
         """Append the residuals of one batch and their derivatives, with a column for every signal."""

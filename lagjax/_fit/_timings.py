@@ -21,10 +21,11 @@ from lagjax._crossings import directions_of, sections_of
 from lagjax._failures import sentence
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Guess, Measured, require_start
-from lagjax._layout import Layout, halves
-from lagjax._machine_code import MachineCode, Noted, _derivatives, _tolerances, flow_of, surfaces_of
+from lagjax._layout import Layout
+from lagjax._machine_code import MachineCode, Noted, Surfaces, _derivatives, _tolerances, flow_of, surfaces_of
 from lagjax._machine_code._steps import KEPT
 from lagjax._problem import Problem
+from lagjax._program import Program, lower
 from lagjax._results import ENDED_WELL
 from lagjax._system import System
 
@@ -183,18 +184,21 @@ def _require_possible(flat: Flat, t0: float) -> None:
 
 
 class Crossed(NamedTuple):
-    """M crossings: times `t` (M,) and `order`, in which these increase; and with the steps of the run that noted them.
+    """M crossings of each of N motions: when, `t` (N, M), and `order` (N, M), in which these times increase.
 
-    `by_y` (M, 2n) and `by_numbers` (M, P) say how each time moves with the state there and with the parameters.
+    `by_y` (N, M, 2n) and `by_numbers` (N, M, P) say how each moves with the state there, at a fixed time, and with the
+    parameters. `ok` (N,) is false where a motion failed, or has not all of the crossings: its times are NaN. The rest
+    is the run that came by, with its steps.
     """
 
     t: np.ndarray
     order: np.ndarray
     by_y: np.ndarray
     by_numbers: np.ndarray
+    ok: np.ndarray
     ts: np.ndarray
     y0: np.ndarray
-    params: np.ndarray
+    numbers: np.ndarray
     steps: tuple
 
 
@@ -202,66 +206,73 @@ class Clock:
     """The crossings of one `Timings` in a scene: their times, and their derivatives forward and in reverse."""
 
     def __init__(self, system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float):
-        keys, functions = sections_of(timings.section)
-        self.flat, self.layout, self.keys, self.functions = timings.flat, layout, keys, functions
-        self.span = np.array([float(timings.t0), self._end(timings)])
+        self.flat, self.layout = timings.flat, layout
+        self.keys, functions = sections_of(timings.section)
+        self.span = np.array([float(timings.t0), _end(timings)])
         params = parameters.restore(parameters.first)
         problem = Problem.about(system, layout, params, ts=tuple(self.span), rtol=_SHARPER * rtol, max_steps=_BUDGET)
-        surfaces = MachineCode().refuses(problem) or surfaces_of(
-            problem, functions, directions_of(timings.direction, keys), "A section"
-        )
+        directions = directions_of(timings.direction, self.keys)
+        surfaces = MachineCode().refuses(problem) or surfaces_of(problem, functions, directions, "A section")
         if isinstance(surfaces, str):
             raise ValueError(f"Crossing times are found in machine code, which there is none of: {surfaces}.")
         self.noting = flow_of(dataclasses.replace(problem, guards=surfaces.guards(notes=True)))
         self.flow, self.room = flow_of(problem), int(self.flat.numbers.max()) + 1
         self.tolerances = _tolerances(problem)
         self.of_tangents = self.tolerances._replace(rtol=rtol, atol=self.tolerances.atol / _SHARPER)
+        self.sections, self._slopes = len(functions), _slopes_of(surfaces, layout.size, len(parameters.first))
+        self._last: tuple[bytes, Crossed] | None = None
+        self.times = self._as_function()
 
-        def values(y, t, numbers):
-            q, qdot = map(layout.restore, halves(y))
-            return jnp.stack([f(q, qdot, t=t, params=parameters.restore(numbers)) for f in functions])
+    # ---- the crossings of N motions ----
 
-        self._slopes = jax.jit(jax.vmap(jax.jacfwd(values, argnums=(0, 1, 2)), in_axes=(0, 0, None)))
-
-    @staticmethod
-    def _end(timings: Timings) -> float:
-        """Until when crossings are looked for."""
-        ends = [timings.ts[1]]
-        for k in np.unique(timings.flat.which):
-            there = (timings.flat.which == k) & np.isfinite(timings.flat.times)
-            if there.any():
-                t, number = timings.flat.times[there], timings.flat.numbers[there]
-                ends.append(t.max() + _PATIENCE * (t.max() - timings.t0) / (number.max() + 1))
-        return float(max(ends))
-
-    def crossed(self, y0: np.ndarray, numbers: np.ndarray) -> Crossed | str:
-        """The crossings of the motion from y0 (2n,) with the parameters `numbers` (P,); or why they are not there."""
-        flat, params = self.flat, numbers[None]
-        ts, y0 = self.span[None], y0[None]
-        noted = self.noting.run(ts, y0, params, self.tolerances._replace(notes=self.room))
-        t, _, count = Noted.read(noted.path[0], len(self.functions))
-        t = t[flat.which, flat.numbers]
-        if not np.isfinite(t).all():
-            return self._why_not(noted, t, count)
-        order = np.argsort(t, kind="stable")
-        ts = np.concatenate([ts[:, 0], t[order]])[None]
-        run = self.flow.run(ts, y0, params, self.tolerances, KEPT)
-        if not np.isin(run.result, ENDED_WELL).all():
-            return sentence(run.result[0], run.t_end[0], ts[0, -1], run.y_end[0], self.layout.names) or ""
-        y = np.empty((len(t), y0.shape[1]))
-        y[order] = run.path[0, 1:]
-        by_y, by_t, by_numbers = (np.asarray(x)[np.arange(len(t)), flat.which] for x in self._slopes(y, t, numbers))
-        pulled = self.flow.anywhere.evaluate(*y.T, t, *numbers)[: self.layout.size]
-        rate = np.concatenate([y[:, self.layout.size :], np.stack(np.broadcast_arrays(*pulled, t)[:-1], axis=-1)], 1)
-        rate = (np.einsum("ms,ms->m", by_y, rate) + by_t)[:, None]
+    def crossed(self, y0: np.ndarray, numbers: np.ndarray) -> Crossed:
+        """The crossings of the motions from y0 (N, 2n) with the parameters `numbers` (N, P)."""
+        count, begin = len(y0), self.span[:1]
+        noted = self.noting.run(self.span[None], y0, numbers, self.tolerances._replace(notes=self.room))
+        rows = noted.path.reshape(count, self.sections, self.room + 1, -1)
+        t = rows[:, self.flat.which, self.flat.numbers, 0]
+        ok = np.isfinite(t).all(axis=1)
+        t = np.where(ok[:, None], t, np.linspace(self.span[0], self.span[1], t.shape[1] + 1)[1:])
+        order = np.argsort(t, axis=1, kind="stable")
+        ts = np.concatenate([np.broadcast_to(begin, (count, 1)), np.take_along_axis(t, order, axis=1)], axis=1)
+        run = self.flow.run(ts, y0, numbers, self.tolerances, KEPT)
+        ok &= np.isin(run.result, ENDED_WELL)
+        y = np.empty((*t.shape, y0.shape[1]))
+        np.put_along_axis(y, order[..., None], run.path[:, 1:], axis=1)
+        by_y, by_numbers = self._moved(t, y, numbers)
         steps = run.path, run.result, run.accepted, run.ticket
-        return Crossed(t, order, -by_y / rate, -by_numbers / rate, ts, y0, params, steps)
+        return Crossed(np.where(ok[:, None], t, np.nan), order, by_y, by_numbers, ok, ts, y0, numbers, steps)
 
-    def _why_not(self, noted, t: np.ndarray, count: np.ndarray) -> str:
-        if not np.isin(noted.result[0], ENDED_WELL):
-            text = sentence(noted.result[0], noted.t_end[0], self.span[1], noted.y_end[0], self.layout.names)
-            return text or ""
-        first = int(np.argmin(np.isfinite(t)))
+    def _moved(self, t: np.ndarray, y: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How the times t (N, M) of crossings move with the states y (N, M, 2n) there, and with the parameters."""
+        (count, crossings, states), n = y.shape, self.layout.size
+        each = np.repeat(numbers, crossings, axis=0)
+        columns = *y.reshape(-1, states).T, t.ravel(), *each.T
+        which = np.tile(self.flat.which, count)
+        slopes = np.empty((len(which), states + 1 + each.shape[1]))
+        values = self._slopes.evaluate(*columns)
+        for k in range(self.sections):
+            own = which == k
+            for j, value in enumerate(values[k * slopes.shape[1] : (k + 1) * slopes.shape[1]]):
+                slopes[own, j] = value if np.ndim(value) == 0 else value[own]
+        pulled = [np.broadcast_to(x, len(which)) for x in self.flow.anywhere.evaluate(*columns)[:n]]
+        rate = np.concatenate([columns[n:states], pulled, np.ones((1, len(which)))]).T
+        slopes /= -np.einsum("ms,ms->m", slopes[:, : states + 1], rate)[:, None]
+        shape = count, crossings, -1
+        return slopes[:, :states].reshape(shape), slopes[:, states + 1 :].reshape(shape)
+
+    def why_not(self, y0: np.ndarray, numbers: np.ndarray) -> str:
+        """Why the crossings of a motion from y0 (2n,) with `numbers` (P,) are not all there."""
+        tolerances = self.tolerances._replace(notes=self.room)
+        noted = self.noting.run(self.span[None], y0[None], numbers[None], tolerances)
+        text = sentence(noted.result[0], noted.t_end[0], self.span[1], noted.y_end[0], self.layout.names)
+        if text:
+            return text
+        t, _, count = Noted.read(noted.path[0], self.sections)
+        missing = ~np.isfinite(t[self.flat.which, self.flat.numbers])
+        if not missing.any():
+            return "Its crossings could not be followed."
+        first = int(np.argmax(missing))
         which = self.flat.which[first]
         name = "" if self.keys is None else f" of section[{self.keys[which]!r}]"
         return (
@@ -269,22 +280,89 @@ class Clock:
             f"{self.flat.numbers[first]}, counted from 0, was measured."
         )
 
+    # ---- derivatives ----
+
     def forward(self, crossed: Crossed, y0_dot: np.ndarray, numbers_dot: np.ndarray) -> np.ndarray:
-        """How the times move along D directions (M, D): of the start (D, 2n), of the parameters (D, P)."""
+        """How the times move along D directions (N, M, D): of the starts (N, D, 2n), of the parameters (N, D, P)."""
         tangents, _ = _derivatives.jvp(
-            self.flow, crossed.ts, crossed.y0, crossed.params, crossed.steps, y0_dot[None], numbers_dot[None],
-            self.of_tangents,
+            self.flow, crossed.ts, crossed.y0, crossed.numbers, crossed.steps, y0_dot, numbers_dot, self.of_tangents
         )  # fmt: skip
-        y_dot = np.empty((len(crossed.t), len(y0_dot), crossed.y0.shape[1]))
-        y_dot[crossed.order] = np.moveaxis(tangents[0, :, 1:], 1, 0)
-        return np.einsum("ms,mds->md", crossed.by_y, y_dot) + crossed.by_numbers @ numbers_dot.T
+        y_dot = np.empty((*crossed.t.shape, *y0_dot.shape[1:]))
+        np.put_along_axis(y_dot, crossed.order[..., None, None], np.moveaxis(tangents[:, :, 1:], 1, 2), axis=1)
+        moved = np.einsum("nms,nmds->nmd", crossed.by_y, y_dot)
+        return moved + np.einsum("nmp,ndp->nmd", crossed.by_numbers, numbers_dot)
 
     def reverse(self, crossed: Crossed, t_ct: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The transpose of `forward`, from cotangents (M,) of the times: of the start (2n,), of the parameters (P,)."""
-        path_ct = np.zeros((1, 1, *crossed.steps[0].shape[1:]))
-        path_ct[0, 0, 1:] = (t_ct[:, None] * crossed.by_y)[crossed.order]
-        end_ct = np.zeros((1, 1, crossed.y0.shape[1]))
+        """The transpose of `forward`, from cotangents (N, M) of the times: of the starts (N, 2n), and (N, P)."""
+        path_ct = np.zeros((len(t_ct), 1, *crossed.steps[0].shape[1:]))
+        path_ct[:, 0, 1:] = np.take_along_axis(t_ct[..., None] * crossed.by_y, crossed.order[..., None], axis=1)
         of_y0, of_numbers = _derivatives.vjp(
-            self.flow, crossed.ts, crossed.y0, crossed.params, crossed.steps, path_ct, end_ct, self.of_tangents
+            self.flow, crossed.ts, crossed.y0, crossed.numbers, crossed.steps, path_ct,
+            np.zeros((len(t_ct), 1, crossed.y0.shape[1])), self.of_tangents,
         )  # fmt: skip
-        return of_y0[0, 0], of_numbers[0, 0] + t_ct @ crossed.by_numbers
+        of_y0, of_numbers = of_y0[:, 0], of_numbers[:, 0] + np.einsum("nm,nmp->np", t_ct, crossed.by_numbers)
+        ok = crossed.ok[:, None]
+        return np.where(ok, of_y0, np.nan), np.where(ok, of_numbers, np.nan)
+
+    def _as_function(self):
+        """`(y0, numbers)` → the times (M,), a function for `jax.jit`, `jax.vmap` and `jax.grad`; NaN where it failed.
+
+        Members of a batch are one run. Its derivatives are those of first order, in reverse.
+        """
+        count = len(self.flat.which)
+
+        def call(host, shapes, *arguments):
+            of = jax.tree.map(lambda size: jax.ShapeDtypeStruct((size,), np.float64), shapes)
+            return jax.pure_callback(host, of, *arguments, vmap_method="broadcast_all")
+
+        @jax.custom_vjp
+        def times(y0, numbers):
+            return call(self._times, count, y0, numbers)
+
+        def forward(y0, numbers):
+            return times(y0, numbers), (y0, numbers)
+
+        def backward(inputs, t_ct):
+            return call(self._cotangents, tuple(x.shape[-1] for x in inputs), *inputs, t_ct)
+
+        times.defvjp(forward, backward)
+        return times
+
+    def _remembered(self, y0: np.ndarray, numbers: np.ndarray) -> Crossed:
+        """`crossed`, of which the last is remembered: what goes back follows what went forward."""
+        key, last = y0.tobytes() + numbers.tobytes(), self._last
+        if last is None or last[0] != key:
+            self._last = last = key, self.crossed(y0, numbers)
+        return last[1]
+
+    def _times(self, y0, numbers):
+        y0, numbers = (np.asarray(x, np.float64) for x in (y0, numbers))
+        crossed = self._remembered(*(x.reshape(-1, x.shape[-1]) for x in (y0, numbers)))
+        return crossed.t.reshape(*y0.shape[:-1], -1)
+
+    def _cotangents(self, *arrays):
+        arrays = [np.asarray(x, np.float64) for x in arrays]
+        y0, numbers, t_ct = (x.reshape(-1, x.shape[-1]) for x in arrays)
+        found = self.reverse(self._remembered(y0, numbers), t_ct)
+        return tuple(x.reshape(like.shape) for x, like in zip(found, arrays[:2], strict=True))
+
+
+def _slopes_of(surfaces: Surfaces, size: int, numbers: int) -> Program:
+    """The derivatives of all sections by (q, q̇, t, params), one section after the other."""
+
+    def slopes(y, params):
+        by = jax.jacfwd(lambda y, params: jnp.stack(surfaces.values.at(y, params)), argnums=(0, 1))(y, params)
+        return jnp.concatenate(by, axis=1)
+
+    return lower(slopes, *(jax.ShapeDtypeStruct((count,), np.float64) for count in (2 * size + 1, numbers)))
+
+
+def _end(timings: Timings) -> float:
+    """Until when crossings are looked for."""
+    ends = [timings.ts[1]]
+    for k in np.unique(timings.flat.which):
+        there = (timings.flat.which == k) & np.isfinite(timings.flat.times)
+        if there.any():
+            t, number = timings.flat.times[there], timings.flat.numbers[there]
+            ends.append(t.max() + _PATIENCE * (t.max() - timings.t0) / (number.max() + 1))
+    return float(max(ends))
