@@ -10,6 +10,7 @@ from lagjax._crossings import Crossings, crossings
 from lagjax._diffrax._solvers import FineOutput
 from lagjax._explain import Explanation
 from lagjax._fit import (
+    Delayed,
     Fit,
     Gaussian,
     Guess,
@@ -39,6 +40,7 @@ __version__ = "0.1.0"
 __all__ = [
     "RESULTS",
     "Crossings",
+    "Delayed",
     "Equilibrium",
     "Explanation",
     "Finding",

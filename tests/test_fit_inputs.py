@@ -115,7 +115,70 @@ def test_a_start_may_follow_from_the_parameters():
     np.testing.assert_allclose(slopes[..., 2], (ends[0] - ends[1]) / (2 * h), atol=1e-7)
 
 
+def delayed_record(tau, end=200, hold="linear"):
+    """Samples at 50 Hz, of which the sensor of `a` is late by tau, and that of `b` is not; the input is a line."""
+    ts, fine = TS[:end], np.arange(20 * end) * 1e-3
+    u = inputs_of(ts)
+    q = exact(fine, np.interp(fine, ts, u), hold)  # at every millisecond
+    late = q[np.maximum(np.arange(end) * 20 - round(tau * 1e3), 0)]
+    return lagjax.Record(ts, {"a": late, "b": q[::20]}, {"u": u}, start=lagjax.Guess(0.2, 0.0))
+
+
+def both(q, qdot):
+    return {"a": q, "b": q}
+
+
+def only_first(params):
+    return {"a": params["tau"], "b": 0.0}
+
+
+@pytest.mark.slow
+def test_the_delay_of_a_sensor_is_found_with_exact_derivatives():
+    record = delayed_record(0.037)
+    observe = lagjax.Delayed(only_first, longest=0.1, observe=both)
+    transforms = {**dict.fromkeys(TRUTH), "tau": lagjax.between(0.0, 0.1)}
+    fit = lagjax.fit(SCENE, record, {**TRUTH, "tau": 0.01, "k": 3.5}, observe=observe, transforms=transforms,
+                     hold="linear", method="whole")  # fmt: skip
+    # `lsim` between the samples is exact for a line, and the fit to rtol 1e-9.
+    assert fit.params["tau"] == pytest.approx(0.037, abs=1e-6) and fit.params["k"] == pytest.approx(4.0, rel=1e-6)
+    assert np.abs(fit.starts[0][0] - 0.3) < 1e-6
+    u, states = fit.u - 1e-2, fit.states
+    slopes = fit.question.at(u, states).slopes[0]
+    for k, step in enumerate(1e-5 * np.eye(len(u))):
+        ends = [fit.question.at(u + way * step, states).residuals[0] for way in (1, -1)]
+        np.testing.assert_allclose(slopes[..., 2 + k], (ends[0] - ends[1]) / 2e-5, rtol=1e-5, atol=1e-7)
+    shown = fit.predict(record)
+    assert np.isnan(shown.values["a"][:5]).all() and np.abs(shown.residuals["a"][6:]).max() < 1e-6
+
+
+@pytest.mark.slow
+def test_sensors_with_a_delay_may_see_time_and_inputs():
+    observe = lagjax.Delayed(lambda p: p["tau"], 0.1, lambda q, qdot, t, inputs: q * t + inputs["u"] + qdot)
+    u = inputs_of(TS)
+    record = lagjax.Record(TS, u, {"u": u}, start=(0.3, -0.2))
+    fit = lagjax.fit(SCENE, record, {**TRUTH, "tau": 0.033}, observe=observe, hold="linear", method="whole")
+    at, h = fit.parameters.moved(fit.parameters.first), 1e-6
+    slopes = fit.question.at(at, fit.states).slopes[0]
+    for k, step in enumerate(h * np.eye(len(at))):
+        ends = [fit.question.at(at + way * step, fit.states).residuals[0] for way in (1, -1)]
+        np.testing.assert_allclose(slopes[..., 2 + k], (ends[0] - ends[1]) / (2 * h), rtol=1e-4, atol=1e-6)
+
+
 # ---- what can be wrong -----------------------------------------------------------------------------------------------
+
+
+def test_what_is_wrong_with_delays_is_a_sentence():
+    u = inputs_of(TS)
+    scene, record = lagjax.System(SCENE.lagrangian.code), lagjax.Record(TS[:10], u[:10], start=(0.0, 0.0))
+    first = {"k": 1.0, "tau": 0.05}
+    with pytest.raises(ValueError, match=r"Record 0 is 0\.18 long, shorter than the longest delay"):
+        lagjax.fit(scene, record, first, observe=lagjax.Delayed(lambda params: params["tau"], 0.2))
+    with pytest.raises(ValueError, match=r"A delay is 0.05, but must lie between 0 and the longest one, 0.04"):
+        lagjax.fit(scene, record, first, observe=lagjax.Delayed(lambda params: params["tau"], 0.04), method="whole")
+    with pytest.raises(ValueError, match="delay must return one number, or a prefix"):
+        lagjax.fit(scene, record, first, observe=lagjax.Delayed(lambda params: {"x": 0.0}, 0.04))
+    with pytest.raises(ValueError, match="longest must be a positive number"):
+        lagjax.Delayed(lambda params: 0.0, 0.0)
 
 
 def test_what_is_wrong_with_inputs_is_a_sentence():

@@ -22,6 +22,7 @@ import numpy as np
 
 from lagjax._consistent import has_constraints
 from lagjax._fit._blame import reading_params
+from lagjax._fit._delays import Delayed
 from lagjax._fit._inputs import HOLDS, Form, asks
 from lagjax._fit._many import Waterfall, distinct, drawn, misfit, short_search
 from lagjax._fit._motions import motions_of
@@ -43,6 +44,7 @@ from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
 
 __all__ = [
+    "Delayed",
     "Fit",
     "Gaussian",
     "Guess",
@@ -94,7 +96,7 @@ def fit(
     - `records`: one `Record` or several, of any lengths; and `lagjax.Timings`, beside them or alone.
     - `params0`: where the search for the parameters begins, in the structure that the scene's functions ask for.
     - `observe`: a function of (q, qdot), and of `t`, `params`, `inputs` by name, that returns what the sensors show in
-      the structure of a record's `values`; by default q.
+      the structure of a record's `values`; by default q. `lagjax.Delayed` where they show it later.
     - `free`: True or False for every parameter, or for whole branches of `params0`; by default all floats are free.
     - `transforms`: `lagjax.positive`, `lagjax.between(a, b)`, `lagjax.angle` or None for every parameter or branch;
       `lagjax.simplex` and `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
@@ -146,6 +148,8 @@ def fit(
     layout = _layout(system, records, params0, form)
     parameters = Parameters.of(params0, free, transforms, layout.dtype)
     question = _question(system, records, layout, parameters, observe, form)
+    if starts > 1 and isinstance(observe, Delayed):
+        raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")
     if starts > 1 and question.clocks:
         raise ValueError("starts must be 1 where there are lagjax.Timings: their search has one beginning.")
     first = next((record for record in records if isinstance(record, Record)), None)
@@ -205,6 +209,8 @@ def _question(system, records, layout, parameters, observe, form) -> Question:
     rtol = DEFAULT_RTOL[layout.dtype]
     motions = motions_of(system, layout, parameters, rtol, None, form)
     recordings = [record for record in records if isinstance(record, Record)]
+    if isinstance(observe, Delayed):
+        _require_longer(recordings, observe.longest)
     signals = Signals(observe, layout, parameters, recordings[0] if recordings else None, form)
     size = _sizes(recordings)
     timings = {k: record for k, record in enumerate(records) if isinstance(record, Timings)}
@@ -220,6 +226,16 @@ def _question(system, records, layout, parameters, observe, form) -> Question:
     return Question(
         records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol, clocks
     )
+
+
+def _require_longer(recordings: list[Record], longest: float) -> None:
+    """Raise `ValueError` for a record of which the delay of its sensors leaves nothing."""
+    for place, record in enumerate(recordings):
+        if (length := record.ts[-1] - record.ts[0]) < longest:
+            raise ValueError(
+                f"Record {place} is {length:g} long, shorter than the longest delay of its sensors, {longest:g}: "
+                "nothing is left of it. Leave it out, or bound the delay closer."
+            )
 
 
 def _sizes(recordings: list[Record]) -> np.ndarray:

@@ -48,6 +48,8 @@ class Density:
         self, question: Question, system: System, noise: AbstractNoise, point: Point, widths: Widths,
         shares: np.ndarray, prior: Callable | None = None,
     ):  # fmt: skip
+        if question.signals.delays is not None:
+            raise ValueError("There is no density for lagjax.Delayed sensors: keep the delay, and shift the times.")
         self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths
         if question.clocks:
             raise NotImplementedError("The density of crossing times is not there yet: give lagjax.Record alone.")

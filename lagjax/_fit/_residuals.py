@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._fit._motions import AbstractMotions
+from lagjax._fit._delays import inputs_at
+from lagjax._fit._inputs import at_instants
+from lagjax._fit._motions import AbstractMotions, Motion
 from lagjax._fit._noise import AbstractNoise, Widths, counts
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Piece, Record, Samples, batches
@@ -111,6 +113,8 @@ class Question:
         columns = self.columns(self.pieces[batch.rows[0]].record)
         values, weights = np.zeros((2, *batch.ts.shape, len(self.names)))
         values[..., columns], weights[..., columns] = batch.values, batch.weights
+        if self.signals.delays is not None and columns.start == 0:
+            weights[batch.ts < batch.ts[:, :1] + self.signals.delays.longest] = 0.0
         return batch._replace(values=values, weights=weights)
 
     def at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
@@ -146,11 +150,10 @@ class Question:
 
     def _sense(self, batch: Samples, y0, numbers, y0_dot, numbers_dot) -> tuple[np.ndarray, np.ndarray] | Failure:
         """What the sensors show of a batch (N, T, S), and how that moves (N, T, S, D)."""
-        motion = self.motions.follow(batch.ts, y0, numbers, y0_dot, numbers_dot, batch.table)
-        if not motion.ok:
-            row, text = motion.why_not(batch.ts, self.layout)
-            return Failure(int(batch.rows[row]), text)
-        values, by_unknowns = self.signals.of(motion, batch.ts, batch.inputs, numbers, numbers_dot)
+        shown = self._delayed(batch, y0, numbers, y0_dot, numbers_dot)
+        if isinstance(shown, Failure):
+            return shown
+        values, by_unknowns = shown
         counted = batch.weights[..., : len(self.signals.names)] > 0
         bad = counted & ~(np.isfinite(values) & np.isfinite(by_unknowns).all(axis=-1))
         if bad.any():
@@ -162,6 +165,42 @@ class Question:
                 f"{sample}, t = {batch.ts[row, place]:g}.",
             )
         return values, by_unknowns
+
+    def _follow(self, batch: Samples, ts, y0, numbers, y0_dot, numbers_dot) -> Motion | Failure:
+        motion = self.motions.follow(ts, y0, numbers, y0_dot, numbers_dot, batch.table)
+        if motion.ok:
+            return motion
+        row, text = motion.why_not(ts, self.layout)
+        return Failure(int(batch.rows[row]), text)
+
+    def _delayed(self, batch: Samples, y0, numbers, y0_dot, numbers_dot) -> tuple[np.ndarray, np.ndarray] | Failure:
+        """The signals at their times, or for each of the delays the signals that have it at earlier times."""
+        delays, signals = self.signals.delays, self.signals
+        if delays is None:
+            motion = self._follow(batch, batch.ts, y0, numbers, y0_dot, numbers_dot)
+            if isinstance(motion, Failure):
+                return motion
+            return signals.of(motion, batch.ts, batch.inputs, numbers, numbers_dot)
+        each = delays.at(numbers)
+        if text := delays.refuses(each):
+            return Failure(int(batch.rows[0]), text)
+        values = np.zeros((*batch.ts.shape, len(signals.names)))
+        slopes = np.zeros((*values.shape, len(numbers_dot)))
+        hold = "zero" if signals.form is None else signals.form.hold
+        for delay in each:
+            ts = np.maximum(batch.ts - delay.value, batch.ts[:, :1])
+            motion = self._follow(batch, ts, y0, numbers, y0_dot, numbers_dot)
+            if isinstance(motion, Failure):
+                return motion
+            inputs, rates = inputs_at(batch.table, batch.inputs, ts, hold)
+            ts_dot = -numbers_dot @ delay.slopes
+            y, n = motion.path.reshape(-1, self.states), self.layout.size
+            pulled = self.motions.rate(ts.ravel(), y, numbers, at_instants(ts.ravel(), inputs.reshape(len(y), -1)))
+            rate = np.concatenate([y[:, n:], pulled], axis=1).reshape(motion.path.shape)
+            motion = motion._replace(tangents=motion.tangents + ts_dot[:, None, None] * rate[:, None])
+            some = signals.of(motion, ts, inputs, numbers, numbers_dot, ts_dot, rates)
+            values[..., delay.signals], slopes[..., delay.signals, :] = (x[:, :, delay.signals] for x in some)
+        return values, slopes
 
     def _time(self, clock: Clock, batch: Samples, y0, numbers, y0_dot, numbers_dot):
         """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D); or a failure."""

@@ -305,7 +305,8 @@ class Fit:
         full = about.at(self.u, state[None])
         if isinstance(full, Failure):
             raise ValueError(about.where(full))
-        return replace(record, values=in_structure(full.residuals[0][0], record)), full.slopes[0][0]
+        shown = np.where(about.batches[0].weights[0] > 0, full.residuals[0][0], np.nan)  # NaN before a delay is over
+        return replace(record, values=in_structure(shown, record)), full.slopes[0][0]
 
     def next_experiment(self, candidates: Sequence[Record] | dict[str, Record]) -> Experiments:
         """Which of several planned records would tell most about the free parameters: the gain in log det (D-optimal).

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import accept
+from lagjax._fit._delays import Delayed, Delays
 from lagjax._fit._inputs import Form
 from lagjax._fit._motions import Motion
 from lagjax._fit._parameters import Parameters
@@ -30,16 +31,19 @@ class Signals:
 
     def __init__(
         self,
-        observe: Callable | None,
+        observe: Callable | Delayed | None,
         layout: Layout,
         parameters: Parameters,
         record: Record | None,
         form: Form | None = None,
     ):
         self.layout, self.parameters, self.form = layout, parameters, form
+        self.delays: Delays | None = None
         if record is None:
             self.names, self._at = (), None
             return
+        if isinstance(observe, Delayed):
+            self.delays, observe = Delays(observe, parameters, record), observe.observe
         if observe is None:
             self.names, self._at, self.at_one_time = layout.names, None, lambda y, *_: y[: layout.size]
             if record.structure != (layout.tree, layout.shapes):
@@ -63,16 +67,20 @@ class Signals:
 
         def with_derivatives(y, t, inputs, numbers):
             state = y, t, numbers, inputs
-            return flat(*state), *jax.jacfwd(flat, argnums=(0, 2))(*state)
+            return flat(*state), *jax.jacfwd(flat, argnums=(0, 2, 1, 3))(*state)
 
         self.at_one_time = flat
         self._at = jax.jit(jax.vmap(with_derivatives, in_axes=(0, 0, 0, None)))
 
-    def of(self, motion: Motion, ts: np.ndarray, inputs: np.ndarray, numbers: np.ndarray, numbers_dot: np.ndarray):
+    def of(
+        self, motion: Motion, ts: np.ndarray, inputs: np.ndarray, numbers: np.ndarray, numbers_dot: np.ndarray,
+        ts_dot: np.ndarray | None = None, rates: np.ndarray | None = None,
+    ):  # fmt: skip
         """The signals (N, T, S) of motions, and their derivatives (N, T, S, D) along the directions of these.
 
         `ts` (N, T) and `inputs` (N, T, I) are times and inputs there, `numbers` (P,) the parameters and `numbers_dot`
-        (D, P) their directions.
+        (D, P) their directions. Where the times move, too, by `ts_dot` (D,), the inputs have `rates` (N, T, I), and
+        `motion` moves with the times already.
         """
         tangents = motion.tangents
         if self._at is None:
@@ -80,10 +88,13 @@ class Signals:
             return motion.path[..., :n], np.ascontiguousarray(np.moveaxis(tangents[..., :n], 1, -1))
         rows, times, states = motion.path.shape
         samples = motion.path.reshape(-1, states), ts.ravel(), inputs.reshape(rows * times, -1)
-        values, by_state, by_numbers = self._in_portions(samples, numbers)
+        values, by_state, by_numbers, by_t, by_inputs = self._in_portions(samples, numbers)
         shape = rows, times, values.shape[1]
         slopes = np.matmul(by_state.reshape(*shape, states), np.moveaxis(tangents, 1, -1))
         slopes += (by_numbers @ numbers_dot.T).reshape(*shape, len(numbers_dot))
+        if ts_dot is not None and rates is not None:
+            rate = by_t + np.einsum("msi,mi->ms", by_inputs, rates.reshape(len(by_t), -1))
+            slopes += rate.reshape(shape)[..., None] * ts_dot
         return values.reshape(shape), slopes
 
     def _in_portions(self, samples, numbers):
@@ -110,6 +121,8 @@ def _require_signals(observed, layout: Layout, parameters: Parameters, record: R
         )
 
 
-def looks_like_positions(observe: Callable | None, record: Record, layout: Layout) -> bool:
+def looks_like_positions(observe: Callable | Delayed | None, record: Record, layout: Layout) -> bool:
     """Whether the signals are positions, or something of their structure (with a gain, a bias): a start for q."""
+    if isinstance(observe, Delayed):
+        observe = observe.observe
     return observe is None or record.structure == (layout.tree, layout.shapes)

@@ -1,0 +1,112 @@
+"""`Delayed`: sensors that show at a time t what was at t − τ, and how that moves with the delay τ.
+
+The motion is followed at the times t − τ themselves, so that nothing is interpolated, and with ẏ its rate there
+
+    δy(t − τ) = δy − ẏ δτ
+
+Before a record begins nothing is known: the samples of its first `longest` units of time are left out, whatever the
+delay of a trial is, so that the sum of squares does not jump where a delay passes a sample.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._fit._inputs import Table
+from lagjax._fit._parameters import Parameters
+from lagjax._fit._records import Record
+
+PyTree = Any
+
+
+@dataclass(frozen=True)
+class Delayed:
+    """Sensors with a delay: `fit(..., observe=lagjax.Delayed(lambda params: params["tau"], longest=0.1))`.
+
+    - `delay`: a function of the parameters that returns the delay of all signals, or a prefix of the structure of a
+      record's `values` with one for each. It is fitted like any parameter, with exact derivatives.
+    - `longest`: the largest delay that is possible. Samples of the first `longest` of every record are left out,
+      because they may show what was before; a trial with a delay beyond, or below zero, counts as one that failed:
+      `lagjax.between(0.0, longest)` keeps it inside.
+    - `observe`: what the sensors show, as for `fit`; by default q. It is asked about the state, the time and the inputs
+      at the delayed time.
+
+    **Raises** `TypeError` or `ValueError` for a `longest` that is no positive number.
+    """
+
+    delay: Callable
+    longest: float
+    observe: Callable | None = None
+
+    def __post_init__(self):
+        if not callable(self.delay):
+            raise TypeError(f"delay must be a function of the parameters; got {self.delay!r}.")
+        if not (np.ndim(self.longest) == 0 and np.isfinite(self.longest) and self.longest > 0):
+            raise ValueError(f"longest must be a positive number, the largest possible delay; got {self.longest!r}.")
+
+
+class Delay(NamedTuple):
+    """One of the delays: the `signals` that have it, its value, and its derivatives by all parameters (P,)."""
+
+    signals: np.ndarray
+    value: float
+    slopes: np.ndarray
+
+
+class Delays:
+    """The delays of the signals of records, as functions of the parameters."""
+
+    def __init__(self, delayed: Delayed, parameters: Parameters, record: Record):
+        leaves, tree = jax.tree.flatten(record.values)
+        places = np.split(np.arange(record.matrix.shape[1]), np.cumsum([x[0].size for x in leaves])[:-1])
+        self.longest = float(delayed.longest)
+
+        def of(numbers):
+            given = delayed.delay(parameters.restore(numbers))
+            try:
+                spread = tree.flatten_up_to(jax.tree.broadcast(given, record.values))
+            except ValueError:
+                raise ValueError("delay must return one number, or a prefix of the structure of values.") from None
+            if any(jnp.shape(one) != () for one in spread):
+                raise ValueError("delay must return numbers, one for all signals or one for each leaf of values.")
+            return jnp.stack([jnp.asarray(one, numbers.dtype) for one in spread])
+
+        self._at = jax.jit(lambda numbers: (of(numbers), jax.jacfwd(of)(numbers)))
+        self.places = places
+        # Leaves that share one number share one motion.
+        jax.eval_shape(of, jax.ShapeDtypeStruct(parameters.first.shape, parameters.first.dtype))
+
+    def at(self, numbers: np.ndarray) -> list[Delay]:
+        """The different delays at the parameters `numbers` (P,)."""
+        values, slopes = (np.asarray(x, float) for x in self._at(numbers))
+        rows, which = np.unique(np.concatenate([values[:, None], slopes], axis=1), axis=0, return_inverse=True)
+        which = which.ravel()
+        return [
+            Delay(np.concatenate([self.places[i] for i in np.flatnonzero(which == k)]), float(row[0]), row[1:])
+            for k, row in enumerate(rows)
+        ]
+
+    def refuses(self, delays: list[Delay]) -> str | None:
+        """Why a trial with these delays is none, as a sentence."""
+        for one in delays:
+            if not 0.0 <= one.value <= self.longest:
+                return f"A delay is {one.value:.4g}, but must lie between 0 and the longest one, {self.longest:g}."
+        return None
+
+
+def inputs_at(table: Table | None, inputs: np.ndarray, ts: np.ndarray, hold: str) -> tuple[np.ndarray, np.ndarray]:
+    """The inputs (N, T, I) at other times `ts` (N, T), and their rates there. `inputs` (N, T, I) tells the shape."""
+    if table is None:
+        return inputs, np.zeros_like(inputs)
+    values, rates = np.empty_like(inputs), np.zeros_like(inputs)
+    for row, (knots, samples) in enumerate(zip(table.knots, table.values, strict=True)):
+        i = np.clip(np.searchsorted(knots, ts[row], side="right") - 1, 0, len(knots) - 2)
+        values[row] = samples[i]
+        if hold == "linear":
+            rates[row] = (samples[i + 1] - samples[i]) / (knots[i + 1] - knots[i])[:, None]
+            values[row] += rates[row] * (ts[row] - knots[i])[:, None]
+    return values, rates
