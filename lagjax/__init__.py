@@ -4,7 +4,21 @@ System(L)  →  simulate(system, q0, qdot0, ts, params)  →  Trajectory
 """
 
 from lagjax import plot, scenes
-from lagjax._analysis import Equilibrium, Linearization, Modes, equilibrium, linearize, normal_modes
+from lagjax._analysis import (
+    Conserved,
+    ConservedQuantities,
+    Equilibrium,
+    Linearization,
+    Modes,
+    SameMotion,
+    conserved_quantities,
+    cyclic_coordinates,
+    equilibrium,
+    linearize,
+    noether_charge,
+    normal_modes,
+    same_motion,
+)
 from lagjax._check import Finding, Findings, check
 from lagjax._crossings import Crossings, crossings
 from lagjax._diffrax._solvers import FineOutput
@@ -39,6 +53,8 @@ from lagjax._trajectory import State, Trajectory, Transitions
 __version__ = "0.1.0"
 __all__ = [
     "RESULTS",
+    "Conserved",
+    "ConservedQuantities",
     "Crossings",
     "Delayed",
     "Equilibrium",
@@ -55,6 +71,7 @@ __all__ = [
     "Modes",
     "Orbit",
     "Record",
+    "SameMotion",
     "SimulationError",
     "State",
     "Statistics",
@@ -71,17 +88,21 @@ __all__ = [
     "angle",
     "between",
     "check",
+    "conserved_quantities",
     "crossings",
+    "cyclic_coordinates",
     "equilibrium",
     "fit",
     "inertia",
     "latin_hypercube",
     "linearize",
+    "noether_charge",
     "normal_modes",
     "periodic_orbit",
     "plot",
     "positive",
     "random",
+    "same_motion",
     "samples",
     "scenes",
     "simplex",

@@ -1,0 +1,183 @@
+"""The transformations among which symmetries are looked for, as vectors of coefficients.
+
+    ξ = b + c t + A q,   τ = α + β t,   and the user's own
+
+For few coordinates every matrix A is tried; for many only those that a leaf of the coordinates suggests: rotations in
+the planes of its last axis and its scaling, for each leaf. A symmetry is any combination of them.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._layout import Layout
+
+# Up to so many coordinates every linear map is tried, 144 of them.
+_ALL_MAPS = 12
+
+# Leaves whose last axis is so long are vectors, which can be rotated.
+_SPACE = (2, 3)
+
+
+class Fields(NamedTuple):
+    """A basis of transformations of n coordinates: the time, n translations, n boosts, M maps, the time's scale, own.
+
+    - `scale` (n,): the sizes of the coordinates, by which translations and boosts are made of order one.
+    - `maps` (M, n, n): the matrices A; `names`: of all K = 2 + 2n + M + U.
+    - `own`: the U of the user, functions (q, t, params) → (ξ, τ).
+    """
+
+    scale: np.ndarray
+    maps: np.ndarray
+    names: tuple[str, ...]
+    own: tuple[Callable, ...]
+
+    @property
+    def count(self) -> int:
+        """K, how many there are."""
+        return len(self.names)
+
+    def apart(self, weights):
+        """Weights (K,) of the time (), translations (n,), boosts (n,), maps (M,), the time's scale () and own (U,)."""
+        n, m = len(self.scale), len(self.maps)
+        first, last = 1 + 2 * n, 1 + 2 * n + m
+        return (
+            weights[0],
+            weights[1 : n + 1],
+            weights[n + 1 : first],
+            weights[first:last],
+            weights[last],
+            weights[last + 1 :],
+        )
+
+    def transform(self, weights, params) -> Callable:
+        """The combination of all with these weights (K,), a function (q, t) → (ξ, τ)."""
+        alpha, b, c, of_maps, beta, of_own = self.apart(weights)
+
+        def combined(q, t):
+            change = (b + c * t) * jnp.asarray(self.scale, q.dtype) + jnp.tensordot(of_maps, self.maps, 1) @ q
+            of_time = alpha + beta * t
+            for k, function in enumerate(self.own):
+                more, more_time = function(q, t, params)
+                change, of_time = change + of_own[k] * more, of_time + of_own[k] * more_time
+            return change, of_time
+
+        return combined
+
+    def weights(self, b=None, c=None, a=None, alpha: float = 0.0, beta: float = 0.0) -> np.ndarray | None:
+        """The weights (K,) of one transformation; None where it is no combination of the basis."""
+        n, m = len(self.scale), len(self.maps)
+        of_maps = np.zeros(m)
+        if a is not None:
+            flat = self.maps.reshape(m, -1).T
+            used = np.flatnonzero((flat != 0)[a.ravel() != 0].any(axis=0))
+            of_maps[used] = np.linalg.lstsq(flat[:, used], a.ravel(), rcond=None)[0]
+            if np.abs(flat @ of_maps - a.ravel()).max() > 1e-12 * np.abs(a).max():
+                return None
+        shift, drift = (np.zeros(n) if x is None else x / self.scale for x in (b, c))
+        return np.concatenate([[alpha], shift, drift, of_maps, [beta], np.zeros(len(self.own))])
+
+
+def fields_of(layout: Layout, scale: np.ndarray, own: dict[str, Callable]) -> Fields:
+    """The basis for coordinates of this layout and of these sizes (n,)."""
+    maps = _maps(layout, scale)
+    names = [
+        "time translation",
+        *(f"translation of {name}" for name in layout.names),
+        *(f"boost of {name}" for name in layout.names),
+        *(name for name, _ in maps),
+        "scaling of the time",
+        *own,
+    ]
+    return Fields(scale, np.array([a for _, a in maps], float), tuple(names), tuple(own.values()))
+
+
+def _maps(layout: Layout, scale: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Matrices A (n, n) by name."""
+    n, names = layout.size, layout.names
+    if n <= _ALL_MAPS:
+        maps = []
+        for i in range(n):
+            for j in range(n):
+                a = np.zeros((n, n))
+                a[i, j] = scale[i] / scale[j]
+                maps.append((f"d{names[i]} = {names[j]}", a))
+        return maps
+    return [(f"{name} of {layout.paths[k]}", a) for k, name, a in leaf_maps(layout)]
+
+
+def leaf_maps(layout: Layout) -> list[tuple[int, str, np.ndarray]]:
+    """Rotations of each leaf in every plane of its last axis, and its scaling: which leaf, the name, A (n, n)."""
+    maps, begin = [], 0
+    for k, shape in enumerate(layout.shapes):
+        size = int(np.prod(shape, dtype=int))
+        place = np.arange(begin, begin + size)
+        scaling = np.zeros((layout.size, layout.size))
+        scaling[place, place] = 1.0
+        maps.append((k, "scaling", scaling))
+        if shape and shape[-1] in _SPACE:
+            vectors = place.reshape(-1, shape[-1])
+            for i in range(shape[-1]):
+                for j in range(i + 1, shape[-1]):
+                    a = np.zeros((layout.size, layout.size))
+                    a[vectors[:, i], vectors[:, j]], a[vectors[:, j], vectors[:, i]] = -1.0, 1.0
+                    maps.append((k, f"rotation in the plane {i}{j}", a))
+        begin += size
+    return maps
+
+
+# ---- those that have a name in textbooks -----------------------------------------------------------------------------
+
+
+def named(layout: Layout, fields: Fields) -> list[tuple[str, np.ndarray]]:
+    """Combinations that textbooks name: the name of what they conserve, and their weights (K,)."""
+    n, axes = layout.size, _axes(layout)
+    one, first_own = np.eye(n), fields.count - len(fields.own)
+    along = [(i, d, _along(n, vectors[:, i])) for d, vectors in axes.items() for i in range(d)]
+    space = {d: "" if len(axes) == 1 else f" of {d}" for d in axes}
+    # The signs are those of what is conserved: h, p, M X − P t.
+    known = [("energy", fields.weights(alpha=-1.0))]
+    known += [(f"momentum of {name}", fields.weights(b=one[i])) for i, name in enumerate(layout.names)]
+    known += [(f"momentum along axis {i}{space[d]}", fields.weights(b=b)) for i, d, b in along]
+    known += [(f"angular momentum {name}", fields.weights(a=a)) for name, a in _rotations(layout, axes)]
+    known += [(f"centre of mass along axis {i}{space[d]}", fields.weights(c=-c)) for i, d, c in along]
+    known += [(f"start of {name}", fields.weights(c=-one[i])) for i, name in enumerate(layout.names)]
+    known += [(name, np.eye(fields.count)[first_own + k]) for k, name in enumerate(fields.names[first_own:])]
+    return [(name, weights) for name, weights in known if weights is not None]
+
+
+def _along(n: int, places: np.ndarray) -> np.ndarray:
+    vector = np.zeros(n)
+    vector[places] = 1.0
+    return vector
+
+
+def _axes(layout: Layout) -> dict[int, np.ndarray]:
+    """The vectors of all leaves whose last axis is 2 or 3 long, places (vectors, d), by d."""
+    vectors, begin = {}, 0
+    for shape in layout.shapes:
+        size = int(np.prod(shape, dtype=int))
+        if shape and shape[-1] in _SPACE:
+            vectors.setdefault(shape[-1], []).append(np.arange(begin, begin + size).reshape(-1, shape[-1]))
+        begin += size
+    return {d: np.concatenate(parts) for d, parts in vectors.items()}
+
+
+def _rotations(layout: Layout, axes: dict[int, np.ndarray]) -> list[tuple[str, np.ndarray]]:
+    """Rotations of all vectors together; of two coordinates that are numbers where there are few."""
+    n, rotations = layout.size, []
+    for d, vectors in axes.items():
+        for i in range(d):
+            for j in range(i + 1, d):
+                a = np.zeros((n, n))
+                a[vectors[:, i], vectors[:, j]], a[vectors[:, j], vectors[:, i]] = -1.0, 1.0
+                rotations.append((f"in the plane {i}{j}", a))
+    if n <= _ALL_MAPS:
+        for i in range(n):
+            for j in range(i + 1, n):
+                a = np.zeros((n, n))
+                a[i, j], a[j, i] = -1.0, 1.0
+                rotations.append((f"of {layout.names[i]}, {layout.names[j]}", a))
+    return rotations

@@ -1,0 +1,125 @@
+"""The gauge G(q, t) of a symmetry, from the change of L that is its time derivative.
+
+Λ = ∂G/∂q·q̇ + ∂G/∂t is affine in q̇, so that ∂G/∂q = ∂Λ/∂q̇ and ∂G/∂t = Λ(q, 0, t). G is their integral along the
+straight line from a state of reference, where it is zero, by Gauss's rule; where ∂G/∂q is constant, G = ∂G/∂q·q.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from lagjax._analysis._fields import Fields
+from lagjax._analysis._noether import State, variation
+from lagjax._analysis._scene import Scene
+
+# Nodes of Gauss's rule: exact for polynomials of degree 63. What it misses, `is_right` finds.
+_NODES = 32
+
+# Parts of the terms of Λ that count as zero, and what the gradient of G may be off.
+_ZERO, _RIGHT = 1e-10, 1e-9
+
+
+class Changes(NamedTuple):
+    """How L changes under D transformations at S states: Λ (S, D), ∂Λ/∂q̇ (S, D, n), Λ at rest, the size of its terms.
+
+    `gradients` (S, D, 2n) are those of the charges p·ξ − h τ − G by q and q̇.
+    """
+
+    values: np.ndarray
+    slopes: np.ndarray
+    at_rest: np.ndarray
+    sizes: np.ndarray
+    gradients: np.ndarray
+
+
+def changes_of(scene: Scene, fields: Fields, weights: np.ndarray, states: State) -> tuple[Changes, State]:
+    """Those of the transformations with these weights (D, K), at the states where they are finite, and these states."""
+    parts = [np.asarray(x) for x in _changes(jnp.asarray(weights), fields, states, *scene.arguments)]
+    well = np.logical_and.reduce([np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in parts])
+    return Changes(*(x[well] for x in parts)), State(*(x[well] for x in states))
+
+
+def gauge_of(scene: Scene, fields: Fields, weights: np.ndarray, k: int, changes: Changes) -> Callable | None:
+    """G(q, t=0.0, params=None) of the symmetry with these weights (K,), number k; None where L does not change."""
+    values, slopes, at_rest, sizes = (x[:, k] for x in changes[:4])
+    size = sizes.max()
+    if np.abs(values).max() <= _ZERO * size:
+        return None
+    spread = np.ptp(slopes, axis=0).max() <= _ZERO * (np.abs(slopes).max() + size)
+    return _function(scene, fields, weights, bool(spread and np.abs(at_rest).max() <= _ZERO * size))
+
+
+def is_right(gauge: Callable, scene: Scene, k: int, changes: Changes, states: State) -> bool:
+    """Whether ∂G/∂q is what transformation number k asks for, at some of the states of `changes`."""
+    restore = scene.layout.restore
+
+    @jax.jit
+    def gradient(q, t):
+        return jax.vmap(jax.grad(lambda q, t: gauge(restore(q), t, scene.params)))(q, t)
+
+    some = slice(0, 4)
+    off = np.abs(np.asarray(gradient(states.q[some], states.t[some])) - changes.slopes[some, k])
+    return bool(off.max() <= _RIGHT * np.abs(changes.slopes[:, k]).max() + _ZERO * changes.sizes[:, k].max())
+
+
+def _function(scene: Scene, fields: Fields, weights: np.ndarray, constant: bool) -> Callable:
+    layout, system = scene.layout, scene.system
+    nodes, shares = np.polynomial.legendre.leggauss(_NODES)
+    nodes, shares = 0.5 * (nodes + 1), 0.5 * shares
+    reference = np.asarray(scene.q)
+
+    def gauge(q, t=0.0, params=None):
+        there = Scene.flat(system, layout, layout.flatten(q), jnp.zeros(layout.size, layout.dtype), params)
+        transform = fields.transform(jnp.asarray(weights, layout.dtype), params)
+        start, t = jnp.asarray(reference, layout.dtype), jnp.asarray(t, layout.dtype)
+
+        def change(q, qdot, t):
+            return variation(there, transform, q, qdot, t)
+
+        def slope(q, t):
+            return jax.grad(change, argnums=1)(q, jnp.zeros_like(q), t)
+
+        if constant:
+            return slope(start, jnp.zeros_like(t)) @ there.q
+        way = there.q - start
+        along = jax.vmap(lambda s: slope(start + s * way, t) @ way)(jnp.asarray(nodes, layout.dtype))
+        in_time = jax.vmap(lambda s: change(start, jnp.zeros_like(start), s * t) * t)(jnp.asarray(nodes, layout.dtype))
+        return jnp.asarray(shares, layout.dtype) @ (along + in_time)
+
+    return gauge
+
+
+@eqx.filter_jit
+def _changes(weights: Array, fields: Fields, states: State, *arguments) -> tuple:
+    """The fields of `Changes`."""
+    scene = Scene.flat(*arguments)
+
+    def of_state(state):
+        return jax.lax.map(lambda w: _change(scene, fields.transform(w, scene.params), state), weights)
+
+    return jax.lax.map(of_state, states)
+
+
+def _change(scene: Scene, transform: Callable, state: State) -> tuple:
+    q, qdot, t = state.q, state.qdot, state.t
+
+    def change(qdot):
+        return variation(scene, transform, q, qdot, t)
+
+    def charge(q, qdot):
+        moved, of_time = transform(q, t)
+        place = q, qdot, t, scene.numbers
+        return scene.motion.momentum(*place) @ moved - of_time * scene.motion.energy(*place)
+
+    place = q, qdot, t, scene.numbers
+    (moved, of_time), slope = transform(q, t), jax.grad(change)(jnp.zeros_like(qdot))
+    by_q, by_qdot = jax.grad(charge, argnums=(0, 1))(q, qdot)
+    size = jnp.abs(scene.motion.generalized_force(*place)) @ jnp.abs(moved)
+    size = size + jnp.sum(jnp.abs(scene.motion.momentum(*place))) * jnp.max(jnp.abs(moved))
+    size = size + jnp.abs(of_time * scene.motion.lagrangian(*place))
+    return change(qdot), slope, change(jnp.zeros_like(qdot)), size, jnp.concatenate([by_q - slope, by_qdot])

@@ -1,0 +1,129 @@
+"""`same_motion`: whether two Lagrangians are of one motion."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from lagjax._analysis._noether import State, euler_lagrange
+from lagjax._analysis._scene import Scene
+from lagjax._layout import Layout
+from lagjax._system import System, require_system
+
+PyTree = Any
+
+# What may be left of the difference, beside the terms that cancel in it.
+_SAME = 1e-9
+
+# Random states, of which rounding decides at none.
+_STATES = 64
+
+
+class SameMotion(NamedTuple):
+    """Whether two systems have the same Euler–Lagrange equations up to a factor.
+
+    - `same`: True or False.
+    - `factor`: the best f in E_a = f E_b; NaN where b has no equations.
+    - `residual`: the largest |E_a − f E_b| over the terms of E_a, of any coordinate at any of the states.
+    - `where`: a sentence that names the coordinate and the state at which it is largest.
+    """
+
+    same: bool
+    factor: float
+    residual: float
+    where: str
+
+    def __bool__(self) -> bool:
+        return self.same
+
+
+def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, seed: int = 0) -> SameMotion:
+    r"""Whether L_a = f L_b + dG(q, t)/dt with a number f: whether the two have one motion.
+
+        E = d/dt ∂L/∂q̇ − ∂L/∂q − Q,     E_a = f E_b  for all q, q̇, q̈ and t
+
+    That is asked at 64 random states about (q, q̇), at which q̈ is anything; no G need be known. Forces Q count as well.
+    The same motion may have Lagrangians that differ by more (sin(q) and what it equals on every motion, a coordinate
+    that is decoupled and has a factor of its own): they are not the same here.
+
+    - `a`, `b`: systems of the same coordinates and parameters, without constraints.
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, systems with constraints, or where a
+    Lagrangian is not finite about the state.
+
+    Source: Landau & Lifshitz, *Mechanics*, §2; Olver, *Applications of Lie Groups*, Theorem 4.7.
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    free = lagjax.System(lambda q, v: 0.5 * v**2)
+    boosted = lagjax.System(lambda q, v: 0.5 * (v + 3.0) ** 2)
+    assert lagjax.same_motion(free, boosted, 0.0, 1.0).same
+    ```
+    """
+    require_system(a)
+    require_system(b)
+    scenes = Scene.of(a, q, qdot, params), Scene.of(b, q, qdot, params)
+    if any(scene.constrained for scene in scenes):
+        raise ValueError("same_motion compares Lagrangians: give systems without constraints.")
+    if not all(scene.concrete for scene in scenes):
+        raise ValueError("same_motion looks at numbers: call it outside of jit, vmap and grad, on one state.")
+    states = _states(scenes[0], seed)
+    (of_a, size_a), (of_b, size_b) = (map(np.asarray, _equations(states, *scene.arguments)) for scene in scenes)
+    well = np.isfinite(of_a).all(axis=1) & np.isfinite(of_b).all(axis=1)
+    if well.sum() < _STATES // 4:
+        raise ValueError(
+            "A Lagrangian, or a derivative of it, is not finite at most states about (q, qdot): give a state in the "
+            "middle of where motions take place."
+        )
+    of_a, of_b, size_a, size_b = (x[well] for x in (of_a, of_b, size_a, size_b))
+    states = jax.tree.map(lambda x: np.asarray(x)[well], states)
+    unit = np.maximum(size_a.max(axis=0), np.finfo(float).tiny)  # of each coordinate
+    total = float(np.sum((of_b / unit) ** 2))
+    factor = float(np.sum(of_a * of_b / unit**2)) / total if total > 0 else float("nan")
+    left = np.abs(of_a - (factor * of_b if total > 0 else 0))
+    relative = left / np.maximum(
+        np.maximum(size_a.max(axis=0), abs(np.nan_to_num(factor)) * size_b.max(axis=0)), 1e-300
+    )
+    state, coordinate = np.unravel_index(int(np.argmax(relative)), relative.shape)
+    residual = float(relative[state, coordinate])
+    same = residual <= _SAME and total > 0 and factor != 0
+    return SameMotion(bool(same), factor, residual, _place(scenes[0].layout, states, int(state), int(coordinate)))
+
+
+def _states(scene: Scene, seed: int) -> State:
+    draws = np.random.default_rng(seed).uniform(-1, 1, (3, _STATES, scene.layout.size))
+    q, qdot = np.asarray(scene.q), np.asarray(scene.qdot)
+    speed = 0.3 + np.abs(qdot)
+    t = np.random.default_rng(seed + 100).uniform(-1, 1, _STATES)
+    parts = q + 0.3 * (1 + np.abs(q)) * draws[0], qdot + speed * draws[1], speed * draws[2], t
+    return State(*(jnp.asarray(x, scene.layout.dtype) for x in parts))
+
+
+@eqx.filter_jit
+def _equations(states: State, *arguments) -> tuple[Array, Array]:
+    """E (S, n) and the size of its terms (S, n)."""
+    scene = Scene.flat(*arguments)
+
+    def lagrangian(q, qdot, t):
+        return scene.motion.lagrangian(q, qdot, t, scene.numbers)
+
+    def of_state(state):
+        rate, by_q = euler_lagrange(lagrangian, state)
+        force = scene.motion.nonconservative_force(state.q, state.qdot, state.t, scene.numbers)
+        return rate - by_q - force, jnp.abs(rate) + jnp.abs(by_q) + jnp.abs(force)
+
+    return jax.lax.map(of_state, states)
+
+
+def _place(layout: Layout, states: State, k: int, coordinate: int) -> str:
+    def shown(x):
+        return ", ".join(f"{value:.4g}" for value in x[k][:8]) + (", …" if x.shape[1] > 8 else "")
+
+    return (
+        f"the equation of {layout.names[coordinate]} at q = ({shown(states.q)}), velocities ({shown(states.qdot)}), "
+        f"t = {states.t[k]:.4g}"
+    )
