@@ -220,7 +220,7 @@ def _work(scene: Scene, transform: Callable, state: State) -> Array:
 
 def _finite(of_lagrangian: np.ndarray, of_others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The rows (rows, K) of states where all is finite. Raises `ValueError` where there are too few of them."""
-    well = np.isfinite(of_lagrangian).all(axis=(1, 2)) & np.isfinite(of_others).all(axis=(1, 2))
+    well = np.asarray(np.isfinite(of_lagrangian).all(axis=(1, 2)) & np.isfinite(of_others).all(axis=(1, 2)))
     if well.sum() < max(4, len(well) // 4):
         raise ValueError(
             "The Lagrangian, or a derivative of it, is not finite at most states about (q, qdot): give a state in the "
