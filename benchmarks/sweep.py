@@ -3,7 +3,7 @@
     python -m benchmarks.sweep rate --members 1000000      # against bare batches; resident memory; hours for 10⁸
     python -m benchmarks.sweep map --side 2048             # the map of first flips, as a picture
     python -m benchmarks.sweep kills --count 100           # kill -9 at random moments: the bits of an undisturbed run
-    python -m benchmarks.sweep workers                     # 1, 2, 7 workers, processes, dask, two shells: one SHA-256
+    python -m benchmarks.sweep workers                     # processes, dask, two shells: one SHA-256
     python -m benchmarks.sweep poison --members 1000000    # ten members that fail, one of which aborts its process
     python -m benchmarks.sweep plan                        # 10⁸ members described: seconds and memory
 
@@ -278,45 +278,65 @@ def _by_dask(store: Path, over: dict, unit: int) -> dict[str, str]:
         return {"dask": digest(run(store, over, unit=unit, executor=client.get_executor(), progress=False).store)}
 
 
+KEY = ("theta1", "theta2", "poison")
+NAN, SINGULAR, ENDLESS, ABORTS = 1.0, 2.0, 3.0, 4.0
+
+
 def poison(options: argparse.Namespace) -> dict[str, Any]:
     """Ten members that fail among many; the others are what they are without them, bit for bit."""
-    rng = np.random.default_rng(options.seed)
-    over, bad = _poisoned(options.members, rng)
+    over, bad = _poisoned(options.members, np.random.default_rng(options.seed))
+    rule = dict(
+        q0=poisoned_start, qdot0=poisoned_speed, params=poisoned_params, keep=poisoned_keep, max_steps=2000,
+        unit=max(1, options.members // 8), progress=options.progress,
+    )  # fmt: skip
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        rule = dict(q0=poisoned_start, keep=poisoned_keep, max_steps=2000, progress=options.progress)
         swept = run(Path(folder) / "poisoned", over, isolate=True, **rule)
         print(swept)
         told, data = swept.status(), swept.open()
-        names = {int(member): label for member, _, label, _ in told.failures}
-        clean = dict(over)
-        clean[KEY] = (*over[KEY][:2], np.zeros(options.members))
-        other = run(Path(folder) / "clean", clean, **rule).open()
-        well = np.setdiff1d(np.arange(options.members), bad)
+        other = run(Path(folder) / "clean", {KEY: (*over[KEY][:2], np.zeros(options.members))}, **rule).open()
+        well = np.setdiff1d(np.arange(options.members), list(bad))
         same = all(
             np.array_equal(data[name].values[well], other[name].values[well], equal_nan=True)
-            for name in ("q", "qdot", "flip")
+            for name in ("q", "qdot", "flip", "result")
         )
-    return {"members": options.members, "named": names, "expected": bad.tolist(), "others the same": same}
+    named = {int(failure.member): failure.result for failure in told.failures}
+    kinds = {NAN: "NaN", SINGULAR: "singular", ENDLESS: "endless", ABORTS: "aborts"}
+    return {
+        "members": options.members, "poisoned": {k: kinds[kind] for k, kind in bad.items()}, "named": named,
+        "all named": sorted(named) == sorted(bad), "others the same": same,
+    }  # fmt: skip
 
 
-KEY = ("theta1", "theta2", "poison")
-NAN, ENDLESS, ABORTS = 1.0, 2.0, 3.0
-
-
-def _poisoned(members: int, rng: np.random.Generator) -> tuple[dict, np.ndarray]:
+def _poisoned(members: int, rng: np.random.Generator) -> tuple[dict, dict[int, float]]:
     kinds, bad = np.zeros(members), np.sort(rng.choice(members, 10, replace=False))
-    kinds[bad] = [NAN, NAN, NAN, NAN, ENDLESS, ENDLESS, ENDLESS, ENDLESS, ENDLESS, ABORTS]
+    kinds[bad] = rng.permutation([NAN] * 3 + [SINGULAR] * 3 + [ENDLESS] * 3 + [ABORTS])
     angles = rng.uniform(-np.pi, np.pi, (2, members))
-    return {KEY: (*angles, kinds)}, bad
+    return {KEY: (*angles, kinds)}, {int(k): float(kinds[k]) for k in bad}
 
 
 def poisoned_start(point):
-    fast = jnp.where(point["poison"] == ENDLESS, 1e8, 0.0)  # so fast that no budget of steps suffices
-    return jnp.where(point["poison"] == NAN, jnp.nan, start(point)) + fast * 0
+    return jnp.where(point["poison"] == NAN, jnp.nan, start(point))
+
+
+def poisoned_speed(point):  # so fast that no budget of steps suffices
+    return jnp.where(point["poison"] == ENDLESS, 1e6, 0.0) * jnp.ones(2)
+
+
+def poisoned_params(point):
+    weightless = jnp.where(point["poison"] == SINGULAR, 0.0, 1.0)
+    return {name: jnp.asarray(x) * weightless for name, x in SCENE.params.items()} | {"poison": point["poison"]}
 
 
 def poisoned_keep(trajectory):
-    return keep(trajectory)
+    kind = trajectory.params["poison"]
+    kind = jax.pure_callback(_abort, jax.ShapeDtypeStruct((), float), kind, vmap_method="expand_dims")
+    return keep(trajectory) | {"poison_met": kind}
+
+
+def _abort(kinds):
+    if np.any(kinds == ABORTS):
+        os.abort()
+    return kinds
 
 
 def plan(options: argparse.Namespace) -> dict[str, Any]:

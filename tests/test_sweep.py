@@ -3,17 +3,22 @@
 import errno
 import hashlib
 import json
+import multiprocessing
 import os
+import subprocess
+import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lagjax
 from lagjax import __main__ as command_line
-from lagjax._sweep import _claims, _job, _run, _statistics, _store
+from lagjax._sweep import _claims, _designs, _job, _run, _statistics, _store
 from lagjax._sweep._members import Grid, axes_of
 from lagjax._sweep._store import Store
 
@@ -133,13 +138,14 @@ def test_units_tile_the_members_in_order(shape, size):
     assert max(map(len, numbers)) <= size
 
 
-def test_a_hundred_million_members_are_no_list():
+def test_a_hundred_million_members_are_no_list(monkeypatch):
+    monkeypatch.setattr(_designs, "SLICE", 1000)
     over = {"a": np.linspace(0, 1, 10_000), "b": lagjax.random(10_000)}
     grid = Grid.of(tuple(axis.size for axis in axes_of(over)), 10**6)
     assert grid.members == 10**8 and grid.units == 100 and grid.box(99)[0] == slice(9900, 10_000)
     (axis,) = axes_of({("x", "y"): lagjax.random(10**8, seed=3)})
     start, first = next(axis.pieces())
-    assert start == 0 and len(first) == _store.SLICE
+    assert start == 0 and len(first) == 1000
 
 
 @pytest.mark.parametrize("design", [lagjax.random, pytest.param(lagjax.sobol, marks=pytest.mark.slow)])
@@ -151,10 +157,11 @@ def test_more_members_begin_with_the_same_ones(design, monkeypatch):
     few, many, others = all_of(100), all_of(1000), all_of(100, seed=5)
     np.testing.assert_array_equal(few, many[:100])
     assert ((many >= [0, 1, 2]) & (many < [1, 3, 9])).all() and not np.isin(few, others).any()
-    monkeypatch.setattr("lagjax._sweep._designs.SLICE", 32)  # member k is a function of (seed, k)
+    monkeypatch.setattr(_designs, "SLICE", 32)  # member k is a function of (seed, k)
     np.testing.assert_array_equal(all_of(1000), many)
 
 
+@pytest.mark.slow
 def test_latin_hypercube_has_one_point_in_each_part():
     (axis,) = axes_of({("x", "y"): lagjax.latin_hypercube(50, seed=1)})
     ((_, values),) = axis.pieces()
@@ -283,6 +290,7 @@ def test_disks_that_refuse(tmp_path, undisturbed, monkeypatch, number, words):
     assert digests(tmp_path) == undisturbed
 
 
+@pytest.mark.slow
 def test_damaged_chunks_are_found_and_computed_again(tmp_path, undisturbed):
     swept(tmp_path)
     chunk = sorted((tmp_path / "store" / "end" / "c").glob("*/*"))[2]
@@ -390,3 +398,122 @@ def test_a_process_that_has_ended_is_dead_at_once(store):
     assert gone.claim(0)
     with _claims.Worker(store) as other:
         assert other.claim(0)
+
+
+# ---- to grow ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_finer_grid_takes_what_is_known(tmp_path, monkeypatch):
+    coarse = swept(tmp_path, store=tmp_path / "coarse").store
+    finer = {"length": np.append(OVER["length"], 1.7), "angle": np.linspace(0.0, 3.0, 13)}
+    whole = swept(tmp_path, finer, store=tmp_path / "whole")
+    batch, sizes = _job.Batches.__call__, []
+    monkeypatch.setattr(
+        _job.Batches, "__call__", lambda self, points: sizes.append(points["angle"].size) or batch(self, points)
+    )
+    grown = swept(tmp_path, finer, store=tmp_path / "grown", extend=coarse)
+    assert sum(sizes[2:]) == 7 * 13 - 42  # after two looks
+    assert digests(tmp_path, "grown") == digests(tmp_path, "whole") and grown.status().done == 91
+    with pytest.raises(ValueError, match=r"rtol: None in the store, now 1e-05"):
+        swept(tmp_path, finer, store=tmp_path / "other", extend=coarse, rtol=1e-5)
+    with pytest.raises(ValueError, match=r"(?s)ts: .*leave extend= away"):
+        lagjax.sweep(PENDULUM, OVER, 2 * TS, **{**RULE, "store": tmp_path / "other", "extend": coarse})
+    assert not (tmp_path / "other").exists() and whole.status().done == 91
+
+
+@pytest.mark.slow
+def test_more_members_of_a_design(tmp_path):
+    over = lambda count: {("length", "angle"): lagjax.random(count, seed=2, low=(0.5, 0.0), high=(1.5, 3.0))}
+    few = begun(tmp_path, 3, over=over(45)).path  # of which 30 are done
+    swept(tmp_path, over(75), store=tmp_path / "whole")
+    many = swept(tmp_path, over(75), store=tmp_path / "many", extend=few)
+    assert digests(tmp_path, "many") == digests(tmp_path, "whole") and many.status().results == {"successful": 75}
+
+
+# ---- other processes -------------------------------------------------------------------------------------------------
+
+
+def worker(store, *more):
+    command = [sys.executable, "-m", "lagjax", "sweep", "run", str(store.path), "--quiet", *more]
+    root = str(Path(lagjax.__file__).parents[1])
+    return subprocess.Popen(command, env=os.environ | {"PYTHONPATH": root}, stdout=subprocess.PIPE, text=True)
+
+
+@pytest.mark.slow
+def test_two_shells(tmp_path, undisturbed):
+    store = begun(tmp_path)
+    shells = [worker(store) for _ in range(2)]
+    told = [shell.communicate()[0] for shell in shells]
+    assert digests(tmp_path) == undisturbed and all("42 of 42 members" in text for text in told)
+
+
+@pytest.mark.slow
+def test_kills_lose_nothing_but_the_unit_in_work(tmp_path, undisturbed):
+    store, rng = begun(tmp_path), np.random.default_rng(0)
+    for _ in range(3):
+        shell = worker(store, "--units", "1")
+        time.sleep(rng.uniform(0.5, 4.0))
+        before = store.done()
+        shell.kill()
+        shell.communicate()
+        assert before <= store.done() and not store.damaged(store.spec(), store.done(), whole=True)
+    swept(tmp_path)
+    assert digests(tmp_path) == undisturbed
+
+
+@pytest.mark.slow
+def test_executors(tmp_path, undisturbed):
+    with ThreadPoolExecutor(3) as pool:
+        swept(tmp_path, store=tmp_path / "threads", executor=pool)
+    assert digests(tmp_path, "threads") == undisturbed
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+        swept(tmp_path, store=tmp_path / "processes", executor=pool)
+    assert digests(tmp_path, "processes") == undisturbed
+    with pytest.raises(ValueError, match="forks"):
+        swept(tmp_path, executor=ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")))
+
+
+@pytest.mark.slow
+def test_dask(tmp_path, undisturbed):
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None)
+    with cluster, distributed.Client(cluster) as client:
+        swept(tmp_path, executor=client.get_executor())
+    assert digests(tmp_path) == undisturbed
+
+
+def abort_at(lengths):
+    if np.any(lengths == OVER["length"][3]):
+        os.abort()
+    return lengths
+
+
+def keep_or_abort(trajectory):
+    length = jax.pure_callback(abort_at, jax.ShapeDtypeStruct((), float), trajectory.params, vmap_method="expand_dims")
+    return keep(trajectory) | {"length_met": length}
+
+
+@pytest.mark.slow
+def test_members_that_end_their_process_are_found(tmp_path, undisturbed):
+    over = {"length": OVER["length"], "angle": OVER["angle"][2:4]}
+    run = swept(tmp_path, over, keep=keep_or_abort, isolate=True, unit=4)
+    told, data = run.status(), run.open()
+    assert [f.member for f in told.failures] == [6, 7] and told.results == {"successful": 10, "crashed": 2}
+    assert {f.why for f in told.failures} == {"it ended with status -6"}
+    whole = swept(tmp_path, store=tmp_path / "whole").open().isel(angle=slice(2, 4))
+    well = [0, 1, 2, 4, 5]
+    np.testing.assert_array_equal(data.end.values[well], whole.end.values[well])
+    assert np.isnan(data.end.values[3]).all() and (data.result[3] == 1000).all()
+
+
+@pytest.mark.slow
+def test_members_that_take_too_long(tmp_path):
+    run = swept(tmp_path, {"length": np.linspace(0.5, 1.0, 3)}, q0=1.0, keep=never_at_one, isolate=20.0, unit=3)
+    assert [f.member for f in run.status().failures] == [2] and "longer than 20 s" in run.status().failures[0].why
+
+
+def never_at_one(trajectory):
+    while float(trajectory.params) == 1.0:
+        time.sleep(1.0)
+    return {"end": np.asarray(trajectory.q[-1])}

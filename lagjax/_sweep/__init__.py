@@ -97,6 +97,7 @@ def sweep(
     store: str | Path,
     reduce: dict[str, Statistics] | None = None,
     unit: int | None = None,
+    extend: str | Path | None = None,
     executor: Any = None,
     isolate: bool | float = False,
     progress: bool = True,
@@ -132,6 +133,8 @@ def sweep(
       of the members' values. Read them by `Sweep.statistics()`.
     - `unit`: members of a unit of work, which is a chunk of the store and what a worker that dies loses. By default as
       many as take 20 s here, at most 64 MiB of what is kept.
+    - `extend`: a store of the same scene, of which the members that are also in `over` are taken: to have more members
+      of a design, or a finer grid. It stays as it is.
     - `executor`: any `concurrent.futures.Executor`, such as dask's `client.get_executor()`; a task is a unit. By
       default this process works, with the machine code's threads on all cores, and writes a unit while it computes the
       next.
@@ -182,7 +185,8 @@ def sweep(
     child = Child(place.path, isolate) if isolate else None
     with child or nullcontext():
         if not place.path.exists():
-            begin(place, axes, motions, unit, child.look if child else first_look)
+            other = None if extend is None else Store(Path(extend).absolute())
+            begin(place, axes, motions, unit, child.look if child else first_look, other)
         spec = place.spec()
         require_same(place, spec, axes, motions)
         job = Job.of(place, spec, motions)

@@ -13,6 +13,7 @@ from lagjax._results import RESULTS, code_of
 from lagjax._sweep import _batch
 from lagjax._sweep._batch import Kept, batches_of, label, quantities_of
 from lagjax._sweep._designs import Design
+from lagjax._sweep._extend import carry, require_extensible
 from lagjax._sweep._job import Job, require_versions, versions
 from lagjax._sweep._members import RESERVED, Axis, Grid, points_of
 from lagjax._sweep._scene import Motions, difference, packed, texts, users_path
@@ -36,8 +37,15 @@ def first_look(motions: Motions, points: dict[str, np.ndarray]) -> tuple[Kept, f
 Look = Callable[[Motions, dict[str, np.ndarray]], tuple[Kept, float, bool]]
 
 
-def begin(store: Store, axes: tuple[Axis, ...], motions: Motions, unit: int | None, look: Look = first_look) -> None:
-    """Make the store, after a look at what a few members take and keep."""
+def begin(
+    store: Store,
+    axes: tuple[Axis, ...],
+    motions: Motions,
+    unit: int | None,
+    look: Look = first_look,
+    extend: Store | None = None,
+) -> None:
+    """Make the store, after a look at what a few members take and keep, with the members that `extend` knows."""
     scene = packed(motions)
     points, shape = _few(axes), tuple(axis.size for axis in axes)
     kept, seconds, conserves = look(motions, points)
@@ -54,7 +62,11 @@ def begin(store: Store, axes: tuple[Axis, ...], motions: Motions, unit: int | No
     }  # fmt: skip
     codes = sorted({code_of(item) for item in RESULTS._name_to_item.values()} | set(_batch.NAMES))
     title = f"lagjax sweep over {', '.join(names)}"
+    if extend is not None:
+        require_extensible(extend, extend.spec(), spec)
     store.create(spec, scene, axes, title, {-1: "not_done"} | {code: label(code) for code in codes})
+    if extend is not None:
+        carry(extend, store)
 
 
 def in_doubles() -> bool:

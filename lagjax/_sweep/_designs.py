@@ -41,9 +41,12 @@ class Design:
     def pieces(self, names: tuple[str, ...]):
         """Yield (start, values (m, names)) one after the other, m at most `SLICE`."""
         draw = {"random": self._random, "sobol": self._sobol, "latin_hypercube": self._hypercube}[self.kind]
-        low, high = np.array(self.low), np.array(self.high)
         for start, units in draw(names):
-            yield start, low + (high - low) * units
+            columns = np.empty(units.shape[::-1])  # one by one: a loop over so few names would be the inner one
+            for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
+                np.multiply(units[:, k], high - low, out=columns[k])
+                columns[k] += low
+            yield start, columns.T
 
     def _key(self, names: tuple[str, ...]) -> int:
         """Of 128 bits, from the seed and the names: two axes with one seed are drawn independently."""

@@ -45,8 +45,8 @@ def _compute_alone(child: "Child", job: Job, unit: int) -> Unit:
         try:
             return child.ask(("unit", unit, crashed))
         except _Died as death:
-            start, batch = parts(job.grid.size(unit), job.spec["batch"])[death.batch]
-            suspects = [j for j in range(start, min(start + batch, job.grid.size(unit))) if j not in crashed]
+            which, count = parts(job, unit)[death.batch]
+            suspects = [j for j in which[:count].tolist() if j not in crashed]
             found = dict.fromkeys(_search(child, unit, suspects, whole=False), death.why)
             again += not found
             if len(crashed | found) > _MOST or again > 1:

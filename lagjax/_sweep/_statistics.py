@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._sweep._store import arrays_as_bytes
+
 RELATIVE = 1e-3  # of a quantile: its error, as a part of it; bins of a sketch, and its bytes, go as one over it
 _LOG_GAMMA = np.log((1 + RELATIVE) / (1 - RELATIVE))
 _OFFSET = 2**20  # more than |log x| / log γ of any double
@@ -201,10 +203,9 @@ def _quantiles(how: Statistics, sketch: np.ndarray) -> list[float]:
 
 def to_bytes(partials: dict[str, Partial]) -> bytes:
     """Statistics of a unit by the names of quantities, as one file."""
-    arrays = {f"{name}/{field}": x for name, part in partials.items() for field, x in part._asdict().items()}
-    file = io.BytesIO()
-    np.savez(file, **arrays)
-    return file.getvalue()
+    return arrays_as_bytes(
+        {f"{name}/{field}": x for name, part in partials.items() for field, x in part._asdict().items()}
+    )
 
 
 def from_bytes(data: bytes) -> dict[str, Partial]:

@@ -12,6 +12,7 @@ last of its files is. To write a unit again changes nothing, so that it does no 
 
 import errno
 import hashlib
+import io
 import json
 import os
 import shutil
@@ -28,6 +29,7 @@ from lagjax._sweep._members import Axis, Grid
 
 FORMAT = 1
 JOB = ".sweep"
+KNOWN = "known"  # the folder of members that were taken from another store
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -157,6 +159,14 @@ class Store:
         """The statistics of a unit, as bytes."""
         return (self.job / "done" / f"{unit}.npz").read_bytes()
 
+    def known(self, unit: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Members of a unit that were taken from another store: which of it, and what is kept of them by name."""
+        file = self.job / KNOWN / f"{unit}.npz"
+        if not file.exists():
+            return np.zeros(0, int), {}
+        with np.load(file) as arrays:
+            return arrays["which"], {name[3:]: arrays[name] for name in arrays if name.startswith("of ")}
+
     def write_unit(self, spec: dict, unit: int, values: dict[str, np.ndarray], record: dict, statistics: bytes) -> None:
         """Write the chunks of a unit (values (members, …) by name), and then that it is done."""
         grid, hashes = self.grid(spec), {}
@@ -256,6 +266,13 @@ class _Explained:
             error.errno,
             f"{self.store.path}: {self.what}: {text}; all units that are done are kept, and nothing is lost",
         ) from error
+
+
+def arrays_as_bytes(arrays: dict[str, np.ndarray]) -> bytes:
+    """Arrays by name as one file."""
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    return file.getvalue()
 
 
 def write_through(file: Path, data) -> None:

@@ -30,10 +30,15 @@ class Unit(NamedTuple):
     statistics: bytes
 
 
-def parts(size: int, most: int) -> list[tuple[int, int]]:
-    """The batches of a unit of so many members: where each begins, and the size of all of them."""
-    batch = math.ceil(size / math.ceil(size / most))
-    return [(start, batch) for start in range(0, size, batch)]
+def parts(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
+    """The batches of a unit: its members in each, all of one length, and how many of them are not copies."""
+    known, _ = job.store.known(unit)
+    left = np.setdiff1d(np.arange(job.grid.size(unit)), known)
+    if not left.size:
+        return []
+    batch = math.ceil(len(left) / math.ceil(len(left) / job.spec["batch"]))
+    starts = range(0, len(left), batch)
+    return [(left[np.minimum(np.arange(k, k + batch), len(left) - 1)], min(batch, len(left) - k)) for k in starts]
 
 
 def _nobody(batch: int) -> None:
@@ -47,18 +52,20 @@ def compute(
     began, spent = time.monotonic(), time.process_time()
     shape, size = job.grid.box_shape(unit), job.grid.size(unit)
     axes = job.store.coordinates(job.spec["axes"], job.grid.box(unit))
-    values, drifts, complaints = {}, np.full(size, np.nan), {}
-    for k, (start, batch) in enumerate(parts(size, job.spec["batch"])):
+    drifts, complaints = np.full(size, np.nan), {}
+    known, of_known = job.store.known(unit)
+    values = {q.name: np.empty((size, *q.shape), q.dtype) for q in (*job.batches.quantities, RESULT)}
+    for name, x in of_known.items():
+        values[name][known] = x
+    for k, (which, count) in enumerate(parts(job, unit)):
         tell(k)
-        which = np.minimum(np.arange(start, start + batch), size - 1)
-        count = min(batch, size - start)
-        kept = job.batches(points_of(axes, shape, _without(which, crashed)))
+        kept, own = job.batches(points_of(axes, shape, _without(which, crashed))), which[:count]
         job.require_engine(kept)
         for name, x in {**kept.values, RESULT.name: kept.result}.items():
-            values.setdefault(name, np.empty((size, *x.shape[1:]), x.dtype))[start : start + count] = x[:count]
+            values[name][own] = x[:count]
         if kept.drift is not None:
-            drifts[start : start + count] = kept.drift[:count]
-        complaints |= {start + j: text for j, text in kept.complaints.items() if j < count}
+            drifts[own] = kept.drift[:count]
+        complaints |= {int(own[j]): text for j, text in kept.complaints.items() if j < count}
     for j in crashed:
         _blank(job, values, drifts, j)
     complaints |= crashed
