@@ -29,7 +29,7 @@ def keep(trajectory):
 
 
 def swept(side, duration, store):
-    angles = np.pi * ((2 * np.arange(side) + 1) / side - 1)
+    angles = np.pi * (2 * np.arange(side) + 1 - side) / side
     return lagjax.sweep(
         SCENE.system,
         {"theta1": angles, "theta2": angles},

@@ -517,3 +517,16 @@ def never_at_one(trajectory):
     while float(trajectory.params) == 1.0:
         time.sleep(1.0)
     return {"end": np.asarray(trajectory.q[-1])}
+
+
+@pytest.mark.slow
+def test_example(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(lagjax.__file__).parents[1] / "examples"))
+    pytest.importorskip("matplotlib").use("agg")
+    import flip_map
+
+    (picture,) = flip_map.main(["--side", "12", "--duration", "2", "--out", str(tmp_path)])
+    assert picture.stat().st_size > 10_000
+    flip = lagjax.Sweep(tmp_path / "flips.zarr").open().flip.values
+    np.testing.assert_array_equal(flip, flip[::-1, ::-1])  # mirrored starts flip at the same time
+    assert 0 < np.isfinite(flip).sum() < flip.size

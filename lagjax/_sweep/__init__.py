@@ -121,7 +121,8 @@ def sweep(
     - `ts`: output times, shape (T,), of every member.
     - `q0`, `qdot0`, `params`: values for all, or functions of one member's point, which is a dict of numbers by the
       names in `over`.
-    - `keep(trajectory)`: a dict of what remains of a member, numbers or arrays by names, from its `Trajectory`.
+    - `keep(trajectory)`: a dict of what remains of a member, numbers or arrays by names, from its `Trajectory`. It may
+      call `lagjax.crossings` from `trajectory.q[0]`, `trajectory.qdot[0]`, for the times at which something happens.
     - `store`: a folder. `xarray.open_zarr(store)` reads it, with the names of `over` as dimensions and coordinates, the
       kept quantities as variables, and `result`: how each member ended, −1 for those still to do. NaN, or the least
       integer, stands where there is no value.

@@ -34,7 +34,10 @@ def require_extensible(old: Store, spec: dict, now: dict) -> None:
     if lines:
         later = ""
         if spec["ts"] != now["ts"]:
-            later = "\nWhat is kept of a motion does not tell how it goes on: leave extend= away for other times."
+            later = (
+                "\nWhat is kept of a motion does not tell how it goes on: leave extend= away, or keep the state at the "
+                "end, and sweep over that from there, with a tuple of names and a tuple of arrays."
+            )
         raise ValueError(f"{old.path} has members of another description. What differs:\n" + "\n".join(lines) + later)
 
 

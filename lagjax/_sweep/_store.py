@@ -30,6 +30,7 @@ from lagjax._sweep._members import Axis, Grid
 FORMAT = 1
 JOB = ".sweep"
 KNOWN = "known"  # the folder of members that were taken from another store
+_LEFT = 3600.0  # seconds after which a file that nobody has touched is of a dead worker; those who live beat
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -235,10 +236,18 @@ class Store:
                 pass
 
     def require_writable(self) -> None:
-        """Raise `OSError`, with a sentence, where nothing can be written here."""
+        """Raise `OSError`, with a sentence, where nothing can be written here; remove what dead workers have left."""
         with self._explained("nothing was computed"):
-            self.write(self.job / "aside" / "probe", b"", "probe")
-            (self.job / "aside" / "probe").unlink(missing_ok=True)
+            probe = self.job / "aside" / f"probe-{os.getpid()}-{os.urandom(4).hex()}"
+            self.write(probe, b"", "probe")
+            now = probe.stat().st_mtime  # by the clock of the disk
+            probe.unlink(missing_ok=True)
+            for file in (file for folder in ("aside", "workers") for file in (self.job / folder).iterdir()):
+                try:
+                    if file.stat().st_mtime < now - _LEFT:
+                        file.unlink()
+                except FileNotFoundError:  # another one removes it
+                    pass
 
     def _explained(self, what: str) -> "_Explained":
         return _Explained(self, what)
