@@ -286,7 +286,7 @@ def poison(options: argparse.Namespace) -> dict[str, Any]:
     """Ten members that fail among many; the others are what they are without them, bit for bit."""
     over, bad = _poisoned(options.members, np.random.default_rng(options.seed))
     rule = dict(
-        q0=poisoned_start, qdot0=poisoned_speed, params=poisoned_params, keep=poisoned_keep, max_steps=2000,
+        q0=poisoned_start, params=poisoned_params, keep=poisoned_keep, max_steps=2000,
         unit=max(1, options.members // 8), progress=options.progress,
     )  # fmt: skip
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
@@ -315,16 +315,15 @@ def _poisoned(members: int, rng: np.random.Generator) -> tuple[dict, dict[int, f
 
 
 def poisoned_start(point):
-    return jnp.where(point["poison"] == NAN, jnp.nan, start(point))
-
-
-def poisoned_speed(point):  # so fast that no budget of steps suffices
-    return jnp.where(point["poison"] == ENDLESS, 1e6, 0.0) * jnp.ones(2)
+    small = jnp.where(point["poison"] == ENDLESS, 0.01, 1.0)
+    return jnp.where(point["poison"] == NAN, jnp.nan, small * start(point))
 
 
 def poisoned_params(point):
     weightless = jnp.where(point["poison"] == SINGULAR, 0.0, 1.0)
-    return {name: jnp.asarray(x) * weightless for name, x in SCENE.params.items()} | {"poison": point["poison"]}
+    params = {name: jnp.asarray(x) * weightless for name, x in SCENE.params.items()}
+    fast = jnp.where(point["poison"] == ENDLESS, 1e12, 1.0)  # oscillations for which no budget of steps suffices
+    return params | {"g": fast * params["g"], "poison": point["poison"]}
 
 
 def poisoned_keep(trajectory):

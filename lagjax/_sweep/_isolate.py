@@ -96,6 +96,7 @@ class Child:
             raise ValueError(f"isolate must be True, False, or the seconds that a batch may take; got {limit!r}.")
         self.path, self.limit = path, PATIENCE if limit is True else float(limit)
         self._process: subprocess.Popen | None = None
+        self._ready = False  # whether it has started: the limit is for batches
 
     def __enter__(self):
         return self
@@ -134,10 +135,12 @@ class Child:
             pass  # it has died, which the next lines find
         while True:
             try:
-                kind, value = replies.get(timeout=self.limit)
+                kind, value = replies.get(timeout=self.limit if self._ready else PATIENCE)
             except queue.Empty:
                 kind, value = "late", None
-            if kind == "batch":
+            if kind == "ready":
+                self._ready = True
+            elif kind == "batch":
                 batch = value
             elif kind == "answer":
                 return value
@@ -171,7 +174,7 @@ class Child:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | more
             )
-            self._replies = queue.SimpleQueue()
+            self._ready, self._replies = False, queue.SimpleQueue()
             threading.Thread(target=_listen, args=(self._process.stdout, self._replies), daemon=True).start()
         return self._process, self._replies
 
@@ -198,6 +201,7 @@ def serve(path: str) -> None:
         pickle.dump((kind, value), answers)
         answers.flush()
 
+    tell("ready", None)
     while True:
         try:
             what, unit, members = pickle.load(requests)
