@@ -41,7 +41,7 @@ from lagjax._fit import (
 from lagjax._health import Health
 from lagjax._hybrid import Transition, simulate_hybrid
 from lagjax._machine_code import MachineCode
-from lagjax._orbits import Orbit, periodic_orbit
+from lagjax._orbits import LyapunovExponent, Orbit, lyapunov_exponent, lyapunov_spectrum, periodic_orbit
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._samples import samples
@@ -67,6 +67,7 @@ __all__ = [
     "Guess",
     "Health",
     "Linearization",
+    "LyapunovExponent",
     "MachineCode",
     "Modes",
     "Orbit",
@@ -97,6 +98,8 @@ __all__ = [
     "latin_hypercube",
     "linearize",
     "noether_charge",
+    "lyapunov_exponent",
+    "lyapunov_spectrum",
     "normal_modes",
     "periodic_orbit",
     "plot",

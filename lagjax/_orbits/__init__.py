@@ -1,9 +1,11 @@
 """Orbits: where motions return, how they depend on energy and parameters, how fast they part, which path is taken.
 
 `_arcs` follows motions with their derivatives, on rows; `_rank` decides about singular values; `_shooting` closes
-chains of arcs, `_floquet` says what their multipliers are, and `_orbit` is `periodic_orbit`.
+chains of arcs, `_floquet` says what their multipliers are, and `_orbit` is `periodic_orbit`. `_lyapunov` is about
+motions that never return.
 """
 
+from lagjax._orbits._lyapunov import LyapunovExponent, lyapunov_exponent, lyapunov_spectrum
 from lagjax._orbits._orbit import Orbit, periodic_orbit
 
-__all__ = ["Orbit", "periodic_orbit"]
+__all__ = ["LyapunovExponent", "Orbit", "lyapunov_exponent", "lyapunov_spectrum", "periodic_orbit"]

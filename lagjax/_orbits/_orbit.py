@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._layout import Layout, halves
+from lagjax._layout import halves
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
 from lagjax._orbits._floquet import UNSTABLE, multipliers_of, reduce
 from lagjax._orbits._shooting import Chain, Closing
-from lagjax._problem import end_to_end, rows
+from lagjax._orbits._starts import starts
 from lagjax._results import SUCCESSFUL, SimulationError
 from lagjax._system import System
-from lagjax._validate import as_arrays, require_finite, require_flag, require_number
+from lagjax._validate import require_finite, require_flag, require_number
 
 PyTree = Any
 
@@ -97,8 +97,7 @@ def periodic_orbit(
     ```
     """
     require_flag(throw, "throw")
-    periods = _periods(period)
-    layout, y0 = _starts(q0, qdot0, periods)
+    periods, layout, y0 = starts(q0, qdot0, period, "period")
     q, qdot = map(layout.restore, halves(y0[0]))
     arcs = Arcs.of(system, q, qdot, params, RTOL, "Periodic orbits")
     found = find(_closing(arcs, energy, image), y0, periods.ravel())
@@ -109,17 +108,6 @@ def periodic_orbit(
     q, qdot = map(layout.restore, halves(found.y))
     arrays = jax.tree.map(jnp.asarray, (q, qdot, *found[1:6]))
     return Orbit._make([*arrays, found.message])
-
-
-def _periods(period) -> np.ndarray:
-    """The periods, () or (N,)."""
-    require_finite(period, "period")
-    periods = np.asarray(period, float)
-    if periods.ndim > 1 or not periods.size:
-        raise ValueError(f"period must be one number, or an array (N,) of a batch; got shape {periods.shape}.")
-    if not (periods > 0).all():
-        raise ValueError(f"period must be positive; got {periods.min()}.")
-    return periods
 
 
 def _closing(arcs: Arcs, energy, image) -> Closing:
@@ -147,26 +135,6 @@ def _closing(arcs: Arcs, energy, image) -> Closing:
     if np.linalg.matrix_rank(matrix) < states:
         raise ValueError("image must be invertible: it sends different states to the same one.")
     return plain._replace(matrix=matrix, shift=shift)
-
-
-def _starts(q0, qdot0, periods: np.ndarray) -> tuple[Layout, np.ndarray]:
-    """The layout of one state, and all states (N, 2n)."""
-    for name, value in (("q0", q0), ("qdot0", qdot0)):
-        require_finite(value, name)
-    if periods.ndim == 0:
-        layout = Layout.of(q0, qdot0)
-        leaves = jax.tree.leaves(as_arrays((q0, qdot0), layout.dtype, "state"))
-        return layout, np.asarray(end_to_end(leaves, np.dtype(float)))[None]
-    leaves = jax.tree.leaves((q0, qdot0))
-    if any(np.shape(leaf)[:1] != periods.shape for leaf in leaves):
-        shapes = sorted({np.shape(leaf) for leaf in leaves})
-        raise ValueError(
-            f"period has shape {periods.shape}, a batch: every leaf of q0 and qdot0 must have that many members as its "
-            f"first axis; got shapes {shapes}."
-        )
-    layout = Layout.of(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], (q0, qdot0)))
-    leaves = jax.tree.leaves(as_arrays((q0, qdot0), layout.dtype, "state"))
-    return layout, np.asarray(rows(leaves, [0] * len(leaves), len(periods), np.dtype(float)))
 
 
 class Found(NamedTuple):
