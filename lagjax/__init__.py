@@ -41,7 +41,16 @@ from lagjax._fit import (
 from lagjax._health import Health
 from lagjax._hybrid import Transition, simulate_hybrid
 from lagjax._machine_code import MachineCode
-from lagjax._orbits import LyapunovExponent, Orbit, lyapunov_exponent, lyapunov_spectrum, periodic_orbit
+from lagjax._orbits import (
+    LyapunovExponent,
+    Orbit,
+    Path,
+    action,
+    find_path,
+    lyapunov_exponent,
+    lyapunov_spectrum,
+    periodic_orbit,
+)
 from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
 from lagjax._results import RESULTS, SimulationError
 from lagjax._samples import samples
@@ -71,6 +80,7 @@ __all__ = [
     "MachineCode",
     "Modes",
     "Orbit",
+    "Path",
     "Record",
     "SameMotion",
     "SimulationError",
@@ -86,6 +96,7 @@ __all__ = [
     "Transitions",
     "WorkPrecision",
     "WorkPrecisionRow",
+    "action",
     "angle",
     "between",
     "check",
@@ -93,6 +104,7 @@ __all__ = [
     "crossings",
     "cyclic_coordinates",
     "equilibrium",
+    "find_path",
     "fit",
     "inertia",
     "latin_hypercube",
