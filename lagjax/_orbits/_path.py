@@ -94,10 +94,10 @@ def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None
 
 def _along_motion(system: System, path: Trajectory, params) -> tuple[np.ndarray, Callable]:
     """The times of outputs, and what gives (q, q̇) of a motion at times between."""
-    first = jax.tree.map(lambda x: x[0], (path.q, path.qdot))
+    q, qdot = jax.tree.map(lambda x: x[0], (path.q, path.qdot))
 
     def states(times):
-        run = simulate(system, *first, jnp.concatenate([path.ts[:1], times]), params, rtol=RTOL)
+        run = simulate(system, q, qdot, jnp.concatenate([path.ts[:1], times]), params, rtol=RTOL)
         return jax.tree.map(lambda x: x[1:], (run.q, run.qdot))
 
     return np.asarray(path.ts), states
