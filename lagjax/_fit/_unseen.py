@@ -119,12 +119,35 @@ def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
         whole = [int(f * int(common)) for f in fractions]
         if max(map(abs, whole)) > _LARGEST_EXPONENT or np.abs(np.array(whole) / common - row).max() > _EXACT:
             return None
-        rows.append(whole if next(x for x in whole if x) > 0 else [-x for x in whole])
+        rows.append(whole)
+    rows = _plain(rows)
     for space in spaces[1:]:
         left = np.array(rows, float) @ space
         if np.abs(left).max() > _EXACT * np.abs(space).max():
             return None
     return rows
+
+
+def _plain(rows: list[list[int]]) -> list[list[int]]:
+    """Whole rows of the same span with fewer minus signs, and then smaller numbers: a·m and b·m, not a/b and a·m."""
+
+    def weight(row):
+        return sum(x < 0 for x in row), sum(map(abs, row)), [-x for x in row]  # the last so that a/b is not b/a
+
+    def upright(row):
+        return min(row, [-x for x in row], key=weight)
+
+    rows = [upright(row) for row in rows]
+    while True:  # the weights fall at every turn, and are whole
+        better = []
+        for i, row in enumerate(rows):
+            for other in rows[:i] + rows[i + 1 :]:
+                sums = [upright([a + sign * b for a, b in zip(row, other, strict=True)]) for sign in (1, -1)]
+                better += [(weight(new), i, new) for new in sums if weight(new)[:2] < weight(row)[:2]]
+        if not better:
+            return sorted(rows, reverse=True)
+        _, i, new = min(better)
+        rows[i] = new
 
 
 def _product(row: list[int], names: list[str]) -> str:

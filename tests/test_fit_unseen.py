@@ -1,0 +1,131 @@
+"""Twenty scenes whose freedoms are known: every one is named, none is invented, and fixing what is named ends it."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+TS, SIGMA = np.linspace(0.0, 4.0, 101), 2e-3
+
+
+def spring(stiffness, mass=lambda p: 1.0):
+    return lambda q, v, p: 0.5 * mass(p) * v**2 - 0.5 * stiffness(p) * q**2
+
+
+# name: (L, params, more of the scene, sensors, what must be said, what to fix)
+SCENES = {
+    "scale of mass": (
+        spring(lambda p: p["k"], lambda p: p["m"]), {"k": 4.0, "m": 1.5}, {}, None,
+        ["A common factor of params['k'] and params['m']"], ["m"],
+    ),
+    "scale of mass, friction and stiffness": (
+        spring(lambda p: p["k"], lambda p: p["m"]), {"c": 0.3, "k": 4.0, "m": 1.5},
+        {"dissipation": lambda q, v, params: 0.5 * params["c"] * v**2}, None,
+        ["A common factor of params['c'], params['k'] and params['m']"], ["k"],
+    ),
+    "mass and length of a pendulum": (
+        lambda q, v, p: p["m"] * (0.5 * p["l"] ** 2 * v**2 + p["g"] * p["l"] * jnp.cos(q)),
+        {"g": 9.8, "l": 0.9, "m": 2.0}, {}, None,
+        ["A common factor of params['g'] and params['l']", "depends on params['m']"], ["m", "g"],
+    ),
+    "charge in a gauge": (
+        lambda q, v, p: spring(lambda p: p["k"])(q, v, p) + p["a"] * q**2 * v, {"a": 0.7, "k": 4.0}, {}, None,
+        ["depends on params['a']"], ["a"],
+    ),
+    "two charges in a gauge": (
+        lambda q, v, p: spring(lambda p: p["k"])(q, v, p) + p["a"] * p["b"] * jnp.cos(q) * v,
+        {"a": 0.7, "b": 0.2, "k": 4.0}, {}, None, ["depends on params['a']", "depends on params['b']"], ["a", "b"],
+    ),
+    "level of a potential": (
+        lambda q, v, p: spring(lambda p: p["k"])(q, v, p) - p["level"], {"k": 4.0, "level": 3.0}, {}, None,
+        ["depends on params['level']"], ["level"],
+    ),
+    "product": (
+        spring(lambda p: p["a"] * p["b"]), {"a": 2.0, "b": 3.0}, {}, None,
+        ["only params['a']·params['b'] is seen"], ["a"],
+    ),
+    "product with a square": (
+        spring(lambda p: p["a"] * p["b"] ** 2), {"a": 2.0, "b": 1.4}, {}, None,
+        ["only params['a']·params['b']^2 is seen"], ["a"],
+    ),
+    "product and ratio of three": (
+        spring(lambda p: p["a"] * p["b"] / p["c"]), {"a": 6.0, "b": 2.0, "c": 2.5}, {}, None,
+        ["Of params['a'], params['b'] and params['c'] only"], ["a", "b"],
+    ),
+    "two products of one mass": (
+        lambda q, v, p: 0.5 * v**2 - p["m"] * (p["a"] * q**2 / 2 + p["b"] * q**4 / 4), {"a": 2.0, "b": 3.0, "m": 1.3},
+        {}, None, ["Of params['a'], params['b'] and params['m'] only"], ["m"],
+    ),
+    "springs side by side": (
+        spring(lambda p: p["a"] + p["b"]), {"a": 2.0, "b": 2.5}, {}, None,
+        ["only params['a'] + params['b'] is seen"], ["b"],
+    ),
+    "difference": (
+        spring(lambda p: p["a"] - 2 * p["b"]), {"a": 9.0, "b": 1.5}, {}, None,
+        ["only params['a'] − 2 params['b'] is seen"], ["a"],
+    ),
+    "springs one behind the other": (
+        spring(lambda p: p["a"] * p["b"] / (p["a"] + p["b"])), {"a": 6.0, "b": 9.0}, {}, None,
+        ["A combination of params['a'] and params['b'] is not seen"], ["a"],
+    ),
+    "inertia of what turns freely": (
+        lambda q, v, p: 0.5 * p["I"] * v**2, {"I": 2.0, "bias": 0.0}, {}, lambda q, v, params: q + params["bias"],
+        ["depends on params['I']", "depends on params['bias']"], None,
+    ),
+    "torque over inertia": (
+        lambda q, v, p: 0.5 * p["I"] * v**2 + p["torque"] * q, {"I": 2.0, "torque": 1.0}, {}, None,
+        ["A common factor of params['I'] and params['torque']"], ["I"],
+    ),
+    "gain of a sensor of a linear scene": (
+        spring(lambda p: p["k"]), {"gain": 2.0, "k": 4.0}, {}, lambda q, v, params: params["gain"] * q,
+        ["depends on params['gain']"], ["gain"],
+    ),
+    "place of a spring and of its ruler": (
+        lambda q, v, p: 0.5 * v**2 - 0.5 * p["k"] * (q - p["place"]) ** 2, {"bias": 0.3, "k": 4.0, "place": 0.2}, {},
+        lambda q, v, params: q + params["bias"], ["only params['bias'] + params['place'] is seen"], ["place"],
+    ),
+    "force over mass": (
+        spring(lambda p: p["k"], lambda p: p["m"]), {"F": 1.0, "k": 4.0, "m": 1.5},
+        {"forces": lambda q, v, t, params: params["F"] * jnp.cos(3 * t)}, None,
+        ["A common factor of params['F'], params['k'] and params['m']"], ["F"],
+    ),
+    "friction of two bearings": (
+        spring(lambda p: p["k"]), {"a": 0.2, "b": 0.1, "k": 4.0},
+        {"dissipation": lambda q, v, params: 0.5 * (params["a"] + params["b"]) * v**2}, None,
+        ["only params['a'] + params['b'] is seen"], ["b"],
+    ),
+    "a branch that is never taken": (
+        lambda q, v, p: spring(lambda p: p["k"])(q, v, p) - jnp.where(q > 50.0, p["wall"] * q, 0.0),
+        {"k": 4.0, "wall": 3.0}, {}, None, ["depends on params['wall']"], ["wall"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
+def test_freedoms_that_are_known_are_named_and_no_others(name):
+    lagrangian, params, more, observe, sentences, fixed = SCENES[name]
+    scene = lagjax.System(lambda q, v, params: lagrangian(q, v, params), **more)
+    run = lagjax.simulate(scene, 1.0, 0.3, TS, params)
+    shown = np.asarray(run.q) if observe is None else np.array([observe(q, 0.0, params) for q in run.q])
+    record = lagjax.Record(TS, shown + SIGMA * np.random.default_rng(0).normal(size=shown.shape))
+    fit = lagjax.fit(scene, record, params, observe=observe)
+    assert len(fit.unseen) == len(sentences), fit.unseen
+    for sentence in sentences:
+        assert any(sentence in said for said in fit.unseen), fit.unseen
+    if fixed is not None:
+        free = {key: key not in fixed for key in params}
+        fit = lagjax.fit(scene, record, params, observe=observe, free=free)
+        assert fit.unseen == () and fit.ok, fit
+
+
+def test_a_sentence_for_what_only_enters_as_a_product():
+    name = "two products of one mass"
+    lagrangian, params, *_ = SCENES[name]
+    scene = lagjax.System(lambda q, v, params: lagrangian(q, v, params))
+    q = np.asarray(lagjax.simulate(scene, 1.0, 0.3, TS, params).q)
+    [said] = lagjax.fit(scene, lagjax.Record(TS, q), params).unseen
+    assert said == (
+        "Of params['a'], params['b'] and params['m'] only params['a']·params['m'] and params['b']·params['m'] are seen."
+    )
