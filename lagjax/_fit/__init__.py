@@ -7,8 +7,9 @@
 
 Files: `_records`, `_parameters` and `_transforms` take what the user gives; `_motions` and `_signals` follow motions
 and sensors with their derivatives; `_residuals` and `_noise` say how far off a trial is; `_segments` says where to
-begin, `_solve` goes down from there; `_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_profile`, `_density`,
-`_sample`, `_next`, `_report` and `_result` say what that means.
+begin, and `_weak` where that is far off; `_solve` goes down from there, or `_gradient`, from many starts by `_many`;
+`_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_profile`, `_density`, `_sample`, `_next`, `_report` and `_result`
+say what that means.
 """
 
 import functools
@@ -23,6 +24,7 @@ import numpy as np
 from lagjax._consistent import has_constraints
 from lagjax._fit._blame import reading_params
 from lagjax._fit._delays import Delayed
+from lagjax._fit._gradient import descend, ended
 from lagjax._fit._inputs import HOLDS, Form, asks
 from lagjax._fit._many import Waterfall, distinct, drawn, misfit, short_search
 from lagjax._fit._motions import motions_of
@@ -39,6 +41,7 @@ from lagjax._fit._transforms import angle, between, inertia, positive, simplex
 from lagjax._fit._uncertainty import Information, information
 from lagjax._fit._unseen import sentences
 from lagjax._fit._verdict import verdict
+from lagjax._fit._weak import weak_start
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
@@ -60,7 +63,7 @@ __all__ = [
 ]  # fmt: skip
 PyTree = Any
 
-METHODS = ("auto", "segments", "whole")
+METHODS = ("auto", "segments", "whole", "gradient")
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
 # independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.
 _ENOUGH, _ENOUGH_OF_LEVEL = 1e-3, 1e-2
@@ -68,6 +71,7 @@ _ENOUGH_OF_GLIMPSES = 0.1
 _POOR, _COARSE = 2.0, 0.02  # times scatter or size of signals: beyond, the shortest segments were not fitted
 _LOOSE = 3.0  # standard deviations of u about its first value on these levels, where u is a logarithm or the like
 _TRIALS, _TRIALS_OF_LEVEL = 60, 20
+_STEPS = 3000  # of a descent by gradients
 _BEST = 4  # of many starts go through the whole search
 
 
@@ -112,7 +116,8 @@ def fit(
     - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
       its own read off the data, and lets these grow together: for that the signals must have the structure of q. "auto"
       does that where the signals allow it and records are longer than the motion's time scale, so that long and chaotic
-      records, and parameters that are far off, find their minimum.
+      records, and parameters that are far off, find their minimum. "gradient" goes down gradients in reverse mode, by
+      Adam of optax: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance.
 
     Intervals count correlated residuals for what they are worth (`Fit.noise`); what cannot be seen in the data is said
     in words (`Fit.unseen`) and has infinite intervals.
@@ -157,7 +162,13 @@ def fit(
     if progress:
         question.watch = _Printer(question.size)
     y0 = np.stack([_start(record, readers, layout, k, params0) for k, record in enumerate(records)])
-    search = functools.partial(_search, question, noise=noise, method=method, readers=readers)
+    if method == "gradient":
+        if starts > 1:
+            raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
+        descent = _by_gradient(question, system, parameters.moved(parameters.first), y0, noise, readers)
+        return _told(system, observe, question, descent, noise, None)
+    weak = functools.partial(_weakly, question, system, readers=readers or [])
+    search = functools.partial(_search, question, noise=noise, method=method, readers=readers, weak=weak)
     descent, waterfall = _searches(question, search, parameters.moved(parameters.first), y0, starts, seed)
     question.watch = None
     return _told(system, observe, question, descent, noise, waterfall)
@@ -265,6 +276,44 @@ def _start(record: Measured, readers: list[Reader | None] | None, layout: Layout
     return reader.states(np.array([0]))[0]
 
 
+def _by_gradient(question: Question, system: System, u, y0, noise, readers) -> Descent:
+    """The descent by gradients: over the shortest segments of the records, where they can be read, then over all."""
+    told, question.watch = question.watch, None
+    tell = None if told is None else lambda text: print(text, file=sys.stderr, flush=True)
+    steps = _STEPS
+    if readers is not None:
+        u = _weakly(question, system, u, readers)
+        u, steps = _over_segments(question, system, u, noise, readers, tell), _STEPS - _STEPS // 3
+    done = descend(question, system, u, y0, noise, steps, tell)
+    if not isinstance(done, Failure):
+        done = ended(question, done[0], done[1], noise, _STEPS, done[2])
+    if isinstance(done, Failure):
+        raise ValueError(question.where(done) + " Begin nearer: other params0, or starts that are known.")
+    return done
+
+
+def _weakly(question: Question, system: System, u, readers: list[Reader | None]) -> np.ndarray:
+    """The u that balances the weak form of Lagrange's equations, u itself where there is none."""
+    reading = [reader for reader in readers if reader is not None]
+    scale = time_scale(reading, question.motions, question.parameters.numbers(u))
+    found = weak_start(question, system, u, readers, scale)
+    return u if found is None else found
+
+
+def _over_segments(question: Question, system: System, u, noise, readers, tell) -> np.ndarray:
+    """The u that a third of the steps come to over short segments, each with a start of its own."""
+    reading = [reader for reader in readers if reader is not None]
+    recordings = [None if reader is None else reader.record for reader in readers]
+    cuts = levels(recordings, time_scale(reading, question.motions, question.parameters.numbers(u)))
+    if not cuts or question.clocks:
+        return u
+    pieces = cuts[0]
+    states = np.stack([readers[piece.record].states(piece.places[:1])[0] for piece in pieces])
+    part = question.of(pieces, np.ones(len(pieces), bool))
+    done = descend(part, system, u, states, noise, _STEPS // 3, tell)
+    return u if isinstance(done, Failure) else done[0]
+
+
 def _searches(question: Question, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
     """The best of the searches from u and from `starts` − 1 random values, and what all of them came to."""
     if starts == 1:
@@ -303,12 +352,12 @@ class _Printer:
         print(f"trial {self.trials}: {text}", file=sys.stderr, flush=True)
 
 
-def _search(question: Question, u, starts, noise, method: str, readers) -> Descent:
+def _search(question: Question, u, starts, noise, method: str, readers, weak) -> Descent:
     """The search of whole records, after that of growing segments where the method asks for it."""
     if method == "segments" and readers is None:
         raise ValueError('method="segments" reads starts off the data: for that values must have the structure of q.')
     if method != "whole" and readers is not None:
-        u, starts = _grown(question, u, starts, noise, readers)
+        u, starts = _grown(question, u, starts, noise, readers, weak)
     done = minimise(question, u, starts, noise, _ENOUGH, _TRIALS)
     if isinstance(done, Failure):
         raise ValueError(question.where(done) + " Begin nearer: other params0, or starts that are known.")
@@ -324,14 +373,16 @@ class _Begun(NamedTuple):
     misfit: float
 
 
-def _grown(question: Question, u, starts, noise, readers: list[Reader | None]) -> tuple[np.ndarray, np.ndarray]:
+def _grown(
+    question: Question, u, starts, noise, readers: list[Reader | None], weak: Callable
+) -> tuple[np.ndarray, np.ndarray]:
     """Better first values of u and of the starts, from segments that grow together to whole records."""
     anchor = Anchor(u, np.where(np.isfinite(question.parameters.reach), 1.0 / _LOOSE, 0.0))
     search = functools.partial(_level, question, noise=noise, readers=readers, anchor=anchor)
     begun = _begun(question, u, starts, readers, search)
-    if begun.misfit > 0.0:
-        other = _glimpsed(question, u, noise, readers, anchor)
-        begun = min(begun, _begun(question, other, starts, readers, search), key=lambda one: one.misfit)
+    for other in (lambda: weak(u), lambda: _glimpsed(question, u, noise, readers, anchor)):
+        if begun.misfit > 0.0:  # the shortest segments were not fitted from here
+            begun = min(begun, _begun(question, other(), starts, readers, search), key=lambda one: one.misfit)
     u, best = begun.u, begun.best
     for pieces in begun.cuts[1:]:
         done = search(pieces, u, best)

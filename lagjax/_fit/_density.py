@@ -57,10 +57,10 @@ class Density:
         self._form = form if form is not None and asks(system) else None
         self._scene = system if self._form is None else self._form.driven(system)
         self._tails = np.isfinite(widths.dof)
-        self._moves_dof = isinstance(noise, StudentT) and noise.dof is None
+        self.moves_dof = isinstance(noise, StudentT) and noise.dof is None
         share = np.log(np.clip(widths.dof, 1.01 * _LEAST_DOF, 0.99 * _MOST_DOF) / _LEAST_DOF)
         share = share / math.log(_MOST_DOF / _LEAST_DOF)
-        dof = np.log(share / (1 - share)) if self._moves_dof else np.zeros(0)
+        dof = np.log(share / (1 - share)) if self.moves_dof else np.zeros(0)
         starts = point.starts[question.fitted].ravel()
         self.first = np.concatenate([point.u, starts, np.log(widths.sigma), dof])
         self.names = (*question.parameters.labels, *self._names_of_starts(), *self._names_of_noise())
@@ -71,7 +71,7 @@ class Density:
 
     def _names_of_noise(self) -> list[str]:
         names = self.question.names
-        return [f"log σ of {name}" for name in names] + [f"ν of {name}" for name in names] * self._moves_dof
+        return [f"log σ of {name}" for name in names] + [f"ν of {name}" for name in names] * self.moves_dof
 
     def __len__(self) -> int:
         return len(self.first)
@@ -87,7 +87,7 @@ class Density:
             .set(rest[:states].reshape(-1, self.question.states))
         )
         sigma, moved = jnp.exp(rest[states : states + count]), rest[states + count :]
-        dof = self._dof(moved) if self._moves_dof else jnp.asarray(self.widths.dof, x.dtype)
+        dof = self._dof(moved) if self.moves_dof else jnp.asarray(self.widths.dof, x.dtype)
         return Unknowns(u, self._begun(starts, u), sigma, dof)
 
     @staticmethod
@@ -111,15 +111,18 @@ class Density:
     def __call__(self, x):
         """log p(x), up to a constant; −∞ where a motion could not be followed."""
         at = self.unknowns(jnp.asarray(x, self.question.layout.dtype))
-        total = self.question.parameters.log_volume(at.u, jnp)
+        total = self.log_likelihood(x) + self.question.parameters.log_volume(at.u, jnp)
         if self.prior is not None:
             total = total + self.prior(self.params(at.u))
-        if self._moves_dof:
+        if self.moves_dof:
             moved = x[-len(self.widths.sigma) :]
             total = total + jnp.sum(jax.nn.log_sigmoid(moved) + jax.nn.log_sigmoid(-moved))
-        for batch in self.question.batches:
-            total = total + self._likelihood(self.residuals(batch, at), batch, at)
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+    def log_likelihood(self, x):
+        """Σ_s shares_s log L_s, up to a constant; NaN where a motion could not be followed."""
+        at = self.unknowns(jnp.asarray(x, self.question.layout.dtype))
+        return sum(self._likelihood(self.residuals(batch, at), batch, at) for batch in self.question.batches)
 
     def residuals(self, batch: Samples, at: Unknowns):
         """What the sensors show less what was measured, (N, T, S), of the records of one batch."""

@@ -399,6 +399,8 @@ def record_matrix(values: PyTree, record) -> np.ndarray:
     return np.concatenate([np.reshape(leaf, (len(record), -1)) for leaf in jax.tree.leaves(values)], axis=1)
 
 
+_LISTED = 8  # numbers of one array that a table lists; of more it says how many there are
+
 # ---- in words --------------------------------------------------------------------------------------------------------
 
 
@@ -449,7 +451,13 @@ def _table_of_parameters(fit: Fit) -> list[str]:
     values = fit.parameters.values(fit.u)
     width = max(len(name) for name in (*fit.parameters.names, "parameter"))
     rows = [f"{'parameter':<{width}}  {'value':>12}  {'95 % interval':>27}  relative"]
-    for name, x, a, b in zip(fit.parameters.names, values, low, high, strict=True):
+    many = {part.label: len(part.places) for part in fit.parameters.parts if len(part.places) > _LISTED}
+    for label, count in many.items():
+        rows.append(f"{label:<{width}}  {f'{count} numbers':>12}")
+    owners = [part.label for part in fit.parameters.parts for _ in part.places]
+    for owner, name, x, a, b in zip(owners, fit.parameters.names, values, low, high, strict=True):
+        if owner in many:
+            continue
         relative = 100 * (b - a) / 2 / abs(x) if x else np.inf
         shown = f"± {relative:.2g} %" if np.isfinite(relative) else "not seen"
         rows.append(f"{name:<{width}}  {x:>12.6g}  {a:>12.6g} … {b:>12.6g}  {shown}")

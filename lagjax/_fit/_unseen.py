@@ -6,6 +6,7 @@ and at another point, then only a product of powers enters, such as m·l. The sa
 sums. Everything else is told as the direction that it is.
 """
 
+import re
 from fractions import Fraction
 
 import numpy as np
@@ -15,6 +16,7 @@ from lagjax._fit._parameters import Parameters
 from lagjax._fit._residuals import Failure, Point, Question
 from lagjax._fit._uncertainty import seen
 
+_MOST_NAMES = 12  # in one sentence
 _LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
 
 
@@ -167,6 +169,8 @@ def _sum(row: list[int], names: list[str]) -> str:
 
 
 def _listed(names: list[str]) -> str:
+    if len(names) > _MOST_NAMES:  # weights of a network: whole arrays instead of their numbers
+        names = list(dict.fromkeys(re.sub(r"\[[\d, ]+\]$", "", name) for name in names))
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 

@@ -1,0 +1,107 @@
+"""The weak form of Lagrange's equations: parameters from states that were read off the data, without any motion.
+
+With a bump φ that vanishes at both ends of a window, integration by parts takes the time derivative off the momentum:
+
+    ∫ (φ̇ p + φ F) dt = 0,      p = ∂L/∂q̇,   F = ∂L/∂q + Q
+
+which asks for q and q̇ of the data and for no second derivative of them. It is linear where the parameters are, and has
+one minimum where long motions have many. It is not scaled like the noise, and biased by that of q̇: a start, from which
+the search then goes on. Each coordinate is divided by the size of its own ∫ φ̇ p, or else all masses would shrink to
+nothing together.
+Source: Messenger & Bortz, *Weak SINDy*, J. Comput. Phys. 443 (2021) 110525; Bortz, Messenger & Dukic, Bull. Math.
+Biol. 85 (2023) 110, for parameters.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.optimize import least_squares
+
+from lagjax._consistent import has_constraints
+from lagjax._fit._inputs import Driven, asks, at_instants
+from lagjax._fit._residuals import Question
+from lagjax._fit._segments import Reader
+from lagjax._layout import halves
+from lagjax._system import System
+
+_SAMPLES = 2000  # of all records, at most
+_FEWEST = 9  # samples in a window
+_POWER = 4  # of the bump (1 − s²)ᵖ, whose first derivatives vanish at its ends
+_TRIALS = 100
+_WIDE = 3.0  # time scales in half a window: a bump sees what turns over within it
+
+
+class _Windows:
+    """Bumps on the samples of one record: `inside` and `rate` (W, T), which integrate with φ and φ̇ by trapezia."""
+
+    def __init__(self, ts: np.ndarray, half: float):
+        spans = np.gradient(ts)
+        spans[0], spans[-1] = 0.5 * (ts[1] - ts[0]), 0.5 * (ts[-1] - ts[-2])
+        half = min(max(half, 0.5 * _FEWEST * np.max(np.diff(ts))), 0.5 * (ts[-1] - ts[0]))
+        count = max(1, int(np.ceil((ts[-1] - ts[0]) / half)) - 1)
+        centres = np.linspace(ts[0] + half, ts[-1] - half, count)
+        s = np.clip((ts - centres[:, None]) / half, -1.0, 1.0)
+        self.inside = spans * (1 - s**2) ** _POWER
+        self.rate = -2 * _POWER / half * spans * s * (1 - s**2) ** (_POWER - 1)
+
+
+def weak_start(question: Question, system: System, u: np.ndarray, readers: list[Reader | None], scale: float):
+    """The u (F,) that balances the weak form best, in a search from `u`; None where there is nothing to balance.
+
+    `scale` is the motion's time scale, `system` the scene as its author wrote it.
+    """
+    if has_constraints(system) or not np.isfinite(scale):
+        return None
+    residuals, dtype = imbalance(question, system, readers, scale), question.layout.dtype
+    value, slope = jax.jit(residuals), jax.jit(jax.jacfwd(residuals))
+    to_host: Any = lambda f: lambda u: np.asarray(f(u.astype(dtype)), float)  # noqa: E731
+    if not (np.isfinite(to_host(value)(u)).all() and np.isfinite(to_host(slope)(u)).all()):
+        return None
+    try:
+        done = least_squares(to_host(value), u, to_host(slope), x_scale="jac", max_nfev=_TRIALS)
+    except (ValueError, np.linalg.LinAlgError):  # a trial that is not finite
+        return None
+    return done.x if np.isfinite(done.x).all() else None
+
+
+def imbalance(question: Question, system: System, readers: list[Reader | None], scale: float):
+    """∫ (φ̇ p + φ F) dt of all windows and coordinates, over the size of ∫ φ̇ p: a function of u (F,) for JAX."""
+    layout, parameters, form = question.layout, question.parameters, question.signals.form
+    form = form if form is not None and asks(system) else None
+    scene = system if form is None else form.driven(system)
+    pieces = _read([reader for reader in readers if reader is not None], _WIDE * scale)
+
+    def both(y, t, table, numbers):
+        params = parameters.restore(numbers)
+        params = params if form is None else Driven(params, *table)
+        motion = scene.motion(layout, params)
+        state = (*halves(y), t, params)
+        return jnp.stack([motion.momentum(*state), motion.generalized_force(*state)])
+
+    at_all = jax.vmap(both, in_axes=(0, 0, 0 if form is not None else None, None))
+
+    y, t, inputs = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
+    table = tuple(at_instants(t, inputs)) if form is not None else None
+    rate, inside = (block_diag(*[getattr(piece[3], name) for piece in pieces]) for name in ("rate", "inside"))
+
+    def residuals(u):
+        p, force = jnp.moveaxis(at_all(y, t, table, parameters.numbers(u, jnp)), 1, 0)
+        moved, forced = rate @ p, inside @ force
+        return ((moved + forced) / jnp.sqrt(jnp.sum(moved**2, axis=0))).ravel()
+
+    return residuals
+
+
+def _read(readers: list[Reader], half: float) -> list[tuple]:
+    """States (T, 2n), times, inputs and windows of every record, thinned to so many samples in all."""
+    found = []
+    for reader in readers:
+        count = max(_FEWEST + 1, _SAMPLES // len(readers))
+        places = np.unique(np.linspace(0, len(reader.record) - 1, min(count, len(reader.record))).astype(int))
+        ts = reader.record.ts[places]
+        if len(ts) > 2:
+            found.append((reader.states(places), ts, reader.record.input_matrix[places], _Windows(ts, half)))
+    return found
