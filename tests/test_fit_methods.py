@@ -328,11 +328,14 @@ def weak(fit, u):
 
 
 def test_the_weak_form_finds_parameters_from_anywhere_without_a_motion():
-    fit = spring_fit()
+    ts = np.linspace(0.0, 12.0, 241)
+    q = np.asarray(lagjax.simulate(SPRING, 2.0, 0.0, ts, {"k": 4.0, "c": 0.3}).q)
+    one = lagjax.Record(ts, q + 0.02 * np.random.default_rng(0).normal(size=q.shape))
+    fit = lagjax.fit(SPRING, one, {"k": 4.0, "c": 0.3}, transforms=lagjax.positive)
     for factor in (1e-3, 1e3):
         residuals, u = weak(fit, fit.u + np.log(factor))
         c, k = fit.parameters.values(u)
-        assert k == pytest.approx(4.0, rel=0.1) and 0.1 < c < 0.9  # from rates of noisy data
+        assert k == pytest.approx(4.0, rel=0.1) and c == pytest.approx(0.3, rel=0.5)  # rates of noisy data are damped
     slopes = jax.jacfwd(residuals)(fit.u)
     central = [(residuals(fit.u + e) - residuals(fit.u - e)) / 2e-6 for e in 1e-6 * np.eye(2)]
     np.testing.assert_allclose(slopes, np.transpose(central), atol=1e-7)

@@ -41,7 +41,7 @@ class _Windows:
         spans = np.gradient(ts)
         spans[0], spans[-1] = 0.5 * (ts[1] - ts[0]), 0.5 * (ts[-1] - ts[-2])
         half = min(max(half, 0.5 * _FEWEST * np.max(np.diff(ts))), 0.5 * (ts[-1] - ts[0]))
-        count = max(1, int(np.ceil((ts[-1] - ts[0]) / half)) - 1)
+        count = max(1, int(np.ceil(2 * (ts[-1] - ts[0]) / half)) - 3)  # each begins a quarter behind the one before
         centres = np.linspace(ts[0] + half, ts[-1] - half, count)
         s = np.clip((ts - centres[:, None]) / half, -1.0, 1.0)
         self.inside = spans * (1 - s**2) ** _POWER
