@@ -1,24 +1,34 @@
 """What a scene does, from its Lagrangian alone: where it stays, how it oscillates, what it conserves."""
 
+from lagjax._analysis._coordinates import ChangedCoordinates, change_coordinates
 from lagjax._analysis._equilibrium import Equilibrium, equilibrium
+from lagjax._analysis._hamiltonian import CanonicalTrajectory, Hamiltonian, hamiltonian
 from lagjax._analysis._linearize import Linearization, linearize
 from lagjax._analysis._modes import Modes, normal_modes
 from lagjax._analysis._noether import cyclic_coordinates, noether_charge
+from lagjax._analysis._routh import Routhian, routhian
 from lagjax._analysis._same import SameMotion, same_motion
 from lagjax._analysis._symmetries import Conserved, ConservedQuantities, conserved_quantities
 
 __all__ = [
+    "CanonicalTrajectory",
+    "ChangedCoordinates",
     "Conserved",
     "ConservedQuantities",
     "Equilibrium",
+    "Hamiltonian",
     "Linearization",
     "Modes",
+    "Routhian",
     "SameMotion",
+    "change_coordinates",
     "conserved_quantities",
     "cyclic_coordinates",
     "equilibrium",
+    "hamiltonian",
     "linearize",
     "noether_charge",
     "normal_modes",
+    "routhian",
     "same_motion",
 ]

@@ -1,0 +1,165 @@
+"""`change_coordinates`: the same scene in other coordinates.
+
+With q = q(Q, t), q̇ = (∂q/∂Q) Q̇ + ∂q/∂t, L is a function of (Q, Q̇, t), and Lagrange's equations hold for it as they do
+for every set of coordinates. Forces become (∂q/∂Q)ᵀ F, so that they do the same work.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from lagjax._analysis._solve import shortest_solution
+from lagjax._arguments import Function, accept
+from lagjax._failures import nan_unless
+from lagjax._layout import Layout
+from lagjax._system import System, require_system
+
+PyTree = Any
+
+# Newton steps to the new coordinates of a state; five are usual.
+_STEPS = 50
+
+
+class ChangedCoordinates(NamedTuple):
+    """A scene in new coordinates, and the way of states between these and the old ones.
+
+    - `system`: the scene in the new coordinates, a `System`.
+    - `old_from_new(Q, Qdot, t=0.0, params=None)`: the state (q, q̇) in the old coordinates.
+    - `new_from_old(q, qdot, guess, t=0.0, params=None)`: (Q, Q̇), Q by Newton's method from a `guess` of it; NaN where
+      that does not arrive, as at a pole of the new coordinates. Both are differentiable, under `jit` and `vmap`.
+    """
+
+    system: System
+    old_from_new: Callable
+    new_from_old: Callable
+
+
+def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordinates:
+    r"""`system` in new coordinates Q, of which the old ones are the function q = `old_from_new(Q)`.
+
+        L'(Q, Q̇, t) = L(q(Q, t), (∂q/∂Q) Q̇ + ∂q/∂t, t)
+
+    - `old_from_new(Q)`: the old coordinates in their structure, from the new ones in any; it may ask for `t` (frames
+      that move) and `params` by name.
+
+    Forces, dissipation and constraints come along. In a frame that moves the energy is another one, and may be
+    conserved where the old one is not.
+
+    **Raises** `TypeError` for a function of another signature; `ValueError` when a state is changed whose new
+    coordinates are more or fewer than the old ones.
+
+    Source: Landau & Lifshitz, *Mechanics*, §1, §39 (rotating frames).
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    plane = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q)
+    polar = lagjax.change_coordinates(plane, lambda p: p["r"] * jnp.array([jnp.cos(p["phi"]), jnp.sin(p["phi"])]))
+    polar.system.energy({"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 1.0})  # 1.0
+    ```
+    """
+    require_system(system)
+    place = accept(old_from_new, "old_from_new", ("Q",))
+
+    def old_state(Q, Qdot, t, params):
+        Q, Qdot, t = jax.tree.map(lambda x: jnp.asarray(x, float), (Q, Qdot, t))
+        return jax.jvp(lambda Q, t: place(Q, t=t, params=params), (Q, t), (Qdot, jnp.ones_like(t)))
+
+    def lagrangian(Q, Qdot, t, params):
+        return system.lagrangian(*old_state(Q, Qdot, t, params), t=t, params=params)
+
+    def forces(Q, Qdot, t, params):
+        assert system.forces is not None
+        force = system.forces(*old_state(Q, Qdot, t, params), t=t, params=params)
+        return jax.vjp(lambda Q: place(Q, t=t, params=params), Q)[1](force)[0]
+
+    def dissipation(Q, Qdot, t, params):
+        assert system.dissipation is not None
+        return system.dissipation(*old_state(Q, Qdot, t, params), t=t, params=params)
+
+    def constraints(Q, t, params):
+        assert system.constraints is not None
+        return system.constraints(place(Q, t=t, params=params), t=t, params=params)
+
+    def velocity_constraints(Q, Qdot, t, params):
+        assert system.velocity_constraints is not None
+        return system.velocity_constraints(*old_state(Q, Qdot, t, params), t=t, params=params)
+
+    def of_role(function: Function | None, changed: Callable, roles: int = 2) -> Callable | None:
+        return None if function is None else asking(changed, {*function.extras, *place.extras}, roles)
+
+    changed = System(
+        asking(lagrangian, {*system.lagrangian.extras, *place.extras}),
+        forces=of_role(system.forces, forces),
+        dissipation=of_role(system.dissipation, dissipation),
+        constraints=of_role(system.constraints, constraints, 1),
+        velocity_constraints=of_role(system.velocity_constraints, velocity_constraints),
+        path=system.path,  # pyright: ignore[reportArgumentType]
+    )
+
+    def to_old(Q, Qdot, t=0.0, params=None):
+        return old_state(Q, Qdot, t, params)
+
+    def to_new(q, qdot, guess, t=0.0, params=None):
+        return _new_state(place, q, qdot, guess, t, params)
+
+    return ChangedCoordinates(changed, to_old, to_new)
+
+
+def asking(function: Callable, extras: set[str], roles: int = 2) -> Callable:
+    """`function(*roles, t, params)` with the signature of one that asks for these extras alone.
+
+    A function that does not ask for the time is known not to depend on it.
+    """
+    if roles == 1:
+        forms = {
+            (False, False): lambda q: function(q, 0.0, None),
+            (True, False): lambda q, t: function(q, t, None),
+            (False, True): lambda q, params: function(q, 0.0, params),
+            (True, True): lambda q, t, params: function(q, t, params),
+        }
+    else:
+        forms = {
+            (False, False): lambda q, qdot: function(q, qdot, 0.0, None),
+            (True, False): lambda q, qdot, t: function(q, qdot, t, None),
+            (False, True): lambda q, qdot, params: function(q, qdot, 0.0, params),
+            (True, True): lambda q, qdot, t, params: function(q, qdot, t, params),
+        }
+    return forms["t" in extras, "params" in extras]
+
+
+def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, params: PyTree) -> tuple[PyTree, PyTree]:
+    """(Q, Q̇) with q(Q, t) = q and (∂q/∂Q) Q̇ + ∂q/∂t = q̇."""
+    old, new = Layout.of(q, qdot), Layout.of(guess, guess)
+    if old.size != new.size:
+        raise ValueError(
+            f"There are {new.size} new coordinates for {old.size} old ones: a state has new coordinates where both are "
+            "as many. Where the old ones are constrained, compute the new ones by hand."
+        )
+    t, wanted = jnp.asarray(t, old.dtype), old.flatten(q)
+
+    def off(x, t):
+        return old.flatten(place(new.restore(x), t=t, params=params)) - wanted
+
+    def find(f, start):
+        def moves(carry):
+            _, moved, count = carry
+            return (moved > 1e-14) & (count < _STEPS)
+
+        def once(carry):
+            x, _, count = carry
+            step = shortest_solution(jax.jacfwd(f)(x), f(x))
+            return x - step, jnp.max(jnp.abs(step) / (1 + jnp.abs(x))), count + 1
+
+        return jax.lax.while_loop(moves, once, (start, jnp.ones((), start.dtype), 0))[0]
+
+    def solve(linear, right):
+        return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right)
+
+    x = jax.lax.custom_root(lambda x: off(x, t), jax.lax.stop_gradient(new.flatten(guess)), find, solve)
+    arrived = jnp.max(jnp.abs(off(x, t))) <= 1e-10 * (1 + jnp.max(jnp.abs(wanted)))
+    x = nan_unless(arrived, x)
+    jacobian, drift = jax.jacfwd(off, argnums=0)(x, t), jax.jacfwd(off, argnums=1)(x, t)
+    return new.restore(x), new.restore(shortest_solution(jacobian, old.flatten(qdot) - drift))

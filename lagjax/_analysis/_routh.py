@@ -1,0 +1,152 @@
+"""`routhian`: the motion of a scene without its cyclic coordinates, at given momenta of these.
+
+    R(s, ṡ; μ) = L − μ·ċ,   ∂L/∂ċ(s, ṡ, ċ) = μ
+
+R is a Lagrangian for the other coordinates s. The cyclic ones c follow by an integral over the time.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from lagjax._analysis._coordinates import asking
+from lagjax._analysis._scene import Scene
+from lagjax._layout import Layout
+from lagjax._linear import factorize
+from lagjax._simulate import simulate
+from lagjax._system import System
+from lagjax._trajectory import State, Trajectory
+
+PyTree = Any
+
+# Nodes of Gauss's rule between two output times, on which cyclic coordinates are integrated.
+_NODES = 8
+
+
+class Routhian(NamedTuple):
+    """A scene without its cyclic coordinates.
+
+    - `system`: its `System`, with the Lagrangian R. Its coordinates are an array (n − k,), in the order in which those
+      left lie end to end (`names`), its parameters {"momenta": μ (k,), "params": the scene's own}.
+    - `names`, `cyclic`: the names of the coordinates that are left, and of those that are gone.
+    - `reduce(q, qdot, t=0.0, params=None)`: (s, ṡ, the parameters of `system`) of a state of the scene.
+    - `restore(s, sdot, c, params, t=0.0)`: the state (q, q̇) of the scene, with the cyclic coordinates c (k,).
+    - `simulate(q0, qdot0, ts, params, **options)`: the motion of the scene, a `Trajectory`, by that of `system`.
+    """
+
+    system: System
+    names: tuple[str, ...]
+    cyclic: tuple[str, ...]
+    reduce: Callable
+    restore: Callable
+    simulate: Callable
+
+
+def routhian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> Routhian:
+    r"""`system` reduced by its cyclic coordinates on which nothing acts, at constant momenta of these.
+
+        R(s, ṡ; μ) = L − μ·ċ      with ċ from  ∂L/∂ċ = μ
+
+    Which coordinates those are is read off the scene's programs; of q, qdot and params only the structure matters. L
+    must be quadratic in their velocities.
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a system with constraints or forces, or
+    without cyclic coordinates, or where nothing would be left.
+
+    Source: Routh, *Stability of a Given State of Motion* (1877); Landau & Lifshitz, *Mechanics*, §41.
+
+    ```python
+    import lagjax
+
+    kepler = lagjax.System(lambda q, v: 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) + 1 / q["r"])
+    radial = lagjax.routhian(kepler, {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 1.0})
+    print(radial.names)  # ("q['r']",)
+    ```
+    """
+    scene = Scene.of(system, q, qdot, params)
+    if scene.constrained or system.forces is not None or system.dissipation is not None:
+        raise ValueError("routhian is of systems without constraints, forces and dissipation: R is a Lagrangian alone.")
+    gone, layout = np.array(scene.conserved, int), scene.layout
+    left = np.array([i for i in range(layout.size) if i not in gone], int)
+    if not len(gone) or not len(left):
+        what = "every coordinate is" if len(gone) else "no coordinate is"
+        raise ValueError(f"There is nothing to reduce: {what} cyclic ({', '.join(layout.names)}).")
+    whole = _Whole(system, layout, left, gone)
+    extras = {*system.lagrangian.extras, "params"}
+    reduced = System(asking(whole.routh, extras), path=system.path)  # pyright: ignore[reportArgumentType]
+    names = tuple(layout.names[i] for i in left), tuple(layout.names[i] for i in gone)
+    return Routhian(reduced, *names, whole.reduce, whole.restore, lambda *a, **o: _simulate(whole, reduced, *a, **o))
+
+
+class _Whole(NamedTuple):
+    """The scene before it is reduced, and the places of the coordinates that are left and gone."""
+
+    system: System
+    layout: Layout
+    left: np.ndarray
+    gone: np.ndarray
+
+    def joined(self, s, c) -> Array:
+        """The vector (n,) of both kinds."""
+        return jnp.zeros(self.layout.size, self.layout.dtype).at[self.left].set(s).at[self.gone].set(c)
+
+    def lagrangian(self, s, sdot, cdot, t, params):
+        """L, in which the cyclic coordinates may have any value."""
+        q, qdot = self.joined(s, jnp.zeros(len(self.gone))), self.joined(sdot, cdot)
+        return self.system.lagrangian(self.layout.restore(q), self.layout.restore(qdot), t=t, params=params)
+
+    def turning(self, s, sdot, t, params) -> Array:
+        """ċ (k,) at the momenta in the parameters of the reduced scene."""
+        none = jnp.zeros(len(self.gone), self.layout.dtype)
+
+        def momenta(cdot):
+            return jax.grad(lambda x: self.lagrangian(s, sdot, x, t, params["params"]))(cdot)
+
+        mass, missing = jax.jacfwd(momenta)(none), params["momenta"] - momenta(none)
+        if len(self.gone) == 1:  # a division, of which machine code is made
+            return missing / mass[0]
+        return factorize(mass).solve(missing)
+
+    def routh(self, s, sdot, t, params):
+        """R."""
+        cdot = self.turning(s, sdot, t, params)
+        return self.lagrangian(s, sdot, cdot, t, params["params"]) - params["momenta"] @ cdot
+
+    def reduce(self, q, qdot, t: Any = 0.0, params=None) -> tuple[Array, Array, dict]:
+        """(s, ṡ, the parameters of the reduced scene)."""
+        p = self.layout.flatten(self.system.momentum(q, qdot, t, params))[self.gone]
+        q, qdot = self.layout.flatten(q), self.layout.flatten(qdot)
+        return q[self.left], qdot[self.left], {"momenta": p, "params": params}
+
+    def restore(self, s, sdot, c, params, t=0.0) -> tuple[PyTree, PyTree]:
+        """(q, q̇)."""
+        cdot = self.turning(s, sdot, jnp.asarray(t, self.layout.dtype), params)
+        return self.layout.restore(self.joined(s, c)), self.layout.restore(self.joined(sdot, cdot))
+
+
+def _simulate(whole: _Whole, reduced: System, q0, qdot0, ts, params=None, **options) -> Trajectory:
+    """The motion of the scene: that of the reduced one at the output times and at nodes between them."""
+    ts = jnp.asarray(ts, whole.layout.dtype)
+    s0, sdot0, momenta = whole.reduce(q0, qdot0, ts[0], params)
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    gaps, count = jnp.diff(ts), len(ts) - 1
+    between = ts[:-1, None] + gaps[:, None] * jnp.asarray(0.5 * (nodes + 1))
+    fine = jnp.concatenate([jnp.column_stack([ts[:-1, None], between]).ravel(), ts[-1:]])
+    done = simulate(reduced, s0, sdot0, fine, momenta, **options)
+    turning = jax.vmap(lambda s, v, t: whole.turning(s, v, t, momenta))(done.q, done.qdot, fine)
+    inside = turning[:-1].reshape(count, _NODES + 1, -1)[:, 1:]
+    turned = 0.5 * gaps[:, None] * jnp.einsum("g,cgk->ck", jnp.asarray(weights), inside)
+    start = whole.layout.flatten(q0)[whole.gone]
+    c = jnp.concatenate([start[None], start + jnp.cumsum(turned, axis=0)])
+    every = slice(None, None, _NODES + 1)
+    s, v = done.q[every], done.qdot[every]
+    q, qdot = jax.vmap(lambda s, v, c, t: whole.restore(s, v, c, momenta, t))(s, v, c, ts)
+    end = State(ts[-1], jax.tree.map(lambda x: x[-1], q), jax.tree.map(lambda x: x[-1], qdot))
+    fields = {name: getattr(done, name) for name in Trajectory.__dataclass_fields__}
+    return Trajectory.of(
+        **{**fields, "ts": ts, "q": q, "qdot": qdot, "end": end, "system": whole.system, "params": params}
+    )

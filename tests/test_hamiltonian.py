@@ -1,0 +1,132 @@
+"""The same motion in other coordinates, in phase space, and without its cyclic coordinates."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+TIGHT = {"rtol": 1e-13, "atol": 1e-15}
+TS = jnp.linspace(0.0, 5.0, 6)
+START = jnp.array([1.0, 0.2]), jnp.array([0.0, 1.1])
+
+PLANE = lagjax.System(lambda q, v: 0.5 * v @ v + 1 / jnp.sqrt(q @ q))
+CENTRAL = lagjax.System(lambda q, v: 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) + 1 / q["r"])
+
+
+def polar(p):
+    return p["r"] * jnp.array([jnp.cos(p["phi"]), jnp.sin(p["phi"])])
+
+
+def turned(p, t):
+    return jnp.array([jnp.cos(t) * p[0] - jnp.sin(t) * p[1], jnp.sin(t) * p[0] + jnp.cos(t) * p[1]])
+
+
+# ---- the heart -------------------------------------------------------------------------------------------------------
+
+
+def test_the_energy_in_polar_coordinates():
+    changed = lagjax.change_coordinates(PLANE, polar)
+    state = {"r": 2.0, "phi": 0.3}, {"r": 0.5, "phi": 0.7}
+    np.testing.assert_allclose(changed.system.energy(*state), CENTRAL.energy(*state), rtol=1e-14)
+
+
+# ---- coordinates -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_one_motion_in_polar_and_in_turning_coordinates():
+    plain = lagjax.simulate(PLANE, *START, TS, **TIGHT)
+    for place, guess in ((polar, {"r": 1.0, "phi": 0.1}), (turned, jnp.ones(2))):
+        changed = lagjax.change_coordinates(PLANE, place)
+        run = lagjax.simulate(changed.system, *changed.new_from_old(*START, guess), TS, **TIGHT)
+        q, qdot = jax.vmap(changed.old_from_new)(run.q, run.qdot, TS)
+        np.testing.assert_allclose(q, plain.q, atol=1e-11)
+        np.testing.assert_allclose(qdot, plain.qdot, atol=1e-11)
+
+
+@pytest.mark.slow
+def test_forces_and_constraints_come_along():
+    drag = lagjax.System(lambda q, v: 0.5 * v @ v, forces=lambda q, v: -v, dissipation=lambda q, v: 0.1 * v @ v)
+    changed = lagjax.change_coordinates(drag, polar)
+    state = {"r": 2.0, "phi": 0.3}, {"r": 0.5, "phi": 0.7}
+    q, qdot = changed.old_from_new(*state)
+    power = drag.generalized_force(q, qdot) @ qdot
+    force = changed.system.generalized_force(*state)
+    kinetic = {"r": 2.0 * 0.7**2, "phi": 0.0}  # ∂L/∂Q
+    np.testing.assert_allclose(sum((force[k] - kinetic[k]) * state[1][k] for k in force), power, rtol=1e-13)
+    circle = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q @ q - 4.0)
+    assert jnp.abs(lagjax.change_coordinates(circle, polar).system.constraint_residual(*state)) < 1e-14
+    with pytest.raises(ValueError, match="There are 1 new coordinates for 2 old ones"):
+        lagjax.change_coordinates(PLANE, lambda a: jnp.array([a, a])).new_from_old(*START, 1.0)
+    lost, _ = changed.new_from_old(*START, {"r": 0.0, "phi": 0.1})
+    assert not np.isfinite(lost["r"]) or np.isclose(abs(lost["r"]), np.sqrt(1.04))
+
+
+# ---- phase space -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_canonical_and_lagrangian_motions_agree():
+    def double(q, v):
+        kinetic = v[0] ** 2 + jnp.cos(q[0] - q[1]) * v[0] * v[1] + 0.5 * v[1] ** 2
+        return kinetic + 9.81 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+
+    system = lagjax.System(double)
+    canonical = lagjax.hamiltonian(system)
+    q0, v0 = jnp.array([1.0, 0.5]), jnp.array([0.3, -0.2])
+    p0 = canonical.momentum(q0, v0)
+    np.testing.assert_allclose(canonical.velocity(q0, p0), v0, atol=1e-15)
+    plain = lagjax.simulate(system, q0, v0, TS, **TIGHT)
+    run = canonical.simulate(q0, p0, TS, **TIGHT)
+    assert run.ok
+    np.testing.assert_allclose(run.q, plain.q, atol=1e-11)
+    np.testing.assert_allclose(run.p, plain.momentum(), atol=1e-11)
+
+
+@pytest.mark.slow
+def test_legendre_where_velocities_are_bounded():
+    canonical = lagjax.hamiltonian(lagjax.System(lambda q, v: -jnp.sqrt(1 - v @ v) - 0.5 * q @ q))
+    q, v = jnp.array([1.0, 0.5]), jnp.array([0.9, -0.4])
+    p = canonical.momentum(q, v)
+    np.testing.assert_allclose(canonical.velocity(q, p), v, rtol=1e-12)
+    np.testing.assert_allclose(canonical.energy(q, p), jnp.sqrt(1 + p @ p) + 0.5 * q @ q, rtol=1e-12)
+    by_q, by_p = jax.grad(canonical.energy, argnums=(0, 1))(q, p)
+    rate, force = canonical.equations(q, p)
+    np.testing.assert_allclose(rate, by_p, rtol=1e-11)
+    np.testing.assert_allclose(force, -by_q, rtol=1e-11)
+
+
+# ---- without cyclic coordinates --------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_central_problem_is_one_dimensional():
+    state = {"r": 1.0, "phi": 0.3}, {"r": 0.1, "phi": 1.1}
+    radial = lagjax.routhian(CENTRAL, *state)
+    assert radial.names == ("q['r']",) and radial.cyclic == ("q['phi']",)
+    s, sdot, params = radial.reduce(*state)
+    assert s.shape == (1,)
+    # r̈ = p²/r³ − 1/r²
+    np.testing.assert_allclose(radial.system.acceleration(s, sdot, params=params), [1.1**2 - 1], rtol=1e-13)
+    plain = lagjax.simulate(CENTRAL, *state, TS, **TIGHT)
+    run = radial.simulate(*state, TS, **TIGHT)
+    for name in ("r", "phi"):
+        np.testing.assert_allclose(run.q[name], plain.q[name], atol=1e-11)
+        np.testing.assert_allclose(run.qdot[name], plain.qdot[name], atol=1e-11)
+    assert run.engine == "MachineCode" and run.system is CENTRAL
+
+
+@pytest.mark.slow
+def test_what_cannot_be_reduced_is_said():
+    with pytest.raises(ValueError, match="no coordinate is cyclic"):
+        lagjax.routhian(PLANE, *START)
+    with pytest.raises(ValueError, match="every coordinate is cyclic"):
+        lagjax.routhian(lagjax.System(lambda q, v: 0.5 * v**2), 0.0, 1.0)
+    drag = lagjax.System(lambda q, v: 0.5 * v @ v, forces=lambda q, v: -v)
+    with pytest.raises(ValueError, match="without constraints, forces"):
+        lagjax.routhian(drag, *START)
+    rod = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q @ q - 1)
+    with pytest.raises(ValueError, match="without constraints"):
+        lagjax.hamiltonian(rod)
