@@ -49,10 +49,12 @@ from lagjax._health import Health
 from lagjax._hybrid import Transition, simulate_hybrid
 from lagjax._machine_code import MachineCode
 from lagjax._orbits import (
+    Family,
     LyapunovExponent,
     Orbit,
     Path,
     action,
+    family,
     find_path,
     lyapunov_exponent,
     lyapunov_spectrum,
@@ -77,6 +79,7 @@ __all__ = [
     "Delayed",
     "Equilibrium",
     "Explanation",
+    "Family",
     "Finding",
     "Findings",
     "FineOutput",
@@ -116,6 +119,7 @@ __all__ = [
     "crossings",
     "cyclic_coordinates",
     "equilibrium",
+    "family",
     "find_path",
     "fit",
     "hamiltonian",

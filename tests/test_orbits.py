@@ -94,3 +94,38 @@ def test_the_figure_of_eight():
     np.testing.assert_allclose(turns, [0.00842272, 0.00842272, 0.29809253, 0.29809253], atol=1e-8)
     assert orbit.stable and orbit.closure < 1e-13
     np.testing.assert_array_equal(orbit.multipliers[4:], 1.0)  # of time, two shifts with their boosts, and turns
+
+
+def test_a_family_of_swings():
+    # Every swing of a pendulum up to the separatrix at E = 1, each with its period in closed form.
+    begin = lagjax.periodic_orbit(PENDULUM, 0.5, 0.0, 6.4)
+    swings = lagjax.family(PENDULUM, begin, until=0.9, step=0.3)
+    assert "until" in swings.message and swings.energy[-1] > 0.9 and not swings.fold.any()
+    np.testing.assert_allclose(swings.period, 4 * ellipk((np.asarray(swings.energy) + 1) / 2), rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_nonlinear_normal_modes_of_a_double_pendulum():
+    scene = lagjax.scenes.double_pendulum()
+    for sign, frequency in zip((1, -1), lagjax.scenes.double_pendulum_frequencies(scene.params), strict=True):
+        shape = np.array([1.0, sign * np.sqrt(2.0)])
+        at_rest, period = np.zeros(2), float(2 * np.pi / frequency)
+        begin = lagjax.periodic_orbit(scene.system, 0.02 * shape, at_rest, period, scene.params)
+        mode = lagjax.family(scene.system, begin, scene.params, until=-25.0, step=0.1)
+        assert "until" in mode.message and np.asarray(mode.closure).max() < 1e-11
+        first = 2 * np.pi / np.asarray(mode.period)[0]
+        np.testing.assert_allclose(first, frequency, rtol=2e-3)  # the amplitude squared
+        pairs = np.asarray(mode.multipliers)
+        np.testing.assert_allclose(pairs[:, 0] * pairs[:, 1], 1.0, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_family_by_a_parameter():
+    swing = lagjax.System(lambda q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+    begin = lagjax.periodic_orbit(swing, 1.0, 0.0, 6.5, {"g": 1.0})
+    swings = lagjax.family(swing, begin, {"g": 1.0}, by="g", until=1.3, step=0.1)
+    np.testing.assert_allclose(swings.period, begin.period)
+    modulus = (np.asarray(swings.energy) / np.asarray(swings.value) + 1) / 2
+    np.testing.assert_allclose(4 * ellipk(modulus) / np.sqrt(swings.value), begin.period, rtol=1e-9)
+    with pytest.raises(ValueError, match="by must be 'energy' or one of"):
+        lagjax.family(swing, begin, {"g": 1.0}, by="length")

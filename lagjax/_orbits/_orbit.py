@@ -152,7 +152,7 @@ class Found(NamedTuple):
 def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> Found:
     """The orbits near these guesses; what does not close well is tried with ever more arcs, and the best counts."""
     arcs = closing.arcs
-    counts = _arcs_each(arcs, y0, period)
+    counts = arcs_each(arcs, y0, period)
     most = np.minimum(_MOST_ARCS, _MORE * counts)
     found = _nothing(len(y0), y0.shape[1])
     waiting = np.arange(len(y0))
@@ -169,7 +169,7 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> Found:
     return found
 
 
-def _arcs_each(arcs: Arcs, y0, period) -> np.ndarray:
+def arcs_each(arcs: Arcs, y0, period) -> np.ndarray:
     """How many arcs each orbit is divided into, powers of two: from the steps that its guess takes."""
     run = arcs.ends(np.stack([np.zeros(len(period)), period], axis=1), y0)
     share = np.where(run.result == SUCCESSFUL, 1.0, np.clip(run.t_end / period, 1e-3, 1.0))
