@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._crossings import Crossings
 from lagjax._fit import Fit
 from lagjax._fit._figures import draw_record
 from lagjax._fit._result import record_matrix
@@ -88,6 +89,65 @@ def path(x, y, *, values=None, label: str | None = None, cmap: str = "viridis", 
     ax.autoscale_view()
     _colorbar(lines, ax, label)
     return ax
+
+
+def poincare(crossings: Crossings, projection: Callable, *, values=None, label: str | None = None, size=None, ax=None):
+    """A Poincaré section: a point for every crossing, of one motion or of a batch; a batch has a colour per member.
+
+    - `projection`: a function of one state (q, qdot) that returns (x, y), the coordinates on the section.
+    - `values`: shape (N,), one number per member of a batch, such as its energy or its Lyapunov exponent, by which
+      points are coloured instead, with a colour bar called `label`. `size` is that of the points, by default as suits
+      how many there are.
+
+    >>> lagjax.plot.poincare(crossings, lambda q, qdot: (q[1], qdot[1]))
+    """
+    x, y, members = _section_points(crossings, projection)
+    ax = _axes(ax)
+    size = np.clip(2e4 / max(1, len(x)), 0.02, 9.0) if size is None else size
+    style: dict[str, Any] = dict(s=size, linewidths=0, rasterized=True)
+    if values is None:
+        ax.scatter(x, y, c=np.array(COLORS)[members % len(COLORS)], **style)
+        return ax
+    points = ax.scatter(x, y, c=np.asarray(values)[members], cmap="viridis", **style)
+    _colorbar(points, ax, label)
+    return ax
+
+
+def return_map(crossings: Crossings, value: Callable, *, ax=None):
+    """The first return map of a section: a `value` of the state at each crossing against that at the one before it.
+
+    - `value`: a function of one state (q, qdot) that returns one number.
+
+    >>> lagjax.plot.return_map(crossings, lambda q, qdot: q[1])
+    """
+    ax = _axes(ax)
+    x, _, members = _section_points(crossings, lambda q, qdot: (value(q, qdot), value(q, qdot)))
+    same = members[1:] == members[:-1]
+    ax.scatter(x[:-1][same], x[1:][same], s=np.clip(2e4 / max(1, len(x)), 0.02, 9.0), color=COLORS[0], linewidths=0)
+    low, high = (float(end) for end in (x.min(initial=0.0), x.max(initial=0.0)))
+    ax.plot([low, high], [low, high], color=GREY, linewidth=0.8)
+    ax.set(xlabel="at one crossing", ylabel="at the next")
+    return ax
+
+
+def _section_points(crossings: Crossings, projection: Callable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x and y of all crossings, and the member that each belongs to. Raises `ValueError` where there are none."""
+    if not isinstance(crossings, Crossings):
+        raise TypeError(
+            f"crossings must be what lagjax.crossings returns for one section; got {type(crossings).__name__}."
+        )
+    t = np.asarray(crossings.t)
+    if not np.isfinite(t).any():
+        raise ValueError(
+            "The section was never crossed: there is nothing to draw. Follow the motion longer, or move it."
+        )
+    states = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[t.ndim :]), (crossings.q, crossings.qdot)
+    )
+    x, y = (np.asarray(value) for value in jax.vmap(projection)(*states))
+    there = np.isfinite(t.ravel())
+    members = np.repeat(np.arange(t.size // t.shape[-1]), t.shape[-1])
+    return x[there], y[there], members[there]
 
 
 def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None):
