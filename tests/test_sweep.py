@@ -191,7 +191,7 @@ def test_goes_on_where_it_stopped(tmp_path, undisturbed):
 
 def test_another_process_goes_on(tmp_path, undisturbed, capsys):
     begun(tmp_path, 1)
-    _job.opened.cache_clear()
+    _job._opened.cache_clear()
     assert command_line.main(["sweep", "run", str(tmp_path / "store"), "--quiet"]) == 0
     assert digests(tmp_path) == undisturbed and "42 of 42" in capsys.readouterr().out
     assert command_line.main(["sweep", "check", str(tmp_path / "store")]) == 0
@@ -344,6 +344,7 @@ def test_a_store_whose_creation_was_interrupted_is_made_anew(tmp_path, undisturb
         (dict(reduce={"nothing": lagjax.Statistics()}), "does not return"),
         (dict(unit=0), "positive whole number"),
         (dict(isolate="yes"), "isolate must be"),
+        (dict(isolate=True, executor=ThreadPoolExecutor()), "or an executor"),
     ],
 )
 def test_mistakes_are_sentences(tmp_path, changes, words):

@@ -180,6 +180,8 @@ def sweep(
     require_flag(progress, "progress")
     settings = dict(rtol=rtol, atol=atol, max_steps=max_steps, event=event, solver=solver)
     motions = Motions(system, np.asarray(ts, float), q0, qdot0, params, _callable(keep), _reduce(reduce), settings)
+    if executor is not None and isolate:
+        raise ValueError("isolate is for sweeps of this process: give it, or an executor, whose processes may die too.")
     axes, place = axes_of(over), Store(Path(store).absolute())
     if place.unfinished_creation():
         place.clear()

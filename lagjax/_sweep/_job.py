@@ -1,5 +1,7 @@
 """`Job`: a store with the functions that belong to it, in a process that is to compute."""
 
+import hashlib
+import json
 import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -49,14 +51,22 @@ def precision(spec: dict) -> Iterator[None]:
         yield
 
 
-@lru_cache(maxsize=4)
 def opened(path: str) -> Job:
-    """The job of a store in a process that knows nothing but its path. Raises where it is not what was begun."""
+    """The job of a store in a process that knows nothing but its path. Raises where it is not what was begun.
+
+    A store that was removed and made anew is another one; each is opened once.
+    """
+    store = Store(Path(path))
+    return _opened(path, hashlib.sha256(json.dumps(store.spec()).encode() + store.scene()).hexdigest())
+
+
+@lru_cache(maxsize=4)
+def _opened(path: str, content: str) -> Job:
     store = Store(Path(path))
     spec = store.spec()
     require_versions(store, spec)
     with precision(spec):
-        motions = unpacked((store.job / "scene.pkl").read_bytes(), spec["path"])
+        motions = unpacked(store.scene(), spec["path"])
         names = [name for axis in spec["axes"] for name in axis["names"]]
         if change := difference(spec["scene"], texts(motions, names)):
             raise ValueError(f"{store.path}: the scene is not here what it was when the store was begun.\n{change}")

@@ -39,7 +39,7 @@ def work(job: Job, tell: Tell = lambda: None, compute_unit: Compute = compute, m
 
 def _to_do(job: Job, worker: Worker, tell: Tell) -> Iterator[int]:
     """The units that this worker has claimed, one after the other, until all are done."""
-    units, own = set(range(job.grid.units)), set()
+    units, own = set(range(job.grid.units)), set()  # of its own the last one may still be in the writer
     while left := sorted(units - job.store.done() - own):
         taken = False
         for unit in left:
@@ -54,8 +54,6 @@ def _to_do(job: Job, worker: Worker, tell: Tell) -> Iterator[int]:
         if not taken:
             tell()
             time.sleep(_POLL)  # others work on the rest, or have died and are being watched
-    while own - job.store.done():
-        return  # the writer has the last ones
 
 
 class _Writer:

@@ -89,6 +89,10 @@ class Store:
             )
         return spec
 
+    def scene(self) -> bytes:
+        """The functions of the sweep, as bytes."""
+        return (self.job / "scene.pkl").read_bytes()
+
     def grid(self, spec: dict) -> Grid:
         """The members and units."""
         return Grid(tuple(spec["shape"]), tuple(spec["chunk"]))
