@@ -424,12 +424,15 @@ def test_a_finer_grid_takes_what_is_known(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_more_members_of_a_design(tmp_path):
+@pytest.mark.parametrize("slice", [16, 2**20])
+def test_more_members_of_a_design(tmp_path, slice, monkeypatch):
+    monkeypatch.setattr(_designs, "SLICE", slice)  # coordinates of more are written by those who compute the members
     over = lambda count: {("length", "angle"): lagjax.random(count, seed=2, low=(0.5, 0.0), high=(1.5, 3.0))}
     few = begun(tmp_path, 3, over=over(45)).path  # of which 30 are done
     swept(tmp_path, over(75), store=tmp_path / "whole")
     many = swept(tmp_path, over(75), store=tmp_path / "many", extend=few)
-    assert digests(tmp_path, "many") == digests(tmp_path, "whole") and many.status().results == {"successful": 75}
+    assert digests(tmp_path, "many") == digests(tmp_path, "whole") and not many.open().angle.isnull().any()
+    assert many.status().results == {"successful": 75}
 
 
 # ---- other processes -------------------------------------------------------------------------------------------------

@@ -38,46 +38,47 @@ class Design:
         """What the rule is, without the count."""
         return {"rule": self.kind, "seed": self.seed, "low": list(self.low), "high": list(self.high)}
 
-    def pieces(self, names: tuple[str, ...]):
-        """Yield (start, values (m, names)) one after the other, m at most `SLICE`."""
+    @classmethod
+    def of(cls, axis: dict) -> "Design":
+        """The rule of an axis that a store describes."""
+        return cls(axis["rule"], axis["size"], axis["seed"], tuple(axis["low"]), tuple(axis["high"]))
+
+    def piece(self, names: tuple[str, ...], start: int) -> np.ndarray:
+        """The values (m, names) from the one with the number `start` on, a multiple of `SLICE`; m is at most that."""
         draw = {"random": self._random, "sobol": self._sobol, "latin_hypercube": self._hypercube}[self.kind]
-        for start, units in draw(names):
-            columns = np.empty(units.shape[::-1])  # one by one: a loop over so few names would be the inner one
-            for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
-                np.multiply(units[:, k], high - low, out=columns[k])
-                columns[k] += low
-            yield start, columns.T
+        units = draw(names, start, min(SLICE, self.count - start))
+        columns = np.empty(units.shape[::-1])  # one by one: a loop over so few names would be the inner one
+        for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
+            np.multiply(units[:, k], high - low, out=columns[k])
+            columns[k] += low
+        return columns.T
 
     def _key(self, names: tuple[str, ...]) -> int:
         """Of 128 bits, from the seed and the names: two axes with one seed are drawn independently."""
         mixed = int.from_bytes(hashlib.sha256("\n".join(names).encode()).digest()[:8], "little")
         return (mixed << 64) | self.seed
 
-    def _random(self, names):
+    def _random(self, names, start: int, count: int) -> np.ndarray:
         """Member k takes numbers k·d … k·d + d − 1 of the counter-based generator Philox 4×64."""
-        size = len(names)
-        for start in range(0, self.count, SLICE):
-            bits = np.random.Philox(key=self._key(names))
-            block, inside = divmod(start * size, 4)  # the counter goes on by one for each four numbers
-            bits.advance(block)
-            numbers = np.random.Generator(bits).random(inside + size * min(SLICE, self.count - start))
-            yield start, numbers[inside:].reshape(-1, size)
+        bits = np.random.Philox(key=self._key(names))
+        block, inside = divmod(start * len(names), 4)  # the counter goes on by one for each four numbers
+        bits.advance(block)
+        numbers = np.random.Generator(bits).random(inside + count * len(names))
+        return numbers[inside:].reshape(-1, len(names))
 
-    def _sobol(self, names):
+    def _sobol(self, names, start: int, count: int) -> np.ndarray:
         from scipy.stats import qmc
 
         engine = qmc.Sobol(len(names), scramble=True, rng=np.random.default_rng(self._key(names)))
-        for start in range(0, self.count, SLICE):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # that the count is no power of two: the user's choice
-                yield start, engine.random(min(SLICE, self.count - start))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that the count is no power of two: the user's choice
+            return (engine.fast_forward(start) if start else engine).random(count)
 
-    def _hypercube(self, names):
+    def _hypercube(self, names, start: int, count: int) -> np.ndarray:
         from scipy.stats import qmc
 
         everything = qmc.LatinHypercube(len(names), rng=np.random.default_rng(self._key(names))).random(self.count)
-        for start in range(0, self.count, SLICE):
-            yield start, everything[start : start + SLICE]
+        return everything[start : start + count]
 
 
 def random(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:

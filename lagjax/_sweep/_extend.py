@@ -6,6 +6,7 @@ are written at once; of the others the known members stand aside, until their un
 """
 
 import json
+from functools import partial
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def carry(old: Store, new: Store) -> int:
     """Take what is known from `old` into `new`, of which nothing is done yet; how many members that is."""
     before, spec, total = old.spec(), new.spec(), 0
     (new.job / KNOWN).mkdir(exist_ok=True)
-    grid, places = new.grid(spec), [_places(old, new, axis["names"]) for axis in spec["axes"]]
+    grid, places = new.grid(spec), list(map(partial(_places, old, new), before["axes"], spec["axes"]))
     for unit in range(grid.units):
         box = [x[part] for x, part in zip(places, grid.box(unit), strict=True)]
         inside = [np.flatnonzero(x >= 0) for x in box]
@@ -64,9 +65,10 @@ def carry(old: Store, new: Store) -> int:
     return total
 
 
-def _places(old: Store, new: Store, names: list[str]) -> np.ndarray:
+def _places(old: Store, new: Store, of_old: dict, of_new: dict) -> np.ndarray:
     """For each place along an axis of `new` the one in `old` with the same values; −1 where there is none."""
-    before, now = (np.stack([np.asarray(s.array(name)[:]) for name in names], axis=1) for s in (old, new))
+    sides = [s.coordinates([axis], (slice(0, axis["size"]),))[0] for s, axis in ((old, of_old), (new, of_new))]
+    before, now = (np.stack([side[name] for name in of_new["names"]], axis=1) for side in sides)
     if len(before) <= len(now) and np.array_equal(before, now[: len(before)]):  # as of a design with more members
         return np.concatenate([np.arange(len(before)), np.full(len(now) - len(before), -1)])
     known = {row.tobytes(): k for k, row in enumerate(before)}

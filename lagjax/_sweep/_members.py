@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lagjax._sweep import _designs
 from lagjax._sweep._designs import Design
 
 RESERVED = ("result",)
@@ -35,7 +36,8 @@ class Axis:
     def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
         """(start, values (m, names)), one after the other."""
         if isinstance(self.source, Design):
-            yield from self.source.pieces(self.names)
+            for start in range(0, self.size, _designs.SLICE):
+                yield start, self.source.piece(self.names, start)
         else:
             yield 0, np.stack(self.source, axis=1)
 

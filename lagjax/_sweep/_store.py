@@ -24,7 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from lagjax._sweep._designs import SLICE
+from lagjax._sweep import _designs
+from lagjax._sweep._designs import Design
 from lagjax._sweep._members import Axis, Grid
 
 FORMAT = 1
@@ -132,11 +133,25 @@ class Store:
             self.write(self.job / "spec.json", json.dumps(spec, indent=1, ensure_ascii=False).encode(), "spec")
 
     def coordinates(self, axes: list[dict], box: tuple[slice, ...]) -> list[dict[str, np.ndarray]]:
-        """The values along each axis of a box of members, by names."""
-        return [
-            {name: np.asarray(self.array(name)[part]) for name in axis["names"]}
-            for axis, part in zip(axes, box, strict=True)
-        ]
+        """The values along each axis of a box of members, by names; long designs are written when first read."""
+        sides = []
+        for axis, part in zip(axes, box, strict=True):
+            if _is_drawn_late(axis["rule"], axis["size"]):
+                for k in range(part.start // _designs.SLICE, (part.stop - 1) // _designs.SLICE + 1):
+                    self._draw(axis, k)
+            sides.append({name: np.asarray(self.array(name)[part]) for name in axis["names"]})
+        return sides
+
+    def _draw(self, axis: dict, k: int) -> None:
+        """Write chunk k of the coordinates of a design, where it is not there; whoever does writes the same."""
+        files = [self.path / name / "c" / str(k) for name in axis["names"]]
+        if all(file.exists() for file in files):
+            return
+        values = Design.of(axis).piece(tuple(axis["names"]), k * _designs.SLICE)
+        for file, column in zip(files, values.T, strict=True):
+            chunk = np.full(_designs.SLICE, np.nan)
+            chunk[: len(column)] = column
+            self.write(file, chunk.astype("<f8", copy=False).data, f"{file.parent.parent.name}-{k}")
 
     def array(self, name: str):
         """An array of the store, to be read from."""
@@ -296,19 +311,27 @@ def write_through(file: Path, data) -> None:
         os.fsync(opened.fileno())
 
 
+def _is_drawn_late(rule: str, size: int) -> bool:
+    """Whether the coordinates of an axis are written by those who compute its members: so that 10⁸ cost no time."""
+    return rule != "values" and size > _designs.SLICE
+
+
 def _write_axis(group, axis: Axis) -> None:
     """The values along an axis as coordinates, some at a time."""
+    chunk = min(axis.size, _designs.SLICE)
     arrays = [
         group.create_array(
-            name, shape=(axis.size,), chunks=(min(axis.size, SLICE),), dtype="float64", compressors=None, filters=None,
+            name, shape=(axis.size,), chunks=(chunk,), dtype="float64", compressors=None, filters=None,
             fill_value=np.nan, dimension_names=(axis.dimension,),
         )
         for name in axis.names
     ]  # fmt: skip
+    if isinstance(axis.source, Design) and _is_drawn_late(axis.source.kind, axis.size):
+        return
     for start, values in axis.pieces():
         for column, array in zip(values.T, arrays, strict=True):
-            for begin in range(0, len(column), SLICE):
-                array[start + begin : start + begin + SLICE] = column[begin : begin + SLICE]
+            for begin in range(0, len(column), _designs.SLICE):
+                array[start + begin : start + begin + _designs.SLICE] = column[begin : begin + _designs.SLICE]
 
 
 def require_zarr():
