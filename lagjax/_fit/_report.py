@@ -62,15 +62,17 @@ def pictures_of(records, residuals: list[np.ndarray], names, sigma, covariance, 
 
         return _picture((max(6.4, 3.6 * count), 4.2), draw)
 
-    shown = np.unique(np.linspace(0, len(records) - 1, min(len(records), _RECORDS)).astype(int))
-    heading = "Data over fit, and residuals"
-    if len(shown) < len(records) or count < len(names):
-        heading += f" (records {', '.join(map(str, shown))} of {len(records)}; {count} of {len(names)} signals)"
-    figures = {heading: [one(records[k], residuals[k]) for k in shown]}
-    every = np.concatenate(residuals)
-    figures["Residuals against the normal distribution"] = [
-        _picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))
-    ]
+    figures = {}
+    if len(records):
+        shown = np.unique(np.linspace(0, len(records) - 1, min(len(records), _RECORDS)).astype(int))
+        heading = "Data over fit, and residuals"
+        if len(shown) < len(records) or count < len(names):
+            heading += f" (records {', '.join(map(str, shown))} of {len(records)}; {count} of {len(names)} signals)"
+        figures[heading] = [one(records[k], residuals[k]) for k in shown]
+        every = np.concatenate(residuals)
+        figures["Residuals against the normal distribution"] = [
+            _picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))
+        ]
     side = min(3.2 + 0.45 * len(covariance.names), 12.0)
     figures["Correlations of the parameters"] = [
         _picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), covariance.matrix, covariance.names))
