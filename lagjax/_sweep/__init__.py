@@ -7,6 +7,7 @@ _statistics          what is said of all members without a list
 _scene               the user's functions: text, hash, the way to another process
 _store, _claims      the files; who has which unit
 _batch, _job, _unit  what computes a unit
+_begin, _extend      stores that are begun; those that take members of another one
 _run, _isolate       workers: here, in children, by executors
 _status              how far it is
 """
