@@ -396,6 +396,14 @@ def along(directions, rows=1, states=2):
 
 
 @pytest.mark.slow
+def test_restitution_comes_out_of_the_times_of_bounces():
+    example = importlib.import_module("bounces")
+    params, half, residuals = example.main([])
+    assert (np.abs(params - example.TRUTH) < 2 * half).all()
+    assert half[1] < 2e-3 and np.sqrt(np.mean(residuals**2)) < 1.5 * example.SIGMA
+
+
+@pytest.mark.slow
 def test_the_real_axis_with_dry_friction(capsys):
     file = Path(__file__).parents[2] / "shared" / "data" / "emps_identification.npz"
     if not file.exists():
