@@ -18,8 +18,8 @@ import numpy as np
 import lagjax
 
 SIGMA, FRICTION = 0.01, 0.05
-TS = np.linspace(0.0, 4.0, 61)
-RECORDS, HELD_OUT = 10, 3
+TS = np.linspace(0.0, 4.0, 81)
+RECORDS, HELD_OUT = 12, 3
 FIRST = 1.0  # from which the start of the motion in the picture is found
 
 
@@ -85,12 +85,13 @@ def picture(fit, values, held, file):
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, nargs="?", default=Path("out"), help="folder for the picture")
+    parser.add_argument("--progress", action="store_true", help="print how the search goes")
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
 
     values, exact, starts = recordings()
     seen = slice(0, RECORDS - HELD_OUT)
-    fit = learned(values[seen])
+    fit = learned(values[seen], progress=options.progress)
     print(fit)
     errors = held_out_errors(fit, exact[-HELD_OUT:], starts[-HELD_OUT:])
     print(f"\nfriction {float(fit.params['c']):.4f} (true {FRICTION})")

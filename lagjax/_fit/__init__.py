@@ -277,13 +277,13 @@ def _start(record: Measured, readers: list[Reader | None] | None, layout: Layout
 
 
 def _by_gradient(question: Question, system: System, u, y0, noise, readers) -> Descent:
-    """The descent by gradients: over the shortest segments of the records, where they can be read, then over all."""
+    """The descent by gradients: over segments of the records that grow, where they can be read, then over all."""
     told, question.watch = question.watch, None
     tell = None if told is None else lambda text: print(text, file=sys.stderr, flush=True)
     steps = _STEPS
     if readers is not None:
-        u = _weakly(question, system, u, readers)
-        u, steps = _over_segments(question, system, u, noise, readers, tell), _STEPS - _STEPS // 3
+        u = _over_segments(question, system, _weakly(question, system, u, readers), noise, readers, tell)
+        steps = _STEPS // 3
     done = descend(question, system, u, y0, noise, steps, tell)
     if not isinstance(done, Failure):
         done = ended(question, done[0], done[1], noise, _STEPS, done[2])
@@ -301,17 +301,17 @@ def _weakly(question: Question, system: System, u, readers: list[Reader | None])
 
 
 def _over_segments(question: Question, system: System, u, noise, readers, tell) -> np.ndarray:
-    """The u that a third of the steps come to over short segments, each with a start of its own."""
+    """The u that two thirds of the steps come to over segments that grow, each with a start of its own."""
     reading = [reader for reader in readers if reader is not None]
     recordings = [None if reader is None else reader.record for reader in readers]
     cuts = levels(recordings, time_scale(reading, question.motions, question.parameters.numbers(u)))
-    if not cuts or question.clocks:
-        return u
-    pieces = cuts[0]
-    states = np.stack([readers[piece.record].states(piece.places[:1])[0] for piece in pieces])
-    part = question.of(pieces, np.ones(len(pieces), bool))
-    done = descend(part, system, u, states, noise, _STEPS // 3, tell)
-    return u if isinstance(done, Failure) else done[0]
+    for pieces in [] if question.clocks else cuts:
+        states = np.stack([readers[piece.record].states(piece.places[:1])[0] for piece in pieces])
+        part = question.of(pieces, np.ones(len(pieces), bool))
+        done = descend(part, system, u, states, noise, 2 * _STEPS // (3 * len(cuts)), tell)
+        if not isinstance(done, Failure):
+            u = done[0]
+    return u
 
 
 def _searches(question: Question, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:

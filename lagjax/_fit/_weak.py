@@ -57,6 +57,8 @@ def weak_start(question: Question, system: System, u: np.ndarray, readers: list[
         return None
     residuals, dtype = imbalance(question, system, readers, scale), question.layout.dtype
     value, slope = jax.jit(residuals), jax.jit(jax.jacfwd(residuals))
+    if jax.eval_shape(residuals, u.astype(dtype)).size < 2 * len(u):
+        return None  # a network would follow the noise of so few windows
     to_host: Any = lambda f: lambda u: np.asarray(f(u.astype(dtype)), float)  # noqa: E731
     if not (np.isfinite(to_host(value)(u)).all() and np.isfinite(to_host(slope)(u)).all()):
         return None
