@@ -71,8 +71,6 @@ def picture(fit, values, held, file):
     left.set(xlabel="q", ylabel="V")
     left.legend(frameon=False)
     prediction = fit.predict(lagjax.Record(TS, np.where(TS < FIRST, held, np.nan)))
-    low, high = prediction.bands()
-    right.fill_between(TS, low, high, color="#0072B2", alpha=0.25, linewidth=0, label="95 % band")
     right.axvline(FIRST, color="0.7", linewidth=1)
     right.plot(TS, held, ".", color="0.4", label="held out; its start is from the left of the line")
     right.plot(TS, prediction.values, color="#0072B2", label="predicted")

@@ -124,3 +124,19 @@ def test_bands_hold_new_samples_and_widen_away_from_the_data(done):
     # With all data the standard deviation of the curve is that of the least squares: the trace of the hat matrix.
     whole = done.predict(done.records[0]).deviation
     assert np.sum((whole / done.noise["q"].sigma) ** 2) == pytest.approx(4 * len(TS) / (len(TS) - 4), rel=0.02)
+
+
+def test_a_prediction_that_depends_on_what_is_seen_has_a_band():
+    # Only the products m root² and m c enter beside m: a common factor is free, and moves no prediction.
+    scene = lagjax.System(
+        lambda q, v, params: 0.5 * params["m"] * v**2 - 0.5 * params["k"] * q**2,
+        forces=lambda q, v, params: -params["c"] * v,
+    )
+    one = record()
+    free, kept = (
+        lagjax.fit(scene, one, {"m": 1.0, "k": 2.25, "c": 0.1}, free={"m": m, "k": True, "c": True})
+        for m in (True, False)
+    )
+    assert len(free.unseen) == 1
+    np.testing.assert_allclose(free.predict(one).deviation, kept.predict(one).deviation, rtol=1e-3)
+    np.testing.assert_allclose(free.start_intervals()[0][0], kept.start_intervals()[0][0], rtol=1e-3)

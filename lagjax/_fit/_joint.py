@@ -47,11 +47,10 @@ def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Info
     follows = into.T @ b.reshape(-1, b.shape[-1])
     own = np.concatenate([into.reshape(a.shape), b - a @ follows], axis=-1)
     square = np.sum([correlated_square(own[None, :, s], lags[s]) for s in range(len(lags))], axis=0)
-    unseen = ~np.isfinite(np.diag(known.covariance))
-    covariance = np.where(unseen[:, None] | unseen, 0.0, known.covariance)
+    covariance = _of_seen(known)
     shared = square[:states, states:] @ known.white @ follows.T
     found = known.lost * (square[:states, :states] - shared - shared.T) + follows @ covariance @ follows.T
-    lost = (np.abs(v[~sees]) > 1e-6).any(axis=0) | (np.abs(follows[:, unseen]) > 1e-12).any(axis=1)
+    lost = (np.abs(v[~sees]) > 1e-6).any(axis=0) | _moves(follows, known)
     found[lost], found[:, lost] = np.nan, np.nan
     found[lost, lost] = np.inf
     return found, follows
@@ -77,9 +76,18 @@ def deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.n
     """
     a = slopes[..., :states]
     along = slopes[..., states:] - a @ follows
-    covariance = known.covariance
-    unseen = ~np.isfinite(np.diag(covariance))
-    covariance = np.where(unseen[:, None] | unseen, 0.0, covariance)
+    covariance = _of_seen(known)
     variance = np.einsum("tsf,fg,tsg->ts", along, covariance, along) + np.einsum("tsi,ij,tsj->ts", a, start, a)
-    moved = (np.abs(along[..., unseen]) > 1e-9 * np.abs(along).max(initial=0.0)).any(axis=-1)
-    return np.where(moved, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+    return np.where(_moves(along, known), np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _of_seen(known: Information) -> np.ndarray:
+    """The covariance (F, F) of what is seen, zero along what is not; with white residuals where some is not."""
+    return known.covariance if not known.null.size else known.lost * known.white
+
+
+def _moves(rows: np.ndarray, known: Information) -> np.ndarray:
+    """Whether rows (..., F) of derivatives depend on a direction that is not seen."""
+    if not known.null.size:
+        return np.zeros(rows.shape[:-1], bool)
+    return (np.abs(rows @ known.null) > 1e-6 * np.abs(rows).max(initial=0.0)).any(axis=-1)
