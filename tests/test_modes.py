@@ -240,6 +240,34 @@ def test_zero_modes_of_cyclic_coordinates():
 
 
 @pytest.mark.slow
+def test_what_has_no_modes_is_said():
+    sliding = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - 0.5 * q @ q)
+    with pytest.raises(ValueError, match="mass matrix is singular or not positive definite"):
+        lagjax.normal_modes(sliding, jnp.zeros(2))
+    down, twice = jnp.array([0.0, -1.0]), lambda q: [q @ q - 1.0, 2 * (q @ q) - 2.0]
+    redundant = lagjax.System(lambda q, v, params: 0.5 * v @ v - params * q[1], constraints=twice)
+    with pytest.raises(ValueError, match="Drop the redundant ones"):
+        jax.jit(lambda g: lagjax.normal_modes(redundant, down, g).frequencies)(G)
+
+
+@pytest.mark.slow
+def test_a_molecule_has_three_zero_modes_in_the_plane():
+    def molecule(q, v, params):
+        masses = jnp.array([16.0, 1.0, 1.0])
+        stretched = [jnp.sqrt(jnp.sum((q[i] - q[j]) ** 2)) - r for i, j, r in ((0, 1, 1.0), (0, 2, 1.0), (1, 2, 1.5))]
+        return 0.5 * jnp.sum(masses[:, None] * v**2) - 0.5 * params * sum(x**2 for x in stretched)
+
+    system, guess = lagjax.System(molecule), jnp.array([[0.0, 0.0], [0.8, 0.7], [-0.8, 0.6]])
+
+    def frequencies(stiffness):
+        return lagjax.normal_modes(system, lagjax.equilibrium(system, guess, stiffness).q, stiffness).frequencies
+
+    found = frequencies(1.0)
+    np.testing.assert_array_equal(found[:3], 0.0)
+    np.testing.assert_allclose(jax.jacfwd(frequencies)(1.0), 0.5 * found, atol=1e-10)
+
+
+@pytest.mark.slow
 def test_linearization():
     q, v = jnp.array([0.3, 0.2]), jnp.array([1.0, 2.0])
     linear = lagjax.linearize(DOUBLE, q, v, EQUAL)

@@ -144,6 +144,16 @@ def test_combinations():
 
 
 @pytest.mark.slow
+def test_toda_and_a_damped_oscillator():
+    toda = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.sum(jnp.exp(q - jnp.roll(q, -1))))
+    assert names(toda, jnp.zeros(3), jnp.ones(3)) == ["energy", "total momentum", "centre of all coordinates"]
+    damped = lagjax.System(lambda q, v, t: jnp.exp(0.4 * t) * (0.5 * v**2 - 0.5 * q**2))  # Caldirola and Kanai
+    assert names(damped, 1.0, 0.5) == ["combination: +1 time translation, -0.2 scaling of q"]
+    with pytest.raises(ValueError, match="finite at no state"):
+        names(lagjax.System(lambda q, v: 0.5 * v**2 + jnp.log(q)), -5.0, 0.5)
+
+
+@pytest.mark.slow
 def test_a_gauge_that_is_no_polynomial():
     hidden = lagjax.System(lambda q, v: 0.5 * v @ v + jnp.cos(q[0]) * v[0] * q[1] + jnp.sin(q[0]) * v[1])
     found = {c.name: c for c in lagjax.conserved_quantities(hidden, jnp.ones(2), jnp.ones(2))}

@@ -38,9 +38,17 @@ class Changes(NamedTuple):
 
 
 def changes_of(scene: Scene, fields: Fields, weights: np.ndarray, states: State) -> tuple[Changes, State]:
-    """Those of the transformations with these weights (D, K), at the states where they are finite, and these states."""
+    """Those of the transformations with these weights (D, K), at the states where they are finite, and these states.
+
+    Raises `ValueError` where there are none.
+    """
     parts = [np.asarray(x) for x in _changes(jnp.asarray(weights), fields, states, *scene.arguments)]
     well = np.logical_and.reduce([np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in parts])
+    if not well.any():
+        raise ValueError(
+            "The Lagrangian is finite at no state about (q, qdot), although derivatives are: give a state in "
+            "the middle of where motions take place."
+        )
     return Changes(*(x[well] for x in parts)), State(*(x[well] for x in states))
 
 

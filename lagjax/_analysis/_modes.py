@@ -21,6 +21,7 @@ from lagjax._analysis._linearize import steady_matrices
 from lagjax._analysis._scene import Scene
 from lagjax._failures import nan_unless
 from lagjax._linear import dependent_rows, factorize, least_norm, schur_complement
+from lagjax._linear import rank as rank_of
 from lagjax._system import System
 from lagjax._validate import is_concrete
 
@@ -37,7 +38,8 @@ class Modes(eqx.Module):
 
     - `frequencies` (n,): ω in radians per unit of time; zero for a mode that does not oscillate.
     - `shapes`: the deviation of every coordinate, in the structure of q with the mode as first axis. Real, xᵀM x = 1
-      and the largest entry positive, where nothing turns or damps; else complex with xᴴM x = 1.
+      and the largest entry positive, where nothing turns or damps and L has a scalar program (see
+      `System.explain`); else complex with xᴴM x = 1.
     - `stable` (): whether no mode grows exponentially. A mode of frequency zero may still drift away.
     - `exponents` (n, 2), complex: both s of e^{st}, iω and −iω of an oscillation, ±κ of an instability.
     - `damping_ratios` (n,): −Re s/|s| of the first of them; zero without damping.
@@ -99,7 +101,8 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     (critical damping).
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a scene that depends on the time, or a q
-    that is no equilibrium; inside `jit` the modes are NaN there. So they are where M is not positive definite.
+    that is no equilibrium, or where M is not positive definite; inside `jit` the modes are NaN there. Inside `jit` all
+    constraints count as independent, and modes are NaN where they are not.
 
     Source: Landau & Lifshitz, *Mechanics*, §23–25; Routh, *Stability of a Given State of Motion*, ch. IV; derivatives:
     Fox & Kapoor, AIAA J. 6 (1968) 2426.
@@ -117,10 +120,15 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     cyclic, rank = scene.conserved, _rank(scene)
     reversible = scene.reversible and qdot is None
     exponents, shapes, residual = _modes(cyclic, rank, reversible, *scene.arguments)
-    if scene.concrete and residual > _BALANCED:
+    if scene.concrete and not residual <= _BALANCED:
         raise ValueError(
             f"q is not an equilibrium: forces are left that a deviation of {float(residual):.2g} of q's size would "
             "make. Find one first: q = lagjax.equilibrium(system, q, params).q."
+        )
+    if scene.concrete and not np.isfinite(np.asarray(exponents)).all():
+        raise ValueError(
+            "There are no modes: the mass matrix is singular or not positive definite at q, so that small motions are "
+            "no oscillations there. lagjax.check(system, q, qdot) tells which velocity has no kinetic energy."
         )
     size = jnp.max(jnp.abs(exponents), initial=0)
     stable = jnp.all(exponents.real <= _grows_beyond(size)) & jnp.all(jnp.isfinite(exponents))
@@ -140,6 +148,11 @@ def _rank(scene: Scene) -> int:
         return 0
     jacobian = scene.jacobian(scene.q, scene.qdot)
     if not scene.concrete:
+        if len(jacobian) >= scene.layout.size:
+            raise ValueError(
+                f"There are {len(jacobian)} constraints for {scene.layout.size} coordinates, which leave nothing to "
+                "oscillate if they are independent, as they count inside jit, vmap and grad. Drop the redundant ones."
+            )
         return len(jacobian)
     schur = schur_complement(scene.mass_matrix(scene.q, scene.qdot), jacobian)
     return len(jacobian) - len(dependent_rows(np.asarray(schur)))
@@ -151,7 +164,7 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
     scene = Scene.flat(*arguments)
     q = scene.q
     mass, rates, stiffness, jacobian, left = steady_matrices(scene, q)
-    residual = _distance(scene, q, left, stiffness)
+    residual = _distance(scene, q, left, stiffness) + jnp.where(_rank_is(jacobian, rank), 0, jnp.nan)
     keep = np.array([i for i in range(len(q)) if i not in cyclic], int)
     gone = np.array(cyclic, int)
     reduced, follow = _without_cyclic(mass, rates, stiffness, keep, gone)
@@ -171,6 +184,15 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
     balanced = residual <= _BALANCED
     exponents = jax.lax.complex(*(nan_unless(balanced, x) for x in (exponents.real, exponents.imag)))[order]
     return exponents, jnp.where(balanced, shapes, jnp.nan), residual
+
+
+def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
+    """Whether so many of the constraints are independent."""
+    if not len(jacobian):
+        return jnp.asarray(True)
+    lengths = jnp.sqrt(jnp.sum(jacobian**2, axis=1, keepdims=True))
+    unit = jax.lax.stop_gradient(jacobian / jnp.where(lengths > 0, lengths, 1))
+    return rank_of(unit @ unit.T) == rank
 
 
 def _distance(scene: Scene, q: Vector, left: Vector, stiffness: Matrix) -> Float[Array, ""]:
