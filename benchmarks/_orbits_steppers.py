@@ -2,9 +2,9 @@
 
     python -m benchmarks._orbits_steppers --periods 10000
 
-Störmer–Verlet, which is the variational integrator of order 2, and symmetric compositions of it of order 4 (3
-stages), 6 (9) and 8 (15), compiled by numba, with summation that carries rounding errors; against Taylor series
-of lagjax for one motion. Each at several steps or tolerances: CPU seconds, and the largest relative error of the energy.
+Störmer–Verlet, the variational integrator of order 2, and symmetric compositions of it of order 4 (3 stages), 6 (9)
+and 8 (15), compiled by numba, with summation that carries rounding errors; against Taylor series of lagjax for one
+motion. Each at several steps or tolerances: CPU seconds, and the largest relative error of the energy.
 
 Source: Yoshida, Phys. Lett. A 150 (1990) 262; Kahan & Li, Math. Comp. 66 (1997) 1089; Hairer, Lubich & Wanner,
 *Geometric Numerical Integration*, §V.3, §VI.6 and §VIII.5.

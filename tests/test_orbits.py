@@ -129,3 +129,14 @@ def test_a_family_by_a_parameter():
     np.testing.assert_allclose(4 * ellipk(modulus) / np.sqrt(swings.value), begin.period, rtol=1e-9)
     with pytest.raises(ValueError, match="by must be 'energy' or one of"):
         lagjax.family(swing, begin, {"g": 1.0}, by="length")
+
+
+@pytest.mark.slow
+def test_a_family_that_ends_says_where():
+    # At E = 1 is the separatrix, whose period is infinite.
+    begin = lagjax.periodic_orbit(PENDULUM, 2.0, 0.0, 8.0)
+    swings = lagjax.family(PENDULUM, begin, until=2.0, step=1.0, count=60)
+    assert swings.energy[-1] < 1.0 and swings.energy[-1] > 0.9
+    assert "could not be followed beyond" in swings.message or "raise count" in swings.message
+    with pytest.raises(ValueError, match="must be one periodic orbit that is ok"):
+        lagjax.family(PENDULUM, begin._replace(ok=jnp.asarray(False)))
