@@ -36,6 +36,7 @@ from lagjax._fit._result import Covariance, Fit, SignalNoise
 from lagjax._fit._segments import Reader, glimpses, levels, time_scale, whole
 from lagjax._fit._signals import Signals, looks_like_positions
 from lagjax._fit._solve import Anchor, Descent, minimise
+from lagjax._fit._starts import Manifold
 from lagjax._fit._timings import Clock, Timings
 from lagjax._fit._transforms import angle, between, inertia, positive, simplex
 from lagjax._fit._uncertainty import Information, information
@@ -155,6 +156,8 @@ def fit(
     question = _question(system, records, layout, parameters, observe, form)
     if starts > 1 and isinstance(observe, Delayed):
         raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")
+    if starts > 1 and question.manifold is not None:
+        raise ValueError("starts must be 1 where starts on constraints are fitted: their search has one beginning.")
     if starts > 1 and question.clocks:
         raise ValueError("starts must be 1 where there are lagjax.Timings: their search has one beginning.")
     first = next((record for record in records if isinstance(record, Record)), None)
@@ -229,14 +232,17 @@ def _question(system, records, layout, parameters, observe, form) -> Question:
     if timings:
         size = np.append(size, max(np.ptp(record.ts) for record in timings.values()))
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
+    manifold = None
     if fitted.any() and has_constraints(system):
-        raise ValueError(
-            f"records[{int(np.argmax(fitted))}] has no known start: a start on constraints cannot be fitted yet. Give "
-            "start=(q0, qdot0), or use coordinates without constraints."
-        )
+        if form is not None and asks(system):
+            raise ValueError(
+                "A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0)."
+            )
+        manifold = Manifold(system, layout, parameters, motions.projection)
     return Question(
-        records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol, clocks
-    )
+        records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol, clocks,
+        manifold,
+    )  # fmt: skip
 
 
 def _require_longer(recordings: list[Record], longest: float) -> None:

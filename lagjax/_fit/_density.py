@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
+from scipy.special import polygamma
 
 from lagjax._fit._inputs import Driven, asks
 from lagjax._fit._noise import AbstractNoise, StudentT, Widths
@@ -48,6 +49,8 @@ class Density:
         self, question: Question, system: System, noise: AbstractNoise, point: Point, widths: Widths,
         shares: np.ndarray, prior: Callable | None = None,
     ):  # fmt: skip
+        if question.manifold is not None:
+            raise ValueError("There is no density for starts on constraints that are fitted: give start=(q0, qdot0).")
         if question.signals.delays is not None:
             raise ValueError("There is no density for lagjax.Delayed sensors: keep the delay, and shift the times.")
         self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths
@@ -158,6 +161,24 @@ class Density:
         each = jnp.where(self._tails, tails, -0.5 * squares) - jnp.log(at.sigma)
         return jnp.sum(jnp.where(batch.weights > 0, each * self.shares, 0.0))
 
+    def _of_noise(self, samples: np.ndarray) -> np.ndarray:
+        """The covariance of log σ, and of the numbers that move ν, from Fisher's information of so many samples (S,).
+
+        Per sample of Student's t it is 2ν/(ν+3) for log σ, [ψ′(ν/2) − ψ′((ν+1)/2)]/4 − (ν+5)/(2ν(ν+1)(ν+3)) for ν and
+        −2/((ν+1)(ν+3)) between them. Source: Lange, Little & Taylor (1989), appendix B.
+        """
+        count, d = len(samples), np.where(self._tails, self.widths.dof, 1.0)
+        information = np.diag(samples * np.where(self._tails, 2 * d / (d + 3), 2.0))
+        if self._moves_dof:
+            share = 1 / (1 + np.exp(-self.first[-count:]))
+            rate = d * math.log(_MOST_DOF / _LEAST_DOF) * share * (1 - share)
+            own = 0.25 * (polygamma(1, d / 2) - polygamma(1, (d + 1) / 2)) - (d + 5) / (2 * d * (d + 1) * (d + 3))
+            both = np.diag(-2 * samples * rate / ((d + 1) * (d + 3)))
+            information = np.block(
+                [[information, both], [both, np.diag(samples * own * rate**2 + 2 * share * (1 - share))]]
+            )
+        return np.linalg.inv(information)
+
     def covariance(self) -> np.ndarray:
         """The covariance (D, D) of x in the approximation of least squares, about the fit.
 
@@ -183,8 +204,7 @@ class Density:
         unit = precision / np.outer(scale, scale)
         if np.linalg.eigvalsh(unit).min() < 1e-13:
             raise ValueError("Some combination of the parameters and starts is not seen: keep it fixed.")
-        samples = (question.weights > 0).sum(axis=0) * self.shares
-        rest = [*0.5 / samples, *np.full(len(self) - size - len(samples), 0.25)]
-        found = np.diag(np.concatenate([np.zeros(size), rest]))
+        found = np.zeros((len(self), len(self)))
+        found[size:, size:] = self._of_noise((question.weights > 0).sum(axis=0) * self.shares)
         found[:size, :size] = np.linalg.inv(unit) / np.outer(scale, scale)
         return found

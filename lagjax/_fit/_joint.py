@@ -34,12 +34,16 @@ def of_starts(question: Question, point: Point, widths: Widths, known: Informati
         rows = np.sqrt(batch.weights)[..., None] / widths.sigma[:, None] * slopes
         for row, piece in zip(batch.rows.tolist(), rows, strict=True):
             if question.fitted[row]:
-                found.covariance[row], found.follows[row] = _of_start(piece, states, lags, known)
+                across = np.zeros((states, states)) if point.across is None else point.across[row]
+                found.covariance[row], found.follows[row] = _of_start(piece, states, lags, known, across)
     return found
 
 
-def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Information):
-    """The covariance (2n, 2n) of one start, and A⁺B, from its weighted rows (T, S, 2n + F)."""
+def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Information, across: np.ndarray):
+    """The covariance (2n, 2n) of one start, and A⁺B, from its weighted rows (T, S, 2n + F).
+
+    What is `across` (2n, 2n) the constraints is not free, and no less known for not being seen.
+    """
     a, b = rows[..., :states], rows[..., states:]
     u, values, v = np.linalg.svd(a.reshape(-1, states), full_matrices=False)
     sees = values > 1e-10 * values.max()
@@ -50,7 +54,8 @@ def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Info
     covariance = _of_seen(known)
     shared = square[:states, states:] @ known.white @ follows.T
     found = known.lost * (square[:states, :states] - shared - shared.T) + follows @ covariance @ follows.T
-    lost = (np.abs(v[~sees]) > 1e-6).any(axis=0) | _moves(follows, known)
+    not_seen = v[~sees] - v[~sees] @ across.T
+    lost = (np.abs(not_seen) > 1e-6).any(axis=0) | _moves(follows, known)
     found[lost], found[:, lost] = np.nan, np.nan
     found[lost, lost] = np.inf
     return found, follows

@@ -23,6 +23,7 @@ from lagjax._fit._parameters import Parameters
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import Flow, MachineCode, _derivatives, _tolerances, flow_of
 from lagjax._machine_code._steps import KEPT
+from lagjax._native import Projection
 from lagjax._problem import Problem
 from lagjax._results import ENDED_WELL
 from lagjax._simulate import simulate
@@ -57,7 +58,9 @@ class Motion(NamedTuple):
 
 
 class AbstractMotions(abc.ABC):
-    """What follows motions and their tangents."""
+    """What follows motions and their tangents; `projection` puts states on the constraints, where it is a program."""
+
+    projection: Projection | None = None
 
     @abc.abstractmethod
     def follow(
@@ -96,6 +99,7 @@ class _ByMachineCode(AbstractMotions):
     def __init__(self, problem: Callable[[int], Problem], is_driven: bool):
         """`problem(room)` is about the scene with tables of inputs of so many instants."""
         self.problem, self.tolerances, self.is_driven = problem, _tolerances(problem(2)), is_driven
+        self.projection = None if is_driven else flow_of(problem(2)).projection
 
     def _flow(self, numbers: np.ndarray, table: Table | None) -> tuple[Flow, np.ndarray]:
         """The flow of the scene with inputs of this room, made once for all that are equal, and its parameters."""

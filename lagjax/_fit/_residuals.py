@@ -18,18 +18,23 @@ from lagjax._fit._noise import AbstractNoise, Widths, counts
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Piece, Record, Samples, batches
 from lagjax._fit._signals import Signals
-from lagjax._fit._starts import Origins
+from lagjax._fit._starts import Manifold, Origins, Placed
 from lagjax._fit._timings import Clock
 from lagjax._layout import Layout
 
 
 class Point(NamedTuple):
-    """One trial: the unknowns, and for each batch the residuals (N, T, S) and their derivatives (N, T, S, D)."""
+    """One trial: the unknowns, and for each batch the residuals (N, T, S) and their derivatives (N, T, S, D).
+
+    Where starts lie on constraints `across` (N, 2n, 2n) takes a change of each to its part across these, which changes
+    nothing that is measured.
+    """
 
     u: np.ndarray
     starts: np.ndarray
     residuals: list[np.ndarray]
     slopes: list[np.ndarray]
+    across: np.ndarray | None = None
 
     def flat(self) -> np.ndarray:
         """All residuals, (M, S)."""
@@ -62,10 +67,11 @@ class Question:
         size: np.ndarray,
         rtol: float,
         clocks: dict[int, Clock] | None = None,
+        manifold: Manifold | None = None,
     ):
         self.records, self.pieces, self.fitted = records, pieces, fitted
         self.watch: Callable[[Point | Failure], None] | None = None  # is told of every trial
-        self.clocks = {} if clocks is None else clocks
+        self.clocks, self.manifold = {} if clocks is None else clocks, manifold
         timed = any(piece.record in self.clocks for piece in pieces)
         self.names = (*signals.names, *(("times",) if timed else ()))
         self.size, self.rtol, self.least = size[: len(self.names)], rtol, rtol * size[: len(self.names)]
@@ -85,7 +91,8 @@ class Question:
     def of(self, pieces: list[Piece], fitted: np.ndarray) -> "Question":
         """The same question about other pieces of the records."""
         part = Question(
-            self.records, pieces, fitted, self.motions, self.signals, self.parameters, self.size, self.rtol, self.clocks
+            self.records, pieces, fitted, self.motions, self.signals, self.parameters, self.size, self.rtol,
+            self.clocks, self.manifold,
         )  # fmt: skip
         part.watch = self.watch
         return part
@@ -127,24 +134,43 @@ class Question:
     def _at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
         numbers, directions = self.parameters.numbers(u), self.parameters.directions(u)
         starts, moved = self.origins.move(starts, numbers, directions)
+        tangents = across = None
+        if self.manifold is not None and self.fitted.any():
+            starts, tangents, moved = self._placed(starts, moved, numbers, directions)
+            across = np.where(self.fitted[:, None, None], np.eye(self.states) - tangents, 0.0)
+            if (lost := ~np.isfinite(starts).all(axis=1)).any():
+                return Failure(int(np.argmax(lost)), "No start near the one that was tried satisfies the constraints.")
         if not (np.isfinite(numbers).all() and np.isfinite(directions).all() and np.isfinite(starts).all()):
             return Failure(0, "A parameter is not finite.")
         residuals, slopes = [], []
         for batch in self.batches:
-            along = self._along(batch, moved, directions)
+            along = self._along(batch, moved, directions, tangents)
             clock = self.clocks.get(self.pieces[batch.rows[0]].record)
             follow = self._sense if clock is None else functools.partial(self._time, clock)
             shown = follow(batch, starts[batch.rows], numbers, *along)
             if isinstance(shown, Failure):
                 return shown
             self._collect(batch, *shown, residuals, slopes)
-        return Point(u, starts, residuals, slopes)
+        return Point(u, starts, residuals, slopes, across)
 
-    def _along(self, batch: Samples, moved: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _placed(self, starts, moved, numbers, directions) -> Placed:
+        """The starts that are fitted put on the constraints; the others as they are."""
+        assert self.manifold is not None
+        t = np.array([self.records[piece.record].ts[piece.places[0]] for piece in self.pieces])
+        some, free = self.fitted, Placed(starts, np.tile(np.eye(self.states), (len(starts), 1, 1)), moved)
+        for mine, new in zip(free, self.manifold.put(starts[some], t[some], numbers, directions), strict=True):
+            mine[some] = new
+        return free
+
+    def _along(
+        self, batch: Samples, moved: np.ndarray, directions: np.ndarray, tangents: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Directions of the starts (N, D, 2n) and of the parameters (D, P): D = 2n + F, or F where no start is free."""
         states = self.states if self.fitted[batch.rows].any() else 0
         y0_dot = np.zeros((len(batch.rows), states + len(directions), self.states))
         y0_dot[:, :states] = np.eye(states, self.states)
+        if tangents is not None and states:
+            y0_dot[:, :states] = tangents[batch.rows].swapaxes(1, 2)
         y0_dot[:, states:] = moved[batch.rows]
         return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
 
@@ -245,7 +271,12 @@ class Question:
         for batch, factor, r, slopes in zip(self.batches, factors, point.residuals, point.slopes, strict=True):
             rows = np.concatenate([slopes, r[..., None]], axis=-1)
             rows *= factor[..., None]
-            found[batch.rows] = compressed(rows.reshape(len(r), -1, columns))
+            rows = rows.reshape(len(r), -1, columns)
+            if point.across is not None:  # of a size that keeps the condition
+                size = np.abs(rows[..., : self.states]).max() or 1.0
+                more = np.pad(size * point.across[batch.rows], ((0, 0), (0, 0), (0, columns - self.states)))
+                rows = np.concatenate([rows, more], axis=1)
+            found[batch.rows] = compressed(rows)
         return found
 
     def where(self, failure: Failure) -> str:

@@ -263,7 +263,7 @@ class Fit:
         piece = [Piece(0, np.arange(len(record)))]
         question = Question(
             [record], piece, np.array([not is_known]), self.question.motions, self.question.signals, fixed,
-            self.question.size, self.question.rtol,
+            self.question.size, self.question.rtol, None, self.question.manifold,
         )  # fmt: skip
         if is_known:
             point = question.at(np.zeros(0), state[None])
