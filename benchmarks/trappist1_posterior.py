@@ -49,7 +49,7 @@ def main():
     parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--warm", type=int, default=5)
     parser.add_argument("--chains", type=int, default=16)
-    parser.add_argument("--step", type=float, default=0.55)
+    parser.add_argument("--step", type=float, default=0.4)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     elements = trappist1.published(options.elements)

@@ -156,7 +156,7 @@ def fit(
     question = _question(system, records, layout, parameters, observe, form)
     if starts > 1 and isinstance(observe, Delayed):
         raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")
-    if starts > 1 and question.manifold is not None:
+    if starts > 1 and question.manifold is not None and question.fitted.any():
         raise ValueError("starts must be 1 where starts on constraints are fitted: their search has one beginning.")
     if starts > 1 and question.clocks:
         raise ValueError("starts must be 1 where there are lagjax.Timings: their search has one beginning.")
@@ -233,12 +233,10 @@ def _question(system, records, layout, parameters, observe, form) -> Question:
         size = np.append(size, max(np.ptp(record.ts) for record in timings.values()))
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
     manifold = None
-    if fitted.any() and has_constraints(system):
-        if form is not None and asks(system):
-            raise ValueError(
-                "A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0)."
-            )
+    if has_constraints(system) and not asks(system):
         manifold = Manifold(system, layout, parameters, motions.projection)
+    elif has_constraints(system) and fitted.any():
+        raise ValueError("A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0).")
     return Question(
         records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol, clocks,
         manifold,

@@ -49,7 +49,7 @@ class Density:
         self, question: Question, system: System, noise: AbstractNoise, point: Point, widths: Widths,
         shares: np.ndarray, prior: Callable | None = None,
     ):  # fmt: skip
-        if question.manifold is not None:
+        if question.manifold is not None and question.fitted.any():
             raise ValueError("There is no density for starts on constraints that are fitted: give start=(q0, qdot0).")
         if question.signals.delays is not None:
             raise ValueError("There is no density for lagjax.Delayed sensors: keep the delay, and shift the times.")
