@@ -1,5 +1,8 @@
 """`fit` of crossing times: when a pendulum passes a gate, alone and beside records, and sentences for what is wrong."""
 
+import importlib
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +29,7 @@ SCENE = lagjax.System(
 SECTIONS = {"bottom": bottom, "gate": gate}
 DIRECTIONS = {"bottom": 0, "gate": 1}
 FIRST = {"g": 9.0, "c": 0.02}
+FILES = ("transit_times", "elements_agol2021")
 
 
 def measured(sigma=0.0, params=TRUTH):
@@ -114,6 +118,21 @@ def test_the_density_of_timings_and_records_has_the_gradient_of_differences_also
         ends = [float(density(off[1] + way * h)) for way in (1, -1)]
         central = (ends[0] - ends[1]) / (2 * h[k])
         assert float(slope[1, k]) == pytest.approx(central, rel=1e-5, abs=1e-6 * float(abs(slope[1]).max()))
+
+
+@pytest.mark.slow
+def test_the_transit_times_of_trappist_1_are_those_of_the_published_fit(monkeypatch, capsys):
+    root = Path(__file__).parent.parent
+    files = [root.parent / "shared" / "data" / f"trappist1_{name}.csv" for name in FILES]
+    if not all(file.exists() for file in files):
+        pytest.skip(f"the transit times are not at {files[0]}")
+    monkeypatch.syspath_prepend(str(root / "examples"))
+    trappist1 = importlib.import_module("trappist1")
+    fit = trappist1.main([str(file) for file in files])
+    elements, deviation = trappist1.published(files[1]), np.sqrt(np.diag(fit.covariance.matrix)).reshape(5, 7)
+    for k, name in enumerate(trappist1.ELEMENTS):
+        assert (np.abs(fit.params[name] - elements[name]) < 0.1 * deviation[k]).all()
+    assert "χ² 679." in capsys.readouterr().out and 1.0 < fit.noise["times"].dof < 6.0
 
 
 # ---- what can be wrong -----------------------------------------------------------------------------------------------

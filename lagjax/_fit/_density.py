@@ -54,8 +54,6 @@ class Density:
         if question.signals.delays is not None:
             raise ValueError("There is no density for lagjax.Delayed sensors: keep the delay, and shift the times.")
         self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths
-        if question.clocks:
-            raise NotImplementedError("The density of crossing times is not there yet: give lagjax.Record alone.")
         form = question.signals.form
         self._form = form if form is not None and asks(system) else None
         self._scene = system if self._form is None else self._form.driven(system)

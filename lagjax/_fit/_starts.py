@@ -70,7 +70,8 @@ class Manifold:
 
     def __init__(self, system: System, layout: Layout, parameters: Parameters, projection: Projection | None):
         def project(y: jax.Array, t, numbers) -> jax.Array:
-            q, qdot = system.project(*map(layout.restore, halves(y)), t, parameters.restore(numbers))
+            q, qdot = map(layout.restore, halves(y))
+            q, qdot = system.project(q, qdot, t, parameters.restore(numbers))
             return jnp.concatenate([layout.flatten(q), layout.flatten(qdot)])
 
         def with_derivatives(y, t, numbers):
