@@ -159,7 +159,7 @@ def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, param
         return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right)
 
     x = jax.lax.custom_root(lambda x: off(x, t), jax.lax.stop_gradient(new.flatten(guess)), find, solve)
-    arrived = jnp.max(jnp.abs(off(x, t))) <= 1e-10 * (1 + jnp.max(jnp.abs(wanted)))
+    arrived = jnp.max(jnp.abs(off(x, t))) <= jnp.finfo(x.dtype).eps ** 0.6 * (1 + jnp.max(jnp.abs(wanted)))
     x = nan_unless(arrived, x)
     jacobian, drift = jax.jacfwd(off, argnums=0)(x, t), jax.jacfwd(off, argnums=1)(x, t)
     return new.restore(x), new.restore(shortest_solution(jacobian, old.flatten(qdot) - drift))

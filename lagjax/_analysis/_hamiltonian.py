@@ -167,7 +167,7 @@ class _Flat(NamedTuple):
             return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right)
 
         v = jax.lax.custom_root(off, jnp.zeros_like(p), find, solve)
-        return nan_unless(jnp.max(jnp.abs(off(v))) <= 1e-10 * (1 + jnp.max(jnp.abs(p))), v)
+        return nan_unless(jnp.max(jnp.abs(off(v))) <= jnp.finfo(p.dtype).eps ** 0.6 * (1 + jnp.max(jnp.abs(p))), v)
 
     def rates(self, q: Vector, p: Vector, t) -> tuple[Vector, Vector]:
         """(q̇, ṗ)."""

@@ -77,8 +77,8 @@ def _kind(pair: np.ndarray, size: float) -> str:
 
 
 def _grows_beyond(size):
-    """The real part that counts as growth: rounding splits a double zero by √eps of the largest exponent."""
-    return 1e-7 * size
+    """The real part that counts as growth: rounding splits a double zero by √eps of the largest exponent, or more."""
+    return 7 * float(np.finfo(size.dtype).eps) ** 0.5 * size
 
 
 def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTree = None) -> Modes:
@@ -120,7 +120,7 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     cyclic, rank = scene.conserved, _rank(scene)
     reversible = scene.reversible and qdot is None
     exponents, shapes, residual = _modes(cyclic, rank, reversible, *scene.arguments)
-    if scene.concrete and not residual <= _BALANCED:
+    if scene.concrete and not residual <= _BALANCED[scene.layout.dtype]:
         raise ValueError(
             f"q is not an equilibrium: forces are left that a deviation of {float(residual):.2g} of q's size would "
             "make. Find one first: q = lagjax.equilibrium(system, q, params).q."
@@ -139,7 +139,7 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
 
 
 # How far from an equilibrium modes are still those of it, in units of 1 + max|q|. Linear in that are their errors.
-_BALANCED = 1e-6
+_BALANCED = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
 
 
 def _rank(scene: Scene) -> int:
@@ -181,7 +181,7 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
         shapes = jnp.concatenate([own, shapes])
     order = jnp.argsort(jax.lax.stop_gradient(exponents[:, 0].imag), stable=True)
     shapes = _normalised(shapes[order], mass)
-    balanced = residual <= _BALANCED
+    balanced = residual <= _BALANCED[scene.layout.dtype]
     exponents = jax.lax.complex(*(nan_unless(balanced, x) for x in (exponents.real, exponents.imag)))[order]
     return exponents, jnp.where(balanced, shapes, jnp.nan), residual
 
@@ -253,7 +253,7 @@ def _of_reversible(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Arra
     zero = _UNITS * len(mass) * jnp.finfo(size.dtype).eps * jax.lax.stop_gradient(size)
     rate = jnp.sqrt(jnp.where(jnp.abs(squares) > zero, jnp.abs(squares), 1))
     frequency, growth = jnp.where(squares > zero, rate, 0), jnp.where(squares < -zero, rate, 0)
-    ignored = jnp.max(jnp.abs(shapes.T @ rates @ shapes)) <= 1e-9 * jnp.sqrt(size)
+    ignored = jnp.max(jnp.abs(shapes.T @ rates @ shapes)) <= jnp.finfo(size.dtype).eps ** 0.6 * jnp.sqrt(size)
     frequency, growth = nan_unless(ignored, frequency), nan_unless(ignored, growth)
     return jnp.stack([jax.lax.complex(growth, frequency), jax.lax.complex(-growth, -frequency)], axis=1), shapes
 

@@ -51,8 +51,8 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
 
     - `a`, `b`: systems of the same coordinates and parameters, without constraints.
 
-    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, systems with constraints, or where a
-    Lagrangian is not finite about the state.
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, systems with constraints, float32, or
+    where a Lagrangian is not finite about the state.
 
     Source: Landau & Lifshitz, *Mechanics*, §2; Olver, *Applications of Lie Groups*, Theorem 4.7.
 
@@ -67,6 +67,7 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     require_system(a)
     require_system(b)
     scenes = Scene.of(a, q, qdot, params), Scene.of(b, q, qdot, params)
+    scenes[0].require_double("same_motion")
     if any(scene.constrained for scene in scenes):
         raise ValueError("same_motion compares Lagrangians: give systems without constraints.")
     if not all(scene.concrete for scene in scenes):

@@ -75,6 +75,14 @@ class Scene(NamedTuple):
             return None
         return self.derivation
 
+    def require_double(self, what: str) -> None:
+        """Raise `ValueError` where numbers are single, whose rounding is no proof of anything."""
+        if self.layout.dtype != np.float64:
+            raise ValueError(
+                f"{what} decides by what rounding leaves, and float32 leaves too much: give float64, after "
+                "jax.config.update('jax_enable_x64', True)."
+            )
+
     def require_autonomous(self, what: str) -> None:
         """Raise `ValueError` where a function of the scene depends on the time."""
         roles = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")

@@ -105,8 +105,8 @@ def conserved_quantities(
     problem, the third integral of Toda's chain. In coordinates that are not Cartesian rotations are not linear: angles
     that are cyclic are found, for others give generators.
 
-    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a generator of the wrong structure, or
-    where L is not finite about the state.
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a generator of the wrong structure,
+    float32, or where L is not finite about the state.
 
     Source: Olver, *Applications of Lie Groups to Differential Equations*, §4.4 (variational symmetries), §5.3.
 
@@ -118,6 +118,7 @@ def conserved_quantities(
     ```
     """
     scene = Scene.of(system, q, qdot, params)
+    scene.require_double("conserved_quantities")
     if not scene.concrete:
         raise ValueError("conserved_quantities looks at numbers: call it outside of jit, vmap and grad, on one state.")
     scale = 0.3 * (np.abs(np.asarray(scene.q)) + 1.0)
