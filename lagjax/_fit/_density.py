@@ -167,7 +167,7 @@ class Density:
         """
         count, d = len(samples), np.where(self._tails, self.widths.dof, 1.0)
         information = np.diag(samples * np.where(self._tails, 2 * d / (d + 3), 2.0))
-        if self._moves_dof:
+        if self.moves_dof:
             share = 1 / (1 + np.exp(-self.first[-count:]))
             rate = d * math.log(_MOST_DOF / _LEAST_DOF) * share * (1 - share)
             own = 0.25 * (polygamma(1, d / 2) - polygamma(1, (d + 1) / 2)) - (d + 5) / (2 * d * (d + 1) * (d + 3))
