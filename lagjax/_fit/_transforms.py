@@ -196,10 +196,11 @@ class Between(AbstractSeparable):
     def limits(self, u):
         """The steps to where u is `reach` less or more."""
         each = _logistic(u) * _logistic(-u)
-        low, high = (
-            np.where(u < 0, _logistic(u + by) - _logistic(u), _logistic(-u) - _logistic(-u - by)) / each
-            for by in (-self.reach, self.reach)
-        )
+        with np.errstate(invalid="ignore", divide="ignore"):  # NaN, no limit, where x is rounded to its bound
+            low, high = (
+                np.where(u < 0, _logistic(u + by) - _logistic(u), _logistic(-u) - _logistic(-u - by)) / each
+                for by in (-self.reach, self.reach)
+            )
         return low, high
 
     def stepped(self, u, step):
