@@ -22,7 +22,8 @@ def shape_of(printed: str) -> str:
     return " ".join(re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", printed).split())
 
 
-def test_readme_code(capsys):
+def test_readme_code(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     # One session, as a reader would type it; what a block prints is what the README shows right after it.
     shown = re.findall(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", README, flags=re.DOTALL)
     assert len(shown) == len(blocks(README)) and sum(bool(printed) for _, printed in shown) > 5
