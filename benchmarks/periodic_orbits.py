@@ -154,7 +154,8 @@ def _store(path: Path, names, table) -> None:
             digits = [f"{table[column][k]:.15g}" for column in ("v1", "v2", "period")]
             sizes = [f"{table[column][k]:.1e}" for column in ("closure", "asymmetry")]
             values = [f"{x.real:.9g}{x.imag:+.9g}i" for x in table["multipliers"][k, :4]]
-            stable = ("stable" if table["stable"][k] else "unstable") if table["ok"][k] else ""
+            known = table["ok"][k] and not table["message"][k]
+            stable = ("stable" if table["stable"][k] else "unstable") if known else ""
             write([name, *digits, *sizes, stable, *values, table["message"][k].split("\n")[0]])
 
 

@@ -6,6 +6,7 @@ import pytest
 from scipy.special import ellipk
 
 import lagjax
+from lagjax._orbits import _orbit
 
 PENDULUM = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
 
@@ -47,6 +48,12 @@ def test_a_batch_at_an_energy_and_its_failures():
     assert orbits.ok[0] and orbits.ok[2] and orbits.q0.shape == (3,)
     np.testing.assert_allclose(np.asarray(orbits.period)[np.asarray(orbits.ok)], 4 * ellipk(0.25), rtol=1e-13)
     assert all((text == "") == bool(ok) for text, ok in zip(orbits.message, orbits.ok, strict=True))
+
+
+def test_multipliers_that_rounding_has_spoilt_are_not_judged(monkeypatch):
+    monkeypatch.setattr(_orbit, "multipliers_of", lambda *_: np.array([1.0, 0.9]))
+    orbit = lagjax.periodic_orbit(PENDULUM, 1.0, 0.0, 6.5)
+    assert orbit.ok and not orbit.stable and "miss it by 0.1" in orbit.message
 
 
 def test_up_to_an_image():

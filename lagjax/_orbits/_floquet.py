@@ -19,6 +19,10 @@ import numpy as np
 UNSTABLE = 1e-5
 
 
+# Pairs that multiply to one within this have multipliers that a judgement about stability may rest on.
+UNCERTAIN = 1e-3
+
+
 class Reduced(NamedTuple):
     """The arcs without the known ones: `growth` (K, m, m), and how many multipliers are 1 by symmetry."""
 
@@ -60,6 +64,12 @@ def multipliers_of(reduced: Reduced, paired: bool) -> np.ndarray:
     if paired:
         values = _in_pairs(values)
     return np.concatenate([values, np.ones(reduced.known, complex)])
+
+
+def off_pairs(multipliers: np.ndarray) -> float:
+    """By how much the pairs of `multipliers_of`, two neighbours each, miss a product of one: the largest miss."""
+    firsts, seconds = multipliers[0::2], multipliers[1::2]
+    return float(np.abs(firsts[: len(seconds)] * seconds - 1).max(initial=0.0))
 
 
 def _of_product(growth: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from lagjax._layout import halves
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
-from lagjax._orbits._floquet import UNSTABLE, multipliers_of, reduce
+from lagjax._orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, off_pairs, reduce
 from lagjax._orbits._shooting import Chain, Closing
 from lagjax._orbits._starts import starts
 from lagjax._results import SUCCESSFUL, SimulationError
@@ -38,8 +38,10 @@ class Orbit(NamedTuple):
     - `multipliers` (2n,): the eigenvalues of the monodromy matrix, complex, each beside its reciprocal where the energy
       is conserved, the largest first, and last of all those that are 1 by the time shift and by conserved momenta.
     - `closure` (): the largest defect of its arcs, in the units of the state; of a single arc |φ(y; T) − y|.
-    - `stable`: whether no multiplier is larger than 1, so that errors do not grow exponentially.
-    - `ok`: whether it closes; `message`: a sentence that says why not, where all numbers are those of the best trial.
+    - `stable`: whether no multiplier is larger than 1, so that errors do not grow exponentially; False where rounding
+      leaves that open, because pairs that should multiply to 1 miss it by more than 1e-3.
+    - `ok`: whether it closes; `message`: a sentence that says why not (all numbers are then those of the best trial),
+      or that the multipliers are uncertain, and by how much.
     """
 
     q0: PyTree
@@ -210,6 +212,13 @@ def told(closing: Closing, chain: Chain) -> Found:
         for k, place in enumerate(places.tolist()):
             multipliers[place] = multipliers_of(reduce(closed.growth[k], *known[k]), closing.arcs.conserves)
     stable = np.abs(np.where(np.isnan(multipliers), np.inf, multipliers)).max(axis=1) < 1 + UNSTABLE
+    off = np.array([off_pairs(row) if closing.arcs.conserves else 0.0 for row in multipliers])
+    for place in np.flatnonzero(ok & (off > UNCERTAIN)).tolist():
+        stable[place] = False
+        message[place] = (
+            f"The orbit closes, but its multipliers are uncertain: pairs that should multiply to 1 miss it by "
+            f"{off[place]:.2g}, so that nothing is known of its stability."
+        )
     return Found(chain.y[:, 0], chain.period, multipliers, closure, stable & ok, ok, tuple(message))
 
 
