@@ -21,7 +21,7 @@ import numpy as np
 
 from lagjax._sweep._batch import Kept
 from lagjax._sweep._begin import first_look, in_doubles
-from lagjax._sweep._job import Job, opened, precision
+from lagjax._sweep._job import Job, opened
 from lagjax._sweep._members import points_of
 from lagjax._sweep._scene import Motions, packed, unpacked, users_path
 from lagjax._sweep._unit import Unit, compute, parts
@@ -212,19 +212,24 @@ def serve(path: str) -> None:
                 tell("answer", _look(unit, members))
                 continue
             job = opened(path)
-            with precision(job.spec):
-                if what == "unit":
-                    tell("answer", compute(job, unit, members, lambda k: tell("batch", k)))
-                else:
-                    tell("answer", _probe(job, unit, members))
+            _count_in(bool(job.spec["x64"]))
+            if what == "unit":
+                tell("answer", compute(job, unit, members, lambda k: tell("batch", k)))
+            else:
+                tell("answer", _probe(job, unit, members))
         except Exception:  # told to the parent, which raises it
             tell("error", traceback.format_exc())
 
 
 def _look(request: tuple[bytes, list[str], bool], points: dict[str, np.ndarray]) -> tuple[Kept, float, bool]:
     data, path, doubles = request
-    with jax.enable_x64(doubles):
-        return first_look(unpacked(data, path), points)
+    _count_in(doubles)
+    return first_look(unpacked(data, path), points)
+
+
+def _count_in(doubles: bool) -> None:
+    """Switch this process, which is nobody else's, to a precision: callbacks of `keep` run in threads of their own."""
+    jax.config.update("jax_enable_x64", doubles)
 
 
 def _probe(job: Job, unit: int, members: list[int]) -> None:
