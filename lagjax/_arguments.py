@@ -50,7 +50,15 @@ class Function(eqx.Module):
                 f"{self.name} asks for `inputs`, which only the records of lagjax.fit have. To follow a motion with "
                 "sampled inputs, let it ask for `t` instead, and call lagjax.samples(knots, values)(t)."
             )
-        return function(*roles, **{name: extras[name] for name in self.extras})
+        try:
+            return function(*roles, **{name: extras[name] for name in self.extras})
+        except (AttributeError, TypeError) as reason:
+            if "params" in self.extras and extras["params"] is None:
+                raise TypeError(
+                    f"{self.name} asks for `params`, and none were given ({reason}): pass params in the structure that "
+                    "it reads."
+                ) from reason
+            raise
 
 
 def accept(

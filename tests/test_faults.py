@@ -77,6 +77,10 @@ REFUSED = {
     # System: the functions
     "L is a number": (ask(3.0), TypeError, "lagrangian must be a function"),
     "L without velocities": (ask(lambda q: 0.0), TypeError, r"must have the form lagrangian\(q, qdot\)"),
+    "params that are not given": (
+        run(lagjax.System(lambda q, v, params: 0.5 * v**2 - params["k"] * q), 1.0, 0.0, TS, None), TypeError,
+        "none were given",
+    ),
     "L asks for an unknown name": (ask(lambda q, v, mass: 0.0), TypeError, "asks for `mass`"),
     "L without its sum": (ask(lambda q, v: v**2), TypeError, "a missing sum"),
     "L returns nothing": (ask(lambda q, v: None), TypeError, "must return one scalar"),
