@@ -200,17 +200,18 @@ def work_precision(result: WorkPrecision, *, ax=None):
 def fit(fit: Fit, record: int = 0, *, figure=None):
     """Data over fit of one record of a `Fit`, and the residuals with ±2σ below, a column for each signal.
 
-    Draws into `figure`, or a new one, and returns the Axes (2, S).
+    Draws into `figure`, or a new one, and returns the Axes (2, S). Records of several systems are counted through.
 
     >>> lagjax.plot.fit(fit, record=3)
     """
     matplotlib = _matplotlib()
-    names = fit.question.signals.names
+    one, columns = fit.records[record], fit.question.columns(record)
+    names = fit.question.names[columns]
     if figure is None:
         figure = matplotlib.pyplot.figure(figsize=(max(6.4, 3.6 * len(names)), 4.6), layout="constrained")
     axes = figure.subplots(2, len(names), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
-    one = fit.records[record]
-    draw_record(axes, one, record_matrix(fit.residuals[record], one), names, fit.widths.sigma)
+    residuals = fit.question.end_to_end(fit.residuals)[record]
+    draw_record(axes, one, record_matrix(residuals, one), names, fit.widths.sigma[columns])
     return axes
 
 

@@ -6,10 +6,10 @@
                           begins                  directions
 
 Files: `_records`, `_parameters` and `_transforms` take what the user gives; `_motions` and `_signals` follow motions
-and sensors with their derivatives; `_residuals` and `_noise` say how far off a trial is; `_segments` says where to
-begin, and `_weak` where that is far off; `_solve` goes down from there, or `_gradient`, from many starts by `_many`;
-`_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_profile`, `_density`, `_sample`, `_next`, `_report` and `_result`
-say what that means.
+and sensors with their derivatives; `_residuals` and `_noise` say how far off a trial is, and `_systems` how far one of
+several systems; `_segments` says where to begin, and `_weak` where that is far off; `_solve` goes down from there, or
+`_gradient`, from many starts by `_many`; `_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_profile`, `_density`,
+`_sample`, `_next`, `_report` and `_result` say what that means.
 """
 
 import functools
@@ -31,18 +31,19 @@ from lagjax._fit._motions import motions_of
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Guess, Measured, Piece, Record, in_structure, known_start, require_alike, started
-from lagjax._fit._residuals import Failure, Question
+from lagjax._fit._residuals import AbstractQuestion, Failure, Question
 from lagjax._fit._result import Covariance, Fit, SignalNoise
 from lagjax._fit._segments import Reader, glimpses, levels, time_scale, whole
 from lagjax._fit._signals import Signals, looks_like_positions
 from lagjax._fit._solve import Anchor, Descent, minimise
 from lagjax._fit._starts import Manifold
+from lagjax._fit._systems import asked, by_name, naming
 from lagjax._fit._timings import Clock, Timings
 from lagjax._fit._transforms import angle, between, inertia, positive, simplex
 from lagjax._fit._uncertainty import Information, information
 from lagjax._fit._unseen import sentences
 from lagjax._fit._verdict import verdict
-from lagjax._fit._weak import weak_start
+from lagjax._fit._weak import balanced
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
@@ -77,11 +78,11 @@ _BEST = 4  # of many starts go through the whole search
 
 
 def fit(
-    system: System,
-    records: Record | Timings | list,
+    system: System | dict[str, System],
+    records: Record | Timings | list | dict[str, Any],
     params0: PyTree,
     *,
-    observe: Callable | None = None,
+    observe: Callable | dict[str, Callable | None] | None = None,
     free: PyTree = None,
     transforms: PyTree = None,
     noise: AbstractNoise | None = None,
@@ -99,6 +100,8 @@ def fit(
     **Arguments**
 
     - `records`: one `Record` or several, of any lengths; and `lagjax.Timings`, beside them or alone.
+    - `system`: one scene, or a dict of scenes by name that share parameters, such as two machines with the same
+      bearings. `records` is then a dict of the same names, and `observe` one for all or such a dict.
     - `params0`: where the search for the parameters begins, in the structure that the scene's functions ask for.
     - `observe`: a function of (q, qdot), and of `t`, `params`, `inputs` by name, that returns what the sensors show in
       the structure of a record's `values`; by default q. `lagjax.Delayed` where they show it later.
@@ -139,7 +142,6 @@ def fit(
     print(lagjax.fit(scene, record, {"k": 1.0}, transforms=lagjax.positive))
     ```
     """
-    require_system(system)
     if not (isinstance(starts, int | np.integer) and starts > 0):
         raise ValueError(f"starts must be a positive whole number; got {starts!r}.")
     if method not in METHODS:
@@ -149,32 +151,67 @@ def fit(
     noise = Gaussian() if noise is None else noise
     if not isinstance(noise, AbstractNoise):
         raise TypeError(f"noise must be lagjax.Gaussian() or lagjax.StudentT(); got {noise!r}.")
-    records = require_alike(records)
-    form = _form(system, records, hold)
-    layout = _layout(system, records, params0, form)
-    parameters = Parameters.of(params0, free, transforms, layout.dtype)
-    question = _question(system, records, layout, parameters, observe, form)
-    if starts > 1 and isinstance(observe, Delayed):
-        raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")
-    if starts > 1 and question.manifold is not None and question.fitted.any():
-        raise ValueError("starts must be 1 where starts on constraints are fitted: their search has one beginning.")
-    if starts > 1 and question.clocks:
-        raise ValueError("starts must be 1 where there are lagjax.Timings: their search has one beginning.")
-    first = next((record for record in records if isinstance(record, Record)), None)
-    readers = _readers(records) if first is not None and looks_like_positions(observe, first, layout) else None
+    scenes = _scenes(system, records, params0, observe, hold)
+    parameters = Parameters.of(params0, free, transforms, np.result_type(*(scene.layout.dtype for scene in scenes)))
+    question = asked({scene.name: _question(scene, parameters) for scene in scenes})
+    _require_one_beginning(question, starts, method)
+    readers = _readers(scenes)
     if progress:
         question.watch = _Printer(question.size)
-    y0 = np.stack([_start(record, readers, layout, k, params0) for k, record in enumerate(records)])
+    y0 = _starts(scenes, readers, question.states, params0)
+    first, told = parameters.moved(parameters.first), (system, observe, question)
+    systems = [scene.system for scene in scenes]
     if method == "gradient":
-        if starts > 1:
-            raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
-        descent = _by_gradient(question, system, parameters.moved(parameters.first), y0, noise, readers)
-        return _told(system, observe, question, descent, noise, None)
-    weak = functools.partial(_weakly, question, system, readers=readers or [])
+        return _told(*told, _by_gradient(question, systems[0], first, y0, noise, readers), noise, None)
+    weak = functools.partial(_weakly, question, systems, readers=readers or [])
     search = functools.partial(_search, question, noise=noise, method=method, readers=readers, weak=weak)
-    descent, waterfall = _searches(question, search, parameters.moved(parameters.first), y0, starts, seed)
+    descent, waterfall = _searches(question, search, first, y0, starts, seed)
     question.watch = None
-    return _told(system, observe, question, descent, noise, waterfall)
+    return _told(*told, descent, noise, waterfall)
+
+
+class _Scene(NamedTuple):
+    """One system of a fit: its name, None for the only one, its records and sensors, and the structure of its inputs
+    and coordinates."""
+
+    name: str | None
+    system: System
+    records: list[Any]
+    observe: Callable | Delayed | None
+    form: Form | None
+    layout: Layout
+
+
+def _scenes(system, records, params0, observe, hold: str) -> list[_Scene]:
+    """The systems with their records, checked."""
+    scenes = []
+    for name, one, own, sensors in by_name(system, records, observe):
+        with naming(name):
+            require_system(one)
+            own = require_alike(own)
+            form = _form(one, own, hold)
+            scenes.append(_Scene(name, one, own, sensors, form, _layout(one, own, params0, form)))
+    return scenes
+
+
+def _require_one_beginning(question: AbstractQuestion, starts: int, method: str) -> None:
+    """Raise `ValueError` where many starts, or a descent by gradients, are asked for and cannot be."""
+    if method == "gradient" and starts > 1:
+        raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
+    if not isinstance(question, Question):
+        if method == "gradient":
+            raise ValueError('method="gradient" is for one system: leave `method` at "auto" for several.')
+        if starts > 1:
+            raise ValueError("starts must be 1 where there are several systems: their search has one beginning.")
+        return
+    if starts == 1:
+        return
+    if question.signals.delays is not None:
+        raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")
+    if question.manifold is not None and question.fitted.any():
+        raise ValueError("starts must be 1 where starts on constraints are fitted: their search has one beginning.")
+    if question.clocks:
+        raise ValueError("starts must be 1 where there are lagjax.Timings: their search has one beginning.")
 
 
 def _form(system: System, records: list[Record], hold: str) -> Form | None:
@@ -218,8 +255,13 @@ def _layout(system: System, records: list[Record], params0, form: Form | None) -
     return Layout.of(q, qdot)
 
 
-def _question(system, records, layout, parameters, observe, form) -> Question:
-    """The question about whole records."""
+def _question(scene: _Scene, parameters: Parameters) -> Question:
+    """The question about whole records of one system."""
+    with naming(scene.name):
+        return _about(*scene[1:], parameters)
+
+
+def _about(system, records, observe, form, layout, parameters) -> Question:
     rtol = DEFAULT_RTOL[layout.dtype]
     motions = motions_of(system, layout, parameters, rtol, None, form)
     recordings = [record for record in records if isinstance(record, Record)]
@@ -260,10 +302,36 @@ def _sizes(recordings: list[Record]) -> np.ndarray:
     return np.sqrt(np.nanmean(np.concatenate([record.matrix for record in recordings]) ** 2, axis=0))
 
 
-def _readers(records: list) -> list[Reader | None]:
-    """What reads states off the data, for each record; all together try windows at a few hundred places."""
-    probes = max(8, 256 // len(records))
-    return [Reader.of(record, probes) if isinstance(record, Record) else None for record in records]
+def _readers(scenes: list[_Scene]) -> list[Reader | None] | None:
+    """What reads states off the data, for each record whose signals are positions; None where there is no such record.
+
+    All records of a system together try windows at a few hundred places.
+    """
+    readers = []
+    for scene in scenes:
+        first = next((record for record in scene.records if isinstance(record, Record)), None)
+        reads, probes = first is not None and looks_like_positions(scene.observe, first, scene.layout), 256
+        probes = max(8, probes // len(scene.records))
+        readers += [
+            Reader.of(record, probes) if reads and isinstance(record, Record) else None for record in scene.records
+        ]
+    return readers if any(reader is not None for reader in readers) else None
+
+
+def _starts(scenes: list[_Scene], readers: list[Reader | None] | None, states: int, params0) -> np.ndarray:
+    """Where the search for the starts of all records begins, (N, 2n) of the system with the most coordinates."""
+    found, first = [], 0
+    for scene in scenes:
+        own = None if readers is None else readers[first : first + len(scene.records)]
+        with naming(scene.name):
+            found += [_start(record, own, scene.layout, k, params0) for k, record in enumerate(scene.records)]
+        first += len(scene.records)
+    return np.stack([_roomy(state, states) for state in found])
+
+
+def _roomy(state: np.ndarray, states: int) -> np.ndarray:
+    """States (..., 2n) of a system, with zeros up to those of the one with the most coordinates."""
+    return np.concatenate([state, np.zeros((*state.shape[:-1], states - state.shape[-1]))], axis=-1)
 
 
 def _start(record: Measured, readers: list[Reader | None] | None, layout: Layout, place: int, params0) -> np.ndarray:
@@ -280,13 +348,13 @@ def _start(record: Measured, readers: list[Reader | None] | None, layout: Layout
     return reader.states(np.array([0]))[0]
 
 
-def _by_gradient(question: Question, system: System, u, y0, noise, readers) -> Descent:
+def _by_gradient(question, system: System, u, y0, noise, readers) -> Descent:
     """The descent by gradients: over segments of the records that grow, where they can be read, then over all."""
     told, question.watch = question.watch, None
     tell = None if told is None else lambda text: print(text, file=sys.stderr, flush=True)
     steps = _STEPS
     if readers is not None:
-        u = _over_segments(question, system, _weakly(question, system, u, readers), noise, readers, tell)
+        u = _over_segments(question, system, _weakly(question, [system], u, readers), noise, readers, tell)
         steps = _STEPS // 3
     done = descend(question, system, u, y0, noise, steps, tell)
     if not isinstance(done, Failure):
@@ -296,19 +364,36 @@ def _by_gradient(question: Question, system: System, u, y0, noise, readers) -> D
     return done
 
 
-def _weakly(question: Question, system: System, u, readers: list[Reader | None]) -> np.ndarray:
+def _time_scales(question: AbstractQuestion, readers: list[Reader | None], u) -> list[float]:
+    """How long the motion of each record looks like a straight line: of all records of a system the same.
+
+    It is infinite for a system of which no state can be read off.
+    """
+    scales, numbers = [], question.parameters.numbers(u)
+    for part in question.parts:
+        reading = [reader for reader in readers[part.records] if reader is not None]
+        scale = time_scale(reading, part.question.motions, numbers) if reading else np.inf
+        scales += [scale] * len(part.question.records)
+    return scales
+
+
+def _weakly(question: AbstractQuestion, systems: list[System], u, readers: list[Reader | None]) -> np.ndarray:
     """The u that balances the weak form of Lagrange's equations, u itself where there is none."""
-    reading = [reader for reader in readers if reader is not None]
-    scale = time_scale(reading, question.motions, question.parameters.numbers(u))
-    found = weak_start(question, system, u, readers, scale)
+    scales = _time_scales(question, readers, u)
+    found = balanced(
+        [
+            (part.question, system, readers[part.records], scales[part.records.start])
+            for part, system in zip(question.parts, systems, strict=True)
+        ],
+        u,
+    )
     return u if found is None else found
 
 
 def _over_segments(question: Question, system: System, u, noise, readers, tell) -> np.ndarray:
     """The u that two thirds of the steps come to over segments that grow, each with a start of its own."""
-    reading = [reader for reader in readers if reader is not None]
     recordings = [None if reader is None else reader.record for reader in readers]
-    cuts = levels(recordings, time_scale(reading, question.motions, question.parameters.numbers(u)))
+    cuts = levels(recordings, _time_scales(question, readers, u))
     for pieces in [] if question.clocks else cuts:
         states = np.stack([readers[piece.record].states(piece.places[:1])[0] for piece in pieces])
         part = question.of(pieces, np.ones(len(pieces), bool))
@@ -318,10 +403,11 @@ def _over_segments(question: Question, system: System, u, noise, readers, tell) 
     return u
 
 
-def _searches(question: Question, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
+def _searches(question: AbstractQuestion, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
     """The best of the searches from u and from `starts` − 1 random values, and what all of them came to."""
     if starts == 1:
         return search(u, y0), None
+    assert isinstance(question, Question)  # others have one start
     trials = short_search(question, drawn(question.parameters, u, starts, seed), y0)
     misfits, done = trials.misfits.copy(), []
     chosen = distinct(trials, _BEST)
@@ -356,7 +442,7 @@ class _Printer:
         print(f"trial {self.trials}: {text}", file=sys.stderr, flush=True)
 
 
-def _search(question: Question, u, starts, noise, method: str, readers, weak) -> Descent:
+def _search(question: AbstractQuestion, u, starts, noise, method: str, readers, weak) -> Descent:
     """The search of whole records, after that of growing segments where the method asks for it."""
     if method == "segments" and readers is None:
         raise ValueError('method="segments" reads starts off the data: for that values must have the structure of q.')
@@ -378,7 +464,7 @@ class _Begun(NamedTuple):
 
 
 def _grown(
-    question: Question, u, starts, noise, readers: list[Reader | None], weak: Callable
+    question: AbstractQuestion, u, starts, noise, readers: list[Reader | None], weak: Callable
 ) -> tuple[np.ndarray, np.ndarray]:
     """Better first values of u and of the starts, from segments that grow together to whole records."""
     anchor = Anchor(u, np.where(np.isfinite(question.parameters.reach), 1.0 / _LOOSE, 0.0))
@@ -396,33 +482,37 @@ def _grown(
     return u, np.stack([best[k, 0] for k in range(len(question.records))])
 
 
-def _begun(question: Question, u, starts, readers: list[Reader | None], search) -> _Begun:
+def _begun(question: AbstractQuestion, u, starts, readers: list[Reader | None], search) -> _Begun:
     """The search on the shortest segments, from u, whose misfit is positive where they were not fitted.
 
     It is the mean logarithm of the noise σ of the signals, over `_POOR` times the scatter of the data or a share
     `_COARSE` of the signals' size, whichever is larger.
     """
-    reading = [reader for reader in readers if reader is not None]
     recordings = [None if reader is None else reader.record for reader in readers]
-    cuts = levels(recordings, time_scale(reading, question.motions, question.parameters.numbers(u)))
+    cuts = levels(recordings, _time_scales(question, readers, u))
     best = {(k, 0): start for k, start in enumerate(starts)}
     if not cuts:
         return _Begun(u, cuts, best, -np.inf)
     done = search(cuts[0], u, best)
     if isinstance(done, Failure):
         return _Begun(u, cuts, best, np.inf)
-    scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in reading], axis=0))
-    ratio = done.widths.sigma / np.maximum(_POOR * scatter, _COARSE * question.size[: len(scatter)])
+    near = []
+    for part in question.parts:
+        if reading := [reader for reader in readers[part.records] if reader is not None]:
+            scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in reading], axis=0))
+            near.append(np.maximum(_POOR * scatter, _COARSE * part.question.size[: len(scatter)]))
+    ratio = done.widths.sigma / np.concatenate(near)
     return _Begun(done.point.u, cuts, best, float(np.mean(np.log(ratio))))
 
 
-def _level(question: Question, pieces: list[Piece], u, best, noise, readers, anchor) -> Descent | Failure:
+def _level(question: AbstractQuestion, pieces: list[Piece], u, best, noise, readers, anchor) -> Descent | Failure:
     """The search on one cut of the records. The states in `best`, by record and sample, begin it and take its end."""
     firsts = [(piece.record, int(piece.places[0])) for piece in pieces]
     for k, reader in enumerate(readers):
         new = [place for record, place in firsts if record == k and (k, place) not in best]
         if new and reader is not None:
-            best |= {(k, place): y for place, y in zip(new, reader.states(np.array(new)), strict=True)}
+            read = _roomy(reader.states(np.array(new)), question.states)
+            best |= {(k, place): y for place, y in zip(new, read, strict=True)}
     part = question.of(pieces, np.array([question.fitted[k] or place > 0 for k, place in firsts]))
     y0 = np.stack([best[first] for first in firsts])
     done = minimise(part, u, y0, noise, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
@@ -431,16 +521,25 @@ def _level(question: Question, pieces: list[Piece], u, best, noise, readers, anc
     return done
 
 
-def _glimpsed(question: Question, u, noise, readers: list[Reader | None], anchor: Anchor) -> np.ndarray:
+def _glimpsed(question: AbstractQuestion, u, noise, readers: list[Reader | None], anchor: Anchor) -> np.ndarray:
     """The u that suits the accelerations of local cubics: these have one minimum where segments are too long for u."""
-    reading = [reader for reader in readers if reader is not None]
-    scale = time_scale(reading, question.motions, question.parameters.numbers(u))
-    short, states = glimpses(reading, 0.25 * scale)
-    part = Question(
-        short, whole(short), np.ones(len(short), bool), question.motions, question.signals, question.parameters,
-        question.size, question.rtol,
-    )  # fmt: skip
-    done = minimise(part, u, states, noise, _ENOUGH_OF_GLIMPSES, _TRIALS_OF_LEVEL, anchor)
+    scales, short, states = _time_scales(question, readers, u), {}, []
+    for part in question.parts:
+        reading = [reader for reader in readers[part.records] if reader is not None]
+        scale, about = scales[part.records.start], part.question
+        if not (reading and np.isfinite(scale)):
+            continue
+        records, begun = glimpses(reading, 0.25 * scale)
+        states.append(_roomy(begun, question.states))
+        short[part.name] = Question(
+            records, whole(records), np.ones(len(records), bool), about.motions, about.signals, about.parameters,
+            about.size, about.rtol,
+        )  # fmt: skip
+    if not short:
+        return u
+    part = asked(short)
+    y0 = np.concatenate(states)[:, : part.states]
+    done = minimise(part, u, y0, noise, _ENOUGH_OF_GLIMPSES, _TRIALS_OF_LEVEL, anchor)
     return u if isinstance(done, Failure) else done.point.u
 
 
@@ -448,19 +547,18 @@ def _glimpsed(question: Question, u, noise, readers: list[Reader | None], anchor
 
 
 def _told(
-    system, observe, question: Question, descent: Descent, law: AbstractNoise, waterfall: Waterfall | None
+    system, observe, question: AbstractQuestion, descent: Descent, law: AbstractNoise, waterfall: Waterfall | None
 ) -> Fit:
     """The result in the user's structures and in words."""
-    point, widths, parameters, n = descent.point, descent.widths, question.parameters, question.layout.size
+    point, widths, parameters = descent.point, descent.widths, question.parameters
     known = information(question, point, widths)
     unseen = sentences(question, point, widths, known.null)
-    restore = question.layout.restore
     return Fit(
         params=parameters.restore(parameters.numbers(point.u)),
-        starts=tuple((restore(y[:n]), restore(y[n:])) for y in point.starts),
+        starts=question.by_system([question.restored(k, y) for k, y in enumerate(point.starts)]),
         covariance=Covariance(parameters.names, parameters.covariance(point.u, known.covariance)),
         noise=_noise_by_name(question, widths, known),
-        residuals=_by_record(question, point),
+        residuals=question.by_system(_by_record(question, point)),
         unseen=unseen,
         ok=descent.converged and not unseen,
         message=verdict(descent, unseen, known, question),
@@ -480,7 +578,7 @@ def _told(
     )
 
 
-def _noise_by_name(question: Question, widths, known: Information) -> dict[str, SignalNoise]:
+def _noise_by_name(question: AbstractQuestion, widths, known: Information) -> dict[str, SignalNoise]:
     samples = (question.weights > 0).sum(axis=0)
     columns = zip(widths.sigma, widths.dof, samples, known.effective, 2 * (1 - known.correlation), strict=True)
     return {
@@ -489,11 +587,11 @@ def _noise_by_name(question: Question, widths, known: Information) -> dict[str, 
     }
 
 
-def _by_record(question: Question, point) -> tuple[PyTree, ...]:
+def _by_record(question: AbstractQuestion, point) -> list[PyTree]:
     found: dict[int, PyTree] = {}
     for batch, residuals in zip(question.batches, point.residuals, strict=True):
         for row, left, weights in zip(batch.rows.tolist(), residuals, batch.weights, strict=True):
             record = question.records[row]
             matrix = np.where(weights > 0, left, np.nan)[: len(record), question.columns(row)]
             found[row] = in_structure(matrix, record)
-    return tuple(found[row] for row in range(len(question.records)))
+    return [found[row] for row in range(len(question.records))]

@@ -11,13 +11,12 @@ peculiarities, fails there. Source: Burnham & Anderson, *Model Selection and Mul
 Celisse, *A survey of cross-validation procedures*, Stat. Surv. 4 (2010) 40.
 """
 
-import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._fit._noise import Known
-from lagjax._fit._residuals import Failure, Question
+from lagjax._fit._noise import Known, Widths
+from lagjax._fit._residuals import AbstractQuestion, Failure
 from lagjax._fit._solve import minimise
 
 _ENOUGH, _TRIALS = 1e-2, 40  # a record left out is then told to a hundredth of its noise
@@ -60,7 +59,7 @@ def comparison(fits: dict[str, Any], folds: int) -> Comparison:
     bic = tuple(float(np.log(count) * k - 2 * log) for k, log in zip(free, logs, strict=True))
     names, best, left = tuple(fits), int(np.argmin(bic)), None
     if folds:
-        apart = [left_out(fit.question, fit.u, fit.states, fit.law, folds) for fit in fits.values()]
+        apart = [left_out(fit.question, fit.u, fit.states, fit.law, fit.widths, folds) for fit in fits.values()]
         left, best = tuple(rms for rms, _ in apart), _simplest(free, np.array([scores for _, scores in apart]))
     rows = _table(names, free, logs, aic, bic, left)
     margin = np.partition(np.array(bic), 1)[1] - min(bic)
@@ -101,10 +100,11 @@ def _table(names, free, logs, aic, bic, left) -> list[str]:
     return rows
 
 
-def left_out(question: Question, u: np.ndarray, states: np.ndarray, law, folds: int):
+def left_out(question: AbstractQuestion, u: np.ndarray, states: np.ndarray, law, widths: Widths, folds: int):
     """The root mean square residuals by signal of records that were left out, and for each group their mean logarithm.
 
-    Infinite where one cannot be followed.
+    Infinite where one cannot be followed. A signal that only the records left out have is as noisy as `widths` (S,) of
+    all of them say.
     """
     failed = dict.fromkeys(question.names, np.inf), np.full(folds, np.inf)
     scores = np.zeros(folds)
@@ -115,9 +115,8 @@ def left_out(question: Question, u: np.ndarray, states: np.ndarray, law, folds: 
         done = minimise(rest, u, states[groups != group], law, _ENOUGH, _TRIALS)
         if isinstance(done, Failure):
             return failed
-        apart = _part(question, groups == group)
-        apart.parameters = question.parameters.kept(done.point.u)
-        known = done.widths._replace(sigma=done.widths.sigma[: len(apart.names)])
+        apart = _part(question, groups == group).with_parameters(question.parameters.kept(done.point.u))
+        known = _of_signals(apart.names, (question.names, widths), (rest.names, done.widths))
         end = minimise(apart, np.zeros(0), states[groups == group], Known(known), _ENOUGH, _TRIALS)
         if isinstance(end, Failure):
             return failed
@@ -130,9 +129,15 @@ def left_out(question: Question, u: np.ndarray, states: np.ndarray, law, folds: 
     return rms, scores
 
 
-def _part(question: Question, keep: np.ndarray) -> Question:
+def _of_signals(names: tuple[str, ...], *known: tuple[tuple[str, ...], Widths]) -> Widths:
+    """The noise of signals by their names, from the last of several that knows it."""
+    found = {name: one for own, widths in known for name, one in zip(own, zip(*widths, strict=True), strict=True)}
+    return Widths(*(np.array(numbers) for numbers in zip(*(found[name] for name in names), strict=True)))
+
+
+def _part(question: AbstractQuestion, keep: np.ndarray) -> AbstractQuestion:
     """The question about some of its pieces."""
-    part = copy.copy(question.of([p for p, k in zip(question.pieces, keep, strict=True) if k], question.fitted[keep]))
+    part = question.of([p for p, k in zip(question.pieces, keep, strict=True) if k], question.fitted[keep])
     part.watch = None
     return part
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._fit._noise import Widths
-from lagjax._fit._residuals import Point, Question
+from lagjax._fit._residuals import AbstractQuestion, Point
 
 
 class Correlation(NamedTuple):
@@ -22,7 +22,7 @@ class Correlation(NamedTuple):
     neighbour: float
 
 
-def correlation(question: Question, point: Point, widths: Widths, signal: int) -> Correlation:
+def correlation(question: AbstractQuestion, point: Point, widths: Widths, signal: int) -> Correlation:
     """The correlation of the residuals of one signal, over all pieces.
 
     It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
@@ -81,7 +81,7 @@ def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
     return np.einsum("ntf,ntg->fg", rows, smooth)
 
 
-def share(question: Question, point: Point, widths: Widths) -> float:
+def share(question: AbstractQuestion, point: Point, widths: Widths) -> float:
     """How many independent samples one sample is worth, over all signals: at most 1."""
     laws = [correlation(question, point, widths, signal) for signal in range(len(widths.sigma))]
     return sum(law.count / law.time for law in laws) / max(sum(law.count for law in laws), 1)

@@ -14,7 +14,7 @@ import numpy as np
 
 from lagjax._fit._correlation import correlated_square, correlation
 from lagjax._fit._noise import Widths
-from lagjax._fit._residuals import Point, Question
+from lagjax._fit._residuals import AbstractQuestion, Point
 from lagjax._fit._uncertainty import Information
 
 
@@ -25,7 +25,7 @@ class OfStarts(NamedTuple):
     follows: np.ndarray
 
 
-def of_starts(question: Question, point: Point, widths: Widths, known: Information) -> OfStarts:
+def of_starts(question: AbstractQuestion, point: Point, widths: Widths, known: Information) -> OfStarts:
     """What is known of the starts of all pieces at the end of a search; zero for those that are not fitted."""
     states, free, pieces = question.states, len(point.u), len(question.pieces)
     lags = [correlation(question, point, widths, s).lags for s in range(len(widths.sigma))]

@@ -12,7 +12,6 @@ Source: Chandler & Bate, *Inference for clustered data using the independence lo
 for κ; Raue et al., Bioinformatics 25 (2009) 1923, for what profiles say about identifiability.
 """
 
-import copy
 import itertools
 from typing import NamedTuple, cast
 
@@ -21,7 +20,7 @@ from scipy.optimize import brentq
 from scipy.special import stdtrit
 
 from lagjax._fit._noise import Known, Widths, log_likelihood
-from lagjax._fit._residuals import Failure, Question
+from lagjax._fit._residuals import AbstractQuestion, Failure
 from lagjax._fit._solve import minimise
 from lagjax._fit._uncertainty import Information
 
@@ -66,7 +65,7 @@ class _Place(NamedTuple):
 class _Line:
     """The values of one unknown, of which every one asked for begins from its neighbours."""
 
-    def __init__(self, question: Question, u, starts, widths: Widths, known: Information, which: int):
+    def __init__(self, question: AbstractQuestion, u, starts, widths: Widths, known: Information, which: int):
         self.question, self.widths, self.which = question, widths, which
         reported, white = known.covariance[which, which], known.white[which, which]
         self.scale = white / reported if np.isfinite(reported) and reported > 0 else 1.0 / known.lost
@@ -85,8 +84,7 @@ class _Line:
             return again[0]
         u = self.u.copy()
         u[self.which] = at
-        question = copy.copy(self.question)
-        question.parameters = self.question.parameters.kept(u, self.which)
+        question = self.question.with_parameters(self.question.parameters.kept(u, self.which))
         for others, starts in self._guesses(at):
             done = minimise(question, others, starts, Known(self.widths), _ENOUGH, _TRIALS)
             if not isinstance(done, Failure):
@@ -116,7 +114,9 @@ class _Line:
         return float(done.point.u[self.which]), 2.0 * self.scale * lost
 
 
-def profile(question: Question, u, starts, widths: Widths, known: Information, name: str, level: float) -> Profile:
+def profile(
+    question: AbstractQuestion, u, starts, widths: Widths, known: Information, name: str, level: float
+) -> Profile:
     """The profile of the free number called `name`."""
     parameters = question.parameters
     line = _Line(question, u, starts, widths, known, parameters.unknown(name))

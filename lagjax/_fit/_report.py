@@ -4,7 +4,7 @@ import base64
 import html
 import io
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,8 +51,35 @@ def _picture(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
     return base64.b64encode(file.getvalue()).decode()
 
 
-def pictures_of(records, residuals: list[np.ndarray], names, sigma, covariance, waterfall) -> dict[str, list[str]]:
-    """The pictures of a fit, whose residuals are (T, S) for each record, by their headings."""
+class Drawn(NamedTuple):
+    """Records of one system, their residuals (T, S), and its signals with their noise (S,); `name` None: the only."""
+
+    name: str | None
+    records: list
+    residuals: list[np.ndarray]
+    names: tuple[str, ...]
+    sigma: np.ndarray
+
+
+def pictures_of(systems: list[Drawn], covariance, waterfall) -> dict[str, list[str]]:
+    """The pictures of a fit by their headings."""
+    figures = {}
+    for system in systems:
+        of_one = "" if system.name is None else f"{system.name}: "
+        figures |= {of_one + heading: pictures for heading, pictures in _of_records(*system[1:]).items()}
+    side = min(3.2 + 0.45 * len(covariance.names), 12.0)
+    figures["Correlations of the parameters"] = [
+        _picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), covariance.matrix, covariance.names))
+    ]
+    if waterfall is not None:
+        figures["Waterfall of the starts"] = [
+            _picture((6.4, 3.2), lambda figure: draw_waterfall(figure.subplots(), waterfall.misfits))
+        ]
+    return figures
+
+
+def _of_records(records, residuals: list[np.ndarray], names, sigma) -> dict[str, list[str]]:
+    """Data over fit of the records of one system, whose residuals are (T, S), by their headings."""
     count = min(len(names), _SIGNALS)
 
     def one(record, left):
@@ -72,13 +99,5 @@ def pictures_of(records, residuals: list[np.ndarray], names, sigma, covariance, 
         every = np.concatenate(residuals)
         figures["Residuals against the normal distribution"] = [
             _picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))
-        ]
-    side = min(3.2 + 0.45 * len(covariance.names), 12.0)
-    figures["Correlations of the parameters"] = [
-        _picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), covariance.matrix, covariance.names))
-    ]
-    if waterfall is not None:
-        figures["Waterfall of the starts"] = [
-            _picture((6.4, 3.2), lambda figure: draw_waterfall(figure.subplots(), waterfall.misfits))
         ]
     return figures

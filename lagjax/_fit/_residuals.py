@@ -5,9 +5,11 @@ records. A residual of piece k depends on u and on start k alone: the rows of a 
 residual, are compressed to a triangle of D + 1 rows (QR), in which all sums of squares are the same.
 """
 
+import abc
+import copy
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,7 +50,128 @@ class Failure(NamedTuple):
     text: str
 
 
-class Question:
+class Part(NamedTuple):
+    """One system of a question: its name, None where there is only one; the question about its own records; and which
+    of all records and signals these are."""
+
+    name: str | None
+    question: "Question"
+    records: slice
+    signals: slice
+
+
+class AbstractQuestion(abc.ABC):
+    """What a search sees: N pieces of records with S signals, what is free, and the residuals of a trial.
+
+    - `records`, `pieces` (N,), `fitted` (N,): whether the start of a piece is free; `states`: the numbers of a start.
+    - `names`, `size`, `least` (S,): signals, their root mean square, and the smallest noise that can be told of them.
+    - `batches`: the samples, with a column for every signal; `weights` (M, S): all of theirs; `measured`: how many.
+    - `watch` is told of every trial.
+    """
+
+    records: list[Any]
+    pieces: list[Piece]
+    fitted: np.ndarray
+    states: int
+    names: tuple[str, ...]
+    size: np.ndarray
+    least: np.ndarray
+    batches: list[Samples]
+    weights: np.ndarray
+    measured: int
+    parameters: Parameters
+    watch: Callable[[Point | Failure], None] | None
+
+    @abc.abstractmethod
+    def of(self, pieces: list[Piece], fitted: np.ndarray) -> "AbstractQuestion":
+        """The same question about other pieces of the records."""
+
+    @abc.abstractmethod
+    def with_parameters(self, parameters: Parameters) -> "AbstractQuestion":
+        """The same question where other parameters are free."""
+
+    @abc.abstractmethod
+    def columns(self, record: int) -> slice:
+        """Which of the signals a record has."""
+
+    @abc.abstractmethod
+    def called(self, record: int) -> str:
+        """How the user reaches a record: `records[0]`."""
+
+    @property
+    @abc.abstractmethod
+    def parts(self) -> tuple[Part, ...]:
+        """The systems, each with its question about all of its records."""
+
+    @property
+    @abc.abstractmethod
+    def unknowns(self) -> int:
+        """How many numbers of all starts are free."""
+
+    @abc.abstractmethod
+    def follow(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
+        """The residuals of one trial, or the first piece whose motion failed, untold."""
+
+    def at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
+        """The residuals of one trial, or the first piece whose motion failed."""
+        trial = self.follow(u, starts)
+        if self.watch is not None:
+            self.watch(trial)
+        return trial
+
+    def widths(self, point: Point, noise: AbstractNoise) -> Widths:
+        """The noise of the signals that makes the residuals of a trial likeliest."""
+        return noise.widths(point.flat(), self.weights, self.least)
+
+    def factors(self, point: Point, widths: Widths) -> list[np.ndarray]:
+        """√count/σ of every sample, by which its residual enters the sum of squares."""
+        return [
+            np.sqrt(counts(widths, r, batch.weights)) / widths.sigma
+            for r, batch in zip(point.residuals, self.batches, strict=True)
+        ]
+
+    def cost(self, point: Point, factors: list[np.ndarray]) -> float:
+        """Half the weighted sum of squares."""
+        return 0.5 * sum(float(np.sum((f * r) ** 2)) for f, r in zip(factors, point.residuals, strict=True))
+
+    def triangles(self, point: Point, factors: list[np.ndarray]) -> np.ndarray:
+        """The weighted rows of each piece, compressed: (N, D + 1, D + 1), the residual as last column."""
+        columns = point.slopes[0].shape[-1] + 1
+        found = np.zeros((len(self.pieces), columns, columns))
+        for batch, factor, r, slopes in zip(self.batches, factors, point.residuals, point.slopes, strict=True):
+            rows = np.concatenate([slopes, r[..., None]], axis=-1)
+            rows *= factor[..., None]
+            rows = rows.reshape(len(r), -1, columns)
+            if point.across is not None:  # of a size that keeps the condition
+                size = np.abs(rows[..., : self.states]).max() or 1.0
+                more = np.pad(size * point.across[batch.rows], ((0, 0), (0, 0), (0, columns - self.states)))
+                rows = np.concatenate([rows, more], axis=1)
+            found[batch.rows] = compressed(rows)
+        return found
+
+    def where(self, failure: Failure) -> str:
+        """A sentence for a failure, with the record's number."""
+        piece = self.pieces[failure.piece]
+        begin = self.records[piece.record].ts[piece.places[0]]
+        return f"The motion of {self.called(piece.record)} from t = {begin:g} failed. {failure.text}"
+
+    def restored(self, record: int, state: np.ndarray) -> tuple:
+        """The pair (q, q̇) of a state of a record, of which other systems may leave the last numbers unused."""
+        layout = next(part.question.layout for part in self.parts if record < part.records.stop)
+        return layout.restore(state[: layout.size]), layout.restore(state[layout.size : 2 * layout.size])
+
+    def by_system(self, of_records: Sequence) -> Any:
+        """What there is of every record as a tuple, or in a dict of tuples by the names of systems."""
+        if self.parts[0].name is None:
+            return tuple(of_records)
+        return {part.name: tuple(of_records[part.records]) for part in self.parts}
+
+    def end_to_end(self, of_systems: Any) -> list:
+        """What `by_system` returned, for all records in order."""
+        return list(of_systems) if self.parts[0].name is None else [x for own in of_systems.values() for x in own]
+
+
+class Question(AbstractQuestion):
     """Pieces of records, the scene and its sensors, and what is free.
 
     `fitted` (N,) says of each piece whether its start is free; `size` (S,) is the root mean square
@@ -77,6 +200,7 @@ class Question:
         self.size, self.rtol, self.least = size[: len(self.names)], rtol, rtol * size[: len(self.names)]
         self.motions, self.signals, self.parameters = motions, signals, parameters
         self.layout: Layout = signals.layout
+        self.states = 2 * self.layout.size
         self.batches: list[Samples] = self._in_batches()
         starts = [records[piece.record].start if piece.places[0] == 0 else None for piece in pieces]
         self.origins = Origins(starts, self.layout, parameters)
@@ -84,9 +208,24 @@ class Question:
         self.measured = int((self.weights > 0).sum())
 
     @property
-    def states(self) -> int:
-        """2n, the numbers of a start."""
-        return 2 * self.layout.size
+    def unknowns(self) -> int:
+        """How many numbers of all starts are free."""
+        return self.states * int(self.fitted.sum())
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The one system."""
+        return (Part(None, self, slice(0, len(self.records)), slice(0, len(self.names))),)
+
+    def called(self, record: int) -> str:
+        """How the user reaches a record."""
+        return f"records[{record}]"
+
+    def with_parameters(self, parameters: Parameters) -> "Question":
+        """The same question where other parameters are free."""
+        other = copy.copy(self)
+        other.parameters = parameters
+        return other
 
     def of(self, pieces: list[Piece], fitted: np.ndarray) -> "Question":
         """The same question about other pieces of the records."""
@@ -124,14 +263,8 @@ class Question:
             weights[batch.ts < batch.ts[:, :1] + self.signals.delays.longest] = 0.0
         return batch._replace(values=values, weights=weights)
 
-    def at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
-        """The residuals of one trial, or the first piece whose motion failed."""
-        trial = self._at(u, starts)
-        if self.watch is not None:
-            self.watch(trial)
-        return trial
-
-    def _at(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
+    def follow(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
+        """The residuals of one trial, or the first piece whose motion failed, untold."""
         numbers, directions = self.parameters.numbers(u), self.parameters.directions(u)
         starts, moved = self.origins.move(starts, numbers, directions)
         tangents = across = None
@@ -248,42 +381,6 @@ class Question:
         left[..., columns], moved[..., columns, :] = values, by_unknowns
         residuals.append(np.where(counted, left - batch.values, 0.0))
         slopes.append(np.where(counted[..., None], moved, 0.0))
-
-    def widths(self, point: Point, noise: AbstractNoise) -> Widths:
-        """The noise of the signals that makes the residuals of a trial likeliest."""
-        return noise.widths(point.flat(), self.weights, self.least)
-
-    def factors(self, point: Point, widths: Widths) -> list[np.ndarray]:
-        """√count/σ of every sample, by which its residual enters the sum of squares."""
-        return [
-            np.sqrt(counts(widths, r, batch.weights)) / widths.sigma
-            for r, batch in zip(point.residuals, self.batches, strict=True)
-        ]
-
-    def cost(self, point: Point, factors: list[np.ndarray]) -> float:
-        """Half the weighted sum of squares."""
-        return 0.5 * sum(float(np.sum((f * r) ** 2)) for f, r in zip(factors, point.residuals, strict=True))
-
-    def triangles(self, point: Point, factors: list[np.ndarray]) -> np.ndarray:
-        """The weighted rows of each piece, compressed: (N, D + 1, D + 1), the residual as last column."""
-        columns = point.slopes[0].shape[-1] + 1
-        found = np.zeros((len(self.pieces), columns, columns))
-        for batch, factor, r, slopes in zip(self.batches, factors, point.residuals, point.slopes, strict=True):
-            rows = np.concatenate([slopes, r[..., None]], axis=-1)
-            rows *= factor[..., None]
-            rows = rows.reshape(len(r), -1, columns)
-            if point.across is not None:  # of a size that keeps the condition
-                size = np.abs(rows[..., : self.states]).max() or 1.0
-                more = np.pad(size * point.across[batch.rows], ((0, 0), (0, 0), (0, columns - self.states)))
-                rows = np.concatenate([rows, more], axis=1)
-            found[batch.rows] = compressed(rows)
-        return found
-
-    def where(self, failure: Failure) -> str:
-        """A sentence for a failure, with the record's number."""
-        piece = self.pieces[failure.piece]
-        begin = self.records[piece.record].ts[piece.places[0]]
-        return f"The motion of records[{piece.record}] from t = {begin:g} failed. {failure.text}"
 
 
 def triangle_of(rows: np.ndarray) -> np.ndarray:

@@ -19,8 +19,8 @@ from lagjax._fit._noise import AbstractNoise, Known, Widths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._profile import Profile, profile
 from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike
-from lagjax._fit._report import page, pictures_of
-from lagjax._fit._residuals import Failure, Point, Question
+from lagjax._fit._report import Drawn, page, pictures_of
+from lagjax._fit._residuals import AbstractQuestion, Failure, Part, Point, Question
 from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._segments import Reader
 from lagjax._fit._signals import looks_like_positions
@@ -28,7 +28,6 @@ from lagjax._fit._solve import minimise
 from lagjax._fit._uncertainty import Information
 from lagjax._layout import Layout
 from lagjax._simulate import simulate
-from lagjax._system import System
 from lagjax._trajectory import Trajectory
 
 PyTree = Any
@@ -95,7 +94,7 @@ class Fit:
     """What came out of `fit`. Print it for a table with intervals and a verdict.
 
     - `params`: the parameters in the user's pytree, the free ones where the measurements are likeliest.
-    - `starts`: one (q0, qdot0) per record.
+    - `starts`: one (q0, qdot0) per record. Of several systems a dict by their names, as `residuals` are.
     - `covariance`: of the free numbers, by name (`Covariance`); intervals are made in the transformed numbers.
     - `noise`: the scatter of each signal, by name (`SignalNoise`).
     - `residuals`: per record, what the fit shows less what was measured, in the structure of `values`; NaN if missing.
@@ -106,10 +105,10 @@ class Fit:
     """
 
     params: PyTree
-    starts: tuple[tuple[PyTree, PyTree], ...]
+    starts: Any
     covariance: Covariance
     noise: dict[str, SignalNoise]
-    residuals: tuple[PyTree, ...]
+    residuals: Any
     unseen: tuple[str, ...]
     ok: bool
     message: str
@@ -123,8 +122,8 @@ class Fit:
     law: AbstractNoise = field(repr=False)
     information: Information = field(repr=False)
     widths: Widths = field(repr=False)
-    question: Question = field(repr=False)
-    system: System = field(repr=False)
+    question: AbstractQuestion = field(repr=False)
+    system: Any = field(repr=False)
     observe: Any = field(repr=False)
 
     def __repr__(self) -> str:
@@ -134,7 +133,8 @@ class Fit:
     def rms(self) -> dict[str, float]:
         """The root mean square of the residuals of each signal, in its own unit."""
         squares, count = np.zeros((2, len(self.question.names)))
-        for k, (residuals, record) in enumerate(zip(self.residuals, self.records, strict=True)):
+        each = self.question.end_to_end(self.residuals)
+        for k, (residuals, record) in enumerate(zip(each, self.records, strict=True)):
             matrix, columns = record_matrix(residuals, record), self.question.columns(k)
             squares[columns] += np.nansum(matrix**2, axis=0)
             count[columns] += np.isfinite(matrix).sum(axis=0)
@@ -156,7 +156,7 @@ class Fit:
             ends.append(self.parameters.restore(numbers))
         return ends[0], ends[1]
 
-    def start_intervals(self, level: float = 0.95) -> tuple[tuple, tuple]:
+    def start_intervals(self, level: float = 0.95) -> tuple[Any, Any]:
         """The ends (low, high) of the intervals of the starts, each in the structure of `starts`.
 
         They hold every number of a start with probability `level`, the parameters being uncertain too. A start that is
@@ -169,8 +169,8 @@ class Fit:
                 of_starts(self.question, self._point, self.widths, self.information).covariance, axis1=1, axis2=2
             )
         )
-        n, restore = self.question.layout.size, self.question.layout.restore
-        low, high = (tuple((restore(y[:n]), restore(y[n:])) for y in self.states + s * wide) for s in (-1, 1))
+        ends = (enumerate(self.states + s * wide) for s in (-1, 1))
+        low, high = (self.question.by_system([self.question.restored(k, y) for k, y in end]) for end in ends)
         return low, high
 
     def profile(self, name: str, level: float = 0.95) -> Profile:
@@ -195,6 +195,8 @@ class Fit:
         is the fit, `names` what the numbers are called, `covariance()` that of least squares, and `params(u)` turns the
         first numbers into the user's pytree.
         """
+        if not isinstance(self.question, Question):
+            raise ValueError("There is no density of several systems yet: use `intervals` and `profile`.")
         shares = np.array([noise.effective / noise.samples for noise in self.noise.values()])
         return Density(self.question, self.system, self.law, self._point, self.widths, shares, prior)
 
@@ -222,11 +224,19 @@ class Fit:
         assert isinstance(point, Point)  # it was computed before
         return point
 
-    @property
-    def _of_sensors(self) -> Widths:
-        """The noise of the signals of records, without that of crossing times."""
-        count = len(self.question.signals.names)
-        return Widths(self.widths.sigma[:count], self.widths.dof[:count])
+    def _part(self, system: str | None) -> Part:
+        """One of the systems by its name, or the only one. Raises `ValueError` for a name that there is not."""
+        parts = {part.name: part for part in self.question.parts}
+        if system not in parts:
+            if None in parts:
+                raise ValueError(f"This is a fit of one system without a name: leave system={system!r} out.")
+            raise ValueError(f"This is a fit of several systems: give system=, one of {', '.join(map(repr, parts))}.")
+        return parts[system]
+
+    def _of_sensors(self, part: Part) -> Widths:
+        """The noise of the signals of a system's records, without that of crossing times."""
+        sensors = slice(part.signals.start, part.signals.start + len(part.question.signals.names))
+        return Widths(self.widths.sigma[sensors], self.widths.dof[sensors])
 
     def _quantile(self, level: float) -> float:
         """Student's t of a level, for the effective number of samples less that of parameters."""
@@ -238,37 +248,38 @@ class Fit:
         wide = self._quantile(level) * np.sqrt(np.diag(self.covariance.matrix))
         return self.parameters.ends(self.u, wide)
 
-    def predict(self, record: Record) -> Prediction:
+    def predict(self, record: Record, *, system: str | None = None) -> Prediction:
         """The motion of the fitted scene along a record, which may be another one than those of the fit.
 
         From the record's start if that is known. Else from the start that suits the record's values best, parameters
         kept: to predict from the first samples alone, let `predict` find the start of a short record, and give that to
-        a `Record` of the whole.
+        a `Record` of the whole. `system` is the name of the record's system, where the fit is of several.
 
         Raises `ValueError` where the record has other signals than those of the fit, or its motion fails.
         """
-        [record] = require_alike([record])
-        first = next((one for one in self.records if isinstance(one, Record)), None)
+        [record], part = require_alike([record]), self._part(system)
+        about = part.question
+        first = next((one for one in about.records if isinstance(one, Record)), None)
         if not isinstance(record, Record) or first is None:
             raise TypeError("Only a lagjax.Record is predicted, after a fit of some: for times ask lagjax.crossings.")
         if record.structure != first.structure:
             raise ValueError("The record has other signals than those of the fit.")
         if record.input_structure != first.input_structure:
             raise ValueError("The record has other inputs than those of the fit.")
-        layout, fixed = self.question.layout, self.parameters.kept(self.u)
+        layout, fixed = about.layout, self.parameters.kept(self.u)
         state = known_start(record, layout, 0, self.params)
         is_known = state is not None and not isinstance(record.start, Guess)
         if state is None:
-            state = _start_read_off(record, self.observe, layout)
+            state = _start_read_off(record, self._by_name(self.observe, part), layout)
         piece = [Piece(0, np.arange(len(record)))]
         question = Question(
-            [record], piece, np.array([not is_known]), self.question.motions, self.question.signals, fixed,
-            self.question.size, self.question.rtol, None, self.question.manifold,
+            [record], piece, np.array([not is_known]), about.motions, about.signals, fixed, about.size, about.rtol,
+            None, about.manifold,
         )  # fmt: skip
         if is_known:
             point = question.at(np.zeros(0), state[None])
         else:
-            done = minimise(question, np.zeros(0), state[None], Known(self._of_sensors), enough=1e-3)
+            done = minimise(question, np.zeros(0), state[None], Known(self._of_sensors(part)), enough=1e-3)
             point = done if isinstance(done, Failure) else done.point
         if isinstance(point, Failure):
             raise ValueError(question.where(point))
@@ -276,31 +287,33 @@ class Fit:
         start = layout.restore(point.starts[0, :n]), layout.restore(point.starts[0, n:])
         ts = np.asarray(record.ts, layout.dtype)
         q0, qdot0 = (jax.tree.map(lambda x: np.asarray(x, layout.dtype), half) for half in start)
-        form, driven = self.question.signals.form, (record.ts, record.input_matrix)
-        scene, params = (self.system, self.params) if form is None else form.along(self.system, self.params, *driven)
+        form, driven, scene, params = about.signals.form, (record.ts, record.input_matrix), self.system, self.params
+        scene = self._by_name(scene, part)
+        scene, params = (scene, params) if form is None else form.along(scene, params, *driven)
         trajectory = simulate(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
-        values, deviation = self._shown(record, question, point)
+        values, deviation = self._shown(part, record, question, point)
         left = np.where(record.weight_matrix > 0, values - record.matrix, np.nan)
-        noise = self._of_sensors._replace(sigma=self._of_sensors.sigma * np.sqrt(self.information.lost))
+        noise = self._of_sensors(part)
+        noise = noise._replace(sigma=noise.sigma * np.sqrt(self.information.lost))
         shown, missed, uncertain = (in_structure(matrix, record) for matrix in (values, left, deviation))
         return Prediction(trajectory, shown, missed, start, uncertain, noise)
 
-    def _shown(self, record: Record, question: Question, point: Point) -> tuple[np.ndarray, np.ndarray]:
+    def _shown(self, part: Part, record: Record, question: Question, point: Point) -> tuple[np.ndarray, np.ndarray]:
         """The signals (T, S) of a record that was followed, at all its times, and their standard deviations."""
-        planned, slopes = self._followed(record, point.starts[0])
+        planned, slopes = self._followed(part.question, record, point.starts[0])
         known, states = self.information, question.states
         own, follows = np.zeros((states, states)), np.zeros((states, len(self.u)))
         if question.fitted[0]:
-            rows = np.sqrt(record.weight_matrix)[..., None] / self._of_sensors.sigma[:, None] * slopes
+            rows = np.sqrt(record.weight_matrix)[..., None] / self._of_sensors(part).sigma[:, None] * slopes
             own, follows = start_alone(rows, states, known, effective_share(self))
         return planned.matrix, deviations(slopes, states, own, follows, known)
 
-    def _followed(self, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
+    def _followed(self, of: Question, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
         """A record with what sensors would show for its values, from a state (2n,), and their derivatives (T, S, D)."""
         everywhere = replace(record, values=in_structure(np.zeros_like(record.matrix), record), weights=None)
         about = Question(
-            [everywhere], [Piece(0, np.arange(len(record)))], np.array([True]), self.question.motions,
-            self.question.signals, self.parameters, self.question.size, self.question.rtol,
+            [everywhere], [Piece(0, np.arange(len(record)))], np.array([True]), of.motions, of.signals,
+            self.parameters, of.size, of.rtol,
         )  # fmt: skip
         full = about.at(self.u, state[None])
         if isinstance(full, Failure):
@@ -308,12 +321,15 @@ class Fit:
         shown = np.where(about.batches[0].weights[0] > 0, full.residuals[0][0], np.nan)  # NaN before a delay is over
         return replace(record, values=in_structure(shown, record)), full.slopes[0][0]
 
-    def next_experiment(self, candidates: Sequence[Record] | dict[str, Record]) -> Experiments:
+    def next_experiment(
+        self, candidates: Sequence[Record] | dict[str, Record], *, system: str | None = None
+    ) -> Experiments:
         """Which of several planned records would tell most about the free parameters: the gain in log det (D-optimal).
 
         `candidates`: records, or a dict of them by name, with times, weights, inputs and a start as they are planned.
         Their values are not looked at and may be NaN; a start that is not known, `lagjax.Guess(q0, qdot0)`, counts as
-        one that has to be fitted. Print what comes back for a table.
+        one that has to be fitted. Where the fit is of several systems, `system` is the name of that of all candidates.
+        Print what comes back for a table.
 
         Raises `ValueError` where a planned record has no start, or its motion fails.
 
@@ -322,21 +338,22 @@ class Fit:
         named = candidates if isinstance(candidates, dict) else {f"[{k}]": one for k, one in enumerate(candidates)}
         if not named:
             raise ValueError("candidates is empty: give at least one lagjax.Record.")
-        rows = [self._rows_of(name, record) for name, record in named.items()]
+        rows = [self._rows_of(self._part(system), name, record) for name, record in named.items()]
         return ranked(list(named), rows, self.parameters.labels, self.information)
 
-    def _rows_of(self, name: str, record: Record) -> np.ndarray:
+    def _rows_of(self, part: Part, name: str, record: Record) -> np.ndarray:
         """The rows (M, F) of a planned record in units of the noise, its start eliminated where it is not known."""
         if not isinstance(record, Record) or record.start is None:
             raise ValueError(
                 f"The planned record {name} needs a start: (q0, qdot0), or lagjax.Guess(q0, qdot0) if that is to be "
                 "fitted."
             )
-        state = known_start(record, self.question.layout, 0, self.params)
+        state = known_start(record, part.question.layout, 0, self.params)
         assert state is not None
-        planned, slopes = self._followed(record, state)
-        weights = planned.weight_matrix[..., None] * (effective_share(self) / self._of_sensors.sigma[:, None] ** 2)
-        rows, states = np.sqrt(weights) * slopes, self.question.states
+        planned, slopes = self._followed(part.question, record, state)
+        sigma = self._of_sensors(part).sigma[:, None]
+        weights = planned.weight_matrix[..., None] * (effective_share(self) / sigma**2)
+        rows, states = np.sqrt(weights) * slopes, part.question.states
         own = rows[..., states:]
         if isinstance(record.start, Guess):
             own = own - rows[..., :states] @ start_alone(rows, states, self.information, 1.0)[1]
@@ -349,13 +366,22 @@ class Fit:
         """
         tables = {"Parameters": _cells_of_parameters(self), "Noise": _cells_of_noise(self)}
         texts = {"What to measure next": str(self.next_experiment(experiments))} if experiments else {}
-        pairs = [pair for pair in zip(self.residuals, self.records, strict=True) if isinstance(pair[1], Record)]
-        drawn = [record for _, record in pairs], [record_matrix(r, record) for r, record in pairs]
-        sensors = self.question.signals.names, self._of_sensors.sigma
-        pictures = pictures_of(*drawn, *sensors, self.covariance, self.waterfall)
+        pictures = pictures_of([self._drawn(part) for part in self.question.parts], self.covariance, self.waterfall)
         text = page(_title(self), self.message, self.ok, self.unseen, tables, pictures, texts)
         with open(path, "w", encoding="utf-8") as file:
             file.write(text)
+
+    def _drawn(self, part: Part) -> Drawn:
+        """The records of one system with their residuals."""
+        residuals = self.question.end_to_end(self.residuals)[part.records]
+        pairs = [pair for pair in zip(residuals, part.question.records, strict=True) if isinstance(pair[1], Record)]
+        records, matrices = [record for _, record in pairs], [record_matrix(r, record) for r, record in pairs]
+        return Drawn(part.name, records, matrices, part.question.signals.names, self._of_sensors(part).sigma)
+
+    @staticmethod
+    def _by_name(of_all, part: Part) -> Any:
+        """What there is for one system: by its name, or for all."""
+        return of_all[part.name] if isinstance(of_all, dict) else of_all
 
     def compare(self, other: "Fit | dict[str, Fit]", *, folds: int = 0) -> Comparison:
         """Which of several fits of the same records the data prefer: this one against another, or a dict of others.

@@ -160,12 +160,13 @@ def time_scale(readers: list[Reader], motions: AbstractMotions, numbers: np.ndar
     return float(both.min()) if len(both) else np.inf
 
 
-def levels(records: list[Record | None], scale: float) -> list[list[Piece]]:
+def levels(records: list[Record | None], scales: list[float]) -> list[list[Piece]]:
     """Cuts of the records, from segments of two time scales to whole records, each twice as long as the one before.
 
-    Without any where records are hardly longer than that; None in the place of a record is left out.
+    Each record has its time scale. Without any where records are hardly longer than that; None in the place of a record
+    is left out.
     """
-    edges = [(k, record, _edges(record, 2.0 * scale)) for k, record in enumerate(records) if record is not None]
+    edges = [(k, record, _edges(record, 2.0 * scales[k])) for k, record in enumerate(records) if record is not None]
     most, found, stride = max(len(e) - 1 for *_, e in edges), [], 1
     while stride < most:
         pieces = []
@@ -173,7 +174,7 @@ def levels(records: list[Record | None], scale: float) -> list[list[Piece]]:
             cut = [*e[:-1:stride].tolist(), len(record)]
             if len(cut) > 2 and 2 * (e[-1] - cut[-2]) < e[min(stride, len(e) - 1)] - e[0]:
                 del cut[-2]  # a rest shorter than half a segment joins the one before
-            pieces += [_thinned(record, k, a, b, scale) for a, b in itertools.pairwise(cut)]
+            pieces += [_thinned(record, k, a, b, scales[k]) for a, b in itertools.pairwise(cut)]
         found.append(pieces)
         stride *= 2
     return found

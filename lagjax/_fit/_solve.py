@@ -20,7 +20,7 @@ import numpy as np
 
 from lagjax._fit._correlation import share
 from lagjax._fit._noise import AbstractNoise, Widths
-from lagjax._fit._residuals import Failure, Point, Question, compressed, triangle_of
+from lagjax._fit._residuals import AbstractQuestion, Failure, Point, compressed, triangle_of
 
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
 # least one, damping is below the round-off of derivatives and only keeps columns that nothing depends on from moving.
@@ -80,7 +80,7 @@ class Anchor(NamedTuple):
 
 
 def minimise(
-    question: Question,
+    question: AbstractQuestion,
     u: np.ndarray,
     starts: np.ndarray,
     noise: AbstractNoise,
@@ -138,7 +138,7 @@ class _Model(NamedTuple):
         return eliminate(self.triangles, self.states, scale, damping, self.pull, self.limits)
 
 
-def _model(question: Question, point: Point, noise: AbstractNoise, anchor: Anchor) -> _Model:
+def _model(question: AbstractQuestion, point: Point, noise: AbstractNoise, anchor: Anchor) -> _Model:
     widths = question.widths(point, noise)
     factors = question.factors(point, widths)
     triangles, cost = question.triangles(point, factors), question.cost(point, factors) + anchor.cost(point.u)
@@ -147,7 +147,7 @@ def _model(question: Question, point: Point, noise: AbstractNoise, anchor: Ancho
 
 
 def _descended(
-    question: Question, point: Point, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
+    question: AbstractQuestion, point: Point, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
 ) -> tuple[Point | None, float, int]:
     """The first trial that is better, the damping to go on with, and the count of trials.
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from lagjax._fit._correlation import correlated_square, correlation, together
 from lagjax._fit._noise import Widths
-from lagjax._fit._residuals import Point, Question, compressed
+from lagjax._fit._residuals import AbstractQuestion, Point, compressed
 
 # Singular values below this fraction of the largest, of columns of length one, are null: derivatives are as accurate
 # as the motion, to 1e-9, and a direction that is really seen so little would need a million times the data.
@@ -44,7 +44,7 @@ class Information(NamedTuple):
     lost: float
 
 
-def information(question: Question, point: Point, widths: Widths) -> Information:
+def information(question: AbstractQuestion, point: Point, widths: Widths) -> Information:
     """What the data say about the parameters, at the end of a search."""
     factors = [np.sqrt(b.weights) / widths.sigma for b in question.batches]
     triangles = question.triangles(point, factors)
@@ -59,7 +59,7 @@ def information(question: Question, point: Point, widths: Widths) -> Information
         for s, law in enumerate(lags):
             middle += correlated_square(together(own[:, :, s], batch.weights[..., s] > 0), law)
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
-    used = free - null.shape[1] + question.states * int(question.fitted.sum())
+    used = free - null.shape[1] + question.unknowns
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in widths.dof])
     half = basis @ np.linalg.solve(basis.T @ _square(triangles, question.states) @ basis, basis.T)

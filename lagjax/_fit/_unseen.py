@@ -13,14 +13,14 @@ import numpy as np
 
 from lagjax._fit._noise import Widths
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._residuals import Failure, Point, Question
+from lagjax._fit._residuals import AbstractQuestion, Failure, Point
 from lagjax._fit._uncertainty import seen
 
 _MOST_NAMES = 12  # in one sentence
 _LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
 
 
-def sentences(question: Question, point: Point, widths: Widths, null: np.ndarray) -> tuple[str, ...]:
+def sentences(question: AbstractQuestion, point: Point, widths: Widths, null: np.ndarray) -> tuple[str, ...]:
     """A sentence for every set of parameters of which something is not seen, given the null directions (F, K) of u."""
     if not null.shape[1]:
         return ()
@@ -34,7 +34,7 @@ def sentences(question: Question, point: Point, widths: Widths, null: np.ndarray
     return tuple(found)
 
 
-def _null_elsewhere(question: Question, point: Point, widths: Widths):
+def _null_elsewhere(question: AbstractQuestion, point: Point, widths: Widths):
     """Other values u of the free parameters, a few per cent away, and the null directions there."""
     u = point.u
     near = u + question.parameters.sizes(u) * np.random.default_rng(0).uniform(0.02, 0.06, len(u))

@@ -13,7 +13,7 @@ Influence in Regression* (1982), §3.4, for one observation.
 import numpy as np
 
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._residuals import Point, Question, compressed
+from lagjax._fit._residuals import AbstractQuestion, Point, compressed
 from lagjax._fit._solve import Descent, eliminate
 from lagjax._fit._transforms import Between, Positive
 from lagjax._fit._uncertainty import Information, orthogonal
@@ -26,7 +26,7 @@ _MOST_NAMED = 3
 _CORRELATED = 0.5
 
 
-def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, question: Question) -> str:
+def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, question: AbstractQuestion) -> str:
     """Sentences about a search that ended, and about what it found."""
     parts = [descent.message]
     if unseen:
@@ -91,7 +91,9 @@ def _at_end(name: str, transform: Positive | Between, x: float, step: float, err
     return None
 
 
-def _disagreements(question: Question, triangles: np.ndarray, known: Information, inside: np.ndarray) -> list[str]:
+def _disagreements(
+    question: AbstractQuestion, triangles: np.ndarray, known: Information, inside: np.ndarray
+) -> list[str]:
     """Sentences for the records without which a parameter would move by more than they can have by chance.
 
     Only of parameters `inside` (F,) of their sets: at a bound the sum of squares has a slope.
@@ -106,7 +108,7 @@ def _disagreements(question: Question, triangles: np.ndarray, known: Information
     worst = [(k, int(np.argmax(np.abs(z)))) for k, z in shifts.items()]
     worst = sorted((-abs(shifts[k][i]), k, i) for k, i in worst if abs(shifts[k][i]) > _DISAGREE)
     return [
-        f"records[{k}] disagrees with the others: without it {labels[i]} would move by "
+        f"{question.called(k)} disagrees with the others: without it {labels[i]} would move by "
         f"{-size:.1f} of the standard deviations that chance gives it."
         for size, k, i in worst[:_MOST_NAMED]
     ]

@@ -53,9 +53,22 @@ def weak_start(question: Question, system: System, u: np.ndarray, readers: list[
 
     `scale` is the motion's time scale, `system` the scene as its author wrote it.
     """
-    if has_constraints(system) or not np.isfinite(scale):
+    return balanced([(question, system, readers, scale)], u)
+
+
+def balanced(systems: list[tuple[Question, System, list[Reader | None], float]], u: np.ndarray):
+    """The u (F,) that balances the weak forms of several systems best: each with what `weak_start` takes.
+
+    A system with constraints, or where nothing moves, says nothing.
+    """
+    telling = [one for one in systems if not has_constraints(one[1]) and np.isfinite(one[3])]
+    if not telling:
         return None
-    residuals, dtype = imbalance(question, system, readers, scale), question.layout.dtype
+    each, dtype = [imbalance(*one) for one in telling], telling[0][0].layout.dtype
+
+    def residuals(u):
+        return jnp.concatenate([one(u) for one in each])
+
     value, slope = jax.jit(residuals), jax.jit(jax.jacfwd(residuals))
     if jax.eval_shape(residuals, u.astype(dtype)).size < 2 * len(u):
         return None  # a network would follow the noise of so few windows

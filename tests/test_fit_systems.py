@@ -1,0 +1,157 @@
+"""`fit` of records of several systems that share parameters: a single and a double pendulum on one earth."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import lagjax
+
+TRUTH = {"g": 9.81, "bearing": 0.05, "motor": 2.0}
+FIRST = {"g": 9.6, "bearing": 0.04, "motor": 1.9}
+TS = np.linspace(0.0, 3.0, 91)
+SIGMA = 1e-3
+
+SINGLE = lagjax.System(
+    lambda q, qdot, params: 0.5 * qdot**2 + params["g"] * jnp.cos(q),
+    dissipation=lambda q, qdot, params: 0.5 * params["bearing"] * qdot**2,
+    forces=lambda q, qdot, inputs, params: params["motor"] * inputs,
+)
+
+
+def energy(q, qdot, params):
+    kinetic = qdot[0] ** 2 + 0.5 * qdot[1] ** 2 + qdot[0] * qdot[1] * jnp.cos(q[0] - q[1])
+    return kinetic + params["g"] * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+
+
+DOUBLE = lagjax.System(
+    energy, dissipation=lambda q, qdot, params: 0.5 * params["bearing"] * (qdot[0] ** 2 + (qdot[1] - qdot[0]) ** 2)
+)
+SYSTEMS = {"single": SINGLE, "double": DOUBLE}
+
+
+def tip(q, qdot):
+    """What the camera sees of the double pendulum."""
+    return {"x": jnp.sin(q[0]) + jnp.sin(q[1]), "elbow": q[0]}
+
+
+OBSERVE = {"single": None, "double": tip}
+
+
+RATES = {
+    "single": lambda t, y, g, c, k: [y[1], k * t / 3 - c * y[1] - g * np.sin(y[0])],
+    "double": lambda t, y, g, c, _: [*y[2:], *_double(y[:2], y[2:], g, c)],
+}
+
+
+def _double(q, qdot, g, c):
+    """The accelerations by hand: masses and lengths are one."""
+    across, turning = np.cos(q[0] - q[1]), np.sin(q[0] - q[1])
+    matrix = np.array([[2.0, across], [across, 1.0]])
+    torque = c * np.array([2 * qdot[0] - qdot[1], qdot[1] - qdot[0]])
+    forces = turning * np.array([-(qdot[1] ** 2), qdot[0] ** 2]) - g * np.array([2 * np.sin(q[0]), np.sin(q[1])])
+    return np.linalg.solve(matrix, forces - torque)
+
+
+def followed(name, start):
+    """Positions (T, n) to 1e-10, by another integrator and other equations."""
+    run = solve_ivp(RATES[name], TS[[0, -1]], start, "DOP853", TS, args=tuple(TRUTH.values()), rtol=1e-10, atol=1e-11)
+    return run.y[: len(start) // 2].T
+
+
+def measured(starts=(0.3, -0.5), seed=0):
+    """Driven records of the single pendulum, without starts, and free ones of the double one, with guesses."""
+    rng, single, double = np.random.default_rng(seed), [], []
+    for angle in starts:
+        values = followed("single", [angle, 0.2])[:, 0]
+        single.append(lagjax.Record(TS, values + SIGMA * rng.normal(size=len(TS)), TS / 3))
+        start = np.array([angle, -0.2, 0.3, 0.1])
+        seen = jax.tree.map(np.asarray, jax.vmap(tip)(jnp.asarray(followed("double", start)), np.zeros((len(TS), 2))))
+        seen = {name: values + 2 * SIGMA * rng.normal(size=len(TS)) for name, values in seen.items()}
+        double.append(lagjax.Record(TS, seen, start=lagjax.Guess(start[:2], start[2:])))
+    return {"single": single, "double": double}
+
+
+OPTIONS = {"hold": "linear", "method": "whole"}
+
+
+@pytest.fixture(scope="module")
+def records():
+    return measured()
+
+
+@pytest.fixture(scope="module")
+def joint(records):
+    return lagjax.fit(SYSTEMS, records, FIRST, observe=OBSERVE, **OPTIONS)
+
+
+def test_the_joint_estimate_weighs_those_of_each_system_by_their_information(records, joint):
+    # With the starts eliminated, the sum of squares of each system is a parabola of the parameters, and parabolas add.
+    alone = lagjax.fit(SINGLE, records["single"], FIRST, **OPTIONS)
+    free = {"g": True, "bearing": True, "motor": False}
+    other = lagjax.fit(DOUBLE, records["double"], FIRST, observe=tip, free=free, **OPTIONS)
+    assert joint.covariance.names == ("params['bearing']", "params['g']", "params['motor']")
+    precision, pull = np.zeros((3, 3)), np.zeros(3)
+    for fit, own in ((alone, slice(0, 3)), (other, slice(0, 2))):
+        precision[own, own] += np.linalg.inv(fit.information.white)
+        pull[own] += np.linalg.inv(fit.information.white) @ fit.u
+    deviation = np.sqrt(np.diag(np.linalg.inv(precision)))
+    # A search ends within 0.05 standard deviations; they bend over one by a thousandth of their slopes.
+    np.testing.assert_allclose(joint.u / deviation, np.linalg.solve(precision, pull) / deviation, rtol=0, atol=0.1)
+    scale = np.outer(deviation, deviation)
+    np.testing.assert_allclose(joint.information.white / scale, np.linalg.inv(precision) / scale, rtol=0, atol=0.02)
+    assert joint.ok and (np.abs(joint.u - [0.05, 9.81, 2.0]) < 4 * np.sqrt(np.diag(joint.covariance.matrix))).all()
+    assert (deviation[:2] < 0.95 * np.sqrt(np.diag(other.information.white))).all()
+
+
+def test_what_comes_out_has_the_names_of_the_systems(records, joint):
+    assert list(joint.noise) == ["single: q", "double: values['elbow']", "double: values['x']"]
+    sigma = [noise.sigma / SIGMA for noise in joint.noise.values()]
+    np.testing.assert_allclose(sigma, [1.0, 2.0, 2.0], rtol=0.25)  # of 182 samples each: 5 %
+    assert joint.starts["single"][1][0] == pytest.approx(-0.5, abs=5 * SIGMA)
+    assert np.shape(joint.starts["double"][0][0]) == (2,) and set(joint.residuals["double"][1]) == {"x", "elbow"}
+    low, high = joint.start_intervals(0.9999)
+    assert (low["double"][0][0] < [0.3, -0.2]).all() and (high["double"][0][0] > [0.3, -0.2]).all()
+    text = str(joint)
+    assert "single: q" in text and "4 records" in text
+
+
+def test_a_record_of_one_system_is_predicted(records, joint):
+    for name in SYSTEMS:
+        shown = joint.predict(records[name][0], system=name)
+        left = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(shown.residuals)])
+        assert np.sqrt(np.mean(left**2)) < 3 * SIGMA
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(shown.bands()))
+    with pytest.raises(ValueError, match="give system=, one of 'single', 'double'"):
+        joint.predict(records["single"][0])
+    with pytest.raises(ValueError, match="There is no density of several systems"):
+        joint.sample(10)
+
+
+def test_what_no_system_sees_is_named(records, joint):
+    first = {**FIRST, "mass": 1.0}
+    fit = lagjax.fit(SYSTEMS, records, first, observe=OBSERVE, **OPTIONS)
+    assert fit.unseen == ("Nothing that was measured depends on params['mass'].",)
+    np.testing.assert_allclose(fit.params["g"], joint.params["g"], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "sentence"),
+    [
+        ({"records": []}, TypeError, "records must be a dict by the same names, 'single', 'double'; got list"),
+        ({"records": {"single": []}}, ValueError, "records has nothing for the system 'double'"),
+        ({"observe": {**OBSERVE, "triple": None}}, ValueError, "observe has 'triple', which is the name of no system"),
+        ({"system": SINGLE, "observe": None}, TypeError, "records is a dict, so system must be"),
+        ({"system": SINGLE, "records": [], "observe": {}}, TypeError, "observe is a dict, so system must be"),
+        ({"system": {}}, ValueError, "system is an empty dict"),
+        ({"system": {1: SINGLE}}, TypeError, "have names; 1 is no str"),
+        ({"observe": None}, ValueError, "Of the system 'double': values must have the structure of q"),
+        ({"starts": 4}, ValueError, "starts must be 1 where there are several systems"),
+        ({"method": "gradient"}, ValueError, "is for one system"),
+    ],
+)
+def test_what_cannot_be_is_a_sentence(records, change, error, sentence):
+    given = {"system": SYSTEMS, "records": records, "params0": FIRST, "observe": OBSERVE, **OPTIONS, **change}
+    with pytest.raises(error, match=sentence):
+        lagjax.fit(**given)
