@@ -99,9 +99,9 @@ def fit(
 
     **Arguments**
 
+    - `system`: one scene, or a dict by name of scenes that share parameters: two machines with the same bearings, or
+      one at rest and driven. `records` is then a dict by the same names, and `observe` such a dict or one for all.
     - `records`: one `Record` or several, of any lengths; and `lagjax.Timings`, beside them or alone.
-    - `system`: one scene, or a dict of scenes by name that share parameters, such as two machines with the same
-      bearings. `records` is then a dict of the same names, and `observe` one for all or such a dict.
     - `params0`: where the search for the parameters begins, in the structure that the scene's functions ask for.
     - `observe`: a function of (q, qdot), and of `t`, `params`, `inputs` by name, that returns what the sensors show in
       the structure of a record's `values`; by default q. `lagjax.Delayed` where they show it later.

@@ -4,7 +4,7 @@ Each system has a `Question` of its own, with its coordinates, sensors and input
 start and on u alone, whatever its system: once its start is eliminated, only the columns of the parameters are left,
 and these are the same for all. So the search stays as it is. Rows of all systems are made alike: a start has room for
 the most coordinates, of which a smaller system leaves the last ones without any influence, like those of a start that
-is known; and the signals of all systems stand side by side, with no weight where a record has them not.
+is known; and the signals of all systems stand side by side, with no weight where a record does not have them.
 """
 
 import contextlib
@@ -182,7 +182,7 @@ def _require_names(what: str, given, systems: dict) -> None:
 
 @contextlib.contextmanager
 def naming(name: str | None) -> Iterator[None]:
-    """Sentences about what is wrong in here begin with the name of the system, where there are several."""
+    """Begin sentences about what is wrong in this context with the name of the system, where there are several."""
     try:
         yield
     except (TypeError, ValueError) as reason:
