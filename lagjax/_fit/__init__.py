@@ -100,7 +100,8 @@ def fit(
     **Arguments**
 
     - `system`: one scene, or a dict by name of scenes that share parameters: two machines with the same bearings, or
-      one at rest and driven. `records` is then a dict by the same names, and `observe` such a dict or one for all.
+      one that swings freely in some records and is driven in others. `records` is then a dict by the same names, and
+      `observe` such a dict or one for all.
     - `records`: one `Record` or several, of any lengths; and `lagjax.Timings`, beside them or alone.
     - `params0`: where the search for the parameters begins, in the structure that the scene's functions ask for.
     - `observe`: a function of (q, qdot), and of `t`, `params`, `inputs` by name, that returns what the sensors show in
@@ -198,20 +199,15 @@ def _require_one_beginning(question: AbstractQuestion, starts: int, method: str)
     """Raise `ValueError` where many starts, or a descent by gradients, are asked for and cannot be."""
     if method == "gradient" and starts > 1:
         raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
-    if not isinstance(question, Question):
-        if method == "gradient":
-            raise ValueError('method="gradient" is for one system: leave `method` at "auto" for several.')
-        if starts > 1:
-            raise ValueError("starts must be 1 where there are several systems: their search has one beginning.")
-        return
-    if starts == 1:
-        return
-    if question.signals.delays is not None:
-        raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")
-    if question.manifold is not None and question.fitted.any():
-        raise ValueError("starts must be 1 where starts on constraints are fitted: their search has one beginning.")
-    if question.clocks:
-        raise ValueError("starts must be 1 where there are lagjax.Timings: their search has one beginning.")
+    if method == "gradient" and not isinstance(question, Question):
+        raise ValueError('method="gradient" is for one system: leave `method` at "auto" for several.')
+    for one in [part.question for part in question.parts] if starts > 1 else []:
+        if one.signals.delays is not None:
+            raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")
+        if one.manifold is not None and one.fitted.any():
+            raise ValueError("starts must be 1 where starts on constraints are fitted: their search has one beginning.")
+        if one.clocks:
+            raise ValueError("starts must be 1 where there are lagjax.Timings: their search has one beginning.")
 
 
 def _form(system: System, records: list[Record], hold: str) -> Form | None:
@@ -407,7 +403,6 @@ def _searches(question: AbstractQuestion, search, u, y0, starts: int, seed: int)
     """The best of the searches from u and from `starts` − 1 random values, and what all of them came to."""
     if starts == 1:
         return search(u, y0), None
-    assert isinstance(question, Question)  # others have one start
     trials = short_search(question, drawn(question.parameters, u, starts, seed), y0)
     misfits, done = trials.misfits.copy(), []
     chosen = distinct(trials, _BEST)

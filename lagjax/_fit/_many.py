@@ -18,7 +18,7 @@ import numpy as np
 from lagjax._fit._noise import Widths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Piece
-from lagjax._fit._residuals import Failure, Question, compressed
+from lagjax._fit._residuals import AbstractQuestion, Failure, Question, compressed
 from lagjax._fit._solve import eliminate
 
 _STEPS = 8  # of the short search
@@ -62,7 +62,7 @@ def drawn(parameters: Parameters, u: np.ndarray, count: int, seed: int) -> np.nd
     return np.stack([u, *(parameters.drawn(u, rng) for _ in range(count - 1))])
 
 
-def short_search(question: Question, u: np.ndarray, starts: np.ndarray) -> Trials:
+def short_search(question: AbstractQuestion, u: np.ndarray, starts: np.ndarray) -> Trials:
     """What the starts u (K, F) come to in a few steps, with the records' starts (N, 2n) to begin from; in order."""
     part = _sampled(question)
     at = _tried(part, u, np.repeat(starts[None], len(u), axis=0))
@@ -81,7 +81,7 @@ def short_search(question: Question, u: np.ndarray, starts: np.ndarray) -> Trial
     return Trials(at.u[order], at.starts[order], at.misfits[order])
 
 
-def misfit(widths: Widths, question: Question) -> float:
+def misfit(widths: Widths, question: AbstractQuestion) -> float:
     """The noise that is left, over the size of the signals."""
     return float(np.exp(np.mean(np.log(widths.sigma / question.size))))
 
@@ -104,18 +104,19 @@ class _Tried(NamedTuple):
     triangles: np.ndarray
 
 
-def _sampled(question: Question) -> Question:
+def _sampled(question: AbstractQuestion) -> AbstractQuestion:
     """The question with at most `_SAMPLES` samples of each record."""
+    timed = {part.records.start + k for part in question.parts for k in part.question.clocks}
     pieces = [
         piece
-        if piece.record in question.clocks
+        if piece.record in timed
         else Piece(piece.record, piece.places[np.unique(np.linspace(0, len(piece.places) - 1, _SAMPLES).astype(int))])
         for piece in question.pieces
     ]
     return question.of(pieces, question.fitted)
 
 
-def _tried(question: Question, u: np.ndarray, starts: np.ndarray) -> _Tried:
+def _tried(question: AbstractQuestion, u: np.ndarray, starts: np.ndarray) -> _Tried:
     columns = question.states + u.shape[1] + 1
     found = _Tried(
         u.copy(), starts.copy(), np.full(len(u), np.inf), np.zeros((*starts.shape[:2], columns, columns))
@@ -127,28 +128,42 @@ def _tried(question: Question, u: np.ndarray, starts: np.ndarray) -> _Tried:
     return found
 
 
-def _fill(question: Question, found: _Tried, some: slice) -> None:
+def _fill(question: AbstractQuestion, found: _Tried, some: slice) -> None:
     """The misfits and triangles of some starts, whose motions are one run for each batch of records."""
     parameters, count = question.parameters, some.stop - some.start
     numbers = np.stack([parameters.numbers(u) for u in found.u[some]])
     directions = np.stack([parameters.directions(u) for u in found.u[some]])
-    moves = [question.origins.move(y, *of) for y, *of in zip(found.starts[some], numbers, directions, strict=True)]
-    found.starts[some] = [y for y, _ in moves]
     squares, samples = np.zeros((count, len(question.size))), np.zeros(len(question.size))
     ok = np.isfinite(numbers).all(axis=1) & np.isfinite(directions).all(axis=(1, 2))
-    rows = []
-    for batch in question.batches:
-        each = _residuals(question, batch, found.starts[some], numbers, directions, [m for _, m in moves])
-        ok &= np.isfinite(each).all(axis=(1, 2, 3, 4))
-        rows.append(np.where(np.isfinite(each), each, 0.0))
-        squares += (batch.weights * rows[-1][..., -1] ** 2).sum(axis=(1, 2))
-        samples += (batch.weights > 0).sum(axis=(0, 1))
+    followed = []
+    for part, places in question.apart:
+        own, states = part.question, part.question.states
+        begun = found.starts[some][:, places, :states]
+        moves = [own.origins.move(y, *of) for y, *of in zip(begun, numbers, directions, strict=True)]
+        begun = np.stack([y for y, _ in moves])
+        found.starts[some, places, :states] = begun
+        for batch in own.batches:
+            each = _residuals(own, batch, begun, numbers, directions, [m for _, m in moves])
+            ok &= np.isfinite(each).all(axis=(1, 2, 3, 4))
+            each = np.where(np.isfinite(each), each, 0.0)
+            squares[:, part.signals] += (batch.weights * each[..., -1] ** 2).sum(axis=(1, 2))
+            samples[part.signals] += (batch.weights > 0).sum(axis=(0, 1))
+            followed.append((part, places[batch.rows], batch.weights, each))
     sigma = np.maximum(np.sqrt(squares / samples), question.least)
     found.misfits[some] = np.where(ok, np.exp(np.mean(np.log(sigma / question.size), axis=1)), np.inf)
-    for batch, each in zip(question.batches, rows, strict=True):
-        each *= (np.sqrt(batch.weights) / sigma[:, None, None, :])[..., None]
-        shape = count * len(batch.rows), -1, each.shape[-1]
-        found.triangles[some, batch.rows] = compressed(each.reshape(shape)).reshape(count, -1, *[each.shape[-1]] * 2)
+    for part, places, weights, each in followed:
+        each *= (np.sqrt(weights) / sigma[:, None, None, part.signals])[..., None]
+        small, states = compressed(each.reshape(count * len(places), -1, each.shape[-1])), part.question.states
+        _place(found.triangles[some], places, states, question.states - states, small)
+
+
+def _place(triangles: np.ndarray, places: np.ndarray, states: int, more: int, of_system: np.ndarray) -> None:
+    """Put the triangles of M pieces of one system, (K·M, D, D), at their `places` among those of all, (K, N, …).
+
+    Behind the columns of its `states` these have `more` columns, for a system with more coordinates.
+    """
+    rows = np.insert(of_system, [states] * more, 0.0, axis=-1)
+    triangles[:, places, : rows.shape[-2]] = rows.reshape(len(triangles), len(places), *rows.shape[1:])
 
 
 def _residuals(question: Question, batch, starts, numbers, directions, moved) -> np.ndarray:
@@ -195,7 +210,7 @@ def _sensed(question: Question, batch, starts, numbers, along):
         yield question.signals.of(part, batch.ts, batch.inputs, numbers[k], along[k][1]) if part.ok else None
 
 
-def _step(question: Question, at: _Tried, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def _step(question: AbstractQuestion, at: _Tried, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """Where the damped step of one start leads."""
     triangles, states, none = at.triangles[k], question.states, np.zeros(at.u.shape[1])
     limits = question.parameters.limits(at.u[k])

@@ -105,6 +105,11 @@ class AbstractQuestion(abc.ABC):
 
     @property
     @abc.abstractmethod
+    def apart(self) -> list[tuple[Part, np.ndarray]]:
+        """The systems that have pieces, each with its question about these alone, and which of all they are."""
+
+    @property
+    @abc.abstractmethod
     def unknowns(self) -> int:
         """How many numbers of all starts are free."""
 
@@ -216,6 +221,11 @@ class Question(AbstractQuestion):
     def parts(self) -> tuple[Part, ...]:
         """The one system."""
         return (Part(None, self, slice(0, len(self.records)), slice(0, len(self.names))),)
+
+    @property
+    def apart(self) -> list[tuple[Part, np.ndarray]]:
+        """The one system, with all pieces."""
+        return [(self.parts[0], np.arange(len(self.pieces)))]
 
     def called(self, record: int) -> str:
         """How the user reaches a record."""

@@ -40,21 +40,23 @@ class Several(AbstractQuestion):
             fitted = np.concatenate([question.fitted for question in systems.values()])
         self.pieces, self.fitted = pieces, fitted
         self.states = max(question.states for question in systems.values())
-        self._take_apart()
-        own = [(part.name, part.question) for part in self._own]
+        self._apart = self._taken_apart()
+        own = [(part.name, part.question) for part, _ in self.apart]
         self.names = tuple(f"{name}: {signal}" for name, question in own for signal in question.names)
         self.size, self.least = (np.concatenate([getattr(q, kind) for _, q in own]) for kind in ("size", "least"))
         self.batches = [
-            self._widened(part, rows, batch)
-            for part, rows in zip(self._own, self._rows, strict=True)
-            for batch in part.question.batches
+            self._widened(part, rows, batch) for part, rows in self.apart for batch in part.question.batches
         ]
         self.weights = np.concatenate([b.weights.reshape(-1, len(self.names)) for b in self.batches])
         self.measured = int((self.weights > 0).sum())
 
-    def _take_apart(self) -> None:
-        """Make of every system that has pieces its own question about these, and note which ones of all they are."""
-        owner, self._own, self._rows, signals = np.array([piece.record for piece in self.pieces]), [], [], 0
+    @property
+    def apart(self) -> list[tuple[Part, np.ndarray]]:
+        """The systems that have pieces, each with its question about these alone, and which of all they are."""
+        return self._apart
+
+    def _taken_apart(self) -> list[tuple[Part, np.ndarray]]:
+        owner, found, signals = np.array([piece.record for piece in self.pieces]), [], 0
         for name, question in self.systems.items():
             records = slice(self.first[name], self.first[name] + len(question.records))
             rows = np.flatnonzero((owner >= records.start) & (owner < records.stop))
@@ -62,9 +64,9 @@ class Several(AbstractQuestion):
                 continue
             own = [Piece(self.pieces[row].record - records.start, self.pieces[row].places) for row in rows]
             part = question.of(own, self.fitted[rows])
-            self._own.append(Part(name, part, records, slice(signals, signals + len(part.names))))
-            self._rows.append(rows)
+            found.append((Part(name, part, records, slice(signals, signals + len(part.names))), rows))
             signals += len(part.names)
+        return found
 
     def _widened(self, part: Part, rows: np.ndarray, batch: Samples) -> Samples:
         values, weights = np.zeros((2, *batch.ts.shape, len(self.names)))
@@ -74,12 +76,12 @@ class Several(AbstractQuestion):
     @property
     def parts(self) -> tuple[Part, ...]:
         """The systems, each with its question about all of its records."""
-        return tuple(part._replace(question=self.systems[str(part.name)]) for part in self._own)
+        return tuple(part._replace(question=self.systems[str(part.name)]) for part, _ in self.apart)
 
     @property
     def unknowns(self) -> int:
         """How many numbers of all starts are free."""
-        return sum(part.question.unknowns for part in self._own)
+        return sum(part.question.unknowns for part, _ in self.apart)
 
     def of(self, pieces: list[Piece], fitted: np.ndarray) -> "Several":
         """The same question about other pieces of the records; the signals are those of systems with a piece."""
@@ -92,12 +94,14 @@ class Several(AbstractQuestion):
         other = copy.copy(self)
         other.parameters = parameters
         other.systems = {name: question.with_parameters(parameters) for name, question in self.systems.items()}
-        other._own = [part._replace(question=part.question.with_parameters(parameters)) for part in self._own]
+        other._apart = [
+            (part._replace(question=part.question.with_parameters(parameters)), rows) for part, rows in self.apart
+        ]
         return other
 
     def columns(self, record: int) -> slice:
         """Which of the signals a record has."""
-        part = next(part for part in self._own if part.records.start <= record < part.records.stop)
+        part = next(part for part, _ in self.apart if part.records.start <= record < part.records.stop)
         own = part.question.columns(record - part.records.start)
         return slice(part.signals.start + own.start, part.signals.start + own.stop)
 
@@ -110,7 +114,7 @@ class Several(AbstractQuestion):
         """The residuals of one trial, or the first piece whose motion failed, untold."""
         placed, residuals, slopes = starts.copy(), [], []
         across = np.zeros((len(starts), self.states, self.states))
-        for part, rows in zip(self._own, self._rows, strict=True):
+        for part, rows in self.apart:
             states = part.question.states
             point = part.question.follow(u, starts[rows, :states])
             if isinstance(point, Failure):
