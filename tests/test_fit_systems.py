@@ -177,3 +177,45 @@ def test_what_cannot_be_is_a_sentence(records, change, error, sentence):
     given = {"system": SYSTEMS, "records": records, "params0": FIRST, "observe": OBSERVE, **OPTIONS, **change}
     with pytest.raises(error, match=sentence):
         lagjax.fit(**given)
+
+
+def test_the_next_experiment_is_one_of_a_system(joint):
+    planned = {
+        name: lagjax.Record(TS, 0 * TS, push * TS, start=(0.1, 0.0)) for name, push in (("none", 0), ("strong", 3))
+    }
+    table = joint.next_experiment(planned, system="single")
+    assert table.names == ("strong", "none") and table.parameters[np.argmin(table.deviations[0])] == "params['motor']"
+
+
+@pytest.mark.slow
+def test_profiles_reports_and_plots_know_of_several_systems(joint, tmp_path):
+    pytest.importorskip("matplotlib").use("Agg")
+    low, high = joint.intervals()
+    # Three thousandths of g are far within where the sum of squares is a parabola.
+    np.testing.assert_allclose(joint.profile("params['g']").interval, (low["g"], high["g"]), rtol=1e-5)
+    joint.report(tmp_path / "fit.html")
+    text = (tmp_path / "fit.html").read_text(encoding="utf-8")
+    assert "<h2>single: Data over fit" in text and "<h2>double: Data over fit" in text
+    assert lagjax.plot.fit(joint, record=0).shape == (2, 1) and lagjax.plot.fit(joint, record=2).shape == (2, 2)
+
+
+@pytest.mark.slow
+def test_crossing_times_of_one_system_and_constraints_of_another():
+    gates = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 + params["g"] * jnp.cos(q))
+    rod = lagjax.System(
+        lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - params["g"] * q[1], constraints=lambda q: q @ q - 0.64
+    )
+    sections, span = {"bottom": lambda q, qdot: q}, jnp.array([0.0, 6.0])
+    times = lagjax.crossings(gates, sections, 1.0, 0.0, span, {"g": 9.81})["bottom"]
+    passed = np.asarray(times.t)[: int(times.count)]
+    q0 = 0.8 * np.array([np.sin(0.9), -np.cos(0.9)])
+    values = np.asarray(lagjax.simulate(rod, q0, 0 * q0, TS, {"g": 9.81}).q)
+    timings = lagjax.Timings(
+        sections, {"bottom": passed}, t0=0.0, start=lagjax.Guess(0.9, 0.1), direction={"bottom": 0}
+    )
+    fit = lagjax.fit({"gates": gates, "rod": rod}, {"gates": timings, "rod": lagjax.Record(TS, values)}, {"g": 9.0})
+    # Both are exact to rtol 1e-9 of their motions.
+    assert fit.params["g"] == pytest.approx(9.81, rel=1e-6)
+    assert list(fit.noise) == ["gates: times", "rod: q[0]", "rod: q[1]"]
+    np.testing.assert_allclose(np.concatenate(fit.starts["rod"][0]), [*q0, 0.0, 0.0], atol=1e-6)
+    assert np.isfinite(np.concatenate(fit.start_intervals()[1]["rod"][0])).all()
