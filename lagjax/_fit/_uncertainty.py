@@ -23,6 +23,8 @@ from lagjax._fit._residuals import AbstractQuestion, Point, compressed
 # Singular values below this fraction of the largest, of columns of length one, are null: derivatives are as accurate
 # as the motion, to 1e-9, and a direction that is really seen so little would need a million times the data.
 NULL = 1e-7
+# The length of a column below which it is zero: one over it must have a square, and some room, among finite numbers.
+_NOTHING = 1e-140
 
 
 class Information(NamedTuple):
@@ -76,7 +78,7 @@ def seen(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
     rows = _eliminated(triangles, states)
     before = np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
-    unit = np.where(before > 0, before, 1.0)
+    unit = np.where(before > _NOTHING, before, 1.0)
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
     _, values, directions = np.linalg.svd(rows / unit)
     values = np.append(values, np.zeros(len(unit) - len(values)))
