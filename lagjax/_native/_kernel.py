@@ -307,7 +307,8 @@ class Kernel:
         if directions > 1 and members < self.width / 2:
             return self._tangents(True), min(cores(), members)
         kernel = self.of_members(members)
-        return kernel._tangents(False), kernel.threads(members)
+        # A vector of members is as much work as there are directions, and worth a thread the sooner.
+        return kernel._tangents(False), min(kernel.threads(members * directions), -(-members // kernel.width))
 
     def _tangents_of(self, side_by_side: bool) -> "_Compiled":
         """The kernel of tangents, whose directions stand side by side or members do; compiled when first asked for."""
