@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lagjax._analysis._solve import shortest_solution
+from lagjax._analysis._solve import shortest_preimage, shortest_solution
 from lagjax._arguments import Function, accept
 from lagjax._failures import nan_unless
 from lagjax._layout import Layout
@@ -155,10 +155,7 @@ def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, param
 
         return jax.lax.while_loop(moves, once, (start, jnp.ones((), start.dtype), 0))[0]
 
-    def solve(linear, right):
-        return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right)
-
-    x = jax.lax.custom_root(lambda x: off(x, t), jax.lax.stop_gradient(new.flatten(guess)), find, solve)
+    x = jax.lax.custom_root(lambda x: off(x, t), jax.lax.stop_gradient(new.flatten(guess)), find, shortest_preimage)
     arrived = jnp.max(jnp.abs(off(x, t))) <= jnp.finfo(x.dtype).eps ** 0.6 * (1 + jnp.max(jnp.abs(wanted)))
     x = nan_unless(arrived, x)
     jacobian, drift = jax.jacfwd(off, argnums=0)(x, t), jax.jacfwd(off, argnums=1)(x, t)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._scene import Scene
-from lagjax._analysis._solve import shortest_solution
+from lagjax._analysis._solve import shortest_preimage, shortest_solution
 from lagjax._failures import nan_unless
 from lagjax._linear import factorize, least_norm
 from lagjax._system import System
@@ -110,11 +110,8 @@ def _found(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
     def find(_, start):
         return _polished(residual, _damped(residual, start))
 
-    def solve_tangent(linear, right):
-        return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right)
-
     start = jnp.concatenate([scene.q, least_multipliers(scene, scene.q)])
-    z = jax.lax.custom_root(residual, jax.lax.stop_gradient(start), find, solve_tangent)
+    z = jax.lax.custom_root(residual, jax.lax.stop_gradient(start), find, shortest_preimage)
     q = z[:n]
     ok = _is_root(residual, jax.lax.stop_gradient(z))
     multipliers = least_multipliers(scene, q)

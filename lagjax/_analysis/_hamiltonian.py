@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._coordinates import asking
-from lagjax._analysis._solve import shortest_solution
+from lagjax._analysis._solve import shortest_preimage, shortest_solution
 from lagjax._consistent import has_constraints
 from lagjax._failures import nan_unless
 from lagjax._layout import Layout
@@ -163,10 +163,7 @@ class _Flat(NamedTuple):
 
             return jax.lax.while_loop(moves, once, (start, jnp.ones((), start.dtype), 0))[0]
 
-        def solve(linear, right):
-            return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right)
-
-        v = jax.lax.custom_root(off, jnp.zeros_like(p), find, solve)
+        v = jax.lax.custom_root(off, jnp.zeros_like(p), find, shortest_preimage)
         return nan_unless(jnp.max(jnp.abs(off(v))) <= jnp.finfo(p.dtype).eps ** 0.6 * (1 + jnp.max(jnp.abs(p))), v)
 
     def rates(self, q: Vector, p: Vector, t) -> tuple[Vector, Vector]:

@@ -1,5 +1,7 @@
 """Linear systems that need not be symmetric, nor regular: for Newton's method and its derivative. No LAPACK in XLA."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -22,6 +24,11 @@ def shortest_solution(matrix: Matrix, b: Vector) -> Vector:
         return columns * _regular(rows[:, None] * matrix * columns, rows * b, inverse)
 
     return jax.lax.cond(singular, _shortest, regular, matrix, b)
+
+
+def shortest_preimage(linear: Callable[[Vector], Vector], right: Vector) -> Vector:
+    """x with linear(x) = right, the shortest one: what the implicit derivative of a root asks for."""
+    return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right)
 
 
 def _scales(matrix: Matrix) -> tuple[Vector, Vector]:
