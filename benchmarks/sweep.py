@@ -8,8 +8,8 @@
     python -m benchmarks.sweep plan                        # 10⁸ members described: seconds and memory
 
 Members start from rest at all pairs of angles, run over T = 5 with a median error of 1e-8, and keep the last state and
-the time of the first flip, at which their motion ends. The record goes to `benchmarks/results/sweep.json`, with commit,
-versions and machine.
+the time of the first flip, over which their motion goes on. The record goes to `benchmarks/results/sweep.json`, with
+commit, versions and machine.
 """
 
 import argparse
@@ -25,17 +25,20 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import lagjax
 from benchmarks import _report
+from lagjax._sweep import Store, run_store, status
+from lagjax._sweep._sections import Sections, run_batch
+from lagjax._sweep._status import Progress
 
 SCENE = lagjax.scenes.double_pendulum()
 DURATION, RTOL = 5.0, 5e-9  # of which the median error is 1e-8
@@ -43,18 +46,16 @@ BARE = 4096
 ROOT = Path(__file__).parent.parent
 
 
-def before_flip(q, qdot):
-    """Positive as long as neither arm has gone over the top."""
-    return jnp.pi**2 - jnp.max(q**2)
+def both_below(q, qdot):
+    """Positive from the start until an arm goes over the top."""
+    return (jnp.pi**2 - q[0] ** 2) * (jnp.pi**2 - q[1] ** 2)
 
 
-FLIP = diffrax.Event(before_flip, direction=False)
+FLIPS = {"section": both_below, "direction": -1, "count": 1}
 
 
-def keep(trajectory):
-    flipped = trajectory.result == lagjax.RESULTS.event_occurred
-    time_of_flip = jnp.where(flipped, trajectory.end.t, jnp.nan)
-    return {"q": trajectory.end.q, "qdot": trajectory.end.qdot, "flip": time_of_flip}
+def keep(trajectory, crossings):
+    return {"q": trajectory.end.q, "qdot": trajectory.end.qdot, "flip": crossings.t[0]}
 
 
 def start(point):
@@ -69,7 +70,7 @@ def grid(members: int) -> dict[str, np.ndarray]:
 
 
 RULE = dict(
-    q0=start, qdot0=jnp.zeros(2), params=SCENE.params, keep=keep, event=FLIP, rtol=RTOL,
+    q0=start, qdot0=jnp.zeros(2), params=SCENE.params, keep=keep, crossings=FLIPS, rtol=RTOL,
 )  # fmt: skip
 
 
@@ -82,44 +83,59 @@ def run(store: Path, over: dict, **more) -> lagjax.Sweep:
 
 
 def rate(options: argparse.Namespace) -> dict[str, Any]:
-    """Seconds and CPU seconds of a member, bare and in a sweep, taken in turns; the memory of the sweep."""
-    over = grid(options.members)
-    members = math.prod(len(x) for x in over.values())
+    """Seconds and CPU seconds of a member, bare and in a sweep, taken in turns; the memory of the sweep.
+
+    Bare are batches of 4096 with the same crossings, of which nothing is kept; `plain` ones have only their last state.
+    """
+    over, members = grid(options.members), math.isqrt(options.members) ** 2
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        _bare(over, 1)
-        before, memory = _bare(over, options.bare), _Memory()
-        wall, cpu = time.perf_counter(), time.process_time()
+        place, memory = Path(folder) / "store", _Memory()
+        _begin(place, over)
+        store, parts = Store(place), {"bare": _bare(over), "plain": _bare(over, None)}
+        units = math.ceil(_left(place) / options.rounds)
+        spent = {"sweep": np.zeros(2), **{name: np.zeros(2) for name in parts}}
+        show = Progress(store, store.spec(), options.progress)
         with memory:
-            swept = run(Path(folder) / "store", over, progress=options.progress)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        after = _bare(over, options.bare)
-        told = swept.status()
-        size = sum(file.stat().st_size for file in Path(folder).rglob("*") if file.is_file())
-    bare = [0.5 * (x + y) for x, y in zip(before, after, strict=True)]
-    record = {
-        "members": members, "units": told.units, "results": told.results,
-        "bare µs (wall)": 1e6 * bare[0], "bare µs (CPU)": 1e6 * bare[1],
-        "sweep µs (wall)": 1e6 * wall / members, "sweep µs (CPU)": 1e6 * cpu / members,
-        "overhead (wall)": wall / members / bare[0] - 1, "overhead (CPU)": cpu / members / bare[1] - 1,
+            for turn in range(options.rounds):
+                for name, part in sorted(parts.items(), reverse=bool(turn % 2)):
+                    spent[name] += _spent(part, options.bare)
+                spent["sweep"] += _spent(lambda count: run_store(store, show, count), units)
+        told = status(store)
+        size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
+    counts: dict[str, int] = dict.fromkeys(parts, options.bare * options.rounds * BARE) | {"sweep": members}
+    each: dict[str, np.ndarray] = {name: seconds / counts[name] for name, seconds in spent.items()}
+    record: dict[str, Any] = {"members": members, "units": told.units, "done": told.done, "results": told.results}
+    for k, clock in enumerate(("wall", "CPU")):
+        record |= {f"{name} µs ({clock})": 1e6 * seconds[k] for name, seconds in each.items()}
+        record |= {f"over {name} ({clock})": each["sweep"][k] / each[name][k] - 1 for name in parts}
+    return record | {
         "resident MiB": memory.most, "resident MiB before": memory.before, "stored bytes": size,
-        "hours for 1e8": 1e8 * wall / members / 3600,
-        "worst energy change": told.drift and told.drift[0],
+        "hours for 1e8": 1e8 * each["sweep"][0] / 3600, "worst energy change": told.drift and told.drift[0],
     }  # fmt: skip
-    return record
 
 
-def _bare(over: dict, batches: int) -> tuple[float, float]:
-    """Seconds and CPU seconds of a member in batches of 4096 drawn from the grid."""
-    rng = np.random.default_rng(0)
+def _spent(part: Callable[[int], Any], count: int) -> np.ndarray:
+    """Seconds and CPU seconds of a part of the work."""
     wall, cpu = time.perf_counter(), time.process_time()
-    for _ in range(batches):
-        q0 = np.stack([rng.choice(angles, BARE) for angles in over.values()], axis=1)
-        one = lagjax.simulate_batch(
-            SCENE.system, q0, np.zeros_like(q0), jnp.array([0.0, DURATION]), SCENE.params, event=FLIP, rtol=RTOL
-        )
-        jax.block_until_ready(one.q)
-    count = batches * BARE
-    return (time.perf_counter() - wall) / count, (time.process_time() - cpu) / count
+    part(count)
+    return np.array([time.perf_counter() - wall, time.process_time() - cpu])
+
+
+def _bare(over: dict, flips: dict | None = FLIPS) -> Callable[[int], None]:
+    """Runs batches of 4096 drawn from the grid."""
+    rng = np.random.default_rng(0)
+    settings = dict(rtol=RTOL, atol=None, max_steps=65_536, event=None, solver=None)
+    sections = None if flips is None else Sections.of(flips, keep, settings)
+
+    def batches(count: int) -> None:
+        for _ in range(count):
+            q0 = np.stack([rng.choice(angles, BARE) for angles in over.values()], axis=1)
+            values = {"q0": q0, "qdot0": np.zeros_like(q0), "params": SCENE.params}
+            one, _ = run_batch(SCENE.system, values, jnp.array([0.0, DURATION]), (0, 0, None), settings, sections)
+            jax.block_until_ready(one.q)
+
+    batches(1)
+    return batches
 
 
 class _Memory:
@@ -214,7 +230,7 @@ def kills(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _begin(store: Path, over: dict, unit: int) -> None:
+def _begin(store: Path, over: dict, unit: int | None = None) -> None:
     """A store of which nothing is done."""
     from lagjax import _sweep
 
@@ -326,10 +342,10 @@ def poisoned_params(point):
     return params | {"g": fast * params["g"], "poison": point["poison"]}
 
 
-def poisoned_keep(trajectory):
+def poisoned_keep(trajectory, crossings):
     kind = trajectory.params["poison"]
     kind = jax.pure_callback(_abort, jax.ShapeDtypeStruct((), float), kind, vmap_method="expand_dims")
-    return keep(trajectory) | {"poison_met": kind}
+    return keep(trajectory, crossings) | {"poison_met": kind}
 
 
 def _abort(kinds):
@@ -371,7 +387,8 @@ def _options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", choices=["rate", "map", "kills", "workers", "poison", "plan"])
     parser.add_argument("--members", type=int, default=100_000)
-    parser.add_argument("--bare", type=int, default=20, help="bare batches before and after (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=8, help="turns of the rate (default: %(default)s)")
+    parser.add_argument("--bare", type=int, default=20, help="bare batches of a turn (default: %(default)s)")
     parser.add_argument("--side", type=int, default=2048, help="of the map (default: %(default)s)")
     parser.add_argument("--count", type=int, default=100, help="kills (default: %(default)s)")
     parser.add_argument("--longest", type=float, default=8.0, help="seconds until a kill (default: %(default)s)")

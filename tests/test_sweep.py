@@ -11,6 +11,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -99,6 +100,79 @@ def test_designs_and_names_that_vary_together(tmp_path):
     np.testing.assert_array_equal(data.mass, [1.0, 3.0])
     bare = lagjax.simulate(PENDULUM, float(data.angle[3]), 0.0, TS, 1.0)
     assert float(data.end[1, 3]) == float(bare.q[-1])
+
+
+def at_the_bottom(q, qdot):
+    return q
+
+
+def keep_end_and_crossings(trajectory, crossings):
+    return {"end": trajectory.q[-1], "first": crossings.t[0], "speed": crossings.qdot[0], "count": crossings.count}
+
+
+BOTTOM = {"section": at_the_bottom, "direction": -1, "count": 2}
+WITH_CROSSINGS = dict(keep=keep_end_and_crossings, crossings=BOTTOM)
+
+
+@pytest.mark.parametrize("times", [2, pytest.param(5, marks=pytest.mark.slow)])
+def test_last_state_and_first_crossing_from_one_sweep(tmp_path, times):
+    ts = jnp.linspace(0.0, 2.0, times)
+    data = lagjax.sweep(PENDULUM, OVER, ts, **{**RULE, **WITH_CROSSINGS, "store": tmp_path / "store"}).open()
+    length, angle = (x.ravel() for x in np.meshgrid(*OVER.values(), indexing="ij"))
+    starts = (angle, np.zeros_like(angle), ts, length)
+    bare = lagjax.simulate_batch(PENDULUM, *starts, batch_axes=(0, 0, 0))
+    np.testing.assert_allclose(data.end.values.ravel(), bare.q[:, -1], rtol=1e-7)  # of twenty steps of 1e-9
+    alone = lagjax.crossings(PENDULUM, at_the_bottom, angle[40], 0.0, ts, length[40], direction=-1, count=2)
+    assert data["first"].values.ravel()[40] == alone.t[0] and data["count"].values.ravel()[40] == alone.count
+    down = lagjax.simulate_batch(
+        PENDULUM, *starts, batch_axes=(0, 0, 0), event=diffrax.Event(at_the_bottom, direction=False)
+    )
+    fell = np.asarray(down.result._value) == lagjax.RESULTS.event_occurred._value
+    assert 20 < fell.sum() < 42 and (fell == np.isfinite(data["first"].values.ravel())).all()
+    np.testing.assert_allclose(data["first"].values.ravel()[fell], down.end.t[fell], rtol=1e-9)
+    np.testing.assert_allclose(data.speed.values.ravel()[fell], down.end.qdot[fell], rtol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [dict(isolate=True), dict(unit=1), dict(unit=42)])
+def test_crossings_do_not_depend_on_neighbours_and_workers(tmp_path, how, monkeypatch):
+    ts, rule = jnp.array([0.0, 2.0]), {**RULE, **WITH_CROSSINGS}
+    whole = lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": tmp_path / "whole"}).open().load()
+    store = tmp_path / "store"
+    monkeypatch.setattr("lagjax._sweep.work", lambda *_: _run.work(*_, 2))  # stopped after two units
+    lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how})
+    monkeypatch.undo()
+    data = lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how}).open()
+    for name, values in whole.items():
+        np.testing.assert_array_equal(data[name].values, values.values)
+    with pytest.raises(ValueError, match=r"'count': 2.* in the store, now .*'count': 3"):
+        lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, "crossings": BOTTOM | {"count": 3}})
+    with pytest.raises(ValueError, match=r"(?s)crossings of section.*-    return q.*\+    return q - 0.1"):
+        lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, "crossings": BOTTOM | {"section": beside_it}})
+
+
+def beside_it(q, qdot):
+    return q - 0.1
+
+
+@pytest.mark.slow
+def test_crossings_of_several_sections_under_constraints(tmp_path):
+    disk = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - GRAVITY * q[1], constraints=lambda q: jnp.sum(q**2) - 1.0)
+    sections = {"bottom": lambda q, v: q[0], "height": lambda q, v, t: q[1] + 0.8 + 0.01 * t}
+    angles = np.linspace(0.1, 1.5, 9)
+    on_it = lambda angle: jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
+    q0 = lambda point: (1.0 + 1e-3 * (point["angle"] > 1.4)) * on_it(point["angle"])
+    keep = lambda trajectory, crossings: {"times": {name: x.t for name, x in crossings.items()}}
+    run = lagjax.sweep(
+        disk, {"angle": angles}, jnp.array([0.0, 1.0]), q0=q0, qdot0=jnp.zeros(2), keep=keep,
+        crossings={"section": sections, "count": 3}, store=tmp_path / "store", progress=False,
+    )  # fmt: skip
+    data = run.open()
+    assert run.status().results == {"successful": 8, "inconsistent_start": 1}
+    assert np.isnan(data["times.bottom"][8]).all()
+    alone = lagjax.crossings(disk, sections, on_it(angles[3]), jnp.zeros(2), jnp.array([0.0, 1.0]), count=3)
+    for name in sections:
+        np.testing.assert_allclose(data[f"times.{name}"][3], alone[name].t, rtol=1e-9)
 
 
 def test_statistics_are_those_of_the_members(tmp_path):
@@ -343,6 +417,11 @@ def test_a_store_whose_creation_was_interrupted_is_made_anew(tmp_path, undisturb
         (dict(keep=lambda trajectory: {"angle": trajectory.q}), "another name"),
         (dict(reduce={"nothing": lagjax.Statistics()}), "does not return"),
         (dict(unit=0), "positive whole number"),
+        (dict(keep=keep_end_and_crossings), "keep asks for `crossings`"),
+        (dict(crossings=BOTTOM), "does not ask for them"),
+        (dict(keep=keep_end_and_crossings, crossings=at_the_bottom), "must be a dict"),
+        (dict(**WITH_CROSSINGS, event=at_the_bottom), "ends the motion"),
+        (dict(**WITH_CROSSINGS, solver=diffrax.Tsit5()), "leave solver at None"),
         (dict(isolate="yes"), "isolate must be"),
         (dict(isolate=True, executor=ThreadPoolExecutor()), "or an executor"),
     ],

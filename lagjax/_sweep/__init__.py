@@ -4,6 +4,7 @@ over, q0, keep, … ──► Motions, Grid ──► Store ──► units, cla
 
 _designs, _members   what is swept: axes and rules, the grid of members, its units
 _statistics          what is said of all members without a list
+_sections            motions of a batch with their crossings
 _scene               the user's functions: text, hash, the way to another process
 _store, _claims      the files; who has which unit
 _batch, _job, _unit  what computes a unit
@@ -28,6 +29,7 @@ from lagjax._sweep._job import Job
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._run import run_store, submit, work
 from lagjax._sweep._scene import Motions
+from lagjax._sweep._sections import Sections
 from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merged, summary
 from lagjax._sweep._status import Failure, Progress, Status, status
 from lagjax._sweep._store import Store
@@ -106,6 +108,7 @@ def sweep(
     atol: float | None = None,
     max_steps: int = 65_536,
     event: Any = None,
+    crossings: dict[str, Any] | None = None,
     solver: Any = None,
 ) -> Sweep:
     r"""Run `system` for every point of `over`, keep a few numbers of each motion, and store them in a folder.
@@ -122,8 +125,10 @@ def sweep(
     - `ts`: output times, shape (T,), of every member.
     - `q0`, `qdot0`, `params`: values for all, or functions of one member's point, which is a dict of numbers by the
       names in `over`.
-    - `keep(trajectory)`: a dict of what remains of a member, numbers or arrays by names, from its `Trajectory`. It may
-      call `lagjax.crossings` from `trajectory.q[0]`, `trajectory.qdot[0]`, for the times at which something happens.
+    - `keep(trajectory)`: a dict of what remains of a member, numbers or arrays by names, from its `Trajectory`.
+    - `crossings`: arguments of `lagjax.crossings`, {"section": …, "direction": …, "count": …}. Then `keep(trajectory,
+      crossings)` is told the `Crossings` of that motion, which goes on over them: when something happened first, and
+      where the motion ended, come from one run, if `ts` are two times.
     - `store`: a folder. `xarray.open_zarr(store)` reads it, with the names of `over` as dimensions and coordinates, the
       kept quantities as variables, and `result`: how each member ended, −1 for those still to do. NaN, or the least
       integer, stands where there is no value.
@@ -180,7 +185,8 @@ def sweep(
     require_system(system)
     require_flag(progress, "progress")
     settings = dict(rtol=rtol, atol=atol, max_steps=max_steps, event=event, solver=solver)
-    motions = Motions(system, np.asarray(ts, float), q0, qdot0, params, _callable(keep), _reduce(reduce), settings)
+    sections = Sections.of(crossings, _callable(keep), settings)
+    motions = Motions(system, np.asarray(ts, float), q0, qdot0, params, keep, _reduce(reduce), settings, sections)
     if executor is not None and isolate:
         raise ValueError("isolate is for sweeps of this process: give it, or an executor, whose processes may die too.")
     axes, place = axes_of(over), Store(Path(store).absolute())

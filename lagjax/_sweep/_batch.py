@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._results import name_of, result_from
-from lagjax._simulate import simulate_batch
 from lagjax._sweep._scene import NOT_TRACEABLE, Motions
+from lagjax._sweep._sections import run_batch
 from lagjax._sweep._store import RESULT, Quantity
 from lagjax._trajectory import State, Trajectory
 
@@ -46,7 +46,8 @@ class Kept(NamedTuple):
 def batches_of(motions: Motions, conserves: bool) -> "Batches":
     """What computes batches of these motions; the last ones are remembered, with what was compiled for them."""
     fixed = (motions.system, motions.q0, motions.qdot0, motions.params, motions.keep, *motions.settings.values())
-    key = (*map(id, fixed), motions.ts.tobytes(), bool(conserves), jax.dtypes.canonicalize_dtype(float))
+    sections = motions.sections and motions.sections._replace(functions=tuple(map(id, motions.sections.functions)))
+    key = (*map(id, fixed), sections, motions.ts.tobytes(), bool(conserves), jax.dtypes.canonicalize_dtype(float))
     if key not in _remembered:
         while len(_remembered) >= _REMEMBERED:
             _remembered.pop(next(iter(_remembered)))
@@ -79,25 +80,25 @@ class Batches:
     def __call__(self, points: dict[str, np.ndarray]) -> Kept:
         """What is kept of the members at these points (B,)."""
         motions, ts = self.motions, jnp.asarray(self.motions.ts)
-        q0, qdot0, params = (start(points) if start else getattr(motions, role) for role, start in self._starts.items())
-        run = simulate_batch(motions.system, q0, qdot0, ts, params, batch_axes=self._axes, **motions.settings)
-        arrays = _arrays(run), params if self._axes[2] == 0 else None
+        values = {role: start(points) if start else getattr(motions, role) for role, start in self._starts.items()}
+        run, crossings = run_batch(motions.system, values, ts, self._axes, motions.settings, motions.sections)
+        arrays = (_arrays(run), crossings), values["params"] if self._axes[2] == 0 else None
         self._tolerances = run.tolerances
         try:
             if "keep" in self.slow:
                 raise _Slow
             kept, drift = self._keep_all(*arrays)
-            values, complaints = {name: np.asarray(x) for name, x in _by_name(kept).items()}, {}
+            kept, complaints = {name: np.asarray(x) for name, x in _by_name(kept).items()}, {}
         except (*NOT_TRACEABLE, _Slow) as why:
             if "keep" not in self.slow:
                 self.slow["keep"] = _first_line(why)
             drift = self._drift_alone(*arrays) if self.conserves else None
-            values, complaints = self._one_by_one(run)
+            kept, complaints = self._one_by_one(run, crossings)
         result = np.asarray(run.result._value).astype(RESULT.dtype)
         if complaints:
             result = result.copy()
             result[list(complaints)] = KEEP_FAILED
-        return Kept(values, result, None if drift is None else np.asarray(drift), complaints, run.engine)
+        return Kept(kept, result, None if drift is None else np.asarray(drift), complaints, run.engine)
 
     # ---- compiled for all members ----
 
@@ -121,18 +122,24 @@ class Batches:
         """What `keep` returns of every member, and the change of the energy."""
 
         def of_member(arrays, params):
-            trajectory = self._trajectory(arrays, params)
-            kept = self.motions.keep(trajectory)
-            _require_dict(kept)
-            return kept, self._drift(trajectory)
+            run, crossings = arrays
+            trajectory = self._trajectory(run, params)
+            return self._kept(trajectory, crossings), self._drift(trajectory)
 
         return jax.vmap(of_member, in_axes=(0, self._axes[2]))(arrays, params)
 
     def _drift_alone(self, arrays: tuple, params: PyTree):
         def of_member(arrays, params):
-            return self._drift(self._trajectory(arrays, params))
+            return self._drift(self._trajectory(arrays[0], params))
 
         return jax.jit(jax.vmap(of_member, in_axes=(0, self._axes[2])))(arrays, params)
+
+    def _kept(self, trajectory: Trajectory, crossings: Any) -> dict:
+        """What `keep` returns of one member."""
+        keep, asked = self.motions.keep, {} if self.motions.sections is None else {"crossings": crossings}
+        kept = keep(trajectory, **asked)
+        _require_dict(kept)
+        return kept
 
     def _trajectory(self, arrays: tuple, params: PyTree) -> Trajectory:
         """The trajectory of one member."""
@@ -153,15 +160,15 @@ class Batches:
 
     # ---- member by member ----
 
-    def _one_by_one(self, run: Trajectory) -> tuple[dict[str, np.ndarray], dict[int, str]]:
+    def _one_by_one(self, run: Trajectory, crossings: Any) -> tuple[dict[str, np.ndarray], dict[int, str]]:
         """What `keep` returns of each member, called with numbers; and what is wrong with what it returned."""
-        arrays = jax.tree.map(np.asarray, _arrays(run))
+        arrays = jax.tree.map(np.asarray, (_arrays(run), crossings))
         params, rows, complaints = jax.tree.map(np.asarray, eqx.filter(run.params, eqx.is_array_like)), [], {}
-        for k in range(len(arrays[2])):
+        for k in range(len(run.result._value)):
             of_member = jax.tree.map(lambda x, k=k: x[k], params) if self._axes[2] == 0 else None
             try:
-                kept = self.motions.keep(self._trajectory(jax.tree.map(lambda x, k=k: x[k], arrays), of_member))
-                _require_dict(kept)
+                one, crossed = jax.tree.map(lambda x, k=k: x[k], arrays)
+                kept = self._kept(self._trajectory(one, of_member), crossed)
                 rows.append({name: np.asarray(x) for name, x in _by_name(kept).items()})
             except _NotADict:
                 raise

@@ -109,7 +109,8 @@ def _unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantit
 def _batch_size(motions: Motions, points: dict[str, np.ndarray], kept: Kept) -> int:
     """The most members of a batch: their paths take at most `PATH_BYTES`."""
     q, qdot, _ = motions.start({name: x[0] for name, x in points.items()})
-    each = 8 * 2 * Layout.of(q, qdot).size * len(motions.ts)
+    states = 2 * Layout.of(q, qdot).size
+    each = 8 * states * len(motions.ts) + (motions.sections.bytes_of(states) if motions.sections else 0)
     most = _batch.MOST if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
     return max(1, min(most, _batch.PATH_BYTES // each))
 

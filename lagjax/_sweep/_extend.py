@@ -17,7 +17,7 @@ from lagjax._sweep._members import Grid
 from lagjax._sweep._scene import difference
 from lagjax._sweep._store import KNOWN, RESULT, Store, arrays_as_bytes
 
-_SAME = ("x64", "engine", "ts", "rtol", "atol", "max_steps", "solver", "kept", "reduce")
+_SAME = ("x64", "engine", "ts", "rtol", "atol", "max_steps", "solver", "crossings", "kept", "reduce")
 
 
 def require_extensible(old: Store, spec: dict, now: dict) -> None:

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import accept
+from lagjax._sweep._sections import Sections
 from lagjax._sweep._statistics import Statistics
 from lagjax._system import System
 
@@ -44,6 +45,7 @@ class Motions:
     keep: Callable
     reduce: dict[str, Statistics]
     settings: dict[str, Any]  # of `simulate_batch`: rtol, atol, max_steps, event, solver
+    sections: Sections | None = None  # of which keep is told the crossings
 
     def start(self, point: dict[str, Any]) -> tuple[PyTree, PyTree, PyTree]:
         """(q0, qdot0, params) of the member at a point."""
@@ -52,8 +54,9 @@ class Motions:
 
     def described(self) -> dict:
         """The numbers among it, by name, for the store."""
-        shown = {name: _value_text(value) for name, value in self.settings.items() if name != "event"}
+        shown: dict[str, Any] = {name: _value_text(value) for name, value in self.settings.items() if name != "event"}
         times = {"ends": [float(self.ts[0]), float(self.ts[-1])], "outputs": len(self.ts), "sha256": _hash(self.ts)}
+        shown["crossings"] = self.sections.described() if self.sections else None
         return {"ts": times, **shown, "reduce": {name: how.described() for name, how in self.reduce.items()}}
 
 
@@ -79,6 +82,9 @@ def texts(motions: Motions, names: list[str]) -> dict[str, dict[str, str]]:
         condition = getattr(event, "cond_fn", event)
         of_event = _traced(accept(condition, "event"), (q, qdot), params) if callable(condition) else None
         found["event"] = _entry(condition, of_event) if callable(condition) else _entry(repr(event), None)
+    for name, section in motions.sections.by_name().items() if motions.sections else ():
+        of_section = _traced(accept(section, "section"), (q, qdot), params)
+        found[f"crossings of {name}"] = _entry(section, of_section)
     for role in ("q0", "qdot0", "params"):
         value = getattr(motions, role)
         found[role] = _entry(value, (lambda f=value: jax.make_jaxpr(f)(point)) if callable(value) else None)

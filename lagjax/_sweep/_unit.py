@@ -33,7 +33,8 @@ class Unit(NamedTuple):
 def parts(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
     """The batches of a unit: its members in each, all of one length, and how many of them are not copies."""
     known, _ = job.store.known(unit)
-    left = np.setdiff1d(np.arange(job.grid.size(unit)), known)
+    left = np.arange(job.grid.size(unit))
+    left = np.setdiff1d(left, known) if known.size else left
     if not left.size:
         return []
     batch = math.ceil(len(left) / math.ceil(len(left) / job.spec["batch"]))
@@ -91,9 +92,9 @@ def _blank(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, j: int) 
 
 def _record(job: Job, unit: int, result: np.ndarray, drifts: np.ndarray, complaints: dict[int, str]) -> dict:
     """What is noted of a unit: how members ended, the largest change of energy, and what failed."""
-    codes, counts = np.unique(result, return_counts=True)
+    counts = np.bincount(result)
     record = {"unit": unit, "members": len(result), "engine": job.spec["engine"], "slow": job.batches.slow}
-    record["results"] = {label(int(code)): int(count) for code, count in zip(codes, counts, strict=True)}
+    record["results"] = {label(int(code)): int(counts[code]) for code in np.flatnonzero(counts)}
     failed = np.flatnonzero(~np.isin(result, ENDED_WELL))[:_NAMED]
     record["failed"] = [
         [int(number), label(int(result[j])), complaints.get(int(j), "")]
