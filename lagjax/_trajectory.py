@@ -57,9 +57,9 @@ class Trajectory(eqx.Module):
     - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
     - `tolerances`: rtol and atol of a step; None where it had a fixed size.
     - `engine`: what integrated it, "MachineCode" or "Diffrax"; "" for a hybrid motion.
-    - `mode`, `transitions`: of a hybrid motion (`simulate_hybrid`), else None. `system` is then the dict of its modes,
-      and quantities are those of the mode at every time, NaN where it is −1. A mode is a place in `mode_names`: the
-      dict itself loses its order in `jax.jit`.
+    - `mode`, `transitions`: of a hybrid motion (`simulate_hybrid`), the latter `Transitions`, else None. `system` is
+      then the dict of its modes, and quantities are those of the mode at every time, NaN where it is −1. A mode is a
+      place in `mode_names`: the dict itself loses its order in `jax.jit`.
     """
 
     ts: jax.Array
