@@ -1,6 +1,52 @@
 """lagjax: from a Lagrangian, written as a plain JAX function, to trajectories.
 
 System(L)  →  simulate(system, q0, qdot0, ts, params)  →  Trajectory
+
+What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one of them alone.
+
+**Motion**
+
+- `System`: L, constraints, forces, dissipation; `System.explain` tells what is in it
+- `simulate`, `simulate_batch`: one motion, or many at once, as a `Trajectory` of `State`s
+- `samples`: an input that was measured, as a function of time
+- `crossings`: where a motion crosses a section, as `Crossings`
+- `simulate_hybrid`: a motion through modes, by `Transition`s; those that happened are `Transitions`
+- `MachineCode`, `FineOutput`: what integrates
+- `SimulationError`, `RESULTS`: how a motion ends
+
+**Trust**
+
+- `check`: what is wrong with a scene at a state, as `Findings`, each a `Finding`
+- `Explanation`, `Health`: what `System.explain` and `Trajectory.health` return
+- `work_precision`: what a digit costs; a `WorkPrecision` of `WorkPrecisionRow`s
+
+**What a scene does**
+
+- `equilibrium`, `linearize`, `normal_modes`: at rest and near it: `Equilibrium`, `Linearization`, `Modes`
+- `conserved_quantities`, `noether_charge`, `cyclic_coordinates`: symmetries: `ConservedQuantities`, each `Conserved`
+- `same_motion`: whether two Lagrangians have one motion, as `SameMotion`
+- `change_coordinates`, `hamiltonian`, `routhian`: the scene written otherwise: `ChangedCoordinates`, `Hamiltonian` with
+  its `CanonicalTrajectory`, `Routhian`
+- `periodic_orbit`, `family`: motions that close: `Orbit`, `Family`
+- `lyapunov_spectrum`, `lyapunov_exponent`: chaos; `LyapunovExponent`
+- `action`, `find_path`: between two ends; `Path`
+
+**Parameters from recordings**
+
+- `fit`: the likeliest parameters with intervals, as a `Fit`
+- `Record`, `Timings`, `Guess`, `Delayed`: what was measured, and how
+- `Gaussian`, `StudentT`: the noise
+- `positive`, `between`, `angle`, `simplex`, `inertia`: what parameters may be
+
+**Many members, few numbers of each**
+
+- `sweep`: up to 10⁸ members in a store, as a `Sweep`, with its `Statistics` and `Status`
+- `sobol`, `latin_hypercube`, `random`: points to sweep over
+
+**More**
+
+- `scenes`: ready Lagrangians with exact solutions
+- `plot`: figures
 """
 
 from lagjax import plot, scenes
