@@ -4,8 +4,6 @@ import argparse
 import sys
 from pathlib import Path
 
-import jax
-
 from lagjax._sweep import Store, run_store, status
 from lagjax._sweep._status import Progress
 
@@ -23,7 +21,6 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     store = Store(options.store.absolute())
     spec = store.spec()
-    jax.config.update("jax_enable_x64", bool(spec["x64"]))  # of this whole process: callbacks of `keep` have threads
     show = Progress(store, spec, not options.quiet)
     count = run_store(store, show, options.units)
     show.end()

@@ -1,5 +1,6 @@
 """Sweeps: what is stored is what `simulate_batch` gives, whoever computed it, and whatever happened meanwhile."""
 
+import contextlib
 import errno
 import hashlib
 import json
@@ -557,6 +558,38 @@ def test_executors(tmp_path, undisturbed):
     assert digests(tmp_path, "processes") == undisturbed
     with pytest.raises(ValueError, match="forks"):
         swept(tmp_path, executor=ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")))
+
+
+def digits_of_a_thread(x):
+    """How a thread computes that has chosen nothing, as XLA's have, which call callbacks of large batches."""
+    with ThreadPoolExecutor(1) as pool:
+        return np.full(np.shape(x), pool.submit(lambda: jnp.finfo(jnp.zeros(()).dtype).precision).result(), float)
+
+
+def keep_digits(trajectory):
+    length = trajectory.params
+    digits = jax.pure_callback(
+        digits_of_a_thread, jax.ShapeDtypeStruct((), length.dtype), length, vmap_method="expand_dims"
+    )
+    return {"digits": digits}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", ["this thread", "threads", "processes"])
+def test_callbacks_count_in_the_precision_of_the_caller(tmp_path, workers):
+    pools = {
+        "this thread": contextlib.nullcontext,
+        "threads": lambda: ThreadPoolExecutor(2),
+        "processes": lambda: ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")),
+    }
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with jax.enable_x64(True), pools[workers]() as pool:
+            data = swept(tmp_path, keep=keep_digits, executor=pool).open()
+        assert not jax.config.jax_enable_x64  # as it was
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    assert (data.digits == np.finfo(float).precision).all()
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ import numpy as np
 from lagjax._sweep._begin import begin, first_look, repair, require_same
 from lagjax._sweep._designs import Design, latin_hypercube, random, sobol
 from lagjax._sweep._isolate import Child
-from lagjax._sweep._job import Job
+from lagjax._sweep._job import Job, in_doubles, precision
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._run import run_store, submit, work
 from lagjax._sweep._scene import Motions
@@ -193,7 +193,7 @@ def sweep(
     if place.unfinished_creation():
         place.clear()
     child = Child(place.path, isolate) if isolate else None
-    with child or nullcontext():
+    with precision(in_doubles()), child or nullcontext():
         if not place.path.exists():
             other = None if extend is None else Store(Path(extend).absolute())
             begin(place, axes, motions, unit, child.look if child else first_look, other)

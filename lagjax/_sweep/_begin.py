@@ -5,7 +5,6 @@ import time
 import warnings
 from collections.abc import Callable
 
-import jax
 import numpy as np
 
 from lagjax._layout import Layout
@@ -14,7 +13,7 @@ from lagjax._sweep import _batch
 from lagjax._sweep._batch import Kept, batches_of, label, quantities_of
 from lagjax._sweep._designs import Design
 from lagjax._sweep._extend import carry, require_extensible
-from lagjax._sweep._job import Job, require_versions, versions
+from lagjax._sweep._job import Job, in_doubles, require_versions, versions
 from lagjax._sweep._members import RESERVED, Axis, Grid, points_of
 from lagjax._sweep._scene import Motions, difference, packed, texts, users_path
 from lagjax._sweep._store import FORMAT, RESULT, Quantity, Store
@@ -67,11 +66,6 @@ def begin(
     store.create(spec, scene, axes, title, {-1: "not_done"} | {code: label(code) for code in codes})
     if extend is not None:
         carry(extend, store)
-
-
-def in_doubles() -> bool:
-    """Whether JAX computes in double precision here."""
-    return jax.dtypes.canonicalize_dtype(np.float64) == np.float64
 
 
 def _few(axes: tuple[Axis, ...]) -> dict[str, np.ndarray]:

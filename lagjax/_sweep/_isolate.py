@@ -20,8 +20,8 @@ import jax
 import numpy as np
 
 from lagjax._sweep._batch import Kept
-from lagjax._sweep._begin import first_look, in_doubles
-from lagjax._sweep._job import Job, opened
+from lagjax._sweep._begin import first_look
+from lagjax._sweep._job import Job, in_doubles, opened
 from lagjax._sweep._members import points_of
 from lagjax._sweep._scene import Motions, packed, unpacked, users_path
 from lagjax._sweep._unit import Unit, compute, parts

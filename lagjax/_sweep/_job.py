@@ -3,6 +3,7 @@
 import hashlib
 import json
 import platform
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from importlib import metadata
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from lagjax._sweep._batch import Batches, Kept, batches_of
 from lagjax._sweep._members import Grid
@@ -44,11 +46,50 @@ class Job:
             )
 
 
+def in_doubles() -> bool:
+    """Whether JAX computes in double precision here."""
+    return jax.dtypes.canonicalize_dtype(np.float64) == np.float64
+
+
 @contextmanager
-def precision(spec: dict) -> Iterator[None]:
-    """With numbers of the precision that the store was begun with, in this thread."""
-    with jax.enable_x64(bool(spec["x64"])):
-        yield
+def precision(doubles: bool) -> Iterator[None]:
+    """With numbers of the precision that the store was begun with, in this thread and in those of XLA.
+
+    XLA calls callbacks of `keep` from threads of its own, which see the setting of the process alone: that is changed
+    for so long, where it is another one. Of several stores in one process the first to come decides on it.
+    """
+    with _sharing:
+        if not _inside:
+            _before.append(_of_process())
+            _set_of_process(doubles)
+        _inside.append(doubles)
+    try:
+        with jax.enable_x64(doubles):
+            yield
+    finally:
+        with _sharing:
+            _inside.remove(doubles)
+            if not _inside:
+                _set_of_process(_before.pop())
+
+
+_sharing = threading.Lock()
+_inside: list[bool] = []  # the precisions of all who are inside
+_before: list[bool] = []  # that of the process before the first one came, while somebody is inside
+
+
+def _of_process() -> bool:
+    """Whether this process computes in doubles, whatever this thread has chosen: as a thread sees it that has not."""
+    seen: list[bool] = []
+    thread = threading.Thread(target=lambda: seen.append(in_doubles()))
+    thread.start()
+    thread.join()
+    return seen[0]
+
+
+def _set_of_process(doubles: bool) -> None:
+    if _of_process() != doubles:
+        jax.config.update("jax_enable_x64", doubles)
 
 
 def opened(path: str) -> Job:
@@ -65,7 +106,7 @@ def _opened(path: str, content: str) -> Job:
     store = Store(Path(path))
     spec = store.spec()
     require_versions(store, spec)
-    with precision(spec):
+    with precision(bool(spec["x64"])):
         motions = unpacked(store.scene(), spec["path"])
         names = [name for axis in spec["axes"] for name in axis["names"]]
         if change := difference(spec["scene"], texts(motions, names)):

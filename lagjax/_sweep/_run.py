@@ -28,7 +28,7 @@ def work(job: Job, tell: Tell = lambda: None, compute_unit: Compute = compute, m
     """Do units of a job in this process until all are done, by whomever, or `most` by it; how many it did."""
     job.store.require_writable()
     count = 0
-    with Worker(job.store) as worker, _Writer(job, worker, tell) as writer, precision(job.spec):
+    with Worker(job.store) as worker, _Writer(job, worker, tell) as writer, precision(bool(job.spec["x64"])):
         for unit in _to_do(job, worker, tell):
             writer.put(unit, compute_unit(job, unit))
             count += 1
@@ -104,7 +104,7 @@ def run_unit(path: str, unit: int) -> bool:
     with Worker(job.store) as worker:
         if unit in job.store.done() or not worker.claim(unit):
             return False
-        with precision(job.spec):
+        with precision(bool(job.spec["x64"])):
             job.store.write_unit(job.spec, unit, *compute(job, unit))
         worker.release(unit)
     return True
