@@ -592,6 +592,46 @@ def test_callbacks_count_in_the_precision_of_the_caller(tmp_path, workers):
     assert (data.digits == np.finfo(float).precision).all()
 
 
+class Jobs:
+    """An executor whose tasks are no futures, but can be asked, as those of submitit."""
+
+    def __init__(self):
+        self.pool = ThreadPoolExecutor(2)
+
+    def submit(self, *task):
+        future = self.pool.submit(*task)
+        return Task(future)
+
+
+class Task:
+    def __init__(self, future):
+        self.done, self.result, self.cancel = future.done, future.result, future.cancel
+
+
+class Broken(Jobs):
+    def submit(self, *task):
+        return super().submit(lambda: 1 / 0)
+
+
+@pytest.mark.slow
+def test_tasks_that_are_no_futures(tmp_path, undisturbed, monkeypatch):
+    monkeypatch.setattr(_run, "_POLL", 0.001)
+    with pytest.raises(ZeroDivisionError):
+        swept(tmp_path, executor=Broken())
+    swept(tmp_path, executor=Jobs())
+    assert digests(tmp_path) == undisturbed
+
+
+@pytest.mark.slow
+def test_submitit(tmp_path, undisturbed):
+    submitit = pytest.importorskip("submitit")
+    (tmp_path / "logs").mkdir()
+    executor = submitit.LocalExecutor(tmp_path / "logs")
+    executor.update_parameters(timeout_min=5)
+    swept(tmp_path, executor=executor, unit=10)
+    assert digests(tmp_path) == undisturbed
+
+
 @pytest.mark.slow
 def test_dask(tmp_path, undisturbed):
     distributed = pytest.importorskip("distributed")

@@ -114,7 +114,7 @@ def submit(job: Job, executor: Any, tell: Tell) -> None:
     """Have all units done by an executor, some at a time; goes on until all are, by whomever."""
     _require_no_fork(executor)
     job.store.require_writable()
-    path, running = str(Path(job.store.path).resolve()), set[Future]()
+    path, running = str(Path(job.store.path).resolve()), set[Any]()
     while True:
         left = sorted(set(range(job.grid.units)) - job.store.done())
         if not left:
@@ -132,9 +132,9 @@ def submit(job: Job, executor: Any, tell: Tell) -> None:
             time.sleep(_POLL)
 
 
-def _collect(running: set[Future]) -> int:
+def _collect(running: set[Any]) -> int:
     """Wait for one of these tasks; how many units have been done. Raises what a task has raised."""
-    finished, _ = wait(running, return_when=FIRST_COMPLETED)
+    finished = _first_of(running)
     running -= finished
     try:
         return sum(bool(task.result()) for task in finished)
@@ -142,6 +142,15 @@ def _collect(running: set[Future]) -> int:
         for task in running:
             task.cancel()
         raise
+
+
+def _first_of(running: set[Any]) -> set[Any]:
+    """Those of these tasks that are done, one at least; tasks that are no futures, as those of submitit, are asked."""
+    if all(isinstance(task, Future) for task in running):
+        return wait(running, return_when=FIRST_COMPLETED).done
+    while not (finished := {task for task in running if task.done()}):
+        time.sleep(_POLL)
+    return finished
 
 
 def _require_no_fork(executor: Any) -> None:
