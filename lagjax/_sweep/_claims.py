@@ -35,7 +35,8 @@ class Worker:
         self._identity = {"place": _place(), "pid": os.getpid(), "began": _began(os.getpid())}
 
     def __enter__(self):
-        self._beat()
+        with self.store.explained("nothing was computed"):
+            self._beat()
         self._thread = threading.Thread(target=self._beat_on, daemon=True)
         self._thread.start()
         return self
@@ -70,7 +71,10 @@ class Worker:
             return False
         file = self.claims / f"{unit}.{held[-1] + 1 if held else 0}"
         try:
-            with open(os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY), "w") as opened:
+            with (
+                self.store.explained(f"unit {unit} was not claimed"),
+                open(os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY), "w") as opened,
+            ):
                 opened.write(self.name)
         except FileExistsError:
             return False

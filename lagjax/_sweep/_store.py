@@ -106,7 +106,7 @@ class Store:
     def create(self, spec: dict, scene: bytes, axes: tuple[Axis, ...], title: str, codes: dict[int, str]) -> None:
         """Make the store with empty arrays and the coordinates; it is there when its spec is, which is written last."""
         zarr = require_zarr()
-        with self._explained("made"):
+        with self.explained("the store was not made"):
             self.job.mkdir(parents=True, exist_ok=True)
             for folder in ("done", "claims", "workers", "crashed", "aside"):
                 (self.job / folder).mkdir(exist_ok=True)
@@ -190,7 +190,7 @@ class Store:
     def write_unit(self, spec: dict, unit: int, values: dict[str, np.ndarray], record: dict, statistics: bytes) -> None:
         """Write the chunks of a unit (values (members, …) by name), and then that it is done."""
         grid, hashes = self.grid(spec), {}
-        with self._explained(f"unit {unit} was not written"):
+        with self.explained(f"unit {unit} was not written"):
             for q in self.quantities(spec):
                 data = self._chunk(grid, unit, q, values[q.name])
                 hashes[q.name] = hashlib.sha256(data.data).hexdigest()
@@ -256,7 +256,7 @@ class Store:
 
     def require_writable(self) -> None:
         """Raise `OSError`, with a sentence, where nothing can be written here; remove what dead workers have left."""
-        with self._explained("nothing was computed"):
+        with self.explained("nothing was computed"):
             probe = self.job / "aside" / f"probe-{os.getpid()}-{os.urandom(4).hex()}"
             self.write(probe, b"", "probe")
             now = probe.stat().st_mtime  # by the clock of the disk
@@ -268,7 +268,8 @@ class Store:
                 except FileNotFoundError:  # another one removes it
                     pass
 
-    def _explained(self, what: str) -> "_Explained":
+    def explained(self, what: str) -> "_Explained":
+        """In a `with` statement an error of the disk is raised again as a sentence; `what` it cost."""
         return _Explained(self, what)
 
 
