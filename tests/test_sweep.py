@@ -20,7 +20,7 @@ import pytest
 
 import lagjax
 from lagjax import __main__ as command_line
-from lagjax._sweep import _claims, _designs, _job, _run, _statistics, _store
+from lagjax._sweep import _claims, _designs, _job, _run, _statistics, _store, _unit
 from lagjax._sweep._members import Grid, axes_of
 from lagjax._sweep._store import Store
 
@@ -396,6 +396,19 @@ def test_stores_of_another_version_are_left_alone(tmp_path, undisturbed):
     file.write_text("{")
     with pytest.raises(ValueError, match="cannot be read"):
         swept(tmp_path)
+    assert digests(tmp_path) == undisturbed
+
+
+def test_another_kind_of_cpu_goes_on_and_is_told(tmp_path, undisturbed, monkeypatch):
+    begun(tmp_path, 2)
+    here = _job.cpu()
+    for module in (_job, _unit):
+        monkeypatch.setattr(module, "cpu", lambda: "an abacus")
+    with pytest.warns(
+        UserWarning, match=r"begun on a CPU of the kind .*, and goes on here on an abacus: the last bits"
+    ):
+        told = swept(tmp_path).status()
+    assert told.cpus == (here, "an abacus") and "an abacus: their members" in str(told)
     assert digests(tmp_path) == undisturbed
 
 

@@ -13,7 +13,7 @@ from lagjax._sweep import _batch
 from lagjax._sweep._batch import Kept, batches_of, label, quantities_of
 from lagjax._sweep._designs import Design
 from lagjax._sweep._extend import carry, require_extensible
-from lagjax._sweep._job import Job, in_doubles, require_versions, versions
+from lagjax._sweep._job import Job, cpu, in_doubles, require_versions, versions
 from lagjax._sweep._members import RESERVED, Axis, Grid, points_of
 from lagjax._sweep._scene import Motions, difference, packed, texts, users_path
 from lagjax._sweep._store import FORMAT, RESULT, Quantity, Store
@@ -53,7 +53,7 @@ def begin(
     members = _unit_size(unit, shape, seconds, quantities)
     names = [name for axis in axes for name in axis.names]
     spec = {
-        "format": FORMAT, "versions": versions(), "x64": in_doubles(), "engine": kept.engine,
+        "format": FORMAT, "versions": versions(), "cpu": cpu(), "x64": in_doubles(), "engine": kept.engine,
         "axes": [axis.described() for axis in axes], "shape": shape, "chunk": Grid.of(shape, members).chunk,
         "batch": _batch_size(motions, points, kept), "seconds_per_member": seconds, "conserves": conserves,
         "kept": [{"name": q.name, "shape": q.shape, "dtype": q.dtype.str} for q in quantities], **motions.described(),

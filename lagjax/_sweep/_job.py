@@ -4,6 +4,7 @@ import hashlib
 import json
 import platform
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from llvmlite import binding as llvm
 
 from lagjax._sweep._batch import Batches, Kept, batches_of
 from lagjax._sweep._members import Grid
@@ -33,6 +35,12 @@ class Job:
     @classmethod
     def of(cls, store: Store, spec: dict, motions: Motions) -> "Job":
         """The job of a store whose functions are at hand."""
+        if spec.get("cpu", cpu()) != cpu():
+            warnings.warn(
+                f"{store.path} was begun on a CPU of the kind {spec['cpu']}, and goes on here on {cpu()}: members that "
+                "are computed here may differ from what that one would give, as by a change of rounding.",
+                stacklevel=4,
+            )
         batches = batches_of(motions, spec["conserves"])
         batches.quantities = [q for q in store.quantities({**spec, "reduce": {}}) if q != RESULT]
         return cls(store, spec, store.grid(spec), motions, batches)
@@ -112,6 +120,12 @@ def _opened(path: str, content: str) -> Job:
         if change := difference(spec["scene"], texts(motions, names)):
             raise ValueError(f"{store.path}: the scene is not here what it was when the store was begun.\n{change}")
         return Job.of(store, spec, motions)
+
+
+@lru_cache(maxsize=1)
+def cpu() -> str:
+    """The kind of the CPU, on which the last bits depend as well: by the width of its vectors, and what it fuses."""
+    return f"{llvm.get_host_cpu_name()} ({platform.machine()})"
 
 
 def versions() -> dict[str, str]:

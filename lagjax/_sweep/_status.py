@@ -35,6 +35,7 @@ class Status(NamedTuple):
     - `drift`: the largest change of the energy of a member that ended well, as (change, member, point); None where
       energy is not conserved, or none is known.
     - `slow`: functions that are called member by member, since they are not written in jax.numpy, and why.
+    - `cpus`: the kinds of CPU that computed units; members of several differ as by a change of rounding.
     """
 
     store: str
@@ -49,6 +50,7 @@ class Status(NamedTuple):
     failures: tuple[Failure, ...]
     drift: tuple[float, int, dict[str, float]] | None
     slow: dict[str, str]
+    cpus: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         lines = [f"{self.store}", f"done       {self.done:,} of {self.members:,} members, {self.units_done} of "
@@ -67,6 +69,8 @@ class Status(NamedTuple):
             change, member, point = self.drift
             lines.append(f"energy     changes by at most {change:.1e}, of member {member}, at {text_of(point)}")
         lines += [f"slow       {name} is called member by member: {why}" for name, why in self.slow.items()]
+        if len(self.cpus) > 1:
+            lines.append(f"CPUs       {', '.join(self.cpus)}: their members may differ as by a change of rounding")
         return "\n".join(lines)
 
 
@@ -90,6 +94,7 @@ def status(store: Store) -> Status:
         claimed=len(set(claimed(store)) - set(done)), rate=rate,
         left=None if rate is None else (grid.members - members) / rate, results=results, failures=failures,
         drift=None if worst is None else (worst[0], worst[1], point(store, spec, worst[1])), slow=slow,
+        cpus=tuple(dict.fromkeys(record["cpu"] for record in records if "cpu" in record)),
     )  # fmt: skip
 
 

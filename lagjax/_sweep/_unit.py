@@ -14,7 +14,7 @@ import numpy as np
 
 from lagjax._results import ENDED_WELL
 from lagjax._sweep._batch import CRASHED, KEEP_FAILED, label
-from lagjax._sweep._job import Job
+from lagjax._sweep._job import Job, cpu
 from lagjax._sweep._members import points_of
 from lagjax._sweep._statistics import partial_of, to_bytes
 from lagjax._sweep._store import RESULT
@@ -93,7 +93,13 @@ def _blank(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, j: int) 
 def _record(job: Job, unit: int, result: np.ndarray, drifts: np.ndarray, complaints: dict[int, str]) -> dict:
     """What is noted of a unit: how members ended, the largest change of energy, and what failed."""
     counts = np.bincount(result)
-    record = {"unit": unit, "members": len(result), "engine": job.spec["engine"], "slow": job.batches.slow}
+    record = {
+        "unit": unit,
+        "members": len(result),
+        "engine": job.spec["engine"],
+        "cpu": cpu(),
+        "slow": job.batches.slow,
+    }
     record["results"] = {label(int(code)): int(counts[code]) for code in np.flatnonzero(counts)}
     failed = np.flatnonzero(~np.isin(result, ENDED_WELL))[:_NAMED]
     record["failed"] = [
