@@ -404,9 +404,7 @@ def test_another_kind_of_cpu_goes_on_and_is_told(tmp_path, undisturbed, monkeypa
     here = _job.cpu()
     for module in (_job, _unit):
         monkeypatch.setattr(module, "cpu", lambda: "an abacus")
-    with pytest.warns(
-        UserWarning, match=r"begun on a CPU of the kind .*, and goes on here on an abacus: the last bits"
-    ):
+    with pytest.warns(UserWarning, match=r"begun on a CPU of the kind .*, and goes on here on an abacus"):
         told = swept(tmp_path).status()
     assert told.cpus == (here, "an abacus") and "an abacus: their members" in str(told)
     assert digests(tmp_path) == undisturbed
