@@ -1,0 +1,137 @@
+"""Each worked problem runs as a script and comes to the book's number; its picture stands in the gallery."""
+
+import re
+import runpy
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def run(name, tmp_path, monkeypatch, **sizes):
+    """What `examples/NAME.py` defines when it runs as a script in `tmp_path`, with other constants at its top."""
+    source = (EXAMPLES / f"{name}.py").read_text()
+    for constant, value in sizes.items():
+        source, count = re.subn(rf"^{constant} = .*$", f"{constant} = {value}", source, flags=re.MULTILINE)
+        assert count == 1, f"{name}.py has no constant {constant}"
+    monkeypatch.chdir(tmp_path)
+    scope = {"__name__": "__main__"}
+    with plt.rc_context():
+        exec(compile(source, f"{name}.py", "exec"), scope)
+        plt.close("all")
+    picture = tmp_path / "out" / f"{name}.png"
+    assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 10_000
+    return scope
+
+
+def test_mercurys_perihelion(tmp_path, monkeypatch):
+    # A century is 43″; the next order in GM/c²a is 1e-7 of that. A step is good to 1e-13, an angle of 2600 to 1e-12 of
+    # itself, which is 1e-9 in units of 2e-4, the advance in a century.
+    scope = run("mercury_perihelion", tmp_path, monkeypatch, YEARS=20.0)
+    assert scope["turns"] == 83
+    np.testing.assert_allclose(scope["ours"], scope["book"], rtol=1e-5)
+    assert f"{scope['ours']:.2f}" == "42.98"
+
+
+def test_a_driven_pendulum_comes_to_its_strange_attractor(tmp_path, monkeypatch):
+    scope = run("driven_pendulum", tmp_path, monkeypatch, MEMBERS=200, PERIODS=60)
+    np.testing.assert_allclose(float(scope["spectrum"].sum()), scope["total"], rtol=1e-6)  # rtol 1e-9 over 500 units
+    # Four motions of 5000 units of time scatter by 4 % each.
+    assert abs(scope["ours"] - scope["book"]) < 0.012
+    assert scope["batch"].ok.all() and scope["density"].sum() == 200 * 49  # nobody leaves the frame of the picture
+
+
+@pytest.mark.slow
+def test_a_charge_in_crossed_fields(tmp_path, monkeypatch):
+    scope = run("crossed_fields", tmp_path, monkeypatch, CHARGES=8)
+    # Machine code keeps 1e-9 a step of a circle of unit size, and is better than that by two digits.
+    np.testing.assert_allclose([scope["ours"], scope["height"]], [scope["book"], scope["book_height"]], rtol=1e-9)
+    np.testing.assert_allclose(scope["fan"].q[:, -1], [[3 * scope["drift"] * scope["turn"], 0.0]] * 8, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_foucaults_pendulum(tmp_path, monkeypatch):
+    scope = run("foucault", tmp_path, monkeypatch, HOURS=3.0)
+    # A swing of 0.5 m on 67 m turns by 3a²/8l² = 2.1e-5 slower than an infinitely small one.
+    np.testing.assert_allclose(scope["ours"] / scope["book"] - 1, -2.09e-5, atol=2e-6)
+
+
+@pytest.mark.slow
+def test_a_bead_on_a_rotating_hoop(tmp_path, monkeypatch):
+    scope = run("bead_on_hoop", tmp_path, monkeypatch)
+    np.testing.assert_allclose(scope["ours"], scope["book"], rtol=1e-14)  # Newton's method, to round-off
+    assert scope["error"] < 1e-12 and scope["frequency_error"] < 1e-12 and scope["stable"].all()
+
+
+@pytest.mark.slow
+def test_a_sliding_wedge(tmp_path, monkeypatch):
+    scope = run("sliding_wedge", tmp_path, monkeypatch)
+    for name in ("x", "X"):
+        np.testing.assert_allclose(scope["ours"][name], scope["book"][name], rtol=1e-14)
+    np.testing.assert_allclose(scope["end"], scope["exact"], rtol=1e-11)  # a parabola: one step
+    # t² = 2/|ẍ| with 1/|ẍ| = (M + m s²)/((M + m) g s c), of which ∂/∂M is m c/((M + m)² g s).
+    M, m, alpha, end = scope["M"], scope["m"], scope["alpha"], scope["end"]
+    slope = m / np.tan(alpha) / ((M + m) ** 2 * 9.81) / end
+    np.testing.assert_allclose(scope["by_mass"], slope, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_cylinder_rolls_and_flies_off(tmp_path, monkeypatch):
+    scope = run("rolling_cylinder", tmp_path, monkeypatch)
+    np.testing.assert_allclose(scope["ours"], scope["book"], rtol=1e-9)  # rtol of a step is 1e-9
+    assert (scope["runs"].transitions.count == 1).all() and (np.diff(scope["ours"]) > 0).all()
+
+
+@pytest.mark.slow
+def test_a_spring_pendulum_in_resonance(tmp_path, monkeypatch):
+    scope = run("spring_pendulum", tmp_path, monkeypatch)
+    # The last of two bounces has C = r₀/100; the growth differs from its limit by some C².
+    np.testing.assert_allclose(scope["ours"], scope["book"], rtol=2e-4)
+    share = scope["swinging"] / (scope["bouncing"] + scope["swinging"])
+    assert share.max() > 0.99 and share[-1] < 0.1  # there and back
+
+
+@pytest.mark.slow
+def test_two_pendulums(tmp_path, monkeypatch):
+    scope = run("double_pendulum_chaos", tmp_path, monkeypatch, NEIGHBOURS=4, DURATION=12.0)
+    np.testing.assert_allclose(scope["ours"], scope["book"], rtol=1e-13)
+    np.testing.assert_allclose(scope["ratios"], [2**0.5, -(2**0.5)], rtol=1e-13)
+    growth = np.log(scope["apart"][-1] / scope["apart"][0]) / 12.0
+    assert abs(growth - scope["rate"]) < 0.1  # of 1.27, by the luck of where it begins
+
+
+@pytest.mark.slow
+def test_a_symmetric_top_nods_and_sleeps(tmp_path, monkeypatch):
+    scope = run("symmetric_top", tmp_path, monkeypatch)
+    np.testing.assert_allclose(scope["ours"], scope["book"], rtol=1e-8)  # rtol of a step is 1e-9
+    # Exponents that grow are told from zero beyond 1e-7 of the largest, of which the spin is off by the square.
+    np.testing.assert_allclose(scope["least"], scope["book_least"], rtol=1e-9)
+    awake = np.asarray(scope["spins"]) < 5.5
+    np.testing.assert_allclose(scope["lowest"][awake], scope["closed"][awake], rtol=2e-2)  # outputs each 0.02
+    assert (scope["lowest"][~awake][3:] < 0.1).all()
+
+
+@pytest.mark.slow
+def test_the_restricted_problem_of_three_bodies(tmp_path, monkeypatch):
+    scope = run("restricted_three_body", tmp_path, monkeypatch, ORBITS=25)
+    np.testing.assert_allclose(scope["ours"], scope["book"], rtol=1e-12)
+    np.testing.assert_allclose(scope["routh"], scope["book_routh"], rtol=1e-9)
+    for orbits in scope["families"]:
+        assert (orbits.closure < 1e-9).all() and orbits.period.size == 25
+        assert np.all(np.diff(orbits.energy) > 0)
+
+
+def test_every_worked_problem_has_its_picture():
+    gallery = runpy.run_path(str(EXAMPLES / "gallery.py"))
+    assert sorted(path.stem for path in (EXAMPLES / "gallery").glob("*.png")) == sorted(gallery["NAMES"])
+    for name in gallery["NAMES"]:
+        picture = (EXAMPLES / "gallery" / f"{name}.png").read_bytes()
+        assert picture.startswith(b"\x89PNG") and 10_000 < len(picture) <= 120_000
+        assert f'savefig("out/{name}.png")' in (EXAMPLES / f"{name}.py").read_text()
