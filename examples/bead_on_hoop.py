@@ -10,7 +10,8 @@ Slow hoops leave the bead at the bottom. Beyond $\Omega_c^2 = g/R$ the bottom is
 off at $\cos\theta = g/(R\Omega^2)$: a pitchfork bifurcation (Strogatz, *Nonlinear Dynamics and Chaos*, §3.5). The bead
 oscillates with
 
-$$ \omega^2 = \frac gR - \Omega^2\ \text{ at the bottom},\qquad \omega^2 = \Omega^2 - \frac{g^2}{R^2\Omega^2}\ \text{ beside it} $$
+$$ \omega^2 = \frac gR - \Omega^2\ \text{ at the bottom},\qquad
+   \omega^2 = \Omega^2 - \frac{g^2}{R^2\Omega^2}\ \text{ beside it} $$
 """
 
 # %%

@@ -7,8 +7,8 @@ Two equal pendulums (mass m, length l), the second of which hangs from the first
 $$ L = m l^2\Big(\dot\theta_1^2 + \tfrac12\dot\theta_2^2 + \cos(\theta_1-\theta_2)\,\dot\theta_1\dot\theta_2\Big)
    + m g l\,(2\cos\theta_1 + \cos\theta_2) $$
 
-Small oscillations are two modes, $\omega^2 = (2 \mp \sqrt2)\,g/l$ with $\theta_2/\theta_1 = \pm\sqrt2$ (Landau & Lifshitz,
-*Mechanics*, §23, problem 2). Large ones are chaotic: what begins side by side parts exponentially.
+Small oscillations are two modes, $\omega^2 = (2 \mp \sqrt2)\,g/l$ with $\theta_2/\theta_1 = \pm\sqrt2$ (Landau &
+Lifshitz, *Mechanics*, §23, problem 2). Large ones are chaotic: what begins side by side parts exponentially.
 """
 
 # %%

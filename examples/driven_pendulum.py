@@ -7,7 +7,7 @@ A pendulum in a bath, pushed by a periodic torque, in units of its own time √(
 $$ L = \tfrac12\dot\theta^2 + \cos\theta + A\,\theta\cos\omega t,\qquad D = \frac{1}{2q}\dot\theta^2
    \quad\Rightarrow\quad \ddot\theta + \dot\theta/q + \sin\theta = A\cos\omega t $$
 
-Seen once in every period of the drive its states lie on a strange attractor (Baker & Gollub, *Chaotic Dynamics*, ch. 3).
+Seen once in every period of the drive its states lie on a strange attractor (Baker & Gollub, *Chaotic Dynamics*).
 Two numbers, for q = 20, A = 0.6, ω = 0.7: volumes in phase space shrink by friction alone, so that the Lyapunov
 exponents add up to −1/q; and the largest one is 0.140 (Sprott, *Chaos and Time-Series Analysis*, appendix A).
 """

@@ -67,9 +67,8 @@ plane = plane - plane[0]
 ours = float(plane[-1] / (t[-1] - t[0]) * 3600)
 book = float(-jnp.degrees(PARIS["Omega"] * jnp.sin(PARIS["latitude"])) * 3600)
 print(f"degrees an hour   §39, −Ω sin λ  {book:.5f}   lagjax {ours:.5f}   ({swings} half swings)")
-print(
-    f"relative difference {ours / book - 1:.1e}; a swing of finite size makes −3a²/8l² = {-3 / 8 * (SWING / PARIS['l']) ** 2:.1e}"
-)
+finite = -3 / 8 * (SWING / PARIS["l"]) ** 2
+print(f"relative difference {ours / book - 1:.1e}; a swing of finite size makes −3a²/8l² = {finite:.1e}")
 
 # %% [markdown]
 """
