@@ -31,21 +31,23 @@ class Offender(NamedTuple):
         return f"{self.name}({self.operands}){self.place}, whose {self.fault} is not finite there"
 
 
-def offenders(function: Callable, *arguments) -> list[Offender]:
+def offenders(function: Callable, *arguments, derivatives: bool = True) -> list[Offender]:
     """The operations of `function(q, qdot, t, params)` that are not finite, or whose derivatives by (q, q̇, t) are not.
 
-    They are listed in the order in which they are evaluated.
+    They are listed in the order in which they are evaluated. Without `derivatives`, which take a hundred times as
+    long, only values are looked at.
     """
     collected = []
 
     def visit(equation, operands, moves, results, place):
         chosen = [i for i, x in enumerate(operands) if moves[i] and _floating(x)]
-        if not chosen or not all(_finite(x) for x in operands):
+        # A NaN that is written into the function counts where it is taken, as in where(t > 1, nan, force).
+        if not all(_finite(x) for x, moved in zip(operands, moves, strict=True) if moved):
             return
         name = _name(equation)
         if not all(_finite(x) for x in results):
-            collected.append(Offender(name, _operands(operands, results), place, "value"))
-        elif any(_floating(x) for x in results):
+            collected.append(Offender(name, _operands(_as_written(equation, operands), results), place, "value"))
+        elif derivatives and chosen and all(map(_finite, operands)) and any(_floating(x) for x in results):
             first, second = _derivatives(equation, operands, chosen)
             for fault, values in (("first derivative", first), ("second derivative", second)):
                 if not all(_finite(x) for x in values):
@@ -54,6 +56,31 @@ def offenders(function: Callable, *arguments) -> list[Offender]:
 
     _follow(function, arguments, visit, into_rules=False)
     return collected
+
+
+def poles(function: Callable, *arguments) -> list[Offender]:
+    """The operations of `function(q, qdot, t, params)` that are next to a pole or a branch point, in order.
+
+    There the second derivative of an operation is larger than any that a smooth one has: 1/x at 1e-5 has 2e15, a square
+    root of x² there 2.5e14.
+    """
+    collected = []
+
+    def visit(equation, operands, moves, results, place):
+        chosen = [i for i, x in enumerate(operands) if moves[i] and _floating(x)]
+        if equation.primitive.name not in _WITH_POLES or not chosen or not all(map(_finite, [*operands, *results])):
+            return
+        _, second = _derivatives(equation, operands, chosen)
+        large = [np.where(np.abs(x) > _AT_A_POLE, np.inf, 0.0) for x in map(np.asarray, second)]
+        if not all(map(_finite, large)):
+            collected.append(Offender(_name(equation), _operands(operands, large), place, "second derivative"))
+
+    _follow(function, arguments, visit, into_rules=False)
+    return collected
+
+
+_AT_A_POLE = 1e14
+_WITH_POLES = frozenset(("div", "sqrt", "rsqrt", "cbrt", "pow", "integer_pow", "log", "log1p", "tan", "atan2", "acos"))
 
 
 def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
@@ -189,7 +216,17 @@ def _derivatives(equation, operands, chosen: list[int]) -> tuple[list, list]:
 def _name(equation) -> str:
     body = _body(equation) if equation.primitive.name in _RULES else None
     own = getattr(getattr(body[0], "debug_info", None), "func_name", None) if body else None
-    return own or equation.primitive.name
+    return own or _WRITTEN.get(equation.primitive.name, equation.primitive.name)
+
+
+_WRITTEN = {"select_n": "where"}  # what users call it
+
+
+def _as_written(equation, operands) -> list:
+    """The operands in the order in which users write them: where(condition, if true, if not)."""
+    if equation.primitive.name == "select_n" and len(operands) == 3:
+        return [operands[0], operands[2], operands[1]]
+    return operands
 
 
 def _place(equation) -> str:
