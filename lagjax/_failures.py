@@ -8,6 +8,8 @@ An output that was not reached has no derivative. `where` alone would make it ze
 branch is a constant; `nan_unless` makes it NaN wherever its cotangent is not zero.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,14 +22,16 @@ from lagjax._custom import batch_in_front, differentiated_as
 from lagjax._results import ENDED_WELL, SimulationError, advice, result_from
 
 
-def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
+def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...], explain: Callable | None = None, evidence=()):
     """`tree` again, where its motion ended well; else `SimulationError`, naming what failed, when and in which member.
 
     `result` holds a result code, `end` = (t, y) the time and the state (2n,) at which the motion ended, `t_last` the
     time it was to reach, and `names` (n,) those of the coordinates. Inside `jax.jit` the error is JAX's own, and its
-    text ends with this one.
+    text ends with this one. `explain(result, t, y, t_last, *evidence)` says more about the one member that the message
+    is about: it gets arrays of NumPy and must not compute with JAX, which waits for the host there.
     """
-    passed = check_p.bind(*map(jnp.asarray, (result, end[0], t_last, end[1])), names=names)
+    values = map(jnp.asarray, (result, end[0], t_last, end[1], *evidence))
+    passed = check_p.bind(*values, names=names, explain=explain)
 
     def through(leaf):
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
@@ -37,17 +41,22 @@ def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
     return jax.tree.map(through, tree)
 
 
+def first_failed(result) -> tuple[int, ...] | None:
+    """The place of the first member that failed among results with any batch axes; None where all ended well."""
+    failed = np.argwhere(~np.isin(np.asarray(result), ENDED_WELL))
+    return tuple(failed[0].tolist()) if len(failed) else None
+
+
 def sentence(result, t_end, t_last, y_end, names: tuple[str, ...]) -> str | None:
     """What failed first among members with any batch axes, when, and where it was; None where all ended well."""
     result, t_end, t_last, y_end = map(np.asarray, (result, t_end, t_last, y_end))
-    failed = np.argwhere(~np.isin(result, ENDED_WELL))
-    if not len(failed):
+    member = first_failed(result)
+    if member is None:
         return None
-    member = tuple(failed[0].tolist())
     who = ""
     if member:
-        label = member[0] if len(member) == 1 else member
-        others = f", the first of {len(failed)} that failed" if len(failed) > 1 else ""
+        label, failed = member[0] if len(member) == 1 else member, int(np.sum(~np.isin(result, ENDED_WELL)))
+        others = f", the first of {failed} that failed" if failed > 1 else ""
         who = f" of member {label}{others} among {result.size},"
     t_last, y = np.broadcast_to(t_last, result.shape)[member], y_end[member]
     q, qdot = y[: len(names)], y[len(names) :]
@@ -59,27 +68,40 @@ def sentence(result, t_end, t_last, y_end, names: tuple[str, ...]) -> str | None
     )
 
 
-def _raise(result, t_end, t_last, y_end, *, names) -> None:
+def _raise(result, t_end, t_last, y_end, *evidence, names, explain) -> None:
     if text := sentence(result, t_end, t_last, y_end, names):
-        raise SimulationError(text, None)
+        raise SimulationError(text + _explained(explain, result, t_end, t_last, y_end, *evidence), None)
+
+
+def _explained(explain: Callable | None, result, *values) -> str:
+    """What `explain` says of the first member that failed; nothing where it fails itself: the message must come out."""
+    if explain is None:
+        return ""
+    member = first_failed(result)
+    of_all = np.shape(result)
+    try:
+        t, t_last, y, *evidence = (np.broadcast_to(x, of_all + np.shape(x)[len(of_all) :])[member] for x in values)
+        return explain(int(np.asarray(result)[member]), t, y, t_last, *evidence)
+    except Exception as error:
+        return f"\n(No more is known about it: {type(error).__name__}.)"
 
 
 check_p = Primitive("lagjax_check")
-check_p.def_abstract_eval(lambda result, t_end, t_last, y_end, **_: ShapedArray(result.shape, t_end.dtype))
+check_p.def_abstract_eval(lambda result, t_end, *_, **__: ShapedArray(result.shape, t_end.dtype))
 
 
 @check_p.def_impl
-def _at_once(result, *values, names):
-    _raise(result, *values, names=names)
+def _at_once(result, *values, **settings):
+    _raise(*map(np.asarray, (result, *values)), **settings)
     return jnp.zeros(jnp.shape(result), values[0].dtype)
 
 
 def _compiled(on_host):
     """One comparison where all is well; the host is asked only where something failed."""
 
-    def check(result, *values, names):
+    def check(result, *values, **settings):
         def host(*arrays):
-            _raise(*map(np.asarray, arrays), names=names)
+            _raise(*map(np.asarray, arrays), **settings)
 
         shape = jax.ShapeDtypeStruct(result.shape, values[0].dtype)
         well = jnp.isin(result, jnp.asarray(ENDED_WELL, result.dtype)).all()

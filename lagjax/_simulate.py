@@ -17,14 +17,15 @@ import numpy as np
 
 from lagjax import _linear
 from lagjax._consistent import has_constraints, inconsistent_members, require_consistent
+from lagjax._derivation import derivation_of
+from lagjax._diagnosis import Ended, diagnosis, ended_of, numerical
 from lagjax._diffrax import Diffrax
 from lagjax._engine import asked_for, choose
 from lagjax._failures import raise_where_failed, sentence
-from lagjax._layout import Layout, halves
+from lagjax._layout import Layout, as_vector, halves
 from lagjax._machine_code import MachineCode
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution, axes_per_leaf
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, result_from
-from lagjax._stopped import AHEAD
 from lagjax._system import System, require_system
 from lagjax._trajectory import State, Trajectory
 from lagjax._validate import as_arrays, is_concrete, require_flag
@@ -255,36 +256,43 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     end, code = trajectory.end, trajectory.result._value
     if is_concrete(code) and int(code) in ENDED_WELL:
         return trajectory
-    t_last = trajectory.ts[-1]
+    t_last, system = trajectory.ts[-1], trajectory.system
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((end, code, t_last))):
         y_end = jnp.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
-        states = trajectory.q, trajectory.qdot, end
-        states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)
+        states, told = (trajectory.q, trajectory.qdot, end), _told_at_run_time(trajectory, layout)
+        states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names, *told)
         return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
     y_end = np.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
-    message, system = sentence(code, end.t, t_last, y_end, layout.names) or "", trajectory.system
+    message = sentence(code, end.t, t_last, y_end, layout.names) or ""
     if trajectory.result == RESULTS.mass_matrix_singular and isinstance(system, System):
         mass = np.asarray(system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
         message += f"\n{_describe_null(mass, layout.names)}"
-    if trajectory.result == RESULTS.nonfinite_state and isinstance(system, System):
-        message += _describe_undefined(system, trajectory, layout)
+    if isinstance(system, System):
+        message += diagnosis(system, layout, trajectory.params, ended_of(trajectory, layout))
     raise SimulationError(message, trajectory)
 
 
-def _describe_undefined(system: System, trajectory: Trajectory, layout: Layout) -> str:
-    """A sentence about the forces, or else the accelerations, that are not finite at the end or just ahead of it."""
-    end, params = trajectory.end, trajectory.params
-    rate = end.qdot, system.acceleration(end.q, end.qdot, end.t, params)
-    first, last = (float(trajectory.ts[place]) for place in (0, -1))
-    smallest = float(np.copysign(4 * jnp.finfo(layout.dtype).eps * max(abs(first), abs(last)), last - first))
-    for steps in (0.0, *AHEAD):
-        q, qdot = jax.tree.map(lambda x, dx, s=steps * smallest: x + s * dx if s else x, (end.q, end.qdot), rate)
-        for what, function in (("force on", system.generalized_force), ("acceleration of", system.acceleration)):
-            values = np.asarray(layout.flatten(function(q, qdot, end.t + steps * smallest, params)))
-            bad = [f"{name} ({x})" for name, x in zip(layout.names, values, strict=True) if not np.isfinite(x)]
-            if bad:
-                return f"\nNot finite {'just ahead' if steps else 'there'}: the {what} {', '.join(bad[:8])}."
-    return ""
+def _told_at_run_time(trajectory: Trajectory, layout: Layout) -> tuple:
+    """What says more about a motion that fails inside of `jax.jit`, and the arrays that it needs for that.
+
+    Numbers of many parameters, the weights of a network, are not carried along for it.
+    """
+    numbers = eqx.filter(trajectory.params, eqx.is_array_like)
+    if not isinstance(trajectory.system, System) or sum(np.size(x) for x in jax.tree.leaves(numbers)) > _MOST_NUMBERS:
+        return ()
+    derivation = derivation_of(trajectory.system, layout, trajectory.params)
+
+    def explain(code, t, y, t_last, t_first, y_first, steps, numbers):
+        ended = Ended(code, float(t), y, float(t_last), float(t_first), y_first, int(steps), numbers)
+        return numerical(derivation, ended)
+
+    first = [jax.tree.map(lambda leaf: leaf[0], tree) for tree in (trajectory.q, trajectory.qdot)]
+    y_first = jnp.concatenate([layout.flatten(half) for half in first])
+    evidence = trajectory.ts[0], y_first, trajectory.stats["num_steps"], as_vector(numbers, layout.dtype)
+    return explain, evidence
+
+
+_MOST_NUMBERS = 1000
 
 
 def _describe_null(mass: np.ndarray, names: tuple[str, ...]) -> str:

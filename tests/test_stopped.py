@@ -65,8 +65,90 @@ def test_the_message_names_the_time_and_the_force_that_ends():
         forces=lambda q, v, t: {"x": 0.0, "y": jnp.sqrt(0.5 - t)},
     )
     q0 = {"x": 1.0, "y": 0.0}
-    with pytest.raises(lagjax.SimulationError, match=r"beyond t = 0.5 of(.|\n)*ahead: the force on q\['y'\] \(nan\)\."):
+    with pytest.raises(lagjax.SimulationError, match=r"beyond t = 0.5 of(.|\n)*ahead: the force on q\['y'\] \(nan\), "):
         lagjax.simulate(scene, q0, q0, TS)
+
+
+def kinetic(q, qdot):
+    return 0.5 * jnp.sum(qdot**2)
+
+
+def fades(q, qdot, t):
+    return jnp.where(t > 0.5, jnp.nan, -1.0) * q
+
+
+STOPS = {
+    # L, forces, q0, qdot0, more arguments, and what the message says
+    "a force that ends": (
+        kinetic, fades, 1.0, 0.0, {},
+        r"force on q \(nan\), from t = 0.5 on, whatever the state. It comes from where\(True, nan, -1\) at test_st",
+    ),
+    "a root": (
+        kinetic, lambda q, v: -jnp.sqrt(1 - q), 0.0, 2.0, {}, r"on q \(nan\). It comes from sqrt\(-.*e-1\d\) at test",
+    ),
+    "a logarithm": (
+        lambda q, v: 0.5 * v**2 - 5 * q * jnp.log(q - 0.2), None, 1.0, -1.0, {},
+        r"derivative of L by q \(nan\). It comes from log\(-.*test_stopped",
+    ),
+    "a collision": (
+        lambda q, v: 0.5 * v**2 + 1 / q, None, 1.0, 0.0, {}, r"near a pole of div\(1, .*e-\d+\) at test_stopped",
+    ),
+    "an explosion": (kinetic, lambda q, v: 6 * q**2, 1.0, 2.0, {}, "q runs to infinity within a finite time"),
+    "a stiff spring": (
+        lambda q, v: 0.5 * v @ v - 5e7 * q[0] ** 2 - 0.5 * q[1] ** 2, None, np.array([0.1, 1.0]), np.zeros(2),
+        {"max_steps": 100}, r"1.0e-04 to 1.0e\+00(.|\n)*100 steps led over 0.00\d+ of 2",
+    ),
+    "a pole of coordinates": (
+        lambda q, v: 0.5 * (v["r"] ** 2 + q["r"] ** 2 * v["phi"] ** 2), None, {"r": 1.0, "phi": 0.0},
+        {"r": -1.0, "phi": 1e-7}, {"max_steps": 100}, r"nearly singular there: along dq\['phi'\] it has come down from",
+    ),
+    "a mass that vanishes": (lambda q, v: 0.5 * q * v**2, None, 1.0, -1.0, {}, "nearly singular there: along dq it"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STOPS)
+def test_the_message_tells_what_it_ran_into(name):
+    lagrangian, forces, q0, qdot0, more, expected = STOPS[name]
+    with pytest.raises(lagjax.SimulationError, match=expected):
+        lagjax.simulate(lagjax.System(lagrangian, forces=forces), q0, qdot0, TS, **more)
+
+
+def test_inside_of_jit_the_message_tells_it_too():
+    scene = lagjax.System(kinetic, forces=fades)
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"force on q .nan., from t = 0.5 on, whatever the state"):
+        jax.jit(lambda q: lagjax.simulate(scene, q, 0.0, TS).q)(1.0)
+    with pytest.raises(lagjax.SimulationError, match=r"member 0, the first of 2(.|\n)*force on q .nan., from t = 0.5"):
+        jax.vmap(lambda q: lagjax.simulate(scene, q, 0.0, TS).q)(jnp.ones(2))
+
+
+def test_the_health_of_a_batch_tells_it_of_the_first_that_failed():
+    batch = lagjax.simulate_batch(SCENE, Q0, 0 * Q0, TS, PARAMS, batch_axes=(0, 0, 0), **BUDGET)
+    assert "from t = 0.5 on, whatever the state. It comes from where(True, nan, 0)" in batch.health().diagnosis
+    broken = PARAMS | {"spring": np.array([1.0, np.nan, 1.0, 1.0])}
+    batch = lagjax.simulate_batch(SCENE, Q0, 0 * Q0, TS, broken, batch_axes=(0, 0, 0), **BUDGET)
+    assert "Of the first of them: params['spring'] is nan" in " ".join(str(batch.health()).split())
+
+
+@pytest.mark.slow
+def test_a_solver_that_goes_across_a_kink_names_its_line():
+    scene = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q))
+    with pytest.raises(lagjax.SimulationError, match="pieced together by abs at test_stopped"):
+        lagjax.simulate(scene, 1.0, 0.0, TS, solver=diffrax.Tsit5(), max_steps=60)
+
+
+@pytest.mark.slow
+def test_a_large_scene_that_fails_is_looked_at_in_no_more_time_than_it_ran():
+    """The operations that are gone through are bounded: a look at this one, line by line, would take minutes."""
+
+    def lagrangian(q, qdot):
+        x = q
+        for k in range(5000):
+            x = jnp.sin(x + 1e-3 * k)
+        return 0.5 * qdot @ qdot + 1e-3 * jnp.sum(x)
+
+    scene = lagjax.System(kinetic, forces=lambda q, v, t: fades(q, v, t) + 0 * lagrangian(q, v))
+    with pytest.raises(lagjax.SimulationError, match=r"the force on q(.|\n)*from t = 0.5 on, whatever the state.$"):
+        lagjax.simulate(scene, jnp.ones(2), jnp.zeros(2), TS)
 
 
 def test_a_kink_at_the_start_is_called_a_kink_and_not_stiff():

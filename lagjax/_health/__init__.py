@@ -33,6 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from lagjax._diagnosis import diagnosis, ended_of, with_numbers
 from lagjax._health._borders import Met, is_piecewise, met
 from lagjax._health._compare import global_error
 from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, Members, measured
@@ -61,11 +62,29 @@ def examine(trajectory, reference=None) -> "Health":
         borders=counts,
         borders_located=located,
         outputs=trajectory.ts.shape[-1],
+        diagnosis=_diagnosis(trajectory),
         works=names.works,
         momentum_names=names.momenta,
         constraint_names=names.constraints,
         **fields,
     )
+
+
+def _diagnosis(trajectory) -> str:
+    """What the first member that failed ran into; nothing where none did, or where that is being traced."""
+    if not isinstance(trajectory.system, System):
+        return ""
+    if not all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
+        return ""
+    failed = np.argwhere(~np.asarray(trajectory.ok))
+    if not len(failed):
+        return ""
+    members = Members(trajectory)
+    which = tuple(failed[0].tolist())
+    layout, row = members.layout, int(np.ravel_multi_index(which, members.batch)) if which else 0
+    numbers = np.array([x if np.ndim(x) == 0 else x[row] for x in members.numbers], layout.dtype)
+    ended = ended_of(trajectory, layout, which, numbers)
+    return diagnosis(trajectory.system, layout, with_numbers(members.params, numbers), ended).strip()
 
 
 def _borders(trajectory) -> tuple[bool, Met[Array] | None]:
@@ -116,6 +135,8 @@ class Health(eqx.Module):
       M does not.
     - `gradients_finite`: whether all that the acceleration is solved from has finite derivatives by the state, the time
       and every parameter, at every output; `gradients_time`: the first where not.
+    - `diagnosis`: what the first member that did not reach its end ran into, in words; empty where all did, and under
+      `jax.jit`.
     - `borders`: how often the motion `crossed` a border of a piecewise force or L, began to slide along one (`slid`, as
       dry friction does that sticks), and `grazed` one, first at the time `t` (NaN: never). There a change within the
       tolerance decides whether the border is crossed: derivatives that do not exist are NaN. None where that is not
@@ -151,6 +172,7 @@ class Health(eqx.Module):
     borders: Met[Array] | None
     borders_located: bool = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
+    diagnosis: str = eqx.field(static=True)
     works: bool = eqx.field(static=True)
     momentum_names: tuple[str, ...] | None = eqx.field(static=True)
     constraint_names: tuple[str, ...] = eqx.field(static=True)
@@ -202,6 +224,9 @@ class Health(eqx.Module):
         sentences = {name: _SENTENCES[name].format(_who(members), sides) for name, members in raised.items()}
         if "result" in raised:
             sentences["result"] += " " + self._advice()
+            if self.diagnosis:
+                of = f" Of the first of them: {self.diagnosis}" if self.ok.ndim else f" {self.diagnosis}"
+                sentences["result"] += of.replace("\n", " ")
         if "amplitude" in raised:
             # The atol whose ratio to this motion is that of the present atol to a motion of order one.
             wanted = np.where(raised["amplitude"], np.asarray(self.amplitude * self.amplitude_needed), np.inf)
