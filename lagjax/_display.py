@@ -34,6 +34,25 @@ def summary(trajectory) -> str:
     return "\n".join([_contents(trajectory), _span(trajectory), _verdict(trajectory)])
 
 
+def as_printed(result, printer, cycle: bool) -> None:
+    """What IPython shows of a result whose `str` is meant for reading: that, and not its fields.
+
+    A class takes it as its `_repr_pretty_`. Where `str` has no values to show, inside `jax.jit`, it is the fields.
+    """
+    try:
+        text = str(result)
+    except Exception:  # a display must not fail
+        text = repr(result)
+    printer.text(text)
+
+
+def times_of_members(trajectory) -> np.ndarray:
+    """The output times of every member, (…, T) with the axes of the batch, whether they share them or not."""
+    ts, batch = np.asarray(trajectory.ts), np.shape(trajectory.result._value)
+    inner = (1,) * (len(batch) + 1 - ts.ndim)  # `simulate_batch` shares its times within each batch
+    return np.broadcast_to(ts.reshape(*ts.shape[:-1], *inner, ts.shape[-1]), (*batch, ts.shape[-1]))
+
+
 def _contents(trajectory) -> str:
     batch = trajectory.result._value.shape
     named = [
@@ -50,11 +69,11 @@ def _contents(trajectory) -> str:
 def _span(trajectory) -> str:
     ts, counts = trajectory.ts, [trajectory.stats[name] for name in COUNTS]
     text = f"{ts.shape[-1]} outputs"
-    if _known(ts):
+    if is_known(ts):
         # Under `jax.vmap` members may have times of their own.
         start, end = (_range(np.asarray(ts)[..., place]) for place in (0, -1))
         text = f"t from {start} to {end} at {text}"
-    if not all(map(_known, counts)):
+    if not all(map(is_known, counts)):
         return f"{text}; the steps are being traced"
     steps, rejected = map(np.asarray, counts)
     if steps.size == 0:
@@ -64,14 +83,14 @@ def _span(trajectory) -> str:
     else:
         counted = f"{steps} steps ({rejected} rejected)"
     changes = trajectory.transitions
-    if changes is not None and _known(changes.count):
+    if changes is not None and is_known(changes.count):
         counted += f", {'at most ' if steps.ndim else ''}{np.max(np.asarray(changes.count))} transitions"
     return f"{text}, {counted}"
 
 
 def _verdict(trajectory) -> str:
     code, t_end = trajectory.result._value, trajectory.end.t
-    if not (_known(code) and _known(t_end) and _known(trajectory.ts)):
+    if not (is_known(code) and is_known(t_end) and is_known(trajectory.ts)):
         return "the result is being traced"
     codes, times = np.asarray(code), np.asarray(t_end)
     if codes.ndim == 0:
@@ -92,7 +111,7 @@ def _verdict(trajectory) -> str:
     return f"{', '.join(parts)}: the first that failed is member {shown}, at t = {times[first]:.6g}"
 
 
-def _known(x: Any) -> bool:
+def is_known(x: Any) -> bool:
     """Whether the values of an array can be read here: it is neither traced, nor a shape alone, nor deleted."""
     if isinstance(x, Tracer):
         return False

@@ -15,8 +15,10 @@ import numpy as np
 from lagjax._display import summary
 from lagjax._health import Health, examine
 from lagjax._layout import Layout
+from lagjax._notebook import of_trajectory
 from lagjax._results import RESULTS
 from lagjax._system import System
+from lagjax._tables import dataset, frame
 
 PyTree = Any
 Number = jax.Array | np.ndarray
@@ -93,6 +95,10 @@ class Trajectory(eqx.Module):
         """Three lines; `equinox.tree_pprint` prints the fields."""
         return summary(self)
 
+    def _repr_html_(self) -> str | None:
+        """The three lines and a small figure, for notebooks; None, and they show the lines, where there is none."""
+        return of_trajectory(self)
+
     @property
     def ok(self) -> jax.Array:
         """True where a member reached the last time or its event."""
@@ -140,26 +146,39 @@ class Trajectory(eqx.Module):
         """
         return examine(self, reference)
 
-    def to_xarray(self):
+    def to_xarray(self, units: PyTree = None, time_unit: str | None = None):
         """An `xarray.Dataset` with a variable per leaf of `q` and `qdot` and the dimensions (member,) time, ...
+
+        - `units`: a pytree prefix of `q` of texts or None: "m" for all coordinates, {"x": "m", "theta": "rad"} for
+          each. They stand in the `attrs` of the variables; velocities have them per `time_unit`.
+        - `time_unit`: that of the times, "s" or "year".
+
+        Batches of batches have the dimensions member_0, member_1, …. Members with times of their own, as under
+        `jax.vmap`, have them as a coordinate `t`.
 
         Raises `ImportError` when xarray is not installed.
         """
-        try:
-            import xarray
-        except ImportError:
-            raise ImportError("to_xarray() needs the package xarray: pip install xarray.") from None
-        members = ("member",) * jnp.ndim(self.result._value)
-        variables: dict[str, tuple] = {"ok": (members, np.asarray(self.ok))}
-        for name, tree in (("q", self.q), ("qdot", self.qdot)):
-            for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-                label = ".".join([name, *(_key_text(key) for key in path)])
-                inner = tuple(f"{label}_{axis}" for axis in range(leaf.ndim - len(members) - 1))
-                variables[label] = ((*members, "time", *inner), np.asarray(leaf))
-        if self.mode is not None:
-            variables["mode"] = ((*members, "time"), np.asarray(self.mode), {"names": list(self.mode_names)})
-        time = self.ts if self.ts.ndim == 1 else self.ts[(0,) * (self.ts.ndim - 1)]
-        return xarray.Dataset(variables, coords={"time": np.asarray(time)})
+        return dataset(self, units, time_unit)
+
+    def to_pandas(self, units: PyTree = None, time_unit: str | None = None):
+        """A `pandas.DataFrame` with a row per output and a column per number: q['x'], q[1], …, qdot['x'], ….
+
+        The columns are called as in messages. The index is `t`; of a batch it is (member, t), in that order. Hybrid
+        motions have a column `mode` of names, missing where there is none. `units` and `time_unit` are those of
+        `to_xarray`; they stand in `frame.attrs["units"]`, by column.
+
+        Raises `ImportError` when pandas is not installed.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        spring = lagjax.System(lambda q, qdot: 0.5 * qdot["x"] ** 2 - 0.5 * q["x"] ** 2)
+        run = lagjax.simulate(spring, {"x": 1.0}, {"x": 0.0}, jnp.linspace(0.0, 10.0, 101))
+        table = run.to_pandas(units="m", time_unit="s")
+        print(table["q['x']"].max(), table.attrs["units"])
+        ```
+        """
+        return frame(self, units, time_unit)
 
     def over_members(self, function, *more) -> PyTree:
         """Map `function(q, qdot, (ts, tolerances), params, mode, *more)` over the batch axes, those of `more` too."""
@@ -213,8 +232,3 @@ def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, para
 
 def _varied_where(here, x):
     return jnp.where(here, x, jax.lax.stop_gradient(x)) if eqx.is_array_like(x) else x
-
-
-def _key_text(key: Any) -> str:
-    """A key of a pytree path as plain text: 'theta' for a dict's or a NamedTuple's, '0' for a list's."""
-    return str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", key))))

@@ -1,5 +1,7 @@
 """`print(trajectory)`: three lines that say what it holds, how far it came and how it ended, wherever it is printed."""
 
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -93,3 +95,52 @@ def test_a_scene_is_one_line():
     assert repr(FALL) == "System(lagrangian=falling, path='auto')"
     scene = lagjax.System(falling, constraints=lambda q: q, path="array")
     assert repr(scene) == "System(lagrangian=falling, constraints=<lambda>, path='array')"
+
+
+def test_a_notebook_shows_the_lines_and_a_picture(fallen):
+    for run in (fallen, lagjax.simulate(FALL, 9.0, 0.0, TS)):
+        shown = run._repr_html_()
+        assert repr(run).splitlines()[0] in shown and "data:image/png;base64," in shown
+    assert "png" in jax.vmap(lambda z: lagjax.simulate(FALL, 9.0, 0.0, TS * z))(jnp.ones(2))._repr_html_()
+
+
+def test_names_that_are_html_are_shown_as_they_are():
+    run = lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v["<b>"] ** 2), {"<b>": 0.0}, {"<b>": 1.0}, TS)
+    assert "<b>" not in run._repr_html_() and "&lt;b&gt;" in run._repr_html_()
+
+
+def test_a_picture_of_a_large_batch_is_of_a_few_members(fallen, monkeypatch):
+    from lagjax import _notebook
+
+    places = []
+    monkeypatch.setattr(
+        _notebook, "_of_members", lambda leaf, *rest: places.append([len(x) for x in rest[1:3]]) or np.zeros(places[-1])
+    )
+    wide = eqx.tree_at(lambda t: t.result._value, fallen, jnp.zeros(100_000, int))
+    wide = eqx.tree_at(lambda t: (t.q, t.end.t), wide, (jnp.zeros((100_000, 5)), jnp.zeros(100_000)))
+    assert wide._repr_html_() is not None and places == [[30, 5]]
+
+
+def test_no_picture_where_there_is_nothing_to_draw(fallen, monkeypatch):
+    seen = []
+
+    def run(q0):
+        run = lagjax.simulate(FALL, q0, 0.0, TS, throw=False)
+        seen.append(run._repr_html_())
+        return run
+
+    assert jax.eval_shape(run, 2.0)._repr_html_() is None and seen == [None]
+    assert jax.tree.map(lambda _: 0, fallen)._repr_html_() is None
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert fallen._repr_html_() is None
+
+
+def test_results_show_in_a_notebook_what_they_print():
+    pretty = pytest.importorskip("IPython.lib.pretty").pretty
+
+    crossed = lagjax.crossings(lagjax.System(lambda q, v: 0.5 * v**2), lambda q, v: q, -1.0, 1.0, TS)
+    findings = lagjax.check(FALL, 1.0, 0.0)
+    modes = lagjax.normal_modes(lagjax.System(lambda q, v: 0.5 * v**2 - 2 * q**2), 0.0)
+    for result in (crossed, findings, modes, FALL.explain(1.0, 0.0)):
+        assert pretty(result) == str(result)
+    assert str(crossed) == "1 crossings from t = 1 to 1, all there"
