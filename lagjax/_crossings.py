@@ -13,6 +13,7 @@ import numpy as np
 
 from lagjax._arguments import accept
 from lagjax._consistent import has_constraints, require_consistent
+from lagjax._display import as_printed, is_known
 from lagjax._failures import raise_where_failed, sentence
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import MOST_GUARDS, MachineCode, Noted, Surfaces, surfaces_of
@@ -38,6 +39,16 @@ class Crossings(NamedTuple):
     qdot: PyTree
     count: jax.Array
     ok: jax.Array
+
+    _repr_pretty_ = as_printed
+
+    def __str__(self) -> str:
+        if not all(map(is_known, (self.t, self.count, self.ok))):
+            return repr(self)
+        t, count, ok = (np.asarray(x) for x in (self.t, self.count, self.ok))
+        many = f" of {' × '.join(map(str, count.shape))} motions" if count.ndim else ""
+        when = f" from t = {np.nanmin(t):.6g} to {np.nanmax(t):.6g}" if np.isfinite(t).any() else ""
+        return f"{count.sum()} crossings{many}{when}, {'all there' if ok.all() else f'not all there in {(~ok).sum()}'}"
 
 
 def crossings(

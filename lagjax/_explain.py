@@ -12,6 +12,7 @@ import numpy as np
 
 from lagjax._blame import pieces_of as pieces_in
 from lagjax._diffrax._equations import ArrayEquations, form_of
+from lagjax._display import as_printed
 from lagjax._engine import choose
 from lagjax._linear import dependent_rows
 from lagjax._native import is_large, pieces_of
@@ -78,6 +79,8 @@ class Explanation:
                 for row, factors in dependent_rows(schur_complement).items()
             }
         return replace(self, constraints=tuple(names), dependent_constraints=dependent)
+
+    _repr_pretty_ = as_printed
 
     def __str__(self) -> str:
         rows = [("coordinates", f"{len(self.coordinates)}: {_listed(self.coordinates)}")]

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._diffrax._solvers import FineOutput
+from lagjax._display import as_printed
 from lagjax._engine import choose
 from lagjax._layout import Layout
 from lagjax._machine_code import MachineCode
@@ -75,6 +76,8 @@ class WorkPrecision(eqx.Module):
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    _repr_pretty_ = as_printed
 
     def __str__(self) -> str:
         table = [_HEADER, *map(_cells, self.rows)]

@@ -19,6 +19,7 @@ from lagjax._analysis._eigen import exponents_and_modes, null_space, symmetric_m
 from lagjax._analysis._equilibrium import require_steady
 from lagjax._analysis._linearize import steady_matrices
 from lagjax._analysis._scene import Scene
+from lagjax._display import as_printed
 from lagjax._failures import nan_unless
 from lagjax._linear import dependent_rows, factorize, least_norm, schur_complement
 from lagjax._linear import rank as rank_of
@@ -50,6 +51,8 @@ class Modes(eqx.Module):
     stable: Bool[Array, ""]
     exponents: Complex[Array, "n 2"]
     damping_ratios: Float[Array, " n"]
+
+    _repr_pretty_ = as_printed
 
     def __str__(self) -> str:
         if self.frequencies.ndim != 1 or not is_concrete(self.frequencies):

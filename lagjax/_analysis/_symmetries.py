@@ -21,6 +21,7 @@ from lagjax._analysis._gauge import changes_of, gauge_of, is_right
 from lagjax._analysis._noether import State, euler_lagrange, flat_generator, variation
 from lagjax._analysis._scene import Scene
 from lagjax._arguments import accept
+from lagjax._display import as_printed
 from lagjax._layout import Layout
 from lagjax._system import System
 from lagjax._trajectory import Trajectory
@@ -64,6 +65,8 @@ class ConservedQuantities(list[Conserved]):
     def __init__(self, quantities: list[Conserved], notes: tuple[str, ...] = ()):
         super().__init__(quantities)
         self.notes = notes
+
+    _repr_pretty_ = as_printed
 
     def __str__(self) -> str:
         rows = [f"{c.name}{'' if c.gauge is None else ' (with a gauge term)'}" for c in self]

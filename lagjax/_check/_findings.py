@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+from lagjax._display import as_printed
+
 Level = Literal["error", "warning", "advice"]
 _ORDER = {"error": 0, "warning": 1, "advice": 2}
 _SHOWN, _WIDTH = 12, 110  # findings that fit on one screen, and its columns
@@ -25,6 +27,8 @@ class Finding:
     level: Level
     where: tuple[str, ...]
     message: str
+
+    _repr_pretty_ = as_printed
 
     def __str__(self) -> str:
         text = f"{self.level:8s} {self.kind}: {self.message}"
@@ -60,6 +64,8 @@ class Findings:
 
     def __len__(self) -> int:
         return len(self.found)
+
+    _repr_pretty_ = as_printed
 
     def __str__(self) -> str:
         if not self.found:

@@ -12,6 +12,7 @@ from scipy.special import ndtri, stdtrit
 
 from lagjax._fit._compare import Comparison, comparison, effective_share
 from lagjax._fit._density import Density
+from lagjax._fit._figures import draw_record
 from lagjax._fit._joint import deviations, of_starts, start_alone
 from lagjax._fit._many import Waterfall
 from lagjax._fit._next import Experiments, ranked
@@ -27,7 +28,9 @@ from lagjax._fit._signals import looks_like_positions
 from lagjax._fit._solve import minimise
 from lagjax._fit._uncertainty import Information
 from lagjax._layout import Layout
+from lagjax._notebook import cell
 from lagjax._simulate import simulate
+from lagjax._tables import intervals
 from lagjax._trajectory import Trajectory
 
 PyTree = Any
@@ -128,6 +131,24 @@ class Fit:
 
     def __repr__(self) -> str:
         return _lab_book(self)
+
+    def _repr_html_(self) -> str | None:
+        """The lab book, and data over fit of the first record, for notebooks; None where nothing can be drawn."""
+        return cell(repr(self), self._draw_first, (5.2, 2.8))
+
+    def _draw_first(self, figure) -> None:
+        drawn = next(one for one in map(self._drawn, self.question.parts) if one.records)
+        axes = figure.subplots(2, min(2, len(drawn.names)), squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
+        draw_record(axes, drawn.records[0], drawn.residuals[0], drawn.names[:2], drawn.sigma)
+
+    def to_pandas(self, level: float = 0.95):
+        """A `pandas.DataFrame` with a row per free number, by its name: value, and low and high of its interval.
+
+        The interval holds it with probability `level`; it is as wide as the number's set where it is not seen.
+
+        Raises `ImportError` when pandas is not installed, `ValueError` for a level that is not between 0 and 1.
+        """
+        return intervals(self.parameters.names, self.parameters.values(self.u), *self._ends(level))
 
     @property
     def rms(self) -> dict[str, float]:

@@ -34,6 +34,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax._diagnosis import diagnosis, ended_of, with_numbers
+from lagjax._display import as_printed
 from lagjax._health._borders import Met, is_piecewise, met
 from lagjax._health._compare import global_error
 from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, Members, measured
@@ -249,6 +250,8 @@ class Health(eqx.Module):
             f"Power balance: cannot be told{_who(undecided)} from {outputs} outputs, between which the work is not "
             f"known to a hundredth of the energy. {advice}",
         )
+
+    _repr_pretty_ = as_printed
 
     def __str__(self) -> str:
         rows = [("result", self._results()), ("steps", self._steps())]

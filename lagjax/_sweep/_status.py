@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._display import as_printed
 from lagjax._sweep._claims import claimed
 from lagjax._sweep._members import text_of
 from lagjax._sweep._store import Store
@@ -51,6 +52,8 @@ class Status(NamedTuple):
     drift: tuple[float, int, dict[str, float]] | None
     slow: dict[str, str]
     cpus: tuple[str, ...] = ()
+
+    _repr_pretty_ = as_printed
 
     def __str__(self) -> str:
         lines = [f"{self.store}", f"done       {self.done:,} of {self.members:,} members, {self.units_done} of "
