@@ -1,6 +1,4 @@
-"""A trajectory as a table and as labelled arrays: the numbers of the motion, under the names of its pytree."""
-
-import sys
+"""Kernels as tables against kernels that are written down operation by operation: the same numbers by both."""
 
 import jax
 import jax.numpy as jnp
@@ -8,80 +6,185 @@ import numpy as np
 import pytest
 
 import lagjax
+from lagjax import _native
+from lagjax._derivation import derivation_of, numbers_of
+from lagjax._layout import Layout
+from lagjax._native import _packs, _schedule, _series
+from lagjax._program import OPERATIONS, Unlowerable, lower
 
-pytest.importorskip("pandas")
-pytest.importorskip("xarray")
-
-TS = jnp.linspace(0.0, 1.0, 5)
-SCENE = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["y"] @ v["y"] - 0.5 * q["x"] ** 2)
-START = {"x": 1.0, "y": jnp.array([1.0, 2.0])}, {"x": 0.0, "y": jnp.array([0.0, 1.0])}
-UNITS = {"x": "rad", "y": None}
-
-
-@pytest.fixture(scope="module")
-def run():
-    return lagjax.simulate(SCENE, *START, TS)
+MEMBERS, RTOL, ROOM = 3, 1e-9, 300
+# Every operation is rounded as often in both forms. But of two products in a sum the processor rounds one with the sum,
+# and which one LLVM takes depends on what stands around them: that is round-off of some hundred operations of a step,
+# which a motion of some hundred steps carries along.
+ROUND_OFF = 1e-11
 
 
-@pytest.fixture(scope="module")
-def batch():
-    many = jax.tree.map(lambda x: jnp.stack([x, 2 * x, 3 * x]), START)
-    return lagjax.simulate_batch(SCENE, *many, TS)
+def in_all_forms(*parts, **options):
+    """A kernel written down operation by operation, one as tables, and one as tables with alike operations in lanes."""
+    for border, width in ((10**9, None), (-1, None), (-1, 1)):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(_series, "LARGEST_LINE", border)
+            patch.setattr(_packs, "LEAST_FILLED", 0)
+            kernel = _native.Kernel(*parts, **options, width=width)
+            if width is None:
+                kernel._backward  # noqa: B018  (compiled in the same form)
+            else:
+                kernel._forward  # noqa: B018
+        yield kernel
 
 
-def test_columns_are_named_as_messages_name_them(run):
-    table = run.to_pandas()
-    assert list(table.columns) == ["q['x']", "q['y'][0]", "q['y'][1]", "qdot['x']", "qdot['y'][0]", "qdot['y'][1]"]
-    np.testing.assert_array_equal(table.index, TS)
-    np.testing.assert_array_equal(table["q['x']"], run.q["x"])
-    np.testing.assert_array_equal(table["qdot['y'][1]"], run.qdot["y"][:, 1])
-    assert table.attrs == {} and table.index.name == "t"
-    one = lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v**2), 0.0, 1.0, TS).to_pandas()
-    assert list(one.columns) == ["q", "qdot"]
+def run_and_back(kernel, ts, y0, params):
+    """A run, and the cotangents of its start and of the parameters, from those of its outputs and its end."""
+    run = kernel(ts[None], y0, params, RTOL, 1e-3 * RTOL, 10_000, ROOM * len(y0))
+    counts = np.where(run.complete, run.steps, 0)
+    first = np.cumsum(counts) - counts
+    cotangents = np.random.default_rng(0).normal(size=run.path.shape), np.ones_like(y0)
+    return run, kernel.vjp(ts[None], params, run.table, first, counts, *cotangents, _native.order_for(RTOL))
 
 
-def test_a_batch_has_its_members_first(batch):
-    table = batch.to_pandas()
-    assert table.index.names == ["member", "t"] and len(table) == 15
-    np.testing.assert_array_equal(table.loc[2]["qdot['y'][1]"], batch.qdot["y"][2, :, 1])
-    np.testing.assert_array_equal(table.xs(0.5, level="t")["q['x']"], batch.q["x"][:, 2])
+def assert_same(kernels, ts, y0, params):
+    by_line, by_table, alone = kernels
+    (written, back), (table, back_by_table) = (run_and_back(kernel, ts, y0, params) for kernel in (by_line, by_table))
+    one_by_one = alone(ts[None], y0, params, RTOL, 1e-3 * RTOL, 10_000)
+    np.testing.assert_array_equal(one_by_one.steps, table.steps)
+    np.testing.assert_array_equal(one_by_one.code, table.code)
+    np.testing.assert_allclose(one_by_one.path, table.path, rtol=0, atol=ROUND_OFF * np.nanmax(abs(table.path)))
+    np.testing.assert_array_equal(table.code, written.code)
+    np.testing.assert_array_equal(table.steps, written.steps)
+    np.testing.assert_allclose(table.path, written.path, rtol=0, atol=ROUND_OFF * np.nanmax(abs(written.path)))
+    for tabled, expected in zip(back_by_table, back, strict=True):
+        if expected.size:
+            np.testing.assert_allclose(tabled, expected, rtol=0, atol=ROUND_OFF * np.nanmax(abs(expected)))
 
 
-def test_units(run):
-    table, arrays = run.to_pandas(UNITS, "s"), run.to_xarray(UNITS, "s")
-    assert table.attrs["units"] == {"q['x']": "rad", "qdot['x']": "rad/s", "t": "s"}
-    assert arrays["q.x"].attrs == {"units": "rad"} and arrays["qdot.x"].attrs == {"units": "rad/s"}
-    assert arrays["q.y"].attrs == {} and arrays["time"].attrs == {"units": "s"}
-    np.testing.assert_array_equal(arrays["q.y"], run.q["y"])
-    assert set(run.to_pandas("m").attrs["units"].values()) == {"m"}  # for all; of velocities it is not known
-    with pytest.raises(ValueError, match=r"does not fit the structure of q.*q\['x'\], q\['y'\]"):
-        run.to_pandas({"theta": "rad"})
-    with pytest.raises(TypeError, match="A unit must be text"):
-        run.to_xarray({"x": 1, "y": None})
-    with pytest.raises(TypeError, match="time_unit must be text"):
-        run.to_pandas(time_unit=1)
+# Two by default; the others in the slow part. Written down, the solar system takes LLVM six minutes, which nobody runs:
+# as a table it is held to JPL's ephemeris.
+QUICK = ("double_pendulum", "driven_pendulum")
 
 
-def test_batches_of_batches_and_times_of_their_own():
-    free = lagjax.System(lambda q, v: 0.5 * v**2)
-    run = jax.vmap(lambda size: lagjax.simulate_batch(free, jnp.zeros(3), jnp.ones(3), TS * size))(jnp.arange(1.0, 3.0))
-    table, arrays = run.to_pandas(), run.to_xarray()
-    assert table.index.names == ["member_0", "member_1", "t"] and len(table) == 30
-    np.testing.assert_allclose(table["q"], table.index.get_level_values("t"))
-    assert arrays.sizes == {"member_0": 2, "member_1": 3, "time": 5}
-    np.testing.assert_allclose(arrays["q"], arrays["t"])
+@pytest.mark.parametrize(
+    "scene",
+    [pytest.param(scene, id=scene.__name__, marks=() if scene.__name__ in QUICK else pytest.mark.slow)
+     for scene in lagjax.scenes.ALL if scene is not lagjax.scenes.solar_system],
+)  # fmt: skip
+def test_ready_scenes(scene):
+    made = scene()
+    layout = Layout.of(made.q0, made.qdot0)
+    derivation = derivation_of(made.system, layout, made.params)
+    try:
+        parts = derivation.acceleration, layout.size, derivation.projection
+    except Unlowerable as reason:
+        pytest.skip(str(reason))
+    params = np.array([numbers_of(made.params)], float)
+    y0 = np.concatenate([layout.flatten(made.q0), layout.flatten(made.qdot0)])
+    assert_same(in_all_forms(*parts), np.linspace(0.0, 1.0, 4), np.tile(y0, (MEMBERS, 1)), params)
 
 
 @pytest.mark.slow
-def test_hybrid_motions_have_their_modes_by_name():
-    bounce = lagjax.Transition("fall", "rest", guard=lambda q, v: q, direction=-1, reset=lambda q, v: (q, 0 * v))
-    modes = {"fall": lagjax.System(lambda q, v: 0.5 * v**2 - q), "rest": lagjax.System(lambda q, v: 0.5 * v**2)}
-    run = lagjax.simulate_hybrid(modes, [bounce], "fall", 0.25, 0.0, TS)
-    assert list(run.to_pandas()["mode"]) == ["fall"] * 3 + ["rest"] * 2
+def test_piecewise_operations_parameters_that_are_integers_and_guards():
+    def acceleration(q, v, t, k, n):
+        wall = jnp.maximum(-q[0], 0) ** 1.5 - jnp.minimum(q[0], 1) * jnp.where((q[1] > 0.3) | ~(v[0] < 0), k, 0.5)
+        turned = jnp.sin(jnp.mod(q[1], 2.0)) * jnp.cos(q[1]) / (1 + abs(v[1])) + jnp.tanh(v[0]) + n * jnp.cos(t)
+        return wall, -turned, False
+
+    shapes = jnp.ones(2), jnp.ones(2), 1.0
+    program = lower(acceleration, *shapes, 1.0, 2)
+
+    def value(q, v, t, k, n):
+        return q[0] * q[1] - 0.7
+
+    def guards(q, v, t, k, n):
+        g = value(q, v, t, k, n)
+        return g, v[0] * q[1] + q[0] * v[1], abs(g) + 1.4, abs(v[0] * q[1]) + abs(q[0] * v[1])
+
+    events = _native.Guards(lower(value, *shapes, 1.0, 2), lower(guards, *shapes, 1.0, 2), (0,))
+    y0 = np.random.default_rng(1).uniform(-0.5, 0.5, (MEMBERS, 4)) + np.array([0.5, 0.5, 0, 0])
+    kernels = list(in_all_forms(program, 2, guards=events))
+    assert_same(kernels, np.linspace(0.0, 2.0, 5), y0, np.array([[2.0, 1.0]]))
+    for kernel in kernels[1:]:
+        codes = kernel(np.array([[0.0, 9.0]]), y0, np.array([[2.0, 1.0]]), RTOL, RTOL, 10_000).code
+        assert (codes >= _native.EVENT).any()
 
 
-@pytest.mark.parametrize("package", ["pandas", "xarray"])
-def test_without_the_package_it_says_what_to_install(run, package, monkeypatch):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ImportError, match=rf"to_{package}\(\) needs the package {package}: pip install {package}"):
-        getattr(run, f"to_{package}")()
+# ---- the order in which a table runs --------------------------------------------------------------------------------
+
+
+def everything(x, y, s):
+    """Sums and products in long chains, several results of one node, outputs that are inputs, numbers, or alike."""
+    for k in range(12):
+        x, y = x + y * jnp.cos(x) - jnp.roll(y, k) * jnp.roll(x, 1), (x - y / (2.0 + x * x)) * s
+    angle = jnp.sum(x)
+    return x, y, s, jnp.cos(angle), jnp.where(x[0] > 0, x, y), x[0] > y[0], jnp.ones(2), jnp.sqrt(1 + y * y), x[:2]
+
+
+@pytest.mark.parametrize(("window", "stored"), [(1, 0), (40, 9), (10**6, 30)])
+def test_a_schedule_computes_the_program(window, stored, monkeypatch):
+    monkeypatch.setattr(_schedule, "WINDOW", window)
+    program = lower(everything, jnp.ones(7), jnp.ones(7), 1.0)
+    numbers = np.random.default_rng(0).uniform(0.5, 1.5, 15)
+    plan, memory = _schedule.schedule(program.line, stored), {}
+    count, nodes = len(program.line.outputs), len(program.line.nodes)
+    node_at = {nodes + k: ("slot", plan.size + k) for k in range(count)}  # what is stored, behind the slots
+    node_at |= {node: ("slot", slot) for node, slot in plan.slots.items()}
+    for node, position in plan.inputs.items():
+        node_at[node] = "input", position
+        memory[node_at[node]] = numbers[position]
+    for node, number in plan.constants.items():
+        node_at[node] = "constant", node
+        memory[node_at[node]] = number
+
+    def results(kind, operands):
+        xs = [next(operands) if part is None else results(part, operands)[0] for part in kind.parts]
+        if kind.op in ("copy", "store"):
+            return xs
+        if kind.op == "sincos":
+            return [np.sin(xs[0]), np.cos(xs[0])]
+        return [OPERATIONS[kind.op].value(*xs, *(() if kind.attribute is None else (kind.attribute,)))]
+
+    for group in plan.groups:
+        made = {}  # a group may read all before it writes any
+        for kind, operands, nodes in group:
+            values = results(plan.kinds[kind], iter([memory[node_at[x]] for x in operands]))
+            made |= {node_at[x]: value for x, value in zip(nodes, values, strict=True) if x >= 0}
+        memory |= made
+    found = [memory["slot", k if k < plan.staying else plan.size + k] for k in range(count)]
+    assert plan.staying == count - stored
+    np.testing.assert_allclose(np.array(found, float), np.array(program.evaluate(*numbers), float), rtol=1e-14)
+    assert plan.size < len(program.line.nodes) / 2  # slots are used again
+
+
+def test_what_comes_often_is_one_operation():
+    program = lower(everything, jnp.ones(7), jnp.ones(7), 1.0)
+    plan = _schedule.schedule(program.line, 0)
+    done = [operation for group in plan.groups for operation in group]
+    assert len(done) < 0.8 * program.operations
+    assert max(plan.kinds[operation.kind].operands for operation in done) > 3
+    alike = sum(len(group) for group in plan.groups if len(group) >= _schedule.TIMES[0])
+    assert alike > 0.5 * len(done)
+
+
+# ---- size -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_code_of_a_table_does_not_grow_with_the_scene():
+    """Thirty times the pairs of bodies: the tables are longer, and the code is the same but for a few kinds."""
+    from lagjax._native._integrator import Integrator
+
+    def instructions(count):
+        i, j = np.triu_indices(count, 1)
+
+        def acceleration(q, v, t):
+            distance = jnp.sqrt(jnp.sum((q.reshape(count, 2)[i] - q.reshape(count, 2)[j]) ** 2, axis=1) + 0.1)
+            pull = (q.reshape(count, 2)[i] - q.reshape(count, 2)[j]) / distance[:, None] ** 3
+            return jnp.zeros((count, 2)).at[i].add(-pull).at[j].add(pull).ravel(), False
+
+        states = jax.ShapeDtypeStruct((2 * count,), float)
+        program = lower(acceleration, states, states, 1.0)
+        series = _native.recurrences(program, 2 * count)
+        functions = Integrator(program, series, width=8).motion.module.functions
+        return sum(len(block.instructions) for function in functions for block in function.blocks)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_series, "LARGEST_LINE", -1)
+        small, large = instructions(4), instructions(20)
+    assert large < 1.5 * small

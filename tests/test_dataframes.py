@@ -1,0 +1,87 @@
+"""A trajectory as a table and as labelled arrays: the numbers of the motion, under the names of its pytree."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+pytest.importorskip("pandas")
+pytest.importorskip("xarray")
+
+TS = jnp.linspace(0.0, 1.0, 5)
+SCENE = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["y"] @ v["y"] - 0.5 * q["x"] ** 2)
+START = {"x": 1.0, "y": jnp.array([1.0, 2.0])}, {"x": 0.0, "y": jnp.array([0.0, 1.0])}
+UNITS = {"x": "rad", "y": None}
+
+
+@pytest.fixture(scope="module")
+def run():
+    return lagjax.simulate(SCENE, *START, TS)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    many = jax.tree.map(lambda x: jnp.stack([x, 2 * x, 3 * x]), START)
+    return lagjax.simulate_batch(SCENE, *many, TS)
+
+
+def test_columns_are_named_as_messages_name_them(run):
+    table = run.to_pandas()
+    assert list(table.columns) == ["q['x']", "q['y'][0]", "q['y'][1]", "qdot['x']", "qdot['y'][0]", "qdot['y'][1]"]
+    np.testing.assert_array_equal(table.index, TS)
+    np.testing.assert_array_equal(table["q['x']"], run.q["x"])
+    np.testing.assert_array_equal(table["qdot['y'][1]"], run.qdot["y"][:, 1])
+    assert table.attrs == {} and table.index.name == "t"
+    one = lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v**2), 0.0, 1.0, TS).to_pandas()
+    assert list(one.columns) == ["q", "qdot"]
+
+
+def test_a_batch_has_its_members_first(batch):
+    table = batch.to_pandas()
+    assert table.index.names == ["member", "t"] and len(table) == 15
+    np.testing.assert_array_equal(table.loc[2]["qdot['y'][1]"], batch.qdot["y"][2, :, 1])
+    np.testing.assert_array_equal(table.xs(0.5, level="t")["q['x']"], batch.q["x"][:, 2])
+
+
+def test_units(run):
+    table, arrays = run.to_pandas(UNITS, "s"), run.to_xarray(UNITS, "s")
+    assert table.attrs["units"] == {"q['x']": "rad", "qdot['x']": "rad/s", "t": "s"}
+    assert arrays["q.x"].attrs == {"units": "rad"} and arrays["qdot.x"].attrs == {"units": "rad/s"}
+    assert arrays["q.y"].attrs == {} and arrays["time"].attrs == {"units": "s"}
+    np.testing.assert_array_equal(arrays["q.y"], run.q["y"])
+    assert set(run.to_pandas("m").attrs["units"].values()) == {"m"}  # for all; of velocities it is not known
+    with pytest.raises(ValueError, match=r"does not fit the structure of q.*q\['x'\], q\['y'\]"):
+        run.to_pandas({"theta": "rad"})
+    with pytest.raises(TypeError, match="A unit must be text"):
+        run.to_xarray({"x": 1, "y": None})
+    with pytest.raises(TypeError, match="time_unit must be text"):
+        run.to_pandas(time_unit=1)
+
+
+def test_batches_of_batches_and_times_of_their_own():
+    free = lagjax.System(lambda q, v: 0.5 * v**2)
+    run = jax.vmap(lambda size: lagjax.simulate_batch(free, jnp.zeros(3), jnp.ones(3), TS * size))(jnp.arange(1.0, 3.0))
+    table, arrays = run.to_pandas(), run.to_xarray()
+    assert table.index.names == ["member_0", "member_1", "t"] and len(table) == 30
+    np.testing.assert_allclose(table["q"], table.index.get_level_values("t"))
+    assert arrays.sizes == {"member_0": 2, "member_1": 3, "time": 5}
+    np.testing.assert_allclose(arrays["q"], arrays["t"])
+
+
+@pytest.mark.slow
+def test_hybrid_motions_have_their_modes_by_name():
+    bounce = lagjax.Transition("fall", "rest", guard=lambda q, v: q, direction=-1, reset=lambda q, v: (q, 0 * v))
+    modes = {"fall": lagjax.System(lambda q, v: 0.5 * v**2 - q), "rest": lagjax.System(lambda q, v: 0.5 * v**2)}
+    run = lagjax.simulate_hybrid(modes, [bounce], "fall", 0.25, 0.0, TS)
+    assert list(run.to_pandas()["mode"]) == ["fall"] * 3 + ["rest"] * 2
+
+
+@pytest.mark.parametrize("package", ["pandas", "xarray"])
+def test_without_the_package_it_says_what_to_install(run, package, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=rf"to_{package}\(\) needs the package {package}: pip install {package}"):
+        getattr(run, f"to_{package}")()
