@@ -111,8 +111,12 @@ class Density:
 
     def __call__(self, x):
         """log p(x), up to a constant; −∞ where a motion could not be followed."""
+        return self.posterior(x, self.log_likelihood(x))
+
+    def posterior(self, x, log_likelihood):
+        """log p(x) with what the measurements contribute to it; −∞ where that is no number."""
         at = self.unknowns(jnp.asarray(x, self.question.layout.dtype))
-        total = self.log_likelihood(x) + self.question.parameters.log_volume(at.u, jnp)
+        total = log_likelihood + self.question.parameters.log_volume(at.u, jnp)
         if self.prior is not None:
             total = total + self.prior(self.params(at.u))
         if self.moves_dof:
@@ -123,7 +127,8 @@ class Density:
     def log_likelihood(self, x):
         """Σ_s shares_s log L_s, up to a constant; NaN where a motion could not be followed."""
         at = self.unknowns(jnp.asarray(x, self.question.layout.dtype))
-        return sum(self._likelihood(self.residuals(batch, at), batch, at) for batch in self.question.batches)
+        weighted = [np.sqrt(batch.weights) * self.residuals(batch, at) for batch in self.question.batches]
+        return self.of_weighted(weighted, [batch.weights > 0 for batch in self.question.batches], at)
 
     def residuals(self, batch: Samples, at: Unknowns):
         """What the sensors show less what was measured, (N, T, S), of the records of one batch."""
@@ -149,15 +154,19 @@ class Density:
         shown = jnp.zeros(values.shape, values.dtype).at[..., : shown.shape[-1]].set(shown)
         return jnp.where(batch.weights > 0, shown - values, 0.0)
 
-    def _likelihood(self, residuals, batch: Samples, at: Unknowns):
-        """Σ_s shares_s log L_s of the samples of one batch, up to a constant."""
-        squares = batch.weights * (residuals / at.sigma) ** 2
+    def of_weighted(self, weighted: list, counted: list, at: Unknowns):
+        """Σ_s shares_s log L_s, up to a constant, of √weight · residual (N, T, S) of every batch, where they count.
+
+        For a signal whose noise is Gaussian other numbers with the same sum of squares do as well.
+        """
+        total = -jnp.sum(self.shares * (self.question.weights > 0).sum(axis=0) * jnp.log(at.sigma))
         dof = jnp.where(self._tails, at.dof, 1.0)
-        tails = (
-            gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * jnp.log(dof) - (dof + 1) / 2 * jnp.log1p(squares / dof)
-        )
-        each = jnp.where(self._tails, tails, -0.5 * squares) - jnp.log(at.sigma)
-        return jnp.sum(jnp.where(batch.weights > 0, each * self.shares, 0.0))
+        norm = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * jnp.log(dof)
+        for rows, counts in zip(weighted, counted, strict=True):
+            squares = (rows / at.sigma) ** 2
+            each = jnp.where(self._tails, norm - (dof + 1) / 2 * jnp.log1p(squares / dof), -0.5 * squares)
+            total = total + jnp.sum(jnp.where(counts, each * self.shares, 0.0))
+        return total
 
     def _of_noise(self, samples: np.ndarray) -> np.ndarray:
         """The covariance of log σ, and of the numbers that move ν, from Fisher's information of so many samples (S,).

@@ -224,9 +224,17 @@ class Fit:
     def sample(self, draws: int = 1000, seed: int = 0, *, chains: int = 4, prior: Callable | None = None) -> Any:
         """Draws of the posterior by the No-U-Turn sampler, `draws` of each chain, as `arviz.InferenceData`.
 
-        The density is that of `log_density(prior)`. The sampler's metric is the fit's covariance, and all chains go in
-        one batch of motions. The variables are the free parameters by their names, `q0` and `qdot0` of the records
-        whose starts are fitted, and `sigma`, `dof` of the signals. `arviz.summary` tells whether chains agree.
+        The density is that of `log_density(prior)`, π. The sampler walks in the fit's own metric along π*, the density
+        whose residuals are expanded to second order about the fit, r(0) + J z + ½ zᵀ H z; then one motion of each chain
+        accepts or refuses the draw, with min(1, π(y) π*(x) / [π(x) π*(y)]), so that draws are those of π. Where the
+        expansion is too far from π the sampler follows π with gradients through the motions. `attrs["sampler"]` of what
+        comes back says which it was, and how much was accepted.
+
+        All chains go in one batch of motions: many chains with few draws are cheaper than few with many. The variables
+        are the free parameters by their names, `q0` and `qdot0` of the records whose starts are fitted, and `sigma`,
+        `dof` of the signals. `arviz.summary` tells whether chains agree.
+
+        Source: Hoffman & Gelman, JMLR 15 (2014) 1593; Christen & Fox, J. Comput. Graph. Stat. 14 (2005) 795.
 
         Raises `ImportError` without blackjax and arviz, and `ValueError` where something free is not seen.
         """

@@ -1,18 +1,32 @@
 """`sample`: draws from the posterior of a fit, by the No-U-Turn sampler in the fit's own metric.
 
-The covariance of the fit, C = L Lᵀ, turns its posterior into one that is nearly round: x = x̂ + L z. In z the sampler
-needs no warm-up for a metric, only for its step, and trajectories are short. All chains go side by side in one batch of
-motions.
+The covariance of the fit, C = L Lᵀ, turns its posterior π into one that is nearly round: x = x̂ + L z.
+
+By rule, where that can be had: the sampler moves along π*, the density whose residuals are expanded to second order
+(`_surrogate`), which costs no motions, so many of its steps that y is nearly independent of the x where it began; then
+one exact density decides. The chain goes to y with the probability
+
+    min(1, π(y) π*(x) / [π(x) π*(y)])
+
+and else stays at x. Its draws are those of π itself, whatever π* is, because the inner steps are reversible for π*: a
+poor expansion makes a slow chain, not a wrong one. Nothing of π* is changed after warming. How well it does is
+measured before, on independent pairs of its draws: where less than `_LEAST` of them would be accepted the sampler
+follows π itself, with gradients through the motions at every step.
+
+All chains go side by side in one batch of motions.
 
 Which library: blackjax, whose kernels are plain functions of a log density, so that chains, the loop and what is kept
 are a few lines here. numpyro does the same behind a language for models, of which nothing is needed.
 
-Source: Hoffman & Gelman, *The No-U-Turn sampler*, JMLR 15 (2014) 1593; Vehtari et al., Bayesian Analysis 16 (2021) 667,
-for dispersed chains and what arviz tells of them.
+Source: Hoffman & Gelman, *The No-U-Turn sampler*, JMLR 15 (2014) 1593; Christen & Fox, *MCMC using an approximation*,
+J. Comput. Graph. Stat. 14 (2005) 795; Vehtari et al., Bayesian Analysis 16 (2021) 667, for dispersed chains and what
+arviz tells of them.
 """
 
 import functools
+import math
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,22 +34,172 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._fit._density import Density
+from lagjax._fit._surrogate import Surrogate, expanded
 
 _WARM, _ACCEPTED = 200, 0.85  # draws for the step of every chain; the mean acceptance it is tuned for
+_ROUNDS = (400, 800, 1600)  # draws of all chains from π*: each round has the metric of the one before
+_FEWEST = 50  # of them of one chain: its step needs so many
+_MOST_INNER = 64  # steps of the sampler along π* for one draw: a motion is waited for no longer than that
+_PILOT = 64  # draws of π* that are weighed with π before the first draw
+_LEAST = 0.2  # of them are accepted, or π* is given up: fewer, and a chain may stay where π* is too small
+_SETTLING = 5  # draws that are thrown away: chains begin at weighed draws of the pilot, which are few
 
 
 class Draws(NamedTuple):
-    """`x` (C, K, D): K draws of C chains; of each draw log p, the steps of its trajectory, and if that diverged."""
+    """`x` (C, K, D): K draws of C chains; of each draw log p, the steps of its trajectory, and if that diverged.
+
+    `acceptance` is that of the exact density where draws came from an expansion; `sampler` says in words which it was.
+    """
 
     x: np.ndarray
     log_density: np.ndarray
     steps: np.ndarray
     diverged: np.ndarray
     acceptance: np.ndarray
+    sampler: str
 
 
 def draw(density: Density, draws: int, chains: int, seed: int) -> Draws:
     """Draws of the posterior, from starts that are dispersed as the posterior is."""
+    _blackjax()
+    surrogate = expanded(density)
+    if isinstance(surrogate, str):
+        return _along_exact(density, draws, chains, seed, surrogate)
+    warming, weighing, going = jax.random.split(jax.random.key(seed), 3)
+    sampler, state = _tuned(surrogate, chains, warming)
+    exact = jax.jit(jax.vmap(lambda z: density(surrogate.x(z))))
+    share, start = _weighed(sampler, exact, state, weighing)
+    if share < _LEAST:
+        why = f"Of draws of the expansion of its residuals to second order the exact density accepts {share:.2f}."
+        return _along_exact(density, draws, chains, seed, why)
+    return _corrected(surrogate, sampler, exact, start, draws, going)
+
+
+# ---- along the expansion, each draw accepted or refused by the exact density -----------------------------------------
+
+
+class Sampler(NamedTuple):
+    """The sampler along π*: `move` (keys, state, step, metric), its step and metric (D, D), and how many make a draw.
+
+    A state is that of C chains; the program of one step of all of them is compiled once for warming and drawing.
+    """
+
+    move: Callable
+    step: float
+    metric: Any
+    inner: int
+
+    def draw(self, key, state) -> tuple[Any, np.ndarray, np.ndarray]:
+        """The state after the steps of one draw, how many steps of trajectories they took (C,), and which diverged."""
+        steps, diverged = 0, np.zeros(len(state.position), bool)
+        for k in range(self.inner):
+            state, info = self.move(_keys(key, k, state), state, self.step, self.metric)
+            steps, diverged = steps + np.asarray(info.num_integration_steps), diverged | np.asarray(info.is_divergent)
+        return state, np.asarray(steps), diverged
+
+
+def _keys(key, k: int, state):
+    return jax.random.split(jax.random.fold_in(key, k), len(state.position))
+
+
+def _tuned(surrogate: Surrogate, chains: int, key) -> tuple[Sampler, Any]:
+    """The sampler with a step and a metric from its own draws of π*; and where its chains are."""
+    blackjax = _blackjax()
+    kernel = blackjax.nuts.build_kernel()
+    size, dtype = len(surrogate.centre), surrogate.density.question.layout.dtype
+
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(0, 0, None, None))
+    def move(key, state, step, metric):
+        return kernel(key, state, logdensity_fn=surrogate, step_size=step, inverse_mass_matrix=metric)
+
+    start, update, _ = blackjax.adaptation.step_size.dual_averaging_adaptation(_ACCEPTED)
+    update = jax.jit(update)
+    z, metric, step = jax.random.normal(key, (chains, size), dtype), jnp.eye(size, dtype=dtype), 0.25
+    state = jax.jit(jax.vmap(lambda z: blackjax.nuts.init(z, surrogate)))(z)
+    late = np.zeros((chains, 0, size))
+    for part, pooled in enumerate(_ROUNDS):
+        if part > 0:
+            metric = jnp.asarray(_shrunk(late.reshape(-1, size)), dtype)
+        count, path, tuning, own = (
+            max(_FEWEST, math.ceil(pooled / chains)),
+            [],
+            start(step),
+            jax.random.fold_in(key, part),
+        )
+        for k in range(count):
+            state, info = move(_keys(own, k, state), state, jnp.exp(tuning.log_step_size), metric)
+            tuning = update(tuning, info.acceptance_rate.mean())
+            path.append(np.asarray(state.position, float))
+        late, step = np.stack(path[count // 2 :], axis=1), float(jnp.exp(tuning.log_step_size_avg))
+    effective = float(np.asarray(blackjax.ess(late, chain_axis=0, sample_axis=1)).min())
+    inner = math.ceil(late.shape[0] * late.shape[1] / max(effective, 1.0))
+    return Sampler(move, step, metric, min(max(inner, 1), _MOST_INNER)), state
+
+
+def _shrunk(rows: np.ndarray) -> np.ndarray:
+    """The covariance of draws (M, D), drawn towards that of the fit as if five draws had shown it."""
+    count, size = rows.shape
+    return (count * np.cov(rows.T).reshape(size, size) + 5 * np.eye(size)) / (count + 5)
+
+
+class Chains(NamedTuple):
+    """Where C chains are: the sampler's state along π*, log π (C,) and log π − log π* (C,)."""
+
+    state: Any
+    exact: np.ndarray
+    ratio: np.ndarray
+
+    @staticmethod
+    def at(state, exact: Callable) -> "Chains":
+        """The state weighed by the exact density."""
+        of_z = np.asarray(exact(state.position), float)
+        return Chains(state, of_z, of_z - np.asarray(state.logdensity, float))
+
+
+def _weighed(sampler: Sampler, exact: Callable, state, key) -> tuple[float, Chains]:
+    """How many of independent pairs of draws of π* are accepted, and starts for the chains among these, by weight."""
+    chains, pilot = len(state.position), []
+    for k in range(max(2, math.ceil(_PILOT / chains))):
+        state, *_ = sampler.draw(jax.random.fold_in(key, k), state)
+        pilot.append(Chains.at(state, exact))
+    pool = jax.tree.map(lambda *parts: np.concatenate(parts), *pilot)
+    if not np.isfinite(pool.ratio).any():
+        return 0.0, pool
+    weights = np.exp(pool.ratio - pool.ratio.max())
+    share = np.minimum(1.0, weights[:, None] / np.where(weights > 0, weights, np.inf)).mean()
+    rows = _choices(key).choice(len(weights), chains, p=weights / weights.sum())
+    return float(share), jax.tree.map(lambda part: part[rows], pool)
+
+
+def _choices(key) -> np.random.Generator:
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)))
+
+
+def _corrected(surrogate: Surrogate, sampler: Sampler, exact: Callable, at: Chains, draws: int, key) -> Draws:
+    """Draws of π: every proposal of π* accepted or refused by the exact density."""
+    kept, choices = [], _choices(key)
+    for k in range(_SETTLING + draws):
+        state, steps, diverged = sampler.draw(jax.random.fold_in(key, k), at.state)
+        proposed = Chains.at(state, exact)
+        accepted = np.exp(np.minimum(0.0, proposed.ratio - at.ratio))  # 0 where a motion could not be followed
+        goes = choices.uniform(size=len(accepted)) < accepted
+        at = jax.tree.map(lambda new, old: np.where(goes.reshape(-1, *[1] * (new.ndim - 1)), new, old), proposed, at)  # noqa: B023
+        kept.append((at.state.position, at.exact, steps, diverged, accepted))
+    z, log_density, steps, diverged, accepted = (np.stack(part[_SETTLING:], axis=1) for part in zip(*kept, strict=True))
+    words = (
+        f"{sampler.inner} steps of the No-U-Turn sampler along the second-order expansion of the residuals for every "
+        f"draw, which the exact density then accepts or refuses; it accepts {accepted.mean():.2f}."
+    )
+    x = np.asarray(surrogate.centre + z @ surrogate.root.T)
+    return Draws(x, log_density, steps, diverged, accepted, words)
+
+
+# ---- along the exact density -----------------------------------------------------------------------------------------
+
+
+def _along_exact(density: Density, draws: int, chains: int, seed: int, why: str) -> Draws:
+    """Draws by gradients through the motions; `why` says what speaks against the expansion."""
     blackjax = _blackjax()
     root = jnp.asarray(np.linalg.cholesky(density.covariance()), density.question.layout.dtype)
     centre = jnp.asarray(density.first, root.dtype)
@@ -63,7 +227,9 @@ def draw(density: Density, draws: int, chains: int, seed: int) -> Draws:
         return jax.tree.map(lambda leaf: leaf[_WARM:], kept)
 
     z, *rest = jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(seed), chains))
-    return Draws(np.asarray(centre + z @ root.T), *(np.asarray(leaf) for leaf in rest))
+    words = f"The No-U-Turn sampler along the exact density, with gradients through the motions. {why}"
+    log_density, steps, diverged, acceptance = (np.asarray(leaf) for leaf in rest)
+    return Draws(np.asarray(centre + z @ root.T), log_density, steps, diverged, acceptance, words)
 
 
 def inference_data(density: Density, drawn: Draws) -> Any:
@@ -92,7 +258,8 @@ def inference_data(density: Density, drawn: Draws) -> Any:
         "lp": drawn.log_density, "n_steps": drawn.steps, "diverging": drawn.diverged,
         "acceptance_rate": drawn.acceptance,
     }  # fmt: skip
-    return arviz.from_dict(posterior=posterior, sample_stats=stats, dims=dims, coords=coords)
+    attributes = {"sampler": drawn.sampler}
+    return arviz.from_dict(posterior=posterior, sample_stats=stats, dims=dims, coords=coords, attrs=attributes)
 
 
 def _told(density: Density, x):

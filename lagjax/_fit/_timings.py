@@ -220,23 +220,31 @@ class Clock:
         self.tolerances = _tolerances(problem)
         self.of_tangents = self.tolerances._replace(rtol=rtol, atol=self.tolerances.atol / _SHARPER)
         self.sections, self._slopes = len(functions), _slopes_of(surfaces, layout.size, len(parameters.first))
-        self._last: tuple[bytes, Crossed] | None = None
+        self._last: tuple[bytes, tuple[np.ndarray, np.ndarray]] | None = None
         self.times = self._as_function()
 
     # ---- the crossings of N motions ----
 
-    def crossed(self, y0: np.ndarray, numbers: np.ndarray) -> Crossed:
-        """The crossings of the motions from y0 (N, 2n) with the parameters `numbers` (N, P)."""
-        count, begin = len(y0), self.span[:1]
+    def noted(self, y0: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """When the motions from y0 (N, 2n) with the parameters `numbers` (N, P) cross, (N, M), and which have all of
+        the crossings, (N,). The times of one that has not are spread over the span."""
         noted = self.noting.run(self.span[None], y0, numbers, self.tolerances._replace(notes=self.room))
-        rows = noted.path.reshape(count, self.sections, self.room + 1, -1)
+        rows = noted.path.reshape(len(y0), self.sections, self.room + 1, -1)
         t = rows[:, self.flat.which, self.flat.numbers, 0]
         ok = np.isfinite(t).all(axis=1)
-        t = np.where(ok[:, None], t, np.linspace(self.span[0], self.span[1], t.shape[1] + 1)[1:])
+        return np.where(ok[:, None], t, np.linspace(self.span[0], self.span[1], t.shape[1] + 1)[1:]), ok
+
+    def crossed(self, y0: np.ndarray, numbers: np.ndarray, noted: tuple[np.ndarray, np.ndarray] | None = None):
+        """The crossings of the motions from y0 (N, 2n) with the parameters `numbers` (N, P), as `Crossed`.
+
+        `noted` is what the method of that name returned for the same motions, where it was asked before.
+        """
+        t, ok = self.noted(y0, numbers) if noted is None else noted
+        count, begin = len(y0), self.span[:1]
         order = np.argsort(t, axis=1, kind="stable")
         ts = np.concatenate([np.broadcast_to(begin, (count, 1)), np.take_along_axis(t, order, axis=1)], axis=1)
         run = self.flow.run(ts, y0, numbers, self.tolerances, KEPT)
-        ok &= np.isin(run.result, ENDED_WELL)
+        ok = ok & np.isin(run.result, ENDED_WELL)
         y = np.empty((*t.shape, y0.shape[1]))
         np.put_along_axis(y, order[..., None], run.path[:, 1:], axis=1)
         by_y, by_numbers = self._moved(t, y, numbers)
@@ -328,22 +336,20 @@ class Clock:
         times.defvjp(forward, backward)
         return times
 
-    def _remembered(self, y0: np.ndarray, numbers: np.ndarray) -> Crossed:
-        """`crossed`, of which the last is remembered: what goes back follows what went forward."""
-        key, last = y0.tobytes() + numbers.tobytes(), self._last
-        if last is None or last[0] != key:
-            self._last = last = key, self.crossed(y0, numbers)
-        return last[1]
-
     def _times(self, y0, numbers):
+        """The times alone, which need no second run: what is noted is kept for a cotangent that follows."""
         y0, numbers = (np.asarray(x, np.float64) for x in (y0, numbers))
-        crossed = self._remembered(*(x.reshape(-1, x.shape[-1]) for x in (y0, numbers)))
-        return crossed.t.reshape(*y0.shape[:-1], -1)
+        rows = tuple(x.reshape(-1, x.shape[-1]) for x in (y0, numbers))
+        t, ok = noted = self.noted(*rows)
+        self._last = y0.tobytes() + numbers.tobytes(), noted
+        return np.where(ok[:, None], t, np.nan).reshape(*y0.shape[:-1], -1)
 
     def _cotangents(self, *arrays):
         arrays = [np.asarray(x, np.float64) for x in arrays]
         y0, numbers, t_ct = (x.reshape(-1, x.shape[-1]) for x in arrays)
-        found = self.reverse(self._remembered(y0, numbers), t_ct)
+        key, last = y0.tobytes() + numbers.tobytes(), self._last
+        noted = last[1] if last is not None and last[0] == key else None
+        found = self.reverse(self.crossed(y0, numbers, noted), t_ct)
         return tuple(x.reshape(like.shape) for x, like in zip(found, arrays[:2], strict=True))
 
 
