@@ -511,7 +511,7 @@ def test_a_finer_grid_takes_what_is_known(tmp_path, monkeypatch):
     assert digests(tmp_path, "grown") == digests(tmp_path, "whole") and grown.status().done == 91
     with pytest.raises(ValueError, match=r"rtol: None in the store, now 1e-05"):
         swept(tmp_path, finer, store=tmp_path / "other", extend=coarse, rtol=1e-5)
-    with pytest.raises(ValueError, match=r"(?s)ts: .*leave extend= away"):
+    with pytest.raises(ValueError, match=r"(?s)ts: .*give ts that begin at 2, where"):
         lagjax.sweep(PENDULUM, OVER, 2 * TS, **{**RULE, "store": tmp_path / "other", "extend": coarse})
     assert not (tmp_path / "other").exists() and whole.status().done == 91
 
@@ -526,6 +526,64 @@ def test_more_members_of_a_design(tmp_path, slice, monkeypatch):
     many = swept(tmp_path, over(75), store=tmp_path / "many", extend=few)
     assert digests(tmp_path, "many") == digests(tmp_path, "whole") and not many.open().angle.isnull().any()
     assert many.status().results == {"successful": 75}
+
+
+def keep_end(trajectory):
+    return {"end": trajectory.end, "fastest": jnp.abs(trajectory.qdot).max()}
+
+
+TO_ONE, TO_TWO = TS[:3], TS[2:]
+
+
+def in_pieces(folder, **changes):
+    """The sweeps from 0 to 1, and from there to 2."""
+    rule = {**RULE, "keep": keep_end, **changes}
+    first = lagjax.sweep(PENDULUM, OVER, TO_ONE, **{**rule, "store": folder / "first"})
+    return first, lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**rule, "store": folder / "rest", "extend": first.store})
+
+
+def test_a_later_end_goes_on_from_the_states_that_are_kept(tmp_path):
+    first, rest = in_pieces(tmp_path)
+    one, two = first.open(), rest.open()
+    length, angle = (x.ravel() for x in np.meshgrid(*OVER.values(), indexing="ij"))
+    whole = lagjax.simulate_batch(PENDULUM, angle, np.zeros_like(angle), TS, length, batch_axes=(0, 0, 0))
+    np.testing.assert_allclose(two["end.q"].values.ravel(), whole.q[:, -1], atol=1e-7)  # of forty steps of 1e-9
+    fastest = np.maximum(one.fastest, two.fastest).values.ravel()
+    np.testing.assert_allclose(fastest, np.abs(whole.qdot).max(axis=1), atol=1e-7)
+    state = (one[name].values.ravel() for name in ("end.q", "end.qdot"))
+    bare = lagjax.simulate_batch(PENDULUM, *state, TO_TWO, length, batch_axes=(0, 0, 0))
+    np.testing.assert_array_equal(two["end.q"].values.ravel(), bare.q[:, -1])
+    other = {**RULE, "store": tmp_path / "other", "extend": first.store}
+    with pytest.raises(ValueError, match=r"axes: .* in the store, now"):
+        lagjax.sweep(PENDULUM, {**OVER, "length": [1.0]}, TO_TWO, **other)
+    with pytest.raises(ValueError, match=r"(?s)which cannot go on.*q0"):
+        lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**other, "q0": 0.5})
+    with pytest.raises(ValueError, match="does not have the states in which its motions ended"):
+        lagjax.sweep(PENDULUM, OVER, TS + 2.0, **{**other, "extend": swept(tmp_path).store})
+    with pytest.raises(ValueError, match=r"goes_on_from: .* in the store, now None"):
+        lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**RULE, "keep": keep_end, "store": rest.store})
+    (first.store / ".sweep" / "done" / "0.json").unlink()
+    with pytest.raises(ValueError, match="1 units are not done"):
+        lagjax.sweep(PENDULUM, OVER, TO_TWO, **other)
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.slow
+def test_a_later_end_of_members_that_have_ended_and_by_other_workers(tmp_path, monkeypatch):
+    first, rest = in_pieces(tmp_path, event=at_the_bottom)
+    whole = swept(tmp_path, keep=keep_end, event=at_the_bottom)
+    one, two, both = (run.open().load() for run in (first, rest, whole))
+    np.testing.assert_array_equal(two.result, both.result)
+    fell = (one.result == lagjax.RESULTS.event_occurred._value).values
+    assert 10 < fell.sum() < 42 and np.isnan(two["end.t"].values[fell]).all()
+    for name in ("end.t", "end.q", "end.qdot"):
+        np.testing.assert_allclose(np.where(fell, one[name], two[name]), both[name], atol=1e-7)
+    rule = {**RULE, "keep": keep_end, "extend": first.store, "event": at_the_bottom}
+    children = lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**rule, "store": tmp_path / "children", "isolate": True})
+    monkeypatch.setattr("lagjax._sweep.work", lambda *_: None)
+    begun = lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**rule, "store": tmp_path / "shell"})
+    assert worker(Store(begun.store)).wait() == 0
+    assert digests(tmp_path, "rest") == digests(tmp_path, "shell") == digests(tmp_path, children.store)
 
 
 # ---- other processes -------------------------------------------------------------------------------------------------

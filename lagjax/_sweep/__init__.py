@@ -9,13 +9,14 @@ _scene               the user's functions: text, hash, the way to another proces
 _store, _claims      the files; who has which unit
 _batch, _job, _unit  what computes a unit
 _begin, _extend      stores that are begun; those that take members of another one
+_later               motions that go on where those of another store were left
 _run, _isolate       workers: here, in children, by executors
 _status              how far it is
 """
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from lagjax._sweep._begin import begin, first_look, repair, require_same
 from lagjax._sweep._designs import Design, latin_hypercube, random, sobol
 from lagjax._sweep._isolate import Child
 from lagjax._sweep._job import Job, in_doubles, precision
+from lagjax._sweep._later import goes_on, left_in
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._run import run_store, submit, work
 from lagjax._sweep._scene import Motions
@@ -141,7 +143,9 @@ def sweep(
     - `unit`: members of a unit of work, which is a chunk of the store and what a worker that dies loses. By default as
       many as take 20 s here, at most 64 MiB of what is kept.
     - `extend`: a store of the same scene, of which the members that are also in `over` are taken: to have more members
-      of a design, or a finer grid. It stays as it is.
+      of a design, or a finer grid. It stays as it is. For a later end let `keep` return {"end": trajectory.end, …}, and
+      give `ts` that begin at the last time of that store: its motions go on from there, and `keep` sees the rest of
+      them. Members that have ended before have their `result` of then.
     - `executor`: any `concurrent.futures.Executor`, such as dask's `client.get_executor()`; a task is a unit. By
       default this process works, with the machine code's threads on all cores, and writes a unit while it computes the
       next.
@@ -193,9 +197,11 @@ def sweep(
     if place.unfinished_creation():
         place.clear()
     child = Child(place.path, isolate) if isolate else None
+    other = None if extend is None else Store(Path(extend).absolute())
     with precision(in_doubles()), child or nullcontext():
+        if other is not None and goes_on(other, motions):
+            motions = replace(motions, left=left_in(other, axes, motions))
         if not place.path.exists():
-            other = None if extend is None else Store(Path(extend).absolute())
             begin(place, axes, motions, unit, child.look if child else first_look, other)
         spec = place.spec()
         require_same(place, spec, axes, motions)

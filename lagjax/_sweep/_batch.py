@@ -47,7 +47,14 @@ def batches_of(motions: Motions, conserves: bool) -> "Batches":
     """What computes batches of these motions; the last ones are remembered, with what was compiled for them."""
     fixed = (motions.system, motions.q0, motions.qdot0, motions.params, motions.keep, *motions.settings.values())
     sections = motions.sections and motions.sections._replace(functions=tuple(map(id, motions.sections.functions)))
-    key = (*map(id, fixed), sections, motions.ts.tobytes(), bool(conserves), jax.dtypes.canonicalize_dtype(float))
+    key = (
+        *map(id, fixed),
+        sections,
+        motions.left and motions.left.path,
+        motions.ts.tobytes(),
+        bool(conserves),
+        jax.dtypes.canonicalize_dtype(float),
+    )
     if key not in _remembered:
         while len(_remembered) >= _REMEMBERED:
             _remembered.pop(next(iter(_remembered)))
@@ -66,7 +73,8 @@ class Batches:
         self.motions, self.conserves = motions, conserves
         self.quantities: list[Quantity] = []  # what is kept of each member, once that is known
         self.slow: dict[str, str] = {}  # which functions are called member by member, and why
-        roles = {"q0": motions.q0, "qdot0": motions.qdot0, "params": motions.params}
+        begin = motions.left or motions
+        roles = {"q0": begin.q0, "qdot0": begin.qdot0, "params": motions.params}
         if not any(map(callable, roles.values())):
             raise ValueError(
                 "None of q0, qdot0 and params is a function: all members would be the same. Write q0=lambda point: "
@@ -232,11 +240,14 @@ def _require_dict(kept: Any) -> None:
 
 def _by_name(kept: dict) -> dict[str, Any]:
     """The leaves of what `keep` returns by names, those of inner trees with points: 'end.theta'."""
-    leaves = jax.tree_util.tree_leaves_with_path(kept)
-    return {
-        ".".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path): x
-        for path, x in leaves
-    }
+    return dict(zip(jax.tree.leaves(names_of(kept)), jax.tree.leaves(kept), strict=True))
+
+
+def names_of(kept: dict) -> dict:
+    """What `keep` returns with the name of every leaf in its place."""
+    return jax.tree_util.tree_map_with_path(
+        lambda path, _: ".".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path), kept
+    )
 
 
 def _first_line(error: BaseException) -> str:

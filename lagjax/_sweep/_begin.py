@@ -14,6 +14,7 @@ from lagjax._sweep._batch import Kept, batches_of, label, quantities_of
 from lagjax._sweep._designs import Design
 from lagjax._sweep._extend import carry, require_extensible
 from lagjax._sweep._job import Job, cpu, in_doubles, require_versions, versions
+from lagjax._sweep._later import states
 from lagjax._sweep._members import RESERVED, Axis, Grid, points_of
 from lagjax._sweep._scene import Motions, difference, packed, texts, users_path
 from lagjax._sweep._store import FORMAT, RESULT, Quantity, Store
@@ -46,7 +47,7 @@ def begin(
 ) -> None:
     """Make the store, after a look at what a few members take and keep, with the members that `extend` knows."""
     scene = packed(motions)
-    points, shape = _few(axes), tuple(axis.size for axis in axes)
+    points, shape = _few(axes, motions), tuple(axis.size for axis in axes)
     kept, seconds, conserves = look(motions, points)
     quantities = quantities_of(kept)
     _require_names(quantities, axes, motions.reduce)
@@ -61,6 +62,7 @@ def begin(
     }  # fmt: skip
     codes = sorted({code_of(item) for item in RESULTS._name_to_item.values()} | set(_batch.NAMES))
     title = f"lagjax sweep over {', '.join(names)}"
+    extend = None if motions.left else extend  # of which no member is taken as it is
     if extend is not None:
         require_extensible(extend, extend.spec(), spec)
     store.create(spec, scene, axes, title, {-1: "not_done"} | {code: label(code) for code in codes})
@@ -68,18 +70,18 @@ def begin(
         carry(extend, store)
 
 
-def _few(axes: tuple[Axis, ...]) -> dict[str, np.ndarray]:
-    """Points of some thousand members, evenly spread over the grid; of designs their first ones."""
+def _few(axes: tuple[Axis, ...], motions: Motions) -> dict[str, np.ndarray]:
+    """Points of some thousand members, evenly spread over the grid; of designs, and of what goes on, the first ones."""
     sides, shape = [], []
     for axis in axes:
         _, values = next(axis.pieces())
         count = min(axis.size, max(2, round(_PROBED ** (1 / len(axes)))), len(values))
-        which = (
-            np.arange(count) if isinstance(axis.source, Design) else np.linspace(0, len(values) - 1, count).astype(int)
-        )
+        first = isinstance(axis.source, Design) or motions.left is not None
+        which = np.arange(count) if first else np.linspace(0, len(values) - 1, count).astype(int)
         sides.append({name: values[which, c] for c, name in enumerate(axis.names)})
         shape.append(count)
-    return points_of(sides, tuple(shape), np.arange(int(np.prod(shape))))
+    points = points_of(sides, tuple(shape), np.arange(int(np.prod(shape))))
+    return points | (states(motions.left, tuple(map(slice, shape)))[0] if motions.left else {})
 
 
 def _conserves(motions: Motions, points: dict[str, np.ndarray]) -> bool:

@@ -36,8 +36,8 @@ def require_extensible(old: Store, spec: dict, now: dict) -> None:
         later = ""
         if spec["ts"] != now["ts"]:
             later = (
-                "\nWhat is kept of a motion does not tell how it goes on: leave extend= away, or keep the state at the "
-                "end, and sweep over that from there, with a tuple of names and a tuple of arrays."
+                "\nWhat is kept of a motion does not tell how it goes on. For a later end give ts that begin at "
+                f"{spec['ts']['ends'][1]:g}, where the motions of that store end; else leave extend= away."
             )
         raise ValueError(f"{old.path} has members of another description. What differs:\n" + "\n".join(lines) + later)
 

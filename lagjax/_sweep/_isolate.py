@@ -22,9 +22,8 @@ import numpy as np
 from lagjax._sweep._batch import Kept
 from lagjax._sweep._begin import first_look
 from lagjax._sweep._job import Job, in_doubles, opened
-from lagjax._sweep._members import points_of
 from lagjax._sweep._scene import Motions, packed, unpacked, users_path
-from lagjax._sweep._unit import Unit, compute, parts
+from lagjax._sweep._unit import Unit, compute, parts, starts
 
 PATIENCE = 600.0  # seconds for a batch, and for the start of a child: a scene of 100 bodies compiles for a minute
 _MOST = 100  # members of a unit that may end their process: each takes a dozen children to find
@@ -234,6 +233,5 @@ def _count_in(doubles: bool) -> None:
 
 def _probe(job: Job, unit: int, members: list[int]) -> None:
     """Compute some members of a unit, in a batch no larger than that takes."""
-    axes = job.store.coordinates(job.spec["axes"], job.grid.box(unit))
     which = np.array(members)[np.arange(2 ** (len(members) - 1).bit_length()) % len(members)]
-    job.batches(points_of(axes, job.grid.box_shape(unit), which))
+    job.batches(starts(job, unit)[0](which))

@@ -16,7 +16,7 @@ import types
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +29,25 @@ from lagjax._system import System
 
 PyTree = Any
 ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
+MOTION = (*ROLES, "q0", "qdot0", "params")  # what a motion depends on, besides its tolerances
 NOT_TRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
 _SHOWN = 40  # lines of a difference
+
+
+class Left(NamedTuple):
+    """Where motions were left that go on: the path of the store, and its names of the leaves of q and q̇ at the end."""
+
+    path: str
+    q: PyTree
+    qdot: PyTree
+
+    def q0(self, point: dict[str, Any]) -> PyTree:
+        """q of a member, whose point has the values by these names."""
+        return jax.tree.map(point.__getitem__, self.q)
+
+    def qdot0(self, point: dict[str, Any]) -> PyTree:
+        """q̇ of a member, whose point has the values by these names."""
+        return jax.tree.map(point.__getitem__, self.qdot)
 
 
 @dataclass(frozen=True)
@@ -46,17 +63,26 @@ class Motions:
     reduce: dict[str, Statistics]
     settings: dict[str, Any]  # of `simulate_batch`: rtol, atol, max_steps, event, solver
     sections: Sections | None = None  # of which keep is told the crossings
+    left: Left | None = None  # where they go on from, instead of q0 and qdot0
 
     def start(self, point: dict[str, Any]) -> tuple[PyTree, PyTree, PyTree]:
         """(q0, qdot0, params) of the member at a point."""
         q0, qdot0, params = (x(point) if callable(x) else x for x in (self.q0, self.qdot0, self.params))
         return q0, qdot0, params
 
+    def shapes(self, names: list[str]) -> tuple[PyTree, PyTree, PyTree]:
+        """(q0, qdot0, params) of a member whose point has these names: shapes, or numbers that are as good."""
+        try:
+            return jax.eval_shape(self.start, {name: jnp.zeros(()) for name in names})
+        except NOT_TRACEABLE:
+            return self.start({name: 0.5 for name in names})
+
     def described(self) -> dict:
         """The numbers among it, by name, for the store."""
         shown: dict[str, Any] = {name: _value_text(value) for name, value in self.settings.items() if name != "event"}
         times = {"ends": [float(self.ts[0]), float(self.ts[-1])], "outputs": len(self.ts), "sha256": _hash(self.ts)}
         shown["crossings"] = self.sections.described() if self.sections else None
+        shown["goes_on_from"] = self.left and self.left.path
         return {"ts": times, **shown, "reduce": {name: how.described() for name, how in self.reduce.items()}}
 
 
@@ -66,11 +92,7 @@ class Motions:
 def texts(motions: Motions, names: list[str]) -> dict[str, dict[str, str]]:
     """For every function and value: its text, and its program as JAX traces it (the text where it cannot)."""
     point = {name: jnp.zeros(()) for name in names}
-    try:
-        state = jax.eval_shape(motions.start, point)
-    except NOT_TRACEABLE:
-        state = motions.start({name: 0.5 for name in names})
-    q, qdot, params = state
+    q, qdot, params = motions.shapes(names)
     found = {}
     for role in ROLES:
         function = getattr(motions.system, role)

@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._results import ENDED_WELL
+from lagjax._results import ENDED_WELL, SUCCESSFUL
 from lagjax._sweep._batch import CRASHED, KEEP_FAILED, label
 from lagjax._sweep._job import Job, cpu
+from lagjax._sweep._later import states
 from lagjax._sweep._members import points_of
 from lagjax._sweep._statistics import partial_of, to_bytes
 from lagjax._sweep._store import RESULT
@@ -42,6 +43,15 @@ def parts(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
     return [(left[np.minimum(np.arange(k, k + batch), len(left) - 1)], min(batch, len(left) - k)) for k in starts]
 
 
+def starts(job: Job, unit: int) -> tuple[Callable[[np.ndarray], dict[str, np.ndarray]], np.ndarray]:
+    """What gives the points of some members of a unit; and how all of them ended before, where they go on."""
+    box, shape = job.grid.box(unit), job.grid.box_shape(unit)
+    axes, more, before = job.store.coordinates(job.spec["axes"], box), {}, np.full(job.grid.size(unit), SUCCESSFUL)
+    if job.motions.left is not None:
+        more, before = states(job.motions.left, box)
+    return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in more.items()}, before
+
+
 def _nobody(batch: int) -> None:
     pass
 
@@ -51,8 +61,7 @@ def compute(
 ) -> Unit:
     """Compute a unit without members that are known to end their process, and how; `tell(k)` before the k-th batch."""
     began, spent = time.monotonic(), time.process_time()
-    shape, size = job.grid.box_shape(unit), job.grid.size(unit)
-    axes = job.store.coordinates(job.spec["axes"], job.grid.box(unit))
+    size, (points, before) = job.grid.size(unit), starts(job, unit)
     drifts, complaints = np.full(size, np.nan), {}
     known, of_known = job.store.known(unit)
     values = {q.name: np.empty((size, *q.shape), q.dtype) for q in (*job.batches.quantities, RESULT)}
@@ -60,15 +69,16 @@ def compute(
         values[name][known] = x
     for k, (which, count) in enumerate(parts(job, unit)):
         tell(k)
-        kept, own = job.batches(points_of(axes, shape, _without(which, crashed))), which[:count]
+        kept, own = job.batches(points(_without(which, crashed))), which[:count]
         job.require_engine(kept)
         for name, x in {**kept.values, RESULT.name: kept.result}.items():
             values[name][own] = x[:count]
         if kept.drift is not None:
             drifts[own] = kept.drift[:count]
         complaints |= {int(own[j]): text for j, text in kept.complaints.items() if j < count}
-    for j in crashed:
-        _blank(job, values, drifts, j)
+    ended = np.flatnonzero(before != SUCCESSFUL)  # before these motions began
+    _blank(job, values, drifts, ended, before[ended])
+    _blank(job, values, drifts, list(crashed), CRASHED)
     complaints |= crashed
     record = _record(job, unit, values[RESULT.name], drifts, complaints)
     record |= {"seconds": time.monotonic() - began, "cpu_seconds": time.process_time() - spent}
@@ -83,11 +93,11 @@ def _without(which: np.ndarray, crashed: Mapping[int, str]) -> np.ndarray:
     return np.where(bad, which[~bad][0], which)
 
 
-def _blank(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, j: int) -> None:
-    """A member of which nothing is known but that it ended its process."""
+def _blank(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, which, result) -> None:
+    """Members of which nothing is known but their results."""
     for q in job.batches.quantities:
-        values[q.name][j] = q.nothing
-    values[RESULT.name][j], drifts[j] = CRASHED, np.nan
+        values[q.name][which] = q.nothing
+    values[RESULT.name][which], drifts[which] = result, np.nan
 
 
 def _record(job: Job, unit: int, result: np.ndarray, drifts: np.ndarray, complaints: dict[int, str]) -> dict:
