@@ -26,8 +26,8 @@ def run(name, tmp_path, monkeypatch, **sizes):
     with plt.rc_context():
         exec(compile(source, f"{name}.py", "exec"), scope)
         plt.close("all")
-    picture = tmp_path / "out" / f"{name}.png"
-    assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 10_000
+    pictures = list((tmp_path / "out").glob(f"{name}*.png"))
+    assert pictures and all(picture.read_bytes().startswith(b"\x89PNG") for picture in pictures)
     return scope
 
 
@@ -135,3 +135,22 @@ def test_every_worked_problem_has_its_picture():
         picture = (EXAMPLES / "gallery" / f"{name}.png").read_bytes()
         assert picture.startswith(b"\x89PNG") and 10_000 < len(picture) <= 120_000
         assert f'savefig("out/{name}.png")' in (EXAMPLES / f"{name}.py").read_text()
+
+
+@pytest.mark.slow
+def test_the_first_hour(tmp_path, monkeypatch, capsys):
+    scope = run("first_hour", tmp_path, monkeypatch, SIDE=24)
+    assert len(list((tmp_path / "out").glob("first_hour_*.png"))) == 4
+    assert "write jnp.sum(v**2) and not" in " ".join(capsys.readouterr().out.split())
+    assert scope["drift"] < 1e-14
+    # From h = 1 the bead passes the lowest point with 5 g; outputs are 10 ms apart, 1 % of a swing.
+    np.testing.assert_allclose(scope["force"].max(), 5 * 9.81, rtol=1e-2)
+    # The map mirrored in y has the other two magnets.
+    mirrored = np.array([0, 2, 1])[np.asarray(scope["nearest"])[::-1]]
+    assert scope["batch"].ok.all() and np.mean(mirrored == scope["nearest"]) > 0.95
+    # An amplitude of 0.01 lengthens the period by 0.01²/16.
+    np.testing.assert_allclose([scope["time"], scope["slope"]], [scope["quarter"]] * 2, rtol=1e-5)
+    # 361 frames with a noise of 0.01 tell the length to 4e-4 of itself, the friction to 3e-3 of itself.
+    params = scope["fit"].params
+    np.testing.assert_allclose(params["l"], 0.62, rtol=2e-3)
+    np.testing.assert_allclose(params["c"], 0.02, rtol=2e-2)
