@@ -114,8 +114,8 @@ A pendulum with an iron bob swings over three magnets and loses energy to the ai
 rest? `dissipation` is half of the power that friction takes. One call of `simulate_batch` follows all starts, the first
 axis of what goes in and of what comes out:
 
-$$ L = \tfrac12 v^2 - \tfrac12 r^2 + \sum_i \frac{1}{\sqrt{|\mathbf r-\mathbf r_i|^2+h^2}},\qquad
-   D = \tfrac12 c\,v^2 $$
+$$ L = \tfrac12 v^2 - \tfrac14 r^2 + \sum_i \frac{1}{\sqrt{|\mathbf r-\mathbf r_i|^2+h^2}},\qquad
+   D = \tfrac1{10} v^2,\qquad h = 0.3 $$
 """
 
 # %%
