@@ -47,6 +47,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 - `scenes`: ready Lagrangians with exact solutions
 - `plot`: figures
+- `Animation`: a motion as a film, made by `Trajectory.animate`
 """
 
 from lagjax import plot, scenes
@@ -72,6 +73,7 @@ from lagjax._analysis import (
     routhian,
     same_motion,
 )
+from lagjax._animation import Animation
 from lagjax._check import Finding, Findings, check
 from lagjax._crossings import Crossings, crossings
 from lagjax._diffrax._solvers import FineOutput
@@ -117,6 +119,7 @@ from lagjax._trajectory import State, Trajectory, Transitions
 __version__ = "0.1.0"
 __all__ = [
     "RESULTS",
+    "Animation",
     "CanonicalTrajectory",
     "ChangedCoordinates",
     "Conserved",

@@ -4,6 +4,7 @@ Time is the first axis of `q` and `qdot`; the members of a batch are an axis bef
 states are methods: they cost nothing until they are asked for, and they are differentiable.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._animation import Animation, animated
 from lagjax._display import summary
 from lagjax._health import Health, examine
 from lagjax._layout import Layout
@@ -179,6 +181,34 @@ class Trajectory(eqx.Module):
         ```
         """
         return frame(self, units, time_unit)
+
+    def animate(self, points: Callable, trace: Any = None, *, speed: float = 1.0, fps: float = 30.0) -> Animation:
+        """A film of this motion: an `Animation`, which `save` writes to a GIF, an MP4 or a page of HTML.
+
+        - `points`: a function of q, and of `t` and `params` by name, that says where things are: an array (2,) or (3,)
+          for a point, (k, 2) or (k, 3) for a line through k points, or a dict of such arrays by name. All in the plane,
+          or all in space.
+        - `trace`: which points leave a trace that fades: a place among the points, a name in the dict (the last point
+          of that line), a pair (name, place), or a list of these.
+        - `speed`: units of time that pass in a second; `fps`: frames in a second.
+
+        Frames are evenly spaced in time, whatever the outputs are; between them the motion is the cubic through q and
+        q̇ (Hermite), so that a film is as smooth as its outputs are close. Both axes have one scale. Of a batch the
+        first 50 members are drawn into one picture.
+
+        Raises `ImportError` where matplotlib is missing, when the film is made; `ValueError` for points, traces and
+        speeds that cannot be shown.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q))
+        run = lagjax.simulate(pendulum, 2.0, 0.0, jnp.linspace(0.0, 5.0, 101))
+        film = run.animate(lambda q: jnp.array([[0.0, 0.0], [jnp.sin(q), -jnp.cos(q)]]), trace=1)
+        film.save("pendulum.gif")
+        ```
+        """
+        return animated(self, points, trace, speed, fps)
 
     def over_members(self, function, *more) -> PyTree:
         """Map `function(q, qdot, (ts, tolerances), params, mode, *more)` over the batch axes, those of `more` too."""

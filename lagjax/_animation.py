@@ -1,0 +1,376 @@
+"""`Animation`: a motion that moves, by matplotlib. `Trajectory.animate` makes one.
+
+    Trajectory ─► Course of each member ─► states at the frames ─► positions of points ─► pictures ─► a file
+
+A trajectory is known at its output times alone. Between two of them the state follows the cubic that has q and q̇ of
+both ends (Hermite); across a change of mode of a hybrid motion it ends with the state before it, and goes on along the
+parabola that meets the next output, since the velocity after a reset is not recorded.
+"""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from lagjax._arguments import Function, accept
+from lagjax._diagnosis import with_numbers
+from lagjax._display import is_known, times_of_members
+from lagjax._health._measure import Members
+
+PyTree = Any
+MEMBERS = 50  # that are drawn of a batch, the first ones
+FRAMES = 20_000  # of which a film has fewer
+TRAIL = 2.0  # seconds of the film over which a trace fades
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_VIDEO, _PAGE = (".mp4", ".m4v", ".mov", ".webm"), (".html", ".htm")
+_SIZE, _DPI = 4.8, 100  # inches of a side, and dots in one
+
+
+class Course(NamedTuple):
+    """Where one member is between K knots: times (K,), q (K, n), and q̇ (K, n) just before and after each.
+
+    NaN after a knot: the velocity there is not known.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """q (F, n) at some times; NaN beyond the ends."""
+        sign = np.sign(self.t[-1] - self.t[0])
+        place = np.clip(np.searchsorted(sign * self.t, sign * times, side="left") - 1, 0, len(self.t) - 2)
+        h = (self.t[place + 1] - self.t[place])[:, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            x = np.where(h == 0, 0.0, (times[:, None] - self.t[place][:, None]) / h)
+            a, b, end = self.q[place], self.q[place + 1], h * self.before[place + 1]
+            begin = h * self.after[place]
+            begin = np.where(np.isnan(begin), 2 * (b - a) - end, begin)
+            rise = b - a
+            return a + x * (begin + x * (3 * rise - 2 * begin - end + x * (begin + end - 2 * rise)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Animation:
+    """A motion as a film; made by `Trajectory.animate`. `save` writes it to a file, and a notebook shows it.
+
+    - `positions(times)`: where the points are, a dict of arrays (members, frames, k, 2 or 3) by name.
+    - `span`: the first and the last time; `speed`: units of time in a second of the film; `fps`: frames in a second.
+    - `traces`: the points that leave a trace, (name, place) each.
+    """
+
+    positions: Callable[[np.ndarray], dict[str, np.ndarray]]
+    span: tuple[float, float]
+    speed: float
+    fps: float
+    traces: tuple[tuple[str, int], ...]
+
+    def __repr__(self) -> str:
+        begin, end = self.span
+        seconds = f"{abs(end - begin) / self.speed:.3g} s at {self.fps:g} frames a second"
+        return f"Animation from t = {begin:.6g} to {end:.6g}, {seconds}: save it to .gif, .mp4 or .html"
+
+    def _repr_html_(self) -> str | None:
+        """The film itself, for notebooks; None where it cannot be made."""
+        try:
+            return self._page()
+        except Exception:  # a display must not fail
+            return None
+
+    def times(self, fps: float | None = None) -> np.ndarray:
+        """The times of the frames, evenly spaced from the first to the last."""
+        begin, end = self.span
+        count = int(np.ceil(abs(end - begin) / self.speed * (fps or self.fps))) + 1
+        times = begin + np.arange(count) * np.sign(end - begin) * self.speed / (fps or self.fps)
+        return np.clip(times, min(self.span), max(self.span))
+
+    def save(self, path) -> None:
+        """Write the film: to a GIF, to MP4 (or .webm, .mov), or to a page of HTML, by the suffix of `path`.
+
+        MP4 needs the program ffmpeg, or the package imageio-ffmpeg. A GIF has times in hundredths of a second: its
+        frames are as close to `fps` as that allows, and no faster or slower than the motion.
+
+        Raises `ImportError` without matplotlib, `ValueError` for another suffix, `RuntimeError` without ffmpeg.
+        """
+        suffix = Path(path).suffix.lower()
+        if suffix == ".gif":
+            fps = 100 / max(1, round(100 / self.fps))
+            matplotlib = _matplotlib()
+            self._film(fps).save(path, writer=matplotlib.animation.PillowWriter(fps=fps * (1 - 1e-9)), dpi=_DPI)
+        elif suffix in _VIDEO:
+            self._video(path)
+        elif suffix in _PAGE:
+            head = '<!doctype html><meta charset="utf-8"><title>A motion</title>'
+            Path(path).write_text(head + self._page(), encoding="utf-8")
+        else:
+            raise ValueError(
+                f"The suffix of {str(path)!r} names no film: write .gif, {', '.join(_VIDEO)}, .html; got {suffix!r}."
+            )
+
+    def _video(self, path) -> None:
+        matplotlib, program = _matplotlib(), _ffmpeg()
+        if program is None:
+            raise RuntimeError(
+                "To write a video takes the program ffmpeg, which is not there: install it, or pip install "
+                "imageio-ffmpeg. A .gif and an .html need none."
+            )
+        with matplotlib.rc_context({"animation.ffmpeg_path": program}):
+            self._film(self.fps).save(path, writer=matplotlib.animation.FFMpegWriter(fps=self.fps), dpi=_DPI)
+
+    def _page(self) -> str:
+        """The film as HTML: a video where ffmpeg is there, else pictures and a few lines of JavaScript."""
+        matplotlib, program = _matplotlib(), _ffmpeg()
+        film = self._film(self.fps)
+        if program is None:
+            return film.to_jshtml(fps=self.fps)
+        with matplotlib.rc_context({"animation.ffmpeg_path": program, "savefig.dpi": _DPI}):
+            return film.to_html5_video()
+
+    def _film(self, fps: float):
+        """matplotlib's own animation, on a figure of its own."""
+        matplotlib, times = _matplotlib(), self.times(fps)
+        positions = self.positions(times)
+        figure = matplotlib.figure.Figure(figsize=_size(positions), layout="constrained", dpi=_DPI)
+        matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+        show = _drawn(figure, positions, times, self.traces, max(1, round(TRAIL * fps)))
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # it is laid out: to do so for every frame takes most of the time
+        return matplotlib.animation.FuncAnimation(
+            figure, show, frames=len(times), init_func=lambda: (), interval=1000 / fps, cache_frame_data=False
+        )
+
+
+def animated(trajectory, points: Callable, trace, speed: float, fps: float) -> Animation:
+    """The `Animation` of a trajectory; see `Trajectory.animate`."""
+    _require_positive(speed=speed, fps=fps)
+    if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):
+        raise ValueError("animate draws numbers: call it outside of jit, vmap and grad.")
+    function = accept(points, "points", ("q",))
+    members = Members(trajectory)
+    courses = [_course(trajectory, members, k) for k in range(min(members.count, MEMBERS))]
+    reached = [course.t[np.isfinite(course.q).all(axis=1)] for course in courses]
+    known = np.concatenate(reached)
+    if not len(known):
+        raise ValueError("None of the members was followed to any output: there is nothing to show.")
+    begin = courses[0].t[0]
+    end = float(known[np.argmax(np.abs(known - begin))])
+    seconds = abs(end - begin) / speed
+    if not 2 <= seconds * fps + 1 <= FRAMES:
+        raise ValueError(
+            f"The motion takes {abs(end - begin):.6g}, which makes {seconds * fps + 1:.3g} frames at speed={speed:g} "
+            f"and fps={fps:g}. speed={abs(end - begin) / 10:.2g} shows it in ten seconds."
+        )
+
+    def positions(times: np.ndarray) -> dict[str, np.ndarray]:
+        each = [_positions(function, members, k, course.at(times), times) for k, course in enumerate(courses)]
+        return {name: np.stack([one[name] for one in each]) for name in each[0]}
+
+    shapes = {name: array.shape[2:] for name, array in positions(np.array([begin])).items()}
+    return Animation(positions, (float(begin), end), float(speed), float(fps), _traced(trace, shapes))
+
+
+def _require_positive(**numbers) -> None:
+    for name, value in numbers.items():
+        if isinstance(value, bool) or np.ndim(value) or not np.isreal(value) or not 0 < value < np.inf:
+            raise ValueError(f"{name} must be a positive number; got {value!r}.")
+
+
+# ---- where the points are --------------------------------------------------------------------------------------------
+
+
+def _course(trajectory, members: Members, k: int) -> Course:
+    """The knots of a member: its outputs, and the states just before its transitions."""
+
+    def of_member(tree):
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+        rank = len(members.batch)
+        leaves = [leaf.reshape(members.count, *leaf.shape[rank:])[k] for leaf in leaves]
+        return np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1).astype(float)
+
+    t = times_of_members(trajectory).reshape(members.count, -1)[k].astype(float)
+    q, qdot = of_member(trajectory.q), of_member(trajectory.qdot)
+    changes = trajectory.transitions
+    if changes is None:
+        return Course(t, q, qdot, qdot)
+    when = np.asarray(changes.t).reshape(members.count, -1)[k]
+    there = np.isfinite(when)
+    before = of_member(changes.qdot)[there]
+    order = np.argsort(np.concatenate([t, when[there]]), kind="stable")
+    return Course(
+        np.concatenate([t, when[there]])[order],
+        np.concatenate([q, of_member(changes.q)[there]])[order],
+        np.concatenate([qdot, before])[order],
+        np.concatenate([qdot, np.full_like(before, np.nan)])[order],
+    )
+
+
+def _positions(function: Function, members: Members, k: int, q: np.ndarray, times: np.ndarray) -> dict[str, np.ndarray]:
+    """The points (frames, number, 2 or 3) of a member at its states q (frames, n), by name."""
+    numbers = np.array([x if np.ndim(x) == 0 else x[k] for x in members.numbers], members.layout.dtype)
+    params = with_numbers(members.params, numbers)
+    states = members.layout.restore(q.astype(members.layout.dtype))
+    drawn = _at_states(function, states, times.astype(members.layout.dtype), params)
+    named = drawn if isinstance(drawn, dict) else {"": drawn}
+    return {str(name): _as_points(name, np.asarray(value), len(q)) for name, value in named.items()}
+
+
+@eqx.filter_jit
+def _at_states(function: Function, states, times, params):
+    return jax.vmap(lambda q, t: function(q, t=t, params=params))(states, times)
+
+
+def _as_points(name, value: np.ndarray, frames: int) -> np.ndarray:
+    if value.ndim == 2:  # one point
+        value = value[:, None, :]
+    if value.ndim != 3 or value.shape[-1] not in (2, 3):
+        what = f"points[{name!r}]" if name != "" else "points"
+        raise ValueError(
+            f"{what} must be one point, shape (2,) or (3,), or a line through k points, shape (k, 2) or (k, 3); got "
+            f"shape {value.shape[1:]}. Return a dict of such arrays to draw several."
+        )
+    return value
+
+
+def _traced(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int], ...]:
+    """The points that leave a trace, (name, place) each: a name means the last point of its line."""
+    if len({shape[-1] for shape in shapes.values()}) > 1:
+        raise ValueError("points has some in the plane and some in space: give all of them two numbers, or three.")
+    if trace is None:
+        return ()
+    listed = trace if isinstance(trace, list) else [trace]
+    first = next(iter(shapes))
+    pairs = [one if isinstance(one, tuple) else (one, -1) if isinstance(one, str) else (first, one) for one in listed]
+    for name, place in pairs:
+        known = isinstance(place, int | np.integer) and name in shapes and -shapes[name][0] <= place < shapes[name][0]
+        if not known:
+            lines = ", ".join(f"{name!r} of {shape[0]} points" for name, shape in shapes.items())
+            raise ValueError(
+                f"trace={trace!r} names no point: there are {lines}. Give a name, a place, or (name, place)."
+            )
+    return tuple((name, int(place)) for name, place in pairs)
+
+
+# ---- pictures --------------------------------------------------------------------------------------------------------
+
+
+def _drawn(figure, positions: dict[str, np.ndarray], times: np.ndarray, traces, trail: int) -> Callable:
+    """Set the figure up; a function that shows frame i."""
+    ax, space = _axes(figure, positions), next(iter(positions.values())).shape[-1] == 3
+    count = len(next(iter(positions.values())))
+    opacity = max(0.2, count**-0.5)
+    lines, faded = [], []
+    for color, (name, array) in zip(_cycled(len(positions)), positions.items(), strict=True):
+        style = dict(color=color, alpha=opacity, linewidth=2, marker="o", markersize=5, solid_capstyle="round")
+        for member in array:
+            lines.append((ax.plot(*([] for _ in range(member.shape[-1])), **style)[0], member))
+        for place in [place for traced, place in traces if traced == name]:
+            for member in array:
+                faded.append((_trace(ax, color, space, opacity), member[:, place], color))
+    clock = (
+        ax.text2D(0.02, 0.97, "", transform=ax.transAxes) if space else ax.text(0.02, 0.97, "", transform=ax.transAxes)
+    )
+
+    def show(i: int):
+        for line, member in lines:
+            if space:
+                line.set_data_3d(*member[i].T)
+            else:
+                line.set_data(*member[i].T)
+        for collection, path, color in faded:
+            recent = path[max(0, i - trail) : i + 1]
+            collection.set_segments(np.stack([recent[:-1], recent[1:]], axis=1))
+            collection.set_color([(*_rgb(color), a * opacity) for a in np.linspace(0, 1, len(recent) - 1)])
+        clock.set_text(f"t = {times[i]:.{_digits(times)}f}")
+        return ()
+
+    return show
+
+
+def _axes(figure, positions):
+    """Axes of equal scale that hold the whole motion."""
+    low, high = _limits(positions)
+    ax = figure.add_subplot(projection="3d" if len(low) == 3 else None)
+    limits = {f"{axis}lim": ends for axis, *ends in zip("xyz", low, high, strict=False)}
+    ax.set(**limits)
+    if len(low) == 3:
+        ax.set_box_aspect(high - low)
+        ax.set(xlabel="x", ylabel="y", zlabel="z")
+        return ax
+    ax.set_aspect("equal")
+    ax.grid(color="0.9", linewidth=0.8)
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color("0.55")
+    ax.tick_params(color="0.55")
+    return ax
+
+
+def _limits(positions) -> tuple[np.ndarray, np.ndarray]:
+    """The box of all points at all times, a twentieth wider, and no side less than a tenth of the longest."""
+    every = np.concatenate([array.reshape(-1, array.shape[-1]) for array in positions.values()])
+    every = every[np.isfinite(every).all(axis=1)]
+    middle, half = (every.max(0) + every.min(0)) / 2, (every.max(0) - every.min(0)) / 2
+    half = np.maximum(1.05 * half, 0.1 * (half.max() or 1.0))
+    return middle - half, middle + half
+
+
+def _size(positions) -> tuple[float, float]:
+    """Width and height of the figure in inches, even numbers of dots, as videos need them."""
+    low, high = _limits(positions)
+    if len(low) == 3:
+        return _SIZE, _SIZE
+    width, height = (high - low) / (high - low).max()
+    return _SIZE * max(width, 0.5), round(_SIZE * max(height, 0.4) * _DPI / 2) * 2 / _DPI
+
+
+def _trace(ax, color: str, space: bool, opacity: float):
+    """An empty line whose pieces have colours of their own."""
+    matplotlib = _matplotlib()
+    if space:
+        from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+        return ax.add_collection3d(Line3DCollection([np.zeros((2, 3))], linewidths=1.2), autolim=False)
+    return ax.add_collection(matplotlib.collections.LineCollection([], linewidths=1.2), autolim=False)
+
+
+def _cycled(count: int) -> list[str]:
+    return [COLORS[k % len(COLORS)] for k in range(count)]
+
+
+def _rgb(color: str) -> tuple[float, ...]:
+    return tuple(int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))
+
+
+def _digits(times: np.ndarray) -> int:
+    """Decimal places that tell frames apart, up to 6."""
+    step = abs(times[1] - times[0]) if len(times) > 1 else 1.0
+    return int(np.clip(np.ceil(-np.log10(10 * step)), 0, 6))
+
+
+def _ffmpeg() -> str | None:
+    """The program that writes videos, of the system or of the package imageio-ffmpeg."""
+    if program := shutil.which("ffmpeg"):
+        return program
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        return get_ffmpeg_exe()
+    except Exception:  # neither is there
+        return None
+
+
+def _matplotlib() -> Any:
+    try:
+        import matplotlib.animation
+        import matplotlib.backends.backend_agg
+        import matplotlib.collections
+        import matplotlib.figure
+    except ImportError:
+        raise ImportError("animate needs the package matplotlib: pip install lagjax[examples].") from None
+    return matplotlib
