@@ -65,7 +65,7 @@ def recursion_of(derivatives: Derivatives, value: int, qdot: Sequence[int]) -> R
     if not any(uses[i] > 1 for i in linear):
         return None
     hessian = _hessian(derivatives, value, curved, frontier)
-    unknowns = _Unknowns(graph, qdot, {i for pair in hessian for i in pair}, uses)
+    unknowns = _Unknowns(graph, qdot, {i for i, j in hessian if i == j}, uses)
     for i, terms in linear.items():
         unknowns.add(i, terms)
     if not unknowns.definitions:
@@ -147,7 +147,8 @@ def _hessian(derivatives: Derivatives, value: int, curved: Iterable[int], fronti
 class _Unknowns:
     """Nodes that are affine in q̇ as combinations of unknowns: coordinates, and velocities that are worth one.
 
-    That is where a combination of several unknowns is used more than once, or has an energy (is `energetic`).
+    That is where a combination of several unknowns is used more than once, or is squared (is `energetic`). What is used
+    once, as Iω in ½ ω·(Iω), is better written out.
     """
 
     def __init__(self, graph: Graph, qdot: Sequence[int], energetic: set[int], uses: dict[int, int]):
@@ -371,10 +372,12 @@ class _Elimination:
 def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> Iterator[_Step]:
     """The order of elimination: of what may be eliminated, that which meets the fewest others.
 
-    Ends early at a coordinate without energy, whose pivot would be zero.
+    Ends early at a coordinate without energy, whose pivot would be zero, or with none but that of products of different
+    velocities: nothing then tells how large its pivot should be.
     """
     others: list[set[int]] = [set() for _ in range(size + len(terms))]
     moving = {u for u, v in energy if u == v}
+    sized = set(moving)
     waiting = [0] * len(others)  # velocities that are still defined by this one
     for u, v in energy:
         others[u].add(v)
@@ -396,10 +399,12 @@ def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> It
         if x in done or degree != len(now):
             continue
         own = tuple(sorted(terms[x - size])) if x >= size else ()
-        if not own and x not in moving:
+        if not own and x not in sized:
             return
         yield _Step(x, own, tuple(sorted(now)))
         done.add(x)
+        if x in sized:
+            sized.update(own)
         _fill(x, own, now, others, moving)
         for u in own:
             waiting[u] -= 1

@@ -55,7 +55,37 @@ def relativistic(n):
     return lagjax.System(lagrangian), None
 
 
-@pytest.mark.parametrize("make", [chain, beam, tree, relativistic])
+def gimbals(n):
+    """Rings in rings with full matrices of inertia: ½ ω·(Iω), where no component of ω is squared in the trace."""
+    axes = np.eye(3)[np.arange(n) % 3]
+    inertias = [np.diag([1.0, 2.0, 2.5]) + 0.1 * (k + 1) for k in range(n)]
+
+    def lagrangian(q, qdot):
+        omega, total = jnp.zeros(3), 0.0
+        for k, a in enumerate(axes):
+            turned = jnp.cos(q[k]) * omega + (1 - jnp.cos(q[k])) * a * (a @ omega) - jnp.sin(q[k]) * jnp.cross(a, omega)
+            omega = turned + a * qdot[k]
+            total = total + 0.5 * omega @ (inertias[k] @ omega)
+        return total
+
+    return lagjax.System(lagrangian), None
+
+
+def products(n):
+    """Velocities built one from another, of which only products of different ones are in the energy."""
+
+    def lagrangian(q, qdot):
+        a, b, total = 0.0, 0.0, 0.0
+        for k in range(0, n, 2):
+            a = jnp.cos(q[k]) * a + qdot[k] + qdot[k + 1]
+            b = jnp.cos(q[k + 1]) * b + qdot[k] - 2.0 * qdot[k + 1]
+            total = total + a * b
+        return total - jnp.sum(q**2)
+
+    return lagjax.System(lagrangian), None
+
+
+@pytest.mark.parametrize("make", [chain, beam, tree, relativistic, gimbals])
 def test_accelerations_are_those_of_the_whole_mass_matrix(make):
     n = 12
     system, params = make(n)
@@ -72,6 +102,15 @@ def test_accelerations_are_those_of_the_whole_mass_matrix(make):
     assert not np.any(singular)
     error = np.abs(np.array(found).T - exact).max()
     assert error <= 10 * condition * np.finfo(float).eps * np.abs(exact).max()
+
+
+def test_an_energy_of_products_alone_is_left_to_the_whole_mass_matrix():
+    system, _ = products(4)
+    q, qdot = np.array([0.3, -0.4, 1.0, 0.2]), np.array([0.5, 0.1, -0.2, 0.7])
+    assert "not positive definite" in str(system.explain(q, qdot))
+    momentum_rate = jax.jvp(lambda q: jax.grad(system.lagrangian, 1)(q, qdot), (q,), (qdot,))[1]
+    exact = np.linalg.solve(system.mass_matrix(q, qdot), jax.grad(system.lagrangian)(q, qdot) - momentum_rate)
+    np.testing.assert_allclose(system.acceleration(q, qdot), exact, rtol=1e-12)
 
 
 @pytest.mark.slow
