@@ -1,4 +1,4 @@
-"""The published periodic orbits of three equal masses in the plane, closed to round-off, with their stability.
+"""The published periodic orbits of three equal masses in the plane, closed and refined to 20 digits, with stability.
 
     python -m benchmarks.periodic_orbits ../shared/data/li_liao_planar_equal_mass_695.csv
 
@@ -6,8 +6,12 @@ The file has rows of a name, v1, v2 and the period; bodies begin at (−1, 0), (
 (v1, v2), (−2 v1, −2 v2). Each orbit is followed in the two positions relative to one of the bodies, that one of the
 three that keeps the others farthest from each other: where two bodies come close, their distance is then a coordinate,
 which has all its digits, and not a difference of two, which would lose those that decide about what follows. All are
-closed as a batch by `lagjax.periodic_orbit`, and what comes out is brought back to the form above. The exact orbit has
-that form; how far the closed one is from it (`asymmetry`) tells how many digits are right: nothing has asked for it.
+closed as a batch by `lagjax.periodic_orbit`, and what comes out is brought back to the form above.
+
+What closes is said twice. `arcs` is the largest defect between the arcs of `periodic_orbit`, in doubles: rounding in
+close encounters, times what follows makes of it, limits it. `closure` is |φ_T(y) − y| of one motion over the whole
+period, followed with 32 digits (`_orbits_extended`), of whose v1, v2 and T the table has the first 20; a start rounded
+to doubles could not close better than `floor`. `change` is by how much v1, v2 and T of `periodic_orbit` differ.
 
 Source of the orbits: X. Li, S. Liao, *More than six hundred new families of Newtonian periodic planar collisionless
 three-body orbits*, Sci. China Phys. Mech. Astron. 60 (2017) 129511.
@@ -16,6 +20,7 @@ three-body orbits*, Sci. China Phys. Mech. Astron. 60 (2017) 129511.
 import argparse
 import csv
 import time
+from decimal import Decimal, localcontext
 from pathlib import Path
 
 import jax
@@ -23,9 +28,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import lagjax
+from benchmarks._orbits_refined import refined
 
 # The other two bodies, by the one that positions are relative to.
 OTHERS = ((1, 2), (0, 2), (0, 1))
+SPEEDS = np.array([1.0, 1.0, -2.0])  # of the bodies, in (v1, v2)
 GLANCES = 2000  # states of an orbit among which the smallest distances are looked for
 
 
@@ -58,14 +65,28 @@ def refine(published: np.ndarray) -> dict[str, np.ndarray]:
     """From v1, v2 and T (N, 3) the columns of the table, each with N rows."""
     r = np.zeros((len(published), 3, 2))
     r[:, 0, 0], r[:, 1, 0] = -1.0, 1.0
-    v = published[:, None, :2] * np.array([1.0, 1.0, -2.0])[:, None]
+    v = published[:, None, :2] * SPEEDS[:, None]
     period = published[:, 2]
-    centre = _best_centre(r, v, period)
+    centre, work = _best_centre(r, v, period)
+    cpu = time.process_time()
     orbit = lagjax.periodic_orbit(BODIES, _relative(r, centre), _relative(v, centre), period)
-    r, v = _bodies(orbit.q0, centre), _bodies(orbit.qdot0, centre)
-    v1, v2, period, asymmetry = _in_published_form(r, v, np.asarray(orbit.period))
-    columns = {"v1": v1, "v2": v2, "period": period, "asymmetry": asymmetry}
-    columns |= {name: np.asarray(getattr(orbit, name)) for name in ("closure", "stable", "ok", "multipliers")}
+    print(f"periodic_orbit: {time.process_time() - cpu:.0f} CPU seconds", flush=True)
+    moved = _bodies(orbit.q0, centre), _bodies(orbit.qdot0, centre)
+    v1, v2, period = _in_published_form(*moved, np.asarray(orbit.period))
+    lost = ~np.isfinite(v1)
+    v1, v2, period = (np.where(lost, y, x) for x, y in zip((v1, v2, period), published.T, strict=True))
+    shape = np.einsum(
+        "nk,ij->nkij", _relative(np.broadcast_to(SPEEDS[:, None] / 3, r.shape), centre)[..., 0], np.eye(2)
+    )
+    cpu = time.process_time()
+    place = _relative(r, centre).reshape(-1, 4)
+    fine = refined(place, shape.reshape(-1, 4, 2), np.stack([v1, v2], axis=1), period, work)
+    print(f"with 32 digits: {time.process_time() - cpu:.0f} CPU seconds", flush=True)
+    change = np.stack([v1 - fine.w[:, 0, 0] / 3, v2 - fine.w[:, 0, 1] / 3, (period - fine.period[:, 0]) / period])
+    numbers = np.concatenate([fine.w.swapaxes(1, 2), fine.period[:, None]], axis=1)  # 3 v1, 3 v2, T: two doubles each
+    columns = {"numbers": numbers, "closure": fine.closure, "step": fine.step, "floor": fine.floor}
+    columns |= {"arcs": np.asarray(orbit.closure), "change": np.abs(change).max(axis=0)}
+    columns |= {name: np.asarray(getattr(orbit, name)) for name in ("stable", "ok", "multipliers")}
     return columns | {"message": np.array(orbit.message, object)}
 
 
@@ -85,22 +106,23 @@ def _bodies(x, centre) -> np.ndarray:
     return bodies - bodies.mean(axis=1, keepdims=True)
 
 
-def _best_centre(r, v, period) -> np.ndarray:
-    """The body of each orbit whose others stay farthest from each other, (N,)."""
+def _best_centre(r, v, period) -> tuple[np.ndarray, np.ndarray]:
+    """The body of each orbit whose others stay farthest from each other, (N,), and how many steps it takes, (N,)."""
     centre = np.full(len(r), 2)  # to look at them
 
     def path(q, u, end):
         ts = end * jnp.arange(GLANCES) / GLANCES
-        return lagjax.simulate(BODIES, q, u, ts, rtol=1e-12, throw=False).q
+        run = lagjax.simulate(BODIES, q, u, ts, rtol=1e-12, throw=False)
+        return run.q, run.stats["num_steps"]
 
-    q = np.asarray(jax.jit(jax.vmap(path))(_relative(r, centre), _relative(v, centre), period / 2))
+    q, steps = map(np.asarray, jax.jit(jax.vmap(path))(_relative(r, centre), _relative(v, centre), period / 2))
     x, y = q[:, :, 0], q[:, :, 1]
     apart = np.stack([np.nanmin(np.linalg.norm(side, axis=2), axis=1) for side in (y, x, x - y)])
-    return np.argmax(apart, axis=0)
+    return np.argmax(apart, axis=0), steps
 
 
-def _in_published_form(r, v, period) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """v1, v2, the period, and how far the state is from the published form where it comes nearest to it, each (N,).
+def _in_published_form(r, v, period) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """v1, v2 and the period of the published form, each (N,).
 
     The start is shifted along the orbit to where the third body passes the middle of the others, turned, and scaled.
     """
@@ -115,8 +137,7 @@ def _in_published_form(r, v, period) -> tuple[np.ndarray, np.ndarray, np.ndarray
     r, v = np.einsum("nij,nkj->nki", turn, r) * a[:, None, None], np.einsum("nij,nkj->nki", turn, v)
     v = v / np.sqrt(a)[:, None, None]
     mean = (v[:, 0] + v[:, 1]) / 2
-    off = np.abs(r[:, 2] - (r[:, 0] + r[:, 1]) / 2).max(axis=1), np.abs(v[:, 1] - v[:, 0]).max(axis=1)
-    return mean[:, 0], mean[:, 1], period * a**1.5, np.maximum(*off)
+    return mean[:, 0], mean[:, 1], period * a**1.5
 
 
 def _attraction(r):
@@ -125,38 +146,60 @@ def _attraction(r):
 
 
 def _summary(names, published, table, wall: float, cpu: float) -> None:
-    ok, well = table["ok"], table["closure"] < 1e-12
-    print(f"{ok.sum()} of {len(ok)} closed, {(ok & well).sum()} of them to below 1e-12, in {wall:.0f} s")
-    print(f"({cpu:.0f} CPU seconds); {table['stable'].sum()} are linearly stable. Median, 90 % and largest:")
-    new = np.stack([table["v1"], table["v2"], table["period"]], axis=1)
+    well, ok = table["closure"] < 1e-12, table["ok"]
+    sure = ok & (table["message"] == "")
+    print(f"{well.sum()} of {len(well)} closed to below 1e-12 over a whole period, {(~well).sum()} not.")
+    print(
+        f"In doubles periodic_orbit closes {ok.sum()}, {(ok & (table['arcs'] < 1e-12)).sum()} of them to below 1e-12;"
+    )
+    print(
+        f"of {sure.sum()} the stability is known, {table['stable'].sum()} are linearly stable. {wall:.0f} s, ", end=""
+    )
+    print(f"{cpu:.0f} CPU seconds. Median, 90 % and largest of")
+    numbers = table["numbers"][..., 0] / np.array([3.0, 3.0, 1.0])
     shown = {
-        "closure": table["closure"],
-        "asymmetry": table["asymmetry"],
-        "|μ1 μ2 − 1|": _pairs(table["multipliers"]),
-        "change of the published numbers": np.abs(new - published).max(axis=1),
+        "closure (32 digits)": table["closure"][well],
+        "last change of v1, v2, T": table["step"][well],
+        "floor of a start in doubles": table["floor"][well],
+        "arcs of periodic_orbit": table["arcs"][ok],
+        "change of v1, v2, T since then": table["change"][ok],
+        "|μ1 μ2 − 1|": _pairs(table["multipliers"])[ok],
+        "change of the published numbers": np.abs(numbers - published).max(axis=1)[well],
     }
     for what, values in shown.items() if ok.any() else ():
-        print("{:34s}{:10.1e}{:10.1e}{:10.1e}".format(what, *np.quantile(values[ok], (0.5, 0.9, 1.0))))
-    for k in np.flatnonzero(~ok).tolist():
-        print(f"{names[k]}: {table['message'][k]}")
+        print("{:34s}{:10.1e}{:10.1e}{:10.1e}".format(what, *np.quantile(values, (0.5, 0.9, 1.0))))
+    for k in np.flatnonzero(~ok | ~well).tolist():
+        print(f"{names[k]}: closure {table['closure'][k]:.1e}; {table['message'][k]}")
 
 
 def _pairs(multipliers) -> np.ndarray:
     return np.abs(multipliers[:, 0:4:2] * multipliers[:, 1:4:2] - 1).max(axis=1)
 
 
+SIZES = ("closure", "step", "floor", "arcs", "change")
+
+
 def _store(path: Path, names, table) -> None:
-    """One row an orbit; of the multipliers the four that are not 1 by symmetry."""
-    with path.open("w", newline="") as file:
-        write = csv.writer(file).writerow
-        write(["name", "v1", "v2", "period", "closure", "asymmetry", "stable", "mu1", "mu2", "mu3", "mu4", "message"])
+    """One row an orbit, v1, v2 and T with 20 digits; of the multipliers the four that are not 1 by symmetry."""
+    with path.open("w", newline="") as file, localcontext(prec=40):
+        write = csv.writer(file, lineterminator="\n").writerow
+        write(["name", "v1", "v2", "period", *SIZES, "limit", "stable", "mu1", "mu2", "mu3", "mu4"])
         for k, name in enumerate(names):
-            digits = [f"{table[column][k]:.15g}" for column in ("v1", "v2", "period")]
-            sizes = [f"{table[column][k]:.1e}" for column in ("closure", "asymmetry")]
-            values = [f"{x.real:.9g}{x.imag:+.9g}i" for x in table["multipliers"][k, :4]]
+            pairs = zip(table["numbers"][k].tolist(), (3, 3, 1), strict=True)
+            digits = [f"{(Decimal(high) + Decimal(low)) / by:.20g}" for (high, low), by in pairs]
+            values = [f"{x.real:.9g}{x.imag:+.6g}i" if abs(x.imag) > 1e-9 * abs(x) else f"{x.real:.9g}"
+                      for x in table["multipliers"][k, :4]]  # fmt: skip
             known = table["ok"][k] and not table["message"][k]
-            stable = ("stable" if table["stable"][k] else "unstable") if known else ""
-            write([name, *digits, *sizes, stable, *values, table["message"][k].split("\n")[0]])
+            stable = ("stable" if table["stable"][k] else "unstable") if known else "unknown"
+            sizes = [f"{table[column][k]:.1e}" for column in SIZES]
+            write([name, *digits, *sizes, _limit(table, k), stable, *values])
+
+
+def _limit(table, k: int) -> str:
+    """What keeps doubles from 1e-12: that the start has 53 bits, or rounding on the way; "" where they reach it."""
+    if table["arcs"][k] < 1e-12 and table["floor"][k] < 1e-12 and table["ok"][k]:
+        return ""
+    return "start" if table["floor"][k] >= 1e-12 else "encounters"
 
 
 def _options() -> argparse.ArgumentParser:

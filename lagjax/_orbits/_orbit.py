@@ -152,12 +152,12 @@ class Found(NamedTuple):
 
 
 def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> Found:
-    """The orbits near these guesses; what does not close well is tried with ever more arcs, and the best counts."""
+    """The orbits near these guesses; what does not close well is tried with more arcs as long as that helps."""
     arcs = closing.arcs
     counts = arcs_each(arcs, y0, period)
     most = np.minimum(_MOST_ARCS, _MORE * counts)
     found = _nothing(len(y0), y0.shape[1])
-    waiting = np.arange(len(y0))
+    waiting, gained = np.arange(len(y0)), np.ones(len(y0), bool)
     while len(waiting):
         for count in np.unique(counts[waiting]).tolist():
             members = waiting[counts[waiting] == count]
@@ -165,8 +165,10 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> Found:
                 parts, y = _shooting.guesses(closing, y0[some], period[some], count)
                 trial = told(closing, _shooting.close(closing, y, period[some], parts))
                 better = ~(found.closure[some] <= trial.closure)
+                gained[some] = better | ~found.ok[some]
                 found = _put(found, some[better], Found._make(np.array(x)[better] for x in trial))
-        waiting = waiting[~(found.closure[waiting] <= WELL_CLOSED) & (counts[waiting] < most[waiting])]
+        worse = ~(found.closure[waiting] <= WELL_CLOSED) & gained[waiting]
+        waiting = waiting[worse & (counts[waiting] < most[waiting])]
         counts[waiting] = np.minimum(_MOST_ARCS, 2 * counts[waiting])
     return found
 
