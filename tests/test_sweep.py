@@ -9,8 +9,9 @@ import os
 import subprocess
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import diffrax
 import jax
@@ -676,7 +677,8 @@ class Jobs:
 
 class Task:
     def __init__(self, future):
-        self.done, self.result, self.cancel = future.done, future.result, future.cancel
+        self.done, self.result = future.done, future.result
+        self.cancel, self.cancelled = future.cancel, future.cancelled
 
 
 class Broken(Jobs):
@@ -691,6 +693,21 @@ def test_tasks_that_are_no_futures(tmp_path, undisturbed, monkeypatch):
         swept(tmp_path, executor=Broken())
     swept(tmp_path, executor=Jobs())
     assert digests(tmp_path) == undisturbed
+
+
+def test_an_interrupt_takes_back_the_tasks_that_wait(tmp_path):
+    begun(tmp_path)
+    waiting = [Task(Future()) for _ in range(6)]
+    tasks = iter(waiting)
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    for task in waiting:
+        task.done = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        swept(tmp_path, executor=SimpleNamespace(submit=lambda *_: next(tasks)))
+    assert all(task.cancelled() for task in waiting)
 
 
 @pytest.mark.slow

@@ -114,7 +114,18 @@ def submit(job: Job, executor: Any, tell: Tell) -> None:
     """Have all units done by an executor, some at a time; goes on until all are, by whomever."""
     _require_no_fork(executor)
     job.store.require_writable()
-    path, running = str(Path(job.store.path).resolve()), set[Any]()
+    running: set[Any] = set()
+    try:
+        _submit_all(job, executor, tell, running)
+    except BaseException:  # of a task, or Ctrl-C: a pool would go on with what waits, before it ends
+        for task in running:
+            task.cancel()
+        raise
+
+
+def _submit_all(job: Job, executor: Any, tell: Tell, running: set[Any]) -> None:
+    """Have all units done, with the tasks that are on their way in `running`."""
+    path = str(Path(job.store.path).resolve())
     while True:
         left = sorted(set(range(job.grid.units)) - job.store.done())
         if not left:
@@ -136,12 +147,7 @@ def _collect(running: set[Any]) -> int:
     """Wait for one of these tasks; how many units have been done. Raises what a task has raised."""
     finished = _first_of(running)
     running -= finished
-    try:
-        return sum(bool(task.result()) for task in finished)
-    except BaseException:
-        for task in running:
-            task.cancel()
-        raise
+    return sum(bool(task.result()) for task in finished)
 
 
 def _first_of(running: set[Any]) -> set[Any]:
