@@ -56,6 +56,9 @@ print(swing.health())
 
 # %% [markdown]
 """
+Numbers that you may want to change belong into `params`. What else a function sees, as 9.81 here or a name defined
+outside, is fixed when the scene is first used: change it, and define the scene again.
+
 *Try:* let it go at 3.1; push it with 6.5 rad/s instead of 0, so that it goes over the top; take it to the Moon.
 
 ## 2. A Lagrangian of your own, with a constraint

@@ -19,6 +19,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
+import numpy as np
 
 import lagjax
 
@@ -27,7 +28,7 @@ plt.style.use("lagjax.figures")
 
 M, R, a, G = 1.0, 1.0, 0.25, 9.81
 START = 0.15
-INERTIA = {"wire, α = 0.01": 0.01, "full, α = ½": 0.5, "hollow, α = 1": 1.0}
+INERTIA = {"axle, α = 0.01": 0.01, "full, α = ½": 0.5, "hollow, α = 1": 1.0}
 
 
 def lagrangian(q, v, params):
@@ -57,7 +58,7 @@ def run(alpha):
     return lagjax.simulate_hybrid(modes, [leaves], "rolling", start, rest, ts, alpha, max_transitions=4)
 
 
-runs = jax.vmap(run)(jnp.array(list(INERTIA.values())))
+runs = jax.jit(jax.vmap(run))(jnp.array(list(INERTIA.values())))
 ours = jnp.degrees(runs.transitions.q["theta1"][:, 0])
 book = jnp.degrees(jnp.arccos(2 * jnp.cos(START) / (3 + jnp.array(list(INERTIA.values())))))
 for name, expected, angle in zip(INERTIA, book, ours, strict=True):
@@ -71,33 +72,33 @@ $$ \lambda_1 = Mg\,[(3+\alpha)\cos\theta_1 - 2\cos\theta_1^0]/(1+\alpha) $$
 """
 
 # %%
-normal = jax.vmap(jax.vmap(modes["rolling"].multipliers, (0, 0, None, None)), (0, 0, None, 0))
+normal = jax.jit(jax.vmap(jax.vmap(modes["rolling"].multipliers, (0, 0, None, None)), (0, 0, None, 0)))
 force = normal(runs.q, runs.qdot, 0.0, jnp.array(list(INERTIA.values())))["normal"] / (M * G)
-full = 1
 
-figure, (left, right) = plt.subplots(1, 2, figsize=(7.6, 3.6), width_ratios=[1.35, 1])
-half, turn = jnp.linspace(-jnp.pi / 2, jnp.pi / 2, 181), jnp.linspace(0, 2 * jnp.pi, 61)
-left.fill(R * jnp.sin(half), R * jnp.cos(half), color="0.88")
-r, theta1, theta2 = (runs.q[name][full] for name in start)
-x, y = r * jnp.sin(theta1), r * jnp.cos(theta1)
-last, leave = int(jnp.argmax(y < a)), int((runs.mode[full] == 0).sum())
+figure, (left, right) = plt.subplots(1, 2, figsize=(7.6, 3.6), width_ratios=[1.45, 1])
+half, turn = np.linspace(-np.pi / 2, np.pi / 2, 181), np.linspace(0, 2 * np.pi, 61)
+left.fill(R * np.sin(half), R * np.cos(half), color="0.88")
+q, mode, force = jax.tree.map(np.asarray, (runs.q, runs.mode, force))
+r, theta1, theta2 = (q[name][1] for name in start)  # of the full cylinder
+x, y = r * np.sin(theta1), r * np.cos(theta1)
+last, leave = np.argmax(y < a), np.sum(mode[1] == 0)
 for i in [*range(0, leave, leave // 5), *range(leave, last, 45)]:
     color = "#0072B2" if i < leave else "#D55E00"
-    left.plot(x[i] + a * jnp.sin(turn), y[i] + a * jnp.cos(turn), color=color, linewidth=1)
-    left.plot([x[i], x[i] + a * jnp.sin(theta2[i])], [y[i], y[i] + a * jnp.cos(theta2[i])], color=color, linewidth=1)
+    left.plot(x[i] + a * np.sin(turn), y[i] + a * np.cos(turn), color=color, linewidth=1)
+    left.plot([x[i], x[i] + a * np.sin(theta2[i])], [y[i], y[i] + a * np.cos(theta2[i])], color=color, linewidth=1)
 left.plot(x[:leave], y[:leave], color="#0072B2", linewidth=2.5, label="rolls")
 left.plot(x[leave:last], y[leave:last], color="#D55E00", linewidth=2.5, label="flies")
 left.plot(x[leave], y[leave], "ko", markersize=6, zorder=5)
-left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", xlim=(-1.05, 1.75), ylim=(-0.02, 1.55))
+left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", xlim=(-1.05, 1.62), ylim=(-0.02, 1.55))
 left.set_title("A full cylinder, from rest")
 left.grid(False)
 left.legend(loc="upper right")
 for k, (name, alpha) in enumerate(INERTIA.items()):
-    rolling = runs.mode[k] == 0
-    angle = runs.q["theta1"][k][rolling]
-    closed = ((3 + alpha) * jnp.cos(angle) - 2 * jnp.cos(START)) / (1 + alpha)
-    line = right.plot(jnp.degrees(angle), force[k][rolling], linewidth=4, alpha=0.4, label=name)[0]
-    right.plot(jnp.degrees(angle), closed, color=line.get_color(), linewidth=1)
+    rolling = mode[k] == 0
+    angle = q["theta1"][k][rolling]
+    closed = ((3 + alpha) * np.cos(angle) - 2 * np.cos(START)) / (1 + alpha)
+    line = right.plot(np.degrees(angle), force[k][rolling], linewidth=4, alpha=0.4, label=name)[0]
+    right.plot(np.degrees(angle), closed, color=line.get_color(), linewidth=1)
     right.plot(ours[k], 0, "ko", markersize=6, zorder=5)
     right.annotate(
         f"{ours[k]:.1f}°", (ours[k], 0), (0, -13 - 10 * (k == 1)), textcoords="offset points", ha="center", fontsize=9

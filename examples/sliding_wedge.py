@@ -64,7 +64,7 @@ def landing(mass):
     return section.t[0]
 
 
-end, by_mass = jax.value_and_grad(landing)(M)
+end, by_mass = jax.jit(jax.value_and_grad(landing))(M)
 exact = jnp.sqrt(2 / -book["x"])
 print(f"time to the table      closed form {exact:.12f} s      lagjax {end:.12f}   (∂/∂M {by_mass:.4f} s/kg)")
 ts = jnp.linspace(0.0, end, 6)
