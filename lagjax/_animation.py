@@ -21,6 +21,7 @@ from lagjax._arguments import Function, accept
 from lagjax._diagnosis import with_numbers
 from lagjax._display import is_known, times_of_members
 from lagjax._health._measure import Members
+from lagjax._layout import Layout
 
 PyTree = Any
 MEMBERS = 50  # that are drawn of a batch, the first ones
@@ -53,7 +54,8 @@ class Course(NamedTuple):
             begin = h * self.after[place]
             begin = np.where(np.isnan(begin), 2 * (b - a) - end, begin)
             rise = b - a
-            return a + x * (begin + x * (3 * rise - 2 * begin - end + x * (begin + end - 2 * rise)))
+            inside = a + x * (begin + x * (3 * rise - 2 * begin - end + x * (begin + end - 2 * rise)))
+            return np.where(x == 1, b, inside)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -184,6 +186,17 @@ def _require_positive(**numbers) -> None:
 # ---- where the points are --------------------------------------------------------------------------------------------
 
 
+def course_of(trajectory) -> tuple[Layout, Course]:
+    """One motion between its outputs. Raises `ValueError` for a batch."""
+    members = Members(trajectory)
+    if members.batch:
+        raise ValueError(
+            "Compare one motion, not a batch: jax.tree.map(lambda x: x[k], (batch.q, batch.qdot)) are the states of "
+            "member k; simulate follows it alone."
+        )
+    return members.layout, _course(trajectory, members, 0)
+
+
 def _course(trajectory, members: Members, k: int) -> Course:
     """The knots of a member: its outputs, and the states just before its transitions."""
 
@@ -217,7 +230,7 @@ def _positions(function: Function, members: Members, k: int, q: np.ndarray, time
     states = members.layout.restore(q.astype(members.layout.dtype))
     drawn = _at_states(function, states, times.astype(members.layout.dtype), params)
     named = drawn if isinstance(drawn, dict) else {"": drawn}
-    return {str(name): _as_points(name, np.asarray(value), len(q)) for name, value in named.items()}
+    return {str(name): as_points(name, np.asarray(value), len(q)) for name, value in named.items()}
 
 
 @eqx.filter_jit
@@ -225,7 +238,8 @@ def _at_states(function: Function, states, times, params):
     return jax.vmap(lambda q, t: function(q, t=t, params=params))(states, times)
 
 
-def _as_points(name, value: np.ndarray, frames: int) -> np.ndarray:
+def as_points(name, value: np.ndarray, frames: int) -> np.ndarray:
+    """The positions of one point or line at some frames, (frames, k, 2 or 3)."""
     if value.ndim == 2:  # one point
         value = value[:, None, :]
     if value.ndim != 3 or value.shape[-1] not in (2, 3):

@@ -17,8 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._analysis import Modes
+from lagjax._animation import as_points, course_of
+from lagjax._arguments import Function, accept
+from lagjax._check._findings import listed
 from lagjax._crossings import Crossings
-from lagjax._fit import Fit
+from lagjax._fit import Fit, Record
 from lagjax._fit._figures import draw_record
 from lagjax._fit._result import record_matrix
 from lagjax._layout import Layout
@@ -60,6 +64,150 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
         lines[0].set_label(name)
     ax.set_xlabel("t")
     return _legend(ax) if layout.size <= len(COLORS) else ax
+
+
+def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, ax=None):
+    """The phase portrait: the velocity of each coordinate against it, from the dot on; a colour for each coordinate.
+
+    - `coordinates`: their names, as messages and tables have them: "q['theta']", "q[0]"; by default all, seven at most.
+    - `members`: of a batch, draw this many, evenly chosen.
+
+    >>> lagjax.plot.phase(trajectory, "q['theta']")
+    """
+    q, qdot = (
+        jax.tree.map(lambda leaf: _some_members(leaf, trajectory, members), tree)
+        for tree in (trajectory.q, trajectory.qdot)
+    )
+    layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0, 0], (q, qdot)))
+    places = _places(layout, coordinates)
+    q, qdot = (np.asarray(jax.vmap(jax.vmap(layout.flatten))(tree)) for tree in (q, qdot))
+    ax, opacity = _axes(ax), max(0.15, len(q) ** -0.5)
+    for color, i in zip(COLORS, places, strict=False):
+        lines = ax.plot(q[:, :, i].T, qdot[:, :, i].T, color=color, alpha=opacity, linewidth=1.2)
+        lines[0].set_label(layout.names[i])
+        ax.plot(q[:, 0, i], qdot[:, 0, i], ".", color=color, markersize=5)
+    if len(places) == 1:
+        name = layout.names[places[0]]
+        ax.set(xlabel=name, ylabel="qdot" + name.removeprefix("q"))
+        return ax
+    ax.set(xlabel="coordinate", ylabel="velocity")
+    return _legend(ax)
+
+
+def _places(layout: Layout, coordinates: tuple[str, ...]) -> list[int]:
+    """The places of coordinates by their names; the first ones, as many as there are colours, where none is named."""
+    if not coordinates:
+        return list(range(min(layout.size, len(COLORS))))
+    if unknown := [name for name in coordinates if name not in layout.names]:
+        raise ValueError(f"There is no coordinate {unknown[0]!r}; there are {listed(layout.names)}.")
+    return [layout.names.index(name) for name in coordinates][: len(COLORS)]
+
+
+def compare(one: Trajectory, other, *coordinates: str, figure=None):
+    """Two motions, or a motion and data, above each other, and their difference below; a column for each coordinate.
+
+    - `one`: a motion. Where `other` has other times it follows the cubic through its outputs (Hermite).
+    - `other`: a `Trajectory`, a `Record`, or a pair (ts, values) with values in the structure of q; NaN is missing.
+    - `coordinates`: their names, as in `phase`; by default the first four.
+
+    Draws into `figure`, or a new one, and returns the Axes (2, S).
+
+    >>> lagjax.plot.compare(trajectory, (ts, measured))
+    """
+    layout, course = course_of(one)
+    ts, values, style = _other(other, layout)
+    places = _places(layout, coordinates)[:4]
+    matplotlib = _matplotlib()
+    if figure is None:
+        figure = matplotlib.pyplot.figure(figsize=(max(6.4, 3.6 * len(places)), 4.6), layout="constrained")
+    axes = figure.subplots(2, len(places), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
+    for (above, below), i in zip(axes.T, places, strict=True):
+        _axes(above).plot(course.t, course.q[:, i], color=COLORS[0], linewidth=1.5, label="motion")
+        above.plot(ts, values[:, i], style, color=COLORS[1], markersize=3.0, linewidth=1.2, label="other")
+        _axes(below).plot(
+            ts, course.at(ts)[:, i] - values[:, i], style[0], color=COLORS[1], markersize=3.0, linewidth=1
+        )
+        above.set_title(layout.names[i], fontsize="medium")
+        below.set_xlabel("t")
+    axes[1][0].set_ylabel("motion − other")
+    axes[0][0].legend(frameon=False, fontsize="small", ncols=2)
+    return axes
+
+
+def _other(other, layout: Layout) -> tuple[np.ndarray, np.ndarray, str]:
+    """The times (T,), the values (T, n) and the style of what a motion is compared with."""
+    if isinstance(other, Trajectory):
+        of_other, course = course_of(other)
+        if of_other.names != layout.names:
+            raise ValueError("The two motions have other coordinates: there is nothing to compare.")
+        return course.t, course.q, "--"
+    if isinstance(other, tuple) and len(other) == 2:
+        other = Record(*other)
+    if not isinstance(other, Record):
+        raise TypeError(f"other must be a Trajectory, a Record, or a pair (ts, values); got {type(other).__name__}.")
+    if other.matrix.shape[1] != layout.size:
+        raise ValueError(
+            f"The data have {other.matrix.shape[1]} numbers at a time, and q has {layout.size}: give values in the "
+            "structure of q, with NaN for what was not measured."
+        )
+    return np.asarray(other.ts), other.matrix, "."
+
+
+def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: Any = None, *, largest: float = 0.3,
+          count: int = 6, figure=None):  # fmt: skip
+    """The shapes of small oscillations with their frequencies: bars, a panel for each mode; or where things are.
+
+    - `points`, `q`, `params`: as in `Trajectory.animate`, and the equilibrium: the points there, in grey, and at the
+      two ends of the swing, of which the largest deviation of a coordinate is `largest`. In the plane.
+    - `count`: draw so many modes, the slowest first.
+
+    Draws into `figure`, or a new one, and returns the Axes (M,). Of a complex shape, where something turns or damps,
+    the real part is drawn.
+
+    >>> lagjax.plot.modes(lagjax.normal_modes(scene, q, params))
+    """
+    frequencies = np.asarray(modes.frequencies)
+    if frequencies.ndim != 1:
+        raise ValueError(f"Draw the modes of one equilibrium at a time; these are {frequencies.shape[:-1]} of them.")
+    if points is not None and q is None:
+        raise ValueError("To draw points give the equilibrium too: lagjax.plot.modes(modes, points, q, params).")
+    shown, shapes = min(count, len(frequencies)), jax.tree.map(lambda leaf: jnp.real(jnp.asarray(leaf)), modes.shapes)
+    matplotlib = _matplotlib()
+    if figure is None:
+        figure = matplotlib.pyplot.figure(figsize=(min(2.4 * shown + 1.0, 12.8), 3.2), layout="constrained")
+    axes = figure.subplots(1, shown, squeeze=False, sharey=True, sharex=points is not None)[0]
+    for k, ax in enumerate(axes):
+        shape = jax.tree.map(lambda leaf, k=k: leaf[k], shapes)
+        if points is None:
+            _bars(_axes(ax), shape)
+        else:
+            _swings(_axes(ax), accept(points, "points", ("q",)), q, shape, params, largest)
+        ax.set_title(f"ω = {frequencies[k]:.4g}", fontsize="medium")
+    return axes
+
+
+def _bars(ax, shape) -> None:
+    """The deviation of every coordinate as a bar, the largest one of length one."""
+    layout = Layout.of(shape, shape)
+    deviation = np.asarray(layout.flatten(shape))
+    ax.bar(np.arange(layout.size), deviation / np.abs(deviation).max(), color=COLORS[0], width=0.7)
+    ax.axhline(0.0, color=GREY, linewidth=0.8)
+    if layout.size <= 12:
+        ax.set_xticks(np.arange(layout.size), layout.names, rotation=45, ha="right", fontsize="small")
+
+
+def _swings(ax, points: Function, q, shape, params, largest: float) -> None:
+    """The points at an equilibrium, and where a coordinate has moved by `largest` along a shape, to both sides."""
+    size = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(shape))
+    for swing, color, style in ((0.0, GREY, "-"), (-largest, COLORS[5], "--"), (largest, COLORS[0], "-")):
+        at = jax.tree.map(lambda x, dx, s=swing: jnp.asarray(x) + s / size * dx, q, shape)
+        drawn = points(at, t=jnp.zeros(()), params=params)
+        for name, value in (drawn if isinstance(drawn, dict) else {"": drawn}).items():
+            line = as_points(name, np.asarray(value)[None], 1)[0]
+            if line.shape[-1] != 2:
+                raise ValueError("plot.modes draws in the plane: return points of two numbers, a projection of them.")
+            ax.plot(*line.T, style, color=color, marker="o", markersize=4, linewidth=1.5)
+    ax.set_aspect("equal", adjustable="box")
 
 
 def path(x, y, *, values=None, label: str | None = None, cmap: str = "viridis", ax=None):

@@ -120,3 +120,48 @@ def test_without_matplotlib_it_says_what_to_install(single, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ImportError, match=r"pip install lagjax\[examples\]"):
         lagjax.plot.trajectory(single)
+
+
+def test_phase_portraits_by_name(single, batch):
+    ax = lagjax.plot.phase(single, "q[1]")
+    np.testing.assert_array_equal(ax.lines[0].get_xydata(), np.stack([single.q[:, 1], single.qdot[:, 1]], axis=1))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("q[1]", "qdot[1]") and ax.get_legend() is None
+    assert len(lagjax.plot.phase(batch, members=5).lines) == 2 * (5 + 1)
+    with pytest.raises(ValueError, match=r"no coordinate 'x'; there are q\[0\], q\[1\]"):
+        lagjax.plot.phase(single, "x")
+
+
+def test_motions_and_data_are_compared(single, batch):
+    ts = np.linspace(0.0, 5.0, 23)  # others than those of the motion
+    above, below = lagjax.plot.compare(single, (ts, np.stack([np.cos(ts), np.full(23, np.nan)], axis=1)))
+    assert above[0].get_title() == "q[0]" and below.shape == (2,)
+    # h⁴/384 of the cubic between outputs that are h = 1/8 apart
+    np.testing.assert_allclose(below[0].lines[0].get_ydata(), 0.0, atol=0.125**4 / 384 + 1e-8)
+    _, below = lagjax.plot.compare(single, single, "q[1]")
+    assert not below[0].lines[0].get_ydata().any()
+    with pytest.raises(ValueError, match="1 numbers at a time, and q has 2"):
+        lagjax.plot.compare(single, (ts, ts))
+    with pytest.raises(ValueError, match="one motion, not a batch"):
+        lagjax.plot.compare(batch, single)
+    with pytest.raises(TypeError, match="must be a Trajectory, a Record, or a pair"):
+        lagjax.plot.compare(single, ts)
+
+
+def test_shapes_of_modes():
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q - 0.5 * (q[0] - q[1]) ** 2)
+    modes = lagjax.normal_modes(scene, jnp.zeros(2))  # 1, in step, and √3, against each other
+    axes = lagjax.plot.modes(modes)
+    assert [ax.get_title() for ax in axes] == ["ω = 1", "ω = 1.732"]
+    heights = [[bar.get_height() for bar in ax.patches] for ax in axes]
+    np.testing.assert_allclose(np.abs(heights), 1.0, atol=1e-12)
+    assert heights[0][0] * heights[0][1] > 0 > heights[1][0] * heights[1][1]
+
+    def points(q):
+        return jnp.stack([jnp.arange(2.0) + q, jnp.zeros(2)], axis=1)
+
+    axes = lagjax.plot.modes(modes, points, jnp.zeros(2), largest=0.2, count=1)
+    moved = [line.get_xdata() for line in axes[0].lines]
+    np.testing.assert_allclose(moved[0], [0, 1])
+    np.testing.assert_allclose(np.abs(moved[2] - moved[0]), 0.2, atol=1e-12)
+    with pytest.raises(ValueError, match="give the equilibrium too"):
+        lagjax.plot.modes(modes, points)
