@@ -129,3 +129,107 @@ def test_a_sentence_for_what_only_enters_as_a_product():
     assert said == (
         "Of params['a'], params['b'] and params['m'] only params['a']·params['m'] and params['b']·params['m'] are seen."
     )
+
+
+# ---- scenes of which everything is seen ------------------------------------------------------------------------------
+
+
+def turning(v, q):
+    return q[0] * v[1] - q[1] * v[0]
+
+
+FLAT, BOTH = (1.0, 0.3), ([1.0, 0.0], [0.1, 0.8])  # starts (q, q̇) of one and of two coordinates
+# name: (L, params, more of the scene, sensors, start). What looks like a freedom of the list above, and is none.
+SEEN = {
+    "friction and stiffness": (
+        spring(lambda p: p["k"]), {"c": 0.3, "k": 4.0},
+        {"dissipation": lambda q, v, params: 0.5 * params["c"] * v**2}, None, FLAT,
+    ),
+    "length of a pendulum in known gravity": (
+        lambda q, v, p: p["m"] * (0.5 * p["l"] ** 2 * v**2 + 9.8 * p["l"] * jnp.cos(q)) / p["m"], {"l": 0.9, "m": 2.0},
+        {"forces": lambda q, v, t, params: (params["m"] - 1.0) * jnp.cos(3 * t)}, None, FLAT,
+    ),
+    "mass under a known force": (
+        spring(lambda p: p["k"], lambda p: p["m"]), {"k": 4.0, "m": 1.5},
+        {"forces": lambda q, v, t, params: 2.0 * jnp.cos(3 * t)}, None, FLAT,
+    ),
+    "a product, and one of its factors": (
+        spring(lambda p: p["a"] * p["b"]), {"a": 0.5, "b": 8.0},
+        {"dissipation": lambda q, v, params: 0.5 * params["a"] * v**2}, None, FLAT,
+    ),
+    "a ratio, and its denominator": (
+        spring(lambda p: p["a"] / p["b"]), {"a": 2.0, "b": 0.5},
+        {"dissipation": lambda q, v, params: 0.5 * params["b"] * v**2}, None, FLAT,
+    ),
+    "a sum and a difference": (
+        spring(lambda p: p["a"] + p["b"]), {"a": 2.5, "b": 2.0},
+        {"dissipation": lambda q, v, params: 0.5 * (params["a"] - params["b"]) * v**2}, None, FLAT,
+    ),
+    "two terms of a potential": (
+        lambda q, v, p: 0.5 * v**2 - p["a"] * q**2 / 2 - p["b"] * q**4 / 4, {"a": 2.0, "b": 3.0}, {}, None, FLAT,
+    ),
+    "gain of a sensor of a pendulum that swings far": (
+        lambda q, v, p: 0.5 * v**2 + p["k"] * jnp.cos(q), {"gain": 2.0, "k": 9.0}, {},
+        lambda q, v, params: params["gain"] * q, (1.8, 0.0),
+    ),
+    "bias of a sensor": (
+        spring(lambda p: p["k"]), {"bias": 0.3, "k": 4.0}, {}, lambda q, v, params: q + params["bias"], FLAT,
+    ),
+    "place of a spring": (
+        lambda q, v, p: 0.5 * v**2 - 0.5 * p["k"] * (q - p["place"]) ** 2, {"k": 4.0, "place": 0.2}, {}, None, FLAT,
+    ),
+    "charge in a field that is no gauge": (
+        lambda q, v, p: 0.5 * v @ v - 0.5 * p["k"] * q @ q + 0.5 * p["B"] * turning(v, q), {"B": 0.7, "k": 4.0}, {},
+        None, BOTH,
+    ),
+    "masses about a centre that holds one of them": (
+        lambda q, v, p: 0.5 * v @ v + p["GM"] / jnp.sqrt(q @ q), {"GM": 1.0}, {}, None, BOTH,
+    ),
+    "torque over a known inertia": (
+        lambda q, v, p: 0.5 * 2.0 * v**2 + p["torque"] * q, {"torque": 1.0}, {}, None, FLAT,
+    ),
+    "force and period of a drive": (
+        spring(lambda p: 4.0), {"F": 1.0, "w": 3.0},
+        {"forces": lambda q, v, t, params: params["F"] * jnp.cos(params["w"] * t)}, None, FLAT,
+    ),
+    "force and phase of a drive": (
+        spring(lambda p: 4.0), {"F": 1.0, "phase": 0.4},
+        {"forces": lambda q, v, t, params: params["F"] * jnp.cos(3 * t + params["phase"])}, None, FLAT,
+    ),
+    "a chain of two, one mass known": (
+        lambda q, v, p: 0.5 * (v[0] ** 2 + p["m"] * v[1] ** 2)
+        - 0.5 * (p["a"] * q[0] ** 2 + p["b"] * (q[1] - q[0]) ** 2),
+        {"a": 4.0, "b": 3.0, "m": 1.5}, {}, None, BOTH,
+    ),
+    "a power of a potential": (
+        lambda q, v, p: 0.5 * v**2 - p["a"] * (q**2 + 0.1) ** p["power"], {"a": 2.0, "power": 1.5}, {}, None, FLAT,
+    ),
+    "gain of the second of two sensors": (
+        spring(lambda p: p["k"]), {"gain": 2.0, "k": 4.0}, {},
+        lambda q, v, params: jnp.stack([q, params["gain"] * v]), FLAT,
+    ),
+    "drag and friction": (
+        spring(lambda p: 4.0), {"air": 0.2, "c": 0.2},
+        {"forces": lambda q, v, params: -params["c"] * v - params["air"] * v * jnp.abs(v)}, None, FLAT,
+    ),
+    "a branch that is taken": (
+        lambda q, v, p: spring(lambda p: p["k"])(q, v, p) - jnp.where(q > 0.5, p["wall"] * (q - 0.5) ** 2, 0.0),
+        {"k": 4.0, "wall": 3.0}, {}, None, FLAT,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEEN)
+def test_of_scenes_that_show_everything_nothing_is_said_to_be_unseen(name):
+    lagrangian, params, more, observe, start = SEEN[name]
+    scene = lagjax.System(lambda q, v, params: lagrangian(q, v, params), **more)
+    q0, qdot0 = (jnp.asarray(half) for half in start)
+    run = lagjax.simulate(scene, q0, qdot0, TS, params)
+    pairs = zip(run.q, run.qdot, strict=True)
+    shown = np.asarray(run.q if observe is None else [observe(q, v, params) for q, v in pairs])
+    record = lagjax.Record(
+        TS, shown + SIGMA * np.random.default_rng(0).normal(size=shown.shape), start=lagjax.Guess(q0, qdot0)
+    )
+    fit = lagjax.fit(scene, record, params, observe=observe)
+    assert fit.unseen == () and fit.ok, fit
