@@ -40,6 +40,7 @@ def test_mercurys_perihelion(tmp_path, monkeypatch):
     assert f"{scope['ours']:.2f}" == "42.98"
 
 
+@pytest.mark.slow
 def test_a_driven_pendulum_comes_to_its_strange_attractor(tmp_path, monkeypatch):
     scope = run("driven_pendulum", tmp_path, monkeypatch, MEMBERS=200, PERIODS=60)
     np.testing.assert_allclose(float(scope["spectrum"].sum()), scope["total"], rtol=1e-6)  # rtol 1e-9 over 500 units
@@ -129,12 +130,13 @@ def test_the_restricted_problem_of_three_bodies(tmp_path, monkeypatch):
 
 
 def test_every_worked_problem_has_its_picture():
-    gallery = runpy.run_path(str(EXAMPLES / "gallery.py"))
+    gallery, readme = runpy.run_path(str(EXAMPLES / "gallery.py")), (EXAMPLES.parent / "README.md").read_text()
     assert sorted(path.stem for path in (EXAMPLES / "gallery").glob("*.png")) == sorted(gallery["NAMES"])
     for name in gallery["NAMES"]:
         picture = (EXAMPLES / "gallery" / f"{name}.png").read_bytes()
         assert picture.startswith(b"\x89PNG") and 10_000 < len(picture) <= 120_000
         assert f'savefig("out/{name}.png")' in (EXAMPLES / f"{name}.py").read_text()
+        assert f"`python examples/{name}.py`" in readme and f"examples/gallery/{name}.png" in readme
 
 
 @pytest.mark.slow
