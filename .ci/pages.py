@@ -145,8 +145,8 @@ def on_files(files, config):
 
 
 def _from_the_top(text: str) -> str:
-    """Links of the README into `examples/`, which is the top of the site."""
-    return text.replace("](examples/", "](")
+    """Links and pictures of the README in `examples/`, which is the top of the site."""
+    return text.replace("](examples/", "](").replace('src="examples/', 'src="')
 
 
 def on_page_content(html, page, config, files):
