@@ -14,6 +14,7 @@ commit, versions and machine.
 
 import argparse
 import hashlib
+import itertools
 import json
 import math
 import multiprocessing
@@ -43,6 +44,7 @@ from lagjax._sweep._status import Progress
 SCENE = lagjax.scenes.double_pendulum()
 DURATION, RTOL = 5.0, 5e-9  # of which the median error is 1e-8
 BARE = 4096
+GOLDEN = (5**0.5 - 1) / 2  # whose multiples are spread evenly between whole numbers
 ROOT = Path(__file__).parent.parent
 
 
@@ -122,14 +124,17 @@ def _spent(part: Callable[[int], Any], count: int) -> np.ndarray:
 
 
 def _bare(over: dict, flips: dict | None = FLIPS) -> Callable[[int], None]:
-    """Runs batches of 4096 drawn from the grid."""
-    rng = np.random.default_rng(0)
+    """Runs batches of 4096 neighbours in the grid, from places all over it."""
+    shape = tuple(map(len, over.values()))
+    members, places = math.prod(shape), itertools.count()
     settings = dict(rtol=RTOL, atol=None, max_steps=65_536, event=None, solver=None)
     sections = None if flips is None else Sections.of(flips, keep, settings)
 
     def batches(count: int) -> None:
         for _ in range(count):
-            q0 = np.stack([rng.choice(angles, BARE) for angles in over.values()], axis=1)
+            first = int(members * (next(places) * GOLDEN % 1.0))
+            which = np.unravel_index((first + np.arange(BARE)) % members, shape)
+            q0 = np.stack([angles[i] for angles, i in zip(over.values(), which, strict=True)], axis=1)
             values = {"q0": q0, "qdot0": np.zeros_like(q0), "params": SCENE.params}
             one, _ = run_batch(SCENE.system, values, jnp.array([0.0, DURATION]), (0, 0, None), settings, sections)
             jax.block_until_ready(one.q)
