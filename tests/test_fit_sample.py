@@ -72,10 +72,10 @@ def test_draws_are_those_of_the_exact_density_whatever_the_expansion_is(bent, ke
     # Kept whole, and without what bends: the exact density corrects for both.
     polynomials = _surrogate._polynomials
     monkeypatch.setattr(_surrogate, "_polynomials", lambda r, slopes, bends: polynomials(r, slopes, kept * bends))
-    drawn = bent.sample(1000, seed=3)
+    drawn = bent.sample(500, seed=3)
     assert drawn.attrs["sampler"].endswith(f"it accepts {float(drawn.sample_stats.acceptance_rate.mean()):.2f}.")
     k, expected = drawn.posterior["params['k']"].values, quadrature(bent)
-    # A quantile of n independent draws is one of the share 0.5 ± 0.5/√n; of 4000 draws 700 or more are independent,
+    # A quantile of n independent draws is one of the share 0.5 ± 0.5/√n; of 2000 draws 700 or more are independent,
     # and 0.06 is three of their deviations.
     shares = [np.mean(k < x) for x in expected]
     np.testing.assert_allclose(shares, [0.1, 0.5, 0.9], atol=0.06)

@@ -37,12 +37,12 @@ from lagjax._fit._density import Density
 from lagjax._fit._surrogate import Surrogate, expanded
 
 _WARM, _ACCEPTED = 200, 0.85  # draws for the step of every chain; the mean acceptance it is tuned for
-_ROUNDS = (400, 800, 1600)  # draws of all chains from π*: each round has the metric of the one before
+_ROUNDS = (400, 800, 3200)  # draws of all chains from π*: each round has the metric of the one before
 _FEWEST = 50  # of them of one chain: its step needs so many
 _MOST_INNER = 64  # steps of the sampler along π* for one draw: a motion is waited for no longer than that
 _PILOT = 64  # draws of π* that are weighed with π before the first draw
 _LEAST = 0.2  # of them are accepted, or π* is given up: fewer, and a chain may stay where π* is too small
-_SETTLING = 5  # draws that are thrown away: chains begin at weighed draws of the pilot, which are few
+_SETTLING = 10  # draws that are thrown away: chains begin at draws of π*, which the exact density has not judged
 
 
 class Draws(NamedTuple):
@@ -158,18 +158,21 @@ class Chains(NamedTuple):
 
 
 def _weighed(sampler: Sampler, exact: Callable, state, key) -> tuple[float, Chains]:
-    """How many of independent pairs of draws of π* are accepted, and starts for the chains among these, by weight."""
-    chains, pilot = len(state.position), []
-    for k in range(max(2, math.ceil(_PILOT / chains))):
+    """How many of independent pairs of draws of π* are accepted, and where its chains are then.
+
+    Starts chosen by weight would not be better ones: the few largest weights are where π* is too small, and a chain
+    stays there for as long as the weight is large.
+    """
+    pilot = []
+    for k in range(max(2, math.ceil(_PILOT / len(state.position)))):
         state, *_ = sampler.draw(jax.random.fold_in(key, k), state)
         pilot.append(Chains.at(state, exact))
-    pool = jax.tree.map(lambda *parts: np.concatenate(parts), *pilot)
-    if not np.isfinite(pool.ratio).any():
-        return 0.0, pool
-    weights = np.exp(pool.ratio - pool.ratio.max())
+    ratio = np.concatenate([at.ratio for at in pilot])
+    if not np.isfinite(ratio).any():
+        return 0.0, pilot[-1]
+    weights = np.exp(ratio - ratio.max())
     share = np.minimum(1.0, weights[:, None] / np.where(weights > 0, weights, np.inf)).mean()
-    rows = _choices(key).choice(len(weights), chains, p=weights / weights.sum())
-    return float(share), jax.tree.map(lambda part: part[rows], pool)
+    return float(share), pilot[-1]
 
 
 def _choices(key) -> np.random.Generator:
@@ -182,7 +185,9 @@ def _corrected(surrogate: Surrogate, sampler: Sampler, exact: Callable, at: Chai
     for k in range(_SETTLING + draws):
         state, steps, diverged = sampler.draw(jax.random.fold_in(key, k), at.state)
         proposed = Chains.at(state, exact)
-        accepted = np.exp(np.minimum(0.0, proposed.ratio - at.ratio))  # 0 where a motion could not be followed
+        with np.errstate(invalid="ignore"):
+            change = proposed.ratio - at.ratio  # −∞ where the motion cannot be followed, +∞ where that of x cannot
+        accepted = np.where(np.isfinite(proposed.exact), np.exp(np.minimum(0.0, change)), 0.0)
         goes = choices.uniform(size=len(accepted)) < accepted
         at = jax.tree.map(lambda new, old: np.where(goes.reshape(-1, *[1] * (new.ndim - 1)), new, old), proposed, at)  # noqa: B023
         kept.append((at.state.position, at.exact, steps, diverged, accepted))
