@@ -192,6 +192,14 @@ def _clear(m, place):
 
 
 @_compiled
+def _scale(m, place, by):
+    """A number times powers of two, one for each lane, (8,)."""
+    for i in range(LANES):
+        m[2 * LANES * place + i] *= by[i]
+        m[2 * LANES * place + LANES + i] *= by[i]
+
+
+@_compiled
 def _multiply(m, total, a, b):
     """total = a b."""
     _clear(m, total)
@@ -217,8 +225,8 @@ def _start_power(m, u, inverse, s):
 
 
 @_compiled
-def _fill(m):
-    """The series of x, y and z, from their first two terms."""
+def _fill(m, unit):
+    """The series of x, y and z, from their first two terms, in units of time (8,)."""
     of = PER_ORDER
     for k in range(ORDER - 1):
         now, next_one = k * of, (k + 2) * of
@@ -233,6 +241,7 @@ def _fill(m):
                     _products(m, square, 1, middle, 0, middle, 0, 1.0, 0.0, 1.0)
             if k == 0:
                 _start_power(m, power, INVERSE + pair, square)
+                _scale(m, power, unit * unit)
             else:  # s u̇ = −3/2 ṡ u
                 _clear(m, WORK)
                 first, last = of + OF_S + pair, power - of
@@ -253,7 +262,21 @@ def _fill(m):
 
 
 @_compiled
-def _step(m, h):
+def _unit_of_time(m, unit):
+    """Powers of two (8,) near the time that the closest two of the bodies take, r^(3/2).
+
+    In other units the last terms of a series in a close encounter would be larger than the largest double.
+    """
+    for i in range(LANES):
+        unit[i] = np.inf
+        for pair in range(3):
+            a = 2 * pair * 2 * LANES + i
+            unit[i] = min(unit[i], (m[a] ** 2 + m[a + 2 * LANES] ** 2) ** 0.75)
+        unit[i] = 2.0 ** np.floor(np.log2(unit[i]))
+
+
+@_compiled
+def _step(m, h, unit):
     """The longest step (8,) whose last two terms are small beside positions and beside velocities."""
     width = 2 * LANES
     for i in range(LANES):
@@ -262,7 +285,7 @@ def _step(m, h):
             a, b = 2 * pair * width + i, (2 * pair + 1) * width + i
             place = np.sqrt(m[a] ** 2 + m[b] ** 2)
             rate = PER_ORDER * width
-            velocity = np.sqrt(m[a + rate] ** 2 + m[b + rate] ** 2) + 1 / np.sqrt(place)
+            velocity = np.sqrt(m[a + rate] ** 2 + m[b + rate] ** 2) + unit[i] / np.sqrt(place)
             for k in (ORDER - 1, ORDER):
                 last = max(abs(m[a + k * rate]), abs(m[b + k * rate]))  # its square may overflow
                 of_place = (LAST_TERMS * place / last) ** (1.0 / k)
@@ -271,8 +294,8 @@ def _step(m, h):
 
 
 @_compiled
-def _advance(m):
-    """The state at the end of the step: Σ r_k hᵏ and Σ k r_k hᵏ⁻¹."""
+def _advance(m, unit):
+    """The state at the end of the step: Σ r_k hᵏ and Σ k r_k hᵏ⁻¹, the latter in units of the time (8,)."""
     for c in range(4):
         _clear(m, WORK + 1)
         _clear(m, WORK + 2)
@@ -283,6 +306,7 @@ def _advance(m):
             if k > 1:
                 _combine(m, WORK, WORK + 2, term, NOTHING, 1.0, float(k), 0.0)
                 _multiply(m, WORK + 2, WORK, STEP)
+        _scale(m, WORK + 2, 1 / unit)
         _combine(m, STATE + c, STATE + c, WORK + 1, NOTHING, 1.0, 1.0, 0.0)
         _combine(m, STATE + 4 + c, STATE + 4 + c, WORK + 2, NOTHING, 1.0, 1.0, 0.0)
 
@@ -291,7 +315,7 @@ def _advance(m):
 def _follow(state, span):
     """Eight states (8, 2, 8), moved by times (2, 8); NaN where that takes too many steps."""
     width = 2 * LANES
-    m, guess = np.zeros(NUMBERS * width), np.zeros(LANES)
+    m, guess, unit = np.zeros(NUMBERS * width), np.zeros(LANES), np.zeros(LANES)
     m[STATE * width : (STATE + 8) * width] = state.ravel()
     m[LEFT * width : (LEFT + 1) * width] = span.ravel()
     m[ONE * width : ONE * width + LANES] = 1.0
@@ -302,18 +326,25 @@ def _follow(state, span):
             for c in range(2):
                 first = d * PER_ORDER + c
                 _combine(m, first + 4, first, first + 2, NOTHING, 1.0, -1.0, 0.0)
-        _fill(m)
-        _step(m, guess)
+        _unit_of_time(m, unit)
+        for c in range(6):
+            _scale(m, PER_ORDER + c, unit)
+        _fill(m, unit)
+        _step(m, guess, unit)
         going = False
         for i in range(LANES):
             left, step = LEFT * width + i, STEP * width + i
-            last = guess[i] >= m[left]
-            m[step] = m[left] if last else guess[i]
-            m[step + LANES] = m[left + LANES] if last else 0.0
-            going = going or not last
+            size = guess[i] * unit[i]
+            on = size < m[left]  # a state that is not finite is at its end
+            m[step] = size if on else m[left]
+            m[step + LANES] = 0.0 if on else m[left + LANES]
+            going = going or on
         _combine(m, LEFT, LEFT, STEP, NOTHING, 1.0, -1.0, 0.0)
-        _advance(m)
+        _scale(m, STEP, 1 / unit)
+        _advance(m, unit)
         if not going:
-            state[:] = m[STATE * width : (STATE + 8) * width].copy().reshape(8, 2, LANES)
-            return
-    state[:] = np.nan
+            break
+    for i in range(LANES):
+        if m[LEFT * width + i] > 0.0:
+            m[STATE * width + i] = np.nan
+    state[:] = m[STATE * width : (STATE + 8) * width].copy().reshape(8, 2, LANES)

@@ -50,7 +50,7 @@ def refined(place, shape, v, period, work) -> Refined:
             slopes = _slopes(place, shape, w, period, work, ends)
             numbers = np.concatenate([w[:, 0], period[:, :1]], axis=1)[:, None]
             floor = 2.0**-53 * np.abs(slopes * numbers).max(axis=(1, 2))
-        going = ~((closure[waiting] <= ENOUGH) & (step[waiting] <= ENOUGH))
+        going = np.isfinite(off).all(axis=1) & ~((closure[waiting] <= ENOUGH) & (step[waiting] <= ENOUGH))
         waiting, off = waiting[going], off[going]
         if not len(waiting):
             break

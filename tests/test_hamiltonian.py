@@ -32,6 +32,11 @@ def test_the_energy_in_polar_coordinates():
     np.testing.assert_allclose(changed.system.energy(*state), CENTRAL.energy(*state), rtol=1e-14)
 
 
+def test_three_lines_each():
+    for one in (lagjax.change_coordinates(PLANE, polar), lagjax.hamiltonian(PLANE)):
+        assert len(repr(one).splitlines()) == 3 and "0x" not in repr(one)
+
+
 # ---- coordinates -----------------------------------------------------------------------------------------------------
 
 

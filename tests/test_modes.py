@@ -298,3 +298,9 @@ def test_more_coordinates_in_one_array_than_are_unfolded():
     """Scenes of more than 256 coordinates in one array had no equations: an IndexError."""
     derivation = derivation_of(CHAIN, Layout.of(jnp.zeros(300), jnp.zeros(300)), np.ones(()))
     assert derivation.shape("mass_matrix") == (300, 300)
+
+
+def test_a_structure_that_the_lagrangian_does_not_read():
+    pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+    with pytest.raises(TypeError, match=r"lagrangian was called with q\['th'\] of shape \(\)"):
+        lagjax.equilibrium(pendulum, {"th": 1.0})

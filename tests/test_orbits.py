@@ -1,12 +1,13 @@
 """Periodic orbits and their families: closed forms, published digits, pairs of multipliers, what cannot be found."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import ellipk
 
 import lagjax
-from lagjax._orbits import _orbit
+from lagjax._orbits import _floquet, _orbit
 
 PENDULUM = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
 
@@ -75,6 +76,32 @@ def test_what_cannot_be_asked():
         lagjax.periodic_orbit(PENDULUM, 0.1, 0.0, np.ones(3))
     with pytest.raises(ValueError, match="must be affine"):
         lagjax.periodic_orbit(PENDULUM, 0.1, 0.0, 6.0, image=lambda q, v: (q**2, v))
+
+
+def test_a_search_is_not_traced():
+    with pytest.raises(TypeError, match="search outside of jit"):
+        jax.jit(lambda a: lagjax.periodic_orbit(PENDULUM, a, 0.0, 6.5).period)(1.0)
+    with pytest.raises(TypeError, match=r"instead of jax\.vmap"):
+        jax.vmap(lambda a: lagjax.periodic_orbit(PENDULUM, a, 0.0, 6.5).period)(jnp.ones(2))
+
+
+def test_an_orbit_in_three_lines():
+    orbit = lagjax.periodic_orbit(PENDULUM, 1.0, 0.0, 6.5)
+    assert len(repr(orbit).splitlines()) == 3 and "stable" in repr(orbit) and type(orbit.message) is str
+    batch = lagjax.periodic_orbit(PENDULUM, np.array([1.0, 0.1]), np.zeros(2), np.array([6.5, 3.5]))
+    assert "1 of 2 close" in repr(batch) and "member 1" in repr(batch)
+    assert repr(jax.tree.map(lambda leaf: None, batch)).startswith("Orbit")  # of axes, say
+
+
+def test_multipliers_of_many_arcs():
+    # Arcs that turn and stretch, of a matrix with multipliers 1e9 … 1e-9: few products, and all digits of the small.
+    rng = np.random.default_rng(0)
+    bases = np.linalg.qr(rng.normal(size=(64, 4, 4)))[0]
+    stretch = np.exp(np.array([1.0, 0.02, -0.02, -1.0]) * np.log(1e9) / 64)
+    arcs = np.stack([bases[(k + 1) % 64] @ np.diag(stretch) @ bases[k].T for k in range(64)])
+    values = np.sort(np.abs(_floquet.multipliers_of(_floquet.Reduced(arcs, 0), True)))
+    np.testing.assert_allclose(values, stretch[::-1] ** 64, rtol=1e-10)
+    assert len(_floquet._merged(arcs)) < 8
 
 
 def test_multipliers_of_henon_heiles():

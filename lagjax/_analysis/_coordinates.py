@@ -10,16 +10,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lagjax._analysis._solve import shortest_preimage, shortest_solution
+from lagjax._analysis._solve import newton, shortest_preimage, shortest_solution
 from lagjax._arguments import Function, accept
 from lagjax._failures import nan_unless
 from lagjax._layout import Layout
 from lagjax._system import System, require_system
 
 PyTree = Any
-
-# Newton steps to the new coordinates of a state; five are usual.
-_STEPS = 50
 
 
 class ChangedCoordinates(NamedTuple):
@@ -34,6 +31,14 @@ class ChangedCoordinates(NamedTuple):
     system: System
     old_from_new: Callable
     new_from_old: Callable
+
+    def __repr__(self) -> str:
+        """Three lines: the scene, and the ways of states with their arguments."""
+        return (
+            f"ChangedCoordinates: system {self.system!r}\n"
+            "old_from_new(Q, Qdot, t, params) for states in the old coordinates\n"
+            "new_from_old(q, qdot, guess, t, params) for states in the new ones"
+        )
 
 
 def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordinates:
@@ -143,19 +148,7 @@ def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, param
     def off(x, t):
         return old.flatten(place(new.restore(x), t=t, params=params)) - wanted
 
-    def find(f, start):
-        def moves(carry):
-            _, moved, count = carry
-            return (moved > 1e-14) & (count < _STEPS)
-
-        def once(carry):
-            x, _, count = carry
-            step = shortest_solution(jax.jacfwd(f)(x), f(x))
-            return x - step, jnp.max(jnp.abs(step) / (1 + jnp.abs(x))), count + 1
-
-        return jax.lax.while_loop(moves, once, (start, jnp.ones((), start.dtype), 0))[0]
-
-    x = jax.lax.custom_root(lambda x: off(x, t), jax.lax.stop_gradient(new.flatten(guess)), find, shortest_preimage)
+    x = jax.lax.custom_root(lambda x: off(x, t), jax.lax.stop_gradient(new.flatten(guess)), newton, shortest_preimage)
     arrived = jnp.max(jnp.abs(off(x, t))) <= jnp.finfo(x.dtype).eps ** 0.6 * (1 + jnp.max(jnp.abs(wanted)))
     x = nan_unless(arrived, x)
     jacobian, drift = jax.jacfwd(off, argnums=0)(x, t), jax.jacfwd(off, argnums=1)(x, t)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._coordinates import asking
-from lagjax._analysis._solve import shortest_preimage, shortest_solution
+from lagjax._analysis._solve import newton, shortest_preimage
 from lagjax._consistent import has_constraints
 from lagjax._failures import nan_unless
 from lagjax._layout import Layout
@@ -24,9 +24,6 @@ from lagjax._system import System, require_system
 
 PyTree = Any
 Vector = Float[Array, " n"]
-
-# Newton steps to a velocity: one where L is quadratic in velocities, ten in relativity.
-_STEPS = 50
 
 
 class CanonicalTrajectory(NamedTuple):
@@ -56,6 +53,14 @@ class Hamiltonian(NamedTuple):
     velocity: Callable
     equations: Callable
     simulate: Callable
+
+    def __repr__(self) -> str:
+        """Three lines: the scene, and the functions with their arguments."""
+        return (
+            f"Hamiltonian of {self.system!r}\n"
+            "energy, velocity and equations of (q, p, t, params), momentum of (q, qdot, t, params)\n"
+            "simulate(q0, p0, ts, params) for canonical motions"
+        )
 
 
 def hamiltonian(system: System) -> Hamiltonian:
@@ -150,38 +155,10 @@ class _Flat(NamedTuple):
         def off(v):
             return self.motion.momentum(q, v, t, self.numbers) - p
 
-        def find(f, start):
-            def moves(carry):
-                _, moved, count = carry
-                return (moved > 1e-14) & (count < _STEPS)
-
-            def once(carry):
-                v, _, count = carry
-                value = f(v)
-                new = v - _shortened(f, v, value, shortest_solution(jax.jacfwd(f)(v), value))
-                return new, jnp.max(jnp.abs(new - v) / (1 + jnp.abs(v))), count + 1
-
-            return jax.lax.while_loop(moves, once, (start, jnp.ones((), start.dtype), 0))[0]
-
-        v = jax.lax.custom_root(off, jnp.zeros_like(p), find, shortest_preimage)
+        v = jax.lax.custom_root(off, jnp.zeros_like(p), newton, shortest_preimage)
         return nan_unless(jnp.max(jnp.abs(off(v))) <= jnp.finfo(p.dtype).eps ** 0.6 * (1 + jnp.max(jnp.abs(p))), v)
 
     def rates(self, q: Vector, p: Vector, t) -> tuple[Vector, Vector]:
         """(q̇, ṗ)."""
         v = self.velocity(q, p, t)
         return v, self.motion.generalized_force(q, v, t, self.numbers)
-
-
-# Halvings of a step that leads out of where L is defined, as beyond the velocity of light.
-_HALVINGS = 30
-
-
-def _shortened(f: Callable, v: Vector, value: Vector, step: Vector) -> Vector:
-    """A Newton step (n,), halved until f is finite and smaller, or no larger but for rounding."""
-    size = jnp.sum(value**2) * (1 + 1e-6)
-
-    def fails(carry):
-        step, count = carry
-        return ~(jnp.sum(f(v - step) ** 2) <= size) & (count < _HALVINGS)
-
-    return jax.lax.while_loop(fails, lambda carry: (0.5 * carry[0], carry[1] + 1), (step, 0))[0]

@@ -31,6 +31,40 @@ def shortest_preimage(linear: Callable[[Vector], Vector], right: Vector) -> Vect
     return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right)
 
 
+def newton(f: Callable[[Vector], Vector], start: Vector) -> Vector:
+    """x with f(x) = 0 that Newton's method reaches from `start` (n,), for `jax.lax.custom_root`; look at f(x).
+
+    A step is halved until f is finite and smaller, or no larger but for rounding.
+    """
+
+    def moves(carry):
+        _, moved, count = carry
+        return (moved > 1e-14) & (count < _STEPS)
+
+    def once(carry):
+        x, _, count = carry
+        value = f(x)
+        new = x - _shortened(f, x, value, shortest_solution(jax.jacfwd(f)(x), value))
+        return new, jnp.max(jnp.abs(new - x) / (1 + jnp.abs(x)), initial=0.0), count + 1
+
+    return jax.lax.while_loop(moves, once, (start, jnp.ones((), start.dtype), 0))[0]
+
+
+def _shortened(f: Callable, x: Vector, value: Vector, step: Vector) -> Vector:
+    size = jnp.sum(value**2) * (1 + 1e-6)
+
+    def fails(carry):
+        step, count = carry
+        return ~(jnp.sum(f(x - step) ** 2) <= size) & (count < _HALVINGS)
+
+    return jax.lax.while_loop(fails, lambda carry: (0.5 * carry[0], carry[1] + 1), (step, 0))[0]
+
+
+# Newton steps: one where f is linear, five to new coordinates of a state, ten to a velocity in relativity. Halvings of
+# one that leads out of where f is defined, as beyond the velocity of light.
+_STEPS, _HALVINGS = 50, 30
+
+
 def _scales(matrix: Matrix) -> tuple[Vector, Vector]:
     """Factors of the rows and of the columns that give each a largest entry of 1; 1 for those of zeros."""
     rows = _reciprocal(jnp.max(jnp.abs(matrix), axis=1))

@@ -53,6 +53,39 @@ class Orbit(NamedTuple):
     ok: jax.Array
     message: str | tuple[str, ...]
 
+    def __repr__(self) -> str:
+        """Three lines: what it holds, its period and multipliers, and how well it closes."""
+        return "\n".join(_lines(self))
+
+
+def _lines(orbit: Orbit) -> list[str]:
+    named = jax.tree_util.tree_leaves_with_path(orbit.q0)
+    batch = np.shape(orbit.period)
+    contents = ", ".join(f"q0{jax.tree_util.keystr(path)} {np.shape(leaf)}" for path, leaf in named[:_SHOWN])
+    more = f", … ({len(named) - _SHOWN} more)" if len(named) > _SHOWN else ""
+    first = f"Orbit{f' of {batch[0]} members' if batch else ''}: {contents}{more}, and qdot0"
+    if not all(isinstance(leaf, jax.Array | np.ndarray) for leaf in orbit[2:7]) or len(batch) > 1:
+        return [first]
+    ok, period = (np.atleast_1d(np.asarray(x)) for x in (orbit.ok, orbit.period))
+    sizes = np.abs(np.asarray(orbit.multipliers)).reshape(len(ok), -1).max(axis=1, initial=0.0)
+    if not batch:
+        verdict = f"closes to {float(orbit.closure):.2g}" if ok[0] else "no orbit"
+        stable = "stable" if orbit.stable else "not known to be stable" if orbit.message else "unstable"
+        told = f"{verdict}, {stable}" if ok[0] else verdict
+        text = f": {orbit.message}" if orbit.message else ""
+        return [first, f"period {period[0]:.9g}, largest |multiplier| {sizes[0]:.6g}", told + text]
+    if not ok.any():
+        return [first, "periods unknown", f"0 of {len(ok)} close: {orbit.message[0]}"]
+    closure, stable = np.asarray(orbit.closure), np.asarray(orbit.stable)
+    span = f"periods from {period[ok].min():.6g} to {period[ok].max():.6g}, |multipliers| up to {sizes[ok].max():.6g}"
+    told = f"{ok.sum()} of {len(ok)} close, to {np.median(closure[ok]):.2g} in the median, {stable.sum()} are stable"
+    if not ok.all():
+        told += f"; the first that does not is member {int(np.argmin(ok))}"
+    return [first, span, told]
+
+
+_SHOWN = 6  # leaves of q0, which may have any number of them
+
 
 def periodic_orbit(
     system: System,
@@ -106,7 +139,7 @@ def periodic_orbit(
     if periods.ndim == 0:
         if throw and not found.ok[0]:
             raise SimulationError(found.message[0], None)
-        found = Found._make(x[0] for x in found)
+        found = Found._make([*(x[0] for x in found[:6]), str(found.message[0])])
     q, qdot = map(layout.restore, halves(found.y))
     arrays = jax.tree.map(jnp.asarray, (q, qdot, *found[1:6]))
     return Orbit._make([*arrays, found.message])
