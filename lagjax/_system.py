@@ -325,18 +325,31 @@ class System(eqx.Module):
     def _check_outputs(self, layout: Layout, params: PyTree) -> None:
         """Trace each function once, on shapes alone, and say what is wrong with what it returns."""
 
-        def returned(function):
+        def returned(function, role):
             state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
             numbers, code = eqx.partition(params, eqx.is_array_like)
-            return jax.eval_shape(lambda q, t, p: function(q, q, t=t, params=eqx.combine(p, code)), state, t, numbers)
+            try:
+                return jax.eval_shape(
+                    lambda q, t, p: function(q, q, t=t, params=eqx.combine(p, code)), state, t, numbers
+                )
+            except (TypeError, KeyError, IndexError, AttributeError) as error:
+                error.add_note(_structure_of(role, state))
+                raise
 
         for function, role in ((self.lagrangian, "lagrangian"), (self.dissipation, "dissipation")):
             if function is not None:
-                _require_scalar(returned(function), role)
+                _require_scalar(returned(function, role), role)
         if self.forces is not None:
-            _require_structure(returned(self.forces), layout)
+            _require_structure(returned(self.forces, "forces"), layout)
         if self.constraints is not None or self.velocity_constraints is not None:
             _require_constraints(self.constraint_structure(layout, params), layout)
+
+
+def _structure_of(role: str, state: PyTree) -> str:
+    """What a function that fails was called with: a dict, where it expects a number, speaks of neither."""
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    shown = ", ".join(f"q{jax.tree_util.keystr(path)} of shape {leaf.shape}" for path, leaf in leaves[:8])
+    return f"{role} was called with {shown}. Give q, qdot and params the structure that it reads."
 
 
 def require_system(system: Any) -> None:
