@@ -130,6 +130,20 @@ def test_the_figure_of_eight():
     np.testing.assert_array_equal(orbit.multipliers[4:], 1.0)  # of time, two shifts with their boosts, and turns
 
 
+def test_the_innermost_stable_circle():
+    # About V = −1/(r − 2) circles have E = −1/(r − 2) + r/(2 (r − 2)²), least at r = 6, within which none is stable.
+    hole = lagjax.System(lambda q, v: 0.5 * v @ v + 1 / (jnp.sqrt(q @ q) - 2))
+    radius, speed = 6.1, np.sqrt(6.1) / 4.1
+    circle = lagjax.periodic_orbit(hole, np.array([radius, 0.0]), np.array([0.0, speed]), 2 * np.pi * radius / speed)
+    circles = lagjax.family(hole, circle, until=-0.1, step=2.0, count=7)
+    r = np.linalg.norm(circles.q0, axis=1)
+    np.testing.assert_allclose(circles.energy, -1 / (r - 2) + r / (2 * (r - 2) ** 2), atol=1e-12)
+    assert np.min(circles.energy) > -1 / 16
+    (fold,) = np.flatnonzero(circles.fold)
+    assert r[fold - 1] > 6 > r[fold]
+    np.testing.assert_array_equal(circles.stable, r > 6)
+
+
 def test_a_family_of_swings():
     # Every swing of a pendulum up to the separatrix at E = 1, each with its period in closed form.
     begin = lagjax.periodic_orbit(PENDULUM, 0.5, 0.0, 6.4)

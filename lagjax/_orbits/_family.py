@@ -123,11 +123,15 @@ def _place(params: PyTree, name: str) -> int:
 
 
 class _Point(NamedTuple):
-    """An orbit of a family: its chain (of one member), the numbers of the scene, and its tangent (2n + F,)."""
+    """An orbit of a family: its chain (of one member), the numbers of the scene, and derivatives by one of them.
+
+    `rate` is that of its value along the family; zero where the family ends.
+    """
 
     chain: Chain
     numbers: np.ndarray
     by_number: np.ndarray
+    rate: float = 0.0
 
 
 class _Follower:
@@ -190,6 +194,13 @@ class _Follower:
             numbers[self.place] += first[-1]
         return self.point(point.chain.y + dy, period, point.chain.parts, numbers)
 
+    def along(self, point: _Point, tangent: np.ndarray) -> _Point:
+        """The same with the rate of its value along a tangent (2n + F,)."""
+        if self.place is not None:
+            return point._replace(rate=float(tangent[-1]))
+        slope = self.arcs.energy_slope(0.0, point.chain.y[:, 0])[0]
+        return point._replace(rate=float(slope @ tangent[: len(slope)]))
+
     def value(self, point: _Point) -> float:
         """The energy, or the parameter."""
         if self.place is not None:
@@ -224,6 +235,7 @@ def _followed(follower: _Follower, y0, period, until, step: float, count: int) -
     rising = follower.value(follower.moved(points[0], 1e-4 * step * tangent, 0.0)) > follower.value(points[0])
     wanted = until is None or until > follower.value(points[0])
     tangent = tangent if rising == wanted else -tangent
+    points[0] = follower.along(points[0], tangent)
     while len(points) < count:
         point, trials = _corrected(follower, follower.moved(points[-1], step * tangent, 0.0), tangent)
         if point is None or _shooting.stopped(point.chain)[0]:
@@ -236,6 +248,7 @@ def _followed(follower: _Follower, y0, period, until, step: float, count: int) -
         if following is None:
             return points, "The family ends where its orbits lose the direction in which they had neighbours."
         tangent = following * np.sign(following @ tangent)
+        points[-1] = follower.along(point, tangent)
         step *= 1.5 if trials <= _QUICK else 0.7
         if until is not None and (follower.value(point) > until) == wanted:
             return points, f"The family was followed until {follower.value(point):.6g}, beyond {until:.6g}."
@@ -258,8 +271,8 @@ def _told(follower: _Follower, points: list[_Point], message: str) -> Family:
     multipliers = np.concatenate([one.multipliers for one in found])
     value = np.array([follower.value(point) for point in points])
     energy = [follower.arcs.with_numbers(point.numbers).energy(0.0, point.chain.y[:, 0])[0] for point in points]
-    fold = np.zeros(len(value), bool)
-    fold[2:] = np.diff(value)[1:] * np.diff(value)[:-1] < 0
+    rate = np.array([point.rate for point in points])
+    fold = np.append(False, rate[1:] * rate[:-1] < 0)
     through = [_passed(multipliers, sign) for sign in (1, -1)]
     q, qdot = map(follower.arcs.layout.restore, halves(np.concatenate([one.y for one in found])))
     period, closure, stable = (
