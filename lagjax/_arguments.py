@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 
 _BY_POSITION = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 _SHOWN = 40  # characters of a parameter, default and annotation included
@@ -53,12 +54,45 @@ class Function(eqx.Module):
         try:
             return function(*roles, **{name: extras[name] for name in self.extras})
         except (AttributeError, TypeError) as reason:
+            if isinstance(reason, _NO_VALUES):
+                _note(reason, self.name, _USE_JAX)
+                raise
             if "params" in self.extras and extras["params"] is None:
                 raise TypeError(
                     f"{self.name} asks for `params`, and none were given ({reason}): pass params in the structure that "
                     "it reads."
                 ) from reason
             raise
+        except KeyError as reason:
+            _note(reason, self.name, _keys_of(roles, extras))
+            raise
+
+
+# Errors of JAX where a function asks a traced number for its value; they are TypeErrors.
+_NO_VALUES = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
+_USE_JAX = (
+    "its arguments have no values while it is differentiated: write jnp.cos(q) for math.cos(q) or numpy.cos(q), "
+    "jnp.where(q > 0, a, b) for `if q > 0`, and no float(q)."
+)
+
+
+_OF_A_SCENE = "a function of a scene"
+
+
+def _keys_of(roles: tuple, extras: dict[str, Any]) -> str:
+    """The keys that its arguments have, where those are dicts."""
+    first = {"q": roles[0]} if roles else {}
+    dicts = {name: value for name, value in (first | extras).items() if isinstance(value, dict)}
+    if not dicts:
+        return "it reads a key that is not there."
+    keys = "; ".join(f"{name} has {', '.join(map(repr, list(value)[:12]))}" for name, value in dicts.items())
+    return f"it reads a key that is not there: {keys}."
+
+
+def _note(error: Exception, name: str, text: str) -> None:
+    """Say beneath an error of Python or JAX which function of the scene it came from, and what that means."""
+    if not any(_OF_A_SCENE in note for note in getattr(error, "__notes__", ())):
+        error.add_note(f"This is {name}, {_OF_A_SCENE}: {text}")
 
 
 def accept(

@@ -1,0 +1,29 @@
+"""What a newcomer's mistakes in a scene's functions say: the error of Python or JAX, and beneath it what to write."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+
+def test_a_key_that_is_not_there_is_told_with_those_that_are():
+    def pendulum(q, qdot, params):
+        return 0.5 * qdot["theta"] ** 2 + params["g"] * jnp.cos(q["theta"])
+
+    with pytest.raises(KeyError) as error:
+        lagjax.simulate(lagjax.System(pendulum), {"theta": 1.0}, {"theta": 0.0}, jnp.arange(3.0), {"G": 9.81})
+    note = error.value.__notes__[0]
+    assert note == (
+        "This is pendulum, a function of a scene: it reads a key that is not there: q has 'theta'; params has 'G'."
+    )
+
+
+@pytest.mark.parametrize("height", [lambda q: math.cos(q), lambda q: np.cos(q), lambda q: q if q > 0 else 0.0])
+def test_functions_that_ask_for_values_are_told_what_to_write(height):
+    with pytest.raises(TypeError) as error:
+        lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v**2 - height(q)), 1.0, 0.0, jnp.arange(3.0))
+    note = error.value.__notes__[0]
+    assert "write jnp.cos(q) for math.cos(q)" in note and "jnp.where(q > 0, a, b) for `if q > 0`" in note
