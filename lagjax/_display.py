@@ -63,7 +63,9 @@ def _contents(trajectory) -> str:
         named[LEAVES_SHOWN - 1 :] = [f"… ({len(named) - LEAVES_SHOWN + 1} more)"]
     members = f" of {' × '.join(map(str, batch))} members" if batch else ""
     modes = f"; modes {', '.join(trajectory.mode_names)}" if trajectory.mode_names else ""
-    return f"Trajectory{members}, {trajectory.ts.dtype}: {', '.join(named)}, and qdot{modes}"
+    off = trajectory.ts.dtype == np.float32 and not jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    dtype = "float32, as jax_enable_x64 is off" if off else trajectory.ts.dtype
+    return f"Trajectory{members}, {dtype}: {', '.join(named)}, and qdot{modes}"
 
 
 def _span(trajectory) -> str:

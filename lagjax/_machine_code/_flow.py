@@ -8,6 +8,7 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from lagjax import _native
@@ -52,7 +53,9 @@ class Tolerances(NamedTuple):
 def unfit(program: Program, size: int, dtype) -> str | None:
     """Why there is no machine code for a scene, as the end of a sentence; None where there is."""
     if dtype != np.float64:
-        return f"the coordinates are {np.dtype(dtype).name}, not float64"
+        is_on = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+        more = "" if is_on else " (jax.config.update('jax_enable_x64', True) first makes them that)"
+        return f"the coordinates are {np.dtype(dtype).name}, not float64{more}"
     if program.operations > LARGEST_PROGRAM:
         return (
             f"its acceleration takes {program.operations} operations, more than the {LARGEST_PROGRAM} whose kernel and "
