@@ -325,7 +325,7 @@ def differences(robot: Robot, theirs: Pinocchio, draws: int = 20) -> dict[str, f
 
 
 def beside_pinocchio(robot: Robot, theirs: Pinocchio, trajectories, starts, duration: float, spent: float):
-    """Prints what one of pinocchio's motions costs through SciPy, beside one of the batch; both at rtol = 1e-9."""
+    """Prints what a motion costs by pinocchio and SciPy on one core, beside one of the batch; both at rtol = 1e-9."""
     from scipy.integrate import solve_ivp
 
     n, few = len(robot.moving), range(4)
@@ -347,7 +347,7 @@ def beside_pinocchio(robot: Robot, theirs: Pinocchio, trajectories, starts, dura
     calls = np.mean([run.nfev for run in runs])
     apart = max(np.abs(run.y[:n, -1] - trajectories.q[i, -1]).max() for i, run in zip(few, runs, strict=True))
     print(
-        f"pinocchio in SciPy's DOP853: {each * 1e3:.1f} ms a motion, {each / spent:.0f} times ours, {apart:.0e} apart"
+        f"pinocchio in SciPy's DOP853, one core: {each * 1e3:.1f} ms a motion, {each / spent:.0f} times ours, {apart:.0e} apart"
     )
     print(f"  its {calls:.0f} accelerations alone, {aba * 1e6:.1f} µs each: {calls * aba / spent:.1f} times our motion")
 
@@ -385,7 +385,7 @@ def main(argv=None):
     jax.block_until_ready(fall().q)
     spent = (time.perf_counter() - began) / options.members
     print(batch)
-    print(f"{spent * 1e6:.0f} µs each")
+    print(f"{spent * 1e6:.0f} µs each, by all cores together")
     if theirs:
         beside_pinocchio(robot, theirs, batch, starts, options.duration, spent)
 
