@@ -347,7 +347,7 @@ def beside_pinocchio(robot: Robot, theirs: Pinocchio, trajectories, starts, dura
     calls = np.mean([run.nfev for run in runs])
     apart = max(np.abs(run.y[:n, -1] - trajectories.q[i, -1]).max() for i, run in zip(few, runs, strict=True))
     print(
-        f"pinocchio in SciPy's DOP853, one core: {each * 1e3:.1f} ms a motion, {each / spent:.0f} times ours, {apart:.0e} apart"
+        f"pinocchio in SciPy's DOP853, one core: {each * 1e3:.1f} ms, {each / spent:.0f} times ours, {apart:.0e} apart"
     )
     print(f"  its {calls:.0f} accelerations alone, {aba * 1e6:.1f} µs each: {calls * aba / spent:.1f} times our motion")
 
