@@ -144,6 +144,25 @@ def test_the_innermost_stable_circle():
     np.testing.assert_array_equal(circles.stable, r > 6)
 
 
+@pytest.mark.slow
+def test_the_figure_of_eight_in_32_digits():
+    pytest.importorskip("numba", reason="the benchmark's double-doubles are compiled by numba")
+    from benchmarks._orbits_extended import ends
+    from benchmarks._orbits_refined import refined
+
+    v, place, shape = np.array([[0.3471168881, 0.5327249454]]), np.array([[-1.0, 0, 1, 0]]), np.tile(np.eye(2), (2, 1))
+    orbit = refined(place, shape[None], v, np.array([6.3259139829]), np.ones(1))
+    assert orbit.closure[0] < 1e-22 and orbit.step[0] < 1e-17
+    # And backwards: (place, 3 v, 3 v) relative to the body in the middle.
+    start = np.zeros((1, 2, 8))
+    start[0, 0, :4], start[0, :, 4:] = place[0], np.tile(orbit.w[0], 2)
+    there = ends(start, orbit.period / 2, np.ones(1))
+    there[..., 4:] *= -1
+    back = ends(there, orbit.period / 2, np.ones(1))
+    back[..., 4:] *= -1
+    np.testing.assert_allclose((back - start).sum(axis=1), 0.0, atol=1e-24)
+
+
 def test_a_family_of_swings():
     # Every swing of a pendulum up to the separatrix at E = 1, each with its period in closed form.
     begin = lagjax.periodic_orbit(PENDULUM, 0.5, 0.0, 6.4)
