@@ -372,7 +372,7 @@ def _ffmpeg() -> str | None:
     if program := shutil.which("ffmpeg"):
         return program
     try:
-        from imageio_ffmpeg import get_ffmpeg_exe
+        from imageio_ffmpeg import get_ffmpeg_exe  # pyright: ignore[reportMissingImports]
 
         return get_ffmpeg_exe()
     except Exception:  # neither is there

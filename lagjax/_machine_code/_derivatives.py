@@ -78,11 +78,14 @@ def _jvp_over_steps(
 
     for steps, rows, members in _steps_of(flow, ts, y0, params, accepted, ticket, tolerances):
         excess = along(steps, rows, members)
-        for k in np.flatnonzero(excess > 1.0).tolist():
+
+        def divide(k: int, steps=steps, rows=rows, members=members, excess=excess):
             row = rows[k : k + 1]
             again = functools.partial(along, rows=row, members=np.zeros(1, int))
             if _over_divided(flow, steps, members[k], params[row[0]], tolerances, excess[k : k + 1], again) is None:
                 path_dot[row], y_dot[row] = np.nan, np.nan
+
+        _native.each_of(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
     at_start = np.broadcast_to((ts == ts[:, :1])[:, None], path_dot.shape[:3])  # also where there was no step
     return np.where(at_start[..., None], dy0[:, :, None], path_dot), y_dot
 
@@ -147,12 +150,15 @@ def _vjp_over_steps(
             continue
         probe = functools.partial(_probed, flow, ts, params, tolerances)
         excess = probe(steps, rows[long], members[long])
-        for k in np.flatnonzero(excess > 1.0).tolist():
+
+        def divide(k: int, steps=steps, rows=rows, members=members, long=long, excess=excess, probe=probe):
+            again = functools.partial(probe, rows=rows[long[k : k + 1]], members=np.zeros(1, int))
+            number = params[rows[long[k]]]
+            return _over_divided(flow, steps, int(members[long[k]]), number, tolerances, excess[k : k + 1], again)
+
+        again = np.flatnonzero(excess > 1.0)
+        for k, better in zip(again, _native.each_of(again.tolist(), divide, _native.cores()), strict=True):
             row = rows[long[k : k + 1]]
-            again = functools.partial(probe, rows=row, members=np.zeros(1, int))
-            better = _over_divided(
-                flow, steps, int(members[long[k]]), params[row[0]], tolerances, excess[k : k + 1], again
-            )  # fmt: skip
             if better is None:
                 y_ct[row], params_ct[row] = np.nan, np.nan
             else:

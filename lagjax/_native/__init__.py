@@ -42,9 +42,10 @@ from lagjax._native._ir import lanes
 from lagjax._native._kernel import Begun, Kernel, Outcome, Projection, cores, order_for, pieces_of, recurrences
 from lagjax._native._series import is_large
 from lagjax._native._sweep import SweepPlan, sweep_handler
+from lagjax._native._threads import each_of
 
 __all__ = [
     "DISCONTINUOUS", "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "STEP_TOO_SMALL",
-    "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "SweepPlan", "cores", "handler", "is_large", "lanes",
-    "order_for", "pieces_of", "recurrences", "sweep_handler", "unavailable", "watched",
+    "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "SweepPlan", "cores", "each_of", "handler",
+    "is_large", "lanes", "order_for", "pieces_of", "recurrences", "sweep_handler", "unavailable", "watched",
 ]  # fmt: skip

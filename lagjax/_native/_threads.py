@@ -12,8 +12,10 @@ import _thread
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
+_outer = threading.local()  # `stopped` of the work that a helper does: whatever it runs by itself ends with that
 SLICE = 0.03  # seconds, more or less: a tenth of what a hand at the keyboard notices, a thousand times what it costs
 
 
@@ -40,10 +42,11 @@ def together(work: Callable[[Callable[[], bool]], int], count: int) -> int:
     hang on `work`, so that no thread outlives it.
     """
     if count == 1:  # nobody else is to be told, or waited for
-        return work(lambda: False)
+        return work(getattr(_outer, "stopped", lambda: False))
     stop, ended, signal = threading.Event(), [], queue.SimpleQueue()
 
     def help_out():
+        _outer.stopped = stop.is_set
         try:
             ended.append(work(stop.is_set))
         except BaseException as failure:
@@ -70,6 +73,25 @@ def together(work: Callable[[Callable[[], bool]], int], count: int) -> int:
             raise result
         total += result
     return total
+
+
+def each_of(places: Sequence, work: Callable[[Any], Any], count: int) -> list:
+    """What `work(place)` returns for all places, which `count` threads take one after the other.
+
+    The first is done before the others begin: it compiles what all of them need.
+    """
+    results = [work(place) for place in places[:1]] + [None] * (len(places) - 1)
+    left = iter(range(1, len(places)))  # one thread at a time is told the next
+
+    def go(stopped) -> int:
+        for k in left:
+            if stopped():
+                break
+            results[k] = work(places[k])
+        return 0
+
+    together(go, max(1, min(count, len(places) - 1)))
+    return results
 
 
 def _wait(helpers: int, ended: list, signal: queue.SimpleQueue, stop: threading.Event) -> None:
