@@ -37,7 +37,7 @@ def jvp(flow: Flow, ts, y0, params, solution, dy0, dparams, tolerances: Toleranc
     members, m = dy0.shape[:2]
     if flow.projection is not None:
         dy0 = _projected_start(flow.projection, ts[:, :1], y0, params, dy0, dparams)
-    groups = max(1, min(_native.cores() // members, math.ceil(m / _native.lanes())))  # of directions: one a thread
+    groups = _groups_of_directions(members, m)
     directions = math.ceil(m / groups)
     padding = ((0, 0), (0, groups * directions - m), (0, 0))
     dy0, dparams = (np.pad(x, padding).reshape(members * groups, directions, -1) for x in (dy0, dparams))
@@ -59,6 +59,22 @@ def jvp(flow: Flow, ts, y0, params, solution, dy0, dparams, tolerances: Toleranc
     path_dot[~np.broadcast_to(np.isfinite(path)[:, None], path_dot.shape)] = np.nan
     y_dot[result != SUCCESSFUL] = np.nan
     return path_dot, y_dot
+
+
+def _groups_of_directions(members: int, m: int) -> int:
+    """Into how many rows the m directions of each member go.
+
+    Of one member alone, one row a thread. Of more members than lanes, two where fewer lanes then stand empty: twenty
+    members fill three vectors of eight badly, forty rows fill five. A row costs its directions and the motion itself.
+    """
+    lanes = _native.lanes()
+    if members < lanes:
+        return max(1, min(_native.cores() // members, math.ceil(m / lanes)))
+
+    def work(groups: int) -> int:
+        return math.ceil(groups * members / lanes) * (1 + math.ceil(m / groups))
+
+    return 2 if work(2) < work(1) else 1
 
 
 def _jvp_over_steps(
