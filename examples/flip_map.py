@@ -63,7 +63,7 @@ def main(argv=None):
     sweep = swept(options.side, options.duration, options.out / "flips.zarr")
     print(sweep)
     picture = options.out / "flip_map.png"
-    draw(sweep.open()).savefig(picture, dpi=150)
+    draw(sweep.open()).savefig(picture, dpi=150, bbox_inches="tight")
     return [picture]
 
 
