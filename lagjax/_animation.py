@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function, accept
@@ -29,6 +30,7 @@ FRAMES = 20_000  # of which a film has fewer
 TRAIL = 2.0  # seconds of the film over which a trace fades
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _VIDEO, _PAGE = (".mp4", ".m4v", ".mov", ".webm"), (".html", ".htm")
+_LARGEST = 2000.0  # megabytes of a page, more than `FRAMES` make
 _SIZE, _DPI = 4.8, 100  # inches of a side, and dots in one
 
 
@@ -44,7 +46,10 @@ class Course(NamedTuple):
     after: np.ndarray
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """q (F, n) at some times; NaN beyond the ends."""
+        """q (F, n) at some times; NaN beyond the ends, but for what a float32 rounds away."""
+        low, high = sorted((self.t[0], self.t[-1]))
+        slack = 1e-6 * (high - low)
+        inside = (times >= low - slack) & (times <= high + slack)
         sign = np.sign(self.t[-1] - self.t[0])
         place = np.clip(np.searchsorted(sign * self.t, sign * times, side="left") - 1, 0, len(self.t) - 2)
         h = (self.t[place + 1] - self.t[place])[:, None]
@@ -54,8 +59,8 @@ class Course(NamedTuple):
             begin = h * self.after[place]
             begin = np.where(np.isnan(begin), 2 * (b - a) - end, begin)
             rise = b - a
-            inside = a + x * (begin + x * (3 * rise - 2 * begin - end + x * (begin + end - 2 * rise)))
-            return np.where(x == 1, b, inside)
+            between = a + x * (begin + x * (3 * rise - 2 * begin - end + x * (begin + end - 2 * rise)))
+            return np.where(inside[:, None], np.where(x == 1, b, between), np.nan)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -102,7 +107,7 @@ class Animation:
         """
         suffix = Path(path).suffix.lower()
         if suffix == ".gif":
-            fps = 100 / max(1, round(100 / self.fps))
+            fps = 100 / max(2, round(100 / self.fps))  # browsers show frames of a hundredth for ten of them
             matplotlib = _matplotlib()
             self._film(fps).save(path, writer=matplotlib.animation.PillowWriter(fps=fps * (1 - 1e-9)), dpi=_DPI)
         elif suffix in _VIDEO:
@@ -129,10 +134,12 @@ class Animation:
         """The film as HTML: a video where ffmpeg is there, else pictures and a few lines of JavaScript."""
         matplotlib, program = _matplotlib(), _ffmpeg()
         film = self._film(self.fps)
-        if program is None:
-            return film.to_jshtml(fps=self.fps)
-        with matplotlib.rc_context({"animation.ffmpeg_path": program, "savefig.dpi": _DPI}):
-            return film.to_html5_video()
+        # Beyond its limit matplotlib leaves frames out, or the whole video.
+        with matplotlib.rc_context({"animation.embed_limit": _LARGEST, "savefig.dpi": _DPI}):
+            if program is None:
+                return film.to_jshtml(fps=self.fps)
+            with matplotlib.rc_context({"animation.ffmpeg_path": program}):
+                return film.to_html5_video()
 
     def _film(self, fps: float):
         """matplotlib's own animation, on a figure of its own."""
@@ -162,6 +169,8 @@ def animated(trajectory, points: Callable, trace, speed: float, fps: float) -> A
         raise ValueError("None of the members was followed to any output: there is nothing to show.")
     begin = courses[0].t[0]
     end = float(known[np.argmax(np.abs(known - begin))])
+    if end == begin:
+        raise ValueError("The motion ended before its second output: there is nothing to show. Give closer ts.")
     seconds = abs(end - begin) / speed
     if not 2 <= seconds * fps + 1 <= FRAMES:
         raise ValueError(
@@ -225,7 +234,7 @@ def _course(trajectory, members: Members, k: int) -> Course:
 
 def _positions(function: Function, members: Members, k: int, q: np.ndarray, times: np.ndarray) -> dict[str, np.ndarray]:
     """The points (frames, number, 2 or 3) of a member at its states q (frames, n), by name."""
-    numbers = np.array([x if np.ndim(x) == 0 else x[k] for x in members.numbers], members.layout.dtype)
+    numbers = np.array([x if np.ndim(x) == 0 else x[k] for x in members.numbers])
     params = with_numbers(members.params, numbers)
     states = members.layout.restore(q.astype(members.layout.dtype))
     drawn = _at_states(function, states, times.astype(members.layout.dtype), params)
@@ -235,7 +244,13 @@ def _positions(function: Function, members: Members, k: int, q: np.ndarray, time
 
 @eqx.filter_jit
 def _at_states(function: Function, states, times, params):
-    return jax.vmap(lambda q, t: function(q, t=t, params=params))(states, times)
+    def drawn(q, t):
+        points = function(q, t=t, params=params)
+        if isinstance(points, dict):
+            return {name: jnp.asarray(value) for name, value in points.items()}
+        return jnp.asarray(points)
+
+    return jax.vmap(drawn)(states, times)
 
 
 def as_points(name, value: np.ndarray, frames: int) -> np.ndarray:
@@ -329,6 +344,8 @@ def _limits(positions) -> tuple[np.ndarray, np.ndarray]:
     """The box of all points at all times, a twentieth wider, and no side less than a tenth of the longest."""
     every = np.concatenate([array.reshape(-1, array.shape[-1]) for array in positions.values()])
     every = every[np.isfinite(every).all(axis=1)]
+    if not len(every):
+        raise ValueError("points returns no finite position at any time: there is nothing to show.")
     middle, half = (every.max(0) + every.min(0)) / 2, (every.max(0) - every.min(0)) / 2
     half = np.maximum(1.05 * half, 0.1 * (half.max() or 1.0))
     return middle - half, middle + half

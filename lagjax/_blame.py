@@ -41,8 +41,11 @@ def offenders(function: Callable, *arguments, derivatives: bool = True) -> list[
 
     def visit(equation, operands, moves, results, place):
         chosen = [i for i, x in enumerate(operands) if moves[i] and _floating(x)]
-        # A NaN that is written into the function counts where it is taken, as in where(t > 1, nan, force).
         if not all(_finite(x) for x, moved in zip(operands, moves, strict=True) if moved):
+            return
+        # A NaN that is written into the function counts where it is taken, as in where(t > 1, nan, force). An infinity
+        # does not: where(mask, q, -inf) is meant.
+        if not all(map(_finite, operands)) and not any(_floating(x) and np.isnan(x).any() for x in results):
             return
         name = _name(equation)
         if not all(_finite(x) for x in results):
@@ -72,6 +75,8 @@ def poles(function: Callable, *arguments) -> list[Offender]:
             return
         _, second = _derivatives(equation, operands, chosen)
         large = [np.where(np.abs(x) > _AT_A_POLE, np.inf, 0.0) for x in map(np.asarray, second)]
+        if equation.primitive.name in _POWERS:  # x⁴ is as curved at 1e13, where there is no pole
+            large = [np.where(np.abs(operands[i]) < 1, x, 0.0) for i, x in zip(chosen, large, strict=True)]
         if not all(map(_finite, large)):
             collected.append(Offender(_name(equation), _operands(operands, large), place, "second derivative"))
 
@@ -80,6 +85,7 @@ def poles(function: Callable, *arguments) -> list[Offender]:
 
 
 _AT_A_POLE = 1e14
+_POWERS = ("pow", "integer_pow")
 _WITH_POLES = frozenset(("div", "sqrt", "rsqrt", "cbrt", "pow", "integer_pow", "log", "log1p", "tan", "atan2", "acos"))
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lagjax._blame import Offender, offenders, pieces_of, poles
@@ -34,6 +35,7 @@ LONGEST = 4000  # equations of a function up to which they are gone through one 
 # A motion that runs away does so on a time scale |q̇|/|q̈| (or |q|/|q̇|) that has shrunk to less than this part of the
 # whole: steps have shrunk to 1e-15 of it when they are given up, and smooth motions are followed to 1e-5 in the budget.
 RUNAWAY = 1e-8
+RUNAWAY_SINGLE = 3e-6  # of float32, whose steps are given up at 5e-7 of the whole
 SINGULAR = 1e-9  # the part of its first value to which an eigenvalue of M has come down where M is called singular
 ESCAPED = 1e3  # times its largest coordinate at the start: a motion to infinity
 
@@ -41,6 +43,12 @@ _CODES = {
     code_of(getattr(RESULTS, name)): name
     for name in ("nonfinite_state", "dt_min_reached", "max_steps_reached", "acceleration_discontinuous")
 }
+
+
+_OVERSTEPPED = (
+    "The state itself is not finite, from the first output on that is NaN: a step of a fixed length does not stop "
+    "where the motion does. Leave dt out, and the message says what it runs into."
+)
 
 
 class Ended(NamedTuple):
@@ -71,14 +79,22 @@ class Undefined(NamedTuple):
 
 def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
     """What is known about a failure, as sentences on a line of their own that begins with a line break; or nothing."""
-    if ended.code not in _CODES:
-        return ""
+    try:
+        return _diagnosed(system, layout, params, ended) if ended.code in _CODES else ""
+    except Exception as error:  # the message of the failure itself must come out
+        return f"\n(No more is known about it: {type(error).__name__}.)"
+
+
+def _diagnosed(system: System, layout: Layout, params, ended: Ended) -> str:
     derivation = derivation_of(system, layout, params)
     state = layout.restore(ended.y[: layout.size]), layout.restore(ended.y[layout.size :])
-    bad = not_finite(params, "params") + not_finite(state[0], "q0") + not_finite(state[1], "qdot0")
+    first = layout.restore(ended.y_first[: layout.size]), layout.restore(ended.y_first[layout.size :])
+    bad = not_finite(params, "params") + not_finite(first[0], "q0") + not_finite(first[1], "qdot0")
     if bad:
         where, value = bad[0]
         return f"\n{where} is {value}: every number must be finite."
+    if not np.isfinite(ended.y).all():
+        return f"\n{_OVERSTEPPED}"
     undefined = _undefined(derivation, ended) or _undefined_by_jax(derivation, params, ended)
     if undefined is not None:
         return f"\n{_told(undefined)}{_line(derivation, params, undefined)}."
@@ -95,6 +111,8 @@ def numerical(derivation: Derivation, ended: Ended) -> str:
         return ""
     if not np.isfinite(ended.numbers).all():
         return "\nA number in params is not finite there."
+    if not np.isfinite(ended.y).all():
+        return f"\n{_OVERSTEPPED}"
     if (undefined := _undefined(derivation, ended)) is not None:
         return f"\n{_told(undefined)}. Outside of jax.jit the message names the line."
     if text := _singular_mass(derivation, ended):
@@ -142,12 +160,14 @@ def _undefined_by_jax(derivation: Derivation, params, ended: Ended) -> Undefined
     """The same for a scene without programs, of which only forces and the gradient of L are looked at."""
     if _has_programs(derivation) or derivation.layout.size > LARGEST:
         return None
-    motion, numbers = derivation.motion, eqx.filter(params, eqx.is_array_like)
+    motion, numbers = derivation.motion, jax.tree.map(jnp.asarray, eqx.filter(params, eqx.is_array_like))
     slope = jax.grad(motion.lagrangian)
     functions: dict[str, Callable | None] = {"given_force": motion.forces, "lagrangian_by_q": slope}
     states, times = _ahead(ended, np.concatenate([halves(ended.y)[1], np.zeros(derivation.layout.size)]))
     values = {
-        name: np.stack([function(*halves(y), t, numbers) for y, t in zip(states, times, strict=True)])
+        name: np.stack(
+            [function(*halves(jnp.asarray(y)), jnp.asarray(t), numbers) for y, t in zip(states, times, strict=True)]
+        )
         for name, function in functions.items()
         if function is not None and _is_short(function, (*halves(ended.y), ended.t, numbers))
     }
@@ -265,7 +285,8 @@ def _running_away(derivation: Derivation, ended: Ended) -> int | None:
         return None
     fastest = int(np.argmax(acceleration))
     scale = velocity[fastest] / acceleration[fastest]
-    return fastest if scale < RUNAWAY * abs(ended.t_last - ended.t_first) and velocity[fastest] > 0 else None
+    part = RUNAWAY if derivation.layout.dtype == np.float64 else RUNAWAY_SINGLE
+    return fastest if scale < part * abs(ended.t_last - ended.t_first) and velocity[fastest] > 0 else None
 
 
 def _escape(derivation: Derivation, ended: Ended, place: int, pole: Offender | None) -> str:
@@ -388,5 +409,8 @@ def with_numbers(params, numbers: np.ndarray):
     if not leaves:
         return params
     ends = np.cumsum([np.size(leaf) for leaf in leaves])[:-1]
-    parts = [part.reshape(np.shape(leaf)) for part, leaf in zip(np.split(numbers, ends), leaves, strict=True)]
+    parts = [
+        part.reshape(np.shape(leaf)).astype(np.result_type(leaf))
+        for part, leaf in zip(np.split(numbers, ends), leaves, strict=True)
+    ]
     return eqx.combine(jax.tree.unflatten(structure, parts), rest)

@@ -131,7 +131,7 @@ def _units(tree: PyTree, units: PyTree, time_unit: str | None) -> tuple[list, li
     if wrong := [unit for unit in of_q if not (unit is None or isinstance(unit, str))]:
         raise TypeError(f"A unit must be text, as 'rad' is, or None; got {wrong[0]!r}.")
     per_time = "" if time_unit is None else time_unit
-    of_qdot = [f"{unit}/{per_time}" if unit is not None and per_time else None for unit in of_q]
+    of_qdot = [f"{unit or 1}/{per_time}" if unit is not None and per_time else None for unit in of_q]
     return of_q, of_qdot
 
 

@@ -94,13 +94,15 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, ax=None)
     return _legend(ax)
 
 
-def _places(layout: Layout, coordinates: tuple[str, ...]) -> list[int]:
-    """The places of coordinates by their names; the first ones, as many as there are colours, where none is named."""
+def _places(layout: Layout, coordinates: tuple[str, ...], most: int = len(COLORS)) -> list[int]:
+    """The places of coordinates by their names; the first ones, at `most`, where none is named."""
     if not coordinates:
-        return list(range(min(layout.size, len(COLORS))))
+        return list(range(min(layout.size, most)))
     if unknown := [name for name in coordinates if name not in layout.names]:
         raise ValueError(f"There is no coordinate {unknown[0]!r}; there are {listed(layout.names)}.")
-    return [layout.names.index(name) for name in coordinates][: len(COLORS)]
+    if len(coordinates) > most:
+        raise ValueError(f"At most {most} coordinates are drawn at once; got {len(coordinates)}.")
+    return [layout.names.index(name) for name in coordinates]
 
 
 def compare(one: Trajectory, other, *coordinates: str, figure=None):
@@ -116,7 +118,7 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
     """
     layout, course = course_of(one)
     ts, values, style = _other(other, layout)
-    places = _places(layout, coordinates)[:4]
+    places = _places(layout, coordinates, most=4)
     matplotlib = _matplotlib()
     if figure is None:
         figure = matplotlib.pyplot.figure(figsize=(max(6.4, 3.6 * len(places)), 4.6), layout="constrained")

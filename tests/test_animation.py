@@ -116,3 +116,19 @@ def test_mistakes_are_sentences(run):
         run.animate(lambda q, v: jnp.zeros(2))
     with pytest.raises(ValueError, match="outside of jit"):
         jax.jit(lambda x: lagjax.simulate(SPRING, {"x": x}, {"x": 0.0}, TS, 1.0).animate(stick).fps)(1.0)
+
+
+def test_beyond_the_outputs_nothing_is_known(run):
+    _, course = _animation.course_of(run)
+    at = course.at(np.array([-3.0, 0.0, 6.0, 8.0]))
+    assert np.isnan(at[[0, 3]]).all()
+    np.testing.assert_allclose(at[1:3, 0], np.cos([0.0, 6.0]), atol=1e-8)
+
+
+def test_points_in_a_list_and_by_a_whole_number():
+    params = {"k": jnp.array([1.0, 2.0]), "which": jnp.array(1)}
+    scene = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params["k"][0] * q["x"] ** 2)
+    run = lagjax.simulate(scene, {"x": 1.0}, {"x": 0.0}, TS, params)
+    film = run.animate(lambda q, params: [[0.0, 0.0], [q["x"], params["k"][params["which"]]]])
+    (positions,) = film.positions(np.array([0.0, 6.0])).values()
+    np.testing.assert_allclose(positions[0, :, 1], [[1.0, 2.0], [np.cos(6.0), 2.0]], atol=1e-8)

@@ -94,3 +94,21 @@ def test_where_few_draws_of_the_expansion_are_accepted_the_sampler_follows_the_e
 def test_an_expansion_that_would_not_fit_says_so(bent, monkeypatch):
     monkeypatch.setattr(_surrogate, "_LARGEST", 5)
     assert "more than 5" in str(_surrogate.expanded(bent.log_density()))
+
+
+@pytest.mark.slow
+def test_a_prior_that_excludes_half_of_the_fit(monkeypatch):
+    # With flat weight above the best k only, the posterior is half of a normal one: mean k + σ √(2/π).
+    rng = np.random.default_rng(0)
+    values = np.cos(2.0 * SHORT) + 0.1 * rng.normal(size=len(SHORT))
+    fit = lagjax.fit(lagjax.System(spring), lagjax.Record(SHORT, values, start=(1.0, 0.0)), {"k": 3.5})
+    best, width = float(fit.params["k"]), float(np.sqrt(fit.covariance.matrix[0, 0]))
+
+    def prior(params):
+        return jnp.where(params["k"] > best, 0.0, -jnp.inf)
+
+    drawn = fit.sample(200, seed=1, prior=prior).posterior["params['k']"].values
+    assert drawn.min() > best and len(np.unique(drawn[:, -1])) == len(drawn)
+    assert abs(drawn.mean() - (best + width * np.sqrt(2 / np.pi))) < 0.2 * width
+    with pytest.raises(ValueError, match="prior is zero where the records put"):
+        fit.sample(10, prior=lambda params: jnp.where(params["k"] > 2 * best, 0.0, -jnp.inf))

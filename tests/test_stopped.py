@@ -198,3 +198,28 @@ def test_what_stopped(name):
 def test_every_result_has_its_text():
     for name in lagjax.RESULTS._name_to_item:
         assert name == "successful" or len(lagjax._results.advice(getattr(lagjax.RESULTS, name))) > 20, name
+
+
+def fourier(q, v, t):  # no scalar program, and it takes arrays of JAX only
+    return jnp.abs(jnp.fft.fft(q.at[0].add(0.0))) * jnp.sqrt(1 - t)
+
+
+@pytest.mark.slow
+def test_a_scene_without_programs_that_fails_keeps_its_error():
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v, forces=fourier)
+    with pytest.raises(lagjax.SimulationError, match="could not be followed beyond t = 1"):
+        lagjax.simulate(scene, jnp.ones(2), jnp.zeros(2), jnp.linspace(0.0, 5.0, 6))
+
+
+def test_a_power_has_no_pole():
+    scene = lagjax.System(lambda q, v: 0.5 * v**2 + 0.25 * q**4)
+    with pytest.raises(lagjax.SimulationError, match="runs to infinity within a finite time"):
+        lagjax.simulate(scene, 1.0, 1.0, jnp.linspace(0.0, 5.0, 6))
+
+
+@pytest.mark.slow
+def test_steps_of_a_fixed_length_do_not_blame_the_start():
+    scene = lagjax.System(lambda q, v: 0.5 * v**2 + 0.25 * q**4)
+    with pytest.raises(lagjax.SimulationError, match="a step of a fixed length") as caught:
+        lagjax.simulate(scene, 1.0, 1.0, jnp.linspace(0.0, 5.0, 6), dt=0.01)
+    assert "q0 is" not in str(caught.value)

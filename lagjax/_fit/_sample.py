@@ -42,6 +42,7 @@ _FEWEST = 50  # of them of one chain: its step needs so many
 _MOST_INNER = 64  # steps of the sampler along π* for one draw: a motion is waited for no longer than that
 _PILOT = 64  # draws of π* that are weighed with π before the first draw
 _LEAST = 0.2  # of them are accepted, or π* is given up: fewer, and a chain may stay where π* is too small
+_TRIED = 100  # draws for the start of a chain where the density is not zero
 _SETTLING = 10  # draws that are thrown away: chains begin at draws of π*, which the exact density has not judged
 
 
@@ -115,7 +116,7 @@ def _tuned(surrogate: Surrogate, chains: int, key) -> tuple[Sampler, Any]:
 
     start, update, _ = blackjax.adaptation.step_size.dual_averaging_adaptation(_ACCEPTED)
     update = jax.jit(update)
-    z, metric, step = jax.random.normal(key, (chains, size), dtype), jnp.eye(size, dtype=dtype), 0.25
+    z, metric, step = _possible(surrogate, (chains, size), dtype, key), jnp.eye(size, dtype=dtype), 0.25
     state = jax.jit(jax.vmap(lambda z: blackjax.nuts.init(z, surrogate)))(z)
     late = np.zeros((chains, 0, size))
     for part, pooled in enumerate(_ROUNDS):
@@ -137,10 +138,25 @@ def _tuned(surrogate: Surrogate, chains: int, key) -> tuple[Sampler, Any]:
     return Sampler(move, step, metric, min(max(inner, 1), _MOST_INNER)), state
 
 
+def _possible(of_z: Callable, shape: tuple[int, int], dtype, key):
+    """Draws (C, D) of the fit's normal density where `of_z` is not zero: a chain that begins outside does not move."""
+    density = jax.jit(jax.vmap(of_z))
+    z = jax.random.normal(key, shape, dtype)
+    for k in range(_TRIED):
+        outside = ~jnp.isfinite(density(z))
+        if not outside.any():
+            return z
+        z = jnp.where(outside[:, None], jax.random.normal(jax.random.fold_in(key, _TRIED + k), shape, dtype), z)
+    raise ValueError(
+        f"The posterior density was zero at each of {_TRIED} draws about the fit: the prior is zero where the records "
+        "put the parameters. Give a prior that is not, or fit again from params0 within it."
+    )
+
+
 def _shrunk(rows: np.ndarray) -> np.ndarray:
-    """The covariance of draws (M, D), drawn towards that of the fit as if five draws had shown it."""
+    """The covariance of draws (M, D), drawn towards that of the fit as if D + 5 draws had shown it."""
     count, size = rows.shape
-    return (count * np.cov(rows.T).reshape(size, size) + 5 * np.eye(size)) / (count + 5)
+    return (count * np.cov(rows.T).reshape(size, size) + (5 + size) * np.eye(size)) / (count + 5 + size)
 
 
 class Chains(NamedTuple):
@@ -153,8 +169,9 @@ class Chains(NamedTuple):
     @staticmethod
     def at(state, exact: Callable) -> "Chains":
         """The state weighed by the exact density."""
-        of_z = np.asarray(exact(state.position), float)
-        return Chains(state, of_z, of_z - np.asarray(state.logdensity, float))
+        of_z, of_expansion = np.asarray(exact(state.position), float), np.asarray(state.logdensity, float)
+        ratio = np.subtract(of_z, of_expansion, out=np.full(len(of_z), -np.inf), where=np.isfinite(of_z))
+        return Chains(state, of_z, ratio)
 
 
 def _weighed(sampler: Sampler, exact: Callable, state, key) -> tuple[float, Chains]:
@@ -171,7 +188,8 @@ def _weighed(sampler: Sampler, exact: Callable, state, key) -> tuple[float, Chai
     if not np.isfinite(ratio).any():
         return 0.0, pilot[-1]
     weights = np.exp(ratio - ratio.max())
-    share = np.minimum(1.0, weights[:, None] / np.where(weights > 0, weights, np.inf)).mean()
+    above = np.sort(weights[weights > 0])  # of pairs i, j the mean of min(1, wᵢ/wⱼ), without a table of all of them
+    share = np.sum(np.cumsum(above) / above + np.arange(len(above))[::-1]) / len(weights) ** 2
     return float(share), pilot[-1]
 
 
@@ -224,14 +242,14 @@ def _along_exact(density: Density, draws: int, chains: int, seed: int, why: str)
         kept = state.position, state.logdensity, info.num_integration_steps, info.is_divergent, info.acceptance_rate
         return (state, tuning), kept
 
-    def chain(key):
-        first, going = jax.random.split(key)
-        state = blackjax.nuts.init(jax.random.normal(first, centre.shape, root.dtype), of_z)
-        keys = jax.random.split(going, _WARM + draws)
+    def chain(key, first):
+        state, keys = blackjax.nuts.init(first, of_z), jax.random.split(key, _WARM + draws)
         _, kept = jax.lax.scan(go, (state, start(0.5)), (keys, jnp.arange(_WARM + draws) < _WARM))
         return jax.tree.map(lambda leaf: leaf[_WARM:], kept)
 
-    z, *rest = jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(seed), chains))
+    begin, going = jax.random.split(jax.random.key(seed))
+    starts = _possible(of_z, (chains, len(centre)), root.dtype, begin)
+    z, *rest = jax.jit(jax.vmap(chain))(jax.random.split(going, chains), starts)
     words = f"The No-U-Turn sampler along the exact density, with gradients through the motions. {why}"
     log_density, steps, diverged, acceptance = (np.asarray(leaf) for leaf in rest)
     return Draws(np.asarray(centre + z @ root.T), log_density, steps, diverged, acceptance, words)

@@ -83,8 +83,8 @@ def _diagnosis(trajectory) -> str:
     members = Members(trajectory)
     which = tuple(failed[0].tolist())
     layout, row = members.layout, int(np.ravel_multi_index(which, members.batch)) if which else 0
-    numbers = np.array([x if np.ndim(x) == 0 else x[row] for x in members.numbers], layout.dtype)
-    ended = ended_of(trajectory, layout, which, numbers)
+    numbers = np.array([x if np.ndim(x) == 0 else x[row] for x in members.numbers])
+    ended = ended_of(trajectory, layout, which, numbers.astype(layout.dtype))
     return diagnosis(trajectory.system, layout, with_numbers(members.params, numbers), ended).strip()
 
 

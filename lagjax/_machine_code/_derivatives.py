@@ -168,17 +168,16 @@ def _vjp_over_steps(
         excess = probe(steps, rows[long], members[long])
 
         def divide(k: int, steps=steps, rows=rows, members=members, long=long, excess=excess, probe=probe):
-            again = functools.partial(probe, rows=rows[long[k : k + 1]], members=np.zeros(1, int))
-            number = params[rows[long[k]]]
-            return _over_divided(flow, steps, int(members[long[k]]), number, tolerances, excess[k : k + 1], again)
-
-        again = np.flatnonzero(excess > 1.0)
-        for k, better in zip(again, _native.each_of(again.tolist(), divide, _native.cores()), strict=True):
             row = rows[long[k : k + 1]]
+            again = functools.partial(probe, rows=row, members=np.zeros(1, int))
+            number = params[row[0]]
+            better = _over_divided(flow, steps, int(members[long[k]]), number, tolerances, excess[k : k + 1], again)
             if better is None:
                 y_ct[row], params_ct[row] = np.nan, np.nan
             else:
-                back(better, row, np.zeros(1, int))
+                back(better, row, np.zeros(1, int))  # here, so that no more than one table a thread is kept
+
+        _native.each_of(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
     at_start = (ts == ts[:, :1])[:, :, None]  # outputs that are the initial state; steps begin after them
     return y_ct + np.sum(path_ct * at_start, axis=1), params_ct
 
