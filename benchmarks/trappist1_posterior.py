@@ -101,6 +101,7 @@ def main():
     parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--chains", type=int, default=64)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--prior", choices=list(PRIORS), help="that one only")
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results", help="folder for the record")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -110,7 +111,7 @@ def main():
     transforms = {**dict.fromkeys(elements), "mass": lagjax.positive}
     fit = lagjax.fit(trappist1.SCENE, timings, elements, transforms=transforms, noise=lagjax.StudentT())
     record["runs"] = []
-    for name in PRIORS:
+    for name in [options.prior] if options.prior else PRIORS:
         record["runs"].append(posterior(fit, name, options.draws, options.chains, options.seed))
         _report.write_json(options.output / "trappist1_posterior.json", record)  # a long run may be interrupted
         tell(record["runs"][-1])
