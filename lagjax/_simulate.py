@@ -17,12 +17,11 @@ import numpy as np
 
 from lagjax import _linear
 from lagjax._consistent import has_constraints, inconsistent_members, require_consistent
-from lagjax._derivation import derivation_of
-from lagjax._diagnosis import Ended, diagnosis, ended_of, numerical
+from lagjax._diagnosis import diagnosis, ended_of
 from lagjax._diffrax import Diffrax
 from lagjax._engine import asked_for, choose
 from lagjax._failures import raise_where_failed, sentence
-from lagjax._layout import Layout, as_vector, halves
+from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution, axes_per_leaf
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, result_from
@@ -259,8 +258,8 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     t_last, system = trajectory.ts[-1], trajectory.system
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((end, code, t_last))):
         y_end = jnp.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
-        states, told = (trajectory.q, trajectory.qdot, end), _told_at_run_time(trajectory, layout)
-        states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names, *told)
+        states = trajectory.q, trajectory.qdot, end
+        states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)
         return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
     y_end = np.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
     message = sentence(code, end.t, t_last, y_end, layout.names) or ""
@@ -270,29 +269,6 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     if isinstance(system, System):
         message += diagnosis(system, layout, trajectory.params, ended_of(trajectory, layout))
     raise SimulationError(message, trajectory)
-
-
-def _told_at_run_time(trajectory: Trajectory, layout: Layout) -> tuple:
-    """What says more about a motion that fails inside of `jax.jit`, and the arrays that it needs for that.
-
-    Numbers of many parameters, the weights of a network, are not carried along for it.
-    """
-    numbers = eqx.filter(trajectory.params, eqx.is_array_like)
-    if not isinstance(trajectory.system, System) or sum(np.size(x) for x in jax.tree.leaves(numbers)) > _MOST_NUMBERS:
-        return ()
-    derivation = derivation_of(trajectory.system, layout, trajectory.params)
-
-    def explain(code, t, y, t_last, t_first, y_first, steps, numbers):
-        ended = Ended(code, float(t), y, float(t_last), float(t_first), y_first, int(steps), numbers)
-        return numerical(derivation, ended)
-
-    first = [jax.tree.map(lambda leaf: leaf[0], tree) for tree in (trajectory.q, trajectory.qdot)]
-    y_first = jnp.concatenate([layout.flatten(half) for half in first])
-    evidence = trajectory.ts[0], y_first, trajectory.stats["num_steps"], as_vector(numbers, layout.dtype)
-    return explain, evidence
-
-
-_MOST_NUMBERS = 1000
 
 
 def _describe_null(mass: np.ndarray, names: tuple[str, ...]) -> str:

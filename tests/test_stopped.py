@@ -113,14 +113,6 @@ def test_the_message_tells_what_it_ran_into(name):
         lagjax.simulate(lagjax.System(lagrangian, forces=forces), q0, qdot0, TS, **more)
 
 
-def test_inside_of_jit_the_message_tells_it_too():
-    scene = lagjax.System(kinetic, forces=fades)
-    with pytest.raises(jax.errors.JaxRuntimeError, match=r"force on q .nan., from t = 0.5 on, whatever the state"):
-        jax.jit(lambda q: lagjax.simulate(scene, q, 0.0, TS).q)(1.0)
-    with pytest.raises(lagjax.SimulationError, match=r"member 0, the first of 2(.|\n)*force on q .nan., from t = 0.5"):
-        jax.vmap(lambda q: lagjax.simulate(scene, q, 0.0, TS).q)(jnp.ones(2))
-
-
 def test_the_health_of_a_batch_tells_it_of_the_first_that_failed():
     batch = lagjax.simulate_batch(SCENE, Q0, 0 * Q0, TS, PARAMS, batch_axes=(0, 0, 0), **BUDGET)
     assert "from t = 0.5 on, whatever the state. It comes from where(True, nan, 0)" in batch.health().diagnosis
