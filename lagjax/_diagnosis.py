@@ -5,8 +5,7 @@ told about one motion: which force is not finite and from when on, the operation
 from, a pole that was reached, a mass matrix that has become singular, an escape to infinity, and what `check` finds at
 the last state: a kink, a jump, stiff terms.
 
-All but the line and `check` is read off the scene's programs in NumPy (`numerical`), which compiles nothing and may be
-asked for from a callback of XLA. Looking for lines stops at scenes whose functions are longer than `LONGEST`, and
+All but the line and `check` is read off the scene's programs in NumPy, which compiles nothing. Looking for lines stops at scenes whose functions are longer than `LONGEST`, and
 `check` is asked for up to `LARGEST` coordinates: a failure must not cost more than a motion does.
 """
 
@@ -103,22 +102,6 @@ def _diagnosed(system: System, layout: Layout, params, ended: Ended) -> str:
     if (at := _running_away(derivation, ended)) is not None:
         return f"\n{_escape(derivation, ended, at, _pole(derivation, params, ended))}"
     return _checked(system, derivation, state, params, ended) or _budget(ended)
-
-
-def numerical(derivation: Derivation, ended: Ended) -> str:
-    """The part of `diagnosis` that is read off programs which are there already: in NumPy, without lines."""
-    if ended.code not in _CODES or not derivation.is_lowered:
-        return ""
-    if not np.isfinite(ended.numbers).all():
-        return "\nA number in params is not finite there."
-    if not np.isfinite(ended.y).all():
-        return f"\n{_OVERSTEPPED}"
-    if (undefined := _undefined(derivation, ended)) is not None:
-        return f"\n{_told(undefined)}. Outside of jax.jit the message names the line."
-    if text := _singular_mass(derivation, ended):
-        return f"\n{text}"
-    at = _running_away(derivation, ended)
-    return _budget(ended) if at is None else f"\n{_escape(derivation, ended, at, None)}"
 
 
 # ---- what is not finite ----------------------------------------------------------------------------------------------

@@ -8,8 +8,6 @@ An output that was not reached has no derivative. `where` alone would make it ze
 branch is a constant; `nan_unless` makes it NaN wherever its cotangent is not zero.
 """
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,16 +20,14 @@ from lagjax._custom import batch_in_front, differentiated_as
 from lagjax._results import ENDED_WELL, SimulationError, advice, result_from
 
 
-def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...], explain: Callable | None = None, evidence=()):
+def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
     """`tree` again, where its motion ended well; else `SimulationError`, naming what failed, when and in which member.
 
     `result` holds a result code, `end` = (t, y) the time and the state (2n,) at which the motion ended, `t_last` the
     time it was to reach, and `names` (n,) those of the coordinates. Inside `jax.jit` the error is JAX's own, and its
-    text ends with this one. `explain(result, t, y, t_last, *evidence)` says more about the one member that the message
-    is about: it gets arrays of NumPy and must not compute with JAX, which waits for the host there.
+    text ends with this one.
     """
-    values = map(jnp.asarray, (result, end[0], t_last, end[1], *evidence))
-    passed = check_p.bind(*values, names=names, explain=explain)
+    passed = check_p.bind(*map(jnp.asarray, (result, end[0], t_last, end[1])), names=names)
 
     def through(leaf):
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
@@ -68,22 +64,9 @@ def sentence(result, t_end, t_last, y_end, names: tuple[str, ...]) -> str | None
     )
 
 
-def _raise(result, t_end, t_last, y_end, *evidence, names, explain) -> None:
+def _raise(result, t_end, t_last, y_end, *, names) -> None:
     if text := sentence(result, t_end, t_last, y_end, names):
-        raise SimulationError(text + _explained(explain, result, t_end, t_last, y_end, *evidence), None)
-
-
-def _explained(explain: Callable | None, result, *values) -> str:
-    """What `explain` says of the first member that failed; nothing where it fails itself: the message must come out."""
-    if explain is None:
-        return ""
-    member = first_failed(result)
-    of_all = np.shape(result)
-    try:
-        t, t_last, y, *evidence = (np.broadcast_to(x, of_all + np.shape(x)[len(of_all) :])[member] for x in values)
-        return explain(int(np.asarray(result)[member]), t, y, t_last, *evidence)
-    except Exception as error:
-        return f"\n(No more is known about it: {type(error).__name__}.)"
+        raise SimulationError(text, None)
 
 
 check_p = Primitive("lagjax_check")
