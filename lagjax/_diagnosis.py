@@ -6,8 +6,8 @@ from, a pole that was reached, a mass matrix that has become singular, an escape
 the last state: a kink, a jump, stiff terms.
 
 All but the line and `check` is read off the scene's programs in NumPy, which compiles nothing. Looking for lines stops
-at scenes whose functions are longer than `LONGEST`, and `check` is asked for up to `LARGEST` coordinates: a failure must
-not cost more than a motion does.
+at scenes whose functions are longer than `LONGEST`, and `check` is asked for up to `LARGEST` coordinates: a failure
+must not cost more than a motion does.
 """
 
 from collections.abc import Callable
