@@ -20,12 +20,13 @@ PyTree = Any
 
 
 class ChangedCoordinates(NamedTuple):
-    """A scene in new coordinates, and the way of states between these and the old ones.
+    """A scene in new coordinates, and the transformations of states between new and old coordinates.
 
     - `system`: the scene in the new coordinates, a `System`.
     - `old_from_new(Q, Qdot, t=0.0, params=None)`: the state (q, q̇) in the old coordinates.
-    - `new_from_old(q, qdot, guess, t=0.0, params=None)`: (Q, Q̇), Q by Newton's method from a `guess` of it; NaN where
-      that does not arrive, as at a pole of the new coordinates. Both are differentiable, under `jit` and `vmap`.
+    - `new_from_old(q, qdot, guess, t=0.0, params=None)`: (Q, Q̇), with Q by Newton's method from a `guess` of Q; NaN
+      where that does not converge, as at a pole of the new coordinates. Both functions are differentiable and work
+      under `jit` and `vmap`.
     """
 
     system: System
@@ -42,15 +43,15 @@ class ChangedCoordinates(NamedTuple):
 
 
 def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordinates:
-    r"""`system` in new coordinates Q, of which the old ones are the function q = `old_from_new(Q)`.
+    r"""`system` in new coordinates Q, from which `old_from_new(Q)` computes the old ones q.
 
         L'(Q, Q̇, t) = L(q(Q, t), (∂q/∂Q) Q̇ + ∂q/∂t, t)
 
     - `old_from_new(Q)`: the old coordinates in their structure, from the new ones in any; it may ask for `t` (frames
       that move) and `params` by name.
 
-    Forces, dissipation and constraints come along. In a frame that moves the energy is another one, and may be
-    conserved where the old one is not.
+    Forces, dissipation and constraints are transformed as well. In a moving frame the energy is a different function,
+    and may be conserved where the energy in the old coordinates is not.
 
     **Raises** `TypeError` for a function of another signature; `ValueError` when a state is changed whose new
     coordinates are more or fewer than the old ones.

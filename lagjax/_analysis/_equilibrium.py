@@ -41,15 +41,16 @@ def equilibrium(
         ∂L/∂q + Q − ∂D/∂q̇ + (∂f/∂q)ᵀλ = 0,   f(q) = 0,   at q̇ = 0
 
     - `q`: the guess, in the user's pytree.
-    - `qdot`: of a steady motion, in the structure of `q`: the velocities with which cyclic coordinates turn, and zero
-      for all others. Found are the others, which then stay where they are (a top that precesses, a bead on a hoop).
-    - `throw`: whether to raise where there is no equilibrium; else `ok` is False, and q is NaN, as it is inside `jit`
-      and `vmap`.
+    - `qdot`: for a steady motion, its velocities in the structure of `q`: those of the cyclic coordinates, and zero for
+      all others. The other coordinates are found: they then stay constant (a top that precesses, a bead on a hoop).
+    - `throw`: whether to raise where no equilibrium is found. With False, and inside `jit` and `vmap`, `ok` is False
+      and q is NaN.
 
-    Stable and unstable equilibria are found alike; `normal_modes` tells which it is. Where they form a family (a
-    coordinate that no force acts on) it is the one where Newton's shortest steps arrive, and its derivatives are those
-    of the nearest one. Steps far from an equilibrium are damped after Levenberg and Marquardt. The result is
-    differentiated implicitly, to every order, by `params`; works under `jit`, `vmap` and `grad`.
+    Stable and unstable equilibria are found alike; `normal_modes` tells which it is. Where equilibria form a family
+    (along a coordinate that no force acts on), the result is the member that minimum-norm Newton steps reach, and its
+    derivatives are those of the nearest member. Far from an equilibrium the steps are damped (Levenberg–Marquardt). The
+    result is differentiated implicitly with respect to `params`, to every order. The function works under `jit`, `vmap`
+    and `grad`.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a scene that depends on the time, a
     velocity of a coordinate that is not cyclic, or where no equilibrium is found.

@@ -40,8 +40,8 @@ class Hamiltonian(NamedTuple):
 
     - `system`: the scene.
     - `energy(q, p, t, params)`: H, a scalar.
-    - `momentum(q, qdot, t, params)` and `velocity(q, p, t, params)`: Legendre's transformation, both ways. The velocity
-      is found by Newton's method, and NaN where p has none (a singular mass matrix).
+    - `momentum(q, qdot, t, params)` and `velocity(q, p, t, params)`: the Legendre transformation in both directions.
+      The velocity is found by Newton's method; it is NaN where p determines none (a singular mass matrix).
     - `equations(q, p, t, params)`: (q̇, ṗ).
     - `simulate(q0, p0, ts, params, **options)`: the canonical motion, a `CanonicalTrajectory`; options as of
       `lagjax.simulate`.
@@ -68,8 +68,8 @@ def hamiltonian(system: System) -> Hamiltonian:
 
         H(q, p, t) = p·q̇ − L,   q̇ = ∂H/∂p,   ṗ = −∂H/∂q + Q
 
-    L need not be quadratic in velocities. Everything is differentiable and works under `jit` and `vmap`. Canonical
-    motions are integrated in (q, p), independently of those of `lagjax.simulate`.
+    L need not be quadratic in the velocities. All functions are differentiable and work under `jit` and `vmap`.
+    Canonical motions are integrated in (q, p), independently of `lagjax.simulate`.
 
     **Raises** `TypeError` for what is no `System`, `ValueError` for a system with constraints.
 

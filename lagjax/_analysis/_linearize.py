@@ -20,8 +20,8 @@ class Linearization(NamedTuple):
     """The linear equations of small deviations from a state, in the order in which the leaves of q lie end to end.
 
     - `A` (2n, 2n) and `B` (2n, n): d/dt (δq, δq̇) = A (δq, δq̇) + B u, where u (n,) are further generalised forces.
-    - `mass_matrix` M, `damping` C, `gyroscopic` G, `stiffness` K, (n, n) each: M δq̈ + (C + G) δq̇ + K δq = u + Jᵀδλ,
-      C symmetric and G skew. M is symmetric, K is where all forces have a potential.
+    - `mass_matrix` M, `damping` C, `gyroscopic` G, `stiffness` K, (n, n) each: M δq̈ + (C + G) δq̇ + K δq = u + Jᵀδλ, C
+      symmetric and G skew. M is symmetric; K is symmetric where all forces have a potential.
     - `constraint_jacobian` J (m, n): constraints allow δq̇ with J δq̇ = 0; no rows without constraints.
     - `names` (n,): those of the coordinates.
     """
@@ -41,9 +41,10 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
 
         d/dt (δq, δq̇) = A (δq, δq̇) + B u,     A = ∂(q̇, q̈)/∂(q, q̇),   B = ∂(q̇, q̈)/∂u
 
-    u are generalised forces that are added. At an equilibrium A has constant entries and the motions are exponentials
-    (`normal_modes`); along a motion they are the variational equations at that instant. With constraints λ answers to a
-    deviation, and A and B keep deviations on the constraints that are on them. Works under `jit`, `vmap` and `grad`.
+    u are additional generalised forces. At an equilibrium A is constant and the solutions are exponentials
+    (`normal_modes`); along a motion these are the variational equations at that instant. With constraints, λ responds
+    to a deviation, and A and B keep a deviation on the constraints if it satisfies them. The function works under
+    `jit`, `vmap` and `grad`.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, or a scene that depends on the time.
 

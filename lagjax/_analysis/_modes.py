@@ -92,20 +92,20 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     with M = ∂²L/∂q̇², the stiffness K = −∂F/∂q and the damping and gyroscopic terms C + G = −∂F/∂q̇ of the force F.
 
     - `q`: an equilibrium, as `equilibrium` finds it.
-    - `qdot`: of a steady motion, with which cyclic coordinates turn (see there): the oscillations about it, at constant
-      momenta of cyclic coordinates, seen from coordinates that turn along.
+    - `qdot`: for a steady motion, its velocities, as `equilibrium` takes them. The modes are then the oscillations
+      about that motion at constant momenta of the cyclic coordinates, in coordinates that move with it.
 
-    With constraints the modes are those of the deviations they allow, as many as there are degrees of freedom; their
-    forces count (a pendulum is held by its rod). Works under `jit`, `vmap` and `grad`, also where frequencies are
-    equal: first derivatives of all that does not depend on which of the modes of equal frequency is which (their sum,
-    say) are right, single ones are those of the modes as they are numbered; of second derivatives that holds for the
-    sum of ω² alone. The frequency of a zero mode has the derivative zero, as is right where a symmetry makes it zero.
-    With friction or gyroscopic forces derivatives are NaN where modes coincide and have one shape between them
-    (critical damping).
+    With constraints, the modes are those of the deviations that the constraints allow, as many as there are degrees of
+    freedom, and the constraint forces contribute (a pendulum is held by its rod). Works under `jit`, `vmap` and `grad`,
+    also where frequencies are equal: first derivatives are right for functions that are symmetric in the modes of equal
+    frequency (their sum, say); the derivative of a single mode is that of the mode as it is numbered. Second
+    derivatives are right for the sum of ω² alone. The frequency of a zero mode has the derivative zero, which is right
+    where a symmetry makes the mode zero. With friction or gyroscopic forces, derivatives are NaN where two modes
+    coincide and share one shape (critical damping).
 
-    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a scene that depends on the time, or a q
-    that is no equilibrium, or where M is not positive definite; inside `jit` the modes are NaN there. Inside `jit` all
-    constraints count as independent, and modes are NaN where they are not.
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a scene that depends on the time, for a q
+    that is no equilibrium, or where M is not positive definite. Inside `jit` the modes are NaN instead. There all
+    constraints are taken as independent, and modes are NaN where they are not.
 
     Source: Landau & Lifshitz, *Mechanics*, §23–25; Routh, *Stability of a Given State of Motion*, ch. IV; derivatives:
     Fox & Kapoor, AIAA J. 6 (1968) 2426.

@@ -28,9 +28,9 @@ Vector = Float[Array, " n"]
 def cyclic_coordinates(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> tuple[str, ...]:
     r"""The names of the coordinates that L does not depend on, as `q['phi']`.
 
-    Read off the scalar program of L, in which no operation reads them: it holds for every state, time and parameter.
-    The momentum of a cyclic coordinate is conserved where no force acts on it, that of a constraint included; which of
-    them are, `conserved_quantities` tells. Of q and qdot only the structure matters.
+    They are read off the scalar program of L, in which no operation uses them: the answer holds for every state, time
+    and parameter. The momentum of a cyclic coordinate is conserved where no force, and no constraint force, acts on it;
+    `conserved_quantities` tells which are. Of q and qdot only the structure matters.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, or where L has no scalar program.
 
@@ -59,10 +59,10 @@ def noether_charge(system: System, generator: Callable, gauge: Callable | None =
     - `generator(q)`: how q changes, ξ(q, t), in the structure of `q`; or a pair (ξ, τ), τ the change of the time.
     - `gauge(q)`: the scalar G(q, t) with dG/dt = the change of L; 0 by default.
 
-    Both may also ask for `t` and `params` by name. Whether the transformation is a symmetry is not asked: along a
-    motion İ = Λ − dG/dt + Q·(ξ − q̇ τ), with Λ the change of L and Q the forces, and `conserved_quantities` with
-    `generators=` tells whether that is zero. Generators that depend on velocities are no point transformations: the
-    Laplace–Runge–Lenz vector of Kepler's problem comes from none.
+    Both may also ask for `t` and `params` by name. The function does not check that the transformation is a symmetry:
+    along a motion İ = Λ − dG/dt + Q·(ξ − q̇ τ), with Λ the change of L and Q the forces, and `conserved_quantities`
+    with `generators=` tells whether that is zero. Generators that depend on velocities are no point transformations:
+    the Laplace–Runge–Lenz vector of Kepler's problem comes from none.
 
     **Raises** `TypeError` when a function has another signature, or, when the charge is called, where the generator
     does not return the structure of q.

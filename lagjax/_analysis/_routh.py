@@ -47,11 +47,11 @@ class Routhian(NamedTuple):
 
 
 def routhian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> Routhian:
-    r"""`system` reduced by its cyclic coordinates on which nothing acts, at constant momenta of these.
+    r"""`system` without the cyclic coordinates on which no force acts, at constant momenta of these.
 
         R(s, ṡ; μ) = L − μ·ċ      with ċ from  ∂L/∂ċ = μ
 
-    Which coordinates those are is read off the scene's programs; of q, qdot and params only the structure matters. L
+    Which coordinates these are is read off the scene's programs; of q, qdot and params only the structure matters. L
     must be quadratic in their velocities.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a system with constraints or forces, or

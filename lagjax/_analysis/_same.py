@@ -41,13 +41,13 @@ class SameMotion(NamedTuple):
 
 
 def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, seed: int = 0) -> SameMotion:
-    r"""Whether L_a = f L_b + dG(q, t)/dt with a number f: whether the two have one motion.
+    r"""Whether L_a = f L_b + dG(q, t)/dt for a number f, so that both systems have the same motions.
 
         E = d/dt ∂L/∂q̇ − ∂L/∂q − Q,     E_a = f E_b  for all q, q̇, q̈ and t
 
-    That is asked at 64 random states about (q, q̇), at which q̈ is anything; no G need be known. Forces Q count as well.
-    The same motion may have Lagrangians that differ by more (sin(q) and what it equals on every motion, a coordinate
-    that is decoupled and has a factor of its own): they are not the same here.
+    The identity is tested at 64 random states about (q, q̇) with random accelerations q̈; no G need be known. Forces Q
+    count as well. Lagrangians of one motion may differ by more than f and G (a decoupled coordinate may have a factor
+    of its own): those do not count as the same here.
 
     - `a`, `b`: systems of the same coordinates and parameters, without constraints.
 

@@ -90,23 +90,24 @@ def conserved_quantities(
 ) -> ConservedQuantities:
     r"""What `system` conserves by a symmetry of its Lagrangian, found from L alone.
 
-    Tried are all combinations of the point transformations
+    All linear combinations of these point transformations are tried,
 
         ξ = b + c t + A q,   τ = α + β t     (translations, boosts, rotations, scalings, the time)
 
-    and of `generators`. A is any matrix for up to 12 coordinates; for more, the rotations and scalings of each leaf.
-    A transformation is a symmetry where it changes L by some dG(q, t)/dt, and neither forces nor constraints do work on
-    it. Energy, momenta, angular momenta and the like come first and under these names, what is left as combinations
-    ("translation of z, rotation": a helix). Each is tested at fresh states: dI/dt there is zero to near rounding.
+    together with `generators`. A is any matrix for up to 12 coordinates; beyond, the rotations and scalings of each
+    leaf. A transformation is a symmetry where it changes L by some dG(q, t)/dt, and neither forces nor constraints do
+    work on it. Energy, momenta, angular momenta and the like come first, under these names; what is left comes as
+    combinations ("translation of z, rotation": a helix). Each conserved quantity I is verified at new random states,
+    where dI/dt must vanish to near rounding.
 
-    - `q`, `qdot`: a state, about which states are drawn; no other properties of it matter. Not traced.
-    - `params`: symmetries are those at these parameters.
+    - `q`, `qdot`: a state of numbers, not traced. The random states are drawn about it; nothing else about it matters.
+    - `params`: the parameters at which symmetries are sought.
     - `generators`: the user's own by name, as `noether_charge` takes them.
     - `seed`: of the random states.
 
     Conserved quantities that come from no point symmetry are not found: the Laplace–Runge–Lenz vector of Kepler's
-    problem, the third integral of Toda's chain. In coordinates that are not Cartesian rotations are not linear: angles
-    that are cyclic are found, for others give generators.
+    problem, the third integral of Toda's chain. In coordinates that are not Cartesian, rotations are not linear: those
+    along a cyclic angle are found; for others give generators.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a generator of the wrong structure,
     float32, or where L is not finite about the state.

@@ -37,13 +37,14 @@ _SHORTEST = 1e-6  # of the first step: a family that asks for shorter ones ends
 
 
 class Family(NamedTuple):
-    """Periodic orbits along a family, N of them, the first of which is where it was begun.
+    """N periodic orbits along a family; the first is the orbit at which the family was begun.
 
-    - `q0`, `qdot0`, `period`, `multipliers`, `closure`, `stable`: those of each orbit (`Orbit`), the orbits first.
+    - `q0`, `qdot0`, `period`, `multipliers`, `closure`, `stable`: those of each orbit (see `Orbit`), with the orbits as
+      first axis.
     - `value` (N,): the energy, or the parameter by which the family was followed; `energy` (N,): h = p·q̇ − L.
     - `fold` (N,): whether `value` turns back between this orbit and the one before it.
-    - `branch` (N,): whether two multipliers pass through 1 there without a fold: another family crosses this one;
-      `doubling` (N,): whether two pass through −1, where a family of twice the period begins.
+    - `branch` (N,): whether two multipliers pass through 1 there without a fold, so that another family crosses this
+      one; `doubling` (N,): whether two pass through −1, where a family of twice the period begins.
     - `message`: a sentence that says why it ends there.
     """
 
@@ -71,12 +72,13 @@ def family(
     step: float = 0.05,
     count: int = 100,
 ) -> Family:
-    """The family of periodic orbits that `orbit` belongs to, from it on, at most `count` of them.
+    """The family of periodic orbits that begins at `orbit`: at most `count` of them.
 
     - `by`: "energy"; or the name of a parameter, such as "g" for `params["g"]`, one number.
-    - `until`: the value of the energy or parameter at which to end, and in whose direction to begin; without it the
-      family goes towards larger values, up to `count` orbits.
-    - `step`: the first length of arc in the units of (q, qdot, T) of a state; later ones suit the trials it takes.
+    - `until`: the energy or the parameter at which the family ends; it also fixes the direction of the first step.
+      Without it the family begins towards larger values and ends after `count` orbits.
+    - `step`: the arc length of the first step, in the units of (q, qdot, T); later steps adapt to the number of Newton
+      iterations.
 
     A nonlinear normal mode is the family by energy that begins at a linear mode: begin with the periodic orbit near
     q + a·shape at rest, whose period is 2π/frequency, for a small amplitude a (`lagjax.normal_modes`).

@@ -37,8 +37,8 @@ class LyapunovExponent(NamedTuple):
     """The largest Lyapunov exponent of a motion, or of many with the members as first axis.
 
     - `value` (): the mean rate at which a tangent grows, per unit of time; `error` (): its standard error, from the
-      scatter among sixteen equal parts of the motion. A regular motion has an exponent of zero, and here one of about
-      log(duration)/duration, which falls below no threshold at once.
+      scatter among sixteen equal parts of the motion. A regular motion has the exponent zero; over a finite duration
+      its `value` is about log(duration)/duration.
     - `ok`: whether the motion could be followed; NaN where not.
     """
 
@@ -59,8 +59,8 @@ def lyapunov_spectrum(
 ) -> jax.Array:
     """All 2n Lyapunov exponents of the motion from (q0, qdot0) over a `duration`, descending, per unit of time.
 
-    Those of a scene without friction come in pairs ±λ that add up to zero to round-off, at every duration; that of the
-    direction along the motion, and those of conserved momenta, tend to zero as log(t)/t.
+    Without friction the exponents come in pairs ±λ whose sums vanish to round-off, at every duration. The exponent
+    along the motion, and those of conserved momenta, tend to zero as log(t)/t.
 
     - `duration`: a number; or an array (N,) for N motions at once, with the members as first axis of every leaf of
       `q0` and `qdot0`. The result is then (N, 2n), NaN for a motion that cannot be followed.
@@ -135,13 +135,13 @@ def lyapunov_exponent(
 ) -> LyapunovExponent:
     """The largest Lyapunov exponent of the motion from (q0, qdot0) over a `duration`, with its standard error.
 
-    A tangent, which begins in a direction that is the same for all, moves along with the motion in one run: for maps
-    of many starts. `duration` is a number, or an array (N,) for N motions at once, with the members as first axis of
-    every leaf of `q0` and `qdot0`; they are followed some thousands at a time, so that memory does not grow with N. A
-    motion that cannot be followed is NaN and not `ok`.
+    One tangent vector, with the same initial direction for every motion, is integrated along with it in a single run,
+    so that maps of many starts are affordable. `duration` is a number, or an array (N,) for N motions at once, with the
+    members as first axis of every leaf of `q0` and `qdot0`; they are followed some thousands at a time, so that memory
+    does not grow with N. A motion that cannot be followed is NaN and not `ok`.
 
-    `rtol` is loose by default: of a chaotic motion no tolerance gives the states at the end, and an exponent is a mean
-    along one that is as typical.
+    `rtol` is loose by default: no tolerance gives the final state of a chaotic motion, and its exponent is a mean that
+    any typical motion has.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene with constraints or without
     machine code.

@@ -38,8 +38,8 @@ class Orbit(NamedTuple):
     - `multipliers` (2n,): the eigenvalues of the monodromy matrix, complex, each beside its reciprocal where the energy
       is conserved, the largest first, and last of all those that are 1 by the time shift and by conserved momenta.
     - `closure` (): the largest defect of its arcs, in the units of the state; of a single arc |φ(y; T) − y|.
-    - `stable`: whether no multiplier is larger than 1, so that errors do not grow exponentially; False where rounding
-      leaves that open, because pairs that should multiply to 1 miss it by more than 1e-3.
+    - `stable`: whether no multiplier is larger than 1, so that errors do not grow exponentially; False also where
+      rounding leaves that open, because the product of a pair that should be 1 is off by more than 1e-3.
     - `ok`: whether it closes; `message`: a sentence that says why not (all numbers are then those of the best trial),
       or that the multipliers are uncertain, and by how much.
     """
@@ -101,21 +101,21 @@ def periodic_orbit(
     r"""The periodic orbit of `system` nearest to a guess (q0, qdot0) of a state of it and `period` of its period.
 
     Solves φ_T(y) = y, with φ_T the motion over the time T, by Newton's method on states at equal parts of the period
-    and on T; of a scene that is driven, in which anything reads `t`, the period is what it is. Derivatives of the arcs
-    are exact. Where the orbit is one of many (begun elsewhere on itself; at another energy; moved or turned, where
-    momenta are conserved), the correction is the shortest one, in the units of (q, qdot, T), that closes it. Which
-    directions are such is decided by the singular values of the equations: zero are those below 1e-8 of the largest.
+    and on T; for a driven scene, one in which anything reads `t`, the period is kept as given. Derivatives of the arcs
+    are exact. Where the orbit is one of many (shifted in time, at another energy, or translated or rotated where
+    momenta are conserved), each correction is the one of least norm, in the units of (q, qdot, T). The rank of the
+    equations is decided by their singular values: those below 1e-8 of the largest count as zero.
 
     - `period`: a number; or an array (N,) for N guesses at once, with the members as first axis of every leaf of `q0`
       and `qdot0`. All guesses share `params`.
     - `energy`: find the orbit with this energy h = p·q̇ − L; by default the nearest one, with whatever energy it has.
     - `image`: an affine function of (q, qdot) that returns (q, qdot), such as an exchange of bodies or a full turn of
-      an angle: the motion then has to return to the image of its start, φ_T(y) = image(y), and the multipliers are
+      an angle. The motion then has to return to the image of its start, φ_T(y) = image(y), and the multipliers are
       those of image⁻¹ φ_T. It should be a symmetry of the scene.
     - `throw`: raise when a single guess leads to no orbit. A batch never raises: look at `ok` and `message`.
 
-    Multipliers that are 1 by symmetry are split off before the others are computed, as
-    K-th roots over K arcs, so that 1e-9 beside 1e9 is as good as any.
+    Multipliers that are 1 by symmetry are split off first. The others are computed as K-th roots over K arcs, so that a
+    multiplier of 1e-9 beside one of 1e9 is as accurate as any.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene with constraints, and for
     one that has no machine code; `SimulationError` where there is no orbit near the guess.

@@ -39,9 +39,10 @@ class Path(NamedTuple):
 
     - `qdot_start`, `qdot_end`: the velocities there, in the user's structure; `trajectory`: the motion, at 129 times.
     - `action` (): ∫ L dt.
-    - `conjugate_times` (k,): when neighbouring paths from the start meet this one again, each as often as it counts.
+    - `conjugate_times` (k,): when neighbouring paths from the start meet this one again, repeated by multiplicity.
     - `index`: how many independent variations with fixed ends lower the action: the conjugate times before the end.
-    - `minimum`: whether the action is least among near paths (`index` 0, the end not conjugate); else it is a saddle.
+    - `minimum`: whether the action is least among nearby paths (`index` 0, and the end not conjugate); otherwise it is
+      a saddle.
     - `closure` (): the largest defect; `ok`, and `message`, a sentence that says why not.
     """
 
@@ -64,9 +65,9 @@ def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None
       function of the time that returns q, between `t_start` and `t_end`, whether it is a motion or not. Its velocity
       is its derivative by JAX.
 
-    By Gauss's rule of ten points between neighbouring outputs of the trajectory, or on 64 equal parts.
+    The integral is a ten-point Gauss rule between neighbouring outputs of the trajectory, or on 64 equal parts.
 
-    **Raises** `ValueError` where twice as many parts give something else: the path is not resolved, or not smooth.
+    **Raises** `ValueError` where twice as many parts give a different value: the path is not resolved, or not smooth.
 
     ```python
     import jax.numpy as jnp, lagjax
@@ -146,8 +147,9 @@ def find_path(
 ) -> Path:
     """The motion of `system` that is at `q_start` at `t_start` and at `q_end` at `t_end`.
 
-    There may be several, or none. Which one is found depends on the `guess`, a function of the time that returns q; by
-    default a straight line. The search is Newton's on states at eight parts of the time, joined by motions.
+    There may be several such motions, or none. Which one is found depends on `guess`, a function of the time that
+    returns q; by default a straight line. The search is multiple shooting: Newton's method on the states at the ends of
+    eight equal parts of the time.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene with constraints or without
     machine code; `SimulationError` where no path is found, unless `throw` is False.
