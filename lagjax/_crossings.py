@@ -196,7 +196,7 @@ def _surfaces(problem: Problem, functions, directions, names) -> Surfaces:
         refusal = MachineCode().refuses_crossings(problem, surfaces)
         surfaces = refusal or surfaces
     if isinstance(surfaces, str):
-        raise ValueError(f"crossings are found in machine code, which this motion has none of: {surfaces}.")
+        raise ValueError(f"crossings are found with machine code, and there is none for this scene: {surfaces}.")
     for k in range(len(functions)):
         if not surfaces.values.depends(k) & set(range(2 * problem.layout.size + 1)):
             which = "section" if names is None else f"section[{names[k]!r}]"

@@ -203,7 +203,7 @@ class Trajectory(eqx.Module):
         import jax.numpy as jnp, lagjax
 
         pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q))
-        run = lagjax.simulate(pendulum, 2.0, 0.0, jnp.linspace(0.0, 5.0, 101))
+        run = lagjax.simulate(pendulum, 2.0, 0.0, jnp.linspace(0.0, 2.0, 41))
         film = run.animate(lambda q: jnp.array([[0.0, 0.0], [jnp.sin(q), -jnp.cos(q)]]), trace=1)
         film.save("pendulum.gif")
         ```

@@ -41,15 +41,21 @@ def test_readme_commands_and_links():
         assert linked.startswith("https://") or (ROOT / linked).exists(), f"the README links to {linked}"
 
 
-PUBLIC = [getattr(lagjax, name) for name in lagjax.__all__ if callable(getattr(lagjax, name))]
-PUBLIC += [lagjax.System.explain, lagjax.System.project]
-COSTLY = (lagjax.work_precision, lagjax.System.project)
+def methods(kind: type) -> dict[str, object]:
+    """The public methods of a class whose docstrings have examples."""
+    own = {name: value for name, value in vars(kind).items() if name[0] != "_" and callable(value)}
+    return {name: value for name, value in own.items() if "```python" in (inspect.getdoc(value) or "")}
 
 
-@pytest.mark.parametrize(
-    "thing", sweep(PUBLIC, kept=lambda thing: thing not in COSTLY), ids=lambda thing: thing.__name__
-)
-def test_docstrings(thing):
-    assert inspect.getdoc(thing), f"{thing.__name__} has no docstring"
+PUBLIC = {name: getattr(lagjax, name) for name in lagjax.__all__ if callable(getattr(lagjax, name))}
+METHODS = {f"{name}.{own}": of for name, it in PUBLIC.items() if inspect.isclass(it) for own, of in methods(it).items()}
+COSTLY = ("work_precision", "System.project", "Trajectory.animate", "Trajectory.to_pandas", "Trajectory.health")
+
+
+@pytest.mark.parametrize("name", sweep(list(PUBLIC | METHODS), kept=lambda name: name not in COSTLY))
+def test_docstrings(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # some examples write a file
+    thing = (PUBLIC | METHODS)[name]
+    assert inspect.getdoc(thing), f"{name} has no docstring"
     for block in blocks(inspect.getdoc(thing)):
-        exec(compile(block, f"{thing.__name__}.__doc__", "exec"), {})
+        exec(compile(block, f"{name}.__doc__", "exec"), {})

@@ -84,7 +84,7 @@ def hamiltonian(system: System) -> Hamiltonian:
     """
     require_system(system)
     if has_constraints(system):
-        raise ValueError("hamiltonian is of systems without constraints: give L in coordinates that satisfy them.")
+        raise ValueError("hamiltonian takes systems without constraints: give L in coordinates that satisfy them.")
 
     def momentum(q, qdot, t=0.0, params=None):
         return system.momentum(q, qdot, t, params)

@@ -103,8 +103,8 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     where a symmetry makes the mode zero. With friction or gyroscopic forces, derivatives are NaN where two modes
     coincide and share one shape (critical damping).
 
-    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a scene that depends on the time, for a q
-    that is no equilibrium, or where M is not positive definite. Inside `jit` the modes are NaN instead. There all
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene that depends on the time, for
+    a q that is no equilibrium, or where M is not positive definite. Inside `jit` the modes are NaN instead. There all
     constraints are taken as independent, and modes are NaN where they are not.
 
     Source: Landau & Lifshitz, *Mechanics*, §23–25; Routh, *Stability of a Given State of Motion*, ch. IV; derivatives:

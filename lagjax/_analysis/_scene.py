@@ -79,8 +79,8 @@ class Scene(NamedTuple):
         """Raise `ValueError` where numbers are single, whose rounding is no proof of anything."""
         if self.layout.dtype != np.float64:
             raise ValueError(
-                f"{what} decides by what rounding leaves, and float32 leaves too much: give float64, after "
-                "jax.config.update('jax_enable_x64', True)."
+                f"{what} tells zero from rounding errors, which are too large in float32: give coordinates in float64, "
+                "after jax.config.update('jax_enable_x64', True)."
             )
 
     def require_autonomous(self, what: str) -> None:
@@ -93,8 +93,8 @@ class Scene(NamedTuple):
         asked = ("lagrangian", "nonconservative_force", "residual", "rates")
         if derivation is None or any(time in derivation.reads(name) for name in asked):
             raise ValueError(
-                f"{what} is of a scene that does not depend on the time, but {', '.join(asking)} of this one asks for "
-                "t. Where a drive turns or moves uniformly, write L in coordinates that move with it."
+                f"{what} is for a scene that does not depend on the time, but {', '.join(asking)} of this one reads t. "
+                "Where a drive turns or moves uniformly, write L in coordinates that move with it."
             )
 
     @property

@@ -82,10 +82,10 @@ def fit(
     seed: int = 0,
     progress: bool = False,
 ) -> Fit:
-    r"""The parameters of a scene that make recordings of its motion likeliest, with what is known about them.
+    r"""The maximum-likelihood parameters of a scene from recordings of its motion, with their intervals.
 
-    Minimises Σ w (observe(q(t), q̇(t)) − value)²/σ² over all samples, with one σ per signal, which is estimated too,
-    by the free numbers of the parameters and by the start of every record whose start is not known.
+    `fit` minimises Σ w (observe(q(t), q̇(t)) − value)²/σ² over all samples. Its unknowns are the free parameters, the
+    start of every record whose start is not known, and one σ per signal.
 
     **Arguments**
 
@@ -95,27 +95,27 @@ def fit(
     - `records`: one `Record` or several, of any lengths; and `lagjax.Timings`, beside them or alone.
     - `params0`: where the search for the parameters begins, in the structure that the scene's functions ask for.
     - `observe`: a function of (q, qdot), and of `t`, `params`, `inputs` by name, that returns what the sensors show in
-      the structure of a record's `values`; by default q. `lagjax.Delayed` where they show it later.
+      the structure of a record's `values`; by default q. `lagjax.Delayed` is for sensors with a delay.
     - `free`: True or False for every parameter, or for whole branches of `params0`; by default all floats are free.
     - `transforms`: `lagjax.positive`, `lagjax.between(a, b)`, `lagjax.angle` or None for every parameter or branch;
       `lagjax.simplex` and `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
       its search and its interval are then relative.
-    - `noise`: `lagjax.Gaussian()`, the default, or `lagjax.StudentT()` where some samples are far off.
-    - `hold`: how the `inputs` of records go on between samples: with "zero" the last one stays, as behind a D/A
-      converter; "linear" joins them by lines. Functions of the scene ask for `inputs` by name.
-    - `starts`: from how many values of the parameters to search, in one batch: from `params0`, and from random ones by
-      `seed`: a decade about a positive number, anywhere between bounds, on a circle or a simplex, and about other
-      numbers as far as they are large. The best few go through the whole search, and `params0` always does;
-      `Fit.waterfall` has what all of them came to.
+    - `noise`: `lagjax.Gaussian()`, the default, or `lagjax.StudentT()` where the data have outliers.
+    - `hold`: how the `inputs` of records continue between samples: "zero" keeps the last sample, as a D/A converter
+      does; "linear" interpolates. Functions of the scene ask for `inputs` by name.
+    - `starts`: the number of parameter values from which to search, as one batch: `params0`, and random ones drawn with
+      `seed`: about a positive number with a decade as standard deviation, uniform between bounds, on a circle or a
+      simplex, and about any other number with its size as standard deviation. The best few go through the whole search,
+      and `params0` always does; `Fit.waterfall` tells where each of them ended.
     - `progress`: print a line for every trial to stderr.
     - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
-      its own read off the data, and lets these grow together: for that the signals must have the structure of q. "auto"
-      does that where the signals allow it and records are longer than the motion's time scale, so that long and chaotic
-      records, and parameters that are far off, find their minimum. "gradient" goes down gradients in reverse mode, by
-      Adam of optax: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance.
+      its own read off the data, and joins these step by step; for that the signals must have the structure of q. "auto"
+      does so where the signals allow it and the records are longer than the motion's time scale: then the search
+      converges for long and chaotic records, and from parameters that are far off. "gradient" descends by reverse-mode
+      gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance.
 
-    Intervals count correlated residuals for what they are worth (`Fit.noise`); what cannot be seen in the data is said
-    in words (`Fit.unseen`) and has infinite intervals.
+    Intervals take the correlation of residuals into account (`Fit.noise`). `Fit.unseen` says in words which parameters
+    the data do not determine; their intervals are infinite.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, and where the motion from the first
     trial cannot be followed, with the record and the time.

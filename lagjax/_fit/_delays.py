@@ -29,13 +29,21 @@ class Delayed:
 
     - `delay`: a function of the parameters that returns the delay of all signals, or a prefix of the structure of a
       record's `values` with one for each. It is fitted like any parameter, with exact derivatives.
-    - `longest`: the largest delay that is possible. Samples of the first `longest` of every record are left out,
-      because they may show what was before; a trial with a delay beyond, or below zero, counts as one that failed:
-      `lagjax.between(0.0, longest)` keeps it inside.
-    - `observe`: what the sensors show, as for `fit`; by default q. It is asked about the state, the time and the inputs
-      at the delayed time.
+    - `longest`: the largest possible delay. The samples in the first `longest` of every record are left out, because
+      they may show the motion before its start. A trial whose delay is negative or larger than `longest` counts as
+      failed; the transform `lagjax.between(0.0, longest)` keeps the delay inside.
+    - `observe`: what the sensors show, as for `fit`; by default q. It gets the state, the time and the inputs at the
+      delayed time.
 
     **Raises** `TypeError` or `ValueError` for a `longest` that is no positive number.
+
+    ```python
+    import lagjax
+
+    sensors = lagjax.Delayed(lambda params: params["delay"], longest=0.1, observe=lambda q, qdot: q)
+    transforms = {"delay": lagjax.between(0.0, 0.1), "mass": lagjax.positive}
+    # lagjax.fit(..., observe=sensors, transforms=transforms)
+    ```
     """
 
     delay: Callable

@@ -207,10 +207,14 @@ class Density:
             precision[np.ix_(own, own)] += columns.T @ columns
         scale = np.sqrt(np.diag(precision))
         if not (scale > 0).all():
-            raise ValueError(f"Nothing that was measured depends on {self.names[int(np.argmin(scale))]}.")
+            raise ValueError(
+                f"Nothing that was measured depends on {self.names[int(np.argmin(scale))]}: fix it with `free`."
+            )
         unit = precision / np.outer(scale, scale)
         if np.linalg.eigvalsh(unit).min() < 1e-13:
-            raise ValueError("Some combination of the parameters and starts is not seen: keep it fixed.")
+            raise ValueError(
+                "The data do not determine some combination of parameters and starts: fix one parameter with `free`."
+            )
         found = np.zeros((len(self), len(self)))
         found[size:, size:] = self._of_noise((question.weights > 0).sum(axis=0) * self.shares)
         found[:size, :size] = np.linalg.inv(unit) / np.outer(scale, scale)

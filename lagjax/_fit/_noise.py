@@ -38,7 +38,14 @@ class AbstractNoise(abc.ABC):
 
 @dataclass(frozen=True)
 class Gaussian(AbstractNoise):
-    """Normal noise; σ of each signal is estimated from the residuals. `fit(..., noise=lagjax.Gaussian())`."""
+    """Normal noise; σ of each signal is estimated from the residuals. It is the default of `fit`.
+
+    ```python
+    import lagjax
+
+    noise = lagjax.Gaussian()  # lagjax.fit(..., noise=noise)
+    ```
+    """
 
     def widths(self, residuals, weights, least):
         """σ² = mean of w e² over the samples that count."""
@@ -52,6 +59,12 @@ class StudentT(AbstractNoise):
     """Student's t noise, for outliers; σ and ν of each signal are estimated unless `dof` fixes ν.
 
     Raises `ValueError` for a `dof` that is not at least 1.
+
+    ```python
+    import lagjax
+
+    noise = lagjax.StudentT()  # lagjax.fit(..., noise=noise)
+    ```
     """
 
     dof: float | None = None

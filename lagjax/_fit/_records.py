@@ -14,7 +14,15 @@ PyTree = Any
 
 
 class Guess(NamedTuple):
-    """A start (q, qdot) that is fitted: where the search for it begins. `Record(..., start=lagjax.Guess(q, v))`."""
+    """A first guess (q, qdot) of a start that is to be fitted, in the structures of q and qdot.
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    ts = jnp.linspace(0.0, 1.0, 101)
+    record = lagjax.Record(ts, jnp.cos(3.0 * ts), start=lagjax.Guess(0.9, 0.0))
+    ```
+    """
 
     q: PyTree
     qdot: PyTree
@@ -39,12 +47,13 @@ class Record(Measured):
     - `ts` (T,): the times, strictly increasing, T ≥ 2. Records need not be equally long, nor equally spaced.
     - `values`: the measured signals in the structure that `observe` returns, with the times as first axis of every
       leaf; by default that of q. NaN where a sample is missing.
-    - `inputs`: what drove the scene and was sampled at the same times, in any structure, with the times as first axis
-      of every leaf: a voltage, the motion of a support. Functions of the scene, and `observe`, ask for it as `inputs`
-      and get its value at their time; between samples it goes on as `fit(..., hold=)` says. None of it may be missing.
-    - `start`: the state at `ts[0]`. A pair (q0, qdot0) is known and kept. `lagjax.Guess(q0, qdot0)` is where the search
-      for it begins. With None it is fitted, from local polynomials through the values. A function of the parameters
-      that returns (q0, qdot0) makes it follow from them, as positions of planets do from orbital elements.
+    - `inputs`: what drove the scene, sampled at the same times, in any structure with the times as first axis of every
+      leaf: a voltage, the motion of a support. Functions of the scene, and `observe`, that take `inputs` get its value
+      at their time; `fit(..., hold=)` says how it continues between samples. No sample of it may be missing.
+    - `start`: the state at `ts[0]`. A pair (q0, qdot0) is known and kept fixed. With `lagjax.Guess(q0, qdot0)` it is
+      fitted, and the search begins there. With None it is fitted too, and the search begins at local polynomials
+      through the values. A function of the parameters that returns (q0, qdot0) computes the start from them, as orbital
+      elements give the positions of planets.
     - `weights`: how much each sample counts, one number or a prefix of the structure of `values`: the variance of a
       sample is that of its signal over its weight. Zero leaves a sample out.
 

@@ -96,15 +96,15 @@ class Prediction(NamedTuple):
 class Fit:
     """What came out of `fit`. Print it for a table with intervals and a verdict.
 
-    - `params`: the parameters in the user's pytree, the free ones where the measurements are likeliest.
-    - `starts`: one (q0, qdot0) per record. Of several systems a dict by their names, as `residuals` are.
-    - `covariance`: of the free numbers, by name (`Covariance`); intervals are made in the transformed numbers.
+    - `params`: the parameters in the user's pytree; the free ones are those of maximum likelihood.
+    - `starts`: one (q0, qdot0) per record. For several systems `starts` and `residuals` are dicts by their names.
+    - `covariance`: of the free numbers, by name (`Covariance`). Intervals are computed in the transformed numbers.
     - `noise`: the scatter of each signal, by name (`SignalNoise`).
-    - `residuals`: per record, what the fit shows less what was measured, in the structure of `values`; NaN if missing.
-    - `unseen`: a sentence for everything that the data do not tell about the free parameters.
-    - `ok`, `message`: whether the search converged and everything free is seen; what happened, in words.
-    - `log_likelihood`, `trials`: of independent samples; how often the motions were computed.
-    - `waterfall`: what all starts came to (`Waterfall`), where there were several; else None.
+    - `residuals`: fitted minus measured values per record, in the structure of `values`; NaN where a sample is missing.
+    - `unseen`: a sentence for each free parameter or combination of them that the data do not determine.
+    - `ok`: whether the search converged and the data determine everything that is free; `message`: what happened.
+    - `log_likelihood`: as if all samples were independent; `trials`: how often the motions were computed.
+    - `waterfall`: where the search from each of several starts ended (`Waterfall`); None for a single start.
     """
 
     params: PyTree
@@ -144,7 +144,8 @@ class Fit:
     def to_pandas(self, level: float = 0.95):
         """A `pandas.DataFrame` with a row per free number, by its name: value, and low and high of its interval.
 
-        The interval holds it with probability `level`; it is as wide as the number's set where it is not seen.
+        The interval contains the number with probability `level`; where the data do not determine the number, the
+        interval is all of its set.
 
         Raises `ImportError` when pandas is not installed, `ValueError` for a level that is not between 0 and 1.
         """
@@ -164,8 +165,8 @@ class Fit:
     def intervals(self, level: float = 0.95) -> tuple[PyTree, PyTree]:
         """The ends (low, high) of the intervals that hold each free number with probability `level`, as two pytrees.
 
-        They stay inside of the sets of the transforms; what is not seen reaches to their ends. A parameter that is not
-        free stands in both.
+        They stay inside the sets of the transforms; the interval of a parameter that the data do not determine is the
+        whole set. A parameter that is not free is both ends of its own interval.
 
         Raises `ValueError` for a level that is not between 0 and 1.
         """
@@ -180,8 +181,8 @@ class Fit:
     def start_intervals(self, level: float = 0.95) -> tuple[Any, Any]:
         """The ends (low, high) of the intervals of the starts, each in the structure of `starts`.
 
-        They hold every number of a start with probability `level`, the parameters being uncertain too. A start that is
-        known stands in both.
+        Each contains its number with probability `level`; the uncertainty of the parameters is included. A start that
+        is known is both ends of its own interval.
 
         Raises `ValueError` for a level that is not between 0 and 1.
         """
@@ -195,11 +196,11 @@ class Fit:
         return low, high
 
     def profile(self, name: str, level: float = 0.95) -> Profile:
-        """How much likelihood is lost where the parameter called `name` is kept away from its best value.
+        """The profile likelihood of the parameter called `name`.
 
-        At every value all other free parameters and starts are fitted anew. The ends of the interval are found on the
-        profile itself, with the effective number of samples that `intervals` uses; `print` gives the verdict: bounded,
-        one-sided, flat, or two minima.
+        It says how much likelihood is lost where the parameter is kept at another value and all other free parameters
+        and starts are fitted anew. The interval is read off the profile itself, with the effective number of samples
+        that `intervals` uses. Printed, the result gives its verdict: bounded, one-sided, flat, or two minima.
 
         Raises `ValueError` for a name that no free parameter has, or that moves only together with others.
 
@@ -211,10 +212,10 @@ class Fit:
     def log_density(self, prior: Callable | None = None) -> Density:
         """The logarithm of the posterior density of all unknowns: a function of one vector for `jax.jit`, `jax.grad`.
 
-        It is flat in the free parameters within their sets, in the starts and in log σ, unless `prior(params)` returns
-        the logarithm of another density of the parameters. Correlated samples count for what they are worth. `first`
-        is the fit, `names` what the numbers are called, `covariance()` that of least squares, and `params(u)` turns the
-        first numbers into the user's pytree.
+        The prior is flat in the free parameters within their sets, in the starts and in log σ, unless `prior(params)`
+        returns the logarithm of another prior density of the parameters. Correlated samples count by their effective
+        number. On the function, `first` is the vector of the fit, `names` names its numbers, `covariance()` is that of
+        least squares, and `params(u)` turns the first numbers into the user's pytree.
         """
         if not isinstance(self.question, Question):
             raise ValueError("There is no density of several systems yet: use `intervals` and `profile`.")
@@ -227,12 +228,12 @@ class Fit:
         The density is that of `log_density(prior)`, π. The sampler walks in the fit's own metric along π*, the density
         whose residuals are expanded to second order about the fit, r(0) + J z + ½ zᵀ H z; then one motion of each chain
         accepts or refuses the draw, with min(1, π(y) π*(x) / [π(x) π*(y)]), so that draws are those of π. Where the
-        expansion is too far from π the sampler follows π with gradients through the motions. `attrs["sampler"]` of what
-        comes back says which it was, and how much was accepted.
+        expansion is too far from π, the sampler follows π itself, with gradients through the motions.
+        `attrs["sampler"]` of the result says which of the two it was, and the share of draws that was accepted.
 
-        All chains go in one batch of motions: many chains with few draws are cheaper than few with many. The variables
-        are the free parameters by their names, `q0` and `qdot0` of the records whose starts are fitted, and `sigma`,
-        `dof` of the signals. `arviz.summary` tells whether chains agree.
+        All chains are integrated as one batch of motions: many chains with few draws are cheaper than few with many.
+        The variables are the free parameters by their names, `q0` and `qdot0` of the records whose starts are fitted,
+        and `sigma`, `dof` of the signals. `arviz.summary` tells whether chains agree.
 
         Source: Hoffman & Gelman, JMLR 15 (2014) 1593; Christen & Fox, J. Comput. Graph. Stat. 14 (2005) 795.
 
@@ -278,11 +279,12 @@ class Fit:
         return self.parameters.ends(self.u, wide)
 
     def predict(self, record: Record, *, system: str | None = None) -> Prediction:
-        """The motion of the fitted scene along a record, which may be another one than those of the fit.
+        """The motion of the fitted scene over a record, which need not be one of those that were fitted.
 
-        From the record's start if that is known. Else from the start that suits the record's values best, parameters
-        kept: to predict from the first samples alone, let `predict` find the start of a short record, and give that to
-        a `Record` of the whole. `system` is the name of the record's system, where the fit is of several.
+        It begins at the record's start if that is known, else at the start that fits the record's values best with the
+        parameters kept. To predict from the first samples alone, let `predict` find the start of a short record, and
+        give that start to a `Record` of the whole. `system` is the name of the record's system, for a fit of several
+        systems.
 
         Raises `ValueError` where the record has other signals than those of the fit, or its motion fails.
         """
@@ -353,12 +355,12 @@ class Fit:
     def next_experiment(
         self, candidates: Sequence[Record] | dict[str, Record], *, system: str | None = None
     ) -> Experiments:
-        """Which of several planned records would tell most about the free parameters: the gain in log det (D-optimal).
+        """Which of several planned records would tell most about the free parameters: D-optimal design.
 
-        `candidates`: records, or a dict of them by name, with times, weights, inputs and a start as they are planned.
-        Their values are not looked at and may be NaN; a start that is not known, `lagjax.Guess(q0, qdot0)`, counts as
-        one that has to be fitted. Where the fit is of several systems, `system` is the name of that of all candidates.
-        Print what comes back for a table.
+        Each is rated by the gain in log det of the information. `candidates`: records, or a dict of them by name, with
+        times, weights, inputs and a start as they are planned. Their values are not read and may be NaN. A start
+        `lagjax.Guess(q0, qdot0)` counts as one that has to be fitted. For a fit of several systems, `system` is the
+        name of the system of all candidates. Printed, the result is a table.
 
         Raises `ValueError` where a planned record has no start, or its motion fails.
 
@@ -391,7 +393,8 @@ class Fit:
     def report(self, path: str | os.PathLike, experiments: Sequence[Record] | dict[str, Record] = ()) -> None:
         """Write one file of HTML: parameters, noise, what is not seen, data over fit, residuals, correlations, starts.
 
-        With `experiments`, planned records, also what to measure next (`next_experiment`). Needs matplotlib.
+        With `experiments`, a set of planned records, it also says what to measure next (`next_experiment`). It needs
+        matplotlib.
         """
         tables = {"Parameters": _cells_of_parameters(self), "Noise": _cells_of_noise(self)}
         texts = {"What to measure next": str(self.next_experiment(experiments))} if experiments else {}
@@ -415,10 +418,10 @@ class Fit:
     def compare(self, other: "Fit | dict[str, Fit]", *, folds: int = 0) -> Comparison:
         """Which of several fits of the same records the data prefer: this one against another, or a dict of others.
 
-        By AIC and BIC, with effective counts of samples, and with `folds` also by cross-validation: the records are
-        dealt into so many groups, each is left out of all fits in turn, and followed with what the rest says about the
-        parameters; only its starts are fitted to it. Print what comes back for a table; in that of a dict this fit is
-        called "this".
+        The fits are compared by AIC and BIC with effective numbers of samples, and with `folds` also by
+        cross-validation: the records are divided into that many groups, each group is left out in turn, and is
+        predicted with the parameters that the other groups give; only its starts are fitted to it. Printed, the result
+        is a table; in that of a dict this fit is called "this".
 
         Raises `ValueError` where the fits are not about the same measurements, or folds are not 0 or 2 to the number of
         records.

@@ -45,14 +45,14 @@ class Timings(Measured):
     - `section`: a function of (q, qdot), and of `t` and `params` by name, that returns one real number; a crossing is
       where that changes sign. A dict of functions for several sections of the same motion.
     - `times`: when it was crossed, (K,), or a dict of such arrays by the names of the sections. NaN where missing.
-    - `t0`: where the motion begins, before all times, and from where crossings are counted.
+    - `t0`: the time at which the motion begins, before all `times`. Crossings are counted from there.
     - `start`: the state at `t0`: (q0, qdot0) if it is known, `lagjax.Guess(q0, qdot0)` to fit it, or a function of the
       parameters that returns (q0, qdot0).
     - `numbers`: which crossing after `t0` each time is, from 0 on, in the form of `times`; by default 0, 1, 2, ….
       Choose a `t0` that is not near a crossing: one that begins before `t0` shifts the numbers of all.
     - `direction`: −1 only where the section falls, +1 only where it rises, 0 both; or a dict.
-    - `weights`: how much each time counts, in the form of `times`: 1/σ² with the errors σ that were given. The fit
-      finds one common factor of all σ, which is 1 where the errors are right.
+    - `weights`: the weight of each time, in the form of `times`: 1/σ² with the stated errors σ. The fit finds one
+      common factor of all σ, which is 1 where the stated errors are right.
 
     **Raises** `TypeError` or `ValueError` where these cannot be right.
 
@@ -214,7 +214,9 @@ class Clock:
         directions = directions_of(timings.direction, self.keys)
         surfaces = MachineCode().refuses(problem) or surfaces_of(problem, functions, directions, "A section")
         if isinstance(surfaces, str):
-            raise ValueError(f"Crossing times are found in machine code, which there is none of: {surfaces}.")
+            raise ValueError(
+                f"Crossing times are found with machine code, and there is none for this scene: {surfaces}."
+            )
         self.noting = flow_of(dataclasses.replace(problem, guards=surfaces.guards(notes=True)))
         self.flow, self.room = flow_of(problem), int(self.flat.numbers.max()) + 1
         self.tolerances = _tolerances(problem)

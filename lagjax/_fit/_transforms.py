@@ -139,7 +139,14 @@ class Unbounded(AbstractSeparable):
 
 @dataclass(frozen=True)
 class Positive(AbstractSeparable):
-    """x = eᵘ: numbers above zero. The ready instance is `lagjax.positive`."""
+    """x = eᵘ: a number above zero. `lagjax.positive` is its instance.
+
+    ```python
+    import lagjax
+
+    transforms = {"mass": lagjax.positive, "friction": lagjax.positive}  # lagjax.fit(..., transforms=transforms)
+    ```
+    """
 
     def value(self, u, xp: Any = np):
         """x(u)."""
@@ -225,10 +232,16 @@ class Between(AbstractSeparable):
 
 @dataclass(frozen=True)
 class Angle(AbstractSeparable):
-    """x = u less whole turns, in (−π, π]: the search is free and the answer is one turn. It is `lagjax.angle`.
+    """x = u less whole turns, in (−π, π]: an angle. `lagjax.angle` is its instance.
 
-    What depends on x must have the period 2π. An interval may end beyond ±π; one that is wider than a turn is
-    (x − π, x + π), and says nothing.
+    The search may go round; the scene must have the period 2π in x. An interval may end beyond ±π; one that is wider
+    than a turn is (x − π, x + π), which means that the data do not determine x.
+
+    ```python
+    import lagjax
+
+    transforms = {"phase": lagjax.angle}  # lagjax.fit(..., transforms=transforms)
+    ```
     """
 
     reach: ClassVar[float] = 0.5 * np.pi
@@ -265,9 +278,17 @@ class Angle(AbstractSeparable):
 
 @dataclass(frozen=True)
 class Simplex(AbstractTransform):
-    """x = c softmax(H u): n numbers above zero whose sum c is that of their start. It is `lagjax.simplex`.
+    """x = c softmax(H u): an array of n numbers above zero with a constant sum c. `lagjax.simplex` is its instance.
 
-    H (n, n − 1) has orthonormal columns of sum zero (Helmert's), so that no number is treated unlike the others.
+    The sum is that of the array in `params0`. H (n, n − 1) has orthonormal columns of sum zero (Helmert's), so that all
+    numbers are treated alike.
+
+    ```python
+    import lagjax
+
+    transforms = {"shares": lagjax.simplex}  # lagjax.fit(..., transforms=transforms)
+    ```
+
     Source: Egozcue et al., *Isometric logratio transformations for compositional data*, Math. Geology 35 (2003) 279.
     """
 
@@ -320,7 +341,7 @@ class Simplex(AbstractTransform):
 
 @dataclass(frozen=True)
 class Inertia(AbstractTransform):
-    """What a rigid body of positive density can have: the log-Cholesky form of its pseudo-inertia. `lagjax.inertia`.
+    """The inertia of a rigid body of positive density, by its log-Cholesky form. `lagjax.inertia` is its instance.
 
     With the mass m, its first moments h = ∫ r dm and second ones Σ = ∫ r rᵀ dm = ½ tr(I) 1 − I, about any point,
 
@@ -329,6 +350,13 @@ class Inertia(AbstractTransform):
 
     is positive definite for every u = (α, d₁, d₂, d₃, s₁₂, s₂₃, s₁₃, t₁, t₂, t₃). The leaf is J itself, (4, 4), or
     (m, h_x, h_y, h_z, I_xx, I_yy, I_zz, I_xy, I_xz, I_yz), where I_xy is the element of the matrix, −∫ x y dm.
+
+    ```python
+    import lagjax
+
+    transforms = {"forearm": lagjax.inertia}  # lagjax.fit(..., transforms=transforms)
+    ```
+
     Source: Rucker & Wensing, *Smooth parameterization of rigid-body inertia*, IEEE RA-L 7 (2022) 2771.
     """
 

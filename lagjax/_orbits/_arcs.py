@@ -72,7 +72,7 @@ class Arcs:
             )
         problem = Problem.about(system, layout, params, rtol=rtol, max_steps=_BUDGET)
         if refusal := MachineCode().refuses(problem):
-            raise ValueError(f"{what} are found by machine code, which this motion has none of: {refusal}.")
+            raise ValueError(f"{what} are found with machine code, and there is none for this scene: {refusal}.")
         return cls(problem, np.asarray(problem.vector))
 
     def with_numbers(self, numbers: np.ndarray) -> "Arcs":

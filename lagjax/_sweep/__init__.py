@@ -115,9 +115,9 @@ def sweep(
 ) -> Sweep:
     r"""Run `system` for every point of `over`, keep a few numbers of each motion, and store them in a folder.
 
-    The store is the job: called again with the same description, `sweep` goes on where it was stopped, by a failure of
-    the machine at any moment too; and `python -m lagjax sweep run STORE` in another shell, on another machine that
-    shares the disk, or in an array of batch jobs works on the same units, and may join or die at any time.
+    The store is the job. Called again with the same description, `sweep` continues where it stopped, also after a
+    failure of the machine at any moment. `python -m lagjax sweep run STORE` in another shell, on another machine that
+    shares the disk, or in an array of batch jobs works on the same units; such workers may join or die at any time.
 
     **Everyday arguments**
 
@@ -129,37 +129,37 @@ def sweep(
       names in `over`.
     - `keep(trajectory)`: a dict of what remains of a member, numbers or arrays by names, from its `Trajectory`.
     - `crossings`: arguments of `lagjax.crossings`, {"section": …, "direction": …, "count": …}. Then `keep(trajectory,
-      crossings)` is told the `Crossings` of that motion, which goes on over them: when something happened first, and
-      where the motion ended, come from one run, if `ts` are two times.
+      crossings)` also gets the `Crossings` of that motion, which does not end at them: the time of the first event and
+      the final state come from one run, if `ts` are two times.
     - `store`: a folder. `xarray.open_zarr(store)` reads it, with the names of `over` as dimensions and coordinates, the
-      kept quantities as variables, and `result`: how each member ended, −1 for those still to do. NaN, or the least
-      integer, stands where there is no value.
+      kept quantities as variables, and `result`: how each member ended, −1 for those still to do. Missing values are
+      NaN, or the least integer of an integer type.
 
     **Rarer ones**
 
-    - `reduce`: for quantities that are too many to keep, `lagjax.Statistics` by their names: count, mean, variance,
-      extremes with their members, histogram, quantiles. Those are merged in the order of the units, and stored instead
-      of the members' values. Read them by `Sweep.statistics()`.
-    - `unit`: members of a unit of work, which is a chunk of the store and what a worker that dies loses. By default as
-      many as take 20 s here, at most 64 MiB of what is kept.
-    - `extend`: a store of the same scene, of which the members that are also in `over` are taken: to have more members
-      of a design, or a finer grid. It stays as it is. For a later end let `keep` return {"end": trajectory.end, …}, and
+    - `reduce`: for quantities that are too many to keep, a dict of `lagjax.Statistics` by their names: count, mean,
+      variance, extremes with their members, histogram, quantiles. These are merged in the order of the units and stored
+      instead of the members' values; `Sweep.statistics()` reads them.
+    - `unit`: the number of members in a unit of work. A unit is a chunk of the store, and all that is lost with a
+      worker that dies. By default as many as take 20 s here, with at most 64 MiB of kept quantities.
+    - `extend`: a store of the same scene, from which the members that are also in `over` are copied, for more members
+      of a design or a finer grid. It is not changed. For a later end let `keep` return {"end": trajectory.end, …}, and
       give `ts` that begin at the last time of that store: its motions go on from there, and `keep` sees the rest of
-      them. Members that have ended before have their `result` of then.
+      them. Members that ended before that time keep their `result`.
     - `executor`: any `concurrent.futures.Executor`, such as dask's `client.get_executor()`; a task is a unit. By
       default this process works, with the machine code's threads on all cores, and writes a unit while it computes the
       next.
-    - `isolate`: compute in a child process. A unit whose child dies, or takes longer over a batch than `isolate`
-      seconds (True: 600), is halved until the members are known that end it; these are labelled `crashed`.
+    - `isolate`: compute in a child process. A unit whose child dies, or takes longer than `isolate` seconds over a
+      batch (True: 600), is halved until the members that end it are known; these are labelled `crashed`.
     - `progress`: a line on stderr.
     - `rtol`, `atol`, `max_steps`, `event`, `solver`: as in `simulate_batch`.
 
     Members that fail cost the others nothing: `result` says how each ended, `print(sweep)` names them. Functions
-    written in jax.numpy are compiled for all members at once; others are called member by member, which is told, and
-    where `keep` then raises or returns another shape for some member, that one is `keep_failed`. Numbers are the same,
-    bit for bit, whoever computes which unit, on machines of one kind of CPU.
+    written in jax.numpy are compiled for all members at once. Others are called member by member, and the status says
+    so; a member for which `keep` then raises, or returns another shape, is `keep_failed`. On machines of one kind of
+    CPU the numbers are the same, bit for bit, whichever worker computes which unit.
 
-    Memory: beside Python and JAX two units of what is kept (128 MiB), and a few times the path of a batch (64 MiB).
+    Memory, beside Python and JAX: two units of kept quantities (128 MiB), and a few times the path of a batch (64 MiB).
 
     **Raises** `TypeError` or `ValueError` for what cannot be right, before anything is computed, and for a store that
     was begun with another description, saying what differs; `OSError` for a disk that is full or read-only,

@@ -84,8 +84,8 @@ class Design:
 def random(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
     """`count` values drawn evenly from [low, high), for a name in `over` of `sweep`, or for a tuple of names.
 
-    Value k is a function of (seed, names, k) alone, by the counter-based generator Philox 4×64: more members begin with
-    the same ones. `low` and `high` are numbers, or one for each name. Raises `ValueError` for bounds that are no
+    Value k is a function of (seed, names, k) alone, by the counter-based generator Philox 4×64: a larger design begins
+    with the same values. `low` and `high` are numbers, or one for each name. Raises `ValueError` for bounds that are no
     interval.
 
     Source: Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*, SC 2011.
@@ -100,10 +100,10 @@ def random(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
 
 
 def sobol(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
-    """`count` points of Sobol's sequence, scrambled, between `low` and `high`: for means, whose error they make small.
+    """`count` points of Sobol's sequence, scrambled, between `low` and `high`: means over them have small errors.
 
-    The arguments are those of `random`; more members begin with the same ones. A power of two is the best `count`.
-    Raises `ValueError` for bounds that are no interval, and beyond 2³⁰ points.
+    The arguments are those of `random`; a larger design begins with the same points. A power of two is the best
+    `count`. Raises `ValueError` for bounds that are no interval, and beyond 2³⁰ points.
 
     Source: `scipy.stats.qmc.Sobol`; Joe & Kuo, SIAM J. Sci. Comput. 30 (2008) 2635; Owen, J. Complexity 14 (1998) 466.
 
@@ -117,7 +117,7 @@ def sobol(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
 
 
 def latin_hypercube(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
-    """`count` points of which each `count`-th part of every interval holds one: a latin hypercube.
+    """A Latin hypercube of `count` points: each of the `count` equal parts of every interval contains one of them.
 
     The arguments are those of `random`. It is a design as a whole: it cannot be extended, and has at most 10⁷ points.
     Raises `ValueError` for bounds that are no interval, and for more points.

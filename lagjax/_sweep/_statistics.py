@@ -21,10 +21,10 @@ _OFFSET = 2**20  # more than |log x| / log γ of any double
 
 
 class Statistics:
-    """What `reduce` asks of a quantity: count, mean, variance, least and greatest with their members, always.
+    """What `reduce` collects of a quantity: always count, mean, variance, and the extremes with their members.
 
     - `edges` (B + 1,): a histogram between these edges, in increasing order; the last bin includes its upper edge.
-    - `quantiles`: levels between 0 and 1, such as (0.05, 0.5, 0.95); read off to a thousandth of the value.
+    - `quantiles`: levels between 0 and 1, such as (0.05, 0.5, 0.95); resolved to a thousandth of the value.
 
     Members that failed, and values that are not finite, are left out and counted. Raises `ValueError` for edges that do
     not increase and levels that are none.

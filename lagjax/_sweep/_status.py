@@ -30,12 +30,13 @@ class Status(NamedTuple):
     """How far a sweep has come; print it, or read its fields.
 
     - `done`, `members`: how many members are done, of how many; `units_done`, `units`, `claimed` alike.
-    - `rate`: members per second of late, None before it is known; `left`: seconds until the end at that rate.
-    - `results`: how many members ended how, by the names of `lagjax.RESULTS`, `crashed` and `keep_failed`.
+    - `rate`: recent members per second, None before it is known; `left`: seconds until the end at that rate.
+    - `results`: the number of members that ended in each way, by the names of `lagjax.RESULTS`, `crashed` and
+      `keep_failed`.
     - `failures`: the first hundred of those that did not end well; the array `result` of the store has all.
     - `drift`: the largest change of the energy of a member that ended well, as (change, member, point); None where
       energy is not conserved, or none is known.
-    - `slow`: functions that are called member by member, since they are not written in jax.numpy, and why.
+    - `slow`: functions that are called member by member because they are not written in jax.numpy, and why not.
     - `cpus`: the kinds of CPU that computed units; members of several differ as by a change of rounding.
     """
 
