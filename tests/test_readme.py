@@ -37,7 +37,12 @@ def test_readme_commands_and_links():
     commands = "\n".join(blocks(README, "sh"))
     assert 'pip install -e ".[test]" && python -m pytest' in commands
     assert (ROOT / re.search(r"python (examples/\S+)", commands)[1]).exists()
+    titles = re.findall(r"^#+ (.*)$", README, flags=re.MULTILINE)
+    headings = {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
     for linked in re.findall(r"\]\(([^)]+)\)", README):
+        if linked.startswith("#"):
+            assert linked[1:] in headings, f"the README links to the section {linked}"
+            continue
         assert linked.startswith("https://") or (ROOT / linked).exists(), f"the README links to {linked}"
 
 
