@@ -67,7 +67,7 @@ class Course(NamedTuple):
 class Animation:
     """A motion as a film; made by `Trajectory.animate`. `save` writes it to a file, and a notebook shows it.
 
-    - `positions(times)`: where the points are, a dict of arrays (members, frames, k, 2 or 3) by name.
+    - `positions(times)`: the positions of the points, a dict of arrays (members, frames, k, 2 or 3) by name.
     - `span`: the first and the last time; `speed`: units of time in a second of the film; `fps`: frames in a second.
     - `traces`: the points that leave a trace, (name, place) each.
     """
@@ -101,7 +101,7 @@ class Animation:
         """Write the film: to a GIF, to MP4 (or .webm, .mov), or to a page of HTML, by the suffix of `path`.
 
         MP4 needs the program ffmpeg, or the package imageio-ffmpeg. A GIF has times in hundredths of a second: its
-        frames are as close to `fps` as that allows, and no faster or slower than the motion.
+        frame rate is as close to `fps` as that allows, and its speed is right.
 
         Raises `ImportError` without matplotlib, `ValueError` for another suffix, `RuntimeError` without ffmpeg.
         """

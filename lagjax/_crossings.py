@@ -30,8 +30,8 @@ class Crossings(NamedTuple):
     """Where a section was crossed, in the order of the motion; NaN beyond the last crossing.
 
     - `t`, shape (count,): when; `q`, `qdot`: the state then, with that axis in front of every leaf.
-    - `count`: how many crossings there were, also where that is more than there is room for.
-    - `ok`: whether the motion reached its end, and all crossings are there.
+    - `count`: how many crossings there were, which may be more than there is room for.
+    - `ok`: whether the motion reached its end and all its crossings are stored.
     """
 
     t: jax.Array
@@ -69,22 +69,22 @@ def crossings(
     r"""Where the motion of `system` from (q0, qdot0) at `ts[0]` crosses a section s(q, q̇, t) = 0 before `ts[-1]`.
 
     - `section`: a function of (q, qdot), and of `t` and `params` by name, that returns one real number. A crossing is
-      where that changes sign; to touch zero is none, and to begin on it neither. A dict of functions gives a dict of
-      `Crossings`, found in one run.
-    - `ts`: times, of which only the first and the last matter; decreasing, to go back in time.
-    - `direction`: −1 only where the section falls, +1 only where it rises, 0 both, as the motion meets it; for a dict
+      where that changes sign; to touch zero is not a crossing, nor is to begin on it. A dict of functions gives a dict
+      of `Crossings`, found in one run.
+    - `ts`: times, of which only the first and the last are used; decreasing to go back in time.
+    - `direction`: −1 for crossings where the section falls along the motion, +1 where it rises, 0 for both; for a dict
       of sections one for all, or a dict.
-    - `count`: the room for the crossings of each section. A motion that has more is an error, or with `throw=False` not
-      `ok`: the first ones are there, and `Crossings.count` tells how many there were.
+    - `count`: the largest number of crossings of each section. A motion with more crossings is an error, or with
+      `throw=False` not `ok`: the result then has the first `count`, and `Crossings.count` tells how many there were.
 
     The other arguments are those of `simulate`. Crossings are found on the Taylor series of the section along each
-    step, by a bound on that polynomial and without sampling, so that none is stepped over, to the rounding of the time;
-    where the section jumps through zero is one, too. Sections may be piecewise (`abs`, `where`, `max`, …).
+    step, by a bound on that polynomial and without sampling, so that none is missed, down to the rounding of the time.
+    A jump of the section through zero is a crossing, too. Sections may be piecewise (`abs`, `where`, `max`, …).
 
-    It works under `jax.jit` and `jax.vmap`, which makes one batch of all members, and has first and second derivatives:
-    with s′ the rate of the section along the motion, those of a crossing time are −ds / s′, and those of the state
-    there include the rate of the state times that. They take one more run. Where the motion only grazes the section s′
-    is zero, and there is no derivative.
+    `crossings` works under `jax.jit` and `jax.vmap`, which makes one batch of all members, and has first and second
+    derivatives. With s′ the rate of the section along the motion, the derivative of a crossing time is −ds / s′, and
+    that of the state there includes the rate of the state times it. Derivatives take one more run. Where the motion
+    only grazes the section, s′ is zero and there is no derivative.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right; `SimulationError` when the motion cannot
     be followed to its end, or has more crossings than `count`. It needs a scene that has machine code (see

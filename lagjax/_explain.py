@@ -28,27 +28,27 @@ _PIECES = {
 
 @dataclass(frozen=True)
 class Explanation:
-    """The facts about a scene; `str` prints them. Where they could not be read off, they are None.
+    """The facts about a scene; `print` shows them as a table. A fact that could not be determined is None.
 
     - `coordinates`: the name of every scalar coordinate; `cyclic`: those that L does not depend on, whose momenta are
-      conserved where no force acts, that of a constraint included.
+      conserved where no force and no constraint force acts.
     - `mass_matrix`: "constant" or "varying", then "diagonal", "block-diagonal" or "dense"; `mass_matrix_depends_on`:
       the coordinates, velocities (`d` before the name) and `t` that it reads.
     - `velocity_terms`: whether forces depend on the velocities; `explicit_time`: whether anything depends on `t`.
     - `energy_conserved`: whether h = p·q̇ − L is constant along every motion.
-    - `borders`: where the accelerations change their piece, as the sign or the whole part of a number and what that
-      reads; on the array path as the operation and its line. `borders_located`: whether steps end exactly there. Else
-      they go across, and derivatives do not see a jump. `narrow`: functions that are flat until their argument comes
-      near (exp, tanh, …), which is watched along every step of machine code.
+    - `borders`: where the accelerations are piecewise: the operation (a sign, a whole part) and what it reads; on the
+      array path the operation and its line. `borders_located`: whether steps end exactly there; otherwise they go
+      across, and derivatives do not see a jump. `narrow`: functions that are flat until their argument comes near (exp,
+      tanh, …), whose arguments machine code watches along every step.
     - `operations`: scalar operations of one acceleration (with constraints in machine code, where M is regular);
       `traced_operations`: of its derivatives before reduction.
-    - `constraints`: the name of every number that is to be zero; `dependent_constraints`: those that, at the state
-      asked about, are combinations of others before them, and of which (up to the part eps^(2/3) of the square of the
-      gradient). They change nothing but the multipliers.
-    - `projection_operations`: scalar operations of one way back to the constraints, taken after every step.
+    - `constraints`: the name of every number that is to be zero; `dependent_constraints`: those that, at the state in
+      question, are combinations of earlier ones, and of which (to eps^(2/3) of the squared gradient). They change
+      nothing but the multipliers.
+    - `projection_operations`: scalar operations of one projection onto the constraints, which follows every step.
     - `path`: "scalar" or "array"; `reason`: why not "scalar".
-    - `solver`: what integrates the motion by default, and where it is not machine code, why not; of machine code,
-      whether it is written operation by operation or walks along tables of them.
+    - `solver`: the default engine, and why not machine code where it is not; for machine code also whether operations
+      are written one by one or stand in tables.
     """
 
     coordinates: tuple[str, ...]

@@ -127,10 +127,10 @@ def work_precision(
 
     The error of a trajectory is the largest |q_i(t) − reference| over all coordinates i and all output times t, in the
     units of q. The reference is the default solver of `simulate` at rtol = 50 round-offs, in float64 wherever that is
-    enabled. Its own error is estimated by its distance to the same at 500 round-offs, and returned as
-    `reference_error`; that distance is mostly the error of the looser one, so the estimate is on the safe side.
-    Outputs between steps are interpolated, and a solver whose interpolation is less accurate than its steps, as that
-    of plain `diffrax.Dopri8()` is, pays for it here as it does in use.
+    enabled. Its own error is estimated by its distance to a second run at 500 round-offs, and returned as
+    `reference_error`; that distance is mostly the error of the second run, so the estimate is on the safe side. Outputs
+    between steps are interpolated: a solver whose interpolation is less accurate than its steps, such as plain
+    `diffrax.Dopri8()`, shows that error here, as it does in use.
 
     - `system`, `q0`, `qdot0`, `ts`, `params`, `max_steps`: as for `simulate`.
     - `solvers`: names, and what `simulate` takes as its `solver`: an adaptive one of diffrax, `lagjax.MachineCode()`,
@@ -140,10 +140,10 @@ def work_precision(
       from 1e-2 to 1e-5 in float32.
     - `batch_axes`: time `simulate_batch` with these axes instead of `simulate`. Errors are then the median and the
       maximum over the members that reached their end.
-    - `repeats`: how often each is timed. The median counts, without the compilation, which is once per solver.
+    - `repeats`: how often each run is timed. The median counts, without the compilation.
 
-    `wasted` counts the steps for which a lane stood empty, as a part of all that were taken. In diffrax a batch steps
-    until its slowest member arrives; machine code gives the lane of a member that has ended to the next one.
+    `wasted` is the share of steps that a lane took for a member that had already ended. In diffrax a batch steps until
+    its slowest member arrives; machine code gives the lane of a member that has ended to the next one.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, `SimulationError` when the reference of
     a single trajectory cannot be followed to its end.

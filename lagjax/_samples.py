@@ -31,12 +31,12 @@ def samples(
 
     where mᵢ is the slope at xᵢ of the parabola through the three samples about it, at the ends through the three
     nearest. That is `scipy.interpolate.CubicHermiteSpline(x, v, numpy.gradient(v, x, axis=0, edge_order=2))`: its slope
-    is continuous, no sample matters farther than two knots away, and it may overshoot. No natural spline: its
-    coefficients depend on all samples at once, so that none could be computed where it is needed.
+    is continuous, no sample matters farther than two knots away, and it may overshoot. It is not a natural spline,
+    whose coefficients depend on all samples at once.
 
-    Outside of the knots nothing is made up: before the first one u is NaN, after the last one the last sample stays
-    with "zero", and u is NaN with "linear" and "cubic". The last knot itself is inside. A motion that comes to where u
-    is NaN fails there, with a sentence that says when.
+    There is no extrapolation: before the first knot u is NaN; after the last knot "zero" keeps the last sample, and u
+    is NaN with "linear" and "cubic". The last knot itself is inside. A motion that reaches a time at which u is NaN
+    fails there, with a sentence that says when.
 
     **Takes**
 
@@ -46,16 +46,17 @@ def samples(
 
     **Gives** u, a function of a time () that returns () or (m,); or of times (…), that returns (…) or (…, m).
 
-    u is a plain JAX function: it can be differentiated by t, by the values, and by the knots except for where it jumps,
-    batched, and compiled. In machine code a step ends at every knot exactly, without a search for it, an entry is read
-    where it is needed, and a gradient by all samples costs as much as one by a single number; so long as knots and
-    values reach `samples` as they are in `params`, or are known numbers: compute with u(t) instead of with the values.
-    Where u jumps, with "zero", derivatives of the motion by the values are exact, and those by the knots contain what a
-    later jump changes. Second derivatives that do not exist here are NaN: by knots at which the acceleration jumps, and
-    across other borders at which it does. Adaptive steps of diffrax end at the knots of a scalar program, too.
+    u is a plain JAX function: it can be batched, compiled, and differentiated with respect to t, the values, and the
+    knots except those where it jumps. In machine code a step ends exactly at every knot, without a search; entries are
+    read where they are needed, and a gradient with respect to all samples costs as much as one with respect to a single
+    number. This holds if knots and values are known numbers or unchanged leaves of `params`: compute with u(t) instead
+    of with the values. Where u jumps, with "zero", derivatives of the motion with respect to the values are exact, and
+    those with respect to the knots include the effect of a jump that comes later. Second derivatives that do not exist
+    are NaN: those with respect to knots at which the acceleration jumps, and those across other borders at which it
+    jumps. Adaptive steps of diffrax end at the knots of a scalar program, too.
 
     **Raises** `TypeError` or `ValueError` for knots that do not increase, shapes that do not fit, samples that are not
-    finite, and an unknown `hold`; of what is traced, only the shapes can be looked at.
+    finite, and an unknown `hold`. Only the shapes of traced arrays can be checked.
 
     ```python
     import jax, jax.numpy as jnp, lagjax

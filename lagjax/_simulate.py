@@ -58,46 +58,52 @@ def simulate(
     - `q0`, `qdot0`: the initial state, pytrees of real floats of one structure. Their dtype (float32, float64) is that
       of the whole integration.
     - `ts`: output times, shape (T,), T ≥ 2, strictly increasing, or strictly decreasing to go back in time.
-    - `params`: whatever the scene's functions ask for; every number in it is traced and differentiable.
+    - `params`: a pytree of the parameters that the scene's functions take; every number in it is traced and
+      differentiable.
     - `rtol`, `atol`: local error per step, |error| ≤ atol + rtol·|y|, in every component of the state (with diffrax, in
       root mean square over them). By default rtol = 1e-9 in float64 and 1e-5 in float32, and atol = rtol/1000. `atol`
-      is in the units of the state. In float32 times, parameters and all arithmetic are float32 too; the ready scenes
-      then come out to 4e-4 of the size of their motion, which is a few periods long. `Trajectory.health` tells more.
+      is in the units of the state. In float32 the times, the parameters and all arithmetic are float32 too; the errors
+      of the ready scenes are then up to 4e-4 of the size of their motion, over a few periods. `Trajectory.health` tells
+      more.
 
     **Rarer ones**
 
-    - `solver`: any diffrax solver for ODEs, or `lagjax.MachineCode()` to insist on the default. That is, in float64 on
-      a CPU, Taylor series in machine code made for the scene, of an order that suits `rtol`; `System.explain` says
-      where that cannot be. Then it is `lagjax.FineOutput(diffrax.Dopri8())`, order 8, with states between its steps
-      about as good as those at their ends (which diffrax's own interpolation for it is not).
+    - `solver`: any diffrax solver for ODEs, or `lagjax.MachineCode()` to insist on machine code. The default, in
+      float64 on a CPU, is Taylor series in machine code made for the scene, of an order that suits `rtol`;
+      `System.explain` says where that is not possible. Then the default is `lagjax.FineOutput(diffrax.Dopri8())`, of
+      order 8, whose states between steps are about as accurate as those at their ends (diffrax's own interpolation for
+      it is less accurate).
     - `dt`: take fixed steps of this size instead of adaptive ones; `rtol` and `atol` then do not apply.
     - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient by diffrax records that many
       times for every member: lower it for the gradient of a large batch.
-    - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued one stops the motion where it
-      changes sign; machine code finds that on its series, without sampling, so that none is stepped over, and a motion
-      that starts on the zero has to leave it first. A Boolean one stops it after the step on which it becomes true,
-      and is for diffrax, as is an event with a root finder of its own; there give a direction where the motion starts
-      on the zero. `diffrax.Event` around such functions sets the direction and the root finder.
+    - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued event stops the motion where it
+      changes sign. Machine code finds that on its series, without sampling, so that none is missed; a motion that
+      starts on the zero has to leave it first. A Boolean event stops the motion after the step on which it becomes
+      true. Boolean events, and events with a root finder of their own, are integrated by diffrax; there give a
+      direction if the motion starts on the zero. `diffrax.Event` around such functions sets the direction and the root
+      finder.
     - `adjoint`: how derivatives are taken. By default machine code goes back over its own steps in reverse mode
-      (`jax.grad`, `jax.vjp`), at the cost of a few motions however many parameters there are, and forward over them
-      along all directions together (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist.
-      What diffrax integrates is differentiated over the recorded steps, in reverse mode only. Pass
-      `diffrax.ForwardMode()` for forward mode there, or any other diffrax adjoint. With an event the default there is
+      (`jax.grad`, `jax.vjp`), at the cost of a few motions however many parameters there are, and forward over them in
+      forward mode, all directions together (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist. A run of
+      diffrax is differentiated over the recorded steps, in reverse mode only. Pass `diffrax.ForwardMode()` for forward
+      mode there, or any other diffrax adjoint. With an event the default there is
       `diffrax.RecursiveCheckpointAdjoint()`; in machine code the end of a motion by an event has first and second
       derivatives.
     - `throw`: raise when the motion does not reach its end. With `throw=False` look at `trajectory.ok`.
     - `progress`: print how far the integration has come; or any diffrax progress meter.
 
     **Borders.** Forces and potentials may have kinks and jumps (`where`, `abs`, `sign`, `clip`, `floor`, …), also in
-    time. Machine code ends a step at every border and begins the next one beyond it; where both sides push onto one, as
-    dry friction at rest does, the motion stays on it. First derivatives take part in that; second ones are NaN where a
-    force jumps on the way. With diffrax steps shrink at borders instead, and derivatives do not see a jump.
+    time. Machine code ends a step at every border and begins the next one beyond it; where both sides push towards the
+    border, as dry friction at rest does, the motion stays on it. First derivatives include the jumps at borders; second
+    derivatives are NaN where a force jumps on the way. With diffrax, steps shrink at borders instead, and derivatives
+    do not see a jump.
 
-    Functions given here (the event, those inside `system`) are compiled once per function *object*: define them once,
-    not in a loop.
+    The event and the functions inside `system` are compiled once per function *object*: define them once, not in a
+    loop.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, before anything is integrated;
-    `SimulationError` when the motion cannot be followed to its end. Inside `jit` the same failures raise at run time.
+    `SimulationError` when the motion cannot be followed to its end. Inside `jit` the same failures are raised at run
+    time.
 
     Source: Jorba & Zou, *A software package for the numerical integration of ODEs by means of high-order Taylor
     methods*, Exp. Math. 14 (2005) 99; Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.4-5.
@@ -147,11 +153,12 @@ def simulate_batch(
     """The motion of many members of one scene at once: the same numbers as `jax.vmap` over `simulate`.
 
     `batch_axes` says for (q0, qdot0, params) which axis runs over the members, as `in_axes` of `jax.vmap` does: an
-    integer, None for what all share, or a pytree of these. The default is a batch of initial states; a sweep over
-    parameters from one initial state is `batch_axes=(None, None, 0)`. In the result the members are the first axis.
+    integer, None for an argument that all members share, or a pytree of these. The default is a batch of initial
+    states; a sweep over parameters from one initial state is `batch_axes=(None, None, 0)`. In the result the members
+    are the first axis.
 
-    A member that fails, or starts from NaN, never raises and costs the others nothing: look at `trajectory.ok` and
-    `trajectory.result`. The other arguments, the errors raised for them, and the source are those of `simulate`.
+    A member that fails, or starts from NaN, never raises and does not affect the others: look at `trajectory.ok` and
+    `trajectory.result`. The other arguments, their errors, and the source are those of `simulate`.
 
     ```python
     import jax.numpy as jnp, lagjax

@@ -39,29 +39,30 @@ class System(eqx.Module):
         d/dt ∂L/∂q̇ = ∂L/∂q + Q − ∂D/∂q̇ + (∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ.
 
     The multipliers λ, μ are those for which f and a stay zero. Their sign is that of L̄ = L + Σ λ f, so that (∂f/∂q)ᵀλ
-    is the force that the constraint exerts. Constraints on velocities act by the principle of d'Alembert and Lagrange:
-    their force does no work on the velocities they allow. They are not added to L. M may be singular where constraints
-    hold what L does not; redundant constraints change nothing but the multipliers, of which the shortest are given.
+    is the force that the constraint exerts. Constraints on velocities follow the principle of d'Alembert and Lagrange:
+    their force does no work on the velocities they allow, and they are not added to L. M may be singular where
+    constraints determine the accelerations that L leaves open. Redundant constraints change nothing but the
+    multipliers, which are then those of least norm.
 
     **Arguments**
 
     - `lagrangian(q, qdot)`: a plain JAX function that returns the scalar L. `q` is any pytree of real floats (a number,
       an array, a dict, a NamedTuple); `qdot` has the same structure. L need not be T − U.
-    - `forces(q, qdot)`: the generalised forces Q that no potential gives, in the structure of `q`.
+    - `forces(q, qdot)`: the generalised forces Q that have no potential, in the structure of `q`.
     - `dissipation(q, qdot)`: the scalar D, half the power that is dissipated when D is quadratic in `qdot`.
     - `constraints(q)`: what must stay zero, f(q, t) = 0: a number, an array, or a dict of named ones.
     - `velocity_constraints(q, qdot)`: a(q, q̇, t) = 0 that cannot be integrated to such an f: rolling, skates.
 
-    Each may also ask, by name, for the time `t` and the parameters `params` (any pytree), and in a scene that is fitted
-    to records for their sampled `inputs` (`lagjax.Record`).
+    Each may also take, by name, the time `t` and the parameters `params` (any pytree), and in a scene that is fitted to
+    records their sampled `inputs` (`lagjax.Record`).
 
     - `path`: how the equations are evaluated. A small scene is reduced to a scalar program that holds only the
       arithmetic it needs, a large one keeps arrays; "auto" chooses, "scalar" and "array" insist. The motion is the
       same.
 
-    **Units.** Any consistent ones, and coordinates of different units may stand side by side: the momentum of q has
-    units mass·length²·time⁻¹/{q}, its force mass·length²·time⁻²/{q}, so that p q̇, F q and L are energies. A change of
-    units changes nothing but numbers.
+    **Units.** Any consistent ones; coordinates of different units may be mixed. The momentum of q has units
+    mass·length²·time⁻¹/{q}, its force mass·length²·time⁻²/{q}, so that p q̇, F q and L are energies. A change of units
+    changes nothing but numbers.
 
     **Raises** `TypeError` when a function has another signature, when coordinates are not real floats or when a
     function does not return what its role asks for; `ValueError` when `q` and `qdot` differ in structure or shape.
@@ -120,7 +121,8 @@ class System(eqx.Module):
     def acceleration(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
         """q̈ from Lagrange's equations, in the structure of `q`; NaN where no acceleration is determined.
 
-        That is where M is singular, or, with constraints, where M and the constraints together leave something free.
+        That is so where M is singular, or, with constraints, where M and the constraints together leave some
+        acceleration free.
         """
         return self._at(Motion.acceleration, q, qdot, t, params, restore=True)
 
@@ -138,7 +140,7 @@ class System(eqx.Module):
     def generalized_force(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
         """∂L/∂q + Q − ∂D/∂q̇, in the structure of `q`, in units energy/{q}.
 
-        Without constraints dp/dt equals it along the motion; with them, together with `constraint_force`.
+        Along a motion dp/dt equals this force plus, with constraints, `constraint_force`.
         """
         return self._at(Motion.generalized_force, q, qdot, t, params, restore=True)
 
@@ -180,8 +182,8 @@ class System(eqx.Module):
             q̂ minimises (q̂ − q)ᵀ M(q, q̇) (q̂ − q)    among all with f(q̂, t) = 0
             v̂ minimises (v̂ − q̇)ᵀ M(q̂, q̇) (v̂ − q̇)   among all with J v̂ + ∂f/∂t = 0 and a(q̂, v̂, t) = 0
 
-        It has the derivatives of that function, of every order, by the state, the time and the parameters. Values and
-        derivatives are NaN where Newton's method does not find it; constraints that contradict each other have none.
+        The projection has derivatives of every order with respect to the state, the time and the parameters. Values and
+        derivatives are NaN where Newton's method does not converge, as for constraints that contradict each other.
 
         **Raises** `ValueError` for a system without constraints.
 
@@ -200,8 +202,8 @@ class System(eqx.Module):
     def explain(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Explanation:
         """What this scene contains and what was left out of its equations; print it, or read its fields.
 
-        Read from the scene's programs, so that all of it holds for every state and time, except which constraints
-        depend on which. Raises what `System` raises for coordinates and functions that cannot be.
+        It is read from the scene's programs, so that all of it holds for every state and time, except which constraints
+        depend on which. Raises the errors of `System` for invalid coordinates and functions.
 
         ```python
         import lagjax

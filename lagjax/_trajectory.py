@@ -60,10 +60,10 @@ class Trajectory(eqx.Module):
       step before it failed.
     - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
     - `tolerances`: rtol and atol of a step; None where it had a fixed size.
-    - `engine`: what integrated it, "MachineCode" or "Diffrax"; "" for a hybrid motion.
-    - `mode`, `transitions`: of a hybrid motion (`simulate_hybrid`), the latter `Transitions`, else None. `system` is
-      then the dict of its modes, and quantities are those of the mode at every time, NaN where it is −1. A mode is a
-      place in `mode_names`: the dict itself loses its order in `jax.jit`.
+    - `engine`: the engine that integrated it, "MachineCode" or "Diffrax"; "" for a hybrid motion.
+    - `mode`, `transitions`: for a hybrid motion (`simulate_hybrid`) the mode at every output time and its
+      `Transitions`; otherwise None. `system` is then the dict of modes, and quantities are those of the mode at every
+      time, NaN where the mode is −1. A mode is a place in `mode_names`, because the dict loses its order in `jax.jit`.
     """
 
     ts: jax.Array
@@ -125,16 +125,16 @@ class Trajectory(eqx.Module):
         return self._at_every_time("constraint_force")
 
     def constraint_residual(self) -> PyTree:
-        """f and a at every output time, in the structure of `multipliers`: how far the motion has drifted."""
+        """f and a at every output time, in the structure of `multipliers`: the drift off the constraints."""
         return self._at_every_time("constraint_residual")
 
     def health(self, reference: "Trajectory | None" = None) -> Health:
-        """How far this motion can be trusted: what must be conserved and is not, constraints, the mass matrix, ...
+        """How far this motion can be trusted: conservation laws, constraints, the mass matrix, gradients.
 
         Print the result for a report with a verdict, or read its fields, which have the batch axes of the trajectory
         (`lagjax.Health`). `reference` is a trajectory of the same system from the same start at the same times, with a
-        tolerance tighter by ten or more: with it the error of the whole motion is estimated. What a law of conservation
-        shows is no bound for that error, which may grow with the motion.
+        tolerance tighter by ten or more; with it the error of the whole motion is estimated. The drift of conserved
+        quantities does not bound that error, which may grow along the motion.
 
         Raises `ValueError` for a reference that cannot be compared or is not tighter.
 
@@ -152,11 +152,11 @@ class Trajectory(eqx.Module):
         """An `xarray.Dataset` with a variable per leaf of `q` and `qdot` and the dimensions (member,) time, ...
 
         - `units`: a pytree prefix of `q` of texts or None: "m" for all coordinates, {"x": "m", "theta": "rad"} for
-          each. They stand in the `attrs` of the variables; velocities have them per `time_unit`.
-        - `time_unit`: that of the times, "s" or "year".
+          each. They are stored in the `attrs` of the variables; the units of velocities are these per `time_unit`.
+        - `time_unit`: the unit of the times, such as "s" or "year".
 
-        Batches of batches have the dimensions member_0, member_1, …. Members with times of their own, as under
-        `jax.vmap`, have them as a coordinate `t`.
+        Nested batches have the dimensions member_0, member_1, …. Where members have times of their own, as under
+        `jax.vmap`, the times are a coordinate `t`.
 
         Raises `ImportError` when xarray is not installed.
         """
@@ -165,9 +165,9 @@ class Trajectory(eqx.Module):
     def to_pandas(self, units: PyTree = None, time_unit: str | None = None):
         """A `pandas.DataFrame` with a row per output and a column per number: q['x'], q[1], …, qdot['x'], ….
 
-        The columns are called as in messages. The index is `t`; of a batch it is (member, t), in that order. Hybrid
-        motions have a column `mode` of names, missing where there is none. `units` and `time_unit` are those of
-        `to_xarray`; they stand in `frame.attrs["units"]`, by column.
+        The columns have the names that messages use. The index is `t`, or (member, t) for a batch. Hybrid motions have
+        a column `mode` of names, missing where there is none. `units` and `time_unit` are those of `to_xarray`; the
+        units are in `frame.attrs["units"]`, by column.
 
         Raises `ImportError` when pandas is not installed.
 
@@ -192,12 +192,11 @@ class Trajectory(eqx.Module):
           of that line), a pair (name, place), or a list of these.
         - `speed`: units of time that pass in a second; `fps`: frames in a second.
 
-        Frames are evenly spaced in time, whatever the outputs are; between them the motion is the cubic through q and
-        q̇ (Hermite), so that a film is as smooth as its outputs are close. Both axes have one scale. Of a batch the
-        first 50 members are drawn into one picture.
+        Frames are evenly spaced in time, whatever the outputs are. Between outputs the motion is the Hermite cubic
+        through q and q̇, so that closer outputs make a better film. Both axes have the same scale. The first 50 members
+        of a batch are drawn into one picture.
 
-        Raises `ImportError` where matplotlib is missing, when the film is made; `ValueError` for points, traces and
-        speeds that cannot be shown.
+        Raises `ImportError` without matplotlib; `ValueError` for points, traces and speeds that cannot be shown.
 
         ```python
         import jax.numpy as jnp, lagjax

@@ -35,9 +35,9 @@ _SMALLEST = 1e4
 def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0, params: PyTree = None) -> Findings:
     r"""What is wrong with `system` at the state (q, qdot), or worth knowing before it is integrated.
 
-    Derivatives are compared with finite differences, L̇ᵢ = [L(x + hᵢ) − L(x − hᵢ)]/2hᵢ and of higher order, on steps
-    over many scales, from both sides and from each. A mass matrix M = ∂²L/∂q̇² that is singular is examined in
-    the neighbourhood as well, which tells why. The arguments are those of `System.acceleration`: numbers, not batches.
+    Derivatives are compared with finite differences, [L(x + hᵢ) − L(x − hᵢ)]/2hᵢ and those of higher order, with steps
+    over many scales, centred and one-sided. Where the mass matrix M = ∂²L/∂q̇² is singular, it is examined in the
+    neighbourhood as well, to find the reason. The arguments are those of `System.acceleration`: numbers, not batches.
 
     **Kinds** of findings, by level (`Finding.level` may be lower for a mild case):
 
@@ -51,8 +51,8 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     - advice: `single_precision`, `integer_parameter`, `small_state`, `ill_conditioned`, `dependent_constraints`,
       `stiff`, `explicit_time`, `border` and `narrow_feature` (what lies ahead: a force switched on at t = 5).
 
-    **Raises** `TypeError`, `ValueError` for a state or for functions that no motion can begin with, in the words of
-    `simulate`; `ValueError` inside `jit`, where there are no numbers.
+    **Raises** `TypeError` or `ValueError`, with the messages of `simulate`, for a state or functions with which no
+    motion can begin; `ValueError` inside `jit`, where there are no numbers.
 
     Source: Press et al., *Numerical Recipes*, §5.7 (differences); Hairer & Wanner, *Solving Ordinary Differential
     Equations II*, §IV.1 (stiffness).

@@ -16,9 +16,9 @@ _SHOWN, _WIDTH = 12, 110  # findings that fit on one screen, and its columns
 class Finding:
     """One thing that is wrong, suspicious or worth knowing about a scene at a state.
 
-    - `kind`: a short name that stays the same, to be compared with; `lagjax.check` lists them.
-    - `level`: "error" where the motion cannot start or would be wrong, "warning" where it is probably not the one that
-      was meant, "advice" where it is right and could be had cheaper or better.
+    - `kind`: a short, stable name for use in programs; the docstring of `lagjax.check` lists all of them.
+    - `level`: "error" where the motion cannot start or would be wrong, "warning" where it is probably not the intended
+      one, "advice" where it is right but could be cheaper or more accurate.
     - `where`: the coordinates, parameters or constraints it is about, by the names the user gave them.
     - `message`: what is wrong and what to change.
     """

@@ -42,12 +42,12 @@ class FineOutput(_Around):
 
     The solver's own interpolant gives states at four points inside the step, the equations give the slopes there, and
     the polynomial of degree seven through yₙ, yₙ₊₁, the slopes at both ends and these four slopes is the new
-    interpolant: one order better than the states that the slopes were taken at, and closer than order tells. For
-    `Dopri8` its error is 5 to 70 times smaller than that of the solver's own, and a few times that of the steps. The
-    price is four evaluations of the right-hand side a step: use it where states between steps are wanted.
+    interpolant: one order higher than that of the states at which the slopes were taken. For `Dopri8` its error is 5 to
+    70 times smaller than that of the solver's own interpolant, and a few times that of the steps. It costs four
+    evaluations of the right-hand side per step: use it where states between steps are wanted.
 
-    `solver` is any explicit one whose last slope is taken at the end of the step (FSAL): `diffrax.Dopri8()`,
-    `diffrax.Tsit5()`. For a single `ODETerm`. Raises `TypeError` for any other.
+    `solver` is any explicit solver whose last slope is taken at the end of the step (FSAL), such as `diffrax.Dopri8()`
+    or `diffrax.Tsit5()`; it integrates a single `ODETerm`. Raises `TypeError` for any other.
 
     Source: Enright, Jackson, Nørsett & Thomsen, *Interpolants for Runge–Kutta formulas*, ACM TOMS 12 (1986) 193–218,
     §3 (boot-strapping).

@@ -116,33 +116,33 @@ class Health(eqx.Module):
 
     - `result`, `ok`, `accepted_steps`, `rejected_steps`: as in the trajectory.
     - `energy`: the largest |h − h₀ − W|, in units of energy, W the work done by forces, by an explicit time and by
-      moving constraints. `energy_allowed`: what the tolerances and round-off may add up to. `work_error`: how well W is
-      known from the outputs alone, zero where nothing does work; an imbalance below it means nothing.
-      Where a force of a piecewise scene does work, that of a motion that has met borders is not judged.
-      `outputs_needed`: about how many outputs would tell whether the power is balanced; the number of outputs where
-      these do. Where a transition lies between two outputs, what it takes is left out, and
-      so is the time from it to the next output.
+      moving constraints. `energy_allowed`: the drift that tolerances and round-off may add up to. `work_error`: the
+      uncertainty of W from the outputs alone, zero where nothing does work; an imbalance below it means nothing. Where
+      a force of a piecewise scene does work, the balance of a motion that has met borders is not judged.
+      `outputs_needed`: about how many outputs would decide whether the power is balanced; the present number where it
+      suffices. Where a transition lies between two outputs, the energy it takes is left out, and so is the time from it
+      to the next output.
     - `amplitude`: the largest change of a coordinate; infinite where nothing moves. `amplitude_needed`: the size below
       which atol allows errors of a ten-thousandth of it or more in every step; zero for fixed steps.
     - `momentum`, as `energy`: for each momentum that is conserved, pᵢ with ∂L/∂qᵢ = 0 and no force of any kind on it; a
-      last axis for those in `momentum_names`, which is None where that is not known; and
-      `momentum_allowed`.
+      last axis for those in `momentum_names`, which is None where that is not known. `momentum_allowed`: as
+      `energy_allowed`.
     - `constraint_distance`: for each of `constraint_names` (a last axis) the largest distance |f| / |∂f/∂q| of q from
       f = 0, zero for a velocity constraint; `constraint_rate`: the same for velocities, |Gq̇ + ∂f/∂t| / |G|.
       `constraint_allowed`: for these two (a last axis).
     - `smallest_eigenvalue` of M = ∂²L/∂q̇² (negative where M is indefinite); `condition`: the largest max|λ| / min|λ|;
-      `scaled_condition`: the same after scaling M to a unit diagonal, which is what accelerations suffer from.
-      `scaled_condition_allowed`: where round-off in q̈ reaches `SLACK` rtol; infinite with constraints, which hold what
-      M does not.
-    - `gradients_finite`: whether all that the acceleration is solved from has finite derivatives by the state, the time
-      and every parameter, at every output; `gradients_time`: the first where not.
-    - `diagnosis`: what the first member that did not reach its end ran into, in words; empty where all did, and under
+      `scaled_condition`: the same after scaling M to a unit diagonal, which decides the accuracy of accelerations.
+      `scaled_condition_allowed`: where round-off in q̈ reaches `SLACK` rtol; infinite with constraints, which may make
+      up for a singular M.
+    - `gradients_finite`: whether all terms of the equations of motion have finite derivatives with respect to the
+      state, the time and every parameter, at every output; `gradients_time`: the first time at which they do not.
+    - `diagnosis`: why the first member that failed did not reach its end, in words; empty where all did, and under
       `jax.jit`.
     - `borders`: how often the motion `crossed` a border of a piecewise force or L, began to slide along one (`slid`, as
       dry friction does that sticks), and `grazed` one, first at the time `t` (NaN: never). There a change within the
       tolerance decides whether the border is crossed: derivatives that do not exist are NaN. None where that is not
-      known: in a hybrid motion, under `jax.jit`, and where `borders_located` is False, for a solver of diffrax took its
-      steps across the borders.
+      known: in a hybrid motion, under `jax.jit`, and where `borders_located` is False, because a solver of diffrax has
+      stepped across the borders.
     - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
       largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
     """

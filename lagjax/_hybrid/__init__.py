@@ -48,11 +48,13 @@ def simulate_hybrid(
     r"""The motion from (q0, qdot0) in mode `start`, at the times `ts`, through every transition on the way.
 
     - `modes`: a `System` for each name; all share the structure of `q0` and `params`.
-    - `transitions`: which mode gives way to which, and where; the earliest one wins, the first listed of several at one
-      instant. The others then follow at once if the mode is the same and the reset has not changed their guards.
-    - `max_transitions`: the budget of transitions. A motion that needs more ends there and says so, with the result
-      `max_transitions_reached`; or `zeno` where no budget is enough: where their times pile up as the bounces of a ball
-      do, seen by intervals that shrink steadily to a sum before `ts[-1]`, or to less than rounding leaves of the time.
+    - `transitions`: from which mode to which, and where. The earliest transition happens; of several at one instant,
+      the first in the list. The others follow at once if the mode is the same and the reset has not changed their
+      guards.
+    - `max_transitions`: the budget of transitions. A motion that needs more ends there, with the result
+      `max_transitions_reached`; or with `zeno` where no budget is enough because the times accumulate, as the bounces
+      of a ball do. Intervals that shrink steadily to a sum before `ts[-1]`, or below the rounding of the time, count as
+      accumulating.
 
     The other arguments are those of `simulate`, `max_steps` counting for each stretch between transitions. The result
     is a `Trajectory` with two more fields: `mode`, for every output time the place of its mode in `modes` (−1 where it
@@ -60,13 +62,13 @@ def simulate_hybrid(
     before the reset, and `source`, `target` as places in `modes`, all of length `max_transitions` with NaN or −1 beyond
     the last, and their `count`.
 
-    Every member of a batch switches at its own time: use `jax.vmap`, `jax.jit` and `jax.grad` around it. Times and
-    states of transitions have first and second derivatives by the initial state and by params; third ones are not
-    right.
+    `jax.vmap`, `jax.jit` and `jax.grad` work around it, and every member of a batch switches at its own time. Times and
+    states of transitions have first and second derivatives with respect to the initial state and params; third
+    derivatives are not right.
 
-    A guard is looked at along the whole of every step, and a step is shortened until it is smooth there: one that
-    touches zero, or crosses it and comes back between two steps, is seen for what it is. A state that a reset leaves
-    off the constraints of its new mode ends the motion with the result `inconsistent_start`.
+    A guard is examined along the whole of every step, and a step is shortened until the guard is smooth there: a guard
+    that touches zero, or crosses it and comes back between two steps, is resolved. A reset to a state off the
+    constraints of the new mode ends the motion with the result `inconsistent_start`.
 
     **Raises** `TypeError`, `ValueError` for arguments that cannot be right, `SimulationError` as `simulate` does. It
     needs scenes that have machine code (see `System.explain`): float64, on the CPU.

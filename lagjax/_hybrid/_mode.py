@@ -38,11 +38,11 @@ class Transition(eqx.Module):
 
     - `guard`: a real function; it may also ask, by name, for `t`, `params` and `multipliers`, the last as the
       constraints of the mode return them.
-    - `direction`: −1 only when it falls, +1 only when it rises, 0 either way. A motion that begins on the surface has
-      to leave it first.
+    - `direction`: −1 only where the guard falls, +1 only where it rises, 0 for both. A motion that begins where the
+      guard is zero has to leave that surface first.
     - `reset(q, qdot)` → (q, qdot): the state after the transition; it may also ask for `t` and `params`. None keeps it.
 
-    Raises `TypeError` or `ValueError` for what cannot be a transition.
+    Raises `TypeError` or `ValueError` for names, guards and directions that are invalid.
 
     ```python
     import lagjax

@@ -43,9 +43,10 @@ __all__ = [
 class MachineCode(AbstractEngine):
     r"""Taylor series in machine code made for the scene: `simulate(..., solver=lagjax.MachineCode())`.
 
-    Left to its default, `solver=None`, a run goes to machine code where it can and to diffrax where it cannot.
-    `MachineCode()` insists: a run that cannot go there is a `ValueError` that says why, instead of a slower run.
-    `simulate`, `simulate_batch` and `work_precision` take it, the last one to compare it with solvers of diffrax.
+    With the default `solver=None` a run goes to machine code where it can and to diffrax where it cannot.
+    `MachineCode()` insists: a run that machine code cannot integrate is a `ValueError` that says why, instead of a
+    slower run. `simulate`, `simulate_batch` and `work_precision` take it, the last one to compare it with solvers of
+    diffrax.
 
     Each coordinate becomes a power series about the present time, of an order p that suits the tolerance,
 
@@ -54,11 +55,11 @@ class MachineCode(AbstractEngine):
     with the coefficients (q̈)ₖ by recurrences through the scalar operations of the acceleration. Four or eight members
     of a batch stand side by side in the vector registers of every core.
 
-    It is for float64 on CPUs, scenes whose acceleration is a scalar program of smooth or piecewise smooth operations
-    that fits into half of the machine's memory, adaptive steps, events that are real numbers, and derivatives by its
-    own adjoint. `System.explain` says whether a scene is one of these.
+    Machine code requires float64 on a CPU, a scene whose acceleration is a scalar program of smooth or piecewise smooth
+    operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;
+    derivatives are by its own adjoint. `System.explain` says whether a scene has machine code.
 
-    **Raises** nothing itself; the run raises `ValueError`, before anything is integrated, where it has no machine code.
+    **Raises** nothing itself; a run without machine code raises `ValueError` before anything is integrated.
 
     Source: Jorba & Zou, *A software package for the numerical integration of ODEs by means of high-order Taylor
     methods*, Exp. Math. 14 (2005) 99–117, §2.1, §3.2.
