@@ -70,9 +70,15 @@ class _Start(NamedTuple):
 def _require_gradients(names: list[str], start: _Start) -> None:
     for name, value, rate, gamma, length in zip(names, *start[:4], strict=True):
         if not np.isfinite([value, rate, gamma, length]).all():
-            raise ValueError(f"{name} is not finite at the initial state (value {value}, gradient {length}).")
+            raise ValueError(
+                f"{name} is not finite at the initial state (value {value}, gradient {length}): start where it is "
+                "finite, or write it so that it is finite there."
+            )
         if length == 0:
-            raise ValueError(f"{name} has zero gradient at the initial state, where it holds nothing.")
+            raise ValueError(
+                f"{name} has zero gradient at the initial state, so that it exerts no force there: write it with a "
+                "gradient that does not vanish where it is zero, f instead of f², say."
+            )
 
 
 def _require_room(names: list[str], start: _Start, coordinates: int, independent: int) -> None:

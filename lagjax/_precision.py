@@ -142,8 +142,8 @@ def work_precision(
       maximum over the members that reached their end.
     - `repeats`: how often each run is timed. The median counts, without the compilation.
 
-    `wasted` is the share of steps that a lane took for a member that had already ended. In diffrax a batch steps until
-    its slowest member arrives; machine code gives the lane of a member that has ended to the next one.
+    `wasted` is the number of steps that lanes spent idle, over the steps that the members needed. In diffrax a batch
+    steps until its slowest member arrives; machine code gives the lane of a member that has ended to the next one.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, `SimulationError` when the reference of
     a single trajectory cannot be followed to its end.

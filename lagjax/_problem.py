@@ -306,9 +306,10 @@ def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTr
         raise ValueError("batch_axes maps over nothing: name the axis of the members in q0, qdot0 or params.")
     if len(set(sizes.values())) > 1:
         listed = ", ".join(f"{label} has {size}" for label, size in sizes.items())
-        raise ValueError(f"The batch must have one size everywhere; {listed}.")
+        raise ValueError(f"All batched arguments must have the same number of members; {listed}.")
     if 0 in sizes.values():
-        raise ValueError("The batch is empty.")
+        listed = ", ".join(label for label, size in sizes.items() if size == 0)
+        raise ValueError(f"The batch is empty: {listed} has no member along its batch axis.")
     return axes, next(iter(sizes.values()))
 
 

@@ -149,7 +149,7 @@ REFUSED = {
     # simulate_batch
     "batch axes for two": (batch(batch_axes=(0, 0)), ValueError, "tuple of three"),
     "an axis that is not there": (batch(batch_axes=(1, 0, None)), ValueError, "it has no axis 1"),
-    "batches of two sizes": (batch(qdot0=jnp.zeros(3)), ValueError, "one size everywhere"),
+    "batches of two sizes": (batch(qdot0=jnp.zeros(3)), ValueError, "same number of members"),
     "a batch of nothing": (batch(batch_axes=(None, None, None)), ValueError, "maps over nothing"),
     "an empty batch": (batch(jnp.zeros(0), jnp.zeros(0)), ValueError, "batch is empty"),
     "NaN that all members share": (batch(params={"m": np.inf, "k": 1.0}), ValueError, r"params\['m'\] is inf"),
@@ -163,8 +163,8 @@ REFUSED = {
         hybrid(lambda: stay(guard=lambda q, v, multipliers: q)), ValueError, "no constraints",
     ),
     "modes in a list": (hybrid(modes=[FREE]), TypeError, "modes must be a dict"),
-    "a start in no mode": (hybrid(start="b"), ValueError, "mode 'b', which does not exist"),
-    "a transition to nowhere": (hybrid(lambda: stay(target="b")), ValueError, "target 'b', which does not exist"),
+    "a start in no mode": (hybrid(start="b"), ValueError, "start is 'b', which is no mode"),
+    "a transition to nowhere": (hybrid(lambda: stay(target="b")), ValueError, "target 'b', which is no mode"),
     "a mode that is never reached": (hybrid(modes={"a": FREE, "b": FREE}), ValueError, "unreachable"),
     "hybrid motion back in time": (hybrid(ts=TS[::-1]), ValueError, "ts must increase"),
     "hybrid motion in single precision": (

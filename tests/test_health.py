@@ -266,7 +266,7 @@ def test_references_that_cannot_be_compared():
         (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS[:-1], params, **tight), "shapes"),
         (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS + 1e-3, params, **tight), "times"),
         (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS, {"k": 1.4}, **tight), "params"),
-        (dataclasses.replace(given, system=lagjax.System(lambda q, v: 0.5 * v**2)), "same system"),
+        (dataclasses.replace(given, system=lagjax.System(lambda q, v: 0.5 * v**2)), "another system"),
         (swinging(rtol=2e-7), "at most 1e-07"),
     ):
         with pytest.raises(ValueError, match=sentence):

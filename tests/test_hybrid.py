@@ -598,9 +598,9 @@ PLANE = lagjax.System(lambda q, v: 0.5 * v @ v)
 @pytest.mark.parametrize(
     ("changes", "error", "sentence"),
     [
-        ({"start": "z"}, ValueError, "start in the mode 'z', which does not exist; there are 'a'"),
-        ({"transitions": [stay("y")]}, ValueError, "source 'y', which does not exist"),
-        ({"transitions": [stay("a", "y")]}, ValueError, "target 'y', which does not exist"),
+        ({"start": "z"}, ValueError, "start is 'z', which is no mode: the modes are 'a'"),
+        ({"transitions": [stay("y")]}, ValueError, "source 'y', which is no mode"),
+        ({"transitions": [stay("a", "y")]}, ValueError, "target 'y', which is no mode"),
         ({"modes": THREE, "transitions": [stay("a", "c"), stay("b", "a")]}, ValueError, "'a' to 'b': unreachable"),
         ({"transitions": [lambda q, v: q]}, TypeError, "must be lagjax.Transition"),
         ({"transitions": stay()}, TypeError, "must be a list of lagjax.Transition"),

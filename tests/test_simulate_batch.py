@@ -115,7 +115,7 @@ def test_to_xarray():
         ({"batch_axes": (None, None, None)}, "maps over nothing"),
         ({"batch_axes": (0, 0)}, "tuple of three"),
         ({"batch_axes": (1, 0, None)}, "q0 has shape \\(8,\\): it has no axis 1"),
-        ({"qdot0": jnp.zeros(7)}, "one size everywhere; q0 has 8, qdot0 has 7"),
+        ({"qdot0": jnp.zeros(7)}, "same number of members; q0 has 8, qdot0 has 7"),
         ({"batch_axes": (0, 0, {"mass": 0})}, "batch_axes for params"),
         ({"params": {"l": jnp.nan, "g": 9.81}}, r"params\['l'\] is nan"),
         ({"q0": 0.1}, "q0 has shape \\(\\)"),

@@ -71,7 +71,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     if jnp.ndim(t) != 0:
         raise ValueError(f"t must be one number; got shape {jnp.shape(t)}.")
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((q, qdot, t, params))):
-        raise ValueError("check looks at numbers: call it outside of jit, vmap and grad, on one state.")
+        raise ValueError("check needs numbers, not traced values: call it outside of jit, vmap and grad, on one state.")
     reported = _inputs(layout, q, qdot, t, params)
     if any(finding.level == "error" for finding in reported):
         return Findings.of(reported)

@@ -117,7 +117,7 @@ def form_of(derivation: Derivation, path: str = "auto") -> "ScalarEquations | Ar
         program = derivation.acceleration.complete
     except Unlowerable as reason:
         if path == "scalar":
-            raise ValueError(f"This scene has no scalar program: {reason}.") from None
+            raise ValueError(f"This scene has no scalar program: {reason}. Leave `path` at 'auto'.") from None
         return ArrayEquations(motion, str(reason))
     if path == "auto" and program.looks_up:  # whose inputs would be the entries of tables, one by one
         return ArrayEquations(motion, "it looks up entries of tables")

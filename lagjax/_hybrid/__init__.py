@@ -146,20 +146,23 @@ def _require_modes(modes, transitions, start, max_transitions) -> None:
         raise TypeError(f"transitions must be a list of lagjax.Transition; got {type(transitions).__name__}.")
     known = ", ".join(map(repr, modes))
     if not isinstance(start, str) or start not in modes:
-        raise ValueError(f"The motion is to start in the mode {start!r}, which does not exist; there are {known}.")
+        raise ValueError(f"start is {start!r}, which is no mode: the modes are {known}.")
     for transition in transitions:
         if not isinstance(transition, Transition):
             raise TypeError(f"transitions must be lagjax.Transition; got {transition!r}.")
         for role in ("source", "target"):
             if getattr(transition, role) not in modes:
                 name = getattr(transition, role)
-                raise ValueError(f"A transition has the {role} {name!r}, which does not exist; there are {known}.")
+                raise ValueError(f"A transition has the {role} {name!r}, which is no mode: the modes are {known}.")
     if jax.tree.leaves((modes, transitions)):
-        raise ValueError("A function of a mode or a transition holds arrays of its own: give them as params.")
+        raise ValueError("A function of a mode or a transition holds arrays of its own: pass these in `params`.")
     reached, growing = {start}, True
     while growing:
         more = {t.target for t in transitions if t.source in reached} - reached
         reached, growing = reached | more, bool(more)
     if lost := [name for name in modes if name not in reached]:
-        raise ValueError(f"No transition leads from {start!r} to {', '.join(map(repr, lost))}: unreachable.")
+        raise ValueError(
+            f"No transition leads from {start!r} to {', '.join(map(repr, lost))}: unreachable. Add a transition to "
+            "each of these modes, or leave them out."
+        )
     require_budget(max_transitions, "max_transitions")

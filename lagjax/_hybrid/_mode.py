@@ -86,7 +86,10 @@ class Mode(NamedTuple):
     def of(cls, name: str, problem: Problem, leaving: tuple[tuple[int, Transition], ...]) -> "Mode":
         """A mode that is ready to run. Raises `ValueError` where it has no machine code."""
         if len(leaving) > MOST_GUARDS:
-            raise ValueError(f"{len(leaving)} transitions leave the mode {name!r}, more than {MOST_GUARDS}.")
+            raise ValueError(
+                f"{len(leaving)} transitions leave the mode {name!r}, and {MOST_GUARDS} are possible: join the guards "
+                "of those that lead to the same mode, with jnp.minimum for instance."
+            )
         code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
         try:
             if refusal := MachineCode().refuses(problem):
