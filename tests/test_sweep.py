@@ -306,6 +306,18 @@ def test_changed_descriptions_are_refused_with_the_difference(tmp_path, undistur
     assert digests(tmp_path) == undisturbed
 
 
+@pytest.mark.slow
+def test_changed_solvers_and_events_are_refused(tmp_path):
+    swept(tmp_path, solver=diffrax.Dopri5())
+    with pytest.raises(ValueError, match=r"solver: .*Dopri5.* in the store, now .*Tsit5"):
+        swept(tmp_path, solver=diffrax.Tsit5())
+    falling, rising, timed = (diffrax.Event(at_the_bottom, direction=way) for way in (False, True, None))
+    swept(tmp_path, store=tmp_path / "event", event=falling)
+    for event in (rising, timed, None):
+        with pytest.raises(ValueError, match=r"(?s)What differs:\nevent"):
+            swept(tmp_path, store=tmp_path / "event", event=event)
+
+
 # ---- what goes wrong -------------------------------------------------------------------------------------------------
 
 

@@ -5,7 +5,7 @@ over, q0, keep, … ──► Motions, Grid ──► Store ──► units, cla
 _designs, _members   what is swept: axes and rules, the grid of members, its units
 _statistics          what is said of all members without a list
 _sections            motions of a batch with their crossings
-_scene               the user's functions: text, hash, the way to another process
+_identity, _scene    the user's functions: what they are, in words; their way to another process
 _store, _claims      the files; who has which unit
 _batch, _job, _unit  what computes a unit
 _begin, _extend      stores that are begun; those that take members of another one

@@ -1,18 +1,13 @@
-"""`Motions`: what is done with each member; its text and its hash, and the way of its functions to another process.
+"""`Motions`: what is done with each member; what tells it from another; its functions' way to other processes.
 
 A worker in another shell gets the functions by cloudpickle: those of the user's script by value, those of modules by
 name, found along the same `sys.path`. Whether they still are what the store was begun with is told by their programs,
 as JAX traces them, with every constant: a change of a global number changes those, though not the text of a function.
+Of what JAX does not trace here, `keep` above all, `_identity` tells it: the code, and all that it uses.
 """
 
 import difflib
-import functools
-import hashlib
-import inspect
-import re
 import sys
-import textwrap
-import types
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import accept
+from lagjax._sweep._identity import array_text, hash_of, identity, source, without_addresses
 from lagjax._sweep._sections import Sections
 from lagjax._sweep._statistics import Statistics
 from lagjax._system import System
@@ -31,6 +27,8 @@ PyTree = Any
 ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
 MOTION = (*ROLES, "q0", "qdot0", "params")  # what a motion depends on, besides its tolerances
 NOT_TRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
+_NUMBERS = ("rtol", "atol", "max_steps")
+_OF_EVENTS = ("direction", "root_finder")  # what a diffrax.Event has besides its condition
 _SHOWN = 40  # lines of a difference
 
 
@@ -79,8 +77,9 @@ class Motions:
 
     def described(self) -> dict:
         """The numbers among it, by name, for the store."""
-        shown: dict[str, Any] = {name: _value_text(value) for name, value in self.settings.items() if name != "event"}
-        times = {"ends": [float(self.ts[0]), float(self.ts[-1])], "outputs": len(self.ts), "sha256": _hash(self.ts)}
+        shown: dict[str, Any] = {name: _value_text(self.settings[name]) for name in _NUMBERS}
+        shown["solver"] = None if self.settings["solver"] is None else identity(self.settings["solver"])
+        times = {"ends": [float(self.ts[0]), float(self.ts[-1])], "outputs": len(self.ts), "sha256": hash_of(self.ts)}
         shown["crossings"] = self.sections.described() if self.sections else None
         shown["goes_on_from"] = self.left and self.left.path
         return {"ts": times, **shown, "reduce": {name: how.described() for name, how in self.reduce.items()}}
@@ -103,7 +102,8 @@ def texts(motions: Motions, names: list[str]) -> dict[str, dict[str, str]]:
     if event is not None:
         condition = getattr(event, "cond_fn", event)
         of_event = _traced(accept(condition, "event"), (q, qdot), params) if callable(condition) else None
-        found["event"] = _entry(condition, of_event) if callable(condition) else _entry(repr(event), None)
+        found["event"] = _entry(condition, of_event)
+        found["event"]["program"] += "\n" + identity([getattr(event, name, None) for name in _OF_EVENTS])
     for name, section in motions.sections.by_name().items() if motions.sections else ():
         of_section = _traced(accept(section, "section"), (q, qdot), params)
         found[f"crossings of {name}"] = _entry(section, of_section)
@@ -125,71 +125,27 @@ def _traced(function, arguments: tuple, params) -> Callable:
 
 
 def _entry(value: Any, program: Callable | None, *more: Any) -> dict[str, str]:
+    """The text of a function or a value, and what it computes: as JAX traces it, else its code and all that it uses."""
     text = source(value) if callable(value) else _value_text(value)
-    used = _used(value) if callable(value) else text
     if program is None:
-        return {"text": text, "program": used}
+        return {"text": text, "program": identity(value)}
     try:
         closed = program()
     except Exception:  # not written in jax.numpy, or it needs leaves that are no numbers: its code stands for it
-        return {"text": text, "program": used}
-    shown = re.sub(r"0x[0-9a-f]+", "0x", str(closed))
+        return {"text": text, "program": identity(value)}
+    shown = without_addresses(str(closed))
     constants = [_value_text(x) for x in [*closed.consts, *jax.tree.leaves(more)]]
-    return {"text": text, "program": "\n".join([shown, *constants])}
-
-
-def source(function: Any) -> str:
-    """The lines of a function, or its name where there are none to be read."""
-    while hasattr(function, "func"):
-        function = function.func
-    try:
-        return textwrap.dedent(inspect.getsource(function)).strip()
-    except (OSError, TypeError):
-        return f"<{getattr(function, '__qualname__', type(function).__name__)}, whose text cannot be read>"
-
-
-def _used(function: Any, depth: int = 0) -> str:
-    """The byte code of a function, and the numbers and functions that it uses from outside; in words."""
-    if isinstance(function, functools.partial):
-        return "\n".join([_used(function.func, depth), _value_text((function.args, function.keywords))])
-    code = getattr(function, "__code__", None)
-    if code is None or depth > 8:
-        return getattr(function, "__qualname__", type(function).__name__)
-    outside = inspect.getclosurevars(function)
-    values = {**outside.globals, **outside.nonlocals}
-    lines = [f"{name} = {_used_text(value, depth + 1)}" for name, value in sorted(values.items())]
-    return "\n".join([_code_text(code), _value_text(function.__defaults__), *lines])
-
-
-def _code_text(code: types.CodeType) -> str:
-    """A hash of what a function does, its numbers and names included; not of where it stands."""
-    inner = [_code_text(x) if isinstance(x, types.CodeType) else repr(x) for x in code.co_consts]
-    text = "\n".join([code.co_code.hex(), repr(code.co_names), repr(code.co_varnames), *inner])
-    return "code " + hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _used_text(value: Any, depth: int) -> str:
-    if inspect.ismodule(value) or inspect.isclass(value):
-        return getattr(value, "__name__", "")
-    if getattr(value, "__module__", "").split(".")[0] in ("jax", "numpy", "lagjax", "equinox", "diffrax"):
-        return f"{value.__module__}.{getattr(value, '__qualname__', '')}"  # the versions tell of these
-    return _used(value, depth) if callable(value) else _value_text(value)
+    called = [identity(value)] if "callback" in shown else []  # functions that a program names, and does not hold
+    return {"text": text, "program": "\n".join([shown, *constants, *called])}
 
 
 def _value_text(value: PyTree) -> str:
     """A pytree of numbers in words, large arrays by their hash."""
     lines = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(value):
-        if isinstance(leaf, jax.Array | np.ndarray) and np.size(leaf) > 16:
-            leaf = f"{leaf.dtype}{np.shape(leaf)} {_hash(np.asarray(leaf))}"
-        elif isinstance(leaf, jax.Array | np.ndarray):
-            leaf = f"{leaf.dtype} {np.asarray(leaf).tolist()}"
-        lines.append(re.sub(r"0x[0-9a-f]+", "0x", f"{jax.tree_util.keystr(path)} {leaf!r}".strip()))
+        text = array_text(leaf) if isinstance(leaf, jax.Array | np.ndarray) else without_addresses(repr(leaf))
+        lines.append(f"{jax.tree_util.keystr(path)} {text}".strip())
     return "\n".join(lines) or "None"
-
-
-def _hash(array: np.ndarray) -> str:
-    return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
 
 
 def difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]) -> str | None:

@@ -28,7 +28,7 @@ from lagjax._sweep import _designs
 from lagjax._sweep._designs import Design
 from lagjax._sweep._members import Axis, Grid
 
-FORMAT = 1
+FORMAT = 2
 JOB = ".sweep"
 KNOWN = "known"  # the folder of members that were taken from another store
 _LEFT = 3600.0  # seconds after which a file that nobody has touched is of a dead worker; those who live beat
