@@ -125,8 +125,6 @@ def test_a_record_of_one_system_is_predicted(records, joint):
         assert ((low[name] < values) & (values < high[name])).mean() > 0.98
     with pytest.raises(ValueError, match="give system=, one of 'single', 'double'"):
         joint.predict(records["single"])
-    with pytest.raises(ValueError, match="There is no density of several systems"):
-        joint.sample(10)
 
 
 def test_segments_of_one_system_bring_all_from_far_off(records, joint):
@@ -170,7 +168,7 @@ def test_what_no_system_sees_is_named(records, joint):
         ({"system": {}}, ValueError, "system is an empty dict"),
         ({"system": {1: SINGLE}}, TypeError, "have names; 1 is no str"),
         ({"observe": None}, ValueError, "Of the system 'double': values must have the structure of q"),
-        ({"method": "gradient"}, ValueError, "is for one system"),
+        ({"method": "gradient", "starts": 2}, ValueError, "goes down from one start"),
     ],
 )
 def test_what_cannot_be_is_a_sentence(records, change, error, sentence):

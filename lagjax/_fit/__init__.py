@@ -151,10 +151,10 @@ def fit(
         question.watch = _Printer(question.size)
     y0 = _starts(scenes, readers, question.states, params0)
     first, told = parameters.moved(parameters.first), (system, observe, question)
-    systems = [scene.system for scene in scenes]
+    systems = {scene.name: scene.system for scene in scenes}
     if method == "gradient":
-        return _told(*told, by_gradient(question, systems[0], first, y0, noise, readers), noise, None)
-    weak = functools.partial(weakly, question, systems, readers=readers or [])
+        return _told(*told, by_gradient(question, systems, first, y0, noise, readers), noise, None)
+    weak = functools.partial(weakly, question, list(systems.values()), readers=readers or [])
     search = functools.partial(search_records, question, noise=noise, method=method, readers=readers, weak=weak)
     descent, waterfall = searches(question, search, first, y0, starts, seed)
     question.watch = None
@@ -189,8 +189,6 @@ def _require_one_beginning(question: AbstractQuestion, starts: int, method: str)
     """Raise `ValueError` where many starts, or a descent by gradients, are asked for and cannot be."""
     if method == "gradient" and starts > 1:
         raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
-    if method == "gradient" and not isinstance(question, Question):
-        raise ValueError('method="gradient" is for one system: leave `method` at "auto" for several.')
     for one in [part.question for part in question.parts] if starts > 1 else []:
         if one.signals.delays is not None:
             raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")

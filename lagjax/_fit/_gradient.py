@@ -17,7 +17,7 @@ import numpy as np
 
 from lagjax._fit._density import Density
 from lagjax._fit._noise import AbstractNoise, Widths
-from lagjax._fit._residuals import Failure, Point, Question
+from lagjax._fit._residuals import AbstractQuestion, Failure, Point
 from lagjax._fit._solve import Descent
 from lagjax._system import System
 
@@ -27,8 +27,8 @@ _STILL = 1.0  # what log L may gain over the last tenth of the steps where the d
 
 
 def descend(
-    question: Question, system: System, u: np.ndarray, starts: np.ndarray, noise: AbstractNoise, steps: int,
-    told: Callable[[str], None] | None = None,
+    question: AbstractQuestion, systems: dict[str | None, System], u: np.ndarray, starts: np.ndarray,
+    noise: AbstractNoise, steps: int, told: Callable[[str], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, bool] | Failure:  # fmt: skip
     """u (F,), the starts (N, 2n) after so many steps, and whether log L has come to rest.
 
@@ -36,11 +36,11 @@ def descend(
     """
     optax = _optax()
     whole = Widths(question.size, np.full(len(question.size), np.inf))
-    density = Density(question, system, noise, Point(u, starts, [], []), whole, np.ones(len(question.size)))
+    density = Density(question, systems, noise, Point(u, starts, [], []), whole, np.ones(len(question.size)))
     first = _with_noise(density, question, noise)
     if isinstance(first, Failure):
         return first
-    scale = jnp.asarray(_scales(density, first), question.layout.dtype)
+    scale = jnp.asarray(_scales(density, first), density.dtype)
     cost = lambda z: -density.log_likelihood(first + scale * z) / question.measured  # noqa: E731
     rate = optax.warmup_cosine_decay_schedule(0.0, _RATE, int(_WARM * steps) + 1, steps)
     adam = optax.apply_if_finite(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate)), steps)
@@ -68,10 +68,10 @@ def descend(
     return x[: len(u)], np.asarray(at.starts, float), bool((rest - costs[-1]) * question.measured < _STILL)
 
 
-def _with_noise(density: Density, question: Question, noise: AbstractNoise) -> np.ndarray | Failure:
+def _with_noise(density: Density, question: AbstractQuestion, noise: AbstractNoise) -> np.ndarray | Failure:
     """The first x (D,), with the noise that its residuals have."""
-    at = density.unknowns(jnp.asarray(density.first, question.layout.dtype))
-    left = [np.asarray(density.residuals(batch, at), float) for batch in question.batches]
+    at = density.unknowns(jnp.asarray(density.first, density.dtype))
+    left = [np.asarray(residuals, float) for residuals in density.residuals(at)]
     for batch, residuals in zip(question.batches, left, strict=True):
         bad = ~np.isfinite(residuals).all(axis=(1, 2))
         if bad.any():
@@ -80,9 +80,8 @@ def _with_noise(density: Density, question: Question, noise: AbstractNoise) -> n
             )
     flat = np.concatenate([r.reshape(-1, r.shape[-1]) for r in left])
     widths = noise.widths(flat, question.weights, question.least)
-    x, count = density.first.copy(), len(widths.sigma)
-    begin = len(x) - count * (1 + density.moves_dof)
-    x[begin : begin + count] = np.log(widths.sigma)
+    x = density.first.copy()
+    x[density.of_noise] = np.log(widths.sigma)
     return x
 
 
@@ -92,14 +91,18 @@ def _scales(density: Density, x: np.ndarray) -> np.ndarray:
     scale = np.ones(len(x))
     unbounded = np.isinf(question.parameters.reach)
     scale[:free] = np.where(unbounded, np.maximum(1.0, np.abs(x[:free])), 1.0)
-    fitted = density.point.starts[question.fitted]
-    if fitted.size:
-        size = np.sqrt(np.mean(fitted**2, axis=0))
-        scale[free : free + fitted.size] = np.tile(np.where(size > 0, size, 1.0), len(fitted))
+    for one in density.systems:
+        fitted = one.rows[one.question.fitted]
+        if len(fitted):
+            places = density.of_starts[fitted, : one.question.states]
+            size = np.sqrt(np.mean(x[places] ** 2, axis=0))
+            scale[places] = np.where(size > 0, size, 1.0)
     return scale
 
 
-def ended(question: Question, u: np.ndarray, starts: np.ndarray, noise, steps: int, rest: bool) -> Descent | Failure:
+def ended(
+    question: AbstractQuestion, u: np.ndarray, starts: np.ndarray, noise, steps: int, rest: bool
+) -> Descent | Failure:
     """What the descent came to, with the derivatives that intervals need."""
     point = question.at(u, starts)
     if isinstance(point, Failure):

@@ -217,10 +217,9 @@ class Fit:
         number. On the function, `first` is the vector of the fit, `names` names its numbers, `covariance()` is that of
         least squares, and `params(u)` turns the first numbers into the user's pytree.
         """
-        if not isinstance(self.question, Question):
-            raise ValueError("There is no density of several systems yet: use `intervals` and `profile`.")
         shares = np.array([noise.effective / noise.samples for noise in self.noise.values()])
-        return Density(self.question, self.system, self.law, self._point, self.widths, shares, prior)
+        systems: dict = self.system if isinstance(self.system, dict) else {None: self.system}
+        return Density(self.question, systems, self.law, self._point, self.widths, shares, prior)
 
     def sample(self, draws: int = 1000, seed: int = 0, *, chains: int = 4, prior: Callable | None = None) -> Any:
         """Draws of the posterior by the No-U-Turn sampler, `draws` of each chain, as `arviz.InferenceData`.
@@ -232,8 +231,9 @@ class Fit:
         `attrs["sampler"]` of the result says which of the two it was, and the share of draws that was accepted.
 
         All chains are integrated as one batch of motions: many chains with few draws are cheaper than few with many.
-        The variables are the free parameters by their names, `q0` and `qdot0` of the records whose starts are fitted,
-        and `sigma`, `dof` of the signals. `arviz.summary` tells whether chains agree.
+        The variables are the free parameters by their names, `q0` and `qdot0` of the records whose starts are fitted
+        (`a: q0` where the fit is of several systems), and `sigma`, `dof` of the signals. `arviz.summary` tells whether
+        chains agree.
 
         Source: Hoffman & Gelman, JMLR 15 (2014) 1593; Christen & Fox, J. Comput. Graph. Stat. 14 (2005) 795.
 

@@ -107,7 +107,7 @@ def _tuned(surrogate: Surrogate, chains: int, key) -> tuple[Sampler, Any]:
     """The sampler with a step and a metric from its own draws of π*; and where its chains are."""
     blackjax = _blackjax()
     kernel = blackjax.nuts.build_kernel()
-    size, dtype = len(surrogate.centre), surrogate.density.question.layout.dtype
+    size, dtype = len(surrogate.centre), surrogate.density.dtype
 
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, 0, None, None))
@@ -224,7 +224,7 @@ def _corrected(surrogate: Surrogate, sampler: Sampler, exact: Callable, at: Chai
 def _along_exact(density: Density, draws: int, chains: int, seed: int, why: str) -> Draws:
     """Draws by gradients through the motions; `why` says what speaks against the expansion."""
     blackjax = _blackjax()
-    root = jnp.asarray(np.linalg.cholesky(density.covariance()), density.question.layout.dtype)
+    root = jnp.asarray(np.linalg.cholesky(density.covariance()), density.dtype)
     centre = jnp.asarray(density.first, root.dtype)
     of_z = lambda z: density(centre + root @ z)  # noqa: E731
     kernel = blackjax.nuts.build_kernel()
@@ -268,11 +268,14 @@ def inference_data(density: Density, drawn: Draws) -> Any:
         posterior[part.label] = values[..., begin : begin + count].reshape(chains, draws, *shape)
         dims[part.label] = [f"{part.label} {axis}" for axis in range(len(shape))]
         begin += count
-    if question.fitted.any():
-        n = question.layout.size
-        coords |= {"record": np.flatnonzero(question.fitted), "coordinate": list(question.layout.names)}
-        posterior |= {"q0": starts[..., question.fitted, :n], "qdot0": starts[..., question.fitted, n:]}
-        dims |= {"q0": ["record", "coordinate"], "qdot0": ["record", "coordinate"]}
+    for one, (part, _) in zip(density.systems, question.apart, strict=True):
+        fitted, layout = one.question.fitted, one.question.layout
+        of = "" if part.name is None else f"{part.name}: "
+        if fitted.any():
+            own, axes = starts[..., one.rows[fitted], : one.question.states], [f"{of}record", f"{of}coordinate"]
+            coords |= dict(zip(axes, (np.flatnonzero(fitted), list(layout.names)), strict=True))
+            posterior |= {f"{of}q0": own[..., : layout.size], f"{of}qdot0": own[..., layout.size :]}
+            dims |= {f"{of}q0": axes, f"{of}qdot0": axes}
     coords["signal"] = list(question.names)
     posterior["sigma"], dims["sigma"] = sigma, ["signal"]
     if np.isfinite(density.widths.dof).any():

@@ -65,15 +65,18 @@ def search_records(question: AbstractQuestion, u, starts, noise, method: str, re
     return _followed(question, done)
 
 
-def by_gradient(question, system: System, u, y0, noise, readers) -> Descent:
+def by_gradient(
+    question: AbstractQuestion, systems: dict[str | None, System], u, y0, noise, readers: list[Reader | None] | None
+) -> Descent:
     """The descent by gradients: over segments of the records that grow, where they can be read, then over all."""
     told, question.watch = question.watch, None
     tell = None if told is None else lambda text: print(text, file=sys.stderr, flush=True)
     steps = _STEPS
     if readers is not None:
-        u = _over_segments(question, system, weakly(question, [system], u, readers), noise, readers, tell)
+        u = weakly(question, list(systems.values()), u, readers)
+        u = _over_segments(question, systems, u, noise, readers, tell)
         steps = _STEPS // 3
-    done = descend(question, system, u, y0, noise, steps, tell)
+    done = descend(question, systems, u, y0, noise, steps, tell)
     if not isinstance(done, Failure):
         done = ended(question, done[0], done[1], noise, _STEPS, done[2])
     return _followed(question, done)
@@ -188,14 +191,15 @@ def weakly(question: AbstractQuestion, systems: list[System], u, readers: list[R
     return u if found is None else found
 
 
-def _over_segments(question: Question, system: System, u, noise, readers, tell) -> np.ndarray:
+def _over_segments(question: AbstractQuestion, systems, u, noise, readers: list[Reader | None], tell) -> np.ndarray:
     """The u that two thirds of the steps come to over segments that grow, each with a start of its own."""
     recordings = [None if reader is None else reader.record for reader in readers]
     cuts = levels(recordings, _time_scales(question, readers, u))
-    for pieces in [] if question.clocks else cuts:
-        states = np.stack([readers[piece.record].states(piece.places[:1])[0] for piece in pieces])
+    for pieces in [] if any(part.question.clocks for part in question.parts) else cuts:
+        reading = ((recorder, piece.places[:1]) for piece in pieces if (recorder := readers[piece.record]))
+        states = np.stack([roomy(one.states(place)[0], question.states) for one, place in reading])
         part = question.of(pieces, np.ones(len(pieces), bool))
-        done = descend(part, system, u, states, noise, 2 * _STEPS // (3 * len(cuts)), tell)
+        done = descend(part, systems, u, states, noise, 2 * _STEPS // (3 * len(cuts)), tell)
         if not isinstance(done, Failure):
             u = done[0]
     return u

@@ -112,12 +112,8 @@ def _bends(density: Density, root: np.ndarray, states: int) -> list[np.ndarray] 
 
 def _places(density: Density, states: int) -> np.ndarray:
     """The places in z (N, d) of the numbers that every piece depends on: those of its start, then the parameters'."""
-    free, fitted = len(density.point.u), density.question.fitted
-    places = np.full((len(fitted), states + free), len(density))
-    places[:, states:] = np.arange(free)
-    begin = free + states * np.arange(int(fitted.sum()))
-    places[fitted, :states] = begin[:, None] + np.arange(states)
-    return places
+    of_starts, free = density.of_starts[:, :states], np.arange(len(density.point.u))
+    return np.concatenate([of_starts, np.broadcast_to(free, (len(of_starts), len(free)))], axis=1)
 
 
 def _ways(density: Density, root: np.ndarray, states: int) -> np.ndarray:
@@ -131,10 +127,8 @@ def _ways(density: Density, root: np.ndarray, states: int) -> np.ndarray:
 
 def _trial(density: Density, step: np.ndarray) -> Point | Failure:
     """The residuals and their derivatives at x̂ + step (D,)."""
-    question, free = density.question, len(density.point.u)
-    starts, fitted = density.point.starts.copy(), question.fitted
-    starts[fitted] += step[free : free + question.states * int(fitted.sum())].reshape(-1, question.states)
-    return question.follow(density.point.u + step[:free], starts)
+    moved = np.append(step, 0.0)[density.of_starts]
+    return density.question.follow(density.point.u + step[: len(density.point.u)], density.point.starts + moved)
 
 
 def _jacobians(density: Density, trial: Point, root: np.ndarray, states: int) -> list[np.ndarray]:

@@ -1,0 +1,146 @@
+"""Posteriors and descents of several systems: against closed forms, and against one system with all of the records."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import lagjax
+
+TS = np.linspace(0.0, 3.0, 31)
+TRUTH, FREE = {"k": 4.0, "c": 1.5}, {"k": True, "c": False}
+STARTS = {"one": (1.0, 0.2), "two": (-0.5, 0.4)}
+
+
+def energy(q, qdot, params):
+    return 0.5 * jnp.sum(qdot**2) - 0.5 * params["k"] * jnp.sum(q**2)
+
+
+def swing(start, k):
+    """q of the oscillator (T,) in closed form."""
+    w = jnp.sqrt(k)
+    return start[0] * jnp.cos(w * TS) + start[1] / w * jnp.sin(w * TS)
+
+
+SPRING, PLANE = lagjax.System(energy), lagjax.System(energy)
+
+
+def records(seed=0, sigma=0.05):
+    """A record of the spring, whose start is fitted, and two of one in a plane: one start follows from c."""
+    rng = np.random.default_rng(seed)
+    one = swing(STARTS["one"], 4.0) + sigma * rng.normal(size=len(TS))
+    two = []
+    for start in (lagjax.Guess(np.array([-0.5, 1.5]), np.array([0.4, 0.0])), _of_c):
+        values = np.stack([swing(STARTS["two"], 4.0), swing((1.5, 0.0), 4.0)], axis=1)
+        two.append(lagjax.Record(TS, values + sigma * rng.normal(size=values.shape), start=start))
+    return {"one": lagjax.Record(TS, one), "two": two}
+
+
+def _of_c(params):
+    return jnp.array([-0.5, params["c"]]), jnp.array([0.4, 0.0])
+
+
+@pytest.fixture(scope="module")
+def joint():
+    return lagjax.fit({"one": SPRING, "two": PLANE}, records(), {"k": 3.8, "c": 1.4}, method="whole")
+
+
+def by_hand(x, shares):
+    """log p of x = (c, k, start of one, start of two[0], log σ of three signals) in closed form."""
+    c, k, (q, v), plane = x[0], x[1], x[2:4], x[4:8]
+    sigma, data = jnp.exp(x[8:11]), records()
+    left = [
+        (0, swing((q, v), k) - data["one"].values),
+        *((j + 1, swing((plane[j], plane[2 + j]), k) - data["two"][0].values[:, j]) for j in (0, 1)),
+        *((j + 1, swing(((-0.5, c)[j], (0.4, 0.0)[j]), k) - data["two"][1].values[:, j]) for j in (0, 1)),
+    ]
+    return sum(shares[s] * jnp.sum(-0.5 * (rows / sigma[s]) ** 2 - jnp.log(sigma[s])) for s, rows in left)
+
+
+@pytest.mark.slow
+def test_the_density_of_several_systems_and_its_derivatives_are_those_of_closed_forms(joint):
+    density = joint.log_density()
+    assert density.names[:8] == (
+        "params['c']", "params['k']", "starts['one'][0].q", "starts['one'][0].qdot",
+        "starts['two'][0].q[0]", "starts['two'][0].q[1]", "starts['two'][0].qdot[0]", "starts['two'][0].qdot[1]",
+    )  # fmt: skip
+    assert density.names[8:] == ("log σ of one: q", "log σ of two: q[0]", "log σ of two: q[1]")
+    rng, width = np.random.default_rng(1), np.sqrt(np.diag(density.covariance()))
+    value_and_grad = jax.jit(jax.value_and_grad(density))
+    for x in density.first + 2 * width * rng.normal(size=(3, len(density))):
+        expected, slope = jax.value_and_grad(by_hand)(jnp.asarray(x), density.shares)
+        value, gradient = value_and_grad(x)
+        # Motions are right to rtol 1e-9, residuals of σ = 0.05 to 1e-7 of it.
+        assert value == pytest.approx(float(expected), rel=1e-6)
+        np.testing.assert_allclose(gradient * width, slope * width, rtol=1e-5, atol=1e-5)
+    hessian = jax.hessian(by_hand)(jnp.asarray(density.first), density.shares)
+    # Expected and observed information differ by what residuals and curvature have in common: a few times 1/√31.
+    scale = np.outer(width, width)
+    np.testing.assert_allclose(density.covariance() / scale, np.linalg.inv(-hessian) / scale, atol=0.2)
+
+
+@pytest.mark.slow
+def test_draws_of_two_systems_are_those_of_one_with_all_records():
+    # Two records of one spring, each as a system of its own: the same likelihood, but that each has a σ.
+    rng = np.random.default_rng(3)
+    both = [
+        lagjax.Record(TS, swing(start, 4.0) + 0.05 * rng.normal(size=len(TS)), start=lagjax.Guess(*start))
+        for start in STARTS.values()
+    ]
+    apart = lagjax.fit({"a": SPRING, "b": SPRING}, {"a": both[0], "b": both[1]}, {"k": 3.8}, method="whole")
+    union = lagjax.fit(SPRING, both, {"k": 3.8}, method="whole")
+    assert apart.u == pytest.approx(union.u, abs=0.2 * np.sqrt(union.information.white[0, 0]))
+    drawn = apart.sample(100, seed=5, chains=8).posterior
+    assert set(drawn.data_vars) == {"params['k']", "a: q0", "a: qdot0", "b: q0", "b: qdot0", "sigma"}
+    # k and the starts are normal to a hundredth. Of 800 draws half are independent: means to 0.05 σ, widths to 4 %.
+    low, high = union.start_intervals(0.6826894921)
+    for name, mean, width in (
+        ("params['k']", union.params["k"], np.sqrt(union.covariance.matrix[0, 0])),
+        ("b: qdot0", union.starts[1][1], 0.5 * (high[1][1] - low[1][1])),
+    ):
+        z = (drawn[name].values.ravel() - mean) / width
+        assert abs(z.mean()) < 0.4 and z.std() == pytest.approx(1.0, rel=0.2)
+        assert stats.kstest(z - z.mean(), "norm").pvalue > 1e-4
+
+
+@pytest.mark.slow
+def test_gradients_bring_several_systems_to_where_least_squares_do(joint):
+    far = {"k": 3.0, "c": 1.4}
+    fit = lagjax.fit({"one": SPRING, "two": PLANE}, records(), far, method="gradient")
+    width = np.sqrt(np.diag(joint.covariance.matrix))
+    np.testing.assert_allclose((fit.u - joint.u) / width, 0.0, atol=0.3)
+    assert fit.log_likelihood == pytest.approx(joint.log_likelihood, abs=0.5)
+
+
+@pytest.mark.slow
+def test_driven_free_and_timed_systems_have_one_density():
+    # A driven record, one without inputs, and crossing times of a third system, with Student's noise.
+    pushed = lagjax.System(energy, forces=lambda q, qdot, inputs, params: params["push"] * inputs)
+    rng = np.random.default_rng(2)
+    driven = np.asarray(
+        lagjax.simulate(
+            lagjax.System(energy, forces=lambda q, qdot, t, params: params["push"] * jnp.sin(t)), 0.5, 0.0, TS,
+            {"k": 4.0, "push": 2.0},
+        ).q
+    )  # fmt: skip
+    passed = np.pi / 4 + np.pi / 2 * np.arange(5)
+    given = {
+        "driven": lagjax.Record(TS, driven + 0.02 * rng.normal(size=31), np.sin(TS)),
+        "free": records(1)["one"],
+        "gate": lagjax.Timings(lambda q, v: q, passed + 0.01 * rng.normal(size=5), 0.0, (1.0, 0.0)),
+    }
+    fit = lagjax.fit(
+        {"driven": pushed, "free": SPRING, "gate": SPRING}, given, {"k": 3.9, "push": 1.9}, hold="linear",
+        noise=lagjax.StudentT(), method="whole",
+    )  # fmt: skip
+    density = fit.log_density(prior=lambda params: -0.5 * params["push"] ** 2)
+    width = np.sqrt(np.diag(density.covariance()))
+    value_and_grad = jax.jit(jax.value_and_grad(density))
+    x = density.first + 0.5 * width * rng.normal(size=len(density))
+    slope = value_and_grad(x)[1]
+    for k in range(len(density)):
+        h = 1e-3 * width[k] * np.eye(len(density))[k]
+        change = (value_and_grad(x + h)[0] - value_and_grad(x - h)[0]) / 2e-3
+        # The difference bends by h², and both values are rounded at rtol 1e-9 of the motion.
+        assert change == pytest.approx(float(slope[k] * width[k]), rel=1e-3, abs=1e-3), density.names[k]
