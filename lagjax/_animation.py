@@ -107,9 +107,7 @@ class Animation:
         """
         suffix = Path(path).suffix.lower()
         if suffix == ".gif":
-            fps = 100 / max(2, round(100 / self.fps))  # browsers show frames of a hundredth for ten of them
-            matplotlib = _matplotlib()
-            self._film(fps).save(path, writer=matplotlib.animation.PillowWriter(fps=fps * (1 - 1e-9)), dpi=_DPI)
+            self._gif(path)
         elif suffix in _VIDEO:
             self._video(path)
         elif suffix in _PAGE:
@@ -119,6 +117,21 @@ class Animation:
             raise ValueError(
                 f"The suffix of {str(path)!r} names no film: write .gif, {', '.join(_VIDEO)}, .html; got {suffix!r}."
             )
+
+    def _gif(self, path) -> None:
+        """Write the pictures one after another, so that no more than one of them is in memory in its full colours."""
+        from PIL import Image  # comes with matplotlib
+
+        hundredths = max(2, round(100 / self.fps))  # browsers show frames of a hundredth for ten of them
+        figure, show, count = self._figure(100 / hundredths)
+
+        def picture(i: int):
+            show(i)
+            figure.canvas.draw()
+            return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
+
+        rest = map(picture, range(1, count))
+        picture(0).save(path, format="GIF", save_all=True, append_images=rest, duration=10 * hundredths, loop=0)
 
     def _video(self, path) -> None:
         matplotlib, program = _matplotlib(), _ffmpeg()
@@ -143,16 +156,22 @@ class Animation:
 
     def _film(self, fps: float):
         """matplotlib's own animation, on a figure of its own."""
+        figure, show, count = self._figure(fps)
+        return _matplotlib().animation.FuncAnimation(
+            figure, show, frames=count, init_func=lambda: (), interval=1000 / fps, cache_frame_data=False
+        )
+
+    def _figure(self, fps: float) -> tuple[Any, Callable, int]:
+        """The figure, a function that sets it to frame i, and how many frames there are."""
         matplotlib, times = _matplotlib(), self.times(fps)
         positions = self.positions(times)
         figure = matplotlib.figure.Figure(figsize=_size(positions), layout="constrained", dpi=_DPI)
         matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
-        show = _drawn(figure, positions, times, self.traces, max(1, round(TRAIL * fps)))
+        show, moving = _drawn(figure, positions, times, self.traces, max(1, round(TRAIL * fps)))
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # it is laid out: to do so for every frame takes most of the time
-        return matplotlib.animation.FuncAnimation(
-            figure, show, frames=len(times), init_func=lambda: (), interval=1000 / fps, cache_frame_data=False
-        )
+        _keep_the_rest(figure, moving)
+        return figure, show, len(times)
 
 
 def animated(trajectory, points: Callable, trace, speed: float, fps: float) -> Animation:
@@ -288,8 +307,8 @@ def _traced(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int],
 # ---- pictures --------------------------------------------------------------------------------------------------------
 
 
-def _drawn(figure, positions: dict[str, np.ndarray], times: np.ndarray, traces, trail: int) -> Callable:
-    """Set the figure up; a function that shows frame i."""
+def _drawn(figure, positions: dict[str, np.ndarray], times: np.ndarray, traces, trail: int) -> tuple[Callable, list]:
+    """Set the figure up; a function that sets it to frame i, and the artists to draw for it."""
     ax, space = _axes(figure, positions), next(iter(positions.values())).shape[-1] == 3
     count = len(next(iter(positions.values())))
     opacity = max(0.2, count**-0.5)
@@ -318,7 +337,34 @@ def _drawn(figure, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
         clock.set_text(f"t = {times[i]:.{_digits(times)}f}")
         return ()
 
-    return show
+    above = [] if space else [ax.spines["left"], ax.spines["bottom"]]  # these stand still, and on top
+    return show, [clock, *above, *(line for line, _ in lines), *(collection for collection, *_ in faded)]
+
+
+def _keep_the_rest(figure, moving: list) -> None:
+    """Draw all but the `moving` artists once and for all: axes with their numbers take ten times as long as these.
+
+    matplotlib draws a figure up to three times a frame, and its own way to draw less, `blit`, is for windows, not files.
+    """
+    draw_all, kept = figure.draw, []
+    order = figure.axes[0].get_children()
+    moving = sorted(sorted(moving, key=order.index), key=lambda artist: artist.get_zorder())
+    deep = [artist for artist in moving if hasattr(artist, "do_3d_projection")]  # which axes in space draw last
+    flat = [artist for artist in moving if artist not in deep]
+
+    def draw(renderer):
+        if not kept:
+            for artist in moving:
+                artist.set_visible(False)
+            draw_all(renderer)
+            kept.append(renderer.copy_from_bbox(figure.bbox))
+            for artist in moving:
+                artist.set_visible(True)
+        renderer.restore_region(kept[0])
+        for artist in flat + sorted(deep, key=lambda artist: -artist.do_3d_projection()):
+            artist.draw(renderer)
+
+    figure.draw = draw
 
 
 def _axes(figure, positions):

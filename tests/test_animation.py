@@ -132,3 +132,22 @@ def test_points_in_a_list_and_by_a_whole_number():
     film = run.animate(lambda q, params: [[0.0, 0.0], [q["x"], params["k"][params["which"]]]])
     (positions,) = film.positions(np.array([0.0, 6.0])).values()
     np.testing.assert_allclose(positions[0, :, 1], [[1.0, 2.0], [np.cos(6.0), 2.0]], atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("space", [False, True])
+def test_a_frame_is_the_whole_figure_drawn_again(run, space):
+    """All but what moves is drawn once and kept: pixel by pixel that is what matplotlib draws of the whole."""
+
+    def points(q):
+        bob = jnp.stack([q["x"], 0.5 * q["x"] ** 2, jnp.sin(3 * q["x"])])[: 3 if space else 2]
+        return {"bob": bob, "rod": jnp.stack([0.3 * bob, bob, -bob])}
+
+    figure, show, count = run.animate(points, trace=["bob", ("rod", 0)])._figure(10.0)
+    for frame in (0, 25, 3, count - 1):
+        show(frame)
+        figure.canvas.draw()
+        quick = np.array(figure.canvas.buffer_rgba())
+        figure.canvas.get_renderer().clear()
+        type(figure).draw(figure, figure.canvas.get_renderer())
+        np.testing.assert_array_equal(quick, np.asarray(figure.canvas.buffer_rgba()))
