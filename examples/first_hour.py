@@ -203,7 +203,8 @@ print(fit)
 
 # %%
 axes = lagjax.plot.fit(fit)
-axes[0, 0].set_title("A filmed pendulum: data, fit, and what is left")
+axes[0, 0].set(title="A filmed pendulum: data, fit, and what is left", ylabel="angle [rad]")
+axes[1, 0].set(xlabel="t [s]", ylabel="residual [rad]")
 axes[0, 0].figure.savefig("out/first_hour_4.png")
 
 # %% [markdown]

@@ -98,15 +98,17 @@ lowest = jnp.degrees(jnp.arccos(jax.vmap(axis)({k: falls.q[k] for k in upright})
 
 # %%
 figure = plt.figure(figsize=(7.6, 5.6))
-figure.get_layout_engine().set(hspace=0.1)
+figure.get_layout_engine().set(hspace=0.12, h_pad=0.1)
 turn = np.linspace(0, 2 * np.pi, 181)
 for k, (name, path) in enumerate(paths.items()):
     ax = figure.add_subplot(2, 3, k + 1)
     ax.fill(np.sin(turn), np.cos(turn), color="0.96")
     for latitude in (30, 60, 90):
         ax.plot(*(np.sin(np.radians(latitude)) * np.array([np.cos(turn), np.sin(turn)])), color="0.75", linewidth=0.7)
-        place = np.sin(np.radians(latitude)) * np.array([-0.6, -0.8])
-        ax.annotate(f"{latitude}°", place, color="0.4", fontsize=8, ha="center", va="center")
+        if latitude == 90:
+            ax.annotate("90°", (-0.72, -0.75), color="0.4", fontsize=8, ha="right", va="top")
+        else:
+            ax.annotate(f"{latitude}°", (0, 0.03 - np.sin(np.radians(latitude))), color="0.4", fontsize=8, ha="center")
     ax.plot(path[:, 0], path[:, 1], linewidth=1.7, color=f"C{k}")
     ax.set_aspect("equal")
     ax.set_axis_off()

@@ -20,7 +20,7 @@ import numpy as np
 
 from lagjax._arguments import Function, accept
 from lagjax._diagnosis import with_numbers
-from lagjax._display import is_known, times_of_members
+from lagjax._display import is_known, numbers_at, times_of_members
 from lagjax._health._measure import Members
 from lagjax._layout import Layout
 
@@ -227,11 +227,10 @@ def course_of(trajectory) -> tuple[Layout, Course]:
 
 def _course(trajectory, members: Members, k: int) -> Course:
     """The knots of a member: its outputs, and the states just before its transitions."""
+    place = np.unravel_index(k, members.batch) if members.batch else ()
 
     def of_member(tree):
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
-        rank = len(members.batch)
-        leaves = [leaf.reshape(members.count, *leaf.shape[rank:])[k] for leaf in leaves]
+        leaves = [numbers_at(leaf, place) for leaf in jax.tree.leaves(tree)]
         return np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1).astype(float)
 
     t = times_of_members(trajectory).reshape(members.count, -1)[k].astype(float)
@@ -344,7 +343,7 @@ def _drawn(figure, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
 def _keep_the_rest(figure, moving: list) -> None:
     """Draw all but the `moving` artists once and for all: axes with their numbers take ten times as long as these.
 
-    matplotlib draws a figure up to three times a frame, and its own way to draw less, `blit`, is for windows, not files.
+    matplotlib draws a figure up to three times a frame; its own way to draw less, `blit`, is for windows, not files.
     """
     draw_all, kept = figure.draw, []
     order = figure.axes[0].get_children()

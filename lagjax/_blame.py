@@ -71,7 +71,8 @@ def poles(function: Callable, *arguments) -> list[Offender]:
 
     def visit(equation, operands, moves, results, place):
         chosen = [i for i, x in enumerate(operands) if moves[i] and _floating(x)]
-        if equation.primitive.name not in _WITH_POLES or not chosen or not all(map(_finite, [*operands, *results])):
+        # The result may be NaN, as that of log(x) for x < 0, whose derivatives are those of log(-x).
+        if equation.primitive.name not in _WITH_POLES or not chosen or not all(map(_finite, operands)):
             return
         _, second = _derivatives(equation, operands, chosen)
         large = [np.where(np.abs(x) > _AT_A_POLE, np.inf, 0.0) for x in map(np.asarray, second)]

@@ -22,6 +22,7 @@ from lagjax._blame import Offender, offenders, pieces_of, poles
 from lagjax._check import check
 from lagjax._check._findings import listed
 from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
+from lagjax._display import numbers_at
 from lagjax._layout import Layout, halves
 from lagjax._linear import eigen
 from lagjax._program import Unlowerable
@@ -284,6 +285,12 @@ def _escape(derivation: Derivation, ended: Ended, place: int, pole: Offender | N
             "finite core."
         )
     far = np.abs(q).max() > ESCAPED * np.abs(q_first).max()
+    if not far and np.abs(v[place]) * abs(ended.t - ended.t_first) < ESCAPED * np.abs(q[place] - q_first[place]):
+        return (
+            f"The acceleration of {name} grows without bound, and its velocity does not: {grown}. The force has a pole "
+            "there: keep the motion away from it, by other initial values or an event=..., or give the force a finite "
+            "core."
+        )
     return (
         f"{name if far else f'The velocity of {name}'} runs to infinity within a finite time: {grown}. The force grows "
         "faster than in proportion to the state, as that of q' = q**2 or of a collision does: look at its sign, or end "
@@ -374,7 +381,7 @@ def ended_of(trajectory, layout: Layout, member: tuple[int, ...] = (), numbers: 
     """Where a trajectory, or one member of a batch of them, began and ended; `numbers` (P,) are its parameters."""
 
     def of_member(tree, *index):
-        leaves = [np.asarray(leaf)[(*member, *index)] for leaf in jax.tree.leaves(tree)]
+        leaves = [numbers_at(leaf, (*member, *index)) for leaf in jax.tree.leaves(tree)]
         return np.concatenate([np.ravel(leaf) for leaf in leaves]).astype(layout.dtype)
 
     ts, end = np.asarray(trajectory.ts), trajectory.end

@@ -122,6 +122,12 @@ def is_known(x: Any) -> bool:
     return isinstance(x, np.ndarray | np.generic)
 
 
+def numbers_at(array, place: tuple) -> np.ndarray:
+    """`array[place]` in NumPy; of an array on another device only that much is copied from there."""
+    elsewhere = isinstance(array, jax.Array) and any(device.platform != "cpu" for device in array.devices())
+    return np.asarray(array[place] if elsewhere else np.asarray(array)[place])
+
+
 def _range(values: np.ndarray) -> str:
     """One number, or the least and the largest of several."""
     if values.size == 0:

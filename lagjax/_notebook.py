@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._display import is_known, times_of_members
+from lagjax._display import is_known, numbers_at, times_of_members
 from lagjax._results import ENDED_WELL
 
 MEMBERS, OUTPUTS, COORDINATES = 30, 400, 6  # that are drawn
@@ -75,9 +75,8 @@ def _draw(figure, trajectory) -> None:
 
 def _of_members(leaf, rank: int, members: np.ndarray, outputs: np.ndarray, place: tuple[int, ...]) -> np.ndarray:
     """One scalar coordinate of some members at some outputs, (members, outputs), without a copy of the others."""
-    array = np.asarray(leaf)
-    flat = array.reshape(-1, *array.shape[rank:])
-    return flat[(members[:, None], outputs[None, :], *place)]
+    of_members = np.unravel_index(members[:, None], leaf.shape[:rank]) if rank else ()
+    return np.atleast_2d(numbers_at(leaf, (*of_members, outputs[None, :] if rank else outputs, *place)))
 
 
 def plain(ax) -> None:

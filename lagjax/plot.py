@@ -22,6 +22,7 @@ from lagjax._animation import as_points, course_of
 from lagjax._arguments import Function, accept
 from lagjax._check._findings import listed
 from lagjax._crossings import Crossings
+from lagjax._display import times_of_members
 from lagjax._fit import Fit, Record
 from lagjax._fit._figures import draw_record
 from lagjax._fit._result import record_matrix
@@ -57,12 +58,15 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
 
     layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0, 0], (q, qdot)))
     paths = np.asarray(jax.vmap(jax.vmap(layout.flatten))(q))
+    ts = times_of_members(trajectory).reshape(-1, paths.shape[1])
+    ts = ts[_some(len(ts), members)]
     for i, name in enumerate(layout.names):
-        lines = ax.plot(
-            _times(trajectory), paths[:, :, i].T, color=COLORS[i % len(COLORS)], alpha=opacity, linewidth=1.5
-        )
+        lines = ax.plot(ts.T, paths[:, :, i].T, color=COLORS[i % len(COLORS)], alpha=opacity, linewidth=1.5)
         lines[0].set_label(name)
     ax.set_xlabel("t")
+    if layout.size == 1:
+        ax.set_ylabel(layout.names[0])
+        return ax
     return _legend(ax) if layout.size <= len(COLORS) else ax
 
 
@@ -318,7 +322,10 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
     error = np.abs(h - h[:, :1]) / unit
     known = np.array(np.isfinite(error).any(axis=0))  # nothing is left of members that an event has ended
     known[0] = False  # zero, which has no logarithm
-    times, error = _times(trajectory)[known], error[:, known]
+    ts = times_of_members(trajectory).reshape(-1, len(known))
+    if (ts != ts[0]).any():
+        raise ValueError("The members have times of their own, at which no median is taken: draw one at a time.")
+    times, error = ts[0, known], error[:, known]
     low, median, high = np.nanquantile(error, (0.05, 0.5, 0.95), axis=0)
     if len(h) > 1:
         ax.fill_between(times, low, high, color=COLORS[0], alpha=0.2, linewidth=0, label="5 to 95 % of the members")
@@ -455,13 +462,13 @@ def _edges(centres) -> tuple[float, float]:
     return float(centres[0] - half), float(centres[-1] + half)
 
 
-def _times(trajectory: Trajectory) -> np.ndarray:
-    """The output times, which all members share."""
-    return np.asarray(trajectory.ts).reshape(-1, trajectory.ts.shape[-1])[0]
-
-
 def _some_members(leaf: Any, trajectory: Trajectory, count: int):
     """At most `count` members of a leaf, evenly chosen, on a first axis that is there for a single trajectory too."""
     batch = np.ndim(trajectory.ok)
     leaf = jnp.reshape(leaf, (-1, *leaf.shape[batch:]))
-    return leaf[np.unique(np.linspace(0, len(leaf) - 1, min(count, len(leaf))).astype(int))]
+    return leaf[_some(len(leaf), count)]
+
+
+def _some(members: int, count: int) -> np.ndarray:
+    """The places of at most `count` members, evenly chosen."""
+    return np.unique(np.linspace(0, members - 1, min(count, members)).astype(int))

@@ -7,6 +7,7 @@ import matplotlib
 matplotlib.use("agg")
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -165,3 +166,17 @@ def test_shapes_of_modes():
     np.testing.assert_allclose(np.abs(moved[2] - moved[0]), 0.2, atol=1e-12)
     with pytest.raises(ValueError, match="give the equilibrium too"):
         lagjax.plot.modes(modes, points)
+
+
+@pytest.mark.slow
+def test_members_are_drawn_at_times_of_their_own():
+    spring = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2)
+    ends, ts = jnp.arange(1.0, 4.0), jnp.linspace(0.0, 1.0, 9)
+    runs = jax.vmap(lambda end: lagjax.simulate(spring, 1.0, 0.0, end * ts))(ends)
+    ax = lagjax.plot.trajectory(runs)
+    for line, times in zip(ax.lines, runs.ts, strict=True):
+        np.testing.assert_array_equal(line.get_xdata(), times)
+        np.testing.assert_allclose(line.get_ydata(), np.cos(times), atol=1e-8)
+    assert ax.get_ylabel() == "q" and ax.get_legend() is None
+    with pytest.raises(ValueError, match="times of their own"):
+        lagjax.plot.energy_error(runs)

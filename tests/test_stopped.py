@@ -93,6 +93,9 @@ STOPS = {
     "a collision": (
         lambda q, v: 0.5 * v**2 + 1 / q, None, 1.0, 0.0, {}, r"near a pole of div\(1, .*e-\d+\) at test_stopped",
     ),
+    "a logarithm of what is negative": (
+        lambda q, v: 0.5 * v**2 - jnp.log(q), None, -1.0, 0.5, {}, r"of q grows .* pole of log\(-.*test_stopped",
+    ),
     "an explosion": (kinetic, lambda q, v: 6 * q**2, 1.0, 2.0, {}, "q runs to infinity within a finite time"),
     "a stiff spring": (
         lambda q, v: 0.5 * v @ v - 5e7 * q[0] ** 2 - 0.5 * q[1] ** 2, None, np.array([0.1, 1.0]), np.zeros(2),

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._display import numbers_at
 from lagjax._health._laws import Law, Sample, power_at, sample_at
 from lagjax._layout import Layout
 from lagjax._validate import is_concrete
@@ -124,7 +125,7 @@ class Members:
     def __init__(self, trajectory):
         self.batch = np.shape(trajectory.result._value)
         self.count, rank = math.prod(self.batch), len(self.batch)
-        first = jax.tree.map(lambda leaf: np.asarray(leaf)[(0,) * (rank + 1)], (trajectory.q, trajectory.qdot))
+        first = jax.tree.map(lambda leaf: numbers_at(leaf, (0,) * (rank + 1)), (trajectory.q, trajectory.qdot))
         self.layout, self._trajectory = Layout.of(*first), trajectory
         # Of the axes of a batch, the innermost shares times and some parameters (`Trajectory.over_members`).
         self._outer = rank - (rank > 0 and np.ndim(trajectory.ts) < 1 + rank)
