@@ -97,11 +97,11 @@ falls = lagjax.simulate_batch(top, disturbed, turning, jnp.linspace(0.0, 60.0, 3
 lowest = jnp.degrees(jnp.arccos(jax.vmap(axis)({k: falls.q[k] for k in upright})[:, 2].min(axis=1)))
 
 # %%
-figure = plt.figure(figsize=(7.6, 5.6))
-figure.get_layout_engine().set(hspace=0.12, h_pad=0.1)
+figure = plt.figure(figsize=(7.6, 5.8))
+grid = figure.add_gridspec(2, 3, hspace=0.06)
 turn = np.linspace(0, 2 * np.pi, 181)
 for k, (name, path) in enumerate(paths.items()):
-    ax = figure.add_subplot(2, 3, k + 1)
+    ax = figure.add_subplot(grid[0, k])
     ax.fill(np.sin(turn), np.cos(turn), color="0.96")
     for latitude in (30, 60, 90):
         ax.plot(*(np.sin(np.radians(latitude)) * np.array([np.cos(turn), np.sin(turn)])), color="0.75", linewidth=0.7)
@@ -113,7 +113,7 @@ for k, (name, path) in enumerate(paths.items()):
     ax.set_aspect("equal")
     ax.set_axis_off()
     ax.set_title(name, loc="center", color=f"C{k}")
-ax = figure.add_subplot(2, 1, 2)
+ax = figure.add_subplot(grid[1, :])
 closed = np.degrees(np.arccos(np.clip(C**2 * np.asarray(spins) ** 2 / (2 * A * MGL) - 1, -1, 1)))
 ax.plot(spins, closed, color="#D55E00", linewidth=1, label="root of the cubic")
 ax.plot(spins, lowest, "o", markersize=3.5, label="begun 0.01° from upright")
