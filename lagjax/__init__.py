@@ -27,7 +27,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 - `same_motion`: whether two Lagrangians have one motion, as `SameMotion`
 - `change_coordinates`, `hamiltonian`, `routhian`: the scene written otherwise: `ChangedCoordinates`, `Hamiltonian` with
   its `CanonicalTrajectory`, `Routhian`
-- `periodic_orbit`, `family`: motions that close: `Orbit`, `Family`
+- `periodic_orbit`, `family`, `branch_off`: motions that close: `Orbit`, `Family`
 - `lyapunov_spectrum`, `lyapunov_exponent`: chaos; `LyapunovExponent`
 - `action`, `find_path`: between two ends; `Path`
 
@@ -102,6 +102,7 @@ from lagjax._orbits import (
     Orbit,
     Path,
     action,
+    branch_off,
     family,
     find_path,
     lyapunov_exponent,
@@ -162,6 +163,7 @@ __all__ = [
     "action",
     "angle",
     "between",
+    "branch_off",
     "change_coordinates",
     "check",
     "conserved_quantities",

@@ -135,13 +135,15 @@ def test_the_innermost_stable_circle():
     hole = lagjax.System(lambda q, v: 0.5 * v @ v + 1 / (jnp.sqrt(q @ q) - 2))
     radius, speed = 6.1, np.sqrt(6.1) / 4.1
     circle = lagjax.periodic_orbit(hole, np.array([radius, 0.0]), np.array([0.0, speed]), 2 * np.pi * radius / speed)
-    circles = lagjax.family(hole, circle, until=-0.1, step=2.0, count=7)
+    circles = lagjax.family(hole, circle, until=-0.1, step=2.0, count=8)
     r = np.linalg.norm(circles.q0, axis=1)
     np.testing.assert_allclose(circles.energy, -1 / (r - 2) + r / (2 * (r - 2) ** 2), atol=1e-12)
-    assert np.min(circles.energy) > -1 / 16
+    assert np.min(circles.energy) > -1 / 16 - 1e-12
     (fold,) = np.flatnonzero(circles.fold)
-    assert r[fold - 1] > 6 > r[fold]
-    np.testing.assert_array_equal(circles.stable, r > 6)
+    # E − E0 is 1e-16 within 3e-7 of r = 6; its slope, whose zero is located, is so within 1e-14.
+    np.testing.assert_allclose(r[fold], 6.0, rtol=1e-9)
+    away = np.arange(len(r)) != fold
+    np.testing.assert_array_equal(circles.stable[away], r[away] > 6)
 
 
 @pytest.mark.slow
@@ -167,7 +169,7 @@ def test_a_family_of_swings():
     # Every swing of a pendulum up to the separatrix at E = 1, each with its period in closed form.
     begin = lagjax.periodic_orbit(PENDULUM, 0.5, 0.0, 6.4)
     swings = lagjax.family(PENDULUM, begin, until=0.9, step=0.3)
-    assert "until" in swings.message and swings.energy[-1] > 0.9 and not swings.fold.any()
+    assert "until" in swings.message and abs(swings.energy[-1] - 0.9) < 1e-12 and not swings.fold.any()
     np.testing.assert_allclose(swings.period, 4 * ellipk((np.asarray(swings.energy) + 1) / 2), rtol=1e-10)
 
 
@@ -207,3 +209,95 @@ def test_a_family_that_ends_says_where():
     assert "could not be followed beyond" in swings.message or "raise count" in swings.message
     with pytest.raises(ValueError, match="must be one periodic orbit that is ok"):
         lagjax.family(PENDULUM, begin._replace(ok=jnp.asarray(False)))
+
+
+def _probe(r, v, params):
+    """The restricted three-body problem in axes that turn along."""
+    (x, y, z), mu = r, params
+    first, second = jnp.sqrt((x + mu) ** 2 + y**2 + z**2), jnp.sqrt((x - 1 + mu) ** 2 + y**2 + z**2)
+    return 0.5 * ((v[0] - y) ** 2 + (v[1] + x) ** 2 + v[2] ** 2) + (1 - mu) / first + mu / second
+
+
+PROBE, EARTH_MOON = lagjax.System(_probe), 0.01215
+
+
+def _lyapunov_orbits(step, until):
+    """The planar orbits about Earth and Moon's L1, whose multipliers are 2600 and its reciprocal."""
+    point = lagjax.equilibrium(PROBE, jnp.array([0.8, 0.0, 0.0]), EARTH_MOON).q
+    modes = lagjax.normal_modes(PROBE, point, EARTH_MOON)
+    k = int(jnp.argmax(jnp.where(jnp.abs(modes.shapes[:, 0]) > 1e-3, modes.frequencies, 0)))
+    omega, shape = modes.frequencies[k], modes.shapes[k] / modes.shapes[k, 0]
+    q0, qdot0 = point + 0.01 * shape.real, 0.01 * (1j * omega * shape).real
+    small = lagjax.periodic_orbit(PROBE, q0, qdot0, 2 * jnp.pi / omega, EARTH_MOON)
+    return lagjax.family(PROBE, small, EARTH_MOON, until=until, step=step)
+
+
+@pytest.mark.slow
+def test_halo_orbits_branch_off_the_planar_ones():
+    planar, other = _lyapunov_orbits(0.05, -1.51), _lyapunov_orbits(3.0, -1.51)
+    assert len(planar.value) < 60 and planar.value[-1] == pytest.approx(-1.51, abs=1e-12)
+    first, _ = np.flatnonzero(planar.branch)
+    # However long the first step: the same two points, where halo orbits (published: C = 3.1743) and axial ones begin.
+    np.testing.assert_allclose(planar.value[planar.branch], other.value[other.branch], atol=1e-10)
+    np.testing.assert_allclose(-2 * planar.value[first], 3.1743, atol=1e-4)
+    # There small deviations in z return after one period: their own monodromy matrix has the eigenvalue 1 twice.
+    start, ts = [x[first] for x in (planar.q0, planar.qdot0)], jnp.array([0.0, 1.0]) * planar.period[first]
+
+    def lift(q, v):
+        end = lagjax.simulate(PROBE, start[0].at[2].set(q), start[1].at[2].set(v), ts, EARTH_MOON, rtol=1e-14)
+        return jnp.stack([end.q[-1, 2], end.qdot[-1, 2]])
+
+    lifted = np.stack([(lift(*x) - lift(*-x)) / 2e-6 for x in 1e-6 * np.eye(2)])
+    np.testing.assert_allclose(np.trace(lifted), 2.0, atol=1e-6)  # of the differences: 1e-12 · 2600²
+
+    halo = lagjax.branch_off(PROBE, planar, int(first), EARTH_MOON)
+    assert halo.ok and abs(halo.q0[2]) > 1e-3
+    halos = lagjax.family(PROBE, halo, EARTH_MOON, count=60)
+    jacobi, highest = -2 * np.asarray(halos.value), np.abs(np.asarray(halos.q0)[:, 2])
+    assert highest.max() > 0.03 and np.asarray(halos.closure).max() < 1e-10
+    # Beyond the fold at 2.998 near-rectilinear ones are stable, until they double their period or fold again.
+    assert np.asarray(halos.fold).any() and np.asarray(halos.stable).any()
+    np.testing.assert_allclose(jacobi[np.asarray(halos.stable)], 3.0, atol=0.01)
+
+
+@pytest.mark.slow
+def test_a_family_does_not_jump_at_a_crossing():
+    # About the branch point of the second mode Newton's method finds orbits of either family: none of the other ones
+    # may stand in this one, where the energy rises all the way and the multipliers change steadily.
+    scene = lagjax.scenes.double_pendulum()
+    frequency = lagjax.scenes.double_pendulum_frequencies(scene.params)[1]
+    start = 0.02 * np.array([1.0, -np.sqrt(2.0)])
+    begin = lagjax.periodic_orbit(scene.system, start, np.zeros(2), float(2 * np.pi / frequency), scene.params)
+    places = []
+    for step in (0.03, 0.3, 3.0):
+        mode = lagjax.family(scene.system, begin, scene.params, until=0.0, step=step)
+        assert (np.diff(mode.value) > 0).all() and not np.asarray(mode.fold).any()
+        (place,) = np.flatnonzero(mode.branch)
+        np.testing.assert_allclose(np.asarray(mode.multipliers)[place], 1.0, atol=1e-4)
+        places.append(mode.value[place])
+    np.testing.assert_allclose(places, places[0], rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_an_orbit_of_twice_the_period_branches_off():
+    begin = lagjax.periodic_orbit(HENON_HEILES, np.array([0.0, 0.1]), np.zeros(2), 6.3)
+    along = lagjax.family(HENON_HEILES, begin, until=0.14)
+    (place,) = np.flatnonzero(along.doubling)
+    np.testing.assert_allclose(np.asarray(along.multipliers)[place, :2], -1.0, atol=1e-4)
+    twice = lagjax.branch_off(HENON_HEILES, along, int(place))
+    assert twice.ok and abs(twice.period / along.period[place] - 2) < 1e-2
+    halfway = lagjax.simulate(HENON_HEILES, twice.q0, twice.qdot0, jnp.linspace(0, twice.period, 3), rtol=1e-13)
+    np.testing.assert_allclose(halfway.q[-1], twice.q0, atol=1e-11)
+    assert np.abs(halfway.q[1] - twice.q0).max() > 1e-3
+    with pytest.raises(ValueError, match="No family crosses at orbit 0"):
+        lagjax.branch_off(HENON_HEILES, along, 0)
+
+
+@pytest.mark.slow
+def test_all_orbits_have_one_period():
+    # Nothing but the energy tells the orbits of an oscillator apart: the family rises in it, and nothing branches.
+    oscillator = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q)
+    begin = lagjax.periodic_orbit(oscillator, np.array([0.3, 0.1]), np.zeros(2), 6.3)
+    orbits = lagjax.family(oscillator, begin, until=2.0)
+    np.testing.assert_allclose(orbits.period, 2 * np.pi, rtol=1e-12)
+    assert (np.diff(orbits.energy) > 0).all() and not (orbits.branch | orbits.fold | orbits.doubling).any()

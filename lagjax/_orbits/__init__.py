@@ -1,11 +1,12 @@
 """Orbits: where motions return, how they depend on energy and parameters, how fast they part, which path is taken.
 
 `_arcs` follows motions with their derivatives, on rows; `_rank` decides about singular values; `_shooting` closes
-chains of arcs, `_floquet` says what their multipliers are, `_orbit` is `periodic_orbit` and
-`_family` `family`. `_lyapunov` is about
-motions that never return, `_path` and `_conjugate` about those from one place to another.
+chains of arcs, `_floquet` says what their multipliers are, `_orbit` is `periodic_orbit`. `_follow` goes along a family,
+`_family` is `family`, `_branch` goes from one to another. `_lyapunov` is about motions that never return, `_path` and
+`_conjugate` about those from one place to another.
 """
 
+from lagjax._orbits._branch import branch_off
 from lagjax._orbits._family import Family, family
 from lagjax._orbits._lyapunov import LyapunovExponent, lyapunov_exponent, lyapunov_spectrum
 from lagjax._orbits._orbit import Orbit, periodic_orbit
@@ -17,6 +18,7 @@ __all__ = [
     "Orbit",
     "Path",
     "action",
+    "branch_off",
     "family",
     "find_path",
     "lyapunov_exponent",

@@ -1,8 +1,5 @@
 """`family`: periodic orbits that belong together, one after the other, by energy or by a parameter.
 
-    predict   along the null vector of the closing equations that is no symmetry
-    correct   by Newton's method within the plane across it, at the same length of arc
-
 A family goes on through folds, where its energy or parameter turns back, because it is followed by its own length of
 arc. Orbits of a conservative scene form families by energy at fixed parameters, and by a parameter at a fixed period;
 limit cycles and driven orbits form them by a parameter alone.
@@ -21,18 +18,15 @@ import numpy as np
 from lagjax._layout import halves, taken_apart
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
-from lagjax._orbits._condense import Condensed, condense
-from lagjax._orbits._orbit import CLOSED, RTOL, Orbit, arcs_each, told
-from lagjax._orbits._rank import decide
-from lagjax._orbits._shooting import Chain, Closing
+from lagjax._orbits._floquet import passing, reduce
+from lagjax._orbits._follow import Follower, Point, Tangent, Whole, corrected, next_step, step_along, tangent_at
+from lagjax._orbits._orbit import RTOL, Found, Orbit, arcs_each, told
 from lagjax._orbits._starts import starts
 from lagjax._system import System
 from lagjax._validate import require_budget, require_tolerance
 
 PyTree = Any
 
-_TRIALS = 8  # of Newton's method: beyond, the step along the family was too long
-_QUICK = 3  # trials after which the next step may be longer
 _SHORTEST = 1e-6  # of the first step: a family that asks for shorter ones ends
 
 
@@ -42,7 +36,7 @@ class Family(NamedTuple):
     - `q0`, `qdot0`, `period`, `multipliers`, `closure`, `stable`: those of each orbit (see `Orbit`), with the orbits as
       first axis.
     - `value` (N,): the energy, or the parameter by which the family was followed; `energy` (N,): h = p·q̇ − L.
-    - `fold` (N,): whether `value` turns back between this orbit and the one before it.
+    - `fold` (N,): whether `value` turns back at this orbit.
     - `branch` (N,): whether two multipliers pass through 1 there without a fold, so that another family crosses this
       one; `doubling` (N,): whether two pass through −1, where a family of twice the period begins.
     - `message`: a sentence that says why it ends there.
@@ -77,8 +71,11 @@ def family(
     - `by`: "energy"; or the name of a parameter, such as "g" for `params["g"]`, one number.
     - `until`: the energy or the parameter at which the family ends; it also fixes the direction of the first step.
       Without it the family begins towards larger values and ends after `count` orbits.
-    - `step`: the arc length of the first step, in the units of (q, qdot, T); later steps adapt to the number of Newton
-      iterations.
+    - `step`: the arc length of the first step, in the units of (q, qdot, T); it and later steps adapt to how fast
+      Newton's method contracts, how far it moves an orbit, and how much the family turns.
+
+    Folds, branch points and doublings between two orbits are located on the arc between them, as well as multipliers
+    and slopes are known there, and are orbits of the family as others are. `branch_off` goes on from there.
 
     A nonlinear normal mode is the family by energy that begins at a linear mode: begin with the periodic orbit near
     q + a·shape at rest, whose period is 2π/frequency, for a small amplitude a (`lagjax.normal_modes`).
@@ -101,15 +98,15 @@ def family(
     period, layout, y0 = starts(orbit.q0, orbit.qdot0, orbit.period, "period")
     q, qdot = map(layout.restore, halves(y0[0]))
     arcs = Arcs.of(system, q, qdot, params, RTOL, "Families")
-    follower = _Follower(arcs, None if by == "energy" else _place(params, by))
+    follower = Follower(arcs, None if by == "energy" else place_of(params, by), until)
     if by == "energy" and not arcs.conserves:
         raise ValueError(
             "The energy of this scene is not conserved, so that there is no family by energy: name a parameter."
         )
-    return _told(follower, *_followed(follower, y0, period.ravel(), until, float(step), count))
+    return _told(follower, *_followed(follower, y0, period.ravel(), float(step), count))
 
 
-def _place(params: PyTree, name: str) -> int:
+def place_of(params: PyTree, name: str) -> int:
     """Where the parameter stands among all numbers."""
     labels, leaves, _ = taken_apart(params, "params")
     begin = 0
@@ -124,142 +121,79 @@ def _place(params: PyTree, name: str) -> int:
     )
 
 
-class _Point(NamedTuple):
-    """An orbit of a family: its chain (of one member), the numbers of the scene, and derivatives by one of them.
+class _Member(NamedTuple):
+    """An orbit of a family, and what it tells: `found` (of one orbit), its multipliers, and what happens there.
 
-    `rate` is that of its value along the family; zero where the family ends.
+    `symmetries` counts those of the orbit; `tests` (4,) change sign at a fold, at a branch point or fold, at a
+    doubling, and at the value where the family is to end.
     """
 
-    chain: Chain
-    numbers: np.ndarray
-    by_number: np.ndarray
-    rate: float = 0.0
+    point: Point
+    tangent: Tangent
+    symmetries: int
+    found: Found
+    tests: np.ndarray
+    events: tuple[bool, bool, bool] = (False, False, False)
 
 
-class _Follower:
-    """What is free along a family: the first state; the period, unless it is held; a parameter, if it has a place."""
-
-    def __init__(self, arcs: Arcs, place: int | None):
-        self.arcs, self.place = arcs, place
-        self.period_is_free = not arcs.driven and (place is None or not arcs.conserves)
-
-    def closing(self, numbers: np.ndarray) -> Closing:
-        return Closing.plain(self.arcs.with_numbers(numbers))
-
-    def point(self, y, period, parts, numbers) -> _Point:
-        """The chain through these states, (1, K, 2n), and its derivative by the parameter (1, K, 2n, 1 or 0)."""
-        closing = self.closing(numbers)
-        chain = _shooting.follow(closing, y, period, parts)
-        if self.place is None:
-            return _Point(chain, numbers, np.zeros((*y.shape, 0)))
-        direction = np.eye(len(numbers))[self.place : self.place + 1]
-        spans = period[:, None] * parts[0] if self.arcs.driven else np.zeros((1, len(parts[0])))
-        times = np.stack([spans[0, :-1], spans[0, 1:]], axis=1)
-        if not self.arcs.driven:
-            times[:, 1] = period[0] * np.diff(parts[0])
-        arc = closing.arcs.follow(times, y[0], direction)
-        return _Point(chain, numbers, arc.by_params[None])
-
-    def equations(self, point: _Point) -> tuple[np.ndarray, Condensed, np.ndarray]:
-        """The matrix (2n, 2n + F) of the first state and what else is free; the chain; the right-hand side (2n,)."""
-        chain = point.chain
-        columns = [chain.rate[..., None] * np.diff(chain.parts)[..., None, None]] if self.period_is_free else []
-        columns = [*columns, point.by_number, chain.defect[..., None]]
-        condensed = condense(chain.growth, np.concatenate(columns, axis=3))
-        matrix = np.concatenate([condensed.first + condensed.last, condensed.more[..., :-1]], axis=2)
-        return matrix[0], condensed, condensed.more[0, :, -1]
-
-    def tangent(self, point: _Point) -> np.ndarray | None:
-        """The unit null vector (2n + F,) that is orthogonal to the symmetries; None where there is none."""
-        matrix, condensed, _ = self.equations(point)
-        states = matrix.shape[0]
-        still, whole = (
-            decide(x[None], np.array([_shooting.RANK])) for x in ((condensed.first + condensed.last)[0], matrix)
-        )
-        symmetries = np.zeros((matrix.shape[1], states - still.rank[0]))
-        symmetries[:states] = still.right[0][:, still.rank[0] :]
-        null = whole.right[0][:, whole.rank[0] :]
-        left = null - symmetries @ (symmetries.T @ null)
-        vectors, sizes, _ = np.linalg.svd(left, full_matrices=False)
-        return vectors[:, 0] if len(sizes) and sizes[0] > 0.5 else None
-
-    def moved(self, point: _Point, first: np.ndarray, right: float) -> _Point:
-        """The point after a change (2n + F,) of what is free, and of the inner states with it."""
-        _, condensed, _ = self.equations(point)
-        states = point.chain.y.shape[2]
-        z = np.append(first[states:], right)[None, :, None]
-        dy = condensed.inner(first[None, :states, None], first[None, :states, None], z)[..., 0]
-        period, numbers = point.chain.period.copy(), point.numbers.copy()
-        if self.period_is_free:
-            period += first[states]
-        if self.place is not None:
-            numbers[self.place] += first[-1]
-        return self.point(point.chain.y + dy, period, point.chain.parts, numbers)
-
-    def along(self, point: _Point, tangent: np.ndarray) -> _Point:
-        """The same with the rate of its value along a tangent (2n + F,)."""
-        if self.place is not None:
-            return point._replace(rate=float(tangent[-1]))
-        slope = self.arcs.energy_slope(0.0, point.chain.y[:, 0])[0]
-        return point._replace(rate=float(slope @ tangent[: len(slope)]))
-
-    def value(self, point: _Point) -> float:
-        """The energy, or the parameter."""
-        if self.place is not None:
-            return float(point.numbers[self.place])
-        return float(self.arcs.energy(0.0, point.chain.y[:, 0])[0])
+def _member(follower: Follower, point: Point, tangent: Tangent, most: int | None) -> _Member:
+    """An orbit with its multipliers; at most `most` directions count as symmetries."""
+    (symmetries,) = _shooting.symmetries(point.chain, most)
+    count = symmetries.null.shape[2]
+    found = told(follower.closing(point.numbers), point.chain, count)
+    reduced = reduce(point.chain.growth[0], *symmetries)
+    through = [passing(reduced, sign) if not found.message[0] else np.nan for sign in (1, -1)]
+    beyond = np.nan if follower.until is None else follower.value(point) - follower.until
+    return _Member(point, tangent, count, found, np.array([follower.slope(point) @ tangent.vector, *through, beyond]))
 
 
-def _corrected(follower: _Follower, point: _Point, tangent: np.ndarray) -> tuple[_Point | None, int]:
-    """The orbit in the plane across the tangent, and after how many trials; None where there is none."""
-    for trial in range(_TRIALS):
-        chain = point.chain
-        if not chain.ok[0] or not chain.period[0] > 0:
-            return None, trial
-        if chain.closure()[0] <= 1e-2 * CLOSED * chain.size()[0]:
-            return point, trial
-        matrix, _, right = follower.equations(point)
-        matrix, right = np.concatenate([matrix, tangent[None]]), np.append(right, 0.0)
-        threshold = _shooting.threshold_of(chain)
-        point = follower.moved(point, -decide(matrix[None], threshold).least_norm(right[None])[0], 1.0)
-    done = point.chain.ok[0] and point.chain.closure()[0] <= CLOSED * point.chain.size()[0]
-    return (point if done else None), _TRIALS
-
-
-def _followed(follower: _Follower, y0, period, until, step: float, count: int) -> tuple[list[_Point], str]:
+def _followed(follower: Follower, y0, period, step: float, count: int) -> tuple[list[_Member], str]:
     """The orbits of a family, and why it ends."""
-    closing = follower.closing(follower.arcs.numbers)
-    parts, y = _shooting.guesses(closing, y0, period, int(arcs_each(follower.arcs, y0, period)[0]))
-    points = [follower.point(y, period, parts, follower.arcs.numbers)]
-    tangent, shortest = follower.tangent(points[0]), _SHORTEST * step
+    point, shortest, until = begun(follower, y0, period), _SHORTEST * step, follower.until
+    tangent = tangent_at(follower, point, None)
     if tangent is None:
-        return points, "The orbit is alone: it closes at no other energy, or parameter, near its own."
-    rising = follower.value(follower.moved(points[0], 1e-4 * step * tangent, 0.0)) > follower.value(points[0])
-    wanted = until is None or until > follower.value(points[0])
-    tangent = tangent if rising == wanted else -tangent
-    points[0] = follower.along(points[0], tangent)
-    while len(points) < count:
-        point, trials = _corrected(follower, follower.moved(points[-1], step * tangent, 0.0), tangent)
-        if point is None or _shooting.stopped(point.chain)[0]:
+        alone = Tangent(np.zeros(point.matrix.shape[1]), 0, np.zeros((point.matrix.shape[1], 0)))
+        message = "The orbit is alone: it closes at no other energy, or parameter, near its own."
+        return [_member(follower, point, alone, None)], message
+    wanted = until is None or until > follower.value(point)
+    tangent = tangent if wanted else tangent._replace(vector=-tangent.vector)
+    members = [_member(follower, point, tangent, None)]
+    while len(members) < count:
+        last = members[-1]
+        there = step_along(follower, last.point, last.tangent, step)
+        if there is None or _shooting.stopped(there.point.chain)[0]:
             step /= 2
             if step < shortest:
-                return points, _end(follower, points[-1], point)
+                return members, _end(follower, last.point, there is not None)
             continue
-        points.append(point)
-        following = follower.tangent(point)
-        if following is None:
-            return points, "The family ends where its orbits lose the direction in which they had neighbours."
-        tangent = following * np.sign(following @ tangent)
-        points[-1] = follower.along(point, tangent)
-        step *= 1.5 if trials <= _QUICK else 0.7
-        if until is not None and (follower.value(point) > until) == wanted:
-            return points, f"The family was followed until {follower.value(point):.6g}, beyond {until:.6g}."
-    return points, f"{count} orbits were found; the family goes on: raise count to follow it further."
+        following = _member(follower, there.point, there.tangent, last.symmetries)
+        members += _between(follower, last, following, step)
+        if until is not None and (follower.value(there.point) > until) == wanted:
+            return members[:count], f"The family was followed until {until:.6g}."
+        members.append(_in_more_arcs(follower, following))
+        step = next_step(step, there)
+    return members[:count], f"{count} orbits were found; the family goes on: raise count to follow it further."
 
 
-def _end(follower: _Follower, last: _Point, trial: _Point | None) -> str:
+def begun(follower: Follower, y0: np.ndarray, period: np.ndarray) -> Point:
+    """The orbit from which a family is followed, in as many arcs as it needs."""
+    closing = follower.closing(follower.arcs.numbers)
+    parts, y = _shooting.guesses(closing, y0, period, int(arcs_each(follower.arcs, y0, period)[0]))
+    return follower.within_growth(follower.point(y, period, parts, follower.arcs.numbers))
+
+
+def _in_more_arcs(follower: Follower, member: _Member) -> _Member:
+    """The same orbit, followed in more arcs where errors grow much along one of its."""
+    point = follower.within_growth(member.point)
+    if point is member.point:
+        return member
+    there = corrected(follower, point, member.tangent)
+    return member if there is None else member._replace(point=there[0])
+
+
+def _end(follower: Follower, last: Point, stopped: bool) -> str:
     where = f"{follower.value(last):.9g}, with a period of {last.chain.period[0]:.6g}"
-    if trial is not None:
+    if stopped:
         return f"The family ends at an equilibrium, near {where}."
     return (
         f"The family could not be followed beyond {where}. It ends there, as at a collision or at an orbit that takes "
@@ -267,27 +201,97 @@ def _end(follower: _Follower, last: _Point, trial: _Point | None) -> str:
     )
 
 
-def _told(follower: _Follower, points: list[_Point], message: str) -> Family:
-    """The family in the user's structure, with what happens between its orbits."""
-    found = [told(follower.closing(point.numbers), point.chain) for point in points]
-    multipliers = np.concatenate([one.multipliers for one in found])
-    value = np.array([follower.value(point) for point in points])
-    energy = [follower.arcs.with_numbers(point.numbers).energy(0.0, point.chain.y[:, 0])[0] for point in points]
-    rate = np.array([point.rate for point in points])
-    fold = np.append(False, rate[1:] * rate[:-1] < 0)
-    through = [_passed(multipliers, sign) for sign in (1, -1)]
-    q, qdot = map(follower.arcs.layout.restore, halves(np.concatenate([one.y for one in found])))
-    period, closure, stable = (
-        np.concatenate([getattr(one, name) for one in found]) for name in ("period", "closure", "stable")
-    )
-    near_fold = fold | np.append(fold[1:], False) | np.append(False, fold[:-1])
-    columns = q, qdot, period, value, np.array(energy), multipliers, closure, stable, fold
-    return Family._make([*jax.tree.map(jnp.asarray, (*columns, through[0] & ~near_fold, through[1])), message])
+# ---- what happens between two orbits ---------------------------------------------------------------------------------
+
+_SAME = 1e-3  # of a step: within, a fold and a branch point are one, where both tests change sign
+_NOISE = 1e-9  # of tests, which are of order one: what is all degenerate, as an isotropic oscillator, passes nothing
+# How far from a branch point orbits are asked for, in parts of the bracket, and the bracket that ends that, in parts of
+# the step: the inverse polynomial through four orbits is then right to its fourth power.
+_BESIDE, _BRACKET = 0.02, 1e-3
 
 
-def _passed(multipliers: np.ndarray, sign: int) -> np.ndarray:
-    """Whether Π (1 − sign·μ) over those that are not 1 by symmetry changes its sign before each orbit, (N,)."""
-    known = int((multipliers == 1).sum(axis=1).min())
-    others = multipliers[:, : multipliers.shape[1] - known]
-    product = np.prod(1 - sign * others, axis=1).real
-    return np.append(False, product[1:] * product[:-1] < 0)
+def _between(follower: Follower, last: _Member, following: _Member, step: float) -> list[_Member]:
+    """The folds, branch points and doublings between two orbits, in their order, up to where the family is to end."""
+    turned = (last.tests * following.tests < 0) & (np.maximum(abs(last.tests), abs(following.tests)) > _NOISE)
+    located = {k: _located(follower, last, following, step, k) for k in np.flatnonzero(turned).tolist()}
+    if 0 in located and 1 in located and abs(located[0][0] - located[1][0]) < _SAME * step:
+        del located[1]
+    ordered = sorted(located.items(), key=lambda item: item[1][0])
+    ends = [place for place, (k, _) in enumerate(ordered, 1) if k == 3]
+    ordered = ordered[: ends[0]] if ends else ordered
+    return [member._replace(events=tuple(k == j for j in range(3))) for k, (_, member) in ordered]
+
+
+def _located(follower: Follower, last: _Member, following: _Member, step: float, k: int) -> tuple[float, _Member]:
+    """Where test k is zero on the arc between two orbits, and the orbit there.
+
+    At a branch point the equations are singular, and about it Newton's method finds orbits of either family. So orbits
+    are asked for beside it, nearer and nearer, from cubic guesses that are much nearer than the other family; the one
+    at the zero is then interpolated, and corrected in all directions but the singular one.
+    """
+    across, asked = last.tangent, {0.0: last, step: following}
+    a, b = 0.0, step
+    while b - a > _BRACKET * step:
+        zero, width = _zero(asked, a, b, k), b - a
+        for s in (max(zero, a + 2 * _BESIDE * width) - _BESIDE * width, zero + _BESIDE * width):
+            if not a < s < b:
+                continue
+            member = _at(follower, asked, a, b, s, across, 0, last.symmetries)
+            if member is None or not np.isfinite(member.tests[k]):
+                return a, asked[a]
+            asked[s] = member
+            a, b = (s, b) if member.tests[k] * asked[a].tests[k] > 0 else (a, s)
+        if b - a > 0.9 * width:
+            break
+    zero = _zero(asked, a, b, k)
+    member = _at(follower, asked, a, b, zero, across, int(k == 1), last.symmetries)
+    return zero, asked[a] if member is None else member
+
+
+def _zero(asked: dict[float, _Member], a: float, b: float, k: int) -> float:
+    """Where the inverse polynomial through the four orbits nearest to a bracket is zero; within it in any case."""
+    near = sorted(asked, key=lambda s: abs(s - (a + b) / 2))[:4]
+    values = [asked[s].tests[k] for s in near]
+    shares = [np.prod([w / (w - v) for w in values[:j] + values[j + 1 :]]) for j, v in enumerate(values)]
+    zero = float(np.dot(near, shares))
+    if a < zero < b:
+        return zero
+    return (a * asked[b].tests[k] - b * asked[a].tests[k]) / (asked[b].tests[k] - asked[a].tests[k])
+
+
+def _at(
+    follower: Follower, asked: dict[float, _Member], a: float, b: float, s: float, across: Tangent, left_out: int,
+    most: int,
+) -> _Member | None:  # fmt: skip
+    """The orbit at an arc s between two of a family that were found at a and b; None where it is none of theirs."""
+    ends = [Whole.of(asked[x].point) for x in (a, b)]
+    slopes = [_rate(follower, asked[x], across) for x in (a, b)]
+    u, width = (s - a) / (b - a), b - a
+    guess = ends[0].times((1 + 2 * u) * (1 - u) ** 2).plus(ends[1], u**2 * (3 - 2 * u))
+    guess = guess.plus(slopes[0], width * u * (1 - u) ** 2).plus(slopes[1], width * u**2 * (u - 1))
+    there = corrected(follower, follower.at(asked[a].point, guess), across, left_out)
+    tangent = None if there is None else tangent_at(follower, there[0], asked[a].tangent)
+    if there is None or tangent is None or tangent.vector @ across.vector < _ALONG:
+        return None
+    return _member(follower, there[0], tangent, most)
+
+
+_ALONG = 0.7  # the cosine of the turn of a tangent between two neighbours, more than which they have by `step_along`
+
+
+def _rate(follower: Follower, member: _Member, across: Tangent) -> Whole:
+    """The change of all numbers along the family by the arc across a tangent."""
+    vector = member.tangent.vector / (member.tangent.vector @ across.vector)
+    return follower.whole(member.point, vector, 0.0)
+
+
+def _told(follower: Follower, members: list[_Member], message: str) -> Family:
+    """The family in the user's structure."""
+    arrays = zip(*(member.found[:6] for member in members), strict=True)
+    found = Found._make([*map(np.concatenate, arrays), ()])
+    points, layout = [member.point for member in members], follower.arcs.layout
+    value, energy = (np.array([of(point) for point in points]) for of in (follower.value, follower.energy))
+    q, qdot = map(layout.restore, halves(found.y))
+    events = np.array([member.events for member in members]).T
+    columns = q, qdot, found.period, value, energy, found.multipliers, found.closure, found.stable, *events
+    return Family._make([*jax.tree.map(jnp.asarray, columns), message])

@@ -66,6 +66,19 @@ def multipliers_of(reduced: Reduced, paired: bool) -> np.ndarray:
     return np.concatenate([values, np.ones(reduced.known, complex)])
 
 
+def passing(reduced: Reduced, sign: int) -> float:
+    """det(1 − sign·G_(K−1) … G_0): zero where a multiplier passes through 1 (`sign` 1) or −1.
+
+    Of the cyclic matrix of the arcs, not of multipliers: two that meet at 1 are known to half the digits only, their
+    product with those of the others to all.
+    """
+    count, m, _ = reduced.growth.shape
+    cyclic = np.eye(count * m).reshape(count, m, count, m)
+    for k in range(count):
+        cyclic[(k + 1) % count, :, k, :] -= (sign if k == 0 else 1) * reduced.growth[k]
+    return float(np.linalg.det(cyclic.reshape(count * m, count * m)))
+
+
 def off_pairs(multipliers: np.ndarray) -> float:
     """By how much the pairs of `multipliers_of`, two neighbours each, miss a product of one: the largest miss."""
     firsts, seconds = multipliers[0::2], multipliers[1::2]

@@ -234,8 +234,11 @@ def _put(found: Found, places: np.ndarray, others: Found) -> Found:
     return Found._make([*arrays, tuple(message)])
 
 
-def told(closing: Closing, chain: Chain) -> Found:
-    """What the search came to: multipliers, stability, and a sentence where it is no orbit."""
+def told(closing: Closing, chain: Chain, most: int | None = None) -> Found:
+    """What the search came to: multipliers, stability, and a sentence where it is no orbit.
+
+    At most `most` directions count as symmetries; without it all that monodromy − 1 sends to zero.
+    """
     closure = chain.closure()
     message = [_sentence(chain, k) for k in range(len(closure))]
     ok = np.array([not text for text in message])
@@ -243,7 +246,7 @@ def told(closing: Closing, chain: Chain) -> Found:
     places = np.flatnonzero(ok)
     if len(places):
         closed = chain.at(places)
-        known = _shooting.symmetries(closed)
+        known = _shooting.symmetries(closed, most)
         for k, place in enumerate(places.tolist()):
             multipliers[place] = multipliers_of(reduce(closed.growth[k], *known[k]), closing.arcs.conserves)
     stable = np.abs(np.where(np.isnan(multipliers), np.inf, multipliers)).max(axis=1) < 1 + UNSTABLE

@@ -227,14 +227,18 @@ class Symmetries(NamedTuple):
     of_transpose: np.ndarray
 
 
-def symmetries(chain: Chain) -> list[Symmetries]:
-    """The rank decision about closed chains."""
+def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
+    """The rank decision about closed chains: which directions are symmetries, at most so many.
+
+    At a branch point monodromy − 1 sends more to zero, by chance: those of the smallest singular values are chosen.
+    """
     forward, null = _null(chain.growth)
     # ℓ_k = G_kᵀ ℓ_(k+1): the same chain, walked back from the end.
     back, of_transpose = _null(np.swapaxes(chain.growth[:, ::-1], 2, 3))
     found = []
     for k in range(len(chain.period)):
         count = chain.y.shape[2] - max(forward.rank[k], back.rank[k])
+        count = count if most is None else min(count, most)
         right, left = null[k][..., null.shape[3] - count :], of_transpose[k][..., null.shape[3] - count :]
         found.append(Symmetries(right, np.roll(left[::-1], 1, axis=0)))
     return found

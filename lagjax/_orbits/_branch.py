@@ -1,0 +1,109 @@
+"""`branch_off`: from a family of periodic orbits to one that crosses it, or that begins there with twice the period.
+
+At a branch point the closing equations have one null vector more than elsewhere on the family. The new family is sought
+at some distance along it, in the plane across, which the old family does not meet.
+
+Source: Keller, *Lectures on Numerical Methods in Bifurcation Problems* (1987), §5.26 (method III).
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._layout import halves
+from lagjax._orbits._arcs import Arcs
+from lagjax._orbits._family import Family, begun, place_of
+from lagjax._orbits._follow import Follower, Point, Tangent, corrected, tangent_at
+from lagjax._orbits._orbit import RTOL, Orbit, told
+from lagjax._orbits._rank import decide
+from lagjax._orbits._starts import starts
+from lagjax._system import System
+from lagjax._validate import require_tolerance
+
+PyTree = Any
+
+
+def branch_off(
+    system: System, family: Family, index: int, params: PyTree = None, *, by: str = "energy", size: float = 0.01
+) -> Orbit:
+    """A periodic orbit of the family that crosses `family` at its orbit `index`, near that orbit.
+
+    Follow it on by `family(system, branch_off(…), params)`: the halo orbits from the planar ones of Lyapunov, say.
+
+    - `index`: of an orbit where `family.branch` or `family.doubling` is True; of the latter the new orbits have twice
+      the period.
+    - `params`, `by`: those with which `family` was followed.
+    - `size`: how far off the new orbit is, in the units of (q, qdot, T) of a state.
+
+    By symmetry there often are two such families, mirror images, of which this is one.
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, an orbit at which no family crosses, and
+    where no orbit is found at that distance.
+
+    ```python
+    import jax, jax.numpy as jnp, lagjax
+    jax.config.update("jax_enable_x64", True)
+
+    star = lagjax.System(lambda q, v: 0.5 * (v @ v - q @ q) - q[0] ** 2 * q[1] + q[1] ** 3 / 3)
+    orbit = lagjax.periodic_orbit(star, jnp.array([0.0, 0.1]), jnp.zeros(2), 6.3)
+    along = lagjax.family(star, orbit, until=0.15)
+    twice = lagjax.branch_off(star, along, int(jnp.argmax(along.doubling)))
+    ```
+    """
+    require_tolerance(size, "size")
+    places = np.flatnonzero(np.asarray(family.branch | family.doubling)).tolist()
+    if index not in places:
+        raise ValueError(
+            f"No family crosses at orbit {index}: index must be that of a branch point or a doubling, "
+            f"{' or '.join(map(str, places)) or 'of which this family has none'}."
+        )
+    turns = 2 if bool(family.doubling[index]) else 1
+    beside = next(k for k in (index - 1, index + 1, index) if 0 <= k < len(family.value))
+    follower, here = _orbit_of(system, family, index, turns, params, by)
+    before = tangent_at(follower, _orbit_of(system, family, beside, turns, params, by)[1], None)
+    point = None if before is None else _beside(follower, here, before, float(size))
+    if before is None or point is None:
+        raise ValueError(
+            f"No orbit of another family was found {size:.3g} from orbit {index}: try another size, or follow the "
+            "family again with another first step, so that its neighbours lie elsewhere."
+        )
+    found = told(follower.closing(point.numbers), point.chain, before.symmetries.shape[1])
+    q, qdot = map(follower.arcs.layout.restore, halves(found.y[0]))
+    arrays = jax.tree.map(jnp.asarray, (q, qdot, *(x[0] for x in found[1:6])))
+    return Orbit._make([*arrays, found.message[0]])
+
+
+def _orbit_of(system: System, family: Family, k: int, turns: int, params, by: str) -> tuple[Follower, Point]:
+    """Orbit k of a family, traversed once or twice, and what is free along it."""
+    q0, qdot0 = jax.tree.map(lambda x: x[k], (family.q0, family.qdot0))
+    period, layout, y0 = starts(q0, qdot0, turns * family.period[k], "period")
+    q, qdot = map(layout.restore, halves(y0[0]))
+    arcs = Arcs.of(system, q, qdot, params, RTOL, "Families")
+    place = None if by == "energy" else place_of(params, by)
+    if place is not None:
+        arcs = arcs.with_numbers(np.where(np.arange(len(arcs.numbers)) == place, float(family.value[k]), arcs.numbers))
+    follower = Follower(arcs, place)
+    return follower, begun(follower, y0, period.ravel())
+
+
+def _beside(follower: Follower, here: Point, before: Tangent, size: float) -> Point | None:
+    """The orbit at a distance from a branch point along the null vector that is no symmetry, nor of the old family.
+
+    How many symmetries there are, and about which directions, is known from a neighbour on the old family: at the
+    branch point singular values do not tell them from the new direction.
+    """
+    states, count = here.matrix.shape[0], before.symmetries.shape[1]
+    still = decide(here.matrix[None, :, :states], np.zeros(1)).right[0][:, states - count - 1 :]
+    null = decide(here.matrix[None], np.zeros(1)).right[0][:, before.rank - 1 :]
+    known = np.zeros((null.shape[0], count + 1))
+    known[:states, :count] = still @ (still.T @ before.symmetries[:states])
+    known[:, count] = null @ (null.T @ before.vector)
+    known = np.linalg.qr(known)[0]
+    left, sizes, _ = np.linalg.svd(null - known @ (known.T @ null), full_matrices=False)
+    if not sizes[0] > 0.5:
+        return None
+    across = Tangent(left[:, 0], before.rank, before.symmetries)
+    there = corrected(follower, follower.moved(here, size * across.vector, 0.0), across)
+    return None if there is None else there[0]

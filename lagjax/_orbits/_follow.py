@@ -1,0 +1,285 @@
+"""How a family of periodic orbits is followed: what is free along it, its tangent, steps of which none is a jump.
+
+    predict   along the null vector of the closing equations that is no symmetry
+    correct   by Newton's method within the plane across it, at the same length of arc
+
+The rank of the closing equations is decided at closed orbits, where degenerate directions are so to rounding, and is
+that of the trials between them. Decided anew at every trial it would have to leave out all that the trial's defect
+may hide, which of an orbit with a multiplier of a thousand is everything but that one direction.
+
+A step stands if Newton's method contracts, if its first correction is short beside the step, and if the chord lies
+midway between tangents that turned little. An orbit of another family that happens to be near fails one of these, or
+is as near as the family bends; how close each came to its bound says how long the next step may be.
+
+Source: Allgower & Georg, *Numerical Continuation Methods* (1990), §6.1 (steps by contraction, distance and angle), §8
+(branch points).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._orbits import _shooting
+from lagjax._orbits._arcs import Arcs
+from lagjax._orbits._condense import Condensed, condense
+from lagjax._orbits._orbit import CLOSED
+from lagjax._orbits._rank import decide
+from lagjax._orbits._shooting import Chain, Closing
+
+_TRIALS = 8  # of Newton's method: beyond, the step along the family was too long
+# A step is repeated at half its length beyond these: the ratio of the second correction to the first, the first one in
+# parts of the step, the turn of the tangent, and how far the chord is from midway between the tangents.
+_CONTRACTION, _DISTANCE, _TURN, _ASKEW = 0.5, 0.4, 0.6, 0.1
+# The next step is chosen for this share of them.
+_USUAL = 0.4
+_LONGEST = 0.3  # of the largest number of a state: orbits of a family along a straight line are some way apart, no more
+# Singular values of closed orbits beyond this share of the largest are no rounding, whatever the rank was before: about
+# branch points they pass through zero.
+_ROUNDING = 1e-11
+# Of an error along one arc: more arcs where it is larger, so that all digits are left to close.
+_LONGEST_GROWTH = 1e3
+
+
+class Point(NamedTuple):
+    """An orbit of a family: its chain (of one member), the numbers of the scene, and the closing equations there.
+
+    `matrix` (2n, 2n + F) are those of the first state and of what else is free, `right` (2n,) their right-hand side.
+    """
+
+    chain: Chain
+    numbers: np.ndarray
+    matrix: np.ndarray
+    condensed: Condensed
+    right: np.ndarray
+
+    @property
+    def free(self) -> np.ndarray:
+        """The first state and the period, (2n + 1,)."""
+        return np.append(self.chain.y[0, 0], self.chain.period)
+
+    def closed(self, share: float) -> bool:
+        """Whether all arcs could be followed and close to this share of the size of the state."""
+        return bool(self.chain.ok[0] and self.chain.closure()[0] <= share * self.chain.size()[0])
+
+
+class Tangent(NamedTuple):
+    """Where a family goes on: the unit `vector` (2n + F,), the rank of the closing equations at a closed orbit, and its
+    symmetries (2n + F, k), an orthonormal basis."""
+
+    vector: np.ndarray
+    rank: int
+    symmetries: np.ndarray
+
+
+class Whole(NamedTuple):
+    """All numbers of a point, or a change of them: `y` (1, K, 2n), `period` (1,), `numbers` (P,) of the scene."""
+
+    y: np.ndarray
+    period: np.ndarray
+    numbers: np.ndarray
+
+    @classmethod
+    def of(cls, point: Point) -> "Whole":
+        """Those of a point."""
+        return cls(point.chain.y, point.chain.period, point.numbers)
+
+    def plus(self, other: "Whole", by: float = 1.0) -> "Whole":
+        """Each plus a multiple of the other's."""
+        return Whole(*(mine + by * one for mine, one in zip(self, other, strict=True)))
+
+    def times(self, by: float) -> "Whole":
+        """Each times a number."""
+        return Whole(*(by * mine for mine in self))
+
+
+class Follower:
+    """What is free along a family: the first state; the period, unless it stays; a parameter, if it has a place.
+
+    `until` is the value where the family is to end.
+    """
+
+    def __init__(self, arcs: Arcs, place: int | None, until: float | None = None):
+        self.arcs, self.place, self.until = arcs, place, until
+        self.period_is_free = not arcs.driven and (place is None or not arcs.conserves)
+
+    def closing(self, numbers: np.ndarray) -> Closing:
+        """What closes an orbit with these parameters."""
+        return Closing.plain(self.arcs.with_numbers(numbers))
+
+    def point(self, y, period, parts, numbers) -> Point:
+        """The chain through these states, (1, K, 2n), and its equations."""
+        closing = self.closing(numbers)
+        chain = _shooting.follow(closing, y, period, parts)
+        columns = [chain.rate[..., None] * np.diff(chain.parts)[..., None, None]] if self.period_is_free else []
+        if self.place is not None:
+            columns.append(self._by_parameter(closing, y, period, parts, self.place))
+        if not chain.ok[0]:
+            nothing = np.zeros((0, 0))
+            return Point(chain, numbers, nothing, Condensed(nothing, nothing, nothing, ()), nothing)
+        condensed = condense(chain.growth, np.concatenate([*columns, chain.defect[..., None]], axis=3))
+        matrix = np.concatenate([condensed.first + condensed.last, condensed.more[..., :-1]], axis=2)[0]
+        return Point(chain, numbers, matrix, condensed, condensed.more[0, :, -1])
+
+    def _by_parameter(self, closing: Closing, y, period, parts, place: int) -> np.ndarray:
+        """The derivatives (1, K, 2n, 1) of the ends of the arcs by the parameter at this place."""
+        direction = np.eye(len(closing.arcs.numbers))[place][None]
+        spans = period[:, None] * parts[0] if self.arcs.driven else np.zeros((1, len(parts[0])))
+        times = np.stack([spans[0, :-1], spans[0, 1:]], axis=1)
+        if not self.arcs.driven:
+            times[:, 1] = period[0] * np.diff(parts[0])
+        return closing.arcs.follow(times, y[0], direction).by_params[None]
+
+    def whole(self, point: Point, first: np.ndarray, right: float) -> "Whole":
+        """The change of all states that goes with one of what is free, (2n + F,), as the linear equations have it."""
+        states = point.chain.y.shape[2]
+        z = np.append(first[states:], right)[None, :, None]
+        dy = point.condensed.inner(first[None, :states, None], first[None, :states, None], z)[..., 0]
+        by = np.zeros(len(point.numbers))
+        if self.place is not None:
+            by[self.place] = first[-1]
+        return Whole(dy, first[states : states + 1] if self.period_is_free else np.zeros(1), by)
+
+    def moved(self, point: Point, first: np.ndarray, right: float) -> Point:
+        """The point after a change (2n + F,) of what is free, and of the inner states with it."""
+        return self.at(point, Whole.of(point).plus(self.whole(point, first, right)))
+
+    def at(self, point: Point, whole: "Whole") -> Point:
+        """The point with these numbers, at the same parts of its period as another."""
+        return self.point(whole.y, whole.period, point.chain.parts, whole.numbers)
+
+    def within_growth(self, point: Point) -> Point:
+        """The same orbit in more arcs where errors grow much along one; the same point where they do not."""
+        y, period, count = point.chain.y[:, 0], point.chain.period, point.chain.y.shape[1]
+        growth = np.log(max(np.linalg.norm(one, 2) for one in point.chain.growth[0])) / np.log(_LONGEST_GROWTH)
+        more = int(2 ** np.ceil(np.log2(max(growth, 1.0))))
+        if more == 1 or count * more > _MOST_ARCS:
+            return point
+        parts, y = _shooting.guesses(self.closing(point.numbers), y, period, count * more)
+        return self.point(y, period, parts, point.numbers)
+
+    def slope(self, point: Point) -> np.ndarray:
+        """The derivative (2n + F,) of the value by what is free."""
+        slope = np.zeros(point.matrix.shape[1])
+        if self.place is not None:
+            slope[-1] = 1.0
+        else:
+            slope[: point.chain.y.shape[2]] = self.arcs.energy_slope(0.0, point.chain.y[:, 0])[0]
+        return slope
+
+    def value(self, point: Point) -> float:
+        """The energy, or the parameter."""
+        if self.place is not None:
+            return float(point.numbers[self.place])
+        return float(self.arcs.energy(0.0, point.chain.y[:, 0])[0])
+
+    def energy(self, point: Point) -> float:
+        """h = p·q̇ − L."""
+        return float(self.arcs.with_numbers(point.numbers).energy(0.0, point.chain.y[:, 0])[0])
+
+
+_MOST_ARCS = 128
+
+
+def tangent_at(follower: Follower, point: Point, before: Tangent | None) -> Tangent | None:
+    """The direction of the family at a closed orbit: on from `before`, or at first that of a rising value.
+
+    None where there is none: the orbit is alone.
+    """
+    states = point.matrix.shape[0]
+    whole = decide(point.matrix[None], np.array([_shooting.RANK]))
+    still = decide(point.matrix[None, :, :states], np.array([_shooting.RANK]))
+    slope, count = follower.slope(point), states - int(still.rank[0])
+    rank = int(whole.rank[0])
+    if before is not None:  # a rank that falls short of itself in passing a branch point
+        at_least = whole.values[0, before.rank - 1] > _ROUNDING * whole.values[0, 0]
+        rank = max(rank, before.rank) if at_least else rank
+        count = min(count, before.symmetries.shape[1]) if at_least else count
+    symmetries = np.zeros((point.matrix.shape[1], count))
+    symmetries[:states] = still.right[0][:, states - count :]
+    if before is None:
+        symmetries = _without(symmetries, slope)
+    null = whole.right[0][:, rank:]
+    left, sizes, _ = np.linalg.svd(null - symmetries @ (symmetries.T @ null), full_matrices=False)
+    left = left[:, sizes > 0.5]
+    vector = left @ (left.T @ (slope if before is None else before.vector))
+    length = np.linalg.norm(vector)
+    if not length > 1e-6 * (np.linalg.norm(slope) if before is None else 1.0):
+        return None
+    return Tangent(vector / length, rank, symmetries)
+
+
+def _without(basis: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of what is orthogonal to a vector in the span of an orthonormal one (m, k)."""
+    along = basis.T @ vector
+    if not np.linalg.norm(along) > 1e-6 * np.linalg.norm(vector):
+        return basis
+    return basis @ np.linalg.svd(along[None], full_matrices=True)[2][1:].T
+
+
+class Step(NamedTuple):
+    """A corrected orbit with its tangent, and which share of its bounds the step took, 1 at most."""
+
+    point: Point
+    tangent: Tangent
+    share: float
+
+
+def corrected(follower: Follower, point: Point, across: Tangent, left_out: int = 0) -> tuple[Point, np.ndarray] | None:
+    """The orbit in the plane across a tangent, and the sizes of Newton's corrections; None where there is none.
+
+    The smallest `left_out` singular values of the equations are left out, as at a branch point, where one is zero.
+    """
+    sizes, before = [], np.inf
+    for _ in range(_TRIALS):
+        if not point.chain.ok[0] or not point.chain.period[0] > 0:
+            return None
+        closure = point.chain.closure()[0]
+        if point.closed(1e-2 * CLOSED) or (closure > 0.5 * before and point.closed(CLOSED)):
+            return point, np.array(sizes)
+        before = closure
+        matrix, right = np.concatenate([point.matrix, across.vector[None]]), np.append(point.right, 0.0)
+        system = decide(matrix[None], np.zeros(1))._replace(rank=np.array([across.rank + 1 - left_out]))
+        change = -system.least_norm(right[None])[0]
+        sizes.append(np.linalg.norm(change))
+        point = follower.moved(point, change, 1.0)
+    return (point, np.array(sizes)) if point.closed(CLOSED) else None
+
+
+def step_along(follower: Follower, last: Point, tangent: Tangent, step: float) -> Step | None:
+    """The orbit one step on; None where the step was too long for the family."""
+    there = corrected(follower, follower.moved(last, step * tangent.vector, 0.0), tangent)
+    if there is None:
+        return None
+    point, sizes = there
+    following = tangent_at(follower, point, tangent)
+    if following is None:
+        return None
+    sizes = np.append(sizes, [0.0, 0.0])
+    contraction = sizes[1] / sizes[0] if sizes[1] > 1e-8 * step else 0.0
+    cosine = np.clip(tangent.vector @ following.vector, -1.0, 1.0)
+    askew = _chord(follower, last, point, step) - (tangent.vector + following.vector) / 2
+    for one in (tangent, following):
+        askew -= one.symmetries @ (one.symmetries.T @ askew)
+    share = max(
+        np.sqrt(contraction / _CONTRACTION),
+        np.sqrt(sizes[0] / step / _DISTANCE),
+        np.arccos(cosine) / _TURN,
+        np.sqrt(np.linalg.norm(askew) / _ASKEW),
+    )
+    return Step(point, following, float(share)) if share <= 1 else None
+
+
+def _chord(follower: Follower, last: Point, point: Point, step: float) -> np.ndarray:
+    """The change of what is free, (2n + F,), in units of the step."""
+    change = point.free - last.free
+    if not follower.period_is_free:
+        change = change[:-1]
+    if follower.place is not None:
+        change = np.append(change, point.numbers[follower.place] - last.numbers[follower.place])
+    return change / step
+
+
+def next_step(step: float, there: Step) -> float:
+    """The length of the next step: half to twice this one, so that it takes the usual share of its bounds."""
+    longer = step * float(np.clip(_USUAL / max(there.share, 1e-300), 0.5, 2.0))
+    return min(longer, _LONGEST * there.point.chain.size()[0])
