@@ -14,6 +14,7 @@ _run, _isolate       workers: here, in children, by executors
 _status              how far it is
 """
 
+import os
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -193,15 +194,13 @@ def sweep(
     motions = Motions(system, np.asarray(ts, float), q0, qdot0, params, keep, _reduce(reduce), settings, sections)
     if executor is not None and isolate:
         raise ValueError("isolate is for sweeps of this process: give it, or an executor, whose processes may die too.")
-    axes, place = axes_of(over), Store(Path(store).absolute())
-    if place.unfinished_creation():
-        place.clear()
+    axes, place = axes_of(over), _place(store, "store")
     child = Child(place.path, isolate) if isolate else None
-    other = None if extend is None else Store(Path(extend).absolute())
+    other = None if extend is None else _place(extend, "extend")
     with precision(in_doubles()), child or nullcontext():
         if other is not None and goes_on(other, motions):
             motions = replace(motions, left=left_in(other, axes, motions))
-        if not place.path.exists():
+        if not place.is_there():
             begin(place, axes, motions, unit, child.look if child else first_look, other)
         spec = place.spec()
         require_same(place, spec, axes, motions)
@@ -214,6 +213,12 @@ def sweep(
             work(job, show, child.compute if child else compute)
     show.end()
     return Sweep(place.path)
+
+
+def _place(path: Any, name: str) -> Store:
+    if not isinstance(path, str | os.PathLike) or not str(path):
+        raise TypeError(f"{name} must be the name of a folder, such as 'map.zarr'; got {path!r}.")
+    return Store(Path(path).expanduser().absolute())
 
 
 def _callable(keep: Any) -> Callable:

@@ -6,10 +6,10 @@ The user's functions are for one member. Where they are written in jax.numpy the
 batch at once; else they are called member by member, which `slow` tells.
 """
 
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +26,8 @@ NAMES = {CRASHED: "crashed", KEEP_FAILED: "keep_failed"}
 MOST = 16_384  # members of a batch: more are no faster in machine code, and take more memory
 MOST_ON_DEVICES = 131_072
 PATH_BYTES = 64 * 2**20  # of the path of a batch
+_MOST_RAISE = 100  # members of a batch for which `keep` raises; each takes a dozen runs of `keep` to find
+_RAISED = re.compile(r"[\w.]+(Error|Exception|Warning|Interrupt): ")
 
 
 def label(code: int) -> str:
@@ -87,44 +89,102 @@ class Batches:
 
     def __call__(self, points: dict[str, np.ndarray]) -> Kept:
         """What is kept of the members at these points (B,)."""
-        motions, ts = self.motions, jnp.asarray(self.motions.ts)
-        values = {role: start(points) if start else getattr(motions, role) for role, start in self._starts.items()}
-        run, crossings = run_batch(motions.system, values, ts, self._axes, motions.settings, motions.sections)
-        arrays = (_arrays(run), crossings), values["params"] if self._axes[2] == 0 else None
-        self._tolerances = run.tolerances
-        try:
-            if "keep" in self.slow:
-                raise _Slow
-            kept, drift = self._keep_all(*arrays)
-            kept, complaints = {name: np.asarray(x) for name, x in _by_name(kept).items()}, {}
-        except (*NOT_TRACEABLE, _Slow) as why:
-            if "keep" not in self.slow:
-                self.slow["keep"] = _first_line(why)
-            drift = self._drift_alone(*arrays) if self.conserves else None
-            kept, complaints = self._one_by_one(run, crossings)
-        result = np.asarray(run.result._value).astype(RESULT.dtype)
+        motions, no_start = self._motions_of(points)
+        kept, drift, complaints = self._kept_of(motions)
+        result = np.asarray(motions.run.result._value).astype(RESULT.dtype)
         if complaints:
             result = result.copy()
             result[list(complaints)] = KEEP_FAILED
-        return Kept(kept, result, None if drift is None else np.asarray(drift), complaints, run.engine)
+        return Kept(kept, result, drift, no_start | complaints, motions.run.engine)
+
+    def bytes_of_one(self, points: dict[str, np.ndarray]) -> int:
+        """The bytes that are kept of a member, of the first of these; 0 where `keep` fails for that one."""
+        motions, _ = self._motions_of({name: x[:1] for name, x in points.items()})
+        try:
+            kept, _ = jax.eval_shape(self._keep_of_all, motions.arrays, motions.params)
+            return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(kept))
+        except NOT_TRACEABLE:
+            (row,), _ = self._rows(motions)
+            return sum(x.nbytes for x in (row or {}).values())
+
+    def _motions_of(self, points: dict[str, np.ndarray]) -> tuple["_Motions", dict[int, str]]:
+        """The motions of these members; and of members for which q0, q̇0 or params raised, why."""
+        motions, ts, complaints = self.motions, jnp.asarray(self.motions.ts), {}
+        values = {
+            role: start(points, complaints) if start else getattr(motions, role) for role, start in self._starts.items()
+        }
+        run, crossings = run_batch(motions.system, values, ts, self._axes, motions.settings, motions.sections)
+        self._tolerances = run.tolerances
+        of_members = values["params"] if self._axes[2] == 0 else None
+        return _Motions(run, crossings, (_arrays(run), crossings), of_members), complaints
+
+    def _kept_of(self, motions: "_Motions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
+        """What `keep` returns of each member, the change of its energy, and for which members `keep` raised."""
+        if "keep" not in self.slow:
+            try:
+                return self._compiled(motions)
+            except NOT_TRACEABLE as why:
+                self.slow["keep"] = _first_line(why)
+        drift = np.asarray(self._drift_alone(motions.arrays, motions.params)) if self.conserves else None
+        kept, complaints = self._one_by_one(motions)
+        return kept, drift, complaints
 
     # ---- compiled for all members ----
 
     def _mapped(self, role: str, function: Callable) -> Callable:
-        """`function(point)` for points (B,) of all members."""
+        """`function(point)` for points (B,) of all members; why it raised for some is added to `complaints`."""
         compiled = jax.jit(jax.vmap(function))
 
-        def start(points):
+        def start(points, complaints):
             if role not in self.slow:
                 try:
                     return jax.tree.map(np.asarray, compiled(points))
                 except NOT_TRACEABLE as why:
                     self.slow[role] = _first_line(why)
-            count = len(next(iter(points.values())))
-            rows = [function({name: float(x[k]) for name, x in points.items()}) for k in range(count)]
-            return jax.tree.map(lambda *leaves: np.stack([np.asarray(x, float) for x in leaves]), *rows)
+            return _start_one_by_one(role, function, points, complaints)
 
         return start
+
+    def _compiled(self, motions: "_Motions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
+        """What is kept of all members at once; members for which `keep` raises while it runs are blank, and told."""
+        everyone = np.arange(len(motions.run.result._value))
+        try:
+            return *self._of_some(motions, None), {}
+        except jax.errors.JaxRuntimeError:
+            complaints = self._raising(motions, everyone)
+            well = np.setdiff1d(everyone, list(complaints))
+            if not complaints or not well.size:  # too little memory; or it always raises
+                raise
+        bad = np.isin(everyone, list(complaints))
+        kept, drift = self._of_some(motions, np.where(bad, well[0], everyone))
+        for name, x in kept.items():
+            kept[name] = np.where(
+                bad.reshape(-1, *[1] * (x.ndim - 1)), Quantity(name, x.shape[1:], x.dtype).nothing, x
+            ).astype(x.dtype)
+        return kept, None if drift is None else np.where(bad, np.nan, drift), complaints
+
+    def _of_some(self, motions: "_Motions", which: np.ndarray | None) -> tuple[dict[str, np.ndarray], Any]:
+        """What is kept of these members (B,), by default of all in their order, and the change of their energy."""
+        arrays = motions.arrays, motions.params
+        if which is not None:
+            arrays = jax.tree.map(lambda x: np.asarray(x)[which], arrays)
+        kept, drift = self._keep_all(*arrays)
+        return {name: np.asarray(x) for name, x in _by_name(kept).items()}, None if drift is None else np.asarray(drift)
+
+    def _raising(self, motions: "_Motions", everyone: np.ndarray) -> dict[int, str]:
+        """The members for which `keep` raises, as from a callback, and what: by halves, in batches of the same size."""
+        found, waiting = {}, [everyone]
+        while waiting and len(found) <= _MOST_RAISE:
+            some = waiting.pop()
+            try:
+                self._of_some(motions, np.resize(some, len(everyone)))
+            except jax.errors.JaxRuntimeError as error:
+                half = len(some) // 2
+                if half:
+                    waiting += [some[half:], some[:half]]
+                else:
+                    found[int(some[0])] = f"keep raised {_raised(error)}"
+        return found if len(found) <= _MOST_RAISE else {}
 
     def _keep_of_all(self, arrays: tuple, params: PyTree) -> tuple:
         """What `keep` returns of every member, and the change of the energy."""
@@ -168,34 +228,58 @@ class Batches:
 
     # ---- member by member ----
 
-    def _one_by_one(self, run: Trajectory, crossings: Any) -> tuple[dict[str, np.ndarray], dict[int, str]]:
+    def _one_by_one(self, motions: "_Motions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
         """What `keep` returns of each member, called with numbers; and what is wrong with what it returned."""
-        arrays = jax.tree.map(np.asarray, (_arrays(run), crossings))
-        params, rows, complaints = jax.tree.map(np.asarray, eqx.filter(run.params, eqx.is_array_like)), [], {}
-        for k in range(len(run.result._value)):
-            of_member = jax.tree.map(lambda x, k=k: x[k], params) if self._axes[2] == 0 else None
-            try:
-                one, crossed = jax.tree.map(lambda x, k=k: x[k], arrays)
-                kept = self._kept(self._trajectory(one, of_member), crossed)
-                rows.append({name: np.asarray(x) for name, x in _by_name(kept).items()})
-            except _NotADict:
-                raise
-            except Exception as error:  # of the user's function: it costs this member, and nobody else
-                rows.append(None)
-                complaints[k] = f"keep raised {type(error).__name__}: {_first_line(error)}"
-        expected = self.quantities or _quantities(next((row for row in rows if row), {}))
+        rows, errors = self._rows(motions)
+        if not self.quantities and not any(rows):
+            raise errors[0]  # at the first look, of all members
+        complaints = {k: f"keep raised {type(error).__name__}: {_first_line(error)}" for k, error in errors.items()}
+        expected = self.quantities or _quantities(next(row for row in rows if row))
         for k, row in enumerate(rows):
             if row is not None and (wrong := _misfit(expected, row)):
                 rows[k], complaints[k] = None, wrong
         return {q.name: _stacked(q, rows) for q in expected}, complaints
 
+    def _rows(self, motions: "_Motions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
+        """What `keep` returns of each member by name, None of those for which it raised; and what it raised."""
+        arrays = jax.tree.map(np.asarray, motions.arrays)
+        params, rows, errors = jax.tree.map(np.asarray, motions.params), [], {}
+        for k in range(len(motions.run.result._value)):
+            try:
+                one, crossed, of_member = jax.tree.map(lambda x, k=k: x[k], (*arrays, params))
+                kept = self._kept(self._trajectory(one, of_member), crossed)
+                rows.append({name: np.asarray(x) for name, x in _by_name(kept).items()})
+            except Exception as error:  # of the user's function: it costs this member, and nobody else
+                rows.append(None)
+                errors[k] = error
+        return rows, errors
 
-class _Slow(Exception):
-    """That `keep` is known to be called member by member."""
+
+class _Motions(NamedTuple):
+    """Motions of a batch and their crossings, the same as arrays of B members, and their params where these differ."""
+
+    run: Trajectory
+    crossings: Any
+    arrays: tuple
+    params: PyTree
 
 
-class _NotADict(TypeError):
-    """That `keep` does not return a dict, which is no matter of one member."""
+def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarray], complaints: dict[int, str]):
+    """`function(point)` called with numbers for each member; NaN, and the complaint, where it raises."""
+    rows, errors = [], {}
+    for k in range(len(next(iter(points.values())))):
+        try:
+            row = function({name: float(x[k]) for name, x in points.items()})
+            rows.append(jax.tree.map(lambda x: np.asarray(x, float), row))
+        except Exception as error:  # of the user's function: it costs this member, and nobody else
+            rows.append(None)
+            errors[k] = error
+    well = next((row for row in rows if row is not None), None)
+    if well is None:
+        raise errors[0]
+    complaints |= {k: f"{role} raised {type(error).__name__}: {_first_line(error)}" for k, error in errors.items()}
+    nothing = jax.tree.map(lambda x: np.full_like(x, np.nan), well)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *(nothing if row is None else row for row in rows))
 
 
 def quantities_of(kept: Kept) -> list[Quantity]:
@@ -231,11 +315,20 @@ def _stacked(q: Quantity, rows: list) -> np.ndarray:
 
 
 def _require_dict(kept: Any) -> None:
-    if not isinstance(kept, dict) or not kept:
-        raise _NotADict(
+    """Raise `TypeError` or `ValueError` where `keep` returns no dict of numbers, each under a name of its own."""
+    if not isinstance(kept, dict) or not jax.tree.leaves(kept):
+        raise TypeError(
             "keep must return a dict that is not empty: names with numbers or arrays, such as {'angle': "
-            f"trajectory.q[-1]}}; it returned {type(kept).__name__}."
+            f"trajectory.q[-1]}}; it returned {type(kept).__name__ if not isinstance(kept, dict) else kept}."
         )
+    names = jax.tree.leaves(names_of(kept))
+    for name, leaf in zip(names, jax.tree.leaves(kept), strict=True):
+        if names.count(name) > 1:
+            raise ValueError(f"keep returns two quantities with the name {name!r} in the store: rename one of them.")
+        dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
+        if dtype.kind not in "fciub":
+            what = type(leaf).__name__ if not hasattr(leaf, "dtype") else f"an array of type {dtype}"
+            raise TypeError(f"keep returns {name!r}, which is of type {what}: numbers can be kept.")
 
 
 def _by_name(kept: dict) -> dict[str, Any]:
@@ -248,6 +341,12 @@ def names_of(kept: dict) -> dict:
     return jax.tree_util.tree_map_with_path(
         lambda path, _: ".".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path), kept
     )
+
+
+def _raised(error: BaseException) -> str:
+    """What a callback raised, of all that XLA says about it."""
+    lines = [line.strip() for line in str(error).split("\n")]
+    return next((line for line in reversed(lines) if _RAISED.match(line)), lines[0])[:200]
 
 
 def _first_line(error: BaseException) -> str:

@@ -1,6 +1,7 @@
 """Stores that are begun, and stores that are there: what both have to be."""
 
 import json
+import math
 import time
 import warnings
 from collections.abc import Callable
@@ -28,10 +29,17 @@ def first_look(motions: Motions, points: dict[str, np.ndarray]) -> tuple[Kept, f
     """What is kept of a few members, the seconds that one of them takes, and whether the energy is constant."""
     conserves = _conserves(motions, points)
     batches = batches_of(motions, conserves)
+    points = _some(points, UNIT_BYTES // max(1, batches.bytes_of_one(points)))
     batches(points)  # which compiles
     began = time.perf_counter()
     kept = batches(points)
     return kept, (time.perf_counter() - began) / len(kept.result), conserves
+
+
+def _some(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
+    """At most so many of these points, one at least."""
+    count = len(next(iter(points.values())))
+    return {name: x[:: -(-count // max(1, most))] for name, x in points.items()}
 
 
 Look = Callable[[Motions, dict[str, np.ndarray]], tuple[Kept, float, bool]]
@@ -48,6 +56,7 @@ def begin(
     """Make the store, after a look at what a few members take and keep, with the members that `extend` knows."""
     scene = packed(motions)
     points, shape = _few(axes, motions), tuple(axis.size for axis in axes)
+    points = _some(points, _room(motions, points))
     kept, seconds, conserves = look(motions, points)
     quantities = quantities_of(kept)
     _require_names(quantities, axes, motions.reduce)
@@ -65,9 +74,10 @@ def begin(
     extend = None if motions.left else extend  # of which no member is taken as it is
     if extend is not None:
         require_extensible(extend, extend.spec(), spec)
-    store.create(spec, scene, axes, title, {-1: "not_done"} | {code: label(code) for code in codes})
-    if extend is not None:
-        carry(extend, store)
+    with store.made_aside() as new:
+        new.create(spec, scene, axes, title, {-1: "not_done"} | {code: label(code) for code in codes})
+        if extend is not None:
+            carry(extend, new)
 
 
 def _few(axes: tuple[Axis, ...], motions: Motions) -> dict[str, np.ndarray]:
@@ -76,6 +86,7 @@ def _few(axes: tuple[Axis, ...], motions: Motions) -> dict[str, np.ndarray]:
     for axis in axes:
         _, values = next(axis.pieces())
         count = min(axis.size, max(2, round(_PROBED ** (1 / len(axes)))), len(values))
+        count = count if math.prod(shape) * count <= _PROBED else 1  # of a dozen axes and more
         first = isinstance(axis.source, Design) or motions.left is not None
         which = np.arange(count) if first else np.linspace(0, len(values) - 1, count).astype(int)
         sides.append({name: values[which, c] for c, name in enumerate(axis.names)})
@@ -104,27 +115,40 @@ def _unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantit
 
 def _batch_size(motions: Motions, points: dict[str, np.ndarray], kept: Kept) -> int:
     """The most members of a batch: their paths take at most `PATH_BYTES`."""
+    most = _batch.MOST if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
+    return max(1, min(most, _room(motions, points)))
+
+
+def _room(motions: Motions, points: dict[str, np.ndarray]) -> int:
+    """The members whose paths, and what is noted on the way, take `PATH_BYTES`; none where one takes more."""
     q, qdot, _ = motions.start({name: x[0] for name, x in points.items()})
     states = 2 * Layout.of(q, qdot).size
-    each = 8 * states * len(motions.ts) + (motions.sections.bytes_of(states) if motions.sections else 0)
-    most = _batch.MOST if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
-    return max(1, min(most, _batch.PATH_BYTES // each))
+    noted = motions.sections.bytes_of(states) if motions.sections else 0
+    return _batch.PATH_BYTES // (8 * states * len(motions.ts) + noted)
 
 
 def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: dict) -> None:
-    names, taken = (
-        [q.name for q in quantities],
-        {*RESERVED, *(a.dimension for a in axes), *(n for a in axes for n in a.names)},
-    )
+    """Raise `ValueError` where what `keep` returns cannot stand in a store under its name, or not be reduced."""
+    names = [q.name for q in quantities]
+    taken = {*RESERVED, *(a.dimension for a in axes), *(n for a in axes for n in a.names)}
+    inner = {dimension: q.name for q in quantities for dimension in q.dimensions}
     for q in quantities:
         if q.name in taken:
             raise ValueError(f"keep returns {q.name!r}, which is a name in over, or `result`: give it another name.")
-        if "/" in q.name or not q.name or q.name.startswith("."):
-            raise ValueError(f"keep returns {q.name!r}: names must not be empty, begin with a dot or contain a slash.")
-        if q.dtype.kind not in "fciub":
-            raise TypeError(f"keep returns {q.name!r} of type {q.dtype}; numbers can be kept.")
+        if "/" in q.name or not q.name or q.name.startswith(".") or q.name == "zarr.json":
+            raise ValueError(
+                f"keep returns {q.name!r}: names must not be empty, begin with a dot, contain a slash, or be zarr.json."
+            )
+    for name in [*names, *taken]:
+        if name in inner:
+            raise ValueError(
+                f"keep returns {inner[name]!r}, an array, of which the store calls an axis {name!r}; something else "
+                "has this name already: rename one of them."
+            )
     if missing := [name for name in reduce if name not in names]:
         raise ValueError(f"reduce names {missing}, which keep does not return; it returns {names}.")
+    if mixed := [q.name for q in quantities if q.name in reduce and q.dtype.kind == "c"]:
+        raise ValueError(f"reduce names {mixed}, which are complex: let keep return real and imaginary parts.")
 
 
 # ---- a store that is there -------------------------------------------------------------------------------------------

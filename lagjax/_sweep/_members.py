@@ -85,7 +85,10 @@ def _axis(key: Any, value: Any) -> Axis:
 
 
 def _column(name: str, value: Any) -> np.ndarray:
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of several lengths
+        array = np.asarray(value, object)
     if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "fiu":
         raise ValueError(
             f"over[{name!r}] must be a 1-D array of real numbers that is not empty, or a design such as "

@@ -64,8 +64,15 @@ class Motions:
     left: Left | None = None  # where they go on from, instead of q0 and qdot0
 
     def start(self, point: dict[str, Any]) -> tuple[PyTree, PyTree, PyTree]:
-        """(q0, qdot0, params) of the member at a point."""
-        q0, qdot0, params = (x(point) if callable(x) else x for x in (self.q0, self.qdot0, self.params))
+        """(q0, qdot0, params) of the member at a point. Raises `ValueError` where they ask it for another name."""
+        try:
+            q0, qdot0, params = (x(point) if callable(x) else x for x in (self.q0, self.qdot0, self.params))
+        except KeyError as why:
+            if why.args[:1] and why.args[0] in point:
+                raise
+            raise ValueError(
+                f"q0, qdot0 or params asks for {why}: a point has the names of `over`, which are {', '.join(point)}."
+            ) from why
         return q0, qdot0, params
 
     def shapes(self, names: list[str]) -> tuple[PyTree, PyTree, PyTree]:

@@ -5,19 +5,23 @@
     STORE/.sweep/done/UNIT.json, UNIT.npz            a unit that is finished: counts, hashes, statistics
     STORE/.sweep/claims/, workers/, crashed/         who works on what; members that end their process
     STORE/.sweep/aside/                              files that are being written
+    .STORE.begun-…                                   a store that is being made, beside the place that it will take
 
 A file appears under its name when all of it is on the disk (written aside, then renamed), and a unit is done when the
 last of its files is. To write a unit again changes nothing, so that it does no harm if two workers do.
 """
 
 import errno
+import glob
 import hashlib
 import io
 import json
 import os
 import shutil
+import time
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +36,7 @@ FORMAT = 2
 JOB = ".sweep"
 KNOWN = "known"  # the folder of members that were taken from another store
 _LEFT = 3600.0  # seconds after which a file that nobody has touched is of a dead worker; those who live beat
+_ABANDONED = 86_400.0  # seconds after which a store that was never made ready is removed; to make one takes minutes
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -43,6 +48,11 @@ class Quantity:
     name: str
     shape: tuple[int, ...]
     dtype: np.dtype
+
+    @property
+    def dimensions(self) -> tuple[str, ...]:
+        """The names of the axes of its shape."""
+        return tuple(f"{self.name}_{k}" for k in range(len(self.shape)))
 
     @property
     def nothing(self) -> Any:
@@ -103,34 +113,57 @@ class Store:
         kept = [Quantity(x["name"], tuple(x["shape"]), np.dtype(x["dtype"])) for x in spec["kept"]]
         return [*(q for q in kept if q.name not in spec["reduce"]), RESULT]
 
-    def create(self, spec: dict, scene: bytes, axes: tuple[Axis, ...], title: str, codes: dict[int, str]) -> None:
-        """Make the store with empty arrays and the coordinates; it is there when its spec is, which is written last."""
-        zarr = require_zarr()
+    def is_there(self) -> bool:
+        """Whether there is something by this name; an empty folder is nothing."""
+        return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
+
+    @contextmanager
+    def made_aside(self) -> "Iterator[Store]":
+        """A store in a folder beside this one's, which takes its place when the `with` statement ends.
+
+        So a store is there when it is whole. Of several processes that make it at once the first one's stays.
+        """
         with self.explained("the store was not made"):
-            self.job.mkdir(parents=True, exist_ok=True)
-            for folder in ("done", "claims", "workers", "crashed", "aside"):
-                (self.job / folder).mkdir(exist_ok=True)
-            names = [name for axis in axes for name in axis.names]
-            group = zarr.create_group(str(self.path), overwrite=False, attributes={"title": title})
-            group.attrs["coordinates"] = " ".join(names)
-            for axis in axes:
-                _write_axis(group, axis)
-            grid, dimensions = self.grid(spec), tuple(axis.dimension for axis in axes)
-            for q in self.quantities(spec):
-                inner = tuple(f"{q.name}_{k}" for k in range(len(q.shape)))
-                about: dict = {}
-                if q == RESULT:
-                    about = {"flag_values": list(codes), "flag_meanings": " ".join(codes.values())}
-                group.create_array(
-                    q.name, shape=grid.shape + q.shape, chunks=grid.chunk + q.shape, dtype=q.dtype, compressors=None,
-                    filters=None, fill_value=-1 if q == RESULT else q.nothing, dimension_names=dimensions + inner,
-                    attributes=about,
-                )  # fmt: skip
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that it is no part of the format yet; readers then list no folders
-                zarr.consolidate_metadata(str(self.path))
-            self.write(self.job / "scene.pkl", scene, "spec")
-            self.write(self.job / "spec.json", json.dumps(spec, indent=1, ensure_ascii=False).encode(), "spec")
+            place = self.path.resolve()
+            place.parent.mkdir(parents=True, exist_ok=True)
+            begun = f".{place.name}.begun-"
+            for folder in place.parent.glob(glob.escape(begun) + "*"):
+                if folder.stat().st_mtime < time.time() - _ABANDONED:
+                    shutil.rmtree(folder, ignore_errors=True)
+            aside = Store(place.parent / f"{begun}{os.getpid()}-{os.urandom(4).hex()}")
+            try:
+                yield aside
+                os.rename(aside.path, place)
+            except OSError:
+                if not (aside.job / "spec.json").exists() or not self.is_there():
+                    raise  # else another process was first
+            finally:
+                shutil.rmtree(aside.path, ignore_errors=True)
+
+    def create(self, spec: dict, scene: bytes, axes: tuple[Axis, ...], title: str, codes: dict[int, str]) -> None:
+        """Make the store with empty arrays and the coordinates."""
+        zarr = require_zarr()
+        for folder in ("done", "claims", "workers", "crashed", "aside"):
+            (self.job / folder).mkdir(parents=True)
+        group = zarr.create_group(str(self.path), overwrite=False, attributes={"title": title})
+        group.attrs["coordinates"] = " ".join(name for axis in axes for name in axis.names)
+        for axis in axes:
+            _write_axis(group, axis)
+        grid, dimensions = self.grid(spec), tuple(axis.dimension for axis in axes)
+        for q in self.quantities(spec):
+            about: dict = {}
+            if q == RESULT:
+                about = {"flag_values": list(codes), "flag_meanings": " ".join(codes.values())}
+            group.create_array(
+                q.name, shape=grid.shape + q.shape, chunks=grid.chunk + q.shape, dtype=q.dtype, compressors=None,
+                filters=None, fill_value=-1 if q == RESULT else q.nothing, dimension_names=dimensions + q.dimensions,
+                attributes=about,
+            )  # fmt: skip
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it is no part of the format yet; readers then list no folders
+            zarr.consolidate_metadata(str(self.path))
+        self.write(self.job / "scene.pkl", scene, "spec")
+        self.write(self.job / "spec.json", json.dumps(spec, indent=1, ensure_ascii=False).encode(), "spec")
 
     def coordinates(self, axes: list[dict], box: tuple[slice, ...]) -> list[dict[str, np.ndarray]]:
         """The values along each axis of a box of members, by names; long designs are written when first read."""
@@ -156,14 +189,6 @@ class Store:
     def array(self, name: str):
         """An array of the store, to be read from."""
         return require_zarr().open_array(str(self.path / name), mode="r")
-
-    def unfinished_creation(self) -> bool:
-        """Whether there is a folder in which a store was begun to be made, and was not."""
-        return self.job.exists() and not (self.job / "spec.json").exists()
-
-    def clear(self) -> None:
-        """Remove what an interrupted `create` has left."""
-        shutil.rmtree(self.path)
 
     # ---- units ----
 
