@@ -10,7 +10,8 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 - `simulate`, `simulate_batch`: one motion, or many at once, as a `Trajectory` of `State`s
 - `samples`: an input that was measured, as a function of time
 - `crossings`: where a motion crosses a section, as `Crossings`
-- `simulate_hybrid`: a motion through modes, by `Transition`s; those that happened are `Transitions`
+- `simulate_hybrid`: a motion through modes, by `Transition`s; those that happened are `Transitions`; `Hybrid`: all of
+  it as one object, for `fit`
 - `MachineCode`, `FineOutput`: what integrates
 - `SimulationError`, `RESULTS`: how a motion ends
 
@@ -94,7 +95,7 @@ from lagjax._fit import (
     simplex,
 )
 from lagjax._health import Health
-from lagjax._hybrid import Transition, simulate_hybrid
+from lagjax._hybrid import Hybrid, Transition, simulate_hybrid
 from lagjax._machine_code import MachineCode
 from lagjax._orbits import (
     Family,
@@ -138,6 +139,7 @@ __all__ = [
     "Guess",
     "Hamiltonian",
     "Health",
+    "Hybrid",
     "Linearization",
     "LyapunovExponent",
     "MachineCode",

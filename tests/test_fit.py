@@ -7,6 +7,7 @@ import importlib
 import itertools
 from pathlib import Path
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.optimize import least_squares
 
 import lagjax
 from lagjax._fit import _correlation, _residuals, _signals, _solve, _transforms
-from lagjax._fit._motions import _ByDiffrax, motions_of
+from lagjax._fit._motions import _ByJAX, motions_of
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._segments import Reader
 from lagjax._fit._verdict import shifts_without
@@ -451,7 +452,8 @@ def test_motions_of_machine_code_and_of_diffrax_agree():
     u = parameters.moved(parameters.first)
     numbers, (y0_dot, numbers_dot) = parameters.numbers(u), along(parameters.directions(u), 2)
     fast = motions_of(SCENE, layout, parameters, 1e-11, None).follow(ts, y0, numbers, y0_dot, numbers_dot)
-    plain = _ByDiffrax(SCENE, layout, parameters, 1e-11, None).follow(ts, y0, numbers, y0_dot, numbers_dot)
+    options = {"rtol": 1e-11, "atol": None, "adjoint": diffrax.ForwardMode()}
+    plain = _ByJAX(SCENE, layout, parameters, options).follow(ts, y0, numbers, y0_dot, numbers_dot)
     np.testing.assert_allclose(fast.path, plain.path, atol=1e-8)
     np.testing.assert_allclose(fast.tangents, plain.tangents, atol=1e-7)
     assert fast.tangents.shape == (2, 4, 5, 2)

@@ -1,5 +1,6 @@
 """`fit` with sampled inputs: an oscillator that is driven, whose motion has a closed form for both holds."""
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -93,7 +94,8 @@ def test_machine_code_and_diffrax_agree_and_derivatives_are_those_of_differences
     y0_dot = np.concatenate([np.broadcast_to(np.eye(2), (2, 2, 2)), np.zeros((2, 3, 2))], axis=1)
     along = y0_dot, np.concatenate([np.zeros((2, 3)), np.eye(3)])
     fast = _motions.motions_of(SCENE, layout, parameters, 1e-12, None, form)
-    plain = _motions._ByDiffrax(form.driven(SCENE), layout, parameters, 1e-12, None, True)
+    options = {"rtol": 1e-12, "atol": None, "adjoint": diffrax.ForwardMode()}
+    plain = _motions._ByJAX(form.driven(SCENE), layout, parameters, options, True)
     one, other = (motions.follow(ts, y0, numbers, *along, table) for motions in (fast, plain))
     np.testing.assert_allclose(one.path, other.path, atol=1e-8)
     np.testing.assert_allclose(one.tangents, other.tangents, atol=1e-7)

@@ -32,20 +32,21 @@ from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Guess, Measured, Record, in_structure, known_start, require_alike, started
 from lagjax._fit._residuals import AbstractQuestion, Failure, Question
 from lagjax._fit._result import Covariance, Fit, SignalNoise
+from lagjax._fit._scene import Scene, first_law, require_scene
 from lagjax._fit._search import by_gradient, roomy, search_records, searches, weakly
 from lagjax._fit._segments import Reader, whole
 from lagjax._fit._signals import Signals, looks_like_positions
 from lagjax._fit._solve import Descent
 from lagjax._fit._starts import Manifold
 from lagjax._fit._systems import asked, by_name, naming
-from lagjax._fit._timings import Clock, Timings
+from lagjax._fit._timings import Timings, clock_of
 from lagjax._fit._transforms import angle, between, inertia, positive, simplex
 from lagjax._fit._uncertainty import Information, information
 from lagjax._fit._unseen import sentences
 from lagjax._fit._verdict import verdict
+from lagjax._hybrid import Hybrid
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL
-from lagjax._system import System, require_system
 
 __all__ = [
     "Delayed",
@@ -68,7 +69,7 @@ METHODS = ("auto", "segments", "whole", "gradient")
 
 
 def fit(
-    system: System | dict[str, System],
+    system: Scene | dict[str, Scene],
     records: Record | Timings | list | dict[str, Any],
     params0: PyTree,
     *,
@@ -89,9 +90,9 @@ def fit(
 
     **Arguments**
 
-    - `system`: one scene, or a dict by name of scenes that share parameters: two machines with the same bearings, or
-      one that swings freely in some records and is driven in others. `records` is then a dict by the same names, and
-      `observe` such a dict or one for all.
+    - `system`: one scene, a `System` or a `lagjax.Hybrid`, or a dict by name of scenes that share parameters: two
+      machines with the same bearings, or one that swings freely in some records and is driven in others. `records` is
+      then a dict by the same names, and `observe` such a dict or one for all.
     - `records`: one `Record` or several, of any lengths; and `lagjax.Timings`, beside them or alone.
     - `params0`: where the search for the parameters begins, in the structure that the scene's functions ask for.
     - `observe`: a function of (q, qdot), and of `t`, `params`, `inputs` by name, that returns what the sensors show in
@@ -150,6 +151,7 @@ def fit(
     if progress:
         question.watch = _Printer(question.size)
     y0 = _starts(scenes, readers, question.states, params0)
+    readers = _to_cut(scenes, readers, method)
     first, told = parameters.moved(parameters.first), (system, observe, question)
     systems = {scene.name: scene.system for scene in scenes}
     if method == "gradient":
@@ -166,7 +168,7 @@ class _Scene(NamedTuple):
     and coordinates."""
 
     name: str | None
-    system: System
+    system: Scene
     records: list[Any]
     observe: Callable | Delayed | None
     form: Form | None
@@ -178,7 +180,7 @@ def _scenes(system, records, params0, observe, hold: str) -> list[_Scene]:
     scenes = []
     for name, one, own, sensors in by_name(system, records, observe):
         with naming(name):
-            require_system(one)
+            require_scene(one)
             own = require_alike(own)
             form = _form(one, own, hold)
             scenes.append(_Scene(name, one, own, sensors, form, _layout(one, own, params0, form)))
@@ -198,9 +200,11 @@ def _require_one_beginning(question: AbstractQuestion, starts: int, method: str)
             raise ValueError("starts must be 1 where there are lagjax.Timings: their search has one beginning.")
 
 
-def _form(system: System, records: list[Record], hold: str) -> Form | None:
+def _form(system: Scene, records: list[Record], hold: str) -> Form | None:
     """The structure of the inputs. Raises `ValueError` where the scene asks for some, and there are none."""
     asking = asks(system)
+    if asking and isinstance(system, Hybrid):
+        raise ValueError(f"{asking[0]} asks for `inputs`, which hybrid motion has none of: make it a function of `t`.")
     for place, record in enumerate(records):
         if asking and (not isinstance(record, Record) or record.input_structure is None):
             raise ValueError(
@@ -213,14 +217,16 @@ def _form(system: System, records: list[Record], hold: str) -> Form | None:
     return Form(tree, shapes, hold)
 
 
-def _layout(system: System, records: list[Record], params0, form: Form | None) -> Layout:
+def _layout(system: Scene, records: list[Record], params0, form: Form | None) -> Layout:
     """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
     begun = next((started(record.start, params0) for record in records if record.start is not None), None)
     read_off = begun is None
     if read_off:  # no record is of crossing times: those have starts
         begun = 2 * (jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values),)
     q, qdot = jax.tree.map(jnp.asarray, begun)
-    scene, params = (system, params0) if form is None else (form.driven(system), form.params(params0, 2))
+    scene, params = first_law(system), params0
+    if form is not None:
+        scene, params = form.driven(scene), form.params(params0, 2)
     try:
         jax.eval_shape(lambda q, qdot: scene.energy(q, qdot, 0.0, params), q, qdot)
     except Exception as reason:
@@ -254,12 +260,14 @@ def _about(system, records, observe, form, layout, parameters) -> Question:
     signals = Signals(observe, layout, parameters, recordings[0] if recordings else None, form)
     size = _sizes(recordings)
     timings = {k: record for k, record in enumerate(records) if isinstance(record, Timings)}
-    clocks = {k: Clock(system, layout, parameters, record, rtol) for k, record in timings.items()}
+    clocks = {k: clock_of(system, layout, parameters, record, rtol) for k, record in timings.items()}
     if timings:
         size = np.append(size, max(np.ptp(record.ts) for record in timings.values()))
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
     manifold = None
-    if has_constraints(system) and not asks(system):
+    if isinstance(system, Hybrid):
+        _require_plain(system, fitted, observe)
+    elif has_constraints(system) and not asks(system):
         manifold = Manifold(system, layout, parameters, motions.projection)
     elif has_constraints(system) and fitted.any():
         raise ValueError("A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0).")
@@ -267,6 +275,14 @@ def _about(system, records, observe, form, layout, parameters) -> Question:
         records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol, clocks,
         manifold,
     )  # fmt: skip
+
+
+def _require_plain(scene: Hybrid, fitted: np.ndarray, observe) -> None:
+    """Raise `ValueError` for what a fit of hybrid motion cannot do."""
+    if fitted.any() and has_constraints(first_law(scene)):
+        raise ValueError("A start on constraints of hybrid motion cannot be fitted: give start=(q0, qdot0).")
+    if isinstance(observe, Delayed):
+        raise ValueError("Sensors of hybrid motion cannot be lagjax.Delayed: keep the delay, and shift the times.")
 
 
 def _require_longer(recordings: list[Record], longest: float) -> None:
@@ -300,6 +316,20 @@ def _readers(scenes: list[_Scene]) -> list[Reader | None] | None:
             Reader.of(record, probes) if reads and isinstance(record, Record) else None for record in scene.records
         ]
     return readers if any(reader is not None for reader in readers) else None
+
+
+def _to_cut(scenes: list[_Scene], readers: list[Reader | None] | None, method: str) -> list[Reader | None] | None:
+    """The readers of records that may be cut into segments: not of hybrid motion, whose mode is known at first only.
+
+    Raises `ValueError` where the method needs some, and there are none for that reason.
+    """
+    hybrid = [isinstance(scene.system, Hybrid) for scene in scenes for _ in scene.records]
+    if method == "segments" and all(hybrid):
+        raise ValueError(
+            'method="segments" cannot cut hybrid motion, whose mode is known at its start alone: leave it.'
+        )
+    left = [None if is_hybrid else reader for is_hybrid, reader in zip(hybrid, readers or [], strict=False)]
+    return left if any(reader is not None for reader in left) else None
 
 
 def _starts(scenes: list[_Scene], readers: list[Reader | None] | None, states: int, params0) -> np.ndarray:

@@ -22,8 +22,9 @@ from lagjax._fit._inputs import Driven, asks
 from lagjax._fit._noise import AbstractNoise, StudentT, Widths
 from lagjax._fit._records import Samples, started
 from lagjax._fit._residuals import AbstractQuestion, Part, Point
+from lagjax._fit._scene import Scene
+from lagjax._fit._scene import follow as follow_scene
 from lagjax._layout import halves
-from lagjax._simulate import simulate
 from lagjax._system import System
 
 _LEAST_DOF, _MOST_DOF = 1.0, 200.0  # ν is between these, with a flat density of its logarithm
@@ -44,7 +45,7 @@ class OfSystem:
     `rows` (N,) says which of all records these are.
     """
 
-    def __init__(self, part: Part, rows: np.ndarray, system: System):
+    def __init__(self, part: Part, rows: np.ndarray, system: Scene):
         question = part.question
         if question.manifold is not None and question.fitted.any():
             raise ValueError("There is no density for starts on constraints that are fitted: give start=(q0, qdot0).")
@@ -53,7 +54,9 @@ class OfSystem:
         self.question, self.rows, self.signals = question, rows, part.signals
         form = question.signals.form
         self._form = form if form is not None and asks(system) else None
-        self._scene = system if self._form is None else self._form.driven(system)
+        self._scene = system
+        if self._form is not None and isinstance(system, System):
+            self._scene = self._form.driven(system)
 
     def begun(self, starts, params):
         """The starts of all records (N, 2n), of which some of this system are functions of the parameters."""
@@ -80,7 +83,7 @@ class OfSystem:
         def follow(ts, y0, inputs, table):
             q, qdot = map(layout.restore, halves(y0))
             own = params if self._form is None else Driven(params, *table)
-            motion = simulate(self._scene, q, qdot, ts, own, rtol=self.question.rtol, throw=False)
+            motion = follow_scene(self._scene, q, qdot, ts, own, rtol=self.question.rtol, throw=False)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))(motion.q, motion.qdot)
             return jax.vmap(lambda y, t, i: signals.at_one_time(y, t, numbers, i))(rows, ts, inputs)
 
@@ -101,7 +104,7 @@ class Density:
     """
 
     def __init__(
-        self, question: AbstractQuestion, systems: dict[str | None, System], noise: AbstractNoise, point: Point,
+        self, question: AbstractQuestion, systems: dict[str | None, Scene], noise: AbstractNoise, point: Point,
         widths: Widths, shares: np.ndarray, prior: Callable | None = None,
     ):  # fmt: skip
         self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths

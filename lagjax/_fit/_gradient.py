@@ -18,8 +18,8 @@ import numpy as np
 from lagjax._fit._density import Density
 from lagjax._fit._noise import AbstractNoise, Widths
 from lagjax._fit._residuals import AbstractQuestion, Failure, Point
+from lagjax._fit._scene import Scene
 from lagjax._fit._solve import Descent
-from lagjax._system import System
 
 _RATE, _WARM = 1e-2, 0.05  # the largest step, in units of each number; the share of steps over which it rises
 _PORTION = 100  # steps in one call: of them the best is kept
@@ -27,7 +27,7 @@ _STILL = 1.0  # what log L may gain over the last tenth of the steps where the d
 
 
 def descend(
-    question: AbstractQuestion, systems: dict[str | None, System], u: np.ndarray, starts: np.ndarray,
+    question: AbstractQuestion, systems: dict[str | None, Scene], u: np.ndarray, starts: np.ndarray,
     noise: AbstractNoise, steps: int, told: Callable[[str], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, bool] | Failure:  # fmt: skip
     """u (F,), the starts (N, 2n) after so many steps, and whether log L has come to rest.

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function
+from lagjax._fit._scene import Scene, laws
 from lagjax._samples import samples
 from lagjax._system import System
 
@@ -83,9 +84,9 @@ class Form(NamedTuple):
         wrapped = [_wrapped(getattr(system, name), self) for name in present]
         return eqx.tree_at(lambda s: [getattr(s, name) for name in present], system, wrapped)
 
-    def along(self, system: System, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[System, PyTree]:
+    def along(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
         """The scene with the inputs (T, I) of a record at `ts` (T,), and its parameters, as `simulate` takes them."""
-        if not asks(system):
+        if not asks(system) or not isinstance(system, System):
             return system, params
         table = table_of([(ts, inputs)])
         return self.driven(system), Driven(params, table.knots[0], table.values[0])
@@ -117,9 +118,9 @@ def _wrapped(function: Function, form: Form) -> Function:
     return Function(arrays, code, ("t", "params"))
 
 
-def asks(system: System) -> list[str]:
+def asks(scene: Scene) -> list[str]:
     """The functions of a scene that ask for `inputs`."""
-    functions = ((name, getattr(system, name)) for name in _FUNCTIONS)
+    functions = ((name, getattr(law, name)) for law in laws(scene) for name in _FUNCTIONS)
     return [name for name, function in functions if function is not None and "inputs" in function.extras]
 
 

@@ -4,7 +4,7 @@ What a fit asks of an engine: rows of starts (N, 2n), each with times of its own
 and for each row a table of inputs where the scene has some. It gives the states (N, T, 2n) and how they move along D
 directions (N, D, T, 2n) of the starts and the parameters together. Machine code follows all directions over the steps
 of the motion, without a program of XLA, so that another number of rows or times compiles nothing; other engines go
-through `jax.jvp` of `simulate`, the plain path that this one is tested against.
+and hybrid motion go through `jax.jvp` of `simulate`, the plain path that this one is tested against.
 """
 
 import abc
@@ -20,14 +20,14 @@ from lagjax._engine import choose
 from lagjax._failures import sentence
 from lagjax._fit._inputs import Driven, Form, Table, asks
 from lagjax._fit._parameters import Parameters
+from lagjax._fit._scene import Scene, first_law, follow
+from lagjax._hybrid import Hybrid
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import Flow, MachineCode, _derivatives, _tolerances, flow_of
 from lagjax._machine_code._steps import KEPT
 from lagjax._native import Projection
 from lagjax._problem import Problem
 from lagjax._results import ENDED_WELL
-from lagjax._simulate import simulate
-from lagjax._system import System
 
 PyTree = Any
 
@@ -79,9 +79,11 @@ class AbstractMotions(abc.ABC):
 
 
 def motions_of(
-    system: System, layout: Layout, parameters: Parameters, rtol, atol, form: Form | None = None
+    system: Scene, layout: Layout, parameters: Parameters, rtol, atol, form: Form | None = None
 ) -> AbstractMotions:
     """What follows the motions of this scene: machine code where it has that, else diffrax. `form` is of its inputs."""
+    if isinstance(system, Hybrid):
+        return _ByJAX(system, layout, parameters, {"rtol": rtol, "atol": atol})
     form = form if asks(system) else None  # inputs that only sensors ask for, or nothing
     scene = system if form is None else form.driven(system)
 
@@ -92,7 +94,8 @@ def motions_of(
 
     if isinstance(choose(problem(2)).engine, MachineCode):
         return _ByMachineCode(problem, form is not None)
-    return _ByDiffrax(scene, layout, parameters, rtol, atol, form is not None)
+    options = {"rtol": rtol, "atol": atol, "adjoint": diffrax.ForwardMode()}
+    return _ByJAX(scene, layout, parameters, options, form is not None)
 
 
 class _ByMachineCode(AbstractMotions):
@@ -124,8 +127,12 @@ class _ByMachineCode(AbstractMotions):
         return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
 
 
-class _ByDiffrax(AbstractMotions):
-    def __init__(self, system: System, layout: Layout, parameters: Parameters, rtol, atol, is_driven: bool = False):
+class _ByJAX(AbstractMotions):
+    """The tangents of hybrid motion, and of diffrax, by `jax.jvp`."""
+
+    def __init__(
+        self, scene: Scene, layout: Layout, parameters: Parameters, options: dict[str, Any], is_driven: bool = False
+    ):
         unfree = [leaf for leaf in parameters.leaves if not hasattr(leaf, "shape")]
         if unfree:
             raise TypeError(f"params0 may only hold numbers where the scene has no machine code; got {unfree[0]!r}.")
@@ -137,10 +144,7 @@ class _ByDiffrax(AbstractMotions):
         def run(state, ts, table):
             y0, numbers = state
             q, qdot = map(layout.restore, halves(y0))
-            trajectory = simulate(
-                system, q, qdot, ts, of(numbers, table), rtol=rtol, atol=atol, adjoint=diffrax.ForwardMode(),
-                throw=False,
-            )  # fmt: skip
+            trajectory = follow(scene, q, qdot, ts, of(numbers, table), throw=False, **options)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))
             end = jnp.concatenate([layout.flatten(trajectory.end.q), layout.flatten(trajectory.end.qdot)])
             path = rows(trajectory.q, trajectory.qdot)
@@ -154,7 +158,7 @@ class _ByDiffrax(AbstractMotions):
 
         def rate(t, y, numbers, table):
             q, qdot = map(layout.restore, halves(y))
-            return layout.flatten(system.acceleration(q, qdot, t, of(numbers, table)))
+            return layout.flatten(first_law(scene).acceleration(q, qdot, t, of(numbers, table)))
 
         self._follow = jax.jit(jax.vmap(with_tangents, in_axes=(0, 0, 0, 0, 0, 0)))
         self._rate = jax.jit(jax.vmap(rate, in_axes=(0, 0, None, 0)))

@@ -21,7 +21,7 @@ from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Piece, Record, Samples, batches
 from lagjax._fit._signals import Signals
 from lagjax._fit._starts import Manifold, Origins, Placed
-from lagjax._fit._timings import Clock
+from lagjax._fit._timings import AbstractClock
 from lagjax._layout import Layout
 
 
@@ -194,7 +194,7 @@ class Question(AbstractQuestion):
         parameters: Parameters,
         size: np.ndarray,
         rtol: float,
-        clocks: dict[int, Clock] | None = None,
+        clocks: dict[int, AbstractClock] | None = None,
         manifold: Manifold | None = None,
     ):
         self.records, self.pieces, self.fitted = records, pieces, fitted
@@ -371,15 +371,15 @@ class Question(AbstractQuestion):
             values[..., delay.signals], slopes[..., delay.signals, :] = (x[:, :, delay.signals] for x in some)
         return values, slopes
 
-    def _time(self, clock: Clock, batch: Samples, y0, numbers, y0_dot, numbers_dot):
+    def _time(self, clock: AbstractClock, batch: Samples, y0, numbers, y0_dot, numbers_dot):
         """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D); or a failure."""
-        crossed = clock.crossed(y0, numbers[None])
-        if not crossed.ok.all():
+        moved = clock.along(y0[0], numbers, y0_dot[0], numbers_dot)
+        if moved is None:
             return Failure(int(batch.rows[0]), clock.why_not(y0[0], numbers))
-        slopes = clock.forward(crossed, y0_dot, numbers_dot[None])
+        times, slopes = moved
         if not np.isfinite(slopes).all():
             return Failure(int(batch.rows[0]), "The derivatives of its crossing times are not finite.")
-        return crossed.t[..., None], slopes[:, :, None]
+        return times[None, :, None], slopes[None, :, None]
 
     def _collect(self, batch: Samples, values, by_unknowns, residuals, slopes) -> None:
         """Append the residuals of one batch and their derivatives, with a column for every signal."""

@@ -23,13 +23,13 @@ from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start
 from lagjax._fit._report import Drawn, page, pictures_of
 from lagjax._fit._residuals import AbstractQuestion, Failure, Part, Point, Question
 from lagjax._fit._sample import draw, inference_data
+from lagjax._fit._scene import follow
 from lagjax._fit._segments import Reader
 from lagjax._fit._signals import looks_like_positions
 from lagjax._fit._solve import minimise
 from lagjax._fit._uncertainty import Information
 from lagjax._layout import Layout
 from lagjax._notebook import cell
-from lagjax._simulate import simulate
 from lagjax._tables import intervals
 from lagjax._trajectory import Trajectory
 
@@ -321,7 +321,7 @@ class Fit:
         form, driven, scene, params = about.signals.form, (record.ts, record.input_matrix), self.system, self.params
         scene = self._by_name(scene, part)
         scene, params = (scene, params) if form is None else form.along(scene, params, *driven)
-        trajectory = simulate(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
+        trajectory = follow(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
         values, deviation = self._shown(part, record, question, point)
         left = np.where(record.weight_matrix > 0, values - record.matrix, np.nan)
         noise = self._of_sensors(part)

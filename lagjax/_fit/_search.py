@@ -6,7 +6,7 @@ parameters by the weak form, where the user's is too far off.
 
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +16,12 @@ from lagjax._fit._many import Waterfall, distinct, drawn, misfit, short_search
 from lagjax._fit._noise import log_likelihood
 from lagjax._fit._records import Piece
 from lagjax._fit._residuals import AbstractQuestion, Failure, Question
+from lagjax._fit._scene import Scene
 from lagjax._fit._segments import Reader, glimpses, levels, time_scale, whole
 from lagjax._fit._solve import Anchor, Descent, minimise
 from lagjax._fit._systems import asked
 from lagjax._fit._weak import balanced
-from lagjax._system import System
+from lagjax._hybrid import Hybrid
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
 # independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.
@@ -66,7 +67,7 @@ def search_records(question: AbstractQuestion, u, starts, noise, method: str, re
 
 
 def by_gradient(
-    question: AbstractQuestion, systems: dict[str | None, System], u, y0, noise, readers: list[Reader | None] | None
+    question: AbstractQuestion, systems: dict[str | None, Scene], u, y0, noise, readers: list[Reader | None] | None
 ) -> Descent:
     """The descent by gradients: over segments of the records that grow, where they can be read, then over all."""
     told, question.watch = question.watch, None
@@ -178,13 +179,17 @@ def _glimpsed(question: AbstractQuestion, u, noise, readers: list[Reader | None]
     return u if isinstance(done, Failure) else done.point.u
 
 
-def weakly(question: AbstractQuestion, systems: list[System], u, readers: list[Reader | None]) -> np.ndarray:
-    """The u that balances the weak form of Lagrange's equations, u itself where there is none."""
+def weakly(question: AbstractQuestion, systems: Sequence[Scene], u, readers: list[Reader | None]) -> np.ndarray:
+    """The u that balances the weak form of Lagrange's equations, u itself where there is none.
+
+    Hybrid motion, whose velocities jump, has none.
+    """
     scales = _time_scales(question, readers, u)
     found = balanced(
         [
             (part.question, system, readers[part.records], scales[part.records.start])
             for part, system in zip(question.parts, systems, strict=True)
+            if not isinstance(system, Hybrid)
         ],
         u,
     )

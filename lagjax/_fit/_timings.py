@@ -6,8 +6,10 @@ the state at the fixed time t* of the crossing moves, the crossing moves by
     δt* = −(∂s/∂y · δy + ∂s/∂p · δp) / ṡ
 
 The crossings are noted along one run (`lagjax.crossings`), a second one gives the states there and their derivatives.
+Of hybrid motion (`lagjax.Hybrid`) the instants are those of its transitions, which have derivatives of their own.
 """
 
+import abc
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,13 +23,16 @@ from lagjax._crossings import directions_of, sections_of
 from lagjax._failures import sentence
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Guess, Measured, require_start
-from lagjax._layout import Layout
+from lagjax._fit._scene import Scene, follow
+from lagjax._hybrid import Hybrid, Transition
+from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode, Noted, Surfaces, _derivatives, _tolerances, flow_of, surfaces_of
 from lagjax._machine_code._steps import KEPT
 from lagjax._problem import Problem
 from lagjax._program import Program, lower
 from lagjax._results import ENDED_WELL
 from lagjax._system import System
+from lagjax._trajectory import Trajectory, Transitions
 
 PyTree = Any
 _BUDGET = 10_000_000  # steps: observations last for thousands of periods
@@ -40,10 +45,11 @@ _SHARPER = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Timings(Measured):
-    """Crossing times of one motion: transits of planets, a pendulum through a light gate.
+    """Crossing times of one motion: transits of planets, a pendulum through a light gate, the bounces of a ball.
 
     - `section`: a function of (q, qdot), and of `t` and `params` by name, that returns one real number; a crossing is
-      where that changes sign. A dict of functions for several sections of the same motion.
+      where that changes sign. A dict of functions for several sections of the same motion. Of a `lagjax.Hybrid` one of
+      its transitions, or a dict of them: the times are those at which it happened.
     - `times`: when it was crossed, (K,), or a dict of such arrays by the names of the sections. NaN where missing.
     - `t0`: the time at which the motion begins, before all `times`. Crossings are counted from there.
     - `start`: the state at `t0`: (q0, qdot0) if it is known, `lagjax.Guess(q0, qdot0)` to fit it, or a function of the
@@ -63,7 +69,7 @@ class Timings(Measured):
     ```
     """
 
-    section: Callable | dict[str, Callable]
+    section: Callable | Transition | dict[str, Callable] | dict[str, Transition]
     times: Any
     t0: float
     start: tuple[PyTree, PyTree] | Guess | Callable
@@ -74,7 +80,9 @@ class Timings(Measured):
     flat: "Flat" = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self):
-        keys, _ = sections_of(self.section)
+        keys, functions = _sections(self.section)
+        if isinstance(functions[0], Transition) and self.direction != 0:
+            raise ValueError("direction is for functions: a transition has its own. Leave it at 0.")
         if self.start is None:
             raise TypeError("A lagjax.Timings needs a start: (q0, qdot0), lagjax.Guess(q0, qdot0), or a function.")
         require_start(self.start)
@@ -101,7 +109,7 @@ class Timings(Measured):
         return len(self.flat.times)
 
     def __repr__(self) -> str:
-        keys, functions = sections_of(self.section)
+        keys, functions = _sections(self.section)
         last, missing = np.nanmax(self.flat.times), int(np.isnan(self.flat.times).sum())
         of = f" of {len(functions)} sections" if keys else ""
         gaps = f", {missing} missing" if missing else ""
@@ -124,12 +132,12 @@ class Timings(Measured):
 
     def restore(self, matrix: np.ndarray) -> PyTree:
         """Numbers for all times, (M, 1), in the form of `times`."""
-        keys, functions = sections_of(self.section)
+        keys, functions = _sections(self.section)
         return _in_form([matrix[self.flat.which == k, 0] for k in range(len(functions))], keys)
 
     def columns(self, values: PyTree) -> np.ndarray:
         """Numbers in the form of `times` as (M, 1)."""
-        keys, _ = sections_of(self.section)
+        keys, _ = _sections(self.section)
         return np.concatenate(_by_section(values, keys, "values"))[:, None]
 
 
@@ -140,6 +148,17 @@ class Flat(NamedTuple):
     times: np.ndarray
     numbers: np.ndarray
     weights: np.ndarray
+
+
+def _sections(section) -> tuple[tuple[str, ...] | None, tuple]:
+    """The names of a dict of sections, or None, and the functions or the transitions."""
+    parts = tuple(section.values()) if isinstance(section, dict) else (section,)
+    which = [isinstance(part, Transition) for part in parts]
+    if not any(which):
+        return sections_of(section)
+    if not all(which):
+        raise TypeError("section must hold functions, or transitions of a lagjax.Hybrid, and not both.")
+    return tuple(section) if isinstance(section, dict) else None, parts
 
 
 def _by_section(values, keys: tuple[str, ...] | None, name: str) -> list[np.ndarray]:
@@ -202,7 +221,124 @@ class Crossed(NamedTuple):
     steps: tuple
 
 
-class Clock:
+class AbstractClock(abc.ABC):
+    """The instants of one `Timings` in a scene, with their derivatives.
+
+    `times(y0, numbers)` gives the times (M,) as a function for `jax.jit`, `jax.vmap` and `jax.grad`; NaN where it
+    failed.
+    """
+
+    times: Callable
+
+    @abc.abstractmethod
+    def along(
+        self, y0: np.ndarray, numbers: np.ndarray, y0_dot: np.ndarray, numbers_dot: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """The times (M,) of the motion from y0 (2n,) with the parameters `numbers` (P,), and how they move (M, D).
+
+        Directions are `y0_dot` (D, 2n) and `numbers_dot` (D, P). None where the motion has not all of the instants.
+        """
+
+    @abc.abstractmethod
+    def why_not(self, y0: np.ndarray, numbers: np.ndarray) -> str:
+        """Why the instants of a motion from y0 (2n,) with `numbers` (P,) are not all there."""
+
+
+def clock_of(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> AbstractClock:
+    """The clock of a scene. Raises `ValueError` where functions are asked of a hybrid one, or transitions of others."""
+    is_of_transitions = isinstance(_sections(timings.section)[1][0], Transition)
+    if isinstance(scene, Hybrid):
+        if not is_of_transitions:
+            raise ValueError("Of a lagjax.Hybrid only the times of its transitions are data: Timings(transition, …).")
+        return HybridClock(scene, layout, parameters, timings, rtol)
+    if is_of_transitions:
+        raise ValueError("Times of transitions are of a lagjax.Hybrid: give that to `fit` in the place of the System.")
+    return Clock(scene, layout, parameters, timings, rtol)
+
+
+class HybridClock(AbstractClock):
+    """The times of transitions of hybrid motion, whose derivatives are those of `simulate_hybrid`."""
+
+    def __init__(self, scene: Hybrid, layout: Layout, parameters: Parameters, timings: Timings, rtol: float):
+        self.flat, self.scene = timings.flat, scene
+        self.keys, transitions = _sections(timings.section)
+        self.ways = np.array([_way(scene, one) for one in transitions])[self.flat.which]
+        if scene.max_transitions < len(self.flat.times):
+            raise ValueError(
+                f"{len(self.flat.times)} transitions were timed, but Hybrid(max_transitions={scene.max_transitions}) "
+                "follows no more than that: give a larger budget."
+            )
+        self.span = np.array([float(timings.t0), _end(timings)])
+        source, target = (jnp.asarray(self.ways[:, k, None]) for k in (0, 1))
+        number = jnp.asarray(self.flat.numbers[:, None])
+
+        def run(y0, numbers):
+            q, qdot = map(layout.restore, halves(y0))
+            return follow(scene, q, qdot, self.span, parameters.restore(numbers), rtol=rtol, throw=False)
+
+        def times(y0, numbers):
+            happened = _transitions(run(y0, numbers))
+            mine = (happened.source == source) & (happened.target == target)  # (M, K)
+            mine = mine & (jnp.cumsum(mine, axis=1) == number + 1)
+            place = jnp.argmax(mine, axis=1)
+            return jnp.where(mine.any(axis=1), happened.t[place], jnp.nan)
+
+        def along(y0, numbers, *dot):
+            t, moved = jax.linearize(times, y0, numbers)
+            return t, jax.vmap(moved)(*dot).T
+
+        self.times, self._along = times, jax.jit(along)
+        self._ended = jax.jit(lambda y0, numbers: _ended(run(y0, numbers)))
+        self.layout = layout
+
+    def along(self, y0, numbers, y0_dot, numbers_dot):
+        """The times (M,) and how they move (M, D); see `AbstractClock`."""
+        t, slopes = (np.asarray(x, float) for x in self._along(y0, numbers, y0_dot, numbers_dot))
+        return (t, slopes) if np.isfinite(t).all() else None
+
+    def why_not(self, y0, numbers):
+        """Why the transitions of a motion are not all there."""
+        missing = ~np.isfinite(np.asarray(jax.jit(self.times)(y0, numbers)))
+        result, t_end, y_end, of_transitions = (np.asarray(x) for x in self._ended(y0, numbers))
+        first = int(np.argmax(missing))
+        happened = int((of_transitions == self.ways[first]).all(axis=1).sum())
+        between = " to ".join(repr(tuple(self.scene.modes)[k]) for k in self.ways[first])
+        text = sentence(int(result), float(t_end), self.span[1], y_end, self.layout.names)
+        return (
+            f"There are {happened} transitions from {between} up to t = {float(t_end):g}, but number "
+            f"{self.flat.numbers[first]}, counted from 0, was measured." + (f" {text}" if text else "")
+        )
+
+
+def _ended(run: Trajectory) -> tuple:
+    """The result, the last time and state of a hybrid motion, and which modes its transitions (K, 2) were between."""
+    flat = [jnp.ravel(leaf) for leaf in jax.tree.leaves((run.end.q, run.end.qdot))]
+    happened = _transitions(run)
+    between = jnp.stack([happened.source, happened.target], axis=1)
+    return run.result._value, run.end.t, jnp.concatenate(flat), between
+
+
+def _transitions(run: Trajectory) -> Transitions:
+    """Those of a hybrid motion, which has them."""
+    assert run.transitions is not None
+    return run.transitions
+
+
+def _way(scene: Hybrid, transition: Transition) -> tuple[int, int]:
+    """The places of both modes of a transition. Raises `ValueError` where it is not alone between them."""
+    names, ways = list(scene.modes), [(one.source, one.target) for one in scene.transitions]
+    way = transition.source, transition.target
+    if all(one is not transition for one in scene.transitions):
+        raise ValueError(f"The timed transition from {way[0]!r} to {way[1]!r} is none of Hybrid(transitions=...).")
+    if ways.count(way) > 1:
+        raise ValueError(
+            f"{ways.count(way)} transitions lead from {way[0]!r} to {way[1]!r}, and times do not tell which happened: "
+            "give the one that was timed a mode of its own as target."
+        )
+    return names.index(way[0]), names.index(way[1])
+
+
+class Clock(AbstractClock):
     """The crossings of one `Timings` in a scene: their times, and their derivatives forward and in reverse."""
 
     def __init__(self, system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float):
@@ -291,6 +427,13 @@ class Clock:
         )
 
     # ---- derivatives ----
+
+    def along(self, y0, numbers, y0_dot, numbers_dot):
+        """The times (M,) and how they move (M, D); see `AbstractClock`."""
+        crossed = self.crossed(y0[None], numbers[None])
+        if not crossed.ok.all():
+            return None
+        return crossed.t[0], self.forward(crossed, y0_dot[None], numbers_dot[None])[0]
 
     def forward(self, crossed: Crossed, y0_dot: np.ndarray, numbers_dot: np.ndarray) -> np.ndarray:
         """How the times move along D directions (N, M, D): of the starts (N, D, 2n), of the parameters (N, D, P)."""

@@ -25,9 +25,36 @@ from lagjax._system import System
 from lagjax._trajectory import State, Trajectory, Transitions
 from lagjax._validate import as_arrays, is_concrete, require_budget, require_flag
 
-__all__ = ["Transition", "simulate_hybrid"]
+__all__ = ["Hybrid", "Transition", "simulate_hybrid"]
 
 PyTree = Any
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hybrid:
+    """A scene whose motion changes its laws, as one object: what `fit` takes in the place of a `System`.
+
+    - `modes`, `transitions`, `start`, `max_transitions`: those of `simulate_hybrid`; every motion begins in the mode
+      `start`.
+
+    **Raises** `TypeError` or `ValueError` as `simulate_hybrid` does.
+
+    ```python
+    import lagjax
+
+    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+    bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.9 * v))
+    scene = lagjax.Hybrid({"flight": ball}, [bounce], "flight")
+    ```
+    """
+
+    modes: dict[str, System]
+    transitions: list[Transition]
+    start: str
+    max_transitions: int = 32
+
+    def __post_init__(self):
+        _require_modes(self.modes, self.transitions, self.start, self.max_transitions)
 
 
 def simulate_hybrid(

@@ -1,0 +1,172 @@
+"""`fit` of hybrid motion: restitution from bounces, friction of a block that sticks and slips, by closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import lagjax
+
+G, E, V0 = 9.81, 0.9, 3.0
+
+FLIGHT = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - G * q)
+BOUNCE = lagjax.Transition(
+    "flight", "flight", guard=lambda q, v: q, direction=-1, reset=lambda q, v, params: (q, -params["e"] * v)
+)
+BALL = lagjax.Hybrid({"flight": FLIGHT}, [BOUNCE], "flight", max_transitions=16)
+
+
+def thrown(params):
+    """The ball leaves the table with the velocity v0."""
+    return 0.0, params["v0"]
+
+
+def times_of(e, v0, count=12):
+    """When a ball that leaves the table at t = 0 comes back: Σ 2 v₀ eʲ/g."""
+    return np.cumsum(2 * v0 * e ** np.arange(count) / G)
+
+
+# A block on a belt of speed BELT, held by a spring: it sticks until the spring wins, and slips until it is as fast.
+BELT, BEGIN = 0.5, (-0.2, 0.0)
+SLIP = lagjax.System(
+    lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2, forces=lambda q, v, params: params["kinetic"]
+)
+STICK = lagjax.System(lambda q, qdot: 0.5 * qdot**2)
+STICKS = lagjax.Transition("slip", "stick", lambda q, v: v - BELT, direction=1, reset=lambda q, v: (q, BELT + 0 * v))
+SLIPS = lagjax.Transition("stick", "slip", lambda q, v, params: params["k"] * q - params["static"], direction=1)
+BLOCK = lagjax.Hybrid({"slip": SLIP, "stick": STICK}, [STICKS, SLIPS], "slip")
+FRICTION = {"k": 4.0, "kinetic": 0.6, "static": 1.2}
+TS = np.linspace(0.0, 8.0, 161)
+
+
+def block(ts, k, kinetic, static):
+    """q of the block in closed form: arcs of an oscillator about kinetic/k, and lines."""
+    w, q, v, t, middle, found = np.sqrt(k), *BEGIN, 0.0, kinetic / k, np.full(len(ts), np.nan)
+    while t < ts[-1]:
+        size, phase = np.hypot(q - middle, v / w), np.arctan2(-v / w, q - middle)
+        # −size·w·sin(w s + phase) = BELT, rising: on the way up before the middle.
+        begin = np.pi + np.arcsin(BELT / (size * w))
+        slips = (begin - phase) % (2 * np.pi) / w
+        slips = slips if slips > 1e-9 else slips + 2 * np.pi / w
+        inside = (ts >= t) & (ts <= t + slips)
+        found[inside] = middle + size * np.cos(w * (ts[inside] - t) + phase)
+        q, t = middle + size * np.cos(w * slips + phase), t + slips
+        sticks = (static / k - q) / BELT
+        inside = (ts >= t) & (ts <= t + sticks)
+        found[inside] = q + BELT * (ts[inside] - t)
+        q, v, t = static / k, BELT, t + sticks
+    return found
+
+
+@pytest.mark.slow
+def test_restitution_from_times_of_bounces_is_that_of_least_squares_on_the_closed_form():
+    times = times_of(E, V0) + 1e-3 * np.random.default_rng(0).normal(size=12)
+    timings = lagjax.Timings(BOUNCE, times, 0.0, thrown)
+    fit = lagjax.fit(BALL, timings, {"e": 0.8, "v0": 2.5})
+    alone = least_squares(lambda x: times_of(*x) - times, [0.8, 2.5], xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    width = np.sqrt(np.diag(fit.information.white))
+    # A search ends within 0.05 standard deviations.
+    np.testing.assert_allclose(fit.u / width, alone.x / width, rtol=0, atol=0.05)
+    expected = 2 * alone.cost / 12 * np.linalg.inv(alone.jac.T @ alone.jac)
+    lost = 12 / (12 - 2)
+    np.testing.assert_allclose(fit.information.white * lost, expected * lost, rtol=1e-2)
+    assert fit.ok and fit.noise["times"].sigma == pytest.approx(1e-3, rel=0.5)
+
+
+@pytest.fixture(scope="module")
+def stuck():
+    values = block(TS, **FRICTION) + 2e-3 * np.random.default_rng(1).normal(size=len(TS))
+    return lagjax.Record(TS, values, start=lagjax.Guess(-0.25, 0.05))
+
+
+@pytest.mark.slow
+def test_static_and_kinetic_friction_come_out_of_a_block_that_sticks_and_slips(stuck):
+    fit = lagjax.fit(BLOCK, stuck, {"k": 3.8, "kinetic": 0.5, "static": 1.1}, transforms=lagjax.positive)
+    low, high = fit.intervals(0.9999)
+    assert fit.ok and all(low[name] < FRICTION[name] < high[name] for name in FRICTION)
+    # Four slips and sticks: each friction shows in where they begin, at 2 mm noise.
+    assert all(0.5 * (high[name] - low[name]) < 0.02 * FRICTION[name] for name in FRICTION)
+    assert fit.noise["q"].sigma == pytest.approx(2e-3, rel=0.2)
+    shown = fit.predict(stuck)
+    assert set(np.asarray(shown.trajectory.mode).tolist()) == {0, 1}
+    np.testing.assert_allclose(shown.values, block(TS, **FRICTION), atol=4e-3)
+
+
+@pytest.mark.slow
+def test_slopes_and_the_density_of_hybrid_motion_are_those_of_differences(stuck):
+    heard = lagjax.Timings(STICKS, np.array([0.1, 2.5, 4.8]) + 0.5, 0.0, BEGIN)
+    fit = lagjax.fit(
+        {"seen": BLOCK, "heard": BLOCK}, {"seen": stuck, "heard": heard}, {"k": 3.9, "kinetic": 0.6, "static": 1.2},
+        free={"k": True, "kinetic": True, "static": True}, method="whole",
+    )  # fmt: skip
+    question, point, h = fit.question, fit._point, 1e-6
+    for k in range(5):
+        moved = []
+        for sign in (-h, h):
+            u, starts = fit.u.copy(), fit.states.copy()
+            if k < 3:
+                u[k] += sign
+            else:
+                starts[0, k - 3] += sign
+            moved.append(question.follow(u, starts))
+        column = k + 2 if k < 3 else k - 3
+        for residuals, slopes in zip(zip(*(one.residuals for one in moved), strict=True), point.slopes, strict=True):
+            change = (residuals[1] - residuals[0]) / (2 * h)
+            # Motions are right to rtol 1e-9, differences then to 1e-9 / 1e-6.
+            np.testing.assert_allclose(slopes[..., column], change, atol=2e-3, rtol=1e-3)
+    density = fit.log_density()
+    width, value_and_grad = np.sqrt(np.diag(density.covariance())), jax.jit(jax.value_and_grad(density))
+    slope = value_and_grad(jnp.asarray(density.first))[1] * width
+    for k in range(len(density)):
+        step = 1e-3 * width[k] * np.eye(len(density))[k]
+        change = (value_and_grad(density.first + step)[0] - value_and_grad(density.first - step)[0]) / 2e-3
+        assert change == pytest.approx(float(slope[k]), rel=1e-2, abs=5e-3), density.names[k]
+
+
+FALLS = lagjax.Record(np.linspace(0.0, 1.0, 11), np.linspace(0.0, 1.0, 11), start=(0.5, 0.0))
+FIRST = {"e": 0.9, "v0": 3.0}
+OTHER = lagjax.Transition("flight", "flight", guard=lambda q, v: q - 9.0)
+TWICE = lagjax.Hybrid({"flight": FLIGHT}, [BOUNCE, OTHER], "flight")
+
+
+def heard(section, times=(0.5, 1.0), **options):
+    return lagjax.Timings(section, np.array(times), 0.0, thrown, **options)
+
+
+@pytest.mark.parametrize(
+    ("system", "records", "options", "sentence"),
+    [
+        (BALL, FALLS, {"method": "segments"}, "cannot cut hybrid motion"),
+        (
+            BALL,
+            FALLS,
+            {"observe": lagjax.Delayed(lambda params: 0.1, 0.2)},
+            "hybrid motion cannot be lagjax.Delayed",
+        ),
+        (BALL, heard(lambda q, v: q), {}, "only the times of its transitions"),
+        (FLIGHT, heard(BOUNCE), {}, "are of a lagjax.Hybrid"),
+        (BALL, heard(OTHER), {}, "is none of Hybrid"),
+        (TWICE, heard(BOUNCE), {}, "2 transitions lead from 'flight' to 'flight'"),
+        (BALL, heard(BOUNCE, np.arange(1.0, 18.0)), {}, "follows no more than that"),
+    ],
+)
+def test_what_a_fit_of_hybrid_motion_cannot_do_is_a_sentence(system, records, options, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        lagjax.fit(system, records, FIRST, **options)
+
+
+def test_timings_of_transitions_and_functions_do_not_mix():
+    with pytest.raises(TypeError, match="and not both"):
+        lagjax.Timings({"a": BOUNCE, "b": lambda q, v: q}, {"a": [1.0], "b": [2.0]}, 0.0, thrown)
+    with pytest.raises(ValueError, match="a transition has its own"):
+        heard(BOUNCE, direction=-1)
+    with pytest.raises(ValueError, match="does not exist"):
+        lagjax.Hybrid({"flight": FLIGHT}, [BOUNCE], "rest")
+
+
+@pytest.mark.slow
+def test_bounces_that_a_motion_does_not_have_are_counted():
+    late = lagjax.Timings(BOUNCE, np.array([0.6, 1.2]), 0.0, (0.5, 0.0), numbers=np.array([0, 9]))
+    with pytest.raises(ValueError, match=r"There are \d transitions from 'flight' to 'flight' up to .* but number 9"):
+        lagjax.fit(BALL, late, {"e": 0.95})
