@@ -202,6 +202,8 @@ def animated(trajectory, points: Callable, trace, speed: float, fps: float) -> A
         return {name: np.stack([one[name] for one in each]) for name in each[0]}
 
     shapes = {name: array.shape[2:] for name, array in positions(np.array([begin])).items()}
+    if not shapes:
+        raise ValueError("points returns an empty dict: there is nothing to show.")
     return Animation(positions, (float(begin), end), float(speed), float(fps), _traced(trace, shapes))
 
 
@@ -296,10 +298,8 @@ def _traced(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int],
     for name, place in pairs:
         known = isinstance(place, int | np.integer) and name in shapes and -shapes[name][0] <= place < shapes[name][0]
         if not known:
-            lines = ", ".join(f"{name!r} of {shape[0]} points" for name, shape in shapes.items())
-            raise ValueError(
-                f"trace={trace!r} names no point: there are {lines}. Give a name, a place, or (name, place)."
-            )
+            lines = ", ".join(f"{name or 'points'!r} of {shape[0]}" for name, shape in shapes.items())
+            raise ValueError(f"trace={trace!r} names no point. Lines are {lines}: give a name, a place, or both.")
     return tuple((name, int(place)) for name, place in pairs)
 
 

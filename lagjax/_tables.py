@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._display import times_of_members
+from lagjax._display import is_known, times_of_members
 from lagjax._layout import Layout
 
 PyTree = Any
@@ -18,6 +18,7 @@ PyTree = Any
 def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
     """An `xarray.Dataset` of a trajectory: see `Trajectory.to_xarray`."""
     xarray = _package("xarray", "to_xarray()")
+    _require_numbers(trajectory, "to_xarray()")
     members = _member_axes(trajectory)
     of_q, of_qdot = _units(trajectory.q, units, time_unit)
     variables: dict[str, tuple] = {"ok": (members, np.asarray(trajectory.ok))}
@@ -40,6 +41,7 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
 def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     """A `pandas.DataFrame` of a trajectory: see `Trajectory.to_pandas`."""
     pandas = _package("pandas", "to_pandas()")
+    _require_numbers(trajectory, "to_pandas()")
     members, names = _member_axes(trajectory), _names(trajectory)
     batch, count = np.shape(trajectory.result._value), trajectory.ts.shape[-1]
     each = times_of_members(trajectory)
@@ -79,6 +81,11 @@ def _package(name: str, what: str):
         return __import__(name)
     except ImportError:
         raise ImportError(f"{what} needs the package {name}: pip install {name}.") from None
+
+
+def _require_numbers(trajectory, what: str) -> None:
+    if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):
+        raise ValueError(f"{what} copies numbers: call it outside of jit, vmap and grad.")
 
 
 def _member_axes(trajectory) -> tuple[str, ...]:

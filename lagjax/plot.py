@@ -22,7 +22,7 @@ from lagjax._animation import as_points, course_of
 from lagjax._arguments import Function, accept
 from lagjax._check._findings import listed
 from lagjax._crossings import Crossings
-from lagjax._display import times_of_members
+from lagjax._display import is_known, times_of_members
 from lagjax._fit import Fit, Record
 from lagjax._fit._figures import draw_record
 from lagjax._fit._result import record_matrix
@@ -44,15 +44,12 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
 
     >>> lagjax.plot.trajectory(trajectory); lagjax.plot.trajectory(trajectory, lambda q, qdot: (q[0], qdot[0]))
     """
+    q, qdot = _states(trajectory, members)
     ax = _axes(ax)
-    q, qdot = (
-        jax.tree.map(lambda leaf: _some_members(leaf, trajectory, members), tree)
-        for tree in (trajectory.q, trajectory.qdot)
-    )
     count = len(jax.tree.leaves(q)[0])
     opacity = max(0.15, count**-0.5)
     if projection is not None:
-        x, y = (np.asarray(value) for value in jax.vmap(jax.vmap(projection))(q, qdot))
+        x, y = map(np.asarray, jax.vmap(jax.vmap(_pair(projection)))(q, qdot))
         ax.plot(x.T, y.T, color=COLORS[0], alpha=opacity, linewidth=1.2)
         return ax
 
@@ -78,10 +75,7 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, ax=None)
 
     >>> lagjax.plot.phase(trajectory, "q['theta']")
     """
-    q, qdot = (
-        jax.tree.map(lambda leaf: _some_members(leaf, trajectory, members), tree)
-        for tree in (trajectory.q, trajectory.qdot)
-    )
+    q, qdot = _states(trajectory, members)
     layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0, 0], (q, qdot)))
     places = _places(layout, coordinates)
     q, qdot = (np.asarray(jax.vmap(jax.vmap(layout.flatten))(tree)) for tree in (q, qdot))
@@ -120,6 +114,7 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
 
     >>> lagjax.plot.compare(trajectory, (ts, measured))
     """
+    _require_numbers(one, "one")
     layout, course = course_of(one)
     ts, values, style = _other(other, layout)
     places = _places(layout, coordinates, most=4)
@@ -143,6 +138,7 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
 def _other(other, layout: Layout) -> tuple[np.ndarray, np.ndarray, str]:
     """The times (T,), the values (T, n) and the style of what a motion is compared with."""
     if isinstance(other, Trajectory):
+        _require_numbers(other, "other")
         of_other, course = course_of(other)
         if of_other.names != layout.names:
             raise ValueError("The two motions have other coordinates: there is nothing to compare.")
@@ -167,17 +163,20 @@ def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: A
       two ends of the swing, of which the largest deviation of a coordinate is `largest`. In the plane.
     - `count`: draw so many modes, the slowest first.
 
-    Draws into `figure`, or a new one, and returns the Axes (M,). Of a complex shape, where something turns or damps,
-    the real part is drawn.
+    Draws into `figure`, or a new one, and returns the Axes (M,). A complex shape, where something turns or damps, is
+    drawn at the instant of its largest deviation.
 
     >>> lagjax.plot.modes(lagjax.normal_modes(scene, q, params))
     """
+    _require(modes, "modes", Modes, "normal_modes")
     frequencies = np.asarray(modes.frequencies)
     if frequencies.ndim != 1:
         raise ValueError(f"Draw the modes of one equilibrium at a time; these are {frequencies.shape[:-1]} of them.")
     if points is not None and q is None:
         raise ValueError("To draw points give the equilibrium too: lagjax.plot.modes(modes, points, q, params).")
-    shown, shapes = min(count, len(frequencies)), jax.tree.map(lambda leaf: jnp.real(jnp.asarray(leaf)), modes.shapes)
+    if points is not None:
+        _require_like(q, jax.tree.map(lambda leaf: leaf[0], modes.shapes))
+    shown, shapes = min(_positive(count, "count"), len(frequencies)), _at_largest(modes.shapes)
     matplotlib = _matplotlib()
     if figure is None:
         figure = matplotlib.pyplot.figure(figsize=(min(2.4 * shown + 1.0, 12.8), 3.2), layout="constrained")
@@ -188,8 +187,34 @@ def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: A
             _bars(_axes(ax), shape)
         else:
             _swings(_axes(ax), accept(points, "points", ("q",)), q, shape, params, largest)
-        ax.set_title(f"ω = {frequencies[k]:.4g}", fontsize="medium")
+        ax.set_title(_rates(modes, k), fontsize="medium")
     return axes
+
+
+def _rates(modes: Modes, k: int) -> str:
+    """The frequency of a mode, its damping ratio if it has one, and how fast it grows if it does."""
+    exponents, ratio = np.asarray(modes.exponents), float(modes.damping_ratios[k])
+    growth, rounding = float(exponents[k].real.max()), 10 * np.finfo(exponents.dtype).eps ** 0.5
+    if growth > rounding * np.abs(exponents).max():
+        oscillates = f"ω = {modes.frequencies[k]:.4g},\n" if modes.frequencies[k] > 0 else ""
+        return f"{oscillates}grows as exp({growth:.4g} t)"
+    return f"ω = {modes.frequencies[k]:.4g}" + (f", ζ = {ratio:.2g}" if ratio > rounding else "")
+
+
+def _at_largest(shapes):
+    """The real parts of shapes, each turned by the phase at which the sum of their squares is largest."""
+    total = sum(jnp.sum(jnp.square(leaf).reshape(len(leaf), -1), axis=1) for leaf in jax.tree.leaves(shapes))
+    turn = jnp.exp(-0.5j * jnp.angle(total))
+    return jax.tree.map(lambda leaf: jnp.real(leaf * turn.reshape(-1, *[1] * (leaf.ndim - 1))), shapes)
+
+
+def _require_like(q, shape) -> None:
+    """Raise where an equilibrium has another structure or other shapes than a mode."""
+    if jax.tree.map(jnp.shape, q) != jax.tree.map(jnp.shape, shape):
+        raise ValueError(
+            f"q must be the equilibrium of these modes, with shapes {jax.tree.map(jnp.shape, shape)}; got "
+            f"{jax.tree.map(jnp.shape, q)}."
+        )
 
 
 def _bars(ax, shape) -> None:
@@ -286,10 +311,7 @@ def return_map(crossings: Crossings, value: Callable, *, ax=None):
 
 def _section_points(crossings: Crossings, projection: Callable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """x and y of all crossings, and the member that each belongs to. Raises `ValueError` where there are none."""
-    if not isinstance(crossings, Crossings):
-        raise TypeError(
-            f"crossings must be what lagjax.crossings returns for one section; got {type(crossings).__name__}."
-        )
+    _require(crossings, "crossings", Crossings, "crossings", " for one section")
     t = np.asarray(crossings.t)
     if not np.isfinite(t).any():
         raise ValueError(
@@ -298,7 +320,7 @@ def _section_points(crossings: Crossings, projection: Callable) -> tuple[np.ndar
     states = jax.tree.map(
         lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[t.ndim :]), (crossings.q, crossings.qdot)
     )
-    x, y = (np.asarray(value) for value in jax.vmap(projection)(*states))
+    x, y = map(np.asarray, jax.vmap(_pair(projection))(*states))
     there = np.isfinite(t.ravel())
     members = np.repeat(np.arange(t.size // t.shape[-1]), t.shape[-1])
     return x[there], y[there], members[there]
@@ -312,6 +334,7 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
 
     >>> lagjax.plot.energy_error(trajectory, scale=params["m"] * params["g"] * params["l"])
     """
+    _require_numbers(trajectory, "trajectory")
     h = np.atleast_2d(trajectory.energy())[np.atleast_1d(trajectory.ok)]
     if not len(h):
         raise ValueError("None of the members reached its end: there is no energy to draw.")
@@ -341,6 +364,7 @@ def work_precision(result: WorkPrecision, *, ax=None):
 
     >>> lagjax.plot.work_precision(lagjax.work_precision(scene, q0, qdot0, ts, params))
     """
+    _require(result, "result", WorkPrecision, "work_precision")
     ax = _axes(ax)
     for i, solver in enumerate(dict.fromkeys(row.solver for row in result)):
         rows = [row for row in result if row.solver == solver]
@@ -361,6 +385,7 @@ def fit(fit: Fit, record: int = 0, *, figure=None):
 
     >>> lagjax.plot.fit(fit, record=3)
     """
+    _require(fit, "fit", Fit, "fit")
     matplotlib = _matplotlib()
     one, columns = fit.records[record], fit.question.columns(record)
     names = fit.question.names[columns]
@@ -458,8 +483,49 @@ def _colorbar(mappable, ax, label):
 
 def _edges(centres) -> tuple[float, float]:
     """Where the first and the last of evenly spaced cells end."""
+    if len(centres) < 2:
+        raise ValueError("A map needs two columns and two rows at least: x and y are the centres of its cells.")
     half = (centres[-1] - centres[0]) / (len(centres) - 1) / 2
     return float(centres[0] - half), float(centres[-1] + half)
+
+
+def _require(value, name: str, kind: type, function: str, more: str = "") -> None:
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be what lagjax.{function} returns{more}; got {type(value).__name__}.")
+
+
+def _require_numbers(trajectory, name: str) -> None:
+    """Raise for what is no trajectory, and for one that is being traced."""
+    _require(trajectory, name, Trajectory, "simulate")
+    if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):
+        raise ValueError("lagjax.plot draws numbers: call it outside of jit, vmap and grad.")
+
+
+def _positive(count, name: str) -> int:
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+        raise ValueError(f"{name} must be a whole number, one at least; got {count!r}.")
+    return int(count)
+
+
+def _states(trajectory: Trajectory, members: int) -> tuple[Any, Any]:
+    """q and qdot of at most so many members, on a first axis that is there for a single trajectory too."""
+    _require_numbers(trajectory, "trajectory")
+    count = _positive(members, "members")
+    states = trajectory.q, trajectory.qdot
+    return jax.tree.map(lambda leaf: _some_members(leaf, trajectory, count), states)
+
+
+def _pair(projection: Callable) -> Callable:
+    """A projection, with a sentence where it does not return two numbers."""
+
+    def two_numbers(q, qdot):
+        values = projection(q, qdot)
+        shapes = [jnp.shape(value) for value in values] if isinstance(values, tuple | list) else jnp.shape(values)
+        if shapes not in ([(), ()], (2,)):
+            raise ValueError(f"projection must return two numbers, (x, y), for one state; got shapes {shapes}.")
+        return values[0], values[1]
+
+    return two_numbers
 
 
 def _some_members(leaf: Any, trajectory: Trajectory, count: int):

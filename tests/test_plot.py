@@ -7,6 +7,7 @@ import matplotlib
 matplotlib.use("agg")
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -180,3 +181,39 @@ def test_members_are_drawn_at_times_of_their_own():
     assert ax.get_ylabel() == "q" and ax.get_legend() is None
     with pytest.raises(ValueError, match="times of their own"):
         lagjax.plot.energy_error(runs)
+
+
+@pytest.mark.slow
+def test_modes_tell_what_grows_and_are_drawn_at_their_largest():
+    saddle = lagjax.System(lambda q, v: 0.5 * v @ v + 0.5 * q[0] ** 2 - 2 * q[1] ** 2)
+    modes = lagjax.normal_modes(saddle, jnp.zeros(2))
+    titles = [ax.get_title() for ax in lagjax.plot.modes(modes)]
+    assert titles == ["grows as exp(1 t)", "ω = 2"]
+    # The phase of a complex shape is anybody's choice: i times a shape is the shape.
+    turned = eqx.tree_at(lambda m: m.shapes, modes, 1j * modes.shapes)
+    for one, other in zip(lagjax.plot.modes(modes), lagjax.plot.modes(turned), strict=True):
+        heights = [[bar.get_height() for bar in ax.patches] for ax in (one, other)]
+        np.testing.assert_allclose(np.abs(heights[1]), np.abs(heights[0]), atol=1e-12)
+    rubbing = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, dissipation=lambda q, v: 0.1 * v**2)
+    assert lagjax.plot.modes(lagjax.normal_modes(rubbing, 0.0))[0].get_title() == "ω = 0.995, ζ = 0.1"
+
+
+@pytest.mark.parametrize(
+    ("draw", "said"),
+    [
+        (lambda run: lagjax.plot.trajectory(SCENE), "must be what lagjax.simulate returns; got System"),
+        (lambda run: lagjax.plot.phase(run, members=0), "members must be a whole number, one at least; got 0"),
+        (lambda run: lagjax.plot.compare((run.ts, run.q), run), "one must be what lagjax.simulate returns; got tuple"),
+        (lambda run: lagjax.plot.trajectory(run, lambda q, v: q[0]), "two numbers, .* for one state; got shapes"),
+        (lambda run: lagjax.plot.energy_error(None), "got NoneType"),
+        (lambda run: lagjax.plot.modes(run), "modes must be what lagjax.normal_modes returns; got Trajectory"),
+        (lambda run: lagjax.plot.fit(run), "fit must be what lagjax.fit returns"),
+        (lambda run: lagjax.plot.work_precision(run), "result must be what lagjax.work_precision returns"),
+        (lambda run: lagjax.plot.state_map(np.zeros(1), np.zeros(3), np.zeros((3, 1))), "two columns and two rows"),
+        (lambda run: jax.eval_shape(lambda r: lagjax.plot.phase(r) and 0, run), "call it outside of jit"),
+        (lambda run: jax.eval_shape(lambda r: r.to_pandas() and 0, run), "copies numbers: call it outside of jit"),
+    ],
+)
+def test_what_cannot_be_drawn_is_said_in_a_sentence(single, draw, said):
+    with pytest.raises((TypeError, ValueError), match=said):
+        draw(single)
