@@ -75,15 +75,21 @@ class Robot(NamedTuple):
 def read(source: str | Path) -> Robot:
     """The robot in a file, or in a string that holds the XML itself. Raises `ValueError` for what it cannot be."""
     text = source if isinstance(source, str) and source.lstrip().startswith("<") else Path(source).read_text()
+    if "<xacro:" in text:
+        raise ValueError("These are macros, not yet URDF: `xacro robot.urdf.xacro > robot.urdf` writes them out.")
     try:
         tree = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise ValueError(f"This is no XML: {error}.") from None
     if tree.tag != "robot":
         raise ValueError(f"A URDF file holds a <robot>; this one holds a <{tree.tag}>.")
+    for tag in ("link", "joint"):
+        names = [_name(element) for element in tree.findall(tag)]
+        if len(set(names)) < len(names):
+            raise ValueError(f"Two {tag}s have one name: {sorted({name for name in names if names.count(name) > 1})}.")
     links = [_name(link) for link in tree.findall("link")]
-    if len(set(links)) < len(links):
-        raise ValueError(f"Two links have one name: {sorted({name for name in links if links.count(name) > 1})}.")
+    if not links:
+        raise ValueError("The <robot> has no <link>.")
     bodies = {_name(link): _body(link) for link in tree.findall("link") if link.find("inertial") is not None}
     joints = [_joint(joint, links) for joint in tree.findall("joint")]
     root, ordered = _in_order(links, joints)
