@@ -161,7 +161,7 @@ def test_timings_of_transitions_and_functions_do_not_mix():
         lagjax.Timings({"a": BOUNCE, "b": lambda q, v: q}, {"a": [1.0], "b": [2.0]}, 0.0, thrown)
     with pytest.raises(ValueError, match="a transition has its own"):
         heard(BOUNCE, direction=-1)
-    with pytest.raises(ValueError, match="does not exist"):
+    with pytest.raises(ValueError, match="is no mode"):
         lagjax.Hybrid({"flight": FLIGHT}, [BOUNCE], "rest")
 
 
