@@ -136,6 +136,8 @@ def fit(
     """
     if not (isinstance(starts, int | np.integer) and starts > 0):
         raise ValueError(f"starts must be a positive whole number; got {starts!r}.")
+    if not (isinstance(seed, int | np.integer) and seed >= 0):
+        raise ValueError(f"seed must be a whole number, 0 or larger; got {seed!r}.")
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}; got {method!r}.")
     if hold not in HOLDS:
@@ -219,9 +221,10 @@ def _form(system: Scene, records: list[Record], hold: str) -> Form | None:
 
 def _layout(system: Scene, records: list[Record], params0, form: Form | None) -> Layout:
     """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
-    begun = next((started(record.start, params0) for record in records if record.start is not None), None)
-    read_off = begun is None
-    if read_off:  # no record is of crossing times: those have starts
+    place = next((k for k, record in enumerate(records) if record.start is not None), None)
+    if place is not None:
+        begun = started(records[place].start, params0)
+    else:  # no record is of crossing times: those have starts
         begun = 2 * (jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values),)
     q, qdot = jax.tree.map(jnp.asarray, begun)
     scene, params = first_law(system), params0
@@ -235,8 +238,11 @@ def _layout(system: Scene, records: list[Record], params0, form: Form | None) ->
                 f"The scene's functions ask for `{where}`, which params0 does not have ({type(reason).__name__}: "
                 f"{str(reason).splitlines()[0]}): params0 is {jax.tree.structure(params0)}."
             ) from reason
-        if not read_off:
-            raise
+        if place is not None:
+            raise ValueError(
+                f"The scene's functions cannot be called with the start of records[{place}] ({type(reason).__name__}: "
+                f"{str(reason).splitlines()[0]}): give it in the structure of q."
+            ) from reason
         raise ValueError(
             "The scene's functions cannot be called with coordinates of the structure of `values`, which q is taken to "
             f"have where no record has a start ({type(reason).__name__}: {str(reason).splitlines()[0]}). If the values "

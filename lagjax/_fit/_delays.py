@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,7 +54,7 @@ class Delayed:
     def __post_init__(self):
         if not callable(self.delay):
             raise TypeError(f"delay must be a function of the parameters; got {self.delay!r}.")
-        if not (np.ndim(self.longest) == 0 and np.isfinite(self.longest) and self.longest > 0):
+        if not (eqx.is_array_like(self.longest) and np.ndim(self.longest) == 0 and 0 < self.longest < np.inf):
             raise ValueError(f"longest must be a positive number, the largest possible delay; got {self.longest!r}.")
 
 

@@ -1,10 +1,12 @@
 """`Record`: one recording of a motion; `Samples`: pieces of records side by side, as rows of one batch."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lagjax._fit._inputs import Table, looked_up, table_of
@@ -136,10 +138,7 @@ class Record(Measured):
 
 
 def _times(ts) -> np.ndarray:
-    try:
-        times = np.asarray(ts, np.float64)
-    except (TypeError, ValueError):
-        raise TypeError(f"ts must be an array of times; got {type(ts).__name__}.") from None
+    times = real_numbers(ts, "ts", "an array of times")
     if times.ndim != 1 or len(times) < 2:
         raise ValueError(f"ts must hold at least two times, in one dimension; got shape {times.shape}.")
     if not np.isfinite(times).all():
@@ -153,6 +152,23 @@ def _times(ts) -> np.ndarray:
     return times
 
 
+def real_numbers(array, name: str, what: str) -> np.ndarray:
+    """The numbers of an array, NaN where a masked one hides them. Raises `TypeError` where they are not real."""
+    if getattr(array, "dtype", None) is not None and np.asarray(array).dtype.kind in "mM":
+        raise TypeError(
+            f"{name} holds dates or durations: give numbers, in seconds (t - t[0]) / np.timedelta64(1, 's')."
+        )
+    try:
+        if np.iscomplexobj(array):
+            raise TypeError
+        masked = isinstance(array, np.ma.MaskedArray)
+        return np.ma.filled(array.astype(np.float64), np.nan) if masked else np.asarray(array, np.float64)
+    except (TypeError, ValueError):
+        of = getattr(array, "dtype", None)
+        of = f"{type(array).__name__}" + (f" of {of}" if of is not None else "")
+        raise TypeError(f"{name} must be {what}; got {of}.") from None
+
+
 def one_signal(values: PyTree) -> PyTree:
     """A list of numbers as an array: it is one signal, not one signal for each."""
     is_list = isinstance(values, list | tuple) and values and all(np.ndim(value) == 0 for value in values)
@@ -160,10 +176,7 @@ def one_signal(values: PyTree) -> PyTree:
 
 
 def _signal(leaf, label: str, times: int) -> np.ndarray:
-    try:
-        values = np.asarray(leaf, np.float64)
-    except (TypeError, ValueError):
-        raise TypeError(f"{label} must be an array of real numbers; got {type(leaf).__name__}.") from None
+    values = real_numbers(leaf, label, "an array of real numbers")
     if values.ndim == 0 or len(values) != times:
         raise ValueError(f"{label} must have the {times} times as its first axis; got shape {values.shape}.")
     if np.isinf(values).any():
@@ -197,7 +210,7 @@ def _matrix_of_weights(record: Record) -> np.ndarray:
         spread = tree.flatten_up_to(jax.tree.broadcast(weights, record.values))
         columns = []
         for weight, leaf in zip(spread, leaves, strict=True):
-            weight = np.asarray(weight, np.float64)
+            weight = real_numbers(weight, "weights", "real numbers")
             weight = weight.reshape(weight.shape + (1,) * (leaf.ndim - weight.ndim)) if weight.ndim else weight
             columns.append(np.broadcast_to(weight, leaf.shape).reshape(len(leaf), -1))
     except ValueError:
@@ -296,6 +309,8 @@ def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, 
 
 def require_alike(records) -> list[Any]:
     """The records and timings as a list. Raises where there is none, or where records differ in their signals."""
+    if not isinstance(records, Measured | Iterable):
+        raise TypeError(f"records must be a lagjax.Record, or a list of them; got {type(records).__name__}.")
     listed = [records] if isinstance(records, Measured) else list(records)
     if not listed:
         raise ValueError("records is empty: a fit needs at least one lagjax.Record.")
@@ -356,4 +371,11 @@ def started(start, params: PyTree) -> tuple[PyTree, PyTree]:
     pair = start(params) if callable(start) else start
     if not (isinstance(pair, tuple) and len(pair) == 2):
         raise TypeError(f"start, as a function of the parameters, must return (q0, qdot0); got {pair!r}.")
-    return pair
+    return jax.tree.map(_as_float, pair[0]), jax.tree.map(_as_float, pair[1])
+
+
+def _as_float(number):
+    """A number or an array of a start: whole numbers too mean real ones."""
+    if not eqx.is_array_like(number) or jnp.issubdtype(kind := jnp.result_type(number), jnp.complexfloating):
+        raise TypeError(f"A start must hold real numbers; got {number!r}.")
+    return number if jnp.issubdtype(kind, jnp.floating) else jnp.asarray(number, float)

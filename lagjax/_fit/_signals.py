@@ -114,11 +114,17 @@ def _require_signals(observed, layout: Layout, parameters: Parameters, record: R
     out = jax.eval_shape(observed, *(jax.ShapeDtypeStruct(shape, layout.dtype) for shape in shapes))
     leaves, tree = jax.tree.flatten(out)
     got = tree, tuple(getattr(leaf, "shape", ()) for leaf in leaves)
+    if any(map(_is_complex, leaves)):
+        raise ValueError("observe returns complex numbers: return their real and imaginary parts.")
     if got != record.structure:
         raise ValueError(
             f"observe returns {got[0]} of shapes {got[1]} at one time, but the values of a record have "
             f"{record.structure[0]} of shapes {record.structure[1]} after their axis of times."
         )
+
+
+def _is_complex(leaf) -> bool:
+    return np.issubdtype(np.result_type(leaf), np.complexfloating)
 
 
 def looks_like_positions(observe: Callable | Delayed | None, record: Record, layout: Layout) -> bool:

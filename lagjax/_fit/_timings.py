@@ -22,7 +22,7 @@ import numpy as np
 from lagjax._crossings import directions_of, sections_of
 from lagjax._failures import sentence
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Guess, Measured, require_start
+from lagjax._fit._records import Guess, Measured, real_numbers, require_start
 from lagjax._fit._scene import Scene, follow
 from lagjax._hybrid import Hybrid, Transition
 from lagjax._layout import Layout, halves
@@ -166,10 +166,7 @@ def _by_section(values, keys: tuple[str, ...] | None, name: str) -> list[np.ndar
     if keys is not None and (not isinstance(values, dict) or set(values) != set(keys)):
         raise ValueError(f"{name} must be a dict with the names of the sections, {', '.join(map(repr, keys))}.")
     parts = [values] if keys is None else [values[key] for key in keys]
-    try:
-        arrays = [np.asarray(part, np.float64) for part in parts]
-    except (TypeError, ValueError):
-        raise TypeError(f"{name} must hold real numbers.") from None
+    arrays = [real_numbers(part, name, "real numbers") for part in parts]
     for array in arrays:
         if array.ndim != 1:
             raise ValueError(f"{name} must be of one dimension for each section; got shape {array.shape}.")
