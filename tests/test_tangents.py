@@ -10,6 +10,7 @@ from lagjax import _native
 from lagjax._layout import Layout
 from lagjax._machine_code import _derivatives, _flow, flow_of
 from lagjax._machine_code._flow import Tolerances
+from lagjax._native import _kernel
 from lagjax._problem import Problem
 
 TOLERANCES = Tolerances(1e-10, 1e-13, 4096)
@@ -130,3 +131,20 @@ def test_tangents_of_motions_whose_steps_are_gone(flow, monkeypatch):
     for a, b in zip(along(flow, y0, numbers, dy0, dparams), kept, strict=True):
         np.testing.assert_array_equal(a, b)
     assert len(runs) == 2  # the motion itself, and once more
+
+
+@pytest.mark.slow
+def test_the_adjoints_of_two_vectors_of_members_go_on_two_threads_with_the_same_bits(flow, monkeypatch):
+    members = 2 * _native.lanes()
+    y0, numbers, rng = starts(members)
+    run = flow.run(TS, y0, numbers, TOLERANCES)
+    residuals = run.path, run.result, run.accepted, run.ticket
+    path_ct, end_ct = rng.normal(size=(members, 1, TS.size, 4)), rng.normal(size=(members, 1, 4))
+    asked, found, together = [], [], _kernel.together
+    monkeypatch.setattr(_kernel, "together", lambda work, count: (asked.append(count), together(work, count))[1])
+    for cores in (1, 2):
+        monkeypatch.setattr(_kernel, "cores", lambda cores=cores: cores)
+        found.append(_derivatives.vjp(flow, TS, y0, numbers, residuals, path_ct, end_ct, TOLERANCES))
+    assert asked[-1] == 2 and set(asked[:-1]) == {1}  # each time the motion once more, and back over it
+    for one, two in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, two)

@@ -171,3 +171,5 @@ SHORTER, RETAKEN, MOST_RETURNS = 1 / 64, 0.9, 16
 
 # Members that make a thread worth its start, in vectors. Doubled, batches of up to that size run on half the cores.
 VECTORS_PER_THREAD = 4
+# What an adjoint costs beside its motion: 16 members go back on two threads. Halved, they do on one.
+MOTIONS_PER_ADJOINT = 4

@@ -13,7 +13,14 @@ import numpy as np
 
 from lagjax._native._adjoint import Adjoint
 from lagjax._native._alone import fills_lanes
-from lagjax._native._constants import DONE, LARGEST_SHARED, LEAST_ORDER, MAX_ORDER, VECTORS_PER_THREAD
+from lagjax._native._constants import (
+    DONE,
+    LARGEST_SHARED,
+    LEAST_ORDER,
+    MAX_ORDER,
+    MOTIONS_PER_ADJOINT,
+    VECTORS_PER_THREAD,
+)
 from lagjax._native._frame import LANE, Layout
 from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
 from lagjax._native._handler import Plan, Rest, aligned, handler
@@ -272,7 +279,8 @@ class Kernel:
     def _back_over(self, members: int) -> "tuple[_Compiled, int]":
         """The transpose for so many members, and on how many threads."""
         kernel = self.of_members(1 if members < self.width / 2 else members)  # few are as fast one after the other
-        return kernel._backward, kernel.threads(members)
+        # A vector of members is as much work as the motions of several, and worth a thread the sooner.
+        return kernel._backward, min(kernel.threads(members * MOTIONS_PER_ADJOINT), -(-members // kernel.width))
 
     def jvp(
         self, ts, params, table, first, counts, y_dot, params_dot, order: int, floor: float
