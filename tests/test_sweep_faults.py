@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import lagjax
+import lagjax.__main__
 from lagjax._sweep import _batch, _begin, _job
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._store import Store
@@ -193,3 +194,47 @@ def test_commands_that_begin_a_store_at_the_same_moment(tmp_path):
     command = [sys.executable, "-c", SCRIPT, str(store), str(time.time() + 6.0)]
     array = [subprocess.Popen(command, env=os.environ | {"PYTHONPATH": root}) for _ in range(2)]
     assert [one.wait(120) for one in array] == [0, 0] and os.listdir(store.parent) == ["store.zarr"]
+
+
+# ---- stores that grow ------------------------------------------------------------------------------------------------
+
+
+def drawn(count, seed=3, kind=lagjax.random):
+    return {("length", "angle"): kind(count, seed=seed, low=(0.5, 0.0), high=(1.5, 3.0))}
+
+
+@pytest.mark.slow
+def test_to_extend_ten_million_members_reads_none_of_their_values(tmp_path, monkeypatch):
+    monkeypatch.setattr("lagjax._sweep.work", lambda *_: None)
+    few = swept(tmp_path / "few", drawn(10**7), unit=10**6)
+    monkeypatch.setattr(Store, "coordinates", lambda *_: pytest.fail("read values"))
+    swept(tmp_path / "many", drawn(3 * 10**7), unit=10**6, extend=few.store)
+
+
+@pytest.mark.slow
+def test_a_store_goes_on_without_the_one_it_began_with(tmp_path):
+    few = swept(tmp_path / "few", drawn(20), unit=10)
+    many = swept(tmp_path / "many", drawn(40), unit=10, extend=few.store)
+    os.rename(few.store, tmp_path / "elsewhere")
+    (many.store / ".sweep" / "done" / "3.json").unlink()
+    assert swept(tmp_path / "many", drawn(40), unit=10, extend=few.store).status().done == 40
+    with pytest.warns(UserWarning, match="no member that is also in `over`.*seeds"):
+        swept(tmp_path / "others", drawn(40, seed=4), extend=tmp_path / "elsewhere")
+
+
+@pytest.mark.slow
+def test_a_later_end_of_stores_that_were_moved(tmp_path):
+    keep_end = lambda trajectory: {"end": trajectory.end}
+    first = swept(tmp_path / "here" / "first", ts=TS[:3], keep=keep_end)
+    rule = dict(ts=TS[2:], keep=keep_end, unit=7)
+    swept(tmp_path / "here" / "rest", extend=first.store, **rule)
+    os.rename(tmp_path / "here", tmp_path / "there")
+    rest, record = tmp_path / "there" / "rest", tmp_path / "there" / "rest" / ".sweep" / "done"
+    (record / "0.json").unlink()
+    assert lagjax.__main__.main(["sweep", "run", str(rest), "--quiet"]) == 0
+    (record / "0.json").unlink()
+    assert swept(rest, extend=tmp_path / "there" / "first", **rule).status().done == 42
+    os.rename(tmp_path / "there" / "first", tmp_path / "there" / "gone")
+    (record / "0.json").unlink()
+    _job._opened.cache_clear()
+    assert lagjax.__main__.main(["sweep", "run", str(rest), "--quiet"]) == 1

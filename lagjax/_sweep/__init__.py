@@ -198,6 +198,8 @@ def sweep(
     child = Child(place.path, isolate) if isolate else None
     other = None if extend is None else _place(extend, "extend")
     with precision(in_doubles()), child or nullcontext():
+        if place.is_there() and other is not None and not place.spec()["goes_on_from"]:
+            other = None  # of which the members were taken: it may be gone
         if other is not None and goes_on(other, motions):
             motions = replace(motions, left=left_in(other, axes, motions))
         if not place.is_there():

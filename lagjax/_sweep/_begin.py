@@ -14,9 +14,9 @@ from lagjax._sweep import _batch
 from lagjax._sweep._batch import Kept, batches_of, label, quantities_of
 from lagjax._sweep._designs import Design
 from lagjax._sweep._extend import carry, require_extensible
-from lagjax._sweep._job import Job, cpu, in_doubles, require_versions, versions
+from lagjax._sweep._job import Job, cpu, goes_on_from, in_doubles, require_versions, versions
 from lagjax._sweep._later import states
-from lagjax._sweep._members import RESERVED, Axis, Grid, points_of
+from lagjax._sweep._members import RESERVED, Axis, Grid, in_words, points_of
 from lagjax._sweep._scene import Motions, difference, packed, texts, users_path
 from lagjax._sweep._store import FORMAT, RESULT, Quantity, Store
 
@@ -67,7 +67,7 @@ def begin(
         "axes": [axis.described() for axis in axes], "shape": shape, "chunk": Grid.of(shape, members).chunk,
         "batch": _batch_size(motions, points, kept), "seconds_per_member": seconds, "conserves": conserves,
         "kept": [{"name": q.name, "shape": q.shape, "dtype": q.dtype.str} for q in quantities], **motions.described(),
-        "scene": texts(motions, names), "path": users_path(),
+        "goes_on_from": goes_on_from(motions, store), "scene": texts(motions, names), "path": users_path(),
     }  # fmt: skip
     codes = sorted({code_of(item) for item in RESULTS._name_to_item.values()} | set(_batch.NAMES))
     title = f"lagjax sweep over {', '.join(names)}"
@@ -159,8 +159,14 @@ def require_same(store: Store, spec: dict, axes: tuple[Axis, ...], motions: Moti
     require_versions(store, spec)
     names = [name for axis in axes for name in axis.names]
     now = {"axes": [axis.described() for axis in axes], "x64": in_doubles(), **motions.described()}
+    now["goes_on_from"] = goes_on_from(motions, store)
     now = json.loads(json.dumps(now))
-    lines = [f"{name}: {spec.get(name)} in the store, now {x}" for name, x in now.items() if spec.get(name) != x]
+    words = {"axes": in_words}
+    lines = [
+        f"{name}: {words.get(name, str)(spec[name])} in the store, now {words.get(name, str)(x)}"
+        for name, x in now.items()
+        if spec[name] != x
+    ]
     if change := difference(spec["scene"], texts(motions, names)):
         lines.append(change)
     if lines:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+GROWING = ("random", "sobol")  # more members begin with the same ones
 SLICE = 2**20  # values that are in memory together: 8 MiB of one name
 _LONGEST_HYPERCUBE = 10_000_000  # scipy makes a latin hypercube as a whole: 80 MB for each name
 _LONGEST_SOBOL = 2**30  # scipy's direction numbers have 30 bits by default

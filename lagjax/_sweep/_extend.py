@@ -6,12 +6,15 @@ are written at once; of the others the known members stand aside, until their un
 """
 
 import json
+import warnings
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from lagjax._results import ENDED_WELL
 from lagjax._sweep._batch import label
+from lagjax._sweep._designs import GROWING
 from lagjax._sweep._job import require_versions
 from lagjax._sweep._members import Grid
 from lagjax._sweep._scene import difference
@@ -47,8 +50,15 @@ def carry(old: Store, new: Store) -> int:
     before, spec, total = old.spec(), new.spec(), 0
     (new.job / KNOWN).mkdir(exist_ok=True)
     grid, places = new.grid(spec), list(map(partial(_places, old, new), before["axes"], spec["axes"]))
+    if not all(place.common for place in places):
+        warnings.warn(
+            f"{old.path} has no member that is also in `over`, so that all are computed: compare the values of its "
+            "axes, and the seeds and bounds of its designs. A latin hypercube cannot be extended.",
+            stacklevel=4,
+        )
+        return 0
     for unit in range(grid.units):
-        box = [x[part] for x, part in zip(places, grid.box(unit), strict=True)]
+        box = [place(part) for place, part in zip(places, grid.box(unit), strict=True)]
         inside = [np.flatnonzero(x >= 0) for x in box]
         if not all(len(x) for x in inside):
             continue
@@ -58,6 +68,7 @@ def carry(old: Store, new: Store) -> int:
         which, found = which[done], {name: x[done] for name, x in found.items()}
         total += len(which)
         if len(which) == grid.size(unit):
+            new.coordinates(spec["axes"], grid.box(unit))  # which nobody else would write
             new.write_unit(spec, unit, found, _record(grid, unit, found[RESULT.name], spec), b"")
         elif len(which):
             data = arrays_as_bytes({"which": which, **{f"of {name}": x for name, x in found.items()}})
@@ -65,21 +76,39 @@ def carry(old: Store, new: Store) -> int:
     return total
 
 
-def _places(old: Store, new: Store, of_old: dict, of_new: dict) -> np.ndarray:
-    """For each place along an axis of `new` the one in `old` with the same values; −1 where there is none."""
+class _Places(NamedTuple):
+    """For places along an axis of the new store those in the old one with the same values; −1 where there is none.
+
+    `known` (size,) lists them; None where both have one rule, by which the first `common` ones are the same.
+    """
+
+    common: int
+    known: np.ndarray | None
+
+    def __call__(self, part: slice) -> np.ndarray:
+        if self.known is not None:
+            return self.known[part]
+        numbers = np.arange(part.start, part.stop)
+        return np.where(numbers < self.common, numbers, -1)
+
+
+def _places(old: Store, new: Store, of_old: dict, of_new: dict) -> _Places:
+    rules = [{name: x for name, x in axis.items() if name != "size"} for axis in (of_old, of_new)]
+    if rules[0] == rules[1] and of_old["rule"] in GROWING:
+        return _Places(min(of_old["size"], of_new["size"]), None)
     sides = [s.coordinates([axis], (slice(0, axis["size"]),))[0] for s, axis in ((old, of_old), (new, of_new))]
     before, now = (np.stack([side[name] for name in of_new["names"]], axis=1) for side in sides)
-    if len(before) <= len(now) and np.array_equal(before, now[: len(before)]):  # as of a design with more members
-        return np.concatenate([np.arange(len(before)), np.full(len(now) - len(before), -1)])
     known = {row.tobytes(): k for k, row in enumerate(before)}
-    return np.array([known.get(row.tobytes(), -1) for row in now])
+    found = np.array([known.get(row.tobytes(), -1) for row in now])
+    return _Places(int(np.sum(found >= 0)), found)
 
 
 def _read(old: Store, spec: dict, places: list[np.ndarray]) -> dict[str, np.ndarray]:
     """What is stored of a product of members, (members, …) by name."""
+    runs = [slice(int(x[0]), int(x[-1]) + 1) if np.all(np.diff(x) == 1) else x for x in places]  # read as they lie
     found = {}
     for q in old.quantities(spec):
-        values = np.asarray(old.array(q.name).oindex[(*places, *(slice(None) for _ in q.shape))])
+        values = np.asarray(old.array(q.name).oindex[(*runs, *(slice(None) for _ in q.shape))])
         found[q.name] = values.reshape(-1, *q.shape)
     return found
 

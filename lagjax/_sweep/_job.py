@@ -2,12 +2,13 @@
 
 import hashlib
 import json
+import os
 import platform
 import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -100,6 +101,20 @@ def _set_of_process(doubles: bool) -> None:
         jax.config.update("jax_enable_x64", doubles)
 
 
+def goes_on_from(motions: Motions, store: Store) -> str | None:
+    """Where the motions of a store were left, as a path from its folder: both may be moved, or seen, elsewhere."""
+    return None if motions.left is None else os.path.relpath(motions.left.path, store.path.parent)
+
+
+def _left_here(motions: Motions, store: Store, path: str | None) -> Motions:
+    """The motions of a store, left where `path` leads from its folder. Raises `FileNotFoundError` if that is gone."""
+    if motions.left is None or path is None:
+        return motions
+    other = Store((store.path.parent / path).resolve())
+    other.spec()
+    return replace(motions, left=motions.left._replace(path=str(other.path)))
+
+
 def opened(path: str) -> Job:
     """The job of a store in a process that knows nothing but its path. Raises where it is not what was begun.
 
@@ -115,7 +130,7 @@ def _opened(path: str, content: str) -> Job:
     spec = store.spec()
     require_versions(store, spec)
     with precision(bool(spec["x64"])):
-        motions = unpacked(store.scene(), spec["path"])
+        motions = _left_here(unpacked(store.scene(), spec["path"]), store, spec["goes_on_from"])
         names = [name for axis in spec["axes"] for name in axis["names"]]
         if change := difference(spec["scene"], texts(motions, names)):
             raise ValueError(f"{store.path}: the scene is not here what it was when the store was begun.\n{change}")

@@ -14,7 +14,7 @@ import numpy as np
 from lagjax._results import SUCCESSFUL
 from lagjax._sweep._batch import names_of
 from lagjax._sweep._job import in_doubles, require_versions
-from lagjax._sweep._members import Axis
+from lagjax._sweep._members import Axis, in_words
 from lagjax._sweep._scene import MOTION, Left, Motions, difference, texts
 from lagjax._sweep._store import RESULT, Store
 from lagjax._trajectory import State
@@ -29,8 +29,10 @@ def left_in(other: Store, axes: tuple[Axis, ...], motions: Motions) -> Left:
     """Where the motions were left. Raises `ValueError` for other ones, and where not all ends are there."""
     spec = other.spec()
     require_versions(other, spec)
-    now = json.loads(json.dumps({"axes": [axis.described() for axis in axes], "x64": in_doubles()}))
-    lines = [f"{name}: {spec[name]} in the store, now {x}" for name, x in now.items() if spec[name] != x]
+    now = json.loads(json.dumps([axis.described() for axis in axes]))
+    lines = [f"axes: {in_words(spec['axes'])} in the store, now {in_words(now)}"] if now != spec["axes"] else []
+    if spec["x64"] != in_doubles():
+        lines.append(f"x64: {spec['x64']} in the store, now {in_doubles()}")
     names = [name for axis in axes for name in axis.names]
     scenes = ({role: x for role, x in of.items() if role in MOTION} for of in (spec["scene"], texts(motions, names)))
     if change := difference(*scenes):

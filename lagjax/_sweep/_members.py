@@ -51,6 +51,18 @@ class Axis:
         return about | {"rule": "values", "ends": ends, "sha256": values}
 
 
+def in_words(axes: list[dict]) -> str:
+    """The axes that a store describes, for a sentence: 'length: 6 values from 0.5 to 1.5 (#53dd0e), …'."""
+    return "; ".join(f"{', '.join(axis['names'])}: {_values_in_words(axis)}" for axis in axes)
+
+
+def _values_in_words(axis: dict) -> str:
+    if axis["rule"] == "values":
+        ends = ", ".join(f"{a:g} to {b:g}" for a, b in axis["ends"])
+        return f"{axis['size']} values from {ends} (#{axis['sha256'][:6]})"
+    return f"{axis['rule']}, {axis['size']} values, seed {axis['seed']}, from {axis['low']} to {axis['high']}"
+
+
 def axes_of(over: Any) -> tuple[Axis, ...]:
     """The axes of `over`. Raises `TypeError` or `ValueError`, with a sentence, where it is no description."""
     if not isinstance(over, dict) or not over:

@@ -88,7 +88,6 @@ class Motions:
         shown["solver"] = None if self.settings["solver"] is None else identity(self.settings["solver"])
         times = {"ends": [float(self.ts[0]), float(self.ts[-1])], "outputs": len(self.ts), "sha256": hash_of(self.ts)}
         shown["crossings"] = self.sections.described() if self.sections else None
-        shown["goes_on_from"] = self.left and self.left.path
         return {"ts": times, **shown, "reduce": {name: how.described() for name, how in self.reduce.items()}}
 
 
