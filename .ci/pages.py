@@ -47,7 +47,7 @@ def makers(name: str) -> list[str]:
             thing = inspect.getattr_static(owner, member)
             returned = getattr(thing, "__annotations__", {}).get("return", "")
             text = returned if isinstance(returned, str) else getattr(returned, "__name__", "") + str(returned)
-            if not member.startswith("_") and not inspect.isclass(thing) and re.search(rf"\b{name}\b", text):
+            if member != "of" and member[0] != "_" and not inspect.isclass(thing) and re.search(rf"\b{name}\b", text):
                 found.append(prefix + member)
     return found
 
@@ -164,7 +164,8 @@ def on_page_content(html, page, config, files):
     if makers_here:
         returned_by = ", ".join(f"<code>{maker}</code>" for maker in makers_here)
         html = html.replace("</h1>", f"</h1>\n<p>Returned by {returned_by}.</p>", 1)
-    pattern = rf"(?P<before>(?:<(?:a|h\d|pre)\b[^>]*>)?)(?P<code><code>(?:lagjax\.)?(?P<name>{names})\b[^<]*</code>)"
+    before = r"(?P<before>(?:<(?:a|h\d|pre)\b[^>]*>(?:<span></span>)?)?)"  # code in these is left alone
+    pattern = rf"{before}(?P<code><code>(?:lagjax\.)?(?P<name>{names})\b[^<]*</code>)"
     return re.sub(pattern, link, html)
 
 

@@ -8,6 +8,7 @@ notebook must never fail because of its last line.
 import base64
 import html
 import io
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -63,6 +64,9 @@ def _draw(figure, trajectory) -> None:
             lines = ax.plot(ts.T, values.T, color=COLORS[drawn], alpha=opacity, linewidth=1.2)
             lines[0].set_label("q" + jax.tree_util.keystr(path) + (str(list(place)) if inside else ""))
             drawn += 1
+    every = sum(math.prod(leaf.shape[rank + 1 :]) for leaf in jax.tree.leaves(trajectory.q))
+    if every > drawn:
+        ax.plot([], [], " ", label=f"… ({every - drawn} more)")
     for member in members[~np.isin(codes[members], ENDED_WELL)]:
         ax.axvline(np.ravel(trajectory.end.t)[member], color="0.4", linewidth=0.8, linestyle=":")
     plain(ax)

@@ -77,3 +77,4 @@ def test_every_public_name_and_every_example_has_a_page(tmp_path):
         assert not re.search(
             r"<(?:script|img|link rel=\"stylesheet\")[^>]*(?:src|href)=\"(?:https?:)?//", page.read_text()
         )
+        assert "<pre><span></span><a" not in page.read_text(), "output that begins with a name is no link"
