@@ -319,9 +319,7 @@ def _drawn(figure, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
         for place in [place for traced, place in traces if traced == name]:
             for member in array:
                 faded.append((_trace(ax, color, space, opacity), member[:, place], color))
-    clock = (
-        ax.text2D(0.02, 0.97, "", transform=ax.transAxes) if space else ax.text(0.02, 0.97, "", transform=ax.transAxes)
-    )
+    clock = (ax.text2D if space else ax.text)(0.02, 0.98, "", transform=ax.transAxes, va="top")
 
     def show(i: int):
         for line, member in lines:
@@ -375,6 +373,7 @@ def _axes(figure, positions):
     if len(low) == 3:
         ax.set_box_aspect(high - low)
         ax.set(xlabel="x", ylabel="y", zlabel="z")
+        ax.locator_params(nbins=5)  # more would run into each other
         return ax
     ax.set_aspect("equal")
     ax.grid(color="0.9", linewidth=0.8)

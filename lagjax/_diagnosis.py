@@ -63,6 +63,7 @@ class Ended(NamedTuple):
     y_first: np.ndarray
     steps: int
     numbers: np.ndarray
+    by_resets: bool = False  # whether the states of a hybrid motion are reset on the way
 
 
 class Undefined(NamedTuple):
@@ -95,7 +96,7 @@ def _diagnosed(system: System, layout: Layout, params, ended: Ended) -> str:
         where, value = bad[0]
         return f"\n{where} is {value}: every number must be finite."
     if not np.isfinite(ended.y).all():
-        return f"\n{_OVERSTEPPED}"
+        return f"\n{_reset_to_nothing(layout, ended) if ended.by_resets else _OVERSTEPPED}"
     undefined = _undefined(derivation, ended) or _undefined_by_jax(derivation, params, ended)
     if undefined is not None:
         return f"\n{_told(undefined)}{_line(derivation, params, undefined)}."
@@ -104,6 +105,12 @@ def _diagnosed(system: System, layout: Layout, params, ended: Ended) -> str:
     if (at := _running_away(derivation, ended)) is not None:
         return f"\n{_escape(derivation, ended, at, _pole(derivation, params, ended))}"
     return _checked(system, derivation, state, params, ended) or _budget(ended)
+
+
+def _reset_to_nothing(layout: Layout, ended: Ended) -> str:
+    names = [*layout.names, *(f"the velocity of {name}" for name in layout.names)]
+    bad = [f"{name} ({value})" for name, value in zip(names, ended.y, strict=True) if not np.isfinite(value)]
+    return f"The reset of the transition at t = {ended.t:.9g} returned {listed(bad)}: every number must be finite."
 
 
 # ---- what is not finite ----------------------------------------------------------------------------------------------
@@ -390,7 +397,8 @@ def ended_of(trajectory, layout: Layout, member: tuple[int, ...] = (), numbers: 
     if numbers is None:
         numbers = np.array(numbers_of(eqx.filter(trajectory.params, eqx.is_array_like)), layout.dtype)
     y, y_first = of_member((end.q, end.qdot)), of_member((trajectory.q, trajectory.qdot), 0)
-    return Ended(int(code), float(t), y, float(ts[-1]), float(ts[0]), y_first, int(steps), numbers)
+    by_resets = trajectory.transitions is not None
+    return Ended(int(code), float(t), y, float(ts[-1]), float(ts[0]), y_first, int(steps), numbers, by_resets)
 
 
 def with_numbers(params, numbers: np.ndarray):
