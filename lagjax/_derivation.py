@@ -144,11 +144,6 @@ class Derivation:
             return lower(on_arrays, *leaves, budget=OPERATION_BUDGET)
 
     @property
-    def is_lowered(self) -> bool:
-        """Whether the programs of the scene are there already, so that to ask for one traces nothing large."""
-        return isinstance(self._made.get("_whole"), Program)
-
-    @property
     def _graph(self) -> Graph | None:
         """The graph of all quantities, to which other programs are added, where it is too large to be copied."""
         origin = self._whole.origin

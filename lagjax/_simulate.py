@@ -174,7 +174,7 @@ def simulate_batch(
     axes, size = axes_per_leaf(values, batch_axes)
     batch = Batch.of(system, values, axes, size, ts, rtol, atol, max_steps, event)
     values = {name: as_arrays(value, batch.member.layout.dtype) for name, value in values.items()}
-    inconsistent = inconsistent_members(system, batch.member.layout, batch.member.ts, values, axes)
+    inconsistent = inconsistent_members(system, batch.member.ts, values, axes)
     engine = choose(batch.member, asked).engine
     trajectory = _trajectory(batch.member, engine, engine.solve_batch(batch), values["params"], batch_axes[2])
     return trajectory if inconsistent is None else _refused(trajectory, inconsistent)

@@ -344,7 +344,7 @@ class System(eqx.Module):
         if self.forces is not None:
             _require_structure(returned(self.forces, "forces"), layout)
         if self.constraints is not None or self.velocity_constraints is not None:
-            _require_constraints(self.constraint_structure(layout, params), layout)
+            _require_constraints(self.constraint_structure(layout, params))
 
 
 def _structure_of(role: str, state: PyTree) -> str:
@@ -416,7 +416,7 @@ def _end_to_end(tree: PyTree) -> jax.Array:
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)])
 
 
-def _require_constraints(structure: tuple, layout: Layout) -> None:
+def _require_constraints(structure: tuple) -> None:
     leaves = jax.tree.leaves(structure)
     if not leaves or not sum(math.prod(leaf.shape) for leaf in leaves):
         raise TypeError("constraints must return at least one number that is to be zero.")

@@ -45,7 +45,7 @@ class Scene(NamedTuple):
         """Measure `system` at a state."""
         q, qdot, t, params = as_arrays((q, qdot, 1.0 * t, params), layout.dtype)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)
-        sizes, derivation = _sizes(layout, q, qdot), derivation_of(system, layout, params)
+        sizes, derivation = _sizes(q, qdot), derivation_of(system, layout, params)
         steps, offsets = ladder(sizes, layout.dtype), _offsets(layout, q, sizes)
         try:
             measured = _evaluated(derivation, state, offsets)
@@ -188,7 +188,7 @@ class Sides(NamedTuple):
     round_off: Any  # how far it may move by_q, momentum, mass, drift, by_v_of_dissipation and the rows of G, each alike
 
 
-def _sizes(layout: Layout, q: PyTree, qdot: PyTree) -> np.ndarray:
+def _sizes(q: PyTree, qdot: PyTree) -> np.ndarray:
     """The size of every coordinate, of every velocity, and of the time along the motion, (2n + 1,).
 
     A coordinate has its absolute value as its size; where that is zero, the largest in its array, or 1. One that is

@@ -90,16 +90,18 @@ class Adjoint:
             )
             steps.insert(0, self._back_projection())
         if borders is not None:
-            clocks = Clocks(self.motion, borders)
-            at_knot = [self._back_knot(clocks, levels or (n,))] if clocks.exist else []
-            if jump is None:
-                at_border = self._back_first_border(borders, levels or (n,))
-            else:
-                at_border = self._back_border(Saltation(self.motion, borders, levels[0] if levels else n, jump))
-            steps = [at_border, *at_knot, *steps, self._note_after()]
+            steps = [*self._back_at_end(borders, levels or (n,), jump), *steps, self._note_after()]
         self._run(steps)
         self._begin()
         self.motion.finish()
+
+    def _back_at_end(self, borders: "Borders", levels: tuple[int, ...], jump) -> list[Code]:
+        """What is done back at the end of a step: over the border that it met, and over a knot of samples."""
+        clocks = Clocks(self.motion, borders)
+        at_knot = [self._back_knot(clocks, levels)] if clocks.exist else []
+        if jump is None:
+            return [self._back_first_border(borders, levels), *at_knot]
+        return [self._back_border(Saltation(self.motion, borders, levels[0], jump)), *at_knot]
 
     def _transposed(self, dtypes):
         """The transposes of the zeroth order and of the order recursion."""
@@ -373,8 +375,7 @@ class Adjoint:
     def _back_border(self, saltation: Saltation) -> Code:
         """From behind the border that a step ends at to before it (`_saltation`)."""
         motion = self.motion
-        for name, count in saltation.fields_along().items():
-            motion.layout.extend(name, count)
+        motion.layout.extend_by(saltation.fields_along())
         frame = motion.function("back_border")
         code, base, numbers = frame.code, saltation.base, saltation.parameters
         frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], 0.0)

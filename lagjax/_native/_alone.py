@@ -108,17 +108,10 @@ class MotionAlone(Motion):
         frame = self._wide("sums", INTEGER)
         code, (k,) = frame.code, frame.arguments
         tables = {key: self._table(runs) for key, runs in self._runs_by_modes().items()}
-        end = code.function.append_basic_block("end")
-        switch = code.builder.switch(k.it, end)
-        for order in range(2, MAX_ORDER):
-            block = code.function.append_basic_block(f"order{order}")
-            switch.add_case(ir.Constant(INTEGER, order), block)
-            code.builder.position_at_end(block)
+        for order in code.cases(k, range(2, MAX_ORDER)):
             for (kind, modes), (table, vectors, size) in tables.items():
                 with code.loop(vectors) as i:
                     self._write_sum(frame, order, kind, modes, code.element(Value(code, table), i * size, WORD))
-            code.builder.branch(end)
-        code.builder.position_at_end(end)
         return frame.finish()
 
     def _runs_by_modes(self) -> dict[tuple, list[Run]]:

@@ -68,8 +68,7 @@ class Borders:
         self.note, self.jump = None, None
         if jump is not None:
             saltation = Saltation(motion, borders, base, jump)
-            for name, count in saltation.fields_along().items():
-                motion.layout.extend(name, count)
+            motion.layout.extend_by(saltation.fields_along())
             self.note, self.jump = saltation.note(), saltation.apply()
         elif len(levels) > 1:
             first = FirstSaltation(motion, borders, levels)
@@ -77,8 +76,7 @@ class Borders:
         self.graze = None if looks_up(borders.program) else self._graze(base)
         self.jump_at_knot = None
         if self.clocks.exist and len(levels) > 1:
-            for name, count in self.clocks.fields().items():
-                motion.layout.extend(name, count)
+            motion.layout.extend_by(self.clocks.fields())
             self.jump_at_knot = self.clocks.jump_of_tangents(levels)
         self.cross = self._cross()
 

@@ -78,9 +78,14 @@ class Layout:
 
     def extend(self, name: str, rows: int, columns: int = 1) -> None:
         """One field more, of so many vectors, behind all others."""
-        begin = -(-self._doubles[0] // self.width) * self.width
+        begin = self.end
         self._offsets[name], self._columns[name] = begin, columns
         self._doubles[0] = begin + rows * columns * self.width
+
+    def extend_by(self, fields: dict[str, int]) -> None:
+        """More fields, by name, of so many vectors each, behind all others."""
+        for name, rows in fields.items():
+            self.extend(name, rows)
 
     def place(self, name: str, *indices: Index) -> Any:
         """The first element of a vector, counted in doubles: `name`, `name[i]` or `name[i, k]`."""

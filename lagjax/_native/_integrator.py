@@ -72,7 +72,7 @@ class Integrator:
         self.notes = guards is not None and guards.notes  # in the place of states at output times
         fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards) | {"active": 1}
         if projection is not None:
-            fields |= Projector.fields(n, self.base_size) | _rank_drops.fields(n, self.guards)
+            fields |= Projector.fields(n) | _rank_drops.fields(n, self.guards)
         if guards is not None:
             fields |= Roots.fields(MAX_ORDER + 2)
         if borders is not None:

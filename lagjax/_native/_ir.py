@@ -332,6 +332,18 @@ class Code:
             yield i
             self.store(i + 1, counter)
 
+    def cases(self, number: Value, values: range) -> Iterator[int]:
+        """A switch: each of the `values` in turn, with the code written meanwhile for where `number` has it."""
+        end = self.function.append_basic_block("end")
+        switch = self.builder.switch(number.it, end)
+        for value in values:
+            block = self.function.append_basic_block(f"case{value}")
+            switch.add_case(ir.Constant(INTEGER, value), block)
+            self.builder.position_at_end(block)
+            yield value
+            self.builder.branch(end)
+        self.builder.position_at_end(end)
+
     @contextmanager
     def repeat_while(self, condition) -> Iterator[None]:
         """The body again and again, as long as `condition()` holds before it."""

@@ -24,7 +24,7 @@ class Projector:
         self.project = self._project()
 
     @staticmethod
-    def fields(n: int, base_size: int) -> dict:
+    def fields(n: int) -> dict:
         """What a thread remembers for it: the projected state at the end of the step, and velocity scales.
 
         Those of derivatives stay zero.

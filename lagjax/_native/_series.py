@@ -129,19 +129,12 @@ class Motion:
         squares = [(a,) for a, b in self.series.cauchy_products if a == b]
         kinds = [("mixed", mixed, 0, mixed_sum), ("squares", squares, len(mixed), square_sum)]
         tables = {name: self.table(pairs) for name, pairs, _, _ in kinds}
-        end = code.function.append_basic_block("end")
-        switch = code.builder.switch(k.it, end)
-        for order in range(2, MAX_ORDER):
-            block = code.function.append_basic_block(f"order{order}")
-            switch.add_case(ir.Constant(INTEGER, order), block)
-            code.builder.position_at_end(block)
+        for order in code.cases(k, range(2, MAX_ORDER)):
             for name, pairs, first, total in kinds:
                 if pairs:
                     with code.loop(len(pairs)) as i:
                         rows = [self._row(frame, tables[name], i * len(pairs[0]) + j) for j in range(len(pairs[0]))]
                         frame["sums", *self.sum_indices(i + first, k)] = total(order, self._reader(code), *rows)
-            code.builder.branch(end)
-        code.builder.position_at_end(end)
         return frame.finish()
 
     def table(self, pairs) -> ir.GlobalVariable:

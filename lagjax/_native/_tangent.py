@@ -82,12 +82,7 @@ class Tangent:
         self.saltation: Saltation | FirstSaltation | None = None
         if borders is not None:
             self._note_borders(borders, levels or (n,), jump)
-            clocks = Clocks(self.motion, borders)
-            if clocks.exist:
-                for name, count in clocks.fields().items():
-                    self.motion.layout.extend(name, count)
-                self.clocks, self.note_knot = clocks, clocks.note_end()
-        self.layout = Layout(lanes, self._fields(projection is not None), beside=self.motion.layout)
+        self.layout = Layout(lanes, self._fields(), beside=self.motion.layout)
         sincos = sincos_function(self.motion.module, lanes, "sincos_of_tangents")
         look_up = self.motion.look_up
         self.form = Tables(self.function, sincos, look_up=look_up) if large else Lines(sincos, look_up)
@@ -111,19 +106,19 @@ class Tangent:
         """What is done at the ends of steps, and where the next ones begin."""
         if jump is not None:
             self.saltation = Saltation(self.motion, borders, levels[0], jump)
-            self._remember(self.saltation.fields_along())
+            self.motion.layout.extend_by(self.saltation.fields_along())
             self.note_border = self.saltation.note_end()
         else:
             self.saltation = FirstSaltation(self.motion, borders, levels)
-            self._remember(self.saltation.fields_along())
+            self.motion.layout.extend_by(self.saltation.fields_along())
             self.begin_behind = self.saltation.note_begin()
             self.note_border = self.saltation.note_end(GuardTable(self.motion, borders))
+        clocks = Clocks(self.motion, borders)
+        if clocks.exist:
+            self.motion.layout.extend_by(clocks.fields())
+            self.clocks, self.note_knot = clocks, clocks.note_end()
 
-    def _remember(self, fields: dict) -> None:
-        for name, count in fields.items():
-            self.motion.layout.extend(name, count)
-
-    def _fields(self, projected: bool) -> dict:
+    def _fields(self) -> dict:
         """What a thread remembers of the direction at hand, in every lane: the tangents of the motion's fields."""
         series, states = self.series, self.states
         fields = {
@@ -427,19 +422,12 @@ class Tangent:
         pairs = self.series.cauchy_products
         mixed, squares = ([p for p in pairs if (p[0] == p[1]) == square] for square in (False, True))
         tables = [self._table(some) for some in (mixed, squares)]
-        end = code.function.append_basic_block("end")
-        switch = code.builder.switch(k.it, end)
-        for order in range(2, MAX_ORDER):
-            block = code.function.append_basic_block(f"order{order}")
-            switch.add_case(ir.Constant(INTEGER, order), block)
-            code.builder.position_at_end(block)
+        for order in code.cases(k, range(2, MAX_ORDER)):
             for table, some, first in zip(tables, (mixed, squares), (0, len(mixed)), strict=True):
                 if some:
                     with code.loop(len(some)) as i:
                         total = self._product(frame, Value(code, table), i, order, first > 0 or not mixed)
                         frame["dsums", i + first] = total
-            code.builder.branch(end)
-        code.builder.position_at_end(end)
         return frame.finish()
 
     def _table(self, pairs) -> ir.GlobalVariable:
@@ -547,14 +535,14 @@ class Tangent:
         frame["is_due"] = 1.0
         with code.repeat_while(lambda: code.any_lane(frame["is_due"] > 0.0)):
             with code.loop(self.lanes) as index:
-                self._await_output(frame, index, group)
+                self._await_output(frame, index)
             with code.only_if(code.any_lane(frame["is_due"] > 0.0)):
                 self._sum(frame, "between", frame["s"])
                 with code.loop(self.lanes) as index:
                     self._write_output(frame, index, group)
         return frame.finish()
 
-    def _await_output(self, frame: Frame, index: Value, group: Value) -> None:
+    def _await_output(self, frame: Frame, index: Value) -> None:
         """Whether the next output of a lane lies in the step, and how far behind its beginning."""
         code, lane, of_motion = frame.code, frame.lane(index), self.lane_of_motion(frame, index)
         member, output = of_motion["member"], code.as_integer(lane["next_output"])
