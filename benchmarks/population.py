@@ -148,7 +148,7 @@ def term(rng, i: int, one: bool):
         f"{a!r} * op.above({min(w, 0.5)!r} - (t / {period!r} - op.floor(t / {period!r})))",
         f"{high!r} * op.part(1 - op.size({x}) / {w!r}) ** 1.5",
         f"{a!r} * op.above({x}) * op.above(t - {tc!r})",
-        f"{high!r} * op.exp(-(op.feature({u}) ** 2)) * op.above(v[{i}])" if False else f"{a!r} * op.size({x}) * v[{i}]",
+        f"{a!r} * op.size({x}) * v[{i}]",
         f"{high!r} * op.exp(op.feature(-op.size({u})))" if w > 1e-2 else f"{a!r} * op.part({x}) ** 2",
         f"-{abs(a)!r} * op.friction(v[{i}])",
     ][k]
@@ -207,19 +207,9 @@ def reference(force, q0, v0) -> np.ndarray:
     rate(t, y)
     op.pieces = _pieces(op, force, y, t, d)
     for _ in range(MOST_BREAKS):
-        f0 = rate(t, y)
-        longest = 0.02
-        for j in op.narrow:
-            if op.pieces[j] and not op.pieces[j + 1]:
-                ahead = 1e-7
-                before = list(op.guards)
-                rate(t + ahead, y + ahead * f0)
-                speed = abs(op.guards[j] - before[j]) / ahead
-                longest = min(longest, max(0.2 / (speed + 1e-3), 1e-6))
-                rate(t, y)
         run = solve_ivp(
             (lambda t, y: np.zeros(2)) if stuck is not None else rate, (t, T), y, "DOP853", events=guard, rtol=1e-12,
-            atol=1e-13, max_step=longest,
+            atol=1e-13, max_step=_longest_step(op, rate, t, y),
         )  # fmt: skip
         if run.status < 0 or abs(run.y[:, -1]).max() > 50:
             raise Rejected
@@ -230,6 +220,19 @@ def reference(force, q0, v0) -> np.ndarray:
         if stuck is None:  # so that every guard is positive
             t, y = t + MOMENT, y + MOMENT * rate(t, y)
     raise Rejected
+
+
+def _longest_step(op, rate, t, y) -> float:
+    """A fifth of the time in which a narrow feature passes, where one is near."""
+    slope, longest, ahead = rate(t, y), 0.02, 1e-7
+    for j in op.narrow:
+        if op.pieces[j] and not op.pieces[j + 1]:
+            before = list(op.guards)
+            rate(t + ahead, y + ahead * slope)
+            speed = abs(op.guards[j] - before[j]) / ahead
+            longest = min(longest, max(0.2 / (speed + 1e-3), 1e-6))
+            rate(t, y)
+    return longest
 
 
 def _pieces(op, force, y, t, d) -> list:

@@ -106,7 +106,9 @@ def accept(
     Raises `TypeError` when it is not callable, when its leading positional parameters are not the `roles`, or when it
     asks by name for anything that is not among the `extras`. Keywords bound with `functools.partial` are left alone.
     """
-    expected = f"{role}({', '.join(roles)}), which may also ask by name for {' and '.join(f'`{e}`' for e in extras)}"
+    *others, last = (f"`{extra}`" for extra in extras)
+    by_name = f"{', '.join(others)} and {last}" if others else last
+    expected = f"{role}({', '.join(roles)}), which may also ask by name for {by_name}"
     if not callable(function):
         raise TypeError(f"{role} must be a function {expected}; got {type(function).__name__}.")
     try:

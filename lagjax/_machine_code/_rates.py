@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from lagjax._machine_code._flow import Flow
+from lagjax._machine_code._lines import is_large, outputs
 from lagjax._program import emit
 
 INSTANT = 1e-9  # of the time; what a border is off by while a motion slides along it is rounding
@@ -20,15 +21,16 @@ INSTANT = 1e-9  # of the time; what a border is off by while a motion slides alo
 def rate(flow: Flow, t, y, params):
     """(q̇, q̈) at states y (…, 2n), t (…), params (…, P); zero where it is not finite: there the motion has ended."""
     n = flow.size
-    if flow.anywhere.looks_up:
+    borders = flow.borders
+    slides = borders is not None and any(guard.slide >= 0 for guard in borders.guards)
+    if flow.anywhere.looks_up or (is_large(flow.anywhere) and not slides):
         return _from_rows(flow, t, y, params)
     scalars = (*(y[..., i] for i in range(2 * n)), t, *(params[..., i] for i in range(flow.numbers)))
     scalars = jnp.broadcast_arrays(*scalars)
-    borders = flow.borders
-    if borders is None or not any(guard.slide >= 0 for guard in borders.guards):
-        acceleration = flow.anywhere(*scalars)[:n]
-    else:
+    if slides:
         acceleration = _on_pieces(borders, scalars, _pieces(borders, scalars, n))[0][:n]
+    else:
+        acceleration = flow.anywhere(*scalars)[:n]
     return _stacked(flow, y, acceleration)
 
 
@@ -39,11 +41,13 @@ def _stacked(flow: Flow, y, acceleration):
 
 
 def _from_rows(flow: Flow, t, y, params):
-    """Of a program that looks up tables, whose parameters are too many to be taken apart."""
+    """Of a program that looks up tables, whose parameters are too many to be taken apart, or of a large one."""
     shape = jnp.broadcast_shapes(y.shape[:-1], t.shape)
     y, time = jnp.broadcast_to(y, (*shape, 2 * flow.size)), jnp.broadcast_to(t, shape)[..., None]
-    acceleration = flow.anywhere.of_rows(jnp.concatenate([y, time], axis=-1), params)[: flow.size]
-    return _stacked(flow, y, acceleration)
+    rows = jnp.concatenate([y, time], axis=-1)
+    if flow.anywhere.looks_up:
+        return _stacked(flow, y, flow.anywhere.of_rows(rows, params)[: flow.size])
+    return _stacked(flow, y, jnp.moveaxis(outputs(flow.anywhere, flow.size, rows, params), -1, 0))
 
 
 def _on_pieces(borders, scalars, pieces) -> tuple[tuple, tuple]:

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from lagjax._derivation import Derivation
+from lagjax._machine_code._lines import outputs
 from lagjax._native import Guards
 from lagjax._program import Program, lower
 
@@ -94,8 +95,10 @@ def moved_with(surfaces: Surfaces, program: Program, k: int) -> Callable:
 
     def rates(t, y, numbers):
         n = y.shape[0] // 2
-        acceleration = jnp.stack(program.at(jnp.append(y, t), numbers)[:n])
-        return surfaces.complete.at(jnp.append(y, t), numbers)[count + k], jnp.concatenate([y[n:], acceleration])
+        acceleration = outputs(program, n, jnp.append(y, t), numbers)
+        return outputs(surfaces.complete, 2 * count, jnp.append(y, t), numbers)[count + k], jnp.append(
+            y[n:], acceleration
+        )
 
     def moved(taken, t, y, numbers):
         value, (rate, slope) = surfaces.values.at(jnp.append(y, t), numbers)[k], rates(t, y, numbers)

@@ -1,0 +1,173 @@
+"""Straight lines as functions of JAX that NumPy evaluates: for programs that XLA would compile for minutes.
+
+With y = g(x) a line and D its derivative by x, there are three functions,
+
+    value     g(x)
+    forward   D(x) v      linear in v, transposed: back
+    back      D(x)ᵀ w     linear in w, transposed: forward
+
+and their own derivatives are these again, of other lines, so that there are derivatives of every order in every mode:
+
+    d value   = forward(x, dx)
+    d forward = forward(x, dv) + forward of the line (x, v) ↦ D(x) v, along dx
+    d back    = back(x, dw)    + forward of the line (x, w) ↦ D(x)ᵀ w, along dx
+
+A line is differentiated on its graph (`_program._pushforward`, `_program._transpose`), which takes milliseconds.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from lagjax._custom import batch_in_front
+from lagjax._machine_code._call import on_host
+from lagjax._program import Program, StraightLine, evaluate, pullback, pushforward
+
+# Operations of a program that XLA compiles; NumPy evaluates a larger one. The second derivative of a motion by its
+# duration took 14 s more of compilation than NumPy takes in all for 188 operations, and minutes for 672. In a compiled
+# loop a small one is faster through XLA. Twice as many would cost several seconds of compilation.
+LARGEST_COMPILED = 100
+
+
+def outputs(program: Program, count: int, first, numbers):
+    """The first `count` outputs (…, count) for the first inputs (…, m) and the others (…, P), by XLA or by NumPy."""
+    if not is_large(program):
+        return jnp.stack(program.at(first, numbers)[:count], axis=-1)
+    shape = jnp.broadcast_shapes(first.shape[:-1], numbers.shape[:-1])
+    parts = [jnp.broadcast_to(x, (*shape, x.shape[-1])) for x in (first, numbers)]
+    return _line_of(program, count)(jnp.concatenate(parts, axis=-1))
+
+
+def is_large(program: Program) -> bool:
+    """Whether NumPy evaluates it: one of many operations, on floats alone, that looks up no tables."""
+    floats = all(dtype.kind == "f" for dtype in program.dtypes)
+    return floats and program.operations > LARGEST_COMPILED and not program.looks_up
+
+
+@functools.lru_cache(maxsize=64)
+def _line_of(program: Program, count: int) -> "Line":
+    line = StraightLine(program.nodes, program.kinds, program.outputs[:count])
+    return Line(line, program.size, program.size)
+
+
+class Line:
+    """A straight line from `size` floats x, with the lines of its derivatives by the first `count`; by identity.
+
+    What a line of derivatives is linear in comes after its first `count` inputs.
+    """
+
+    def __init__(self, line: StraightLine, size: int, count: int):
+        self.line, self.size, self.count = line, size, count
+
+    @property
+    def outputs(self) -> int:
+        """How many numbers it gives."""
+        return len(self.line.outputs)
+
+    @functools.cached_property
+    def forward(self) -> "Line":
+        """(x, v) ↦ D(x) v, v (count,)."""
+        return self._beside(pushforward(self.line, self._dtypes, range(self.count), range(self.outputs)), self.count)
+
+    @functools.cached_property
+    def back(self) -> "Line":
+        """(x, w) ↦ D(x)ᵀ w, w (outputs,)."""
+        return self._beside(pullback(self.line, self._dtypes, range(self.count), range(self.outputs)), self.outputs)
+
+    @property
+    def _dtypes(self) -> list[np.dtype]:
+        return [np.dtype(float)] * self.size
+
+    def _beside(self, line: StraightLine, linear: int) -> "Line":
+        return Line(line, self.size + linear, self.size)
+
+    def __call__(self, x):
+        """g(x) of rows x (…, inputs), under every transformation of JAX."""
+        return value_p.bind(x, line=self)
+
+
+# ---- on the host: NumPy arrays with any batch axes in front ----------------------------------------------------------
+
+
+def _rows(line: StraightLine, *parts) -> np.ndarray:
+    batch = parts[0].shape[:-1]
+    columns = [column for part in parts for column in part.reshape(-1, part.shape[-1]).T]
+    return evaluate(line, columns).T.reshape(*batch, len(line.outputs))
+
+
+def _value(x, *, line: Line):
+    return [_rows(line.line, x)]
+
+
+def _forward(x, v, *, line: Line):
+    return [_rows(line.forward.line, x, v)]
+
+
+def _back(x, w, *, line: Line):
+    return [_rows(line.back.line, x, w)]
+
+
+# ---- primitives ------------------------------------------------------------------------------------------------------
+
+value_p, forward_p, back_p = (Primitive(f"lagjax_line_{name}") for name in ("value", "forward", "back"))
+
+
+def _derivative_of_value(primals, tangents, *, line: Line):
+    (x,), (dx,) = primals, tangents
+    return value_p.bind(x, line=line), forward_p.bind(x, ad.instantiate_zeros(dx), line=line)
+
+
+def _derivative_of_linear(primitive, of):
+    """That of `primitive`, (x, v) ↦ A(x) v, whose line with inputs (x, v) is `of(line)`."""
+
+    def rule(primals, tangents, *, line: Line):
+        (x, v), (dx, dv) = primals, tangents
+        total = None if isinstance(dv, ad.Zero) else primitive.bind(x, dv, line=line)
+        if not isinstance(dx, ad.Zero):
+            more = forward_p.bind(jnp.concatenate([x, v], axis=-1), dx, line=of(line))
+            total = more if total is None else total + more
+        return primitive.bind(x, v, line=line), total
+
+    return rule
+
+
+def _transposed(primitive):
+    return lambda cotangent, x, v, *, line: [None, primitive.bind(x, ad.instantiate_zeros(cotangent), line=line)]
+
+
+def _batched(primitive):
+    return lambda arrays, axes, *, line: (primitive.bind(*batch_in_front(arrays, axes), line=line), 0)
+
+
+def _register(primitive, host, width) -> None:
+    """A primitive that `host` computes, `width(line)` numbers a row: at once, or in a callback of what XLA runs."""
+
+    def shape(x, *_, line: Line):
+        return ShapedArray((*x.shape[:-1], width(line)), np.dtype(float))
+
+    def at_once(*arrays, line: Line):
+        with jax.enable_x64(True):
+            return jax.device_put(host(*map(np.asarray, arrays), line=line)[0])
+
+    def compiled(*arrays, line: Line):
+        return on_host(functools.partial(host, line=line), [shape(*arrays, line=line)], *arrays)[0]
+
+    primitive.def_abstract_eval(shape)
+    primitive.def_impl(at_once)
+    mlir.register_lowering(primitive, mlir.lower_fun(compiled, multiple_results=False), platform="cpu")
+    batching.primitive_batchers[primitive] = _batched(primitive)
+
+
+_register(value_p, _value, lambda line: line.outputs)
+_register(forward_p, _forward, lambda line: line.outputs)
+_register(back_p, _back, lambda line: line.count)
+ad.primitive_jvps[value_p] = _derivative_of_value
+ad.primitive_jvps[forward_p] = _derivative_of_linear(forward_p, lambda line: line.forward)
+ad.primitive_jvps[back_p] = _derivative_of_linear(back_p, lambda line: line.back)
+ad.primitive_transposes[forward_p] = _transposed(back_p)
+ad.primitive_transposes[back_p] = _transposed(forward_p)
