@@ -16,6 +16,7 @@ A line is differentiated on its graph (`_program._pushforward`, `_program._trans
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ from jax.interpreters import ad, batching, mlir
 
 from lagjax._custom import batch_in_front
 from lagjax._machine_code._call import on_host
-from lagjax._program import Program, StraightLine, evaluate, pullback, pushforward
+from lagjax._program import Program, StraightLine, evaluate, pullback, pushforward, steps_of
 
 # Operations of a program that XLA compiles; NumPy evaluates a larger one. The second derivative of a motion by its
 # duration took 14 s more of compilation than NumPy takes in all for 188 operations, and minutes for 672. In a compiled
@@ -70,6 +71,11 @@ class Line:
         return len(self.line.outputs)
 
     @functools.cached_property
+    def steps(self) -> Callable:
+        """What NumPy does one after the other, for a precision; it takes longer to write down than to do."""
+        return functools.cache(functools.partial(steps_of, self.line))
+
+    @functools.cached_property
     def forward(self) -> "Line":
         """(x, v) ↦ D(x) v, v (count,)."""
         return self._beside(pushforward(self.line, self._dtypes, range(self.count), range(self.outputs)), self.count)
@@ -94,22 +100,22 @@ class Line:
 # ---- on the host: NumPy arrays with any batch axes in front ----------------------------------------------------------
 
 
-def _rows(line: StraightLine, *parts) -> np.ndarray:
+def _rows(line: Line, *parts) -> np.ndarray:
     batch = parts[0].shape[:-1]
     columns = [column for part in parts for column in part.reshape(-1, part.shape[-1]).T]
-    return evaluate(line, columns).T.reshape(*batch, len(line.outputs))
+    return evaluate(line.line, columns, line.steps).T.reshape(*batch, line.outputs)
 
 
 def _value(x, *, line: Line):
-    return [_rows(line.line, x)]
+    return [_rows(line, x)]
 
 
 def _forward(x, v, *, line: Line):
-    return [_rows(line.forward.line, x, v)]
+    return [_rows(line.forward, x, v)]
 
 
 def _back(x, w, *, line: Line):
-    return [_rows(line.back.line, x, w)]
+    return [_rows(line.back, x, w)]
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------

@@ -77,6 +77,7 @@ __all__ = [
     "pullback",
     "pushforward",
     "series",
+    "steps_of",
     "traced",
     "with_tangents",
     "without_collections",
