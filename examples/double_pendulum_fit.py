@@ -3,7 +3,9 @@
 The file holds `Y_id` (segments, 2n, samples), of which the first n signals are the angles from the upright, and their
 spacing `dt` in seconds: free swings of a physical double pendulum, which Kaheman, Fasel, Bramburger, Strom, Kutz and
 Brunton published with "The Experimental Multi-Arm Pendulum on a Cart" (HardwareX 2023, arXiv:2205.06231, MIT licence).
-Recordings of a single or a triple pendulum in such a file need no other program.
+Recordings of a single or a triple pendulum in such a file need no other program: the number of arms is that of the
+signals. Samples that are missing are NaN, as behind the end of a segment that is shorter than others; angles may be
+wound, or taken modulo 2π.
 
 The law of friction is chosen by leaving segments out of those that are fitted; the last ones are only predicted.
 
@@ -19,9 +21,9 @@ import numpy as np
 
 import lagjax
 
-HELD_OUT = 6  # segments at the end, which no fit sees
-EVERY = 16  # of the samples at 1 kHz of arms that swing at 3 Hz: residuals are correlated over a hundred
-FIRST = 0.1  # seconds from which the start of a held-out segment is found
+HELD_OUT = 6  # segments at the end, which no fit sees, or a quarter of few
+SPACING = 0.016  # s between samples of arms that swing at 3 Hz: at 1 kHz residuals are correlated over a hundred
+FIRST, FEWEST = 0.1, 8  # seconds from which the start of a held-out segment is found, and samples at least
 SMOOTH = 0.1  # rad/s over which dry friction changes its sign
 SLOW = 1e-3  # m/s below which drag is linear
 FOLDS = 4
@@ -79,11 +81,36 @@ SCENE = lagjax.System(lagrangian, forces=friction)
 
 
 def recordings(file):
-    """The angles of every segment."""
+    """The angles of every segment, from its first to its last sample."""
     with np.load(file) as data:
-        angles, dt = np.moveaxis(data["Y_id"], 1, 2), float(data["dt"])
-    ts = dt * np.arange(angles.shape[1])
-    return [lagjax.Record(ts, values[:, : values.shape[1] // 2]) for values in angles]
+        signals, dt = np.asarray(data["Y_id"], float), float(data["dt"])
+    if signals.ndim != 3 or signals.shape[1] % 2 or not dt > 0:
+        raise SystemExit(f"Y_id must be (segments, 2n, samples), angles before rates, and dt positive: {signals.shape}")
+    angles = np.moveaxis(signals[:, : signals.shape[1] // 2], 1, 2)
+    records = []
+    for values in angles:
+        measured = np.flatnonzero(np.isfinite(values).any(axis=1))
+        if len(measured) > 1:
+            values = values[measured[0] : measured[-1] + 1]
+            records.append(lagjax.Record(dt * np.arange(len(values)), np.stack([unwound(x) for x in values.T], axis=1)))
+    if not records:
+        raise SystemExit("Y_id holds no angle that was measured.")
+    return records
+
+
+def unwound(angle):
+    """An angle (T,) without jumps of 2π, where all of it is within one turn; a gap may hide more than half a turn."""
+    measured = np.isfinite(angle)
+    if measured.any() and np.ptp(angle[measured]) <= 2 * np.pi:
+        angle = angle.copy()
+        angle[measured] = np.unwrap(angle[measured])
+    return angle
+
+
+def thinned(record):
+    """A record with the samples that a fit needs."""
+    step = max(1, round(SPACING / record.ts[1])) if len(record) > 1 else 1
+    return lagjax.Record(record.ts[::step], record.values[::step])
 
 
 def fit_law(records, law, near=None):
@@ -101,13 +128,16 @@ def fit_law(records, law, near=None):
 
 def prediction_errors(fit, records):
     """Root mean square errors of all angles over half a second and over all, (2, n), in mrad."""
-    errors = []
+    early, late = [], []
     for record in records:
-        begin = int(np.searchsorted(record.ts, FIRST))
+        complete = np.flatnonzero(np.isfinite(record.values).all(axis=1))
+        count = max(FEWEST, int(np.searchsorted(record.ts, FIRST)))
+        begin = complete[min(count, len(complete)) - 1] + 1
         start = fit.predict(lagjax.Record(record.ts[:begin], record.values[:begin])).start
-        errors.append(fit.predict(lagjax.Record(record.ts, record.values, start=start)).residuals)
-    errors, half = 1e3 * np.array(errors), int(np.searchsorted(records[0].ts, 0.5)) + 1
-    return np.sqrt([np.mean(errors[:, :half] ** 2, axis=(0, 1)), np.mean(errors**2, axis=(0, 1))])
+        error = 1e3 * fit.predict(lagjax.Record(record.ts, record.values, start=start)).residuals
+        early.append(error[: int(np.searchsorted(record.ts, 0.5)) + 1])
+        late.append(error)
+    return np.sqrt([np.nanmean(np.concatenate(some) ** 2, axis=0) for some in (early, late)])
 
 
 def main(argv=None):
@@ -118,20 +148,23 @@ def main(argv=None):
     jax.config.update("jax_enable_x64", True)
 
     records = recordings(options.file)
-    seen = [lagjax.Record(r.ts[::EVERY], r.values[::EVERY]) for r in records[:-HELD_OUT]]
-    held = records[-HELD_OUT:]
+    count = len(records) - min(HELD_OUT, max(len(records) // 4, int(len(records) > 1)))
+    seen, held = [thinned(record) for record in records[:count]], records[count:]
     fits = {}
     for name, law in LAWS.items():
         if options.law in (None, name):
             fits[name] = fit_law(seen, law, next(iter(fits.values()), None))
     name, fit = next(iter(fits.items()))
     if len(fits) > 1:
-        comparison = fit.compare({other: fits[other] for other in fits if other != name}, folds=min(FOLDS, len(seen)))
+        folds = min(FOLDS, len(seen)) if len(seen) > 1 else 0
+        comparison = fit.compare({other: fits[other] for other in fits if other != name}, folds=folds)
         print(f'{len(seen)} segments; "this" is {name}\n{comparison}\n')
         name = name if comparison.best == "this" else comparison.best
     print(f"{name}\n{fits[name]}")
+    if not held:
+        return fits, None
     errors = prediction_errors(fits[name], held)
-    print(f"\n{len(held)} segments that no fit saw, from their first {FIRST:g} s:")
+    print(f"\n{len(held)} segment{'s' * (len(held) > 1)} that no fit saw, from their first {FIRST:g} s:")
     for span, each in zip(("over 0.5 s", "over all"), errors, strict=True):
         print(f"{span:<12}{' / '.join(f'{error:.2f}' for error in each)} mrad")
     return fits, errors
