@@ -91,6 +91,15 @@ def test_where_few_draws_of_the_expansion_are_accepted_the_sampler_follows_the_e
     np.testing.assert_allclose(shares, [0.1, 0.5, 0.9], atol=0.04)
 
 
+@pytest.mark.slow
+def test_chains_that_stand_still_along_the_expansion_are_not_kept(bent, monkeypatch):
+    # A gradient that is not finite stops every trajectory at its first step.
+    monkeypatch.setattr(_surrogate.Surrogate, "__call__", lambda self, z: jnp.sqrt(0.0 * z[0]))
+    drawn = bent.sample(20, seed=1, chains=2)
+    assert "the chains did not move" in drawn.attrs["sampler"]
+    assert len(np.unique(drawn.posterior["params['k']"].values)) > 20
+
+
 def test_an_expansion_that_would_not_fit_says_so(bent, monkeypatch):
     monkeypatch.setattr(_surrogate, "_LARGEST", 5)
     assert "more than 5" in str(_surrogate.expanded(bent.log_density()))

@@ -67,7 +67,10 @@ def draw(density: Density, draws: int, chains: int, seed: int) -> Draws:
     if isinstance(surrogate, str):
         return _along_exact(density, draws, chains, seed, surrogate)
     warming, weighing, going = jax.random.split(jax.random.key(seed), 3)
-    sampler, state = _tuned(surrogate, chains, warming)
+    tuned = _tuned(surrogate, chains, warming)
+    if isinstance(tuned, str):
+        return _along_exact(density, draws, chains, seed, tuned)
+    sampler, state = tuned
     exact = jax.jit(jax.vmap(lambda z: density(surrogate.x(z))))
     share, start = _weighed(sampler, exact, state, weighing)
     if share < _LEAST:
@@ -103,8 +106,9 @@ def _keys(key, k: int, state):
     return jax.random.split(jax.random.fold_in(key, k), len(state.position))
 
 
-def _tuned(surrogate: Surrogate, chains: int, key) -> tuple[Sampler, Any]:
-    """The sampler with a step and a metric from its own draws of π*; and where its chains are."""
+def _tuned(surrogate: Surrogate, chains: int, key) -> tuple[Sampler, Any] | str:
+    """The sampler with a step and a metric from its own draws of π*, and where its chains are; or a sentence that says
+    that these do not move."""
     blackjax = _blackjax()
     kernel = blackjax.nuts.build_kernel()
     size, dtype = len(surrogate.centre), surrogate.density.dtype
@@ -133,6 +137,8 @@ def _tuned(surrogate: Surrogate, chains: int, key) -> tuple[Sampler, Any]:
             tuning = update(tuning, info.acceptance_rate.mean())
             path.append(np.asarray(state.position, float))
         late, step = np.stack(path[count // 2 :], axis=1), float(jnp.exp(tuning.log_step_size_avg))
+    if not (np.ptp(late, axis=1) > 0).all():  # there is no effective number of draws then
+        return "Along the expansion of its residuals to second order the chains did not move."
     effective = float(np.asarray(blackjax.ess(late, chain_axis=0, sample_axis=1)).min())
     inner = math.ceil(late.shape[0] * late.shape[1] / max(effective, 1.0))
     return Sampler(move, step, metric, min(max(inner, 1), _MOST_INNER)), state
