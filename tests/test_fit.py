@@ -399,9 +399,10 @@ def along(directions, rows=1, states=2):
 @pytest.mark.slow
 def test_restitution_comes_out_of_the_times_of_bounces():
     example = importlib.import_module("bounces")
-    params, half, residuals = example.main([])
-    assert (np.abs(params - example.TRUTH) < 2 * half).all()
-    assert half[1] < 2e-3 and np.sqrt(np.mean(residuals**2)) < 1.5 * example.SIGMA
+    fit = example.main([])
+    low, high = fit.intervals(0.999)
+    assert fit.ok and all(low[name] < example.TRUTH[name] < high[name] for name in example.TRUTH)
+    assert high["e0"] - low["e0"] < 4e-3 and fit.rms["times"] < 1.5 * example.SIGMA
 
 
 @pytest.mark.slow
