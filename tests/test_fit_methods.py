@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._fit import _transforms, _weak
+from lagjax._fit import _search, _transforms, _weak
 from lagjax._fit._segments import Reader, time_scale
 
 TS = np.linspace(0.0, 4.0, 101)
@@ -356,7 +356,8 @@ def test_gradients_come_to_the_same_as_gauss_and_newton():
 
 
 @pytest.mark.slow
-def test_a_network_learns_the_potential_of_its_recordings():
+def test_a_network_learns_the_potential_of_its_recordings(monkeypatch):
+    monkeypatch.setattr(_search, "_STEPS", 1500)  # half of them: enough for what is asked here
     example = importlib.import_module("learned_potential")
     values, exact, starts = example.recordings()
     fit = example.learned(values[:9])
