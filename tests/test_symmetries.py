@@ -214,3 +214,14 @@ def test_what_is_not_the_same_motion_is_said_where():
     nothing = lagjax.System(lambda q, v: q * v)
     assert not lagjax.same_motion(FREE, nothing, 0.0, 1.0).same
     assert not lagjax.same_motion(nothing, FREE, 0.0, 1.0).same
+
+
+@pytest.mark.slow
+def test_one_piece_is_not_the_whole():
+    # From q = 1 on |q| looks like q, under whose constant force L changes by dG/dt when it is moved.
+    wedge = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.abs(q[0]))
+    conserved = lagjax.conserved_quantities(wedge, jnp.array([1.0, 0.2]), jnp.array([0.3, 1.0]))
+    assert [one.name for one in conserved] == ["energy", "momentum of q[1]", "centre of mass along axis 1"]
+    assert "piecewise" in str(conserved)
+    slope = lagjax.System(lambda q, v: 0.5 * v @ v - q[0])
+    assert not lagjax.same_motion(wedge, slope, jnp.array([1.0, 0.2]), jnp.array([0.3, 1.0]))

@@ -63,16 +63,24 @@ def gauge_of(scene: Scene, fields: Fields, weights: np.ndarray, k: int, changes:
 
 
 def is_right(gauge: Callable, scene: Scene, k: int, changes: Changes, states: State) -> bool:
-    """Whether ∂G/∂q is what transformation number k asks for, at some of the states of `changes`."""
+    """Whether ∂G/∂q and ∂G/∂t are what transformation number k asks for, at some of the states of `changes`.
+
+    Of a piecewise L each piece may have a G of its own, and there is none for all.
+    """
     restore = scene.layout.restore
 
     @jax.jit
     def gradient(q, t):
-        return jax.vmap(jax.grad(lambda q, t: gauge(restore(q), t, scene.params)))(q, t)
+        return jax.vmap(jax.grad(lambda q, t: gauge(restore(q), t, scene.params), argnums=(0, 1)))(q, t)
 
-    some = slice(0, 4)
-    off = np.abs(np.asarray(gradient(states.q[some], states.t[some])) - changes.slopes[some, k])
-    return bool(off.max() <= _RIGHT * np.abs(changes.slopes[:, k]).max() + _ZERO * changes.sizes[:, k].max())
+    some = slice(0, 16)
+    by_q, by_t = map(np.asarray, gradient(states.q[some], states.t[some]))
+    off, allowed = np.abs(by_q - changes.slopes[some, k]), _ZERO * changes.sizes[:, k].max()
+    off_rest = np.abs(by_t - changes.at_rest[some, k])
+    return bool(
+        off.max() <= _RIGHT * np.abs(changes.slopes[:, k]).max() + allowed
+        and off_rest.max() <= _RIGHT * np.abs(changes.at_rest[:, k]).max() + allowed
+    )
 
 
 def _function(scene: Scene, fields: Fields, weights: np.ndarray, constant: bool) -> Callable:

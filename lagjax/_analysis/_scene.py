@@ -75,6 +75,17 @@ class Scene(NamedTuple):
             return None
         return self.derivation
 
+    @property
+    def piecewise(self) -> bool:
+        """Whether the motion decides on something: a comparison, an absolute value, a floor."""
+        if self.lowered is None:
+            return False
+        try:
+            borders = self.derivation.borders
+        except Unlowerable:
+            return False
+        return borders is not None and bool(borders.switches)
+
     def require_double(self, what: str) -> None:
         """Raise `ValueError` where numbers are single, whose rounding is no proof of anything."""
         if self.layout.dtype != np.float64:

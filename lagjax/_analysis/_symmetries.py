@@ -32,6 +32,10 @@ PyTree = Any
 # 1e-14; what breaks a symmetry by less than this part is not seen.
 _NULL = 1e-10
 
+# How much farther off the states of a piecewise scene are drawn, on both sides of |q| from any q: one piece may have a
+# symmetry that the next one breaks.
+_FAR = 5.0
+
 # What is left of the same at fresh states for a symmetry to be reported.
 _VERIFIED = 1e-8
 
@@ -125,7 +129,8 @@ def conserved_quantities(
     scene.require_double("conserved_quantities")
     if not scene.concrete:
         raise ValueError("conserved_quantities looks at numbers: call it outside of jit, vmap and grad, on one state.")
-    scale = 0.3 * (np.abs(np.asarray(scene.q)) + 1.0)
+    piecewise = scene.piecewise
+    scale = (_FAR if piecewise else 1.0) * 0.3 * (np.abs(np.asarray(scene.q)) + 1.0)
     fields = fields_of(scene.layout, scale, _own(generators, scene.layout))
     count = 8 + 4 * fields.count // scene.layout.size
     of_lagrangian, of_others = _measured(scene, fields, _states(scene, scale, count, seed))
@@ -141,6 +146,8 @@ def conserved_quantities(
         symmetries = [name for name, _ in _chosen(_null_space(of_lagrangian), known, fields, scene.layout.names)]
         broken = [name for name in symmetries if name not in names and not name.startswith(_COMBINATION)]
         notes += [f"not conserved: {name}, by a symmetry of L that a force or a constraint breaks" for name in broken]
+    if piecewise:
+        notes.append("L or a force is piecewise: beyond borders farther off than states were drawn nothing was tested")
     return ConservedQuantities(quantities, tuple(notes))
 
 
