@@ -42,7 +42,7 @@ def refined(place, shape, v, period, work) -> Refined:
     closure, step, floor = np.full((3, len(v)), np.inf)
     slopes, waiting = np.zeros((len(v), 8, 3)), np.arange(len(v))
     for trial in range(TRIALS):
-        y = _start(place[waiting], shape[waiting], w[waiting])
+        y = start(place[waiting], shape[waiting], w[waiting])
         ends = extended.ends(y, period[waiting], work[waiting])
         off = _difference(ends, y)
         closure[waiting] = np.abs(off).max(axis=1)
@@ -61,7 +61,7 @@ def refined(place, shape, v, period, work) -> Refined:
     return Refined(w, period, closure, step, floor)
 
 
-def _start(place, shape, w) -> np.ndarray:
+def start(place, shape, w) -> np.ndarray:
     """The states (N, 2, 8); in each row of `shape` one number at most is not zero, and that is ±1."""
     y = np.zeros((len(w), 2, 8))
     y[:, 0, :4] = place
@@ -78,7 +78,7 @@ def _slopes(place, shape, w, period, work, ends) -> np.ndarray:
     slopes = np.empty((len(w), 8, 3))
     for k in range(2):
         nearby = NEARBY * np.eye(2)[k] * np.ones((len(w), 1))
-        moved = extended.ends(_start(place, shape, extended.add(w, nearby)), period, work)
+        moved = extended.ends(start(place, shape, extended.add(w, nearby)), period, work)
         slopes[..., k] = _difference(moved, ends) / NEARBY
         slopes[:, 4:, k] -= shape[..., k]
     slopes[..., 2] = extended.rate(ends[:, 0])

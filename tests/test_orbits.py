@@ -150,6 +150,7 @@ def test_the_innermost_stable_circle():
 def test_the_figure_of_eight_in_32_digits():
     pytest.importorskip("numba", reason="the benchmark's double-doubles are compiled by numba")
     from benchmarks._orbits_extended import ends
+    from benchmarks._orbits_multipliers import multipliers
     from benchmarks._orbits_refined import refined
 
     v, place, shape = np.array([[0.3471168881, 0.5327249454]]), np.array([[-1.0, 0, 1, 0]]), np.tile(np.eye(2), (2, 1))
@@ -163,6 +164,12 @@ def test_the_figure_of_eight_in_32_digits():
     back = ends(there, orbit.period / 2, np.ones(1))
     back[..., 4:] *= -1
     np.testing.assert_allclose((back - start).sum(axis=1), 0.0, atol=1e-24)
+    # Simó's multipliers, as above, from differences of such motions: of these the digits are known to twelve.
+    fine = multipliers(start, orbit.period, np.ones(1), np.array([2]))
+    turns = np.sort(np.abs(np.angle(fine.values[0]))) / (2 * np.pi)
+    np.testing.assert_allclose(turns, [0.00842272, 0.00842272, 0.29809253, 0.29809253], atol=1e-8)
+    assert fine.error[0] < 1e-12 and fine.known[0] and not fine.unstable[0]
+    np.testing.assert_allclose(np.abs(fine.values), 1.0, rtol=1e-15)
 
 
 def test_a_family_of_swings():
