@@ -186,7 +186,8 @@ def flip_map(options: argparse.Namespace) -> dict[str, Any]:
     colors = matplotlib.colormaps["magma_r"](matplotlib.colors.LogNorm(0.5, DURATION, clip=True)(flip))
     colors[np.isnan(flip)] = (1.0, 1.0, 1.0, 1.0)
     plt.imsave(picture, colors[::-1])
-    Image.open(picture).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(picture, optimize=True)  # 251 colors
+    exact = Image.open(picture).convert("RGB").quantize(256, dither=Image.Dither.NONE)  # it has fewer
+    exact.save(picture, optimize=True)
     print(swept, picture, sep="\n")
     return {"side": options.side, "seconds": wall, "flipped": float(np.isfinite(flip).mean())}
 
