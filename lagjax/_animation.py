@@ -298,8 +298,10 @@ def _traced(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int],
     for name, place in pairs:
         known = isinstance(place, int | np.integer) and name in shapes and -shapes[name][0] <= place < shapes[name][0]
         if not known:
-            lines = ", ".join(f"{name or 'points'!r} of {shape[0]}" for name, shape in shapes.items())
-            raise ValueError(f"trace={trace!r} names no point. Lines are {lines}: give a name, a place, or both.")
+            lines = ", ".join(f"{name or 'points'!r} of {shape[0]} points" for name, shape in shapes.items())
+            raise ValueError(
+                f"trace={trace!r} names no point: there are {lines}. Give a name, a place, or (name, place)."
+            )
     return tuple((name, int(place)) for name, place in pairs)
 
 
