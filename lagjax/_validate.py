@@ -94,6 +94,12 @@ def is_concrete(value) -> bool:
     return not isinstance(value, Tracer)
 
 
+def require_concrete(tree: PyTree, what: str, instead: str) -> None:
+    """Raise `TypeError` where a number of `what` is being traced; `instead` is a sentence about what to do."""
+    if not all(map(is_concrete, jax.tree.leaves(tree))):
+        raise TypeError(f"{what} is being traced by jax.jit, jax.vmap or jax.grad. {instead}")
+
+
 def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
     """Every number that is NaN or infinite, with its name; values that are being traced have none yet."""
     found = []

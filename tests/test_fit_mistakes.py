@@ -1,5 +1,6 @@
 """What a user may hand to `fit` by mistake, or in another form than floats: a sentence, or the right numbers."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -67,3 +68,16 @@ def test_a_masked_sample_is_missing():
 
 def test_whole_numbers_in_a_start_are_real_ones():
     assert fit(lagjax.Record(TS, Q, start=(1, 0))).params["k"] == pytest.approx(4.0, rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("traced", "sentence"),
+    [
+        (lambda k: lagjax.fit(SPRING, lagjax.Record(TS, Q), {"k": k}), "params0 is being traced"),
+        (lambda k: lagjax.Record(TS, k * Q), "values is being traced"),
+    ],
+)
+@pytest.mark.parametrize("transform", [jax.jit, jax.grad])
+def test_a_fit_within_a_transformation_is_a_sentence(traced, sentence, transform):
+    with pytest.raises(TypeError, match=sentence):
+        transform(traced)(3.5)

@@ -29,7 +29,16 @@ from lagjax._fit._many import Waterfall
 from lagjax._fit._motions import motions_of
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Guess, Measured, Record, in_structure, known_start, require_alike, started
+from lagjax._fit._records import (
+    Guess,
+    Measured,
+    Record,
+    in_structure,
+    known_start,
+    require_alike,
+    require_untraced,
+    started,
+)
 from lagjax._fit._residuals import AbstractQuestion, Failure, Question
 from lagjax._fit._result import Covariance, Fit, SignalNoise
 from lagjax._fit._scene import Scene, first_law, require_scene
@@ -142,6 +151,7 @@ def fit(
         raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}; got {method!r}.")
     if hold not in HOLDS:
         raise ValueError(f"hold must be 'zero' or 'linear'; got {hold!r}.")
+    require_untraced(params0, "params0")
     noise = Gaussian() if noise is None else noise
     if not isinstance(noise, AbstractNoise):
         raise TypeError(f"noise must be lagjax.Gaussian() or lagjax.StudentT(); got {noise!r}.")

@@ -11,6 +11,7 @@ import numpy as np
 
 from lagjax._fit._inputs import Table, looked_up, table_of
 from lagjax._layout import Layout, taken_apart
+from lagjax._validate import require_concrete
 
 PyTree = Any
 
@@ -154,6 +155,7 @@ def _times(ts) -> np.ndarray:
 
 def real_numbers(array, name: str, what: str) -> np.ndarray:
     """The numbers of an array, NaN where a masked one hides them. Raises `TypeError` where they are not real."""
+    require_untraced(array, name)
     if getattr(array, "dtype", None) is not None and np.asarray(array).dtype.kind in "mM":
         raise TypeError(
             f"{name} holds dates or durations: give numbers, in seconds (t - t[0]) / np.timedelta64(1, 's')."
@@ -167,6 +169,16 @@ def real_numbers(array, name: str, what: str) -> np.ndarray:
         of = getattr(array, "dtype", None)
         of = f"{type(array).__name__}" + (f" of {of}" if of is not None else "")
         raise TypeError(f"{name} must be {what}; got {of}.") from None
+
+
+def require_untraced(tree: PyTree, what: str) -> None:
+    """Raise `TypeError` where a number of `what` is being traced."""
+    require_concrete(
+        tree,
+        what,
+        "A fit is a search with numbers, how long depends on what is met: fit outside of them. What can be "
+        "differentiated is the density, `Fit.log_density()`, or a loss of your own around lagjax.simulate.",
+    )
 
 
 def one_signal(values: PyTree) -> PyTree:

@@ -16,7 +16,7 @@ from lagjax._failures import sentence
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode, _derivatives, _tolerances, flow_of
 from lagjax._machine_code._steps import KEPT
-from lagjax._orbits._starts import require_concrete
+from lagjax._orbits._starts import require_untraced
 from lagjax._problem import Problem
 from lagjax._results import SUCCESSFUL
 from lagjax._system import System, require_system
@@ -63,7 +63,7 @@ class Arcs:
         Raises `ValueError`, for `what` was asked, where the scene has constraints or no machine code.
         """
         require_system(system)
-        require_concrete((system, params), "A parameter")
+        require_untraced((system, params), "A parameter")
         layout = Layout.of(q0, qdot0)
         if has_constraints(system):
             raise ValueError(

@@ -8,7 +8,7 @@ import numpy as np
 
 from lagjax._layout import Layout
 from lagjax._problem import end_to_end, rows
-from lagjax._validate import as_arrays, is_concrete, require_finite
+from lagjax._validate import as_arrays, require_concrete, require_finite
 
 PyTree = Any
 
@@ -19,7 +19,7 @@ def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layo
     `time`, called `name`, is one number, or an array of as many as there are members on the first axis of every leaf.
     Raises `TypeError` or `ValueError` where that is not so, or a number is not finite or not there yet.
     """
-    require_concrete((q0, qdot0, time), "The start")
+    require_untraced((q0, qdot0, time), "The start")
     for label, value in ((name, time), ("q0", q0), ("qdot0", qdot0)):
         require_finite(value, label)
     times = np.asarray(time, float)
@@ -43,11 +43,11 @@ def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layo
     return times, layout, np.asarray(rows(arrays, [0] * len(arrays), len(times), dtype))
 
 
-def require_concrete(tree: PyTree, what: str) -> None:
+def require_untraced(tree: PyTree, what: str) -> None:
     """Raise `TypeError` where a number of `what` is being traced."""
-    if not all(map(is_concrete, jax.tree.leaves(tree))):
-        raise TypeError(
-            f"{what} is being traced by jax.jit, jax.vmap or jax.grad. Orbits are searched for with numbers, how often "
-            "depends on what is met: search outside of jit, and give many starts as arrays with the members as first "
-            "axis, instead of jax.vmap."
-        )
+    require_concrete(
+        tree,
+        what,
+        "Orbits are searched for with numbers, how often depends on what is met: search outside of jit, and give many "
+        "starts as arrays with the members as first axis, instead of jax.vmap.",
+    )
