@@ -35,6 +35,9 @@ from benchmarks._orbits_refined import refined, start
 
 # The other two bodies, by the one that positions are relative to.
 OTHERS = ((1, 2), (0, 2), (0, 1))
+# A pair of multipliers that is nearer to ±1 may stand on either side of the unit circle: its sum is known to 1e-6.
+APART = 1e-3
+VERDICTS = "stable", "neutral", "unstable", "unknown"
 SPEEDS = np.array([1.0, 1.0, -2.0])  # of the bodies, in (v1, v2)
 GLANCES = 2000  # states of an orbit among which the smallest distances are looked for
 
@@ -173,7 +176,7 @@ def _summary(names, published, table, wall: float, cpu: float) -> None:
         f"In doubles periodic_orbit closes {ok.sum()}, {(ok & (table['arcs'] < 1e-12)).sum()} of them to below 1e-12;"
     )
     print(f"the stability of {sure.sum()} is known, of {(sure & fine).sum()} from motions with 32 digits;", end=" ")
-    print(f"{table['stable'].sum()} are linearly stable. {wall:.0f} s, ", end="")
+    print(", ".join(f"{(_verdicts(table) == word).sum()} are {word}" for word in VERDICTS), end=f". {wall:.0f} s, ")
     print(f"{cpu:.0f} CPU seconds. Median, 90 % and largest of")
     numbers = table["numbers"][..., 0] / np.array([3.0, 3.0, 1.0])
     shown = {
@@ -208,9 +211,19 @@ def _store(path: Path, names, table) -> None:
             digits = [f"{(Decimal(high) + Decimal(low)) / by:.20g}" for (high, low), by in pairs]
             values = [f"{x.real:.9g}{x.imag:+.6g}i" if abs(x.imag) > 1e-9 * abs(x) else f"{x.real:.9g}"
                       for x in table["multipliers"][k, :4]]  # fmt: skip
-            stable = ("stable" if table["stable"][k] else "unstable") if table["known"][k] else "unknown"
             sizes = [f"{table[column][k]:.1e}" for column in SIZES]
-            write([name, *digits, *sizes, _limit(table, k), stable, table["digits"][k], *values])
+            write([name, *digits, *sizes, _limit(table, k), _verdicts(table)[k], table["digits"][k], *values])
+
+
+def _verdicts(table) -> np.ndarray:
+    """Words (N,): stable, neutral, unstable, unknown.
+
+    Neutral orbits have a pair at ±1 as far as digits tell, and none outside of the unit circle: it takes more digits to
+    see on which side the pair has parted. Those of a high resonance with a stable orbit are so.
+    """
+    at_one = (np.abs(np.abs(table["multipliers"].real) - 1 + 1j * table["multipliers"].imag) < APART).any(axis=1)
+    verdicts = np.where(table["stable"], np.where(at_one, "neutral", "stable"), "unstable")
+    return np.where(table["known"], verdicts, "unknown")
 
 
 def _limit(table, k: int) -> str:

@@ -26,7 +26,7 @@ jax.config.update("jax_enable_x64", True)
 plt.style.use("lagjax.figures")
 
 MU = 0.012150585  # Earth and Moon
-ORBITS = 300
+ORBITS = 60
 
 
 def lagrangian(r, v, params):
@@ -93,7 +93,7 @@ for ax, (width, height, middle) in zip(axes, ((1.4, 1.3, 0.0), (0.25, 0.26, 1.0)
     ax.contourf(x, y, np.minimum(jacobi(x, y), 98), levels, colors=shades)
     ax.contour(x, y, jacobi(x, y), levels[:-1], colors="white", linewidths=0.6)
     for orbits in families:
-        for k in range(0, orbits.period.size, 12):
+        for k in range(0, orbits.period.size, 2):
             ring = lagjax.simulate(probe, orbits.q0[k], orbits.qdot0[k], jnp.linspace(0, orbits.period[k], 301), MU)
             ax.plot(*ring.q.T, color=plt.colormaps["plasma"](0.85 * k / orbits.period.size), linewidth=1.1)
     ax.plot([-MU], [0], "o", color="#0072B2", markersize=12)
