@@ -13,9 +13,9 @@ follow as well as the best, within one standard error of the difference over tho
 
 An axis on rails remembers a force of 0.1 N as millimetres for ever after, and what the motor needs at one and the same
 speed drifts by 0.4 N within this record. A fit of all of it at once bends friction after the drift. So a law is fitted
-from rest to every third rest, about two seconds: thirds that were left out are then followed within 2.7 mm, and
-within 4.4 mm by a fit of whole spans. With friction that jumps at q̇ = 0 the sum of squares has a kink at every
-reversal, where searches creep; here the jump is spread over 2 mm/s.
+from rest to every third rest, about two seconds: the three thirds that were left out are then followed to 2.6 mm RMS,
+where a fit of whole spans gives 4.4. With friction that jumps at q̇ = 0 the sum of squares has a kink at every reversal,
+where searches creep; here the jump is spread over 2 mm/s.
 
 python examples/emps.py emps_identification.npz
 python examples/emps.py emps_identification.npz --follow another_record.npz
