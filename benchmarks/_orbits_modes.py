@@ -20,7 +20,7 @@ def main() -> None:
     """Follow both families, print what happens along them, draw the plot."""
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(prog="python -m benchmarks._orbits_modes", description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=120, help="orbits of each family, at most")
+    parser.add_argument("--count", type=int, default=300, help="orbits of each family, at most")
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
     options = parser.parse_args()
     families = modes(options.count)
