@@ -103,7 +103,7 @@ def _until(ready, seconds: float = 40.0):
 
 def _screenshot(sync, address: str, path: Path) -> str:
     """The text of a page once the motion is there, and its picture at `path`, by Chromium's own protocol."""
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:  # its processes may end after it
         command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1700,1000"]
         command += [f"--user-data-dir={profile}", "--remote-debugging-port=0", address]
         browser = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

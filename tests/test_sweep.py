@@ -424,11 +424,19 @@ def test_another_kind_of_cpu_goes_on_and_is_told(tmp_path, undisturbed, monkeypa
 
 
 @pytest.mark.slow
-def test_a_store_whose_creation_was_interrupted_is_made_anew(tmp_path, undisturbed):
-    swept(tmp_path)
-    (tmp_path / "store" / ".sweep" / "spec.json").unlink()
+def test_a_store_whose_creation_was_interrupted_is_made_anew(tmp_path, undisturbed, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(_store.Store, "write", interrupted)
+        swept(tmp_path)
+    assert not list(tmp_path.iterdir())
     swept(tmp_path)
     assert digests(tmp_path) == undisturbed
+    (tmp_path / "store" / ".sweep" / "spec.json").unlink()
+    with pytest.raises(FileNotFoundError, match="name another folder, or empty this one"):
+        swept(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -76,8 +76,8 @@ class _Walk:
             return self._parts("method", [("of", thing.__self__), ("function", thing.__func__)])
         if isinstance(thing, functools.partial):
             return self._parts("partial", [("of", thing.func), ("args", thing.args), ("keywords", thing.keywords)])
-        if hasattr(thing, "__wrapped__"):  # as what jax.jit returns
-            return self._parts("wrapped", [("function", thing.__wrapped__)])
+        if (inner := _wrapped(thing)) is not None:
+            return self._parts("wrapped", [("function", inner)])
         return self._parts(self.name(type(thing)), _state(thing))
 
     def _parts(self, kind: str, parts) -> str:
@@ -147,6 +147,15 @@ def _with_attributes(used: dict[str, Any], names: set[str]) -> dict[str, Any]:
     return found
 
 
+def _wrapped(thing: Any) -> Any:
+    """The function within one that `functools.wraps` or `jax.jit` made; None of others.
+
+    What jax.jit returns has no `__wrapped__` any more once it came from another process.
+    """
+    state = thing.__getstate__() if type(thing).__name__ == "PjitFunction" else {}
+    return getattr(thing, "__wrapped__", state.get("fun"))
+
+
 def _is_filled(cell: types.CellType) -> bool:
     try:
         return cell.cell_contents is not cell
@@ -161,7 +170,7 @@ def _library_name(value: Any) -> str | None:
         return None
     if isinstance(value, types.FunctionType) and (value.__closure__ or "<locals>" in name):
         return None
-    compiled = not isinstance(value, type | types.FunctionType | types.MethodType) and not hasattr(value, "__wrapped__")
+    compiled = not isinstance(value, type | types.FunctionType | types.MethodType) and _wrapped(value) is None
     return f"{module}.{name}" if compiled or not _is_users(module) else None
 
 

@@ -85,7 +85,11 @@ class Store:
         """The description. Raises `FileNotFoundError` or `ValueError` where this is no store that can be read."""
         file = self.job / "spec.json"
         if not file.exists():
-            raise FileNotFoundError(errno.ENOENT, f"{self.path} is no store of a sweep: it has no {JOB}/spec.json")
+            raise FileNotFoundError(
+                errno.ENOENT,
+                f"{self.path} is no store of a sweep, for it has no {JOB}/spec.json: name another folder, or empty "
+                "this one",
+            )
         try:
             spec = json.loads(file.read_text())
         except ValueError as why:
