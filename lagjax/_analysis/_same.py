@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from lagjax._analysis._noether import State, euler_lagrange
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene import Scene, spread
 from lagjax._layout import Layout
 from lagjax._system import System, require_system
 
@@ -17,9 +17,6 @@ PyTree = Any
 
 # What may be left of the difference, beside the terms that cancel in it.
 _SAME = 1e-9
-
-# How much farther off the states of piecewise systems are drawn, on both sides of |q| from any q.
-_FAR = 5.0
 
 # Random states, of which rounding decides at none.
 _STATES = 64
@@ -76,7 +73,7 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     if not all(scene.concrete for scene in scenes):
         raise ValueError("same_motion looks at numbers: call it outside of jit, vmap and grad, on one state.")
     piecewise = any(scene.piecewise for scene in scenes)
-    states = _states(scenes[0], seed, _FAR if piecewise else 1.0)
+    states = _states(scenes[0], seed, spread(scenes[0].q, piecewise))
     (of_a, size_a), (of_b, size_b) = (map(np.asarray, _equations(states, *scene.arguments)) for scene in scenes)
     well = np.isfinite(of_a).all(axis=1) & np.isfinite(of_b).all(axis=1)
     if well.sum() < _STATES // 4:
@@ -99,12 +96,12 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     return SameMotion(bool(same), factor, residual, _place(scenes[0].layout, states, int(state), int(coordinate)))
 
 
-def _states(scene: Scene, seed: int, far: float) -> State:
+def _states(scene: Scene, seed: int, scale: np.ndarray) -> State:
     draws = np.random.default_rng(seed).uniform(-1, 1, (3, _STATES, scene.layout.size))
     q, qdot = np.asarray(scene.q), np.asarray(scene.qdot)
     speed = 0.3 + np.abs(qdot)
     t = np.random.default_rng(seed + 100).uniform(-1, 1, _STATES)
-    parts = q + far * 0.3 * (1 + np.abs(q)) * draws[0], qdot + speed * draws[1], speed * draws[2], t
+    parts = q + scale * draws[0], qdot + speed * draws[1], speed * draws[2], t
     return State(*(jnp.asarray(x, scene.layout.dtype) for x in parts))
 
 

@@ -19,6 +19,15 @@ from lagjax._validate import as_arrays, is_concrete, require_finite
 PyTree = Any
 Vector = Float[Array, " n"]
 
+# How much farther off the states of a piecewise scene are drawn, on both sides of |q| from any q: one piece may have
+# what the next one has not.
+_FAR = 5.0
+
+
+def spread(q, piecewise: bool) -> np.ndarray:
+    """How far about q (n,) random states are drawn, (n,)."""
+    return (_FAR if piecewise else 1.0) * 0.3 * (1.0 + np.abs(np.asarray(q)))
+
 
 class Scene(NamedTuple):
     """A scene at one state: its functions on vectors, and the numbers they take."""

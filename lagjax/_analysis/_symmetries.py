@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from lagjax._analysis._fields import Fields, fields_of, named
 from lagjax._analysis._gauge import changes_of, gauge_of, is_right
 from lagjax._analysis._noether import State, euler_lagrange, flat_generator, variation
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene import Scene, spread
 from lagjax._arguments import accept
 from lagjax._display import as_printed
 from lagjax._layout import Layout
@@ -31,10 +31,6 @@ PyTree = Any
 # Singular values of the columns, which are of order one, below which a combination is a symmetry. Rounding leaves some
 # 1e-14; what breaks a symmetry by less than this part is not seen.
 _NULL = 1e-10
-
-# How much farther off the states of a piecewise scene are drawn, on both sides of |q| from any q: one piece may have a
-# symmetry that the next one breaks.
-_FAR = 5.0
 
 # What is left of the same at fresh states for a symmetry to be reported.
 _VERIFIED = 1e-8
@@ -130,7 +126,7 @@ def conserved_quantities(
     if not scene.concrete:
         raise ValueError("conserved_quantities looks at numbers: call it outside of jit, vmap and grad, on one state.")
     piecewise = scene.piecewise
-    scale = (_FAR if piecewise else 1.0) * 0.3 * (np.abs(np.asarray(scene.q)) + 1.0)
+    scale = spread(scene.q, piecewise)
     fields = fields_of(scene.layout, scale, _own(generators, scene.layout))
     count = 8 + 4 * fields.count // scene.layout.size
     of_lagrangian, of_others = _measured(scene, fields, _states(scene, scale, count, seed))
