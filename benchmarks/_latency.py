@@ -18,7 +18,7 @@ from benchmarks._cases import Case, double_pendulum
 from benchmarks._contenders import SINGLE, installed
 from benchmarks._measure import seconds
 from lagjax._layout import Layout
-from lagjax._machine_code import flow_of
+from lagjax._machine_code import MachineCode, flow_of
 from lagjax._problem import Problem
 
 TOLERANCE, CALLS, INSIDE = 1e-9, 20, 100
@@ -95,7 +95,7 @@ def _machine_code(case: Case) -> Callable:
     start, ts = _start(case), np.array([[0.0, case.duration]])
     problem = Problem.of(case.scene.system, Layout.of(*start), *start, ts[0], case.scene.params, rtol=TOLERANCE)
     kernel, y0, numbers = flow_of(problem).kernel.of_members(1), problem.y0, problem.vector
-    rtol, atol = map(float, problem.tolerances)
+    rtol, atol = map(float, MachineCode().tolerances(problem, y0))
     return functools.partial(kernel, ts, y0[None], numbers[None], rtol, atol, problem.max_steps)
 
 

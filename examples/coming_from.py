@@ -45,7 +45,7 @@ ours = lagjax.simulate(double_pendulum, q0, qdot0, ts, masses).q
 | `solution.result`, `throw=` | `trajectory.result`, `ok`, `throw=` |
 
 **Stay** if you have a right-hand side and no Lagrangian, or an equation that is stochastic or controlled, or stiff.
-lagjax itself integrates by diffrax in float32 and on GPUs.
+lagjax itself integrates by diffrax on GPUs.
 
 A loop of small operations, which the solution of an ODE is, costs more through XLA on CPUs since jaxlib 0.4.32 (issues
 26145 and 40150 of jax, 615 of diffrax), and some projects stay below that version. The motion below this text, over ten

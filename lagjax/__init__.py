@@ -35,7 +35,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 **Parameters from recordings**
 
 - `fit`: the likeliest parameters with intervals, as a `Fit`
-- `Record`, `Timings`, `Guess`, `Delayed`: what was measured, and how
+- `Record`, `Timings`, `Guess`, `Delayed`, `wrapped`: what was measured, and how
 - `Gaussian`, `StudentT`: the noise
 - `positive`, `between`, `angle`, `simplex`, `inertia`: what parameters may be
 
@@ -51,72 +51,79 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 - `Animation`: a motion as a film, made by `Trajectory.animate`
 """
 
-from lagjax import plot, scenes
-from lagjax._analysis import (
-    CanonicalTrajectory,
-    ChangedCoordinates,
-    Conserved,
-    ConservedQuantities,
-    Equilibrium,
-    Hamiltonian,
-    Linearization,
-    Modes,
-    Routhian,
-    SameMotion,
-    change_coordinates,
-    conserved_quantities,
-    cyclic_coordinates,
-    equilibrium,
-    hamiltonian,
-    linearize,
-    noether_charge,
-    normal_modes,
-    routhian,
-    same_motion,
-)
-from lagjax._animation import Animation
-from lagjax._check import Finding, Findings, check
-from lagjax._crossings import Crossings, crossings
-from lagjax._diffrax._solvers import FineOutput
-from lagjax._explain import Explanation
-from lagjax._fit import (
-    Delayed,
-    Fit,
-    Gaussian,
-    Guess,
-    Record,
-    StudentT,
-    Timings,
-    angle,
-    between,
-    fit,
-    inertia,
-    positive,
-    simplex,
-)
-from lagjax._health import Health
-from lagjax._hybrid import Hybrid, Transition, simulate_hybrid
-from lagjax._machine_code import MachineCode
-from lagjax._orbits import (
-    Family,
-    LyapunovExponent,
-    Orbit,
-    Path,
-    action,
-    branch_off,
-    family,
-    find_path,
-    lyapunov_exponent,
-    lyapunov_spectrum,
-    periodic_orbit,
-)
-from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
-from lagjax._results import RESULTS, SimulationError
-from lagjax._samples import samples
-from lagjax._simulate import simulate, simulate_batch
-from lagjax._sweep import Statistics, Status, Sweep, latin_hypercube, random, sobol, sweep
+import ast
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from lagjax._system import System
-from lagjax._trajectory import State, Trajectory, Transitions
+
+if TYPE_CHECKING:  # each is imported where it is first asked for: all of them take as long as JAX itself
+    from lagjax import plot, scenes
+    from lagjax._analysis import (
+        CanonicalTrajectory,
+        ChangedCoordinates,
+        Conserved,
+        ConservedQuantities,
+        Equilibrium,
+        Hamiltonian,
+        Linearization,
+        Modes,
+        Routhian,
+        SameMotion,
+        change_coordinates,
+        conserved_quantities,
+        cyclic_coordinates,
+        equilibrium,
+        hamiltonian,
+        linearize,
+        noether_charge,
+        normal_modes,
+        routhian,
+        same_motion,
+    )
+    from lagjax._animation import Animation
+    from lagjax._check import Finding, Findings, check
+    from lagjax._crossings import Crossings, crossings
+    from lagjax._diffrax._solvers import FineOutput
+    from lagjax._explain import Explanation
+    from lagjax._fit import (
+        Delayed,
+        Fit,
+        Gaussian,
+        Guess,
+        Record,
+        StudentT,
+        Timings,
+        angle,
+        between,
+        fit,
+        inertia,
+        positive,
+        simplex,
+        wrapped,
+    )
+    from lagjax._health import Health
+    from lagjax._hybrid import Hybrid, Transition, simulate_hybrid
+    from lagjax._machine_code import MachineCode
+    from lagjax._orbits import (
+        Family,
+        LyapunovExponent,
+        Orbit,
+        Path,
+        action,
+        branch_off,
+        family,
+        find_path,
+        lyapunov_exponent,
+        lyapunov_spectrum,
+        periodic_orbit,
+    )
+    from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
+    from lagjax._results import RESULTS, SimulationError
+    from lagjax._samples import samples
+    from lagjax._simulate import simulate, simulate_batch
+    from lagjax._sweep import Statistics, Status, Sweep, latin_hypercube, random, sobol, sweep
+    from lagjax._trajectory import State, Trajectory, Transitions
 
 __version__ = "0.1.0"
 __all__ = [
@@ -198,4 +205,29 @@ __all__ = [
     "sobol",
     "sweep",
     "work_precision",
+    "wrapped",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported from where the block above says."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    path = _places()[name]
+    value = (
+        importlib.import_module(f"{path}.{name}") if path == __name__ else getattr(importlib.import_module(path), name)
+    )
+    return globals().setdefault(name, value)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _places() -> dict[str, str]:
+    """The module of every public name: what a type checker reads, so that it is said once."""
+    assert __spec__ is not None and __spec__.loader is not None
+    tree = ast.parse(__spec__.loader.get_source(__name__))  # type: ignore[attr-defined]
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    imports = (node for node in block.body if isinstance(node, ast.ImportFrom))
+    return {alias.name: str(node.module) for node in imports for alias in node.names}

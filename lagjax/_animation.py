@@ -32,6 +32,7 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#00
 _VIDEO, _PAGE = (".mp4", ".m4v", ".mov", ".webm"), (".html", ".htm")
 _LARGEST = 2000.0  # megabytes of a page, more than `FRAMES` make
 _SIZE, _DPI = 4.8, 100  # inches of a side, and dots in one
+_INTERVALS = 8  # between numbers along a side of that length; twelve of six characters would touch
 
 
 class Course(NamedTuple):
@@ -47,20 +48,32 @@ class Course(NamedTuple):
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """q (F, n) at some times; NaN beyond the ends, but for what a float32 rounds away."""
+        return self.states_at(times)[0]
+
+    def states_at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """q and q̇ (F, n) at some times: the cubic between two knots and its derivative; NaN beyond the ends."""
         low, high = sorted((self.t[0], self.t[-1]))
         slack = 1e-6 * (high - low)
-        inside = (times >= low - slack) & (times <= high + slack)
+        inside = ((times >= low - slack) & (times <= high + slack))[:, None]
         sign = np.sign(self.t[-1] - self.t[0])
         place = np.clip(np.searchsorted(sign * self.t, sign * times, side="left") - 1, 0, len(self.t) - 2)
         h = (self.t[place + 1] - self.t[place])[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             x = np.where(h == 0, 0.0, (times[:, None] - self.t[place][:, None]) / h)
-            a, b, end = self.q[place], self.q[place + 1], h * self.before[place + 1]
-            begin = h * self.after[place]
-            begin = np.where(np.isnan(begin), 2 * (b - a) - end, begin)
-            rise = b - a
-            between = a + x * (begin + x * (3 * rise - 2 * begin - end + x * (begin + end - 2 * rise)))
-            return np.where(inside[:, None], np.where(x == 1, b, between), np.nan)
+            a, b, rate = self.q[place], self.q[place + 1], self.before[place + 1]
+            begin, end, rise = h * self.after[place], h * rate, b - a
+            begin = np.where(np.isnan(begin), 2 * rise - end, begin)
+            second, third = 3 * rise - 2 * begin - end, begin + end - 2 * rise
+            q = a + x * (begin + x * (second + x * third))
+            qdot = (begin + x * (2 * second + 3 * x * third)) / h
+            q, qdot = np.where(x == 1, b, q), np.where(x == 1, rate, qdot)
+            return np.where(inside, q, np.nan), np.where(inside, qdot, np.nan)
+
+    def smooth(self, points: int) -> tuple[np.ndarray, np.ndarray]:
+        """q and q̇ (F, n) at the knots and evenly between them, at `points` times at least: for curves."""
+        knots = np.arange(len(self.t))
+        finer = max(1, -(-points // max(1, len(knots) - 1)))
+        return self.states_at(np.interp(np.arange(finer * (len(knots) - 1) + 1) / finer, knots, self.t))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -216,6 +229,12 @@ def _require_positive(**numbers) -> None:
 # ---- where the points are --------------------------------------------------------------------------------------------
 
 
+def courses_of(trajectory, places) -> tuple[Layout, list[Course]]:
+    """The members in these places of a batch, between their outputs; place 0 of one motion is that motion."""
+    members = Members(trajectory)
+    return members.layout, [_course(trajectory, members, k) for k in places]
+
+
 def course_of(trajectory) -> tuple[Layout, Course]:
     """One motion between its outputs. Raises `ValueError` for a batch."""
     members = Members(trajectory)
@@ -321,7 +340,8 @@ def _drawn(figure, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
         for place in [place for traced, place in traces if traced == name]:
             for member in array:
                 faded.append((_trace(ax, color, space, opacity), member[:, place], color))
-    clock = (ax.text2D if space else ax.text)(0.02, 0.98, "", transform=ax.transAxes, va="top")
+    # Above the scene; at a height of its own, as matplotlib looks for none of a title that is hidden.
+    clock = ax.set_title(f"t = {times[-1]:.{_digits(times)}f}", loc="left", y=1.0, fontsize="medium")
 
     def show(i: int):
         for line, member in lines:
@@ -378,6 +398,13 @@ def _axes(figure, positions):
         ax.locator_params(nbins=5)  # more would run into each other
         return ax
     ax.set_aspect("equal")
+    for axis, share, middle in zip(
+        (ax.xaxis, ax.yaxis), (high - low) / (high - low).max(), (low + high) / 2, strict=True
+    ):
+        if _INTERVALS * share < 2:  # a side of a motion along a line: there is room for one number
+            axis.set_ticks([middle], [f"{middle:.3g}"])
+        else:
+            axis.get_major_locator().set_params(nbins=round(_INTERVALS * share))
     ax.grid(color="0.9", linewidth=0.8)
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)

@@ -11,6 +11,7 @@ records (`lagjax.fit`) also for their sampled `inputs`:
 does not ask for `t` never receives it: such a Lagrangian is autonomous by construction, not by inspection.
 """
 
+import difflib
 import functools
 import inspect
 from collections.abc import Callable
@@ -18,6 +19,8 @@ from typing import Any
 
 import equinox as eqx
 import jax
+
+from lagjax._reads import Edition
 
 _BY_POSITION = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 _SHOWN = 40  # characters of a parameter, default and annotation included
@@ -27,32 +30,34 @@ _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_O
 class Function(eqx.Module):
     """A user's function together with the extras it asks for; called with all of them.
 
-    The function is part of the program, its arrays (the weights of a neural Lagrangian) are data: they are separate
-    fields, so that a scene is a valid argument and result of every JAX transformation.
+    The function is part of the program, in the edition of what it read (`_reads.Edition`); its arrays (the weights of a
+    neural Lagrangian) are data: they are separate fields, so that a scene is a valid argument and result of every JAX
+    transformation.
     """
 
     arrays: Any
-    code: Any = eqx.field(static=True)
+    code: Edition = eqx.field(static=True)
     extras: tuple[str, ...] = eqx.field(static=True)
 
     @property
     def name(self) -> str:
         """The name that the user's function was defined with, or that of its class."""
-        code = self.code
+        code = self.code.function
         while isinstance(code, functools.partial):
             code = code.func
         return getattr(code, "__name__", type(code).__name__)
 
     def __call__(self, *roles: Any, **extras: Any) -> Any:
         """The function's result for the roles, by position, and for those of the extras that it asks for, by name."""
-        function = eqx.combine(self.arrays, self.code)
+        function = eqx.combine(self.arrays, self.code.function)
         if "inputs" in self.extras and "inputs" not in extras:
             raise TypeError(
                 f"{self.name} asks for `inputs`, which only the records of lagjax.fit have. To follow a motion with "
                 "sampled inputs, let it ask for `t` instead, and call lagjax.samples(knots, values)(t)."
             )
         try:
-            return function(*roles, **{name: extras[name] for name in self.extras})
+            with self.code.traced():
+                return function(*roles, **{name: extras[name] for name in self.extras})
         except (AttributeError, TypeError) as reason:
             if isinstance(reason, _NO_VALUES):
                 _note(reason, self.name, _USE_JAX)
@@ -66,6 +71,14 @@ class Function(eqx.Module):
         except KeyError as reason:
             _note(reason, self.name, _keys_of(roles, extras))
             raise
+
+
+# A function, as to call a method of an equinox.Module takes as long as half a motion.
+def present(function: Function) -> Function:
+    """A function in its present edition: this one, where nothing that it reads has changed."""
+    fields = object.__getattribute__(function, "__dict__")
+    code = fields["code"].now()
+    return function if code is fields["code"] else Function(fields["arrays"], code, fields["extras"])
 
 
 # Errors of JAX where a function asks a traced number for its value; they are TypeErrors.
@@ -104,7 +117,8 @@ def accept(
     """Check that `function` has the signature of its `role` in a scene; the result passes the extras it asks for.
 
     Raises `TypeError` when it is not callable, when its leading positional parameters are not the `roles`, or when it
-    asks by name for anything that is not among the `extras`. Keywords bound with `functools.partial` are left alone.
+    asks by name for anything that is not among the `extras`. Keywords bound with `functools.partial` are left alone,
+    and so are those with a default, as `m` in `lambda q, v, m=2.0: …`, unless they look like one of the extras.
     """
     *others, last = (f"`{extra}`" for extra in extras)
     by_name = f"{', '.join(others)} and {last}" if others else last
@@ -124,14 +138,22 @@ def accept(
 
     bound = function.keywords if isinstance(function, functools.partial) else {}
     wanted = [p for p in rest if p.name not in bound]
-    unknown = [str(p) for p in wanted if p.name not in extras or p.kind not in _BY_NAME]
+    given = [p for p in wanted if p.name in extras and p.kind in _BY_NAME]
+    needed = {p.name for p in signature.parameters.values() if p.default is p.empty or _meant(p.name, extras)}
+    unknown = [str(p) for p in wanted if p not in given and p.name in needed]
     if unknown:
         raise TypeError(
             f"{role} asks for {', '.join(f'`{name}`' for name in unknown)}, which lagjax does not provide: it must "
             f"have the form {expected}. Put constants into `params`, or bind them with functools.partial."
         )
     arrays, code = eqx.partition(function, eqx.is_array)
-    return Function(arrays, code, tuple(p.name for p in wanted))
+    return Function(arrays, Edition.of(code), tuple(p.name for p in given))
+
+
+def _meant(name: str, extras: tuple[str, ...]) -> bool:
+    """Whether a name may stand for one of the extras, whose default would then be a silent mistake."""
+    known = [*extras, *(["time"] if "t" in extras else [])]
+    return bool(difflib.get_close_matches(name.lower(), known, cutoff=0.7))
 
 
 def _readable(parameter: inspect.Parameter) -> inspect.Parameter:

@@ -98,9 +98,13 @@ def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
     collected = []
 
     def visit(equation, operands, moves, results, place):
-        side = _side_of(equation.primitive.name)
-        if side is not None and any(m and _floating(x) for m, x in zip(moves, operands, strict=True)):
-            collected.append((_name(equation), place, jnp.asarray(side(results[0], *operands), float)))
+        side, name = _side_of(equation.primitive.name), _name(equation)
+        of_floats = any(m and _floating(x) for m, x in zip(moves, operands, strict=True))
+        if side is not None and (of_floats or (name == "cond" and moves[0])):
+            collected.append((name, place, jnp.asarray(side(results[0], *operands), float)))
+        if name in _LOOPS and of_floats:
+            whole = [jnp.ravel(jnp.asarray(x, float)) for x in results if not _floating(x)]
+            collected.extend([(name, place, jnp.concatenate(whole))] if whole else [])
 
     _follow(function, arguments, visit, into_rules=True)
     return collected
@@ -125,7 +129,10 @@ _SIDES = {
     "clamp": lambda result, low, x, high: 1.0 * (x > low) + (x > high),
     "reduce_max": lambda result, x: jnp.argmax(x),
     "reduce_min": lambda result, x: jnp.argmin(x),
+    "lagjax_locate": lambda result, *operands: result,
+    "cond": lambda result, which, *operands: which,
 }
+_LOOPS = ("scan", "while", "sort")  # which decide inside: the whole numbers that come out tell on which side
 
 
 def _side_of(name: str) -> Callable | None:

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._constraints import TOLERANCE
+from lagjax._constraints import TOLERANCE, sizes
 from lagjax._derivation import columns_of, derivation_of, numbers_of
 from lagjax._layout import Layout
-from lagjax._linear import dependent_rows, schur_complements
+from lagjax._linear import dependent_rows, diagonal_scale, schur_complements
 from lagjax._program import Unlowerable
 from lagjax._validate import is_concrete
 
@@ -40,17 +40,17 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
         (start.values, start.size_q, "q0", "it"),
         (start.rates, start.size_qdot, "qdot0", "its rate of change"),
     ):
-        clash = _contradiction(names, values, what, start.lengths, dependent, tolerance, size)
+        clash = _contradiction(names, values, what, start.scaled_lengths, dependent, tolerance, size)
         if clash and (what == "qdot0" or _nothing_to_find(system, q0, qdot0, ts[0], params)):
             raise ValueError(clash)
-        for name, value, length in zip(names, values, start.lengths, strict=True):
-            distance = abs(value) / length
-            if distance > tolerance * size:
+        for k, (name, value) in enumerate(zip(names, values, strict=True)):
+            if abs(value) > tolerance * size * start.scaled_lengths[k]:
+                distance = abs(value) / start.lengths[k]
                 raise ValueError(
                     f"{what} does not satisfy {name}: {quantity} is {value:.3g} there, a distance of {distance:.3g}. "
                     "Put the state on the constraints first: q0, qdot0 = system.project(q0, qdot0, t, params)."
                 )
-    if clash := _contradiction(names, start.gamma, "the acceleration", start.lengths, dependent, tolerance, 1.0):
+    if clash := _contradiction(names, start.gamma, "the acceleration", start.scaled_lengths, dependent, tolerance, 0.0):
         raise ValueError(clash)
 
 
@@ -63,8 +63,9 @@ class _Start(NamedTuple):
     lengths: np.ndarray  # of the rows of G, (m,)
     schur: np.ndarray  # the Schur complement, (m, m)
     driven: np.ndarray  # whether the constraints move what is at rest, ()
-    size_q: np.ndarray  # 1 + max|q|, ()
-    size_qdot: np.ndarray  # 1 + max|q̇|, ()
+    scaled_lengths: np.ndarray  # the same with coordinates in units of 1/√Mᵢᵢ, (m,)
+    size_q: np.ndarray  # the largest coordinate in these units, ()
+    size_qdot: np.ndarray  # the largest velocity, ()
 
 
 def _require_gradients(names: list[str], start: _Start) -> None:
@@ -122,15 +123,16 @@ def inconsistent_members(system, ts, values: dict, axes: dict) -> jax.Array | No
     if not has_constraints(system) or not _all_concrete((ts, values, system)):
         return None
 
-    t = jnp.asarray(ts[0])
-    return jax.vmap(lambda *one: _inconsistent(system, t, *one), in_axes=tuple(axes.values()))(*values.values())
+    t, span = jnp.asarray(ts[0]), jnp.abs(jnp.asarray(ts[-1]) - ts[0])
+    return jax.vmap(lambda *one: _inconsistent(system, t, span, *one), in_axes=tuple(axes.values()))(*values.values())
 
 
 @eqx.filter_jit
-def _inconsistent(system, t, q0: PyTree, qdot0: PyTree, params: PyTree) -> jax.Array:
+def _inconsistent(system, t, span, q0: PyTree, qdot0: PyTree, params: PyTree) -> jax.Array:
     layout = Layout.of(q0, qdot0)
     state = layout.flatten(q0), layout.flatten(qdot0), t, eqx.filter(params, eqx.is_array_like)
-    return system.motion(layout, params).constraints.inconsistent(*state)
+    motion = system.motion(layout, params)
+    return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, span)
 
 
 def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _Start:
@@ -145,6 +147,8 @@ def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree
     except Unlowerable:
         of = {name: np.asarray(value) for name, value in _compiled(system, layout, q, qdot, t, params).items()}
     on_positions = np.arange(len(of["residual"])) < derivation.position_count
+    unit = diagonal_scale(of["mass_matrix"])
+    size_q, size_qdot = sizes(unit, q, qdot, abs(float(ts[-1]) - float(t)) or np.inf)
     return _Start(
         values=np.where(on_positions, of["residual"], 0),
         rates=of["rates"],
@@ -152,8 +156,9 @@ def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree
         lengths=np.linalg.norm(of["jacobian"], axis=1),
         schur=schur_complements(of["mass_matrix"][None], of["jacobian"][None])[0],
         driven=(of["driving"] != 0).any(),
-        size_q=1 + np.abs(q).max(),
-        size_qdot=1 + np.abs(qdot).max(),
+        scaled_lengths=np.linalg.norm(of["jacobian"] * unit, axis=1),
+        size_q=size_q,
+        size_qdot=size_qdot,
     )
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lagjax import _linear
+from lagjax._linear import diagonal_scale
 
 PyTree = Any
 Vector = Float[Array, " n"]  # one number for each coordinate
@@ -84,15 +85,21 @@ class Constraints(eqx.Module):
         positions = self.f(q, t, params).size
         return distances(self.residual(*state), self.rates(*state), self.jacobian_and_gamma(*state)[0], positions)
 
-    def inconsistent(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Bool[Array, ""]:
+    def inconsistent(
+        self, matrix: Float[Array, "n n"], q: Vector, qdot: Vector, t: Time, params: PyTree, span: Time
+    ) -> Bool[Array, ""]:
         """Whether no motion may start from a state: `TOLERANCE` off a constraint, or one of them has no gradient.
 
-        A state that is not a number is inconsistent.
+        Of a motion over this span of time, with the mass matrix M. A state that is not a number is inconsistent.
         """
-        of_q, of_qdot = self.distances(q, qdot, t, params)
-        size_q, size_qdot = 1 + jnp.max(jnp.abs(q)), 1 + jnp.max(jnp.abs(qdot))
-        near = jnp.maximum(of_q / size_q, of_qdot / size_qdot) <= TOLERANCE[np.dtype(q.dtype)]
-        return ~jnp.all(near & self.jacobian_and_gamma(q, qdot, t, params)[0].any(axis=1))
+        state, unit = (q, qdot, t, params), diagonal_scale(matrix)
+        jacobian = self.jacobian_and_gamma(*state)[0]
+        measured = self.residual(*state), self.rates(*state), jacobian * unit, self.f(q, t, params).size
+        of_q, of_qdot = distances(*measured)
+        size_q, size_qdot = sizes(unit, q, qdot, span)
+        tolerance = TOLERANCE[np.dtype(q.dtype)]
+        near = (of_q <= tolerance * size_q) & (of_qdot <= tolerance * size_qdot)
+        return ~jnp.all(near & jacobian.any(axis=1))
 
     # ---- one Newton step back to the constraints ----
 
@@ -112,10 +119,21 @@ class Constraints(eqx.Module):
 
 # ---- how far a state is from its constraints -------------------------------------------------------------------------
 
-# The distance from a constraint, over 1 + max|q| or 1 + max|q̇|, up to which a motion may start: an initial state that
-# was computed or typed with six (three) digits. The first projection takes care of it. It would also take care of more,
-# but by moving the start to where nobody asked it to be.
+# The distance from a constraint, over the size of q or q̇, up to which a motion may start: an initial state that was
+# computed or typed with six (three) digits. The first projection takes care of it. It would also take care of more, but
+# by moving the start to where nobody asked it to be.
 TOLERANCE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
+
+
+def sizes(unit, q, qdot, span):
+    """The sizes of q and of q̇, (…) each, with coordinates in their `unit` (…, n), 1/√Mᵢᵢ: the same for all of them.
+
+    Velocities that would not move q by more than its size in the whole span of time are as large as those that would.
+    Takes q and qdot (…, n) of NumPy or JAX.
+    """
+    xp = unit.__array_namespace__()
+    of_q, of_qdot = (xp.max(xp.abs(x / unit), axis=-1) for x in (q, qdot))
+    return of_q, xp.maximum(of_qdot, of_q / span)
 
 
 def distances(residual, rates, jacobian, positions: int):
@@ -200,10 +218,11 @@ def nearest_consistent(
     """
     if constraints.on_positions is not None:
         q = _nearest_positions(mass_matrix, constraints, q, qdot, t, params)
-    state = q, qdot, t, params
-    qdot = qdot + constraints.velocity_step(mass_matrix(*state), *state)
+    state, given = (q, qdot, t, params), qdot
+    matrix = mass_matrix(*state)
+    qdot = qdot + constraints.velocity_step(matrix, *state)
     jacobian, _ = constraints.jacobian_and_gamma(q, qdot, t, params)
-    reached = _holds(constraints.rates(q, qdot, t, params), jacobian, qdot)
+    reached = _holds(constraints.rates(q, qdot, t, params), jacobian, diagonal_scale(matrix), qdot, given)
     return q, qdot * jnp.where(reached, 1.0, jnp.nan)  # a product, so that derivatives are NaN as well
 
 
@@ -222,6 +241,10 @@ def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, param
     converge. And from some 44 radii beside a circle it does not arrive, without the first loop.
     """
     matrix = mass_matrix(q0, qdot, t, params)
+    unit = jax.lax.stop_gradient(diagonal_scale(matrix))
+
+    def at_rest(q, moved):
+        return jnp.max(jnp.abs(moved / unit)) <= _AT_REST * jnp.finfo(q.dtype).eps * _size(unit, q, q0)
 
     def stationary(place):
         q, nu = place
@@ -237,15 +260,16 @@ def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, param
         return jax.tree.map(jnp.subtract, place, _solve_symmetric_saddle(linear, value))
 
     def find(_, start):
-        nearby = _until_at_rest(shortest_step, start)
-        q, nu = _until_at_rest(newton_step, (nearby[0], start[1]))
+        nearby = _until_at_rest(shortest_step, start, at_rest)
+        q, nu = _until_at_rest(newton_step, (nearby[0], start[1]), at_rest)
 
         def distance(q):
             return jnp.sqrt((q - q0) @ matrix @ (q - q0))
 
         # For a q0 that is consistent both distances are round-off.
-        farther = distance(q) > 1.001 * distance(nearby[0]) + distance(q0 + _rounding(q0))
-        holds = _holds(constraints.f(q, t, params), jax.jacfwd(constraints.f)(q, t, params), q)
+        rounding = _AT_REST * jnp.finfo(q.dtype).eps * _size(unit, q, q0) * q.size
+        farther = distance(q) > 1.001 * distance(nearby[0]) + rounding
+        holds = _holds(constraints.f(q, t, params), jax.jacfwd(constraints.f)(q, t, params), unit, q, q0)
         return jnp.where(holds & ~farther, q, jnp.nan), nu
 
     start = q0, jnp.zeros_like(constraints.f(q0, t, params))
@@ -261,38 +285,41 @@ def _solve_symmetric_saddle(linear: Callable, right: tuple[Vector, Row]) -> tupl
     return x, -multipliers
 
 
-def _until_at_rest(step: Callable, start: tuple[Vector, Row]) -> tuple[Vector, Row]:
+def _until_at_rest(step: Callable, start: tuple[Vector, Row], at_rest: Callable) -> tuple[Vector, Row]:
     """(q, ν) after as many steps as it takes until q moves no more than rounding; NaN if it always does."""
 
     def moves(carry):
         (q, _), moved, count = carry
-        return (moved > _rounding(q)) & (count < _NEWTON_STEPS)
+        return ~at_rest(q, moved) & (count < _NEWTON_STEPS)
 
     def once(carry):
         place, _, count = carry
         new = step(place)
-        return new, jnp.max(jnp.abs(new[0] - place[0])), count + 1
+        return new, new[0] - place[0], count + 1
 
-    (q, nu), moved, _ = jax.lax.while_loop(moves, once, (start, jnp.asarray(jnp.inf, start[0].dtype), 0))
-    return jnp.where(moved <= _rounding(q), q, jnp.nan), nu
+    (q, nu), moved, _ = jax.lax.while_loop(moves, once, (start, jnp.full_like(start[0], jnp.inf), 0))
+    return jnp.where(at_rest(q, moved), q, jnp.nan), nu
 
 
-def _holds(residual: Row, jacobian: Float[Array, "m n"], state: Vector) -> Bool[Array, ""]:
+def _holds(residual: Row, jacobian: Float[Array, "m n"], unit: Vector, *states: Vector) -> Bool[Array, ""]:
     """Whether constraints hold, in which case the steps did not just become small between some that contradict.
 
     A distance of √eps of the state is allowed: the last step of Newton's method was at the level of rounding, so that
     constraints which can hold do so far better, and those that contradict each other are off by far more. The second
-    term is for a gradient that vanishes, where rounding of the others' size is all that can be asked for.
+    term is for a gradient that vanishes, where rounding of the others' size is all that can be asked for. Coordinates
+    are in their `unit` (n,), and as large as in any of the states (n,).
     """
-    lengths, eps = jnp.sqrt(jnp.sum(jacobian**2, axis=1)), jnp.finfo(residual.dtype).eps
+    lengths, eps = jnp.sqrt(jnp.sum((jacobian * unit) ** 2, axis=1)), jnp.finfo(residual.dtype).eps
     allowed = jnp.sqrt(eps) * lengths + 100 * eps * jnp.max(lengths)
-    return jnp.all(jnp.abs(residual) <= allowed * (1 + jnp.max(jnp.abs(state))))
+    return jnp.all(jnp.abs(residual) <= allowed * _size(unit, *states))
 
 
-def _rounding(q: Vector) -> Float[Array, ""]:
-    """Steps of q at which Newton's method is at rest: 16 units of round-off of the largest coordinate, or of 1.
+def _size(unit: Vector, *states: Vector) -> Float[Array, ""]:
+    """The largest coordinate of some states (n,), in the `unit` (n,) of each."""
+    return jnp.max(jnp.abs(jnp.stack(states) / unit))
 
-    The steps of a converged method are some eps times the condition of the scaled saddle point; below 16 an occasional
-    one would not come to rest and count as not found, and twice that still leaves all but one digit.
-    """
-    return 16 * jnp.finfo(q.dtype).eps * (1 + jnp.max(jnp.abs(q)))
+
+# Steps of q at which Newton's method is at rest, in units of round-off of the largest coordinate. Those of a converged
+# method are some eps times the condition of the scaled saddle point; below 16 an occasional one would not come to rest
+# and count as not found, and twice that still leaves all but one digit.
+_AT_REST = 16

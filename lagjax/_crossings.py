@@ -88,7 +88,7 @@ def crossings(
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right; `SimulationError` when the motion cannot
     be followed to its end, or has more crossings than `count`. It needs a scene that has machine code (see
-    `System.explain`): float64, on the CPU.
+    `System.explain`), on the CPU.
 
     Source: Hénon, *On the numerical computation of Poincaré maps*, Physica D 5 (1982) 412, for the problem; Jorba &
     Zou, Exp. Math. 14 (2005) 99, for the series.
@@ -102,7 +102,7 @@ def crossings(
     period = upward.t[1] - upward.t[0]
     ```
     """
-    require_system(system)
+    system = require_system(system)
     require_flag(throw, "throw")
     require_budget(count, "count")
     names, functions = sections_of(section)
@@ -192,6 +192,9 @@ def directions_of(direction, names) -> tuple[int, ...]:
 
 def _surfaces(problem: Problem, functions, directions, names) -> Surfaces:
     """The sections as programs. Raises `ValueError` where there is no machine code, or a section never changes."""
+    if problem.is_single:
+        with jax.enable_x64(True):
+            return _surfaces(problem.in_doubles, functions, directions, names)
     refusal = MachineCode().refuses(problem)
     surfaces = refusal or surfaces_of(problem, functions, directions, "A section")
     if not isinstance(surfaces, str):

@@ -41,7 +41,7 @@ from lagjax._program._borders import Borders, borders
 from lagjax._program._scalars import applied, joined, spread, stacked
 from lagjax._quantities import OwnRules, quantities
 from lagjax._recursion import Recursion, RecursiveElimination
-from lagjax._saddle import SaddleElimination, TwoCoordinates
+from lagjax._saddle import LARGEST_INDEFINITE, IndefiniteElimination, SaddleElimination, TwoCoordinates
 
 PyTree = Any
 
@@ -349,10 +349,14 @@ class Derivation:
         that says where M is not regular enough.
         """
         n, m, regular = self.layout.size, self._rows(saddle), self._regular(saddle)
+        if regular is None and (self.motion.constrained or n > LARGEST_INDEFINITE):
+            raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
         zeros = self.absent("mass_matrix"), self.absent("jacobian")[:m]
         augmented = self.motion.constrained and not (regular_only or (self._constant_mass and regular))
         if n == 2 and not self.motion.constrained:
             elimination = TwoCoordinates(zeros[0], self.layout.dtype)
+        elif regular is None:
+            elimination = IndefiniteElimination(zeros[0], self.layout.dtype)
         else:
             elimination = SaddleElimination(zeros, self.layout.dtype, augmented, regular_only)
         if elimination.operations > OPERATION_BUDGET:
@@ -376,9 +380,8 @@ class Derivation:
     def _by_recursion(self) -> Program | None:
         """q̈ by the recursion in L; None where there is none, or where it does not hold at a sampled state."""
         self._whole  # noqa: B018  (its trace finds the recursion)
-        if self._recursion is None:
+        if self._recursion is None or self._regular(_ACCELERATION) is None:
             return None
-        self._regular(_ACCELERATION)  # raises where M needs pivoting
         elimination, n = RecursiveElimination(self._recursion, self.layout.dtype), self.layout.size
         places, count = elimination.entries, len(elimination.entries)
         positions = [*self._positions("recursion"), *self._positions("force")]
@@ -464,8 +467,8 @@ class Derivation:
         n, columns = self.layout.size, np.random.default_rng(0).uniform(0.3, 1.2, (3, len(self.scalar_shapes))).T
         return [reach * x for x in columns[:n]] + list(columns[n:])
 
-    def _regular(self, saddle: _Saddle) -> bool:
-        """Whether M is regular in general: at all of the sampled states. Raises `Unlowerable` where it needs pivoting.
+    def _regular(self, saddle: _Saddle) -> bool | None:
+        """Whether M is regular in general: at all of the sampled states; None where it need not be positive definite.
 
         Elimination without pivoting is for positive definite M. With constraints M may be singular, and is then
         augmented by GᵀG. The choice is between right answers: a wrong guess is caught by the test on the pivots. A mass
@@ -475,7 +478,7 @@ class Derivation:
         for reach in (1.0, _FAR):
             if (regular := self._definite(saddle, self._samples(reach))) is not None:
                 return regular
-        raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
+        return None
 
     def _definite(self, saddle: _Saddle, samples: list[tuple[np.ndarray, np.ndarray]]) -> bool | None:
         """Whether M is regular at these samples; None where what is eliminated is not positive definite."""

@@ -38,7 +38,8 @@ class Explanation:
     - `energy_conserved`: whether h = p·q̇ − L is constant along every motion.
     - `borders`: where the accelerations are piecewise: the operation (a sign, a whole part) and what it reads; on the
       array path the operation and its line. `borders_located`: whether steps end exactly there; otherwise they go
-      across, and derivatives do not see a jump. `narrow`: functions that are flat until their argument comes near (exp,
+      across, and there are no derivatives of a motion that crosses a jump. `narrow`: functions that are flat until
+      their argument comes near (exp,
       tanh, …), whose arguments machine code watches along every step.
     - `operations`: scalar operations of one acceleration (with constraints in machine code, where M is regular);
       `traced_operations`: of its derivatives before reduction.

@@ -17,7 +17,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from lagjax._custom import batch_in_front, differentiated_as
-from lagjax._results import ENDED_WELL, SimulationError, advice, result_from
+from lagjax._results import ENDED_WELL, RESULTS, SimulationError, advice, code_of, result_from
 
 
 def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
@@ -54,6 +54,8 @@ def sentence(result, t_end, t_last, y_end, names: tuple[str, ...]) -> str | None
         label, failed = member[0] if len(member) == 1 else member, int(np.sum(~np.isin(result, ENDED_WELL)))
         others = f", the first of {failed} that failed" if failed > 1 else ""
         who = f" of member {label}{others} among {result.size},"
+    if result[member] == code_of(RESULTS.derivatives_lost):
+        return f"The motion{who} has no derivatives here. {advice(result_from(result[member]))}"
     t_last, y = np.broadcast_to(t_last, result.shape)[member], y_end[member]
     q, qdot = y[: len(names)], y[len(names) :]
     state = ", ".join(f"{name} = {value:.6g}" for name, value in zip(names[:8], q[:8], strict=True))

@@ -16,12 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._diffrax import LEAST_RTOL as LEAST_RTOL_OF_DIFFRAX
 from lagjax._diffrax._solvers import FineOutput
 from lagjax._display import as_printed
 from lagjax._engine import choose
 from lagjax._layout import Layout
 from lagjax._machine_code import MachineCode
-from lagjax._problem import LEAST_RTOL, LEAST_RTOL_OF_DIFFRAX, Batch, Problem, axes_per_leaf
+from lagjax._problem import LEAST_RTOL, Batch, Problem, axes_per_leaf
 from lagjax._simulate import simulate, simulate_batch
 from lagjax._system import System, require_system
 from lagjax._trajectory import Trajectory
@@ -187,7 +188,7 @@ def work_precision(
 
 def _problem(system: System, q0: PyTree, qdot0: PyTree, ts, params: PyTree, batch_axes) -> Problem:
     """What is to be integrated, as one problem or as that of one member."""
-    require_system(system)
+    system = require_system(system)
     if batch_axes is None:
         return Problem.of(system, Layout.of(q0, qdot0), q0, qdot0, ts, params)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
@@ -281,7 +282,7 @@ def _require_tolerances(tolerances: Sequence[float], dtype: np.dtype, solvers: M
         raise ValueError(f"tolerances must be a sequence of at least one value of rtol; got {tolerances!r}.")
     # What `simulate` asks for, found before the reference is computed; of machine code alone it asks for less.
     by_diffrax = any(isinstance(solver, diffrax.AbstractSolver) for solver in solvers.values())
-    least = (LEAST_RTOL_OF_DIFFRAX if by_diffrax else LEAST_RTOL[dtype]) * float(jnp.finfo(dtype).eps)
+    least = LEAST_RTOL_OF_DIFFRAX * jnp.finfo(dtype).eps if by_diffrax else LEAST_RTOL * np.finfo(float).eps
     for rtol in tolerances:
         if not (np.isfinite(rtol) and rtol >= least):
             raise ValueError(f"Every tolerance must be a number of at least {least:.1e} in {dtype.name}; got {rtol}.")

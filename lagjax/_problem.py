@@ -11,9 +11,9 @@ vector (q, q̇), and the programs of a scene take the parameters as one vector t
 import abc
 import functools
 import types
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -25,7 +25,10 @@ from jaxtyping import Array, Float, Int
 
 from lagjax._arguments import accept
 from lagjax._derivation import Derivation, derivation_of
+from lagjax._doubles import DOUBLE, SINGLE
 from lagjax._layout import Layout, as_vector, dtype_of, taken_apart
+from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
+from lagjax._reads import Edition
 from lagjax._validate import (
     all_finite,
     as_arrays,
@@ -40,14 +43,14 @@ from lagjax._validate import (
 PyTree = Any
 Numbers = Array | np.ndarray
 
-# Defaults by dtype. The absolute tolerance is far below the relative one, so that states in small units keep their
-# digits; it is there for components that pass through zero.
-DEFAULT_RTOL = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
-_ATOL_OVER_RTOL = 1e-3
-# The smallest rtol, in units of round-off. Machine code, which is for float64, sums with the rounding errors carried
-# along: below one unit its truncation, which has a sign, does not add up to more than the round-off of a long run,
-# which has none. The solvers of diffrax reject steps for the round-off of their error estimate below some ten units.
-LEAST_RTOL, LEAST_RTOL_OF_DIFFRAX = {np.dtype("float64"): 0.25, np.dtype("float32"): 10}, 10
+# The default, also for a state in float32, for which machine code computes in float64: 1e-7 would leave roundings alone
+# of the last digit there, and saves a quarter of the time; 1e-9 gives the digits of the run in float64. The absolute
+# tolerance is far below the relative one, and smaller still in a motion that is as small itself: it is there for
+# components that pass through zero.
+DEFAULT_RTOL = 1e-9
+# The smallest rtol, in units of round-off. Machine code sums with the rounding errors carried along: below one unit its
+# truncation, which has a sign, does not add up to more than the round-off of a long run, which has none.
+LEAST_RTOL = 0.25
 
 
 @jax.tree_util.register_dataclass
@@ -58,7 +61,8 @@ class Problem:
     - `system`, `layout`, `params`: the scene, the structure of its coordinates, and its parameters as the user gave
       them, every number an array.
     - `ts` (T,): the output times, of which the first is that of the initial state `y0` (2n,), q and then q̇.
-    - `tolerances`: rtol and atol of a step; an engine with fixed steps does not look at them.
+    - `tolerances`: rtol and atol of a step as they were given, None where those of the engine hold by default
+      (`AbstractEngine.tolerances`).
     - `max_steps`: the budget of steps, rejected ones included.
     - `event`: functions of the user's state that end the motion.
     - `guards`: the same as a program for machine code (`_native.Guards`), whose signs end the motion; of hybrid motion.
@@ -69,7 +73,7 @@ class Problem:
     params: PyTree
     ts: Float[Numbers, " T"]
     y0: Float[Numbers, " states"]
-    tolerances: tuple[Float[Numbers, ""], Float[Numbers, ""]]
+    tolerances: tuple[Float[Numbers, ""] | None, Float[Numbers, ""] | None]
     max_steps: int = field(metadata={"static": True})
     event: diffrax.Event | None = None
     guards: Hashable = field(metadata={"static": True}, default=None)
@@ -125,6 +129,23 @@ class Problem:
     def is_known(self) -> bool:
         """Whether nothing in it is being traced, so that it can be solved at once."""
         return all(map(is_concrete, (self.ts, self.y0, self.vector)))
+
+    @property
+    def is_single(self) -> bool:
+        """Whether its state is in float32."""
+        return self.layout.dtype == SINGLE
+
+    @functools.cached_property
+    def in_doubles(self) -> "Problem":
+        """The same problem in float64; where numbers are being traced, with zeros in their places."""
+
+        def wide(leaf):
+            if not eqx.is_array_like(leaf) or dtype_of(leaf) != SINGLE:
+                return leaf
+            return np.asarray(leaf, DOUBLE) if is_concrete(leaf) else _zeros(np.shape(leaf), DOUBLE)
+
+        params, ts, y0 = jax.tree.map(wide, (self.params, self.ts, self.y0))
+        return replace(self, layout=replace(self.layout, dtype=DOUBLE), params=params, ts=ts, y0=y0)
 
 
 class Batch(eqx.Module):
@@ -216,7 +237,32 @@ class Solution(NamedTuple):
 
 
 class AbstractEngine(abc.ABC):
-    """What integrates: `MachineCode` or `Diffrax`."""
+    """What integrates: `MachineCode` or `Diffrax`. `default_rtol` is what it takes where nothing is asked for."""
+
+    default_rtol: ClassVar[Mapping[np.dtype, float]] = {DOUBLE: DEFAULT_RTOL, SINGLE: DEFAULT_RTOL}
+
+    def rtol(self, problem: Problem) -> Float[Numbers, ""]:
+        """rtol of a step: that of the problem, or by default that of this engine."""
+        rtol, dtype = problem.tolerances[0], problem.layout.dtype
+        return _read_only(self.default_rtol[dtype], dtype) if rtol is None else as_arrays(rtol, dtype)
+
+    def tolerances(self, problem: Problem, y0: Float[Numbers, "*N states"]) -> tuple:
+        """rtol, and atol where it was given; by default at most a sixteenth of rtol times the size of motions.
+
+        Their size is, in these first states, the largest coordinate, or where they begin at zero how far the largest
+        velocity would lead; or the largest velocity, if that is smaller and not zero.
+        """
+        rtol, atol = self.rtol(problem), problem.tolerances[1]
+        if atol is not None:
+            return rtol, as_arrays(atol, problem.layout.dtype)
+        library: Any = np if all(map(_is_on_host, (y0, problem.ts, rtol))) else jnp
+        # Within `jit` an operation on an array of JAX is traced, even where its numbers are known.
+        y0, ts, relative = map(library.asarray, (y0, problem.ts, rtol))
+        far, fast = library.moveaxis(library.abs(y0).reshape(*y0.shape[:-1], 2, -1).max(axis=-1), -1, 0)
+        far = library.where(far > 0, far, fast * abs(ts[-1] - ts[0]))
+        sizes = library.stack([far, fast])
+        size = library.where(sizes > 0, sizes, library.inf).min(initial=library.inf)
+        return rtol, library.minimum(ATOL_OVER_RTOL * relative, ATOL_OVER_MOTION * relative * size)
 
     @abc.abstractmethod
     def refuses(self, problem: Problem) -> str | None:
@@ -320,30 +366,29 @@ def _checked(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, Any]:
     """The fields of a problem that depend neither on its scene nor on its state. Raises where they cannot be right."""
     ts = output_times(ts, dtype)
     require_budget(max_steps, "max_steps")
-    tolerances = DEFAULT_TOLERANCES[dtype] if rtol is None and atol is None else _tolerances(dtype, rtol, atol)
+    tolerances = _tolerances(dtype, rtol, atol)
     event = _event(event, dtype)
     return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
 
 
-def _tolerances(dtype, rtol, atol) -> tuple[Float[Numbers, ""], Float[Numbers, ""]]:
-    """rtol and atol as arrays, the missing ones by default. Raises where no engine meets them."""
-    rtol = DEFAULT_RTOL[dtype] if rtol is None else require_tolerance(rtol, "rtol")
-    atol = rtol * _ATOL_OVER_RTOL if atol is None else require_tolerance(atol, "atol")
-    if reason := too_tight(rtol, dtype, LEAST_RTOL[dtype]):
+def _tolerances(dtype, rtol, atol) -> tuple[Float[Numbers, ""] | None, Float[Numbers, ""] | None]:
+    """rtol and atol as arrays, where they are given. Raises where no engine meets them."""
+    if rtol is not None and (reason := too_tight(require_tolerance(rtol, "rtol"), DOUBLE, LEAST_RTOL)):
         raise ValueError(f"{reason}.")
-    return as_arrays((1.0 * rtol, 1.0 * atol), dtype)
+    if atol is not None:
+        require_tolerance(atol, "atol")
+
+    def array(x):
+        return np.asarray(x, DOUBLE) if x is not None and is_concrete(x) else as_arrays(x, dtype)
+
+    return array(rtol), array(atol)
 
 
+@functools.lru_cache(maxsize=16)
 def _read_only(number: float, dtype) -> np.ndarray:
     array = np.array(number, dtype)
     array.flags.writeable = False
     return array
-
-
-# For all problems: nobody may write to them.
-DEFAULT_TOLERANCES = {
-    dtype: (_read_only(rtol, dtype), _read_only(rtol * _ATOL_OVER_RTOL, dtype)) for dtype, rtol in DEFAULT_RTOL.items()
-}
 
 
 def too_tight(rtol, dtype, least: float) -> str | None:
@@ -362,12 +407,14 @@ def _event(event, dtype) -> diffrax.Event | None:
     """The event with its functions' signatures checked, and with a root finder that uses the dtype's digits."""
     if event is None:
         return None
-    return _known_event(event, dtype) if isinstance(event, types.FunctionType) else _made_event(event, dtype)
+    return (
+        _known_event(Edition.of(event), dtype) if isinstance(event, types.FunctionType) else _made_event(event, dtype)
+    )
 
 
 @functools.lru_cache(maxsize=64)  # a signature takes as long to read as a short motion
-def _known_event(event: Callable, dtype) -> diffrax.Event:
-    return _made_event(event, dtype)
+def _known_event(event: Edition, dtype) -> diffrax.Event:
+    return _made_event(event.function, dtype)
 
 
 def _made_event(event, dtype) -> diffrax.Event:

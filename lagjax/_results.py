@@ -15,7 +15,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     nonfinite_state = (
         "The state or its acceleration is NaN or infinite there, or just ahead. Look at the Lagrangian, its gradient, "
         "the forces and the parameters at that time and state: a square root or norm at zero, a logarithm of a "
-        "negative number, a branch of `where` that is not taken."
+        "negative number, a branch of `where` that is not taken, knots of a look-up that do not increase."
     )
     acceleration_discontinuous = (
         "The acceleration jumps there, and no step fits over it or the budget of steps was spent on it: a corner "
@@ -23,6 +23,12 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "its two sides modes of simulate_hybrid, or round it off over a width that the motion can resolve. Machine "
         "code ends a step at a jump that is merely crossed; diffrax takes some forty steps for it: then raise "
         "max_steps or loosen rtol."
+    )
+    derivatives_lost = (
+        "The acceleration jumps on the way, where the steps of diffrax go across: a derivative over these steps lacks "
+        "what the jump adds, and is another one. Machine code ends a step there and has it: leave solver at None, in "
+        "float64 on a CPU (`System.explain` says why a scene is not for it). Or make the two sides modes of "
+        "simulate_hybrid, or round the jump off over a width that steps resolve, tanh(v / w) for sign(v)."
     )
     max_transitions_reached = "The budget of transitions was spent. Raise max_transitions, or end ts earlier."
     max_crossings_reached = (

@@ -26,11 +26,17 @@ import numpy as np
 
 from lagjax._linear import rank_tolerance, singular_threshold
 from lagjax._program import _scalars as xp
+from lagjax._program._matrices import orthogonalized, row_weights, solve_orthogonalized
 
 # The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
 # digits of an acceleration may be lost, and twelve remain. Twice as large, a few more states take the general variant,
 # three times as expensive; much smaller, the error of an acceleration would exceed the tolerances.
 REGULAR = 1e-4
+
+
+# Coordinates of the largest M that is solved without being positive definite: 12 000 operations, 2 CPU s of LLVM. With
+# twice as many they would be eight times as many, and diffrax begins as soon.
+LARGEST_INDEFINITE = 16
 
 
 class _Pivot(NamedTuple):
@@ -260,6 +266,35 @@ class TwoCoordinates:
             return right / factors
         a, c, d, inverse = (factors[k] for k in range(4))
         return xp.stacked([(d * right[0] - c * right[1]) * inverse, (a * right[1] - c * right[0]) * inverse])
+
+
+class IndefiniteElimination:
+    """M x = b for an M that need not be positive definite, with no more coordinates than `LARGEST_INDEFINITE`.
+
+    Its columns are made orthogonal (`_program._matrices`), where other matrices are eliminated with pivots. `zeros`
+    (n, n) marks what is zero in M whatever the state; the rest is as in `SaddleElimination`.
+    """
+
+    def __init__(self, zeros: np.ndarray, dtype):
+        self.size, self.entries = len(zeros), np.argwhere(np.tril(~zeros | ~zeros.T))
+        self.threshold = singular_threshold(self.size, dtype) ** 2
+        self.operations = 3 * self.size**3
+
+    def factors(self, values) -> tuple[Any, Any]:
+        """Q and R, and whether M is singular: what is left of a column, squared, is round-off."""
+        n, (row, column) = self.size, self.entries.T
+        places = np.full((n, n), len(self.entries))
+        places[row, column] = places[column, row] = np.arange(len(self.entries))
+        matrix = xp.joined([values, np.zeros(1)])[places]
+        factors, weights = orthogonalized(matrix), row_weights(matrix)
+        sizes = [xp.folded("add", weights * matrix[:, j] * matrix[:, j]) for j in range(n)]
+        lost = factors.squares <= self.threshold * xp.stacked(sizes)
+        duals = xp.where(lost[:, None], np.nan, factors.duals)
+        return factors._replace(duals=duals), xp.folded("or", lost)
+
+    def solve(self, factors, right):
+        """x, linear in `right`."""
+        return solve_orthogonalized(factors, right)
 
 
 def elimination_order(mass: np.ndarray, rows: np.ndarray) -> tuple[list[int], np.ndarray]:

@@ -22,6 +22,7 @@ from lagjax._diffrax import Diffrax
 from lagjax._engine import asked_for, choose
 from lagjax._failures import raise_where_failed, sentence
 from lagjax._layout import Layout, halves
+from lagjax._lift import lifted, lifted_batch
 from lagjax._machine_code import MachineCode
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution, axes_per_leaf
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, result_from
@@ -56,20 +57,21 @@ def simulate(
     **Everyday arguments**
 
     - `q0`, `qdot0`: the initial state, pytrees of real floats of one structure. Their dtype (float32, float64) is that
-      of the whole integration.
+      of times, parameters and results. Machine code computes in float64 in any case and rounds once, at the end.
     - `ts`: output times, shape (T,), T ≥ 2, strictly increasing, or strictly decreasing to go back in time.
     - `params`: a pytree of the parameters that the scene's functions take; every number in it is traced and
       differentiable.
     - `rtol`, `atol`: local error per step, |error| ≤ atol + rtol·|y|, in every component of the state (with diffrax, in
-      root mean square over them). By default rtol = 1e-9 in float64 and 1e-5 in float32, and atol = rtol/1000. `atol`
-      is in the units of the state. In float32 the times, the parameters and all arithmetic are float32 too; the errors
-      of the ready scenes are then up to 4e-4 of the size of their motion, over a few periods. `Trajectory.health` tells
-      more.
+      root mean square over them). By default rtol = 1e-9, and 1e-5 in float32 with diffrax, which computes in the
+      precision of the state; and atol = rtol/1000, but at most rtol/16 times the largest coordinate (for velocities the
+      largest velocity): a motion of 1e-10 metres has the digits that it has in ångströms, unless it starts from rest at
+      q = 0. An `atol` that is given is in the units of the state, and taken as it is. Give one where coordinates have
+      different units and some are below 1e-8.
 
     **Rarer ones**
 
-    - `solver`: any diffrax solver for ODEs, or `lagjax.MachineCode()` to insist on machine code. The default, in
-      float64 on a CPU, is Taylor series in machine code made for the scene, of an order that suits `rtol`;
+    - `solver`: any diffrax solver for ODEs, or `lagjax.MachineCode()` to insist on machine code. The default, on a
+      CPU, is Taylor series in machine code made for the scene, of an order that suits `rtol`;
       `System.explain` says where that is not possible. Then the default is `lagjax.FineOutput(diffrax.Dopri8())`, of
       order 8, whose states between steps are about as accurate as those at their ends (diffrax's own interpolation for
       it is less accurate).
@@ -77,11 +79,11 @@ def simulate(
     - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient by diffrax records that many
       times for every member: lower it for the gradient of a large batch.
     - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued event stops the motion where it
-      changes sign. Machine code finds that on its series, without sampling, so that none is missed; a motion that
-      starts on the zero has to leave it first. A Boolean event stops the motion after the step on which it becomes
-      true. Boolean events, and events with a root finder of their own, are integrated by diffrax; there give a
-      direction if the motion starts on the zero. `diffrax.Event` around such functions sets the direction and the root
-      finder.
+      changes sign. Machine code finds that on its series, without sampling, so that none is missed. A motion that
+      starts on the zero, to rounding, has to leave it first; with a direction only if it leaves the other way, and else
+      it ends at once. A Boolean event stops the motion after the step on which it becomes true. Boolean events, and
+      events with a root finder of their own, are integrated by diffrax; there give a direction if the motion starts on
+      the zero. `diffrax.Event` around such functions sets the direction and the root finder.
     - `adjoint`: how derivatives are taken. By default machine code goes back over its own steps in reverse mode
       (`jax.grad`, `jax.vjp`), at the cost of a few motions however many parameters there are, and forward over them in
       forward mode, all directions together (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist. A run of
@@ -94,12 +96,23 @@ def simulate(
 
     **Borders.** Forces and potentials may have kinks and jumps (`where`, `abs`, `sign`, `clip`, `floor`, …), also in
     time. Machine code ends a step at every border and begins the next one beyond it; where both sides push towards the
-    border, as dry friction at rest does, the motion stays on it. First derivatives include the jumps at borders; second
-    derivatives are NaN where a force jumps on the way. With diffrax, steps shrink at borders instead, and derivatives
-    do not see a jump.
+    border, as dry friction at rest does, the motion stays on it. First and second derivatives, in every mode, include
+    the jumps at borders. Where they do not exist they are NaN: where a border is grazed, and second ones by the knots
+    of samples at which a force jumps (see `samples`). With diffrax, steps shrink at borders and go across, and a
+    derivative over them lacks what a jump of the acceleration adds. So they are searched for a jump where a derivative
+    is asked for: a motion that crosses one, at a place that moves with the state or with parameters that are
+    differentiated, raises `SimulationError` in `jax.grad`; its derivatives are NaN with `throw=False`. With an event or
+    an `adjoint` they are NaN in either case, but by the time of a switch that is a parameter, where they lack its jump;
+    with `diffrax.BacksolveAdjoint` nothing is searched. Corners, where the acceleration is continuous, and jumps at
+    known times add nothing to first derivatives.
 
-    The event and the functions inside `system` are compiled once per function *object*: define them once, not in a
-    loop.
+    **Values that functions read.** What the event and the functions inside `system` read besides their arguments
+    (globals, closures, attributes, helpers) is compared at every call: after `K = 1.0` the motion is that of the new
+    K, and the scene is derived once more; going back to former values goes back to what was derived from them. Of
+    arrays over 1 MiB 4096 numbers are compared, of containers over 10 000 entries their number. Not seen are files, the
+    environment, and names that a function makes up (`globals()["K"]`). Under a `jax.jit` of your own, JAX keeps the
+    values of the first call. Numbers that are being traced, in a scene that is made within `jax.grad`, are parameters.
+    Values that change often belong into `params`, which never compiles anew.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, before anything is integrated;
     `SimulationError` when the motion cannot be followed to its end. Inside `jit` the same failures are raised at run
@@ -117,17 +130,18 @@ def simulate(
     trajectory.q - jnp.cos(trajectory.ts)
     ```
     """
-    require_system(system)
+    system = require_system(system)
     require_flag(throw, "throw")
     layout = Layout.of(q0, qdot0)
     asked = asked_for(solver, dt, adjoint, progress, rtol, atol)
-    problem = Problem.of(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
+    given = Problem.of(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
+    problem = lifted(given)
     if has_constraints(system):
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
-        require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
+        require_consistent(problem.system, layout, problem.ts, q0, qdot0, problem.params)
     engine = choose(problem, asked).engine
     solution = engine.solve(problem)
-    trajectory = _trajectory(problem, engine, solution, problem.params)
+    trajectory = _trajectory(given, engine, solution, given.y0, given.params)
     if not throw or (isinstance(solution.result, np.integer) and solution.result in ENDED_WELL):
         return trajectory
     return raise_unless_ok(trajectory, layout)
@@ -168,20 +182,22 @@ def simulate_batch(
     assert trajectory.q.shape == (1000, 101) and trajectory.ok.all()
     ```
     """
-    require_system(system)
+    system = require_system(system)
     asked = asked_for(solver, dt, adjoint, progress, rtol, atol)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
     axes, size = axes_per_leaf(values, batch_axes)
-    batch = Batch.of(system, values, axes, size, ts, rtol, atol, max_steps, event)
+    given = Batch.of(system, values, axes, size, ts, rtol, atol, max_steps, event)
+    batch = lifted_batch(given)
     values = {name: as_arrays(value, batch.member.layout.dtype) for name, value in values.items()}
     inconsistent = inconsistent_members(system, batch.member.ts, values, axes)
     engine = choose(batch.member, asked).engine
-    trajectory = _trajectory(batch.member, engine, engine.solve_batch(batch), values["params"], batch_axes[2])
+    solution = engine.solve_batch(batch)
+    trajectory = _trajectory(given.member, engine, solution, given.y0, values["params"], batch_axes[2])
     return trajectory if inconsistent is None else _refused(trajectory, inconsistent)
 
 
-def _trajectory(problem: Problem, engine: AbstractEngine, solution: Solution, params: PyTree, params_axes=None):
-    """The solution in the pytree of the user, of one problem or of a batch; `params` are those of all members.
+def _trajectory(problem: Problem, engine: AbstractEngine, solution: Solution, y0, params: PyTree, params_axes=None):
+    """The solution in the pytree of the user, of one problem or of a batch; `y0` and `params` are those of all members.
 
     Where nothing is traced, the few numbers stay in NumPy: each one sent to JAX costs as much as ten steps.
     """
@@ -212,7 +228,7 @@ def _trajectory(problem: Problem, engine: AbstractEngine, solution: Solution, pa
         mode=None,
         transitions=None,
         mode_names=(),
-        tolerances=None if fixed_steps else problem.tolerances,
+        tolerances=None if fixed_steps else engine.tolerances(problem, y0),
         engine=type(engine).__name__,
     )
 

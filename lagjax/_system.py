@@ -5,6 +5,7 @@ first meet a state. `System.motion(layout)` is the same scene in flat coordinate
 """
 
 import math
+import operator
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from lagjax._arguments import Function, accept
+from lagjax._arguments import Function, accept, present
 from lagjax._constraints import Constraints
 from lagjax._derivation import columns_of, derivation_of, numbers_of
 from lagjax._diffrax._equations import form_of
@@ -28,6 +29,7 @@ from lagjax._program import Unlowerable
 from lagjax._validate import as_arrays, is_concrete, require_number
 
 PyTree = Any
+ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
 Time = Float[ArrayLike, ""]  # a number, or an array of shape ()
 
 
@@ -110,11 +112,16 @@ class System(eqx.Module):
 
     def __repr__(self) -> str:
         """One line: the functions of the scene and what each asks for. `equinox.tree_pprint` prints the fields."""
-        roles = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
-        functions = [(role, getattr(self, role)) for role in roles]
+        functions = [(role, getattr(self, role)) for role in ROLES]
         # Mapped to another pytree (axes, filters), a scene is no longer made of functions.
         shown = [f"{role}={getattr(f, 'name', f)}" for role, f in functions if f is not None]
         return f"System({', '.join(shown)}, path={self.path!r})"
+
+    def require_present(self) -> None:
+        """Raise `ValueError` where something that a function of the scene reads has changed since this one was made."""
+        for function in (getattr(self, role) for role in ROLES):
+            if isinstance(function, Function):
+                function.code.require_present()
 
     # ---- the physics of one state: q and qdot in the user's pytree, the time t, the parameters params ----
 
@@ -212,7 +219,7 @@ class System(eqx.Module):
         print(scene.system.explain(scene.q0, scene.qdot0, params=scene.params))
         ```
         """
-        layout = Layout.of(q, qdot)
+        self, layout = present_system(self), Layout.of(q, qdot)
         facts = explain(Problem.about(self, layout, params))
         if self.constraints is None and self.velocity_constraints is None:
             return facts
@@ -257,6 +264,7 @@ class System(eqx.Module):
 
     def _of_constraints(self, quantity: Callable, q, qdot, t, params) -> PyTree:
         self._require_constraints()
+        self = present_system(self)
         return self.by_constraint(self._at(quantity, q, qdot, t, params), Layout.of(q, qdot), params)
 
     def by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
@@ -297,7 +305,7 @@ class System(eqx.Module):
 
     def _at(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
         """One of `Motion`'s functions at a state in the user's pytree, back in that pytree where `restore` says so."""
-        layout = Layout.of(q, qdot)
+        self, layout = present_system(self), Layout.of(q, qdot)
         require_number(t, "t")
         q, qdot, t = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state")
         params = as_arrays(params, layout.dtype)
@@ -354,10 +362,32 @@ def _structure_of(role: str, state: PyTree) -> str:
     return f"{role} was called with {shown}. Give q, qdot and params the structure that it reads."
 
 
-def require_system(system: Any) -> None:
-    """Raise `TypeError` for anything else in its place, a bare Lagrangian most often."""
+def require_system(system: Any) -> System:
+    """The scene with its functions as they are now (`Function.now`): what every public function begins with.
+
+    Raises `TypeError` for anything else in its place, a bare Lagrangian most often.
+    """
     if not isinstance(system, System):
         raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {system!r}.")
+    return present_system(system)
+
+
+def present_system(system: System) -> System:
+    """The scene with its functions as they are now: this one, where nothing that they read has changed."""
+    fields = object.__getattribute__(system, "__dict__")  # an attribute of an equinox.Module takes 2 µs
+    functions = [fields[role] for role in ROLES]
+    now = [present(f) if isinstance(f, Function) else f for f in functions]
+    if all(map(operator.is_, functions, now)):
+        return system
+    return with_functions(system, dict(zip(ROLES, now, strict=True)))
+
+
+def with_functions(system: System, functions: dict[str, Function | None]) -> System:
+    """A scene with other functions, by their roles; the constructor reads signatures, as long as a motion takes."""
+    other = object.__new__(type(system))
+    for name, value in (functions | {"path": system.path}).items():
+        object.__setattr__(other, name, value)
+    return other
 
 
 def _accept(function: Callable, role: str, roles: tuple[str, ...] = ("q", "qdot")) -> Function:

@@ -146,6 +146,7 @@ class Trajectory(eqx.Module):
         print(run.health(reference=lagjax.simulate(pendulum, 1.0, 0.0, run.ts, rtol=1e-6)))
         ```
         """
+        self.require_present()
         return examine(self, reference)
 
     def to_xarray(self, units: PyTree = None, time_unit: str | None = None):
@@ -220,8 +221,14 @@ class Trajectory(eqx.Module):
             mapped = jax.vmap(mapped, in_axes=(0, 0, *axes, 0, *[0] * len(more)))
         return mapped(self.q, self.qdot, (self.ts, self.tolerances), self.params, self.mode, *more)
 
+    def require_present(self) -> None:
+        """Raise `ValueError` where the scene reads other values by now than when this motion was followed."""
+        for system in (self.system,) if isinstance(self.system, System) else self.system.values():
+            system.require_present()
+
     def _at_every_time(self, name: str) -> PyTree:
         """Map a method (q, qdot, t, params) of the system over the time axis, and over the batch axes before it."""
+        self.require_present()
 
         def of_member(q, qdot, times_and_tolerances, params, mode):
             ts, _ = times_and_tolerances

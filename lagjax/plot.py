@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._analysis import Modes
-from lagjax._animation import as_points, course_of
+from lagjax._animation import as_points, course_of, courses_of
 from lagjax._arguments import Function, accept
 from lagjax._check._findings import listed
 from lagjax._crossings import Crossings
@@ -33,10 +33,13 @@ from lagjax._trajectory import Trajectory
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 GREY = "0.55"
+CURVE = 600  # points of a curve, at least: about as many as dots of a figure that is printed
 
 
 def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, members: int = 30, ax=None):
-    """Coordinates against time, one colour each; or, with a `projection`, curves in the plane.
+    """Coordinates against time, one colour each, the first seven of more; or, with a `projection`, curves in the plane.
+
+    `space_time` shows all coordinates of a chain or a lattice.
 
     - `projection`: a function of one state (q, qdot) that returns (x, y): `lambda q, qdot: (q, qdot)` for the phase
       portrait of one coordinate, or where a body is in space.
@@ -57,39 +60,72 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
     paths = np.asarray(jax.vmap(jax.vmap(layout.flatten))(q))
     ts = times_of_members(trajectory).reshape(-1, paths.shape[1])
     ts = ts[_some(len(ts), members)]
-    for i, name in enumerate(layout.names):
-        lines = ax.plot(ts.T, paths[:, :, i].T, color=COLORS[i % len(COLORS)], alpha=opacity, linewidth=1.5)
-        lines[0].set_label(name)
+    shown = _places(layout, ())
+    for color, i in zip(COLORS, shown, strict=False):
+        lines = ax.plot(ts.T, paths[:, :, i].T, color=color, alpha=opacity, linewidth=1.5)
+        lines[0].set_label(layout.names[i])
     ax.set_xlabel("t")
     if layout.size == 1:
         ax.set_ylabel(layout.names[0])
         return ax
-    return _legend(ax) if layout.size <= len(COLORS) else ax
+    return _legend(ax, _share(len(shown), layout))
+
+
+def space_time(trajectory: Trajectory, *, label: str | None = None, cmap: str = "viridis", ax=None):
+    """All coordinates of one motion against time, by colour: waves along a chain, or in the modes of a field.
+
+    - `label`: what the colour bar is called; by default "q".
+
+    The coordinates stand above each other, in the order in which messages name them; every output time is the middle
+    of its column.
+
+    >>> lagjax.plot.space_time(trajectory)
+    """
+    _require_numbers(trajectory, "trajectory")
+    layout, course = course_of(trajectory)
+    ax = _axes(ax)
+    mesh = ax.pcolormesh(
+        course.t, np.arange(layout.size), np.ma.masked_invalid(course.q.T), cmap=cmap, shading="nearest",
+        rasterized=True,
+    )  # fmt: skip
+    ax.set(xlabel="t", ylabel="coordinate")
+    ax.locator_params(axis="y", integer=True)
+    if layout.size <= len(COLORS):
+        ax.set_yticks(np.arange(layout.size), layout.names)
+    ax.grid(False)
+    _colorbar(mesh, ax, "q" if label is None else label)
+    return ax
 
 
 def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, ax=None):
     """The phase portrait: the velocity of each coordinate against it, from the dot on; a colour for each coordinate.
 
-    - `coordinates`: their names, as messages and tables have them: "q['theta']", "q[0]"; by default all, seven at most.
+    Between two outputs the curve is the cubic that has q and q̇ of both (Hermite).
+
+    - `coordinates`: their names, as messages and tables have them: "q['theta']", "q[0]"; by default all, the first
+      seven of more.
     - `members`: of a batch, draw this many, evenly chosen.
 
     >>> lagjax.plot.phase(trajectory, "q['theta']")
     """
-    q, qdot = _states(trajectory, members)
-    layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0, 0], (q, qdot)))
+    _require_numbers(trajectory, "trajectory")
+    chosen = _some(max(1, np.size(trajectory.ok)), _positive(members, "members"))
+    layout, courses = courses_of(trajectory, chosen)
     places = _places(layout, coordinates)
-    q, qdot = (np.asarray(jax.vmap(jax.vmap(layout.flatten))(tree)) for tree in (q, qdot))
-    ax, opacity = _axes(ax), max(0.15, len(q) ** -0.5)
+    ax, opacity = _axes(ax), max(0.15, len(courses) ** -0.5)
+    curves = [course.smooth(CURVE) for course in courses]
     for color, i in zip(COLORS, places, strict=False):
-        lines = ax.plot(q[:, :, i].T, qdot[:, :, i].T, color=color, alpha=opacity, linewidth=1.2)
-        lines[0].set_label(layout.names[i])
-        ax.plot(q[:, 0, i], qdot[:, 0, i], ".", color=color, markersize=5)
+        for q, qdot in curves:
+            ax.plot(q[:, i], qdot[:, i], color=color, alpha=opacity, linewidth=1.2)
+        ax.lines[-len(curves)].set_label(layout.names[i])
+        starts = np.array([(course.q[0, i], course.before[0, i]) for course in courses])
+        ax.plot(*starts.T, ".", color=color, markersize=5)
     if len(places) == 1:
         name = layout.names[places[0]]
         ax.set(xlabel=name, ylabel="qdot" + name.removeprefix("q"))
         return ax
     ax.set(xlabel="coordinate", ylabel="velocity")
-    return _legend(ax)
+    return _legend(ax, _share(len(places), layout))
 
 
 def _places(layout: Layout, coordinates: tuple[str, ...], most: int = len(COLORS)) -> list[int]:
@@ -471,9 +507,14 @@ def _axes(ax):
     return ax
 
 
-def _legend(ax):
-    ax.legend(frameon=False)
+def _legend(ax, title: str | None = None):
+    ax.legend(frameon=False, title=title)
     return ax
+
+
+def _share(shown: int, layout: Layout) -> str | None:
+    """What to say where not all coordinates are shown."""
+    return None if shown == layout.size else f"{shown} of {layout.size} coordinates"
 
 
 def _colorbar(mappable, ax, label):

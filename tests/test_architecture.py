@@ -117,3 +117,15 @@ def test_importing_changes_nothing():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0 and not done.stdout, done.stderr
+
+
+def test_a_name_is_imported_when_it_is_used():
+    code = (
+        "import lagjax, sys; assert 'lagjax._simulate' not in sys.modules, 'it has not been used';"
+        "assert set(lagjax.__all__) <= set(dir(lagjax)) and {*lagjax._places(), 'System'} == set(lagjax.__all__);"
+        "assert not hasattr(lagjax, 'System2') and lagjax.simulate is lagjax.simulate;"
+        "assert not {'scipy.optimize', 'scipy.special', 'lagjax._fit', 'lagjax._sweep'} & set(sys.modules);"
+        "from lagjax import *; assert sweep is lagjax.sweep and plot.__name__ == 'lagjax.plot'"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -32,7 +32,7 @@ def drift(trajectory):
 
 def code(function):
     """The plain function behind what a `System` holds."""
-    return None if function is None else function.code
+    return None if function is None else function.code.function
 
 
 def rebuilt(system, path="auto", **changed):

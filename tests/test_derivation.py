@@ -276,14 +276,18 @@ SCENES = {
     "scalar path asked for": (lagjax.System(free, path="scalar"), np.ones(2), "machine code", ""),
     "array path asked for": (lagjax.System(free, path="array"), np.ones(2), "diffrax", "asked for"),
     "holds arrays": (lagjax.System(Learned(jnp.ones(1))), np.ones(2), "diffrax", "hold arrays of their own"),
-    "float32": (lagjax.System(free), np.ones(2, np.float32), "diffrax", "not float64"),
+    "float32": (lagjax.System(free), np.ones(2, np.float32), "machine code", ""),
     "many coordinates": (lagjax.System(free), np.ones(80), "machine code", ""),
     "many operations": (lagjax.System(pairs(10)), np.ones(10), "diffrax", "operations, more than"),
     "too many for XLA": (lagjax.System(pairs(5)), np.ones(5), "machine code", ""),
-    "no scalar form": (lagjax.System(lambda q, v: free(q, v) - jnp.sum(jax.scipy.special.i0(q))), np.ones(2),
-                       "diffrax", "bessel"),
-    "pivoting": (lagjax.System(lambda q, v: v[0] * v[1] + v[2] * v[0] + 0.5 * v[2] ** 2 - q @ q), np.ones(3),
-                 "diffrax", "pivoting"),
+    "no scalar form": (lagjax.System(lambda q, v: free(q, v) - jnp.sum(jax.scipy.special.gammainc(2.0, q))), np.ones(2),
+                       "diffrax", "igamma"),
+    "pivoting": (
+        lagjax.System(lambda q, v: v[:-1] @ v[1:] + 0.5 * v[2] ** 2 - q @ q), np.ones(17), "diffrax", "pivoting",
+    ),
+    "indefinite, three coordinates": (
+        lagjax.System(lambda q, v: v[0] * v[1] + v[2] * v[0] + 0.5 * v[2] ** 2 - q @ q), np.ones(3), "machine code", "",
+    ),
     "indefinite, two coordinates": (lagjax.System(lambda q, v: v[0] * v[1] - q[0] * q[1]), np.ones(2),
                                     "machine code", ""),
     "constrained": (lagjax.System(free, constraints=lambda q: q @ q - 2.0), np.ones(2), "machine code", ""),
@@ -332,11 +336,28 @@ def test_a_mass_matrix_that_is_a_series_in_weak_forces_is_positive_definite():
     values = derivation.evaluate(["mass_matrix", "force"], state)
     assert not singular
     np.testing.assert_allclose(found, np.linalg.solve(values["mass_matrix"][0], values["force"][0]), rtol=1e-10)
-    # One that is indefinite by construction needs pivoting.
-    signs = np.array([1.0, -1.0, 1.0])
-    system = lagjax.System(lambda q, v: jnp.sum(signs * v**2) + v[0] * v[1] * jnp.cos(q[0] - q[1]) + v[1] * v[2])
+    # One that is indefinite by construction, in units of any size, and singular where two of its coordinates are equal.
+    signs, units = np.array([1.0, -1.0, 1.0]), np.array([1e-9, 1.0, 1e6])
+
+    def indefinite(q, v):
+        v = units * v
+        return jnp.sum(signs * v**2) + v[0] * v[1] * jnp.cos(q[0] - q[1]) + v[1] * v[2] - q @ q
+
+    derivation = of(lagjax.System(indefinite), np.ones(3), np.ones(3))
+    state = list(np.random.default_rng(0).uniform(-1.0, 1.0, (6, 4))) + [0.0]
+    *found, singular = derivation.acceleration.evaluate_many(state)
+    values, scales = derivation.evaluate(["mass_matrix", "force"], state), units[:, None] * units
+    exact = np.linalg.solve(values["mass_matrix"] / scales, (values["force"] / units)[..., None])[..., 0] / units
+    np.testing.assert_allclose(np.array(found).T, exact, rtol=1e-13)
+    assert not singular.any()
     with pytest.raises(Unlowerable, match="not positive definite"):
-        of(system, np.ones(3), np.ones(3)).acceleration  # noqa: B018
+        of(lagjax.System(lambda q, v: v[1:] @ v[:-1]), np.ones(17), np.ones(17)).acceleration  # noqa: B018
+
+
+def test_an_indefinite_mass_matrix_that_is_singular_is_found():
+    system = lagjax.System(lambda q, v: v[0] * v[1] + (q[0] - q[1]) * v[2] ** 2 - v[2] * v[1] * 0.0 - q @ q)
+    *found, singular = of(system, np.ones(3), np.ones(3)).acceleration.evaluate(0.4, 0.4, 0.1, *[0.2] * 3, 0.0)
+    assert singular and np.isnan(found).any()
 
 
 def test_forces_between_bodies_take_what_one_would_write_by_hand():

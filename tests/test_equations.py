@@ -56,7 +56,7 @@ def test_both_forms_follow_one_motion_and_one_gradient():
     ts = jnp.linspace(0.0, 2.0, 5)
 
     def final(path, params):
-        system = lagjax.System(double.system.lagrangian.code, path=path)
+        system = lagjax.System(double.system.lagrangian.code.function, path=path)
         return lagjax.simulate(system, double.q0, double.qdot0, ts, params, rtol=1e-11).q[-1, 1]
 
     values, gradients = zip(
@@ -86,20 +86,21 @@ def test_both_forms_find_a_singular_mass_matrix(lagrangian):
         assert singular and not np.isfinite(acceleration).all()
 
 
-@pytest.mark.slow
-def test_a_mass_matrix_that_needs_pivoting_takes_the_array_path():
+def test_an_indefinite_mass_matrix():
     # L = ẋẏ + żẋ + ½ ż² − U: regular, with a zero on the diagonal of M.
     scene = lagjax.System(lambda q, v: v[0] * v[1] + v[2] * v[0] + 0.5 * v[2] ** 2 - 0.5 * jnp.sum(q**2))
     q = jnp.array([0.3, 0.7, 0.2])
-    assert scene.explain(q, q).path == "array" and "pivoting" in scene.explain(q, q).reason
+    assert scene.explain(q, q).path == "scalar"
     mass = np.array([[0, 1, 1], [1, 0, 0], [1, 0, 1]])
     end = lagjax.simulate(scene, q, jnp.zeros(3), jnp.array([0.0, 1e-3]))
     np.testing.assert_allclose(end.qdot[-1] / 1e-3, -np.linalg.solve(mass, q), rtol=1e-5)
 
 
 def test_forcing_a_path():
-    special = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - jnp.sum(jax.scipy.special.i0(q)), path="scalar")
-    with pytest.raises(ValueError, match="no scalar program: the primitive `bessel_i0e` has no scalar form"):
+    special = lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v**2) - jnp.sum(jax.scipy.special.gammainc(2.0, q)), path="scalar"
+    )
+    with pytest.raises(ValueError, match="no scalar program: the primitive `igamma` has no scalar form"):
         lagjax.simulate(special, jnp.zeros(2), jnp.zeros(2), jnp.array([0.0, 1.0]))
     with pytest.raises(ValueError, match="path must be"):
         lagjax.System(lambda q, v: 0.5 * v**2, path="fast")
@@ -161,8 +162,8 @@ def test_explain_names_borders_and_says_whether_they_are_located():
     smooth = explained(scenes.double_pendulum)
     assert smooth.borders == () and smooth.narrow == () and smooth.borders_located
     assert "borders" not in str(smooth)
-    single = system.explain(np.float32(0.0), np.float32(1.0))  # in diffrax, by a scalar program
-    assert single.borders == facts.borders and not single.borders_located and "not located" in str(single)
+    single = system.explain(np.float32(0.0), np.float32(1.0))
+    assert single.borders == facts.borders and single.borders_located
     arrays = lagjax.System(lambda q, v: 0.5 * v**2, forces=forces, path="array").explain(0.0, 1.0)
     assert not arrays.borders_located
 

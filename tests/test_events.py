@@ -114,6 +114,19 @@ def test_simultaneous_events_and_a_start_on_one():
     assert flight(floor).result == lagjax.RESULTS.successful
 
 
+def test_a_start_on_an_event_ends_at_once_where_it_moves_on_in_the_direction():
+    # From 0 at speed 1, through floor(q) = q: rising. Not with the other direction, nor with none.
+    ends = [flight(diffrax.Event(floor, direction=way)).end.t for way in (True, False, None)]
+    assert ends == [0.0, 1.0, 1.0]
+    down = lambda q, v: -q
+    assert [flight(diffrax.Event(down, direction=way)).end.t for way in (True, False)] == [1.0, 0.0]
+
+
+def test_an_interval_of_a_few_roundings_of_the_time():
+    ts = jnp.array([20.0 - 1e-14, 20.0])
+    assert lagjax.simulate(FREE, 0.0, 1.0, ts, solver=lagjax.MachineCode()).end.t == 20.0
+
+
 @pytest.mark.parametrize(
     ("event", "reason"),
     [

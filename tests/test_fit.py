@@ -406,6 +406,16 @@ def test_restitution_comes_out_of_the_times_of_bounces():
 
 
 @pytest.mark.slow
+def test_a_state_of_first_order_is_the_velocity_of_a_coordinate():
+    """The record is of SciPy on the equations of first order; the guess is off by a third to a half."""
+    example = importlib.import_module("bouc_wen")
+    fit = example.main()
+    low, high = fit.intervals(0.999)
+    assert fit.ok and all(low[name] < example.TRUTH[name] < high[name] for name in example.TRUTH)
+    assert max((high[name] - low[name]) / abs(example.TRUTH[name]) for name in example.TRUTH) < 0.06
+
+
+@pytest.mark.slow
 def test_the_real_axis_with_dry_friction(capsys):
     file = Path(__file__).parents[2] / "shared" / "data" / "emps_identification.npz"
     if not file.exists():

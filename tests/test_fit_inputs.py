@@ -171,7 +171,7 @@ def test_sensors_with_a_delay_may_see_time_and_inputs():
 
 def test_what_is_wrong_with_delays_is_a_sentence():
     u = inputs_of(TS)
-    scene, record = lagjax.System(SCENE.lagrangian.code), lagjax.Record(TS[:10], u[:10], start=(0.0, 0.0))
+    scene, record = lagjax.System(SCENE.lagrangian.code.function), lagjax.Record(TS[:10], u[:10], start=(0.0, 0.0))
     first = {"k": 1.0, "tau": 0.05}
     with pytest.raises(ValueError, match=r"Record 0 is 0\.18 long, shorter than the longest delay"):
         lagjax.fit(scene, record, first, observe=lagjax.Delayed(lambda params: params["tau"], 0.2))
@@ -189,7 +189,7 @@ def test_what_is_wrong_with_inputs_is_a_sentence():
     with pytest.raises(ValueError, match=r"forces asks for `inputs`, which records.0. has none of"):
         lagjax.fit(SCENE, bare, TRUTH)
     with pytest.raises(ValueError, match=r"observe asks for `inputs`, which records.0. has none of"):
-        lagjax.fit(lagjax.System(SCENE.lagrangian.code), bare, TRUTH, observe=lambda q, qdot, inputs: q)
+        lagjax.fit(lagjax.System(SCENE.lagrangian.code.function), bare, TRUTH, observe=lambda q, qdot, inputs: q)
     with pytest.raises(ValueError, match=r"records\[1\] has other inputs than records\[0\]"):
         lagjax.fit(SCENE, [record, bare], TRUTH)
     with pytest.raises(ValueError, match="hold must be 'zero' or 'linear'; got 'cubic'"):

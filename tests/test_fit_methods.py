@@ -11,7 +11,9 @@ import pytest
 
 import lagjax
 from lagjax._fit import _search, _transforms, _weak
-from lagjax._fit._segments import Reader, time_scale
+from lagjax._fit._parameters import Parameters
+from lagjax._fit._segments import Reader, time_scales
+from lagjax._fit._transforms import Unbounded
 
 TS = np.linspace(0.0, 4.0, 101)
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -63,6 +65,39 @@ def test_transforms_of_leaves_are_inverses_with_the_derivatives_of_differences(t
         assert own.log_volume(u) - own.log_volume(other) == pytest.approx(volume[0] - volume[1])
     low, high = own.ends(x, 0.1 * np.ones(len(x)))
     assert (low < x).all() and (x < high).all()
+
+
+def test_an_interval_that_does_not_exclude_a_bound_ends_there_and_is_no_power_of_ten():
+    x, spread = np.array([4e-4, 1.0, 1.0, 2.0]), np.array([0.04, 0.1, np.inf, 2.0])
+    low, high = lagjax.positive.ends(x, spread)
+    np.testing.assert_allclose(low, [0.0, np.exp(-0.1), 0.0, 0.0])
+    np.testing.assert_allclose(high, [0.0404, np.exp(0.1), np.inf, 4.0])
+    low, high = lagjax.between(0.0, 1.0).ends(np.array([0.5, 0.99, 0.01]), np.array([0.1, 0.1, np.inf]))
+    np.testing.assert_allclose(low, [1 / (1 + np.exp(0.4)), 0.89, 0.0])
+    np.testing.assert_allclose(high, [1 / (1 + np.exp(-0.4)), 1.0, 1.0])
+    low, high = Unbounded().ends(np.array([1.0, 1.0]), np.array([2.0, np.inf]))
+    assert (low == [-1.0, -np.inf]).all() and (high == [3.0, np.inf]).all()
+
+
+def test_numbers_of_an_array_are_free_one_by_one():
+    # Two masses that swing apart from each other: a factor of all masses and springs is not seen, and one mass is kept.
+    def masses(q, qdot, params):
+        return 0.5 * jnp.sum(params["m"] * qdot**2) - 0.5 * jnp.sum(q**2) - 0.5 * params["k"] * (q[0] - q[1]) ** 2
+
+    truth = {"k": 2.0, "m": np.array([1.5, 0.7])}
+    q = lagjax.simulate(lagjax.System(masses), jnp.array([1.0, -0.3]), jnp.zeros(2), TS, truth).q
+    fit = lagjax.fit(
+        lagjax.System(masses), lagjax.Record(TS, np.asarray(q)), {"k": 2.0, "m": np.array([1.5, 1.0])},
+        free={"k": True, "m": np.array([False, True])}, transforms=lagjax.positive,
+    )  # fmt: skip
+    assert fit.covariance.names == ("params['k']", "params['m'][1]") and fit.ok
+    assert fit.params["m"][0] == 1.5 and fit.params["m"][1] == pytest.approx(0.7, rel=1e-6)
+    assert fit.intervals()[0]["m"][0] == 1.5
+    shares = {"shares": np.array([0.2, 0.3, 0.5])}
+    with pytest.raises(ValueError, match=r"array of them of the shape \(3,\) for params\['shares'\]; got one of"):
+        Parameters.of(shares, {"shares": np.array([True, False])})
+    with pytest.raises(ValueError, match=r"free as a whole or not at all: its transform is lagjax\.simplex"):
+        Parameters.of(shares, {"shares": np.array([True, False, True])}, lagjax.simplex)
 
 
 def test_every_u_is_an_inertia_that_a_body_can_have():
@@ -322,7 +357,7 @@ def test_a_report_is_one_file_with_everything(tmp_path):
 
 def weak(fit, u):
     readers = [Reader.of(record) for record in fit.records]
-    scale = time_scale(readers, fit.question.motions, fit.parameters.numbers(fit.u))
+    scale = min(time_scales(readers, fit.question.motions, fit.parameters.numbers(fit.u)))
     return _weak.imbalance(fit.question, SPRING, readers, scale), _weak.weak_start(
         fit.question, SPRING, u, readers, scale
     )
@@ -390,6 +425,6 @@ def test_inputs_drive_the_density_the_weak_form_and_many_starts():
     central = [(value(x + step) - value(x - step)) / 2e-5 for step in 1e-5 * np.eye(len(x))]
     np.testing.assert_allclose(jax.jit(jax.grad(density))(x), central, rtol=1e-5, atol=1e-4)
     readers = [Reader.of(one)]
-    scale = time_scale(readers, fit.question.motions, fit.parameters.numbers(fit.u))
+    scale = min(time_scales(readers, fit.question.motions, fit.parameters.numbers(fit.u)))
     u = _weak.weak_start(fit.question, scene, fit.u + 2.0, readers, scale)
     np.testing.assert_allclose(fit.parameters.values(u), [0.3, 4.0], rtol=0.1)

@@ -5,6 +5,7 @@ import pytest
 from scipy.special import stdtrit
 
 import lagjax
+from lagjax._fit._parameters import Parameters
 
 SIGMA = 0.02
 TS = np.linspace(0.0, 6.0, 121)
@@ -84,9 +85,20 @@ def test_a_profile_is_one_sided_where_only_a_bound_is_seen():
 
 def test_only_single_numbers_that_are_free_have_profiles(done):
     with pytest.raises(ValueError, match="there are params"):
-        done.profile("c")
+        done.profile("d")
     with pytest.raises(ValueError, match="level must be between"):
         done.profile("params['c']", level=95)
+
+
+def test_the_end_of_a_name_is_enough_where_it_is_the_only_one(done):
+    assert done.profile("c").name == "params['c']"
+    parameters = Parameters.of({"a": {"l": np.ones(2), "dry": 1.0}, "b": {"dry": 1.0, "1": 2.0}})
+    assert parameters.names[parameters.row("l[1]")] == "params['a']['l'][1]"
+    assert parameters.names[parameters.row("1")] == "params['b']['1']"
+    with pytest.raises(ValueError, match=r"'dry' may be params\['a'\]\['dry'\], params\['b'\]\['dry'\]; there are"):
+        parameters.row("dry")
+    with pytest.raises(ValueError, match="No free parameter is called 'l'"):
+        parameters.row("l")
 
 
 def test_starts_have_the_intervals_of_the_whole_covariance(done):

@@ -1,5 +1,8 @@
 """Draws of a posterior: along the second-order expansion of the residuals, corrected by the exact density."""
 
+import warnings
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +10,8 @@ import pytest
 
 import lagjax
 from lagjax._fit import _sample, _surrogate
+from lagjax._fit._chart import Chart
+from lagjax._fit._parameters import Parameters
 
 SHORT = np.linspace(0.0, 3.0, 61)
 
@@ -34,11 +39,12 @@ def test_an_expansion_to_second_order_is_exact_where_signals_are_quadratic(noise
     records[0] = lagjax.Record(SHORT, records[0].values, start=lagjax.Guess(*starts))
     fit = lagjax.fit(scene, records, {"gain": 1.2}, observe=gain, noise=noise)
     density = fit.log_density(prior=lambda params: -params["gain"])
-    surrogate = _surrogate.expanded(density)
+    chart = Chart.of(density)
+    surrogate = _surrogate.expanded(chart)
     assert not isinstance(surrogate, str)
     assert [block.rows.shape for block in surrogate.blocks] == [(2, terms, 1, 10)]
     z = 3.0 * rng.normal(size=(20, len(density)))
-    exact = jax.vmap(lambda z: density(surrogate.x(z)))(z)
+    exact = jax.vmap(chart.log_density)(z)
     np.testing.assert_allclose(jax.vmap(surrogate)(z), exact, rtol=1e-7)
 
 
@@ -102,7 +108,7 @@ def test_chains_that_stand_still_along_the_expansion_are_not_kept(bent, monkeypa
 
 def test_an_expansion_that_would_not_fit_says_so(bent, monkeypatch):
     monkeypatch.setattr(_surrogate, "_LARGEST", 5)
-    assert "more than 5" in str(_surrogate.expanded(bent.log_density()))
+    assert "more than 5" in str(_surrogate.expanded(Chart.of(bent.log_density())))
 
 
 @pytest.mark.slow
@@ -121,3 +127,168 @@ def test_a_prior_that_excludes_half_of_the_fit(monkeypatch):
     assert abs(drawn.mean() - (best + width * np.sqrt(2 / np.pi))) < 0.2 * width
     with pytest.raises(ValueError, match="prior is zero where the records put"):
         fit.sample(10, prior=lambda params: jnp.where(params["k"] > 2 * best, 0.0, -jnp.inf))
+
+
+# ---- beside a bound --------------------------------------------------------------------------------------------------
+
+BOUNDED = {"a": lagjax.positive, "b": None, "c": lagjax.between(-1.0, 3.0), "d": lagjax.between(0.0, 1e-3)}
+
+
+class Correlated:
+    """Stands in for a density: numbers inside of their sets, beside a bound, and far better known than a bound."""
+
+    def __init__(self, y):
+        self.question = SimpleNamespace(parameters=Parameters.of(y, None, BOUNDED))
+        self.first = np.append(self.question.parameters.moved(self.question.parameters.first), -2.0)
+        self.point, self.dtype = SimpleNamespace(u=self.first[:-1]), np.dtype(float)
+
+    def __len__(self):
+        return len(self.first)
+
+    def covariance(self):
+        by_u = np.append(np.diag(self.question.parameters.jacobian(self.point.u)), 1.0)
+        rows = np.random.default_rng(1).normal(size=(9, len(self))) / np.array([0.1, 2.0, 0.01, 1.0, 0.3])
+        return np.linalg.inv(rows.T @ rows) / np.outer(by_u, by_u)
+
+
+@pytest.mark.parametrize("a, c", [(0.3, 2.99999), (1e-9, -0.999), (50.0, 1.0)])
+def test_the_volume_of_a_chart_is_the_determinant_of_its_derivative(a, c):
+    chart = Chart.of(Correlated({"a": a, "b": 0.5, "c": c, "d": 4e-4}))
+    z = np.random.default_rng(0).normal(size=(40, 5)) * np.array([3.0, 1.0, 3.0, 3.0, 1.0])
+    by_z = jax.vmap(jax.jacfwd(chart.x))(z)
+    change = jax.vmap(lambda z: chart(z)[2])(z) - jnp.linalg.slogdet(by_z)[1]
+    np.testing.assert_allclose(change, change[0], atol=1e-9)  # distances from bounds of 1e-9 are rounded at 1e-16
+    # ζ and x belong together, and z = 0 is the centre, inside of all bounds by what the data leave open.
+    x, zeta, _ = jax.vmap(chart)(z)
+    near = np.abs(z).max(axis=1) < 2.0
+    np.testing.assert_allclose([chart.at(row) for row in np.asarray(zeta)[near]], x[near], rtol=1e-6)
+    np.testing.assert_allclose(chart(jnp.zeros(5))[1], 0.0, atol=1e-9)
+    step = 1e-4 * np.eye(5)
+    slopes = np.stack([chart.at(h) - chart.at(-h) for h in step], axis=1) / 2e-4
+    np.testing.assert_allclose(chart.columns(np.zeros(5)), slopes, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_of_an_array_with_a_number_that_is_kept_the_others_are_drawn():
+    def springs(q, qdot, params):
+        return 0.5 * qdot**2 - 0.5 * jnp.sum(params["k"]) * q**2
+
+    rng = np.random.default_rng(0)
+    record = lagjax.Record(SHORT, np.cos(2.0 * SHORT) + 0.1 * rng.normal(size=len(SHORT)), start=(1.0, 0.0))
+    free = {"k": np.array([False, True])}
+    fit = lagjax.fit(lagjax.System(springs), record, {"k": np.array([1.5, 2.0])}, free=free)
+    drawn = fit.sample(100, chains=4).posterior
+    assert set(drawn.data_vars) == {"params['k'][1]", "sigma"}
+    assert float(drawn["params['k'][1]"].mean()) == pytest.approx(2.5, abs=0.3)
+
+
+def test_chains_that_disagree_are_told_of():
+    rng = np.random.default_rng(0)
+    walk = np.cumsum(rng.normal(size=(4, 300, 1)), axis=1)
+    x = np.concatenate([rng.normal(size=(4, 300, 1)), walk], axis=2)
+    density = SimpleNamespace(names=("params['k']", "params['dry']"))
+    drawn = _sample.Draws(x, *np.zeros((4, 4, 300)), "")
+    with pytest.warns(UserWarning, match=r"1200 draws of params\['dry'\] are worth .* independent .* r-hat"):
+        worst = _sample._warned(density, drawn)
+    assert worst["effective_draws"] < 50 and worst["r_hat"] > 1.2
+    with pytest.warns(UserWarning, match="worth nan independent"):
+        _sample._warned(density, drawn._replace(x=x[:1, :3]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert _sample._warned(density, drawn._replace(x=x[..., :1]))["effective_draws"] > 800
+
+
+COLUMNS = np.stack([np.cos(2 * SHORT), SHORT, np.ones(61), SHORT**2, np.sin(2 * SHORT)], axis=1)
+
+
+def sensor(q, qdot, t, params):
+    columns = jnp.stack([q, t, jnp.ones_like(t), t**2, -qdot / 2])
+    return columns[: len(params)] @ jnp.stack([params[name] for name in sorted(params)])
+
+
+# Of each parameter the best value without bounds and the ends of its set, in standard errors; ∓∞ without one.
+NEAR = (0.7, 0.0, np.inf)
+CASES = {
+    "near zero": [NEAR, (0.0, -np.inf, np.inf)],
+    "to zero": [(-0.5, 0.0, np.inf), (0.0, -np.inf, np.inf)],
+    "both bounds near": [(0.5, 0.0, 2.0), (3.0, 0.0, np.inf)],
+    "no transform": [(0.7, -np.inf, np.inf), (0.0, -np.inf, np.inf)],
+    "five": [NEAR, (3.0, -np.inf, np.inf), (1.0, 0.0, 4.0), (6.0, 0.0, np.inf), (0.3, 0.0, np.inf)],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_draws_of_numbers_beside_their_bounds_are_those_of_a_normal_density_that_is_cut_off(case):
+    # The signal is a sum of known columns, times the parameters: without bounds, and with log σ integrated out, their
+    # posterior is Student's t in closed form; independent draws of it that lie outside of the bounds are left out.
+    best, low, high = np.array(CASES[case]).T
+    rng, size, names = np.random.default_rng(5), len(best), "abcde"
+    columns = COLUMNS[:, :size]
+    noise = 0.1 * rng.normal(size=61)
+    noise -= columns @ np.linalg.lstsq(columns, noise)[0]
+    inverse = np.linalg.inv(columns.T @ columns)
+    error = np.sqrt(noise @ noise / 61 * np.diag(inverse))
+    maps = [
+        None if np.isinf(a) else lagjax.positive if np.isinf(b) else lagjax.between(a * e, b * e)
+        for a, b, e in zip(low, high, error, strict=True)
+    ]
+    fit = lagjax.fit(
+        lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 2.0 * q**2),
+        lagjax.Record(SHORT, columns @ (best * error) + noise, start=(1.0, 0.0)),
+        {name: abs(b) * e + 0.01 * e for name, b, e in zip(names, best, error, strict=False)},
+        observe=sensor, transforms=dict(zip(names, maps, strict=False)),
+    )  # fmt: skip
+    [of_signal] = fit.noise.values()
+    dof = of_signal.effective - size
+    normal = rng.multivariate_normal(np.zeros(size), noise @ noise / dof * inverse, size=2_000_000)
+    exact = best * error + normal / np.sqrt(rng.chisquare(dof, size=(len(normal), 1)) / dof)
+    exact = exact[((exact > low * error) & (exact < high * error)).all(axis=1)]
+    assert len(exact) > 20_000  # shares of it are known to 0.2 %
+    drawn = fit.sample(150, seed=2, chains=8)
+    assert drawn.attrs["effective_draws"] > 300 and drawn.attrs["r_hat"] < 1.05
+    assert drawn.sample_stats.acceptance_rate.mean() > 0.99  # residuals are linear in the numbers
+    shares = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
+    for k in range(size):
+        found = [np.mean(drawn.posterior[f"params['{names[k]}']"].values < q) for q in np.quantile(exact[:, k], shares)]
+        # Three deviations of the share of 300 independent draws.
+        assert (np.abs(found - shares) < 3 * np.sqrt(shares * (1 - shares) / 300)).all(), (names[k], found)
+
+
+@pytest.mark.slow
+def test_where_the_expansion_is_too_narrow_the_exact_density_is_followed(bent, monkeypatch):
+    residuals = _surrogate.Surrogate._residuals
+    monkeypatch.setattr(_surrogate.Surrogate, "_residuals", staticmethod(lambda *of: 3.0 * residuals(*of)))
+    drawn = bent.sample(150, seed=1, chains=8)
+    assert drawn.attrs["sampler"].startswith("The No-U-Turn sampler along the exact density")
+    shares = [np.mean(drawn.posterior["params['k']"].values < x) for x in quadrature(bent)]
+    np.testing.assert_allclose(shares, [0.1, 0.5, 0.9], atol=0.08)
+
+
+@pytest.mark.slow
+def test_dry_friction_that_may_be_zero():
+    def friction(q, qdot, params):
+        return -params["c"] * qdot - params["dry"] * jnp.sign(qdot)
+
+    scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q), forces=friction)
+    ts, truth = np.linspace(0.0, 6.0, 121), {"c": 0.1, "dry": 0.03}
+    q = np.asarray(lagjax.simulate(scene, 1.0, 0.0, ts, truth).q)
+    record = lagjax.Record(ts, q + 6e-3 * np.random.default_rng(0).normal(size=121), start=(1.0, 0.0))
+    fit = lagjax.fit(scene, record, {"c": 0.1, "dry": 0.05}, transforms={"c": None, "dry": lagjax.positive})
+    drawn = fit.sample(100, seed=1, chains=8)
+    # By a quadrature of the exact density over c and dry, log σ integrated out in closed form.
+    density, best = fit.log_density(), np.array([float(fit.params["c"]), float(fit.params["dry"])])
+    matrix = fit.covariance.matrix
+    slope, width = matrix[0, 1] / matrix[1, 1], np.sqrt(matrix[0, 0] - matrix[0, 1] ** 2 / matrix[1, 1])
+    dry = np.linspace(1e-6, best[1] + 6 * np.sqrt(matrix[1, 1]), 81)
+    c = best[0] + slope * (dry[:, None] - best[1]) + width * np.linspace(-5.0, 5.0, 31)
+    at = np.stack([c, np.broadcast_to(np.log(dry)[:, None], c.shape), np.full(c.shape, density.first[-1])], axis=-1)
+    log = np.asarray(jax.jit(jax.vmap(density.log_likelihood))(at.reshape(-1, 3))).reshape(c.shape)
+    count = 121 * density.shares[0]
+    log = -0.5 * count * np.log(-2 * (log + count * density.first[-1]))
+    share = np.exp(log - log.max()).sum(axis=1)
+    share = np.append(0.0, np.cumsum(0.5 * (share[1:] + share[:-1])))
+    shares = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
+    found = [np.mean(drawn.posterior["params['dry']"].values < x) for x in np.interp(shares, share / share[-1], dry)]
+    assert drawn.attrs["effective_draws"] > 300
+    assert (np.abs(found - shares) < 3 * np.sqrt(shares * (1 - shares) / 300)).all(), found

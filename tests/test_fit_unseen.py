@@ -1,5 +1,7 @@
 """Twenty scenes whose freedoms are known: every one is named, none is invented, and fixing what is named ends it."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -233,3 +235,47 @@ def test_of_scenes_that_show_everything_nothing_is_said_to_be_unseen(name):
     )
     fit = lagjax.fit(scene, record, params, observe=observe)
     assert fit.unseen == () and fit.ok, fit
+
+
+# ---- records longer than rounding lets one follow --------------------------------------------------------------------
+
+
+def two_pendulums(q, qdot, params):
+    (a, b), (m, n) = params["l"], params["m"]
+    swing = a * b * qdot[0] * qdot[1] * jnp.cos(q[0] - q[1])
+    kinetic = 0.5 * (m + n) * (a * qdot[0]) ** 2 + n * (0.5 * (b * qdot[1]) ** 2 + swing)
+    return kinetic + 9.81 * ((m + n) * a * jnp.cos(q[0]) + n * b * jnp.cos(q[1])) + params["more"] * jnp.cos(q[0])
+
+
+CHAOTIC = lagjax.System(two_pendulums)
+TRUTH = {"l": jnp.array([1.0, 0.8]), "m": jnp.array([1.0, 0.6]), "more": 0.0}
+HIGH = jnp.array([2.0, 2.5]), jnp.zeros(2)
+
+
+def chaotic_record(end, start):
+    ts = np.linspace(0.0, end, int(20 * end) + 1)
+    q = np.asarray(lagjax.simulate(CHAOTIC, *HIGH, ts, TRUTH).q)
+    return lagjax.Record(ts, q + SIGMA * np.random.default_rng(0).normal(size=q.shape), start=start)
+
+
+@pytest.mark.parametrize("end, power", [(40.0, 15), pytest.param(400.0, 150, marks=pytest.mark.slow)])
+def test_of_a_chaotic_record_nothing_is_said_to_be_unseen_that_is_only_drowned(end, power):
+    # Motions part by e^(2 t) or so: within 40 s by 10^20, within 400 s by more than the square of which is a number.
+    free = {"l": True, "m": True, "more": False}
+    fit = lagjax.fit(CHAOTIC, chaotic_record(end, lagjax.Guess(*HIGH)), TRUTH, free=free, method="whole")
+    assert not fit.ok and not any("depends" in sentence for sentence in fit.unseen)
+    drowned = fit.unseen[-1]
+    assert drowned.startswith("records[0] is chaotic") and "params['l'][1]" in drowned and "shorter" in drowned
+    assert int(re.search(r"e\+(\d+),", drowned)[1]) > power
+    assert fit.unseen[:-1] == (
+        "A common factor of params['m'][0] and params['m'][1] is not seen, only their ratios: keep one of them fixed.",
+    )  # no row sees it, long or short
+    assert np.isinf(fit.intervals()[1]["l"]).all()
+
+
+def test_one_parameter_that_a_chaotic_record_cannot_tell_has_no_interval():
+    # Its one column is not null, and was the whole of what least squares ask: an interval of 1e-18 of its value.
+    free = {"l": False, "m": False, "more": True}
+    fit = lagjax.fit(CHAOTIC, chaotic_record(40.0, HIGH), {**TRUTH, "more": 1e-3}, free=free, method="whole")
+    assert not fit.ok and "is chaotic" in fit.unseen[0] and "about params['more']." in fit.unseen[0]
+    assert fit.intervals()[1]["more"] == np.inf

@@ -22,7 +22,7 @@ pytest.importorskip("scipy", reason="the references are computed with it")
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-from benchmarks import hard_cases, population, soak  # noqa: E402
+from benchmarks import hard_cases, hybrid_population, population, soak  # noqa: E402
 from benchmarks._hard import CASES, Case, Experiment, _constrained, _gravity, _integrable, _rotation  # noqa: E402
 
 # Those that take a second or two, one at least in every file of the table.
@@ -151,3 +151,9 @@ def test_a_leak_would_be_seen():
 @pytest.mark.slow
 def test_of_random_scenes_with_borders_none_is_wrong_without_a_word():
     assert population.main(["--scenes", "40"])["wrong"] == 0
+
+
+@pytest.mark.slow
+def test_of_random_scenes_that_meet_corners_none_is_wrong_without_a_word():
+    counts = hybrid_population.main(["--scenes", "48"])
+    assert counts["wrong"] == counts["named"] == 0 and counts["right"] > 40

@@ -226,7 +226,7 @@ def test_modes_on_constraints():
 
     np.testing.assert_allclose(frequency(G), np.sqrt(G), rtol=1e-13)
     np.testing.assert_allclose(jax.grad(frequency)(G), 0.5 / np.sqrt(G), rtol=1e-12)
-    twice = lagjax.System(ROD.lagrangian.code, constraints=lambda q: [q @ q - 1.0, 2 * (q @ q) - 2.0])
+    twice = lagjax.System(ROD.lagrangian.code.function, constraints=lambda q: [q @ q - 1.0, 2 * (q @ q) - 2.0])
     np.testing.assert_allclose(lagjax.normal_modes(twice, jnp.array([0.0, -1.0]), G).frequencies, [np.sqrt(G)])
 
 
@@ -304,3 +304,47 @@ def test_a_structure_that_the_lagrangian_does_not_read():
     pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
     with pytest.raises(TypeError, match=r"lagrangian was called with q\['th'\] of shape \(\)"):
         lagjax.equilibrium(pendulum, {"th": 1.0})
+
+
+# ---- at borders ------------------------------------------------------------------------------------------------------
+
+
+def _well(q, qdot):
+    return 0.5 * qdot**2 - q**2
+
+
+_PUSH = lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2 - jnp.maximum(q, 0.0) ** 2  # a stop that begins where q is at rest
+JUMPS = "along dq: the force jumps"
+ROUGH = {
+    "dry friction": (lagjax.System(_well, forces=lambda q, qdot: -0.1 * jnp.sign(qdot)), JUMPS),
+    "friction by D": (lagjax.System(_well, dissipation=lambda q, qdot: 0.1 * jnp.abs(qdot)), JUMPS),
+    "a stop": (lagjax.System(_PUSH), "along q: the force has another slope"),
+    "a table": (
+        lagjax.System(_well, forces=lambda q, qdot: -jnp.interp(q, jnp.arange(-1.0, 2.0), jnp.array([-1.0, 0.0, 2.0]))),
+        "along q: the force has another slope",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ROUGH)
+def test_nothing_is_linear_at_a_border(name):
+    system, words = ROUGH[name]
+    for function in (lagjax.normal_modes, lagjax.linearize):
+        with pytest.raises(ValueError, match=rf"does not exist at this state.*{words}.* at .*test_modes\.py"):
+            function(system, 0.0)
+    assert np.isnan(jax.jit(lambda q: lagjax.normal_modes(system, q).frequencies)(0.0)).all()
+    assert np.isnan(jax.jit(lambda q: lagjax.linearize(system, q).A)(0.0)[1]).all()
+
+
+@pytest.mark.parametrize(
+    "force, frequency",
+    [
+        (lambda q, qdot: -0.1 * qdot * jnp.abs(qdot), np.sqrt(2)),  # smooth at rest, though abs is not
+        (lambda q, qdot: -3 * jnp.maximum(q, 0.0) ** 2, np.sqrt(2)),
+        (lambda q, qdot: -jnp.clip(q, -1.0, 1.0), np.sqrt(3)),  # no border here
+        (lambda q, qdot: -q * jnp.where(jnp.abs(qdot) < 1e-6, 1.0, 2.0), np.sqrt(3)),  # one that is beside
+    ],
+)
+def test_borders_that_linearization_does_not_mind(force, frequency):
+    found = lagjax.normal_modes(lagjax.System(_well, forces=force), 0.0).frequencies
+    np.testing.assert_allclose(found, [frequency], atol=1e-12)

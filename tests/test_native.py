@@ -20,7 +20,8 @@ from lagjax._layout import Layout
 from lagjax._machine_code import flow_of
 from lagjax._native import _ir, _kernel, _lanes
 from lagjax._problem import Problem
-from lagjax._program import OPERATIONS, Unlowerable, lower
+from lagjax._program import OPERATIONS, Unlowerable, lower, lower_formula
+from lagjax._program import _scalars as xp
 
 EPS = 2.0**-52
 WIDTH = _ir.lanes()
@@ -129,11 +130,15 @@ FAMILIES = {  # functions of two doubles and an integer; exact ones, and those o
     "of the library's": lambda a, b, n: (jax.nn.sigmoid(a), lax.rsqrt(a)),
     "circular": lambda a, b, n: (jnp.sin(a), jnp.cos(a), jnp.sin(b), jnp.cos(a + b)),
     "constants": lambda a, b, n: (1.5, True, a),
+    "weights": lambda a, b, n: xp.stacked([xp.binade(a), xp.binade(b)]),  # a formula: it comes from no primitive
 }  # fmt: skip
 SPECIAL = [0.0, -0.0, 1.0, -1.0, 0.5, 2.5, -2.5, np.inf, -np.inf, np.nan, 1e-310]
 
 
 def program_of(name):
+    if name == "weights":
+        shapes = [jax.ShapeDtypeStruct((), dtype) for dtype in (float, float, int)]
+        return lower_formula(FAMILIES[name], *shapes, budget=100)
     return lower(FAMILIES[name], 0.5, 0.5, jnp.int64(1))
 
 

@@ -126,11 +126,25 @@ def test_without_matplotlib_it_says_what_to_install(single, monkeypatch):
 
 def test_phase_portraits_by_name(single, batch):
     ax = lagjax.plot.phase(single, "q[1]")
-    np.testing.assert_array_equal(ax.lines[0].get_xydata(), np.stack([single.q[:, 1], single.qdot[:, 1]], axis=1))
+    curve = ax.lines[0].get_xydata()
+    outputs = curve[:: (len(curve) - 1) // (len(TS) - 1)]
+    np.testing.assert_array_equal(outputs, np.stack([single.q[:, 1], single.qdot[:, 1]], axis=1))
+    # An ellipse of half axes 0.5; the rate of the cubic between outputs that are h = 1/8 apart is off by h³/72 √3.
+    np.testing.assert_allclose(np.linalg.norm(curve, axis=1), 0.5, atol=0.5 * 0.125**3 / (72 * 3**0.5) + 1e-8)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("q[1]", "qdot[1]") and ax.get_legend() is None
     assert len(lagjax.plot.phase(batch, members=5).lines) == 2 * (5 + 1)
     with pytest.raises(ValueError, match=r"no coordinate 'x'; there are q\[0\], q\[1\]"):
         lagjax.plot.phase(single, "x")
+
+
+def test_of_many_coordinates_some_are_drawn_and_the_legend_says_so():
+    chain = lagjax.System(lambda q, qdot: 0.5 * qdot @ qdot - 0.5 * jnp.sum(jnp.diff(q) ** 2))
+    run = lagjax.simulate(chain, jnp.zeros(100).at[50].set(1.0), jnp.zeros(100), TS)
+    for draw in (lagjax.plot.phase, lagjax.plot.trajectory):
+        assert draw(run).get_legend().get_title().get_text() == "7 of 100 coordinates"
+    ax = lagjax.plot.space_time(run)
+    np.testing.assert_array_equal(ax.collections[0].get_array().reshape(100, len(TS)), run.q.T)
+    assert ax.get_ylim() == (-0.5, 99.5)
 
 
 def test_motions_and_data_are_compared(single, batch):

@@ -6,6 +6,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -389,9 +390,44 @@ def test_damaged_chunks_are_found_and_computed_again(tmp_path, undisturbed):
     run = lagjax.Sweep(tmp_path / "store")
     assert "is not what was written" in run.damaged()[2]
     chunk.write_bytes(data[: len(data) // 2])
-    with pytest.warns(UserWarning, match=r"unit 2: its chunk of 'end' has 28 bytes, where it should have 56"):
+    with pytest.warns(UserWarning, match=r"unit 2: its chunk of 'end' has 30 bytes, where it should have 60"):
         swept(tmp_path)
     assert digests(tmp_path) == undisturbed and not run.damaged()
+
+
+def test_a_byte_that_has_changed_is_noticed_by_every_reader(tmp_path):
+    run = swept(tmp_path)
+    chunk = sorted((tmp_path / "store" / "end" / "c").glob("*/*"))[2]
+    data = bytearray(chunk.read_bytes())
+    data[5] ^= 1
+    chunk.write_bytes(data)
+    with pytest.raises(ValueError, match="checksum"):
+        run.open().end.load()
+    assert list(run.damaged()) == [2] and not run.status().damaged  # which does not read all
+
+
+def test_units_whose_chunks_are_gone_are_not_done(tmp_path, capsys):
+    run, count = swept(tmp_path), 6
+    whole = run.open().load()
+    assert run.status().units_done == count
+    gone = sorted((tmp_path / "store" / "end" / "c").glob("*/*"))[2]
+    gone.unlink()
+    told = run.status()
+    assert told.units_done == count - 1 and told.done < told.members and sum(told.results.values()) == told.done
+    assert command_line.main(["sweep", "status", str(tmp_path / "store")]) == 0
+    assert "unit 2: its chunk of 'end' is not there" in capsys.readouterr().out
+    with pytest.warns(UserWarning, match="computes them again"):
+        data = run.open().load()
+    lost = np.isnan(data.end.values) & ~np.isnan(whole.end.values)
+    assert lost.any() and (data.result.values[lost] == -1).all()
+    np.testing.assert_array_equal(data.result.values[~lost], whole.result.values[~lost])
+    assert data.result.attrs == whole.result.attrs
+    for name in ("end", "result"):
+        shutil.rmtree(tmp_path / "store" / name / "c")
+    assert run.status().done == 0 and not run.status().results
+    with pytest.warns(UserWarning, match="computed again"):
+        swept(tmp_path)
+    assert run.status().done == told.members
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """What a store knows of the user's functions: two that may compute other numbers have two texts, here and elsewhere."""
 
+import enum
 import functools
 import os
 import subprocess
@@ -18,7 +19,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import find_peaks
 
 import lagjax
-from lagjax._sweep._identity import identity
+from lagjax._reads import identity
 
 
 class Scale:
@@ -37,6 +38,42 @@ class Module(eqx.Module):
 
     def __call__(self, trajectory):
         return {"x": self.factor * trajectory.q[-1]}
+
+
+def of_class(text):
+    """An object of a class that is written with another number."""
+
+    def make(a):
+        space = {"__name__": "__main__", "enum": enum, "sys": sys}
+        exec(text.replace("A", str(a)), space)
+        return space["keep"]
+
+    return make
+
+
+BY_CLASSES = {
+    "private method": "class K:\n def _f(self): return A\n def __call__(self, x): return self._f()\nkeep = K()",
+    "private attribute": "class K:\n _k = A\n def __call__(self, x): return self._k\nkeep = K()",
+    "private static method": (
+        "class K:\n @staticmethod\n def _f(): return A\n def __call__(self, x): return self._f()\nkeep = K()"
+    ),
+    "operator": "class K:\n def __matmul__(self, x): return A\nk = K()\ndef keep(x): return k @ x",
+    "setter's class": "class K:\n @property\n def _k(self): return A\nk = K()\ndef keep(x): return k._k",
+    "base": "class B:\n _k = A\nclass K(B):\n def __call__(self, x): return self._k\nkeep = K()",
+    "enumeration": "class E(enum.Enum):\n X = A\ndef keep(x): return E.X.value * x",
+    "member of an enumeration": "class E(enum.Enum):\n X = A\nX = E.X\ndef keep(x): return X.value * x",
+    "whole enumeration": "class E(enum.IntEnum):\n X = int(A)\nX = E.X\ndef keep(x): return X * x",
+    "number on a function": "def K(): pass\nK.c = A\ndef keep(x): return K.c * x",
+    "number of its own class": "class F(float): pass\nk = F(A)\ndef keep(x): return k * x",
+    "nested class": "class K:\n class _In:\n  k = A\ndef keep(x): return K._In.k",
+    "deque": "import collections\nk = collections.deque([A])\ndef keep(x): return k[0]",
+}
+
+
+def of_import(a):
+    sys.modules["inside_of_keep"] = module = types.ModuleType("inside_of_keep")
+    exec(f"def h(): return {a}", vars(module))
+    return of_class("def keep(x):\n from inside_of_keep import h\n return h()")(a)
 
 
 def times(a):
@@ -81,15 +118,19 @@ KINDS = {
     "key": lambda a: times(jax.random.key(int(a))),
     "spline": spline,
     "user's module": of_module,
+    "module imported inside": of_import,
     "default": with_default,
     "solver": lambda a: (diffrax.Tsit5(), diffrax.Kvaerno5(), diffrax.Kvaerno3())[int(a)],
     "event": lambda a: diffrax.Event(times(3.0), direction=(None, True, False)[int(a)]),
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+KINDS_IN_MEMORY = {kind: of_class(text) for kind, text in BY_CLASSES.items()}
+
+
+@pytest.mark.parametrize("kind", KINDS | KINDS_IN_MEMORY)
 def test_another_value_is_another_text(kind):
-    make = KINDS[kind]
+    make = (KINDS | KINDS_IN_MEMORY)[kind]
     assert identity(make(1.0)) == identity(make(1.0)) != identity(make(2.0))
 
 
@@ -114,10 +155,11 @@ def test_many_functions_that_call_each_other():
 @pytest.mark.slow
 def test_texts_are_the_same_in_another_process(tmp_path):
     # Modules go to another process by name, as files; cloudpickle has no end with those that only stand in memory.
-    functions = {kind: make(1.0) for kind, make in KINDS.items() if make is not of_module}
+    kinds = KINDS | KINDS_IN_MEMORY
+    functions = {kind: make(1.0) for kind, make in kinds.items() if make not in (of_module, of_import)}
     texts = {kind: identity(function) for kind, function in functions.items()}
     code = (
-        "import pickle, sys; from lagjax._sweep._identity import identity\n"
+        "import pickle, sys; from lagjax._reads import identity\n"
         "functions, texts = pickle.load(open(sys.argv[1], 'rb'))\n"
         "other = {kind: (identity(f), texts[kind]) for kind, f in functions.items() if identity(f) != texts[kind]}\n"
         "assert not other, other"

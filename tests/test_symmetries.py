@@ -209,8 +209,6 @@ def test_what_is_not_the_same_motion_is_said_where():
     spring = lagjax.System(lambda q, v: 0.5 * v**2 + 0.5 * q**2)
     other = lagjax.same_motion(FREE, spring, 0.0, 1.0)
     assert other.same is False and other.residual > 1e-2 and "the equation of q at q = (" in other.where
-    with pytest.raises(ValueError, match="rounding errors, which are too large in float32"):
-        lagjax.same_motion(FREE, spring, np.float32(0.0), np.float32(1.0))
     nothing = lagjax.System(lambda q, v: q * v)
     assert not lagjax.same_motion(FREE, nothing, 0.0, 1.0).same
     assert not lagjax.same_motion(nothing, FREE, 0.0, 1.0).same

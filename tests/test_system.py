@@ -165,8 +165,8 @@ def v_squared(v):
         (lambda: 0.0, "must have the form"),
         (lambda t, q, qdot: 0.0, "must have the form"),
         (lambda q, qdot, parms: 0.0, "asks for `parms`"),
-        (lambda q, qdot, table=(0.0,) * 99: 0.0, "asks for `table`, which"),
-        (lambda q, qdot, m=1.0: 0.0, "asks for `m=1.0`"),
+        (lambda q, qdot, parms=(0.0,) * 99: 0.0, "asks for `parms`, which"),
+        (lambda q, qdot, time=1.0: 0.0, "asks for `time=1.0`"),
         (lambda *state: 0.0, "must have the form"),
         (lambda q, qdot, **rest: 0.0, "asks for `\\*\\*rest`"),
         (lambda q, *, qdot: 0.0, "must have the form"),
@@ -204,3 +204,9 @@ def test_refused_forces_and_dissipation():
         lagjax.System(kinetic, forces=lambda q, v: 1.0).acceleration(jnp.ones(2), jnp.ones(2))
     with pytest.raises(TypeError, match="dissipation must return one scalar"):
         lagjax.System(kinetic, dissipation=lambda q, v: v).acceleration(jnp.ones(2), jnp.ones(2))
+
+
+def test_a_default_of_a_function_is_taken_as_it_is():
+    """The usual way to bind a number in a loop."""
+    scenes = [lagjax.System(lambda q, v, m=m, table=(3.0,) * 99: 0.5 * m * v**2 - table[9] * q) for m in (1.0, 2.0)]
+    assert [float(scene.acceleration(0.0, 0.0)) for scene in scenes] == [-3.0, -1.5]

@@ -10,6 +10,7 @@ from lagjax import _native
 from lagjax._derivation import derivation_of, numbers_of
 from lagjax._layout import Layout
 from lagjax._native import _packs, _schedule, _series
+from lagjax._native._integrator import Integrator
 from lagjax._program import OPERATIONS, Unlowerable, lower
 
 MEMBERS, RTOL, ROOM = 3, 1e-9, 300
@@ -166,25 +167,67 @@ def test_what_comes_often_is_one_operation():
 # ---- size -----------------------------------------------------------------------------------------------------------
 
 
+def instructions(acceleration, size):
+    """How many instructions the kernel of q̈ = `acceleration(q, v, t)` has, as tables."""
+    states = jax.ShapeDtypeStruct((size,), float)
+    program = lower(lambda q, v, t: (acceleration(q, v, t), False), states, states, 1.0)
+    borders, series = _native.pieces_of(program, (size,)) or (None, _native.recurrences(program, size))
+    program = program if borders is None else borders.program
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_series, "LARGEST_LINE", -1)
+        functions = Integrator(program, series, borders=borders, width=8).motion.module.functions
+    return sum(len(block.instructions) for function in functions for block in function.blocks)
+
+
 def test_the_code_of_a_table_does_not_grow_with_the_scene():
     """Thirty times the pairs of bodies: the tables are longer, and the code is the same but for a few kinds."""
-    from lagjax._native._integrator import Integrator
 
-    def instructions(count):
+    def of_bodies(count):
         i, j = np.triu_indices(count, 1)
 
         def acceleration(q, v, t):
             distance = jnp.sqrt(jnp.sum((q.reshape(count, 2)[i] - q.reshape(count, 2)[j]) ** 2, axis=1) + 0.1)
             pull = (q.reshape(count, 2)[i] - q.reshape(count, 2)[j]) / distance[:, None] ** 3
-            return jnp.zeros((count, 2)).at[i].add(-pull).at[j].add(pull).ravel(), False
+            return jnp.zeros((count, 2)).at[i].add(-pull).at[j].add(pull).ravel()
 
-        states = jax.ShapeDtypeStruct((2 * count,), float)
-        program = lower(acceleration, states, states, 1.0)
-        series = _native.recurrences(program, 2 * count)
-        functions = Integrator(program, series, width=8).motion.module.functions
-        return sum(len(block.instructions) for function in functions for block in function.blocks)
+        return instructions(acceleration, 2 * count)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_series, "LARGEST_LINE", -1)
-        small, large = instructions(4), instructions(20)
+    small, large = of_bodies(4), of_bodies(20)
     assert large < 1.5 * small
+
+
+def test_the_code_of_narrow_features_does_not_grow_with_their_number():
+    """Ten times the bonds, each with an exponential that is examined along every step."""
+
+    def of_chain(count):
+        def acceleration(q, v, t):
+            pull = jnp.exp(q - jnp.roll(q, -1))
+            return jnp.roll(pull, 1) - pull
+
+        return instructions(acceleration, count)
+
+    assert of_chain(60) < 1.5 * of_chain(6)
+
+
+@pytest.mark.parametrize("count", [32, 80])  # written down, and as tables
+def test_a_soliton_of_the_toda_lattice(count):
+    """qₙ = ln [cosh(κ (n − 1) − β t) / cosh(κ n − β t)], β = sinh κ (Toda, Phys. Rep. 18 (1975) 1), between walls.
+
+    These are so far away that it comes to them as e^(−2 κ 12) at most.
+    """
+    kappa = 1.0
+
+    def soliton(t):
+        n = np.arange(-1, count + 1) - count / 2
+        return np.log(np.cosh(kappa * (n - 1) - np.sinh(kappa) * t) / np.cosh(kappa * n - np.sinh(kappa) * t))
+
+    left, *_, right = soliton(0.0)
+
+    def lattice(q, qdot):
+        q = jnp.concatenate([jnp.array([left]), q, jnp.array([right])])
+        return 0.5 * jnp.sum(qdot**2) - jnp.sum(jnp.exp(q[:-1] - q[1:]))
+
+    h = 1e-3
+    rate = (np.array([1, -8, 8, -1]) / (12 * h)) @ np.stack([soliton(x * h) for x in (-2, -1, 1, 2)])  # to 1e-13
+    run = lagjax.simulate(lagjax.System(lattice), soliton(0.0)[1:-1], rate[1:-1], np.array([0.0, 2.0]), rtol=1e-12)
+    np.testing.assert_allclose(run.q[-1], soliton(2.0)[1:-1], atol=1e-9)

@@ -105,7 +105,7 @@ def test_two_pendulums(tmp_path, monkeypatch):
     np.testing.assert_allclose(scope["ours"], scope["book"], rtol=1e-13)
     np.testing.assert_allclose(scope["ratios"], [2**0.5, -(2**0.5)], rtol=1e-13)
     growth = np.log(scope["apart"][-1] / scope["apart"][0]) / 12.0
-    assert abs(growth - scope["rate"]) < 0.1  # of 1.27, by the luck of where it begins
+    assert abs(growth - scope["rate"]) < 0.15  # of 1.27, by the luck of where it begins and of its first tangent
 
 
 @pytest.mark.slow

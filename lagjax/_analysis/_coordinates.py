@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lagjax._analysis._solve import newton, shortest_preimage, shortest_solution
-from lagjax._arguments import Function, accept
+from lagjax._analysis._solve import is_root, newton, shortest_preimage, shortest_solution
+from lagjax._arguments import Function, accept, present
 from lagjax._failures import nan_unless
 from lagjax._layout import Layout
 from lagjax._system import System, require_system
@@ -66,12 +66,12 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
     polar.system.energy({"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 1.0})  # 1.0
     ```
     """
-    require_system(system)
+    system = require_system(system)
     place = accept(old_from_new, "old_from_new", ("Q",))
 
     def old_state(Q, Qdot, t, params):
         Q, Qdot, t = jax.tree.map(lambda x: jnp.asarray(x, float), (Q, Qdot, t))
-        return jax.jvp(lambda Q, t: place(Q, t=t, params=params), (Q, t), (Qdot, jnp.ones_like(t)))
+        return jax.jvp(lambda Q, t: present(place)(Q, t=t, params=params), (Q, t), (Qdot, jnp.ones_like(t)))
 
     def lagrangian(Q, Qdot, t, params):
         return system.lagrangian(*old_state(Q, Qdot, t, params), t=t, params=params)
@@ -109,7 +109,7 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
         return old_state(Q, Qdot, t, params)
 
     def to_new(q, qdot, guess, t=0.0, params=None):
-        return _new_state(place, q, qdot, guess, t, params)
+        return _new_state(present(place), q, qdot, guess, t, params)
 
     return ChangedCoordinates(changed, to_old, to_new)
 
@@ -150,7 +150,6 @@ def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, param
         return old.flatten(place(new.restore(x), t=t, params=params)) - wanted
 
     x = jax.lax.custom_root(lambda x: off(x, t), jax.lax.stop_gradient(new.flatten(guess)), newton, shortest_preimage)
-    arrived = jnp.max(jnp.abs(off(x, t))) <= jnp.finfo(x.dtype).eps ** 0.6 * (1 + jnp.max(jnp.abs(wanted)))
-    x = nan_unless(arrived, x)
+    x = nan_unless(jax.lax.stop_gradient(is_root(lambda x: off(x, t), x, wanted)), x)
     jacobian, drift = jax.jacfwd(off, argnums=0)(x, t), jax.jacfwd(off, argnums=1)(x, t)
     return new.restore(x), new.restore(shortest_solution(jacobian, old.flatten(qdot) - drift))

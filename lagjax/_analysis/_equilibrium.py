@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._scene import Scene
 from lagjax._analysis._solve import shortest_preimage, shortest_solution
+from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
 from lagjax._linear import factorize, least_norm
 from lagjax._system import System
@@ -33,6 +34,7 @@ class Equilibrium(NamedTuple):
     ok: Bool[Array, ""]
 
 
+@accepts_singles(("q", "qdot"), ("params",))
 def equilibrium(
     system: System, q: PyTree, params: PyTree = None, *, qdot: PyTree = None, throw: bool = True
 ) -> Equilibrium:
@@ -73,7 +75,7 @@ def equilibrium(
         raise ValueError(_sentence(scene))
     of_user = None
     if scene.constrained:
-        of_user = system.by_constraint(multipliers, scene.layout, scene.params)
+        of_user = scene.system.by_constraint(multipliers, scene.layout, scene.params)
     return Equilibrium(scene.layout.restore(place), of_user, ok)
 
 

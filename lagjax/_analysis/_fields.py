@@ -24,12 +24,13 @@ _SPACE = (2, 3)
 class Fields(NamedTuple):
     """A basis of transformations of n coordinates: the time, n translations, n boosts, M maps, the time's scale, own.
 
-    - `scale` (n,): the sizes of the coordinates, by which translations and boosts are made of order one.
+    - `scale` (n,), `time`: the sizes of the coordinates and of the time, by which transformations are of order one.
     - `maps` (M, n, n): the matrices A; `names`: of all K = 2 + 2n + M + U.
     - `own`: the U of the user, functions (q, t, params) → (ξ, τ).
     """
 
     scale: np.ndarray
+    time: float
     maps: np.ndarray
     names: tuple[str, ...]
     own: tuple[Callable, ...]
@@ -57,8 +58,8 @@ class Fields(NamedTuple):
         alpha, b, c, of_maps, beta, of_own = self.apart(weights)
 
         def combined(q, t):
-            change = (b + c * t) * jnp.asarray(self.scale, q.dtype) + jnp.tensordot(of_maps, self.maps, 1) @ q
-            of_time = alpha + beta * t
+            shift = (b + c * t / self.time) * jnp.asarray(self.scale, q.dtype)
+            change, of_time = shift + jnp.tensordot(of_maps, self.maps, 1) @ q, alpha * self.time + beta * t
             for k, function in enumerate(self.own):
                 more, more_time = function(q, t, params)
                 change, of_time = change + of_own[k] * more, of_time + of_own[k] * more_time
@@ -77,11 +78,11 @@ class Fields(NamedTuple):
             if np.abs(flat @ of_maps - a.ravel()).max() > 1e-12 * np.abs(a).max():
                 return None
         shift, drift = (np.zeros(n) if x is None else x / self.scale for x in (b, c))
-        return np.concatenate([[alpha], shift, drift, of_maps, [beta], np.zeros(len(self.own))])
+        return np.concatenate([[alpha / self.time], shift, drift * self.time, of_maps, [beta], np.zeros(len(self.own))])
 
 
-def fields_of(layout: Layout, scale: np.ndarray, own: dict[str, Callable]) -> Fields:
-    """The basis for coordinates of this layout and of these sizes (n,)."""
+def fields_of(layout: Layout, scale: np.ndarray, time: float, own: dict[str, Callable]) -> Fields:
+    """The basis for coordinates of this layout, of these sizes (n,) and of this one of the time."""
     maps = _maps(layout, scale)
     names = [
         "time translation",
@@ -91,7 +92,7 @@ def fields_of(layout: Layout, scale: np.ndarray, own: dict[str, Callable]) -> Fi
         "scaling of the time",
         *own,
     ]
-    return Fields(scale, np.array([a for _, a in maps], float), tuple(names), tuple(own.values()))
+    return Fields(scale, time, np.array([a for _, a in maps], float), tuple(names), tuple(own.values()))
 
 
 def _maps(layout: Layout, scale: np.ndarray) -> list[tuple[str, np.ndarray]]:

@@ -16,6 +16,7 @@ from jaxtyping import Array
 from lagjax._analysis._fields import Fields
 from lagjax._analysis._noether import State, variation
 from lagjax._analysis._scene import Scene
+from lagjax._doubles import accepts_singles
 
 # Nodes of Gauss's rule: exact for polynomials of degree 63. What it misses, `is_right` finds.
 _NODES = 32
@@ -89,6 +90,7 @@ def _function(scene: Scene, fields: Fields, weights: np.ndarray, constant: bool)
     nodes, shares = 0.5 * (nodes + 1), 0.5 * shares
     reference = np.asarray(scene.q)
 
+    @accepts_singles(("q",), ("t", "params"))
     def gauge(q, t=0.0, params=None):
         there = Scene.flat(system, layout, layout.flatten(q), jnp.zeros(layout.size, layout.dtype), params)
         transform = fields.transform(jnp.asarray(weights, layout.dtype), params)

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._coordinates import asking
-from lagjax._analysis._solve import newton, shortest_preimage
+from lagjax._analysis._solve import is_root, newton, shortest_preimage
 from lagjax._consistent import has_constraints
 from lagjax._failures import nan_unless
 from lagjax._layout import Layout
 from lagjax._simulate import simulate
-from lagjax._system import System, require_system
+from lagjax._system import System, present_system, require_system
 
 PyTree = Any
 Vector = Float[Array, " n"]
@@ -82,7 +82,7 @@ def hamiltonian(system: System) -> Hamiltonian:
     canonical.energy(0.0, 2.0)  # 2.0 - 9.81
     ```
     """
-    require_system(system)
+    system = require_system(system)
     if has_constraints(system):
         raise ValueError("hamiltonian takes systems without constraints: give L in coordinates that satisfy them.")
 
@@ -147,7 +147,7 @@ class _Flat(NamedTuple):
     @classmethod
     def of(cls, system: System, q: PyTree, p: PyTree, params: PyTree) -> "_Flat":
         layout = Layout.of(q, p)
-        return cls(layout, system.motion(layout, params), eqx.filter(params, eqx.is_array_like))
+        return cls(layout, present_system(system).motion(layout, params), eqx.filter(params, eqx.is_array_like))
 
     def velocity(self, q: Vector, p: Vector, t) -> Vector:
         """v with ∂L/∂q̇(q, v, t) = p, by Newton's method from rest."""
@@ -156,7 +156,7 @@ class _Flat(NamedTuple):
             return self.motion.momentum(q, v, t, self.numbers) - p
 
         v = jax.lax.custom_root(off, jnp.zeros_like(p), newton, shortest_preimage)
-        return nan_unless(jnp.max(jnp.abs(off(v))) <= jnp.finfo(p.dtype).eps ** 0.6 * (1 + jnp.max(jnp.abs(p))), v)
+        return nan_unless(jax.lax.stop_gradient(is_root(off, v, p)), v)
 
     def rates(self, q: Vector, p: Vector, t) -> tuple[Vector, Vector]:
         """(q̇, ṗ)."""

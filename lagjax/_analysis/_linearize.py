@@ -8,6 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lagjax._analysis._scene import Scene
+from lagjax._analysis._smooth import is_smooth, require_smooth
+from lagjax._doubles import accepts_singles
+from lagjax._failures import nan_unless
 from lagjax._linear import factorize, least_norm, saddle
 from lagjax._system import System
 
@@ -36,6 +39,7 @@ class Linearization(NamedTuple):
     names: tuple[str, ...]
 
 
+@accepts_singles(("q", "qdot"), ("params",))
 def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = None) -> Linearization:
     r"""The equations of motion of `system`, linear in small deviations from the state (q, q̇), at rest by default.
 
@@ -46,7 +50,9 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
     to a deviation, and A and B keep a deviation on the constraints if it satisfies them. The function works under
     `jit`, `vmap` and `grad`.
 
-    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, or a scene that depends on the time.
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene that depends on the time, and
+    for a state at which the force jumps or has a kink, as dry friction at rest does: nothing is linear there. Inside
+    `jit` the derivatives of the force are NaN there instead.
 
     Source: Landau & Lifshitz, *Mechanics*, §23; Meirovitch, *Methods of Analytical Dynamics*, §9.
 
@@ -59,6 +65,7 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
     """
     scene = Scene.of(system, q, qdot, params)
     scene.require_autonomous("A linearization")
+    require_smooth(scene, "A linearization")
     return Linearization(*_linearized(*scene.arguments), names=scene.layout.names)
 
 
@@ -75,6 +82,8 @@ def _linearized(*arguments) -> tuple:
         response = jax.vmap(lambda b: saddle(mass, b, jacobian, gamma)[0], in_axes=1, out_axes=1)(one)
     else:
         response = factorize(mass).solve_columns(one)
+    smooth = is_smooth(scene)
+    by_q, by_qdot, rates, stiffness = (nan_unless(smooth, x) for x in (by_q, by_qdot, rates, stiffness))
     a, b = jnp.block([[zero, one], [by_q, by_qdot]]), jnp.concatenate([zero, response])
     return a, b, mass, 0.5 * (rates + rates.T), 0.5 * (rates - rates.T), stiffness, jacobian
 

@@ -19,9 +19,12 @@ from lagjax._analysis._eigen import exponents_and_modes, null_space, symmetric_m
 from lagjax._analysis._equilibrium import require_steady
 from lagjax._analysis._linearize import steady_matrices
 from lagjax._analysis._scene import Scene
+from lagjax._analysis._smooth import is_smooth, require_smooth
+from lagjax._analysis._solve import shortest_solution
 from lagjax._display import as_printed
+from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
-from lagjax._linear import dependent_rows, factorize, least_norm, schur_complement
+from lagjax._linear import dependent_rows, diagonal_scale, factorize, least_norm, schur_complement
 from lagjax._linear import rank as rank_of
 from lagjax._system import System
 from lagjax._validate import is_concrete
@@ -84,6 +87,7 @@ def _grows_beyond(size):
     return 7 * float(np.finfo(size.dtype).eps) ** 0.5 * size
 
 
+@accepts_singles(("q", "qdot"), ("params",))
 def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTree = None) -> Modes:
     r"""The small oscillations of `system` about its equilibrium `q`.
 
@@ -104,7 +108,8 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     coincide and share one shape (critical damping).
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene that depends on the time, for
-    a q that is no equilibrium, or where M is not positive definite. Inside `jit` the modes are NaN instead. There all
+    a q that is no equilibrium, where M is not positive definite, or where the force jumps or has a kink at q, as dry
+    friction at rest does: nothing is linear there. Inside `jit` the modes are NaN instead. There all
     constraints are taken as independent, and modes are NaN where they are not.
 
     Source: Landau & Lifshitz, *Mechanics*, §23–25; Routh, *Stability of a Given State of Motion*, ch. IV; derivatives:
@@ -120,13 +125,15 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     scene = Scene.of(system, q, qdot, params)
     scene.require_autonomous("A normal mode")
     require_steady(scene)
+    require_smooth(scene, "A normal mode")
     cyclic, rank = scene.conserved, _rank(scene)
     reversible = scene.reversible and qdot is None
     exponents, shapes, residual = _modes(cyclic, rank, reversible, *scene.arguments)
-    if scene.concrete and not residual <= _BALANCED[scene.layout.dtype]:
+    if scene.concrete and not residual <= _BALANCED:
+        made = f" that a deviation of {float(residual):.2g} of q's size would make" if np.isfinite(residual) else ""
         raise ValueError(
-            f"q is not an equilibrium: forces are left that a deviation of {float(residual):.2g} of q's size would "
-            "make. Find one first: q = lagjax.equilibrium(system, q, params).q."
+            f"q is not an equilibrium: forces are left{made}. Find one first: "
+            "q = lagjax.equilibrium(system, q, params).q."
         )
     if scene.concrete and not np.isfinite(np.asarray(exponents)).all():
         raise ValueError(
@@ -141,8 +148,9 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     return Modes(first.imag, scene.layout.restore(shapes), stable, exponents, ratios)
 
 
-# How far from an equilibrium modes are still those of it, in units of 1 + max|q|. Linear in that are their errors.
-_BALANCED = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
+# How far from an equilibrium modes are still those of it, in units of the size of q. Linear in that are their errors.
+# An equilibrium of n coordinates that is given in float32 is off by 6e-8 √n at most.
+_BALANCED = 1e-6
 
 
 def _rank(scene: Scene) -> int:
@@ -166,8 +174,12 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
     """Exponents (k, 2) and shapes (k, n) of the k degrees of freedom, and how far q is from an equilibrium."""
     scene = Scene.flat(*arguments)
     q = scene.q
-    mass, rates, stiffness, jacobian, left = steady_matrices(scene, q)
-    residual = _distance(scene, q, left, stiffness) + jnp.where(_rank_is(jacobian, rank), 0, jnp.nan)
+    matrices = steady_matrices(scene, q)
+    unit = jax.lax.stop_gradient(diagonal_scale(matrices[0]))
+    mass, rates, stiffness = (unit[:, None] * x * unit for x in matrices[:3])
+    jacobian = matrices[3] * unit
+    residual = _distance(scene, unit, jacobian, matrices[4] * unit, stiffness)
+    residual = residual + jnp.where(_rank_is(jacobian, rank), 0, jnp.nan)
     keep = np.array([i for i in range(len(q)) if i not in cyclic], int)
     gone = np.array(cyclic, int)
     reduced, follow = _without_cyclic(mass, rates, stiffness, keep, gone)
@@ -183,8 +195,8 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
         exponents = jnp.concatenate([jnp.zeros((len(gone), 2), exponents.dtype), exponents])
         shapes = jnp.concatenate([own, shapes])
     order = jnp.argsort(jax.lax.stop_gradient(exponents[:, 0].imag), stable=True)
-    shapes = _normalised(shapes[order], mass)
-    balanced = residual <= _BALANCED[scene.layout.dtype]
+    shapes = _normalised(shapes[order], mass) * unit
+    balanced = (residual <= _BALANCED) & is_smooth(scene)
     exponents = jax.lax.complex(*(nan_unless(balanced, x) for x in (exponents.real, exponents.imag)))[order]
     return exponents, jnp.where(balanced, shapes, jnp.nan), residual
 
@@ -198,16 +210,36 @@ def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
     return rank_of(unit @ unit.T) == rank
 
 
-def _distance(scene: Scene, q: Vector, left: Vector, stiffness: Matrix) -> Float[Array, ""]:
-    """How far q is from an equilibrium, in units of 1 + max|q|: by the forces that are left, and by the constraints."""
-    jacobian = scene.jacobian(q, scene.qdot)
-    rows = scene.motion.constraints.residual(q, scene.qdot, jnp.zeros((), q.dtype), scene.numbers)
+def _distance(
+    scene: Scene, unit: Vector, jacobian: Float[Array, "m n"], left: Vector, stiffness: Matrix
+) -> Float[Array, ""]:
+    """How far q is from an equilibrium, in units of its size: by the forces that are left, and by the constraints.
+
+    All are given in the `unit` (n,) of each coordinate. Zero also where the distance changes no mode: where the forces
+    are linear up to a thousand times as far.
+    """
+    q, t = scene.q / unit, jnp.zeros((), scene.q.dtype)
+    rows = scene.motion.constraints.residual(scene.q, scene.qdot, t, scene.numbers)
     values, gradients = jnp.concatenate([left, rows]), jnp.concatenate([stiffness, jacobian])
-    sizes = jnp.sqrt(jnp.sum(gradients**2, axis=1)) * (1 + jnp.max(jnp.abs(q)))
+    slopes = jnp.sqrt(jnp.sum(gradients**2, axis=1))
     # A row without any gradient may be left with the rounding of the others.
-    allowed = jnp.where(sizes > 0, sizes, jnp.max(sizes, initial=0) * 1e-6)
-    off = jnp.where(values == 0, 0, jnp.abs(values) / jnp.where(allowed > 0, allowed, 0))
-    return jax.lax.stop_gradient(jnp.max(off, initial=0))
+    slopes = jnp.where(slopes > 0, slopes, jnp.max(slopes, initial=0) * 1e-6)
+    allowed = slopes * jnp.max(jnp.abs(q), initial=0)
+    off = jnp.max(jnp.where(values == 0, 0, jnp.abs(values) / jnp.where(allowed > 0, allowed, 0)), initial=0)
+    if not scene.constrained:
+        step = shortest_solution(stiffness, left)
+        further = scene.force(scene.q + _FURTHER * unit * step, scene.qdot) * unit
+        expected = left - _FURTHER * stiffness @ step
+        size = jnp.max(jnp.abs(left), initial=0)
+        balances = jnp.max(jnp.abs(stiffness @ step - left), initial=0) <= 1e-3 * size
+        bends = jnp.max(jnp.abs(further - expected), initial=0) > _BENT * _FURTHER * size
+        off = jnp.where(balances & ~bends, 0, off)
+    return jax.lax.stop_gradient(off)
+
+
+# How many times as far as an equilibrium is forces are looked at, and by which part they may differ from linear ones
+# there: the modes are then off by a millionth.
+_FURTHER, _BENT = 1e3, 1e-3
 
 
 def _without_cyclic(mass: Matrix, rates: Matrix, stiffness: Matrix, keep: np.ndarray, gone: np.ndarray):
@@ -262,12 +294,17 @@ def _of_reversible(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Arra
 
 
 def _of_any(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
-    """Exponents (k, 2) and complex amplitudes (k, k), a mode a column."""
+    """Exponents (k, 2) and complex amplitudes (k, k), a mode a column.
+
+    Velocities are in units of the fastest rate there is: positions and they are then of one size.
+    """
     k = len(mass)
     inverse = factorize(mass)
-    zero, one = jnp.zeros_like(mass), jnp.eye(k, dtype=mass.dtype)
     lower = [-inverse.solve_columns(stiffness), -inverse.solve_columns(rates)]
-    values, vectors = exponents_and_modes(jnp.block([[zero, one], lower]))
+    fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(lower[0]))), jnp.max(jnp.abs(lower[1]))))
+    fastest = jnp.where((fastest > 0) & (fastest < jnp.inf), fastest, 1)
+    zero, one = jnp.zeros_like(mass), jnp.eye(k, dtype=mass.dtype)
+    values, vectors = exponents_and_modes(jnp.block([[zero, fastest * one], [lower[0] / fastest, lower[1]]]))
     return jnp.stack([values[:k], values[k:]], axis=1), vectors[:k, :k]
 
 

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lagjax._analysis._scene import Scene
-from lagjax._arguments import Function, accept
+from lagjax._arguments import Function, accept, present
 from lagjax._layout import Layout
 from lagjax._program import Unlowerable
-from lagjax._system import System, require_system
+from lagjax._system import System, present_system, require_system
 
 PyTree = Any
 Vector = Float[Array, " n"]
@@ -77,7 +77,7 @@ def noether_charge(system: System, generator: Callable, gauge: Callable | None =
     angular_momentum(jnp.array([1.0, 0.0]), jnp.array([0.0, 1.2]))  # 1.2
     ```
     """
-    require_system(system)
+    system = require_system(system)
     generator = accept(generator, "generator", ("q",))
     gauge = None if gauge is None else accept(gauge, "gauge", ("q",))
 
@@ -85,11 +85,11 @@ def noether_charge(system: System, generator: Callable, gauge: Callable | None =
         layout = Layout.of(q, qdot)
         scene_q, scene_qdot = layout.flatten(q), layout.flatten(qdot)
         t = jnp.asarray(t, layout.dtype)
-        motion = system.motion(layout, params)
-        change, change_of_time = flat_generator(generator, layout)(scene_q, t, params)
+        motion, by = present_system(system).motion(layout, params), present(generator)
+        change, change_of_time = flat_generator(by, layout)(scene_q, t, params)
         state = scene_q, scene_qdot, t, eqx.filter(params, eqx.is_array_like)
         value = motion.momentum(*state) @ change - change_of_time * motion.energy(*state)
-        return value if gauge is None else value - gauge(q, t=t, params=params)
+        return value if gauge is None else value - present(gauge)(q, t=t, params=params)
 
     return charge
 

@@ -15,10 +15,11 @@ from jaxtyping import Array
 
 from lagjax._analysis._coordinates import asking
 from lagjax._analysis._scene import Scene
+from lagjax._arguments import present
 from lagjax._layout import Layout
 from lagjax._linear import factorize
 from lagjax._simulate import simulate
-from lagjax._system import System
+from lagjax._system import System, present_system
 from lagjax._trajectory import State, Trajectory
 
 PyTree = Any
@@ -75,7 +76,7 @@ def routhian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> 
     if not len(gone) or not len(left):
         what = "every coordinate is" if len(gone) else "no coordinate is"
         raise ValueError(f"There is nothing to reduce: {what} cyclic ({', '.join(layout.names)}).")
-    whole = _Whole(system, layout, left, gone)
+    whole = _Whole(scene.system, layout, left, gone)
     extras = {*system.lagrangian.extras, "params"}
     reduced = System(asking(whole.routh, extras), path=system.path)  # pyright: ignore[reportArgumentType]
     names = tuple(layout.names[i] for i in left), tuple(layout.names[i] for i in gone)
@@ -97,7 +98,7 @@ class _Whole(NamedTuple):
     def lagrangian(self, s, sdot, cdot, t, params):
         """L, in which the cyclic coordinates may have any value."""
         q, qdot = self.joined(s, jnp.zeros(len(self.gone))), self.joined(sdot, cdot)
-        return self.system.lagrangian(self.layout.restore(q), self.layout.restore(qdot), t=t, params=params)
+        return present(self.system.lagrangian)(self.layout.restore(q), self.layout.restore(qdot), t=t, params=params)
 
     def turning(self, s, sdot, t, params) -> Array:
         """ċ (k,) at the momenta in the parameters of the reduced scene."""
@@ -148,5 +149,13 @@ def _simulate(whole: _Whole, reduced: System, q0, qdot0, ts, params=None, **opti
     end = State(ts[-1], jax.tree.map(lambda x: x[-1], q), jax.tree.map(lambda x: x[-1], qdot))
     fields = {name: getattr(done, name) for name in Trajectory.__dataclass_fields__}
     return Trajectory.of(
-        **{**fields, "ts": ts, "q": q, "qdot": qdot, "end": end, "system": whole.system, "params": params}
+        **{
+            **fields,
+            "ts": ts,
+            "q": q,
+            "qdot": qdot,
+            "end": end,
+            "system": present_system(whole.system),
+            "params": params,
+        }
     )

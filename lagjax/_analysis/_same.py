@@ -9,14 +9,18 @@ import numpy as np
 from jaxtyping import Array
 
 from lagjax._analysis._noether import State, euler_lagrange
-from lagjax._analysis._scene import Scene, spread
+from lagjax._analysis._scene import Scene
+from lagjax._analysis._states import moved_by_rounding, random_states
+from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
 from lagjax._system import System, require_system
 
 PyTree = Any
 
-# What may be left of the difference, beside the terms that cancel in it.
-_SAME = 1e-9
+# What may be left of the difference, beside the terms that cancel in it: rounding leaves some 1e-15 of them, and as
+# much of what the numbers of two scenes are made of. Where terms cancel within L it leaves more: so many times what it
+# is seen to change between states a few units in the last place apart, but never more than the last.
+_SAME, _CHANCE, _LARGEST = 1e-13, 100.0, 1e-8
 
 # Random states, of which rounding decides at none.
 _STATES = 64
@@ -27,32 +31,36 @@ class SameMotion(NamedTuple):
 
     - `same`: True or False.
     - `factor`: the best f in E_a = f E_b; NaN where b has no equations.
-    - `residual`: the largest |E_a − f E_b| over the terms of E_a, of any coordinate at any of the states.
+    - `residual`: the largest |E_a − f E_b| over the terms of E_a, of any coordinate at any of the states; `threshold`:
+      up to which it may be rounding, and the two count as the same.
     - `where`: a sentence that names the coordinate and the state at which it is largest.
     """
 
     same: bool
     factor: float
     residual: float
+    threshold: float
     where: str
 
     def __bool__(self) -> bool:
         return self.same
 
 
+@accepts_singles(("q", "qdot"), ("params",))
 def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, seed: int = 0) -> SameMotion:
     r"""Whether L_a = f L_b + dG(q, t)/dt for a number f, so that both systems have the same motions.
 
         E = d/dt ∂L/∂q̇ − ∂L/∂q − Q,     E_a = f E_b  for all q, q̇, q̈ and t
 
-    The identity is tested at 64 random states about (q, q̇) with random accelerations q̈; no G need be known. Forces Q
+    The identity is tested to rounding at 64 random states about (q, q̇), as far off as the size of its numbers and the
+    forces there suggest, in any units, with random accelerations q̈; no G need be known. Forces Q
     count as well. Lagrangians of one motion may differ by more than f and G (a decoupled coordinate may have a factor
     of its own): those do not count as the same here.
 
     - `a`, `b`: systems of the same coordinates and parameters, without constraints.
 
-    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, systems with constraints, float32, or
-    where a Lagrangian is not finite about the state.
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, systems with constraints, or where
+    a Lagrangian is not finite about the state.
 
     Source: Landau & Lifshitz, *Mechanics*, §2; Olver, *Applications of Lie Groups*, Theorem 4.7.
 
@@ -64,45 +72,49 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     assert lagjax.same_motion(free, boosted, 0.0, 1.0).same
     ```
     """
-    require_system(a)
-    require_system(b)
+    a, b = require_system(a), require_system(b)
     scenes = Scene.of(a, q, qdot, params), Scene.of(b, q, qdot, params)
-    scenes[0].require_double("same_motion")
     if any(scene.constrained for scene in scenes):
         raise ValueError("same_motion compares Lagrangians: give systems without constraints.")
     if not all(scene.concrete for scene in scenes):
         raise ValueError("same_motion looks at numbers: call it outside of jit, vmap and grad, on one state.")
     piecewise = any(scene.piecewise for scene in scenes)
-    states = _states(scenes[0], seed, spread(scenes[0].q, piecewise))
-    (of_a, size_a), (of_b, size_b) = (map(np.asarray, _equations(states, *scene.arguments)) for scene in scenes)
-    well = np.isfinite(of_a).all(axis=1) & np.isfinite(of_b).all(axis=1)
-    if well.sum() < _STATES // 4:
+    states = random_states(scenes[0], scenes[0].scales, _STATES, seed, piecewise)
+    differences = _compared(scenes, states)
+    if differences is None:
         raise ValueError(
             "A Lagrangian, or a derivative of it, is not finite at most states about (q, qdot): give a state in the "
             "middle of where motions take place."
         )
-    of_a, of_b, size_a, size_b = (x[well] for x in (of_a, of_b, size_a, size_b))
-    states = jax.tree.map(lambda x: np.asarray(x)[well], states)
-    unit = np.maximum(size_a.max(axis=0), np.finfo(float).tiny)  # of each coordinate
-    total = float(np.sum((of_b / unit) ** 2))
-    factor = float(np.sum(of_a * of_b / unit**2)) / total if total > 0 else float("nan")
-    left = np.abs(of_a - (factor * of_b if total > 0 else 0))
-    relative = left / np.maximum(
-        np.maximum(size_a.max(axis=0), abs(np.nan_to_num(factor)) * size_b.max(axis=0)), 1e-300
-    )
+    factor, relative, well = differences
+    beside = _compared(scenes, moved_by_rounding(states))
+    noise = 0.0 if beside is None else float(np.median(np.abs(relative - beside[1]).max(axis=1)[well & beside[2]]))
+    threshold = min(max(_SAME, _CHANCE * noise), _LARGEST)
     state, coordinate = np.unravel_index(int(np.argmax(relative)), relative.shape)
     residual = float(relative[state, coordinate])
-    same = residual <= _SAME and total > 0 and factor != 0
-    return SameMotion(bool(same), factor, residual, _place(scenes[0].layout, states, int(state), int(coordinate)))
+    same = residual <= threshold and np.isfinite(factor) and factor != 0
+    states = jax.tree.map(np.asarray, states)
+    where = _place(scenes[0].layout, states, int(state), int(coordinate))
+    return SameMotion(bool(same), factor, residual, threshold, where)
 
 
-def _states(scene: Scene, seed: int, scale: np.ndarray) -> State:
-    draws = np.random.default_rng(seed).uniform(-1, 1, (3, _STATES, scene.layout.size))
-    q, qdot = np.asarray(scene.q), np.asarray(scene.qdot)
-    speed = 0.3 + np.abs(qdot)
-    t = np.random.default_rng(seed + 100).uniform(-1, 1, _STATES)
-    parts = q + scale * draws[0], qdot + speed * draws[1], speed * draws[2], t
-    return State(*(jnp.asarray(x, scene.layout.dtype) for x in parts))
+def _compared(scenes, states: State) -> tuple[float, np.ndarray, np.ndarray] | None:
+    """The factor f, |E_a − f E_b| over its terms (S, n), and which states are finite (S,); None where few are."""
+    (of_a, size_a), (of_b, size_b) = (map(np.asarray, _equations(states, *scene.arguments)) for scene in scenes)
+    well = np.asarray(np.isfinite(of_a).all(axis=1) & np.isfinite(of_b).all(axis=1))
+    if well.sum() < _STATES // 4:
+        return None
+    of_a, of_b, size_a, size_b = (np.where(well[:, None], x, 0.0) for x in (of_a, of_b, size_a, size_b))
+    unit = size_a.max(axis=0)  # of each coordinate
+    unit = np.where(unit > 0, unit, size_b.max(axis=0))
+    unit = np.where(unit > 0, unit, 1.0)
+    of_a, of_b, size_a, size_b = (x / unit for x in (of_a, of_b, size_a, size_b))
+    largest = np.abs(of_b).max(initial=0.0) or 1.0  # whose square need not be a double
+    total = float(np.sum((of_b / largest) ** 2))
+    factor = float(np.sum(of_a * (of_b / largest))) / total / largest if total > 0 else float("nan")
+    left = np.abs(of_a - (factor * of_b if total > 0 else 0))
+    terms = np.maximum(size_a.max(axis=0), abs(np.nan_to_num(factor)) * size_b.max(axis=0))
+    return factor, left / np.where(terms > 0, terms, 1.0), well
 
 
 @eqx.filter_jit

@@ -9,24 +9,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._consistent import has_constraints
-from lagjax._derivation import Derivation, columns_of, derivation_of
+from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._layout import Layout
 from lagjax._motion import Motion
 from lagjax._program import Unlowerable
+from lagjax._scales import Scales
 from lagjax._system import System, require_system
 from lagjax._validate import as_arrays, is_concrete, require_finite
 
 PyTree = Any
 Vector = Float[Array, " n"]
-
-# How much farther off the states of a piecewise scene are drawn, on both sides of |q| from any q: one piece may have
-# what the next one has not.
-_FAR = 5.0
-
-
-def spread(q, piecewise: bool) -> np.ndarray:
-    """How far about q (n,) random states are drawn, (n,)."""
-    return (_FAR if piecewise else 1.0) * 0.3 * (1.0 + np.abs(np.asarray(q)))
 
 
 class Scene(NamedTuple):
@@ -47,7 +39,7 @@ class Scene(NamedTuple):
 
         Raises `TypeError` or `ValueError`, with a sentence, for arguments that cannot be right.
         """
-        require_system(system)
+        system = require_system(system)
         rest = jax.tree.map(lambda x: jnp.zeros_like(jnp.asarray(x, float)), q) if qdot is None else qdot
         layout = Layout.of(q, rest)
         require_finite(q, "q")
@@ -95,14 +87,6 @@ class Scene(NamedTuple):
             return False
         return borders is not None and bool(borders.switches)
 
-    def require_double(self, what: str) -> None:
-        """Raise `ValueError` where numbers are single, whose rounding is no proof of anything."""
-        if self.layout.dtype != np.float64:
-            raise ValueError(
-                f"{what} tells zero from rounding errors, which are too large in float32: give coordinates in float64, "
-                "after jax.config.update('jax_enable_x64', True)."
-            )
-
     def require_autonomous(self, what: str) -> None:
         """Raise `ValueError` where a function of the scene depends on the time."""
         roles = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
@@ -131,9 +115,10 @@ class Scene(NamedTuple):
 
     @property
     def reversible(self) -> bool:
-        """Whether nothing but L acts, and L is even in the velocities: the motion backwards is a motion.
+        """Whether nothing but L acts, and no momentum is left at rest: small motions backwards are motions.
 
-        Read off values of L at states that nothing speaks for. A wrong guess has to be caught by who relies on it.
+        Read off momenta at states, and with parameters, that nothing speaks for: they are zero at rest exactly, or as
+        good as any other number, in whatever units. A wrong guess has to be caught by who relies on it.
         """
         motion, n = self.motion, self.layout.size
         if motion.forces is not None or motion.dissipation is not None or self.system.velocity_constraints is not None:
@@ -142,15 +127,27 @@ class Scene(NamedTuple):
             return False
         draws = np.random.default_rng(1).uniform(0.3, 1.2, (3, len(self.derivation.scalar_shapes)))
         draws = draws.astype(self.layout.dtype)
-        q, qdot, t, numbers = draws[:, :n], draws[:, n : 2 * n], draws[:, 2 * n], list(draws[:, 2 * n + 1 :].T)
+        q, t, numbers = draws[:, :n], draws[:, 2 * n], list(draws[:, 2 * n + 1 :].T)
         with np.errstate(all="ignore"):
-            there, back = (
-                self.derivation.evaluate(("lagrangian",), columns_of(q, v, t, numbers))["lagrangian"]
-                for v in (qdot, -qdot)
-            )
-        well = np.isfinite(there) & np.isfinite(back)
-        size = np.max(np.abs(there), where=well, initial=0.0)
-        return bool(well.any() and np.abs(there - back)[well].max() <= 1e-12 * size)
+            momentum = self.derivation.evaluate(("momentum",), columns_of(q, np.zeros_like(q), t, numbers))["momentum"]
+        return bool(np.isfinite(momentum).any() and (momentum[np.isfinite(momentum)] == 0).all())
+
+    @property
+    def scales(self) -> Scales:
+        """How large its coordinates, velocities and the time are, of a scene of numbers."""
+        numbers = numbers_of(self.numbers)
+
+        def evaluated(name, q, qdot):
+            if (derivation := self.lowered) is not None:
+                try:
+                    return derivation.evaluate((name,), columns_of(q, qdot, 0.0, numbers))[name]
+                except Unlowerable:
+                    pass
+            return np.asarray(_evaluated(name, q, qdot, *self.arguments))
+
+        q, qdot = np.asarray(self.q)[None], np.asarray(self.qdot)[None]
+        mass = np.diagonal(evaluated("mass_matrix", q, qdot)[0])
+        return Scales.of(lambda q, qdot: evaluated("force", q, qdot), mass, q[0], qdot[0])
 
     # ---- quantities at a state (q, q̇) and the time zero ----
 
@@ -169,3 +166,11 @@ class Scene(NamedTuple):
     def holds(self, q: Vector) -> Float[Array, " k"]:
         """f, the constraints on positions, (k,)."""
         return self.motion.constraints.f(q, jnp.zeros((), q.dtype), self.numbers)
+
+
+@eqx.filter_jit
+def _evaluated(name: str, q, qdot, *arguments) -> Array:
+    """Forces, or mass matrices, at states (S, n), of a scene without scalar programs."""
+    scene = Scene.flat(*arguments)
+    one = scene.force if name == "force" else scene.mass_matrix
+    return jax.vmap(one)(jnp.asarray(q), jnp.asarray(qdot))

@@ -39,15 +39,27 @@ def newton(f: Callable[[Vector], Vector], start: Vector) -> Vector:
 
     def moves(carry):
         _, moved, count = carry
-        return (moved > 1e-14) & (count < _STEPS)
+        return (moved > _AT_REST) & (count < _STEPS)
 
     def once(carry):
         x, _, count = carry
-        value = f(x)
-        new = x - _shortened(f, x, value, shortest_solution(jax.jacfwd(f)(x), value))
-        return new, jnp.max(jnp.abs(new - x) / (1 + jnp.abs(x)), initial=0.0), count + 1
+        value, jacobian = f(x), jax.jacfwd(f)(x)
+        new = x - _shortened(f, x, value, shortest_solution(jacobian, value))
+        # Each number of x in units of its own, in which all make as much of f.
+        unit = 1 / _scales(jacobian)[1]
+        size = jnp.max(unit * jnp.maximum(jnp.abs(new), jnp.abs(x)), initial=jnp.finfo(x.dtype).tiny)
+        return new, jnp.max(unit * jnp.abs(new - x), initial=0.0) / size, count + 1
 
     return jax.lax.while_loop(moves, once, (start, jnp.ones((), start.dtype), 0))[0]
+
+
+def is_root(f: Callable[[Vector], Vector], x: Vector, given: Vector) -> Bool[Array, ""]:
+    """Whether f(x) = 0: each number of it within eps^0.6 of what x makes of it, or of a term that is `given` (n,).
+
+    Newton's method comes to some eps; where it has gone astray it is off by more than half of the digits.
+    """
+    size = jnp.abs(jax.jacfwd(f)(x)) @ jnp.abs(x) + jnp.abs(given)
+    return jnp.all(jnp.abs(f(x)) <= jnp.finfo(x.dtype).eps ** 0.6 * size)
 
 
 def _shortened(f: Callable, x: Vector, value: Vector, step: Vector) -> Vector:
@@ -60,6 +72,7 @@ def _shortened(f: Callable, x: Vector, value: Vector, step: Vector) -> Vector:
     return jax.lax.while_loop(fails, lambda carry: (0.5 * carry[0], carry[1] + 1), (step, 0))[0]
 
 
+_AT_REST = 1e-14  # of the size of x: some tens of roundings, the square of which is left
 # Newton steps: one where f is linear, five to new coordinates of a state, ten to a velocity in relativity. Halvings of
 # one that leads out of where f is defined, as beyond the velocity of light.
 _STEPS, _HALVINGS = 50, 30

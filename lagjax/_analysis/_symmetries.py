@@ -19,9 +19,11 @@ from jaxtyping import Array, Float
 from lagjax._analysis._fields import Fields, fields_of, named
 from lagjax._analysis._gauge import changes_of, gauge_of, is_right
 from lagjax._analysis._noether import State, euler_lagrange, flat_generator, variation
-from lagjax._analysis._scene import Scene, spread
+from lagjax._analysis._scene import Scene
+from lagjax._analysis._states import moved_by_rounding, random_states
 from lagjax._arguments import accept
 from lagjax._display import as_printed
+from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
 from lagjax._system import System
 from lagjax._trajectory import Trajectory
@@ -29,11 +31,20 @@ from lagjax._trajectory import Trajectory
 PyTree = Any
 
 # Singular values of the columns, which are of order one, below which a combination is a symmetry. Rounding leaves some
-# 1e-14; what breaks a symmetry by less than this part is not seen.
-_NULL = 1e-10
+# 1e-15 of the terms, and as much of what numbers of a scene are made of (a mass that is 0.1 · 3). What breaks a
+# symmetry by less than this part is not seen. Halved, it would come within ten of what the ready scenes leave.
+_NULL = 1e-13
+# Where terms cancel inside of L rounding leaves more: so many times what it is seen to leave. A symmetry that is broken
+# is off by the same at a state and a few units in its last place beside it; one that holds is off by chance.
+_CHANCE = 30.0
+# The largest part of L that may be left at all. Beyond, nothing is told from rounding, and no symmetry is reported.
+_LARGEST = 1e-8
 
-# What is left of the same at fresh states for a symmetry to be reported.
-_VERIFIED = 1e-8
+# At fresh states as much may be left of a symmetry, times this: the largest of many, not their mean.
+_SLACK = 100.0
+
+# What is left of a near symmetry, at most: relativity in the solar system breaks those of Newton by 1e-8.
+_NEARLY = 1e-6
 
 
 class Conserved(NamedTuple):
@@ -60,17 +71,23 @@ class Conserved(NamedTuple):
 
 
 class ConservedQuantities(list[Conserved]):
-    """A list of `Conserved`; `notes` are sentences about symmetries of L that conserve nothing."""
+    """A list of `Conserved`.
 
-    def __init__(self, quantities: list[Conserved], notes: tuple[str, ...] = ()):
+    - `notes`: sentences about symmetries of L that conserve nothing, and about those that nearly hold.
+    - `threshold`: what breaks a symmetry by less than this part of the terms of L could not be told from rounding.
+    """
+
+    def __init__(self, quantities: list[Conserved], notes: tuple[str, ...] = (), threshold: float = 0.0):
         super().__init__(quantities)
-        self.notes = notes
+        self.notes, self.threshold = notes, threshold
 
     _repr_pretty_ = as_printed
 
     def __str__(self) -> str:
         rows = [f"{c.name}{'' if c.gauge is None else ' (with a gauge term)'}" for c in self]
-        return "\n".join([*rows, *self.notes] or ["no symmetry among the transformations that were tried"])
+        rows = rows or ["no symmetry among the transformations that were tried"]
+        told = f"(what breaks a symmetry by less than {self.threshold:.0e} of L's terms would not be seen)"
+        return "\n".join([*rows, *self.notes, told])
 
     def report(self, trajectory: Trajectory) -> str:
         """How far each quantity drifts along a trajectory, a line each; the worst member of a batch."""
@@ -79,6 +96,7 @@ class ConservedQuantities(list[Conserved]):
         return "\n".join(rows)
 
 
+@accepts_singles(("q", "qdot"), ("params",))
 def conserved_quantities(
     system: System,
     q: PyTree,
@@ -97,10 +115,13 @@ def conserved_quantities(
     together with `generators`. A is any matrix for up to 12 coordinates; beyond, the rotations and scalings of each
     leaf. A transformation is a symmetry where it changes L by some dG(q, t)/dt, and neither forces nor constraints do
     work on it. Energy, momenta, angular momenta and the like come first, under these names; what is left comes as
-    combinations ("translation of z, rotation": a helix). Each conserved quantity I is verified at new random states,
-    where dI/dt must vanish to near rounding.
+    combinations ("translation of z, rotation": a helix). Each is verified at new random states. What a symmetry may
+    leave there is told from rounding by how it differs between states a few units in the last place apart; the
+    `threshold` of the result says what would not be seen. A symmetry that is broken by less than a millionth is named
+    in the notes ("nearly conserved").
 
-    - `q`, `qdot`: a state of numbers, not traced. The random states are drawn about it; nothing else about it matters.
+    - `q`, `qdot`: a state of numbers, not traced. The random states are drawn about it, as far as the size of its
+      numbers and the forces there suggest, in any units; nothing else about it matters.
     - `params`: the parameters at which symmetries are sought.
     - `generators`: the user's own by name, as `noether_charge` takes them.
     - `seed`: of the random states.
@@ -109,8 +130,8 @@ def conserved_quantities(
     problem, the third integral of Toda's chain. In coordinates that are not Cartesian, rotations are not linear: those
     along a cyclic angle are found; for others give generators.
 
-    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a generator of the wrong structure,
-    float32, or where L is not finite about the state.
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a generator of the wrong structure, or
+    where L is not finite about the state.
 
     Source: Olver, *Applications of Lie Groups to Differential Equations*, §4.4 (variational symmetries), §5.3.
 
@@ -122,38 +143,76 @@ def conserved_quantities(
     ```
     """
     scene = Scene.of(system, q, qdot, params)
-    scene.require_double("conserved_quantities")
     if not scene.concrete:
         raise ValueError("conserved_quantities looks at numbers: call it outside of jit, vmap and grad, on one state.")
-    piecewise = scene.piecewise
-    scale = spread(scene.q, piecewise)
-    fields = fields_of(scene.layout, scale, _own(generators, scene.layout))
+    piecewise, scales = scene.piecewise, scene.scales
+    fields = fields_of(scene.layout, scales.q, scales.t, _own(generators, scene.layout))
     count = 8 + 4 * fields.count // scene.layout.size
-    of_lagrangian, of_others = _measured(scene, fields, _states(scene, scale, count, seed))
-    known = named(scene.layout, fields)
-    of_both = np.concatenate([of_lagrangian, of_others])
-    chosen = _chosen(_null_space(of_both), known, fields, scene.layout.names)
-    fresh = _states(scene, scale, count, seed + 1)
-    again = np.concatenate(_measured(scene, fields, fresh))
-    chosen = [(name, w) for name, w in chosen if np.abs(again @ w).max() <= _VERIFIED * np.abs(w).max()]
+    here, fresh = (random_states(scene, scales, count, seed + k, piecewise) for k in range(2))
+    measured = _measured(scene, fields, here)
+    known, names = named(scene.layout, fields), scene.layout.names
+    space = measured.symmetries(measured.of_lagrangian, measured.of_others)
+    chosen = _verified(_chosen(space, known, fields, names), _measured(scene, fields, fresh))
     quantities, notes = _quantities(scene, fields, chosen, fresh)
-    if of_others.size:
-        names = {name for name, _ in chosen}
-        symmetries = [name for name, _ in _chosen(_null_space(of_lagrangian), known, fields, scene.layout.names)]
-        broken = [name for name in symmetries if name not in names and not name.startswith(_COMBINATION)]
+    found = {name for name, _ in chosen}
+    if measured.of_others.size:
+        of_lagrangian = measured.symmetries(measured.of_lagrangian)
+        broken = [name for name in _named(_chosen(of_lagrangian, known, fields, names)) if name not in found]
         notes += [f"not conserved: {name}, by a symmetry of L that a force or a constraint breaks" for name in broken]
+    notes += _near_symmetries(measured, space, known)
     if piecewise:
         notes.append("L or a force is piecewise: beyond borders farther off than states were drawn nothing was tested")
-    return ConservedQuantities(quantities, tuple(notes))
+    return ConservedQuantities(quantities, tuple(notes), measured.threshold)
+
+
+def _named(chosen: list[tuple[str, np.ndarray]]) -> list[str]:
+    return [name for name, _ in chosen if not name.startswith(_COMBINATION)]
+
+
+def _verified(chosen: list[tuple[str, np.ndarray]], fresh: "_Measured") -> list[tuple[str, np.ndarray]]:
+    """Those that hold at fresh states as well."""
+    rows = np.concatenate([fresh.of_lagrangian, fresh.of_others])
+    return [(name, w) for name, w in chosen if np.abs(rows @ w).max() <= _SLACK * fresh.threshold * np.abs(w).max()]
+
+
+def _near_symmetries(measured: "_Measured", space: np.ndarray, known: list[tuple[str, np.ndarray]]) -> list[str]:
+    """Sentences about those with a name that hold but for a small part, which a motion may not show."""
+    rows, taken, notes = np.concatenate([measured.of_lagrangian, measured.of_others]), space, []
+    for name, weights in known:
+        unit = weights / np.linalg.norm(weights)
+        part = np.sqrt(np.mean((rows @ unit) ** 2))
+        if not measured.threshold < part <= _NEARLY or np.linalg.norm(unit - taken @ (taken.T @ unit)) <= 1e-7:
+            continue
+        taken = np.linalg.qr(np.column_stack([taken, unit]))[0]
+        notes.append(f"nearly conserved: {name}, by a symmetry that {part:.1g} of the terms of L break")
+    return notes
 
 
 _COMBINATION = "combination: "
 
 
-def _measured(scene: Scene, fields: Fields, states: State) -> tuple[np.ndarray, np.ndarray]:
-    """The columns of L and of forces and constraints at states (rows, K) each, where they are finite."""
-    of_lagrangian, of_others = _columns(fields, states, *scene.arguments)
-    return _finite(np.asarray(of_lagrangian), np.asarray(of_others))
+class _Measured(NamedTuple):
+    """The columns of L and of forces and constraints at states, (rows, K) each, and what rounding may leave of them."""
+
+    of_lagrangian: np.ndarray
+    of_others: np.ndarray
+    threshold: float
+
+    def symmetries(self, *columns: np.ndarray) -> np.ndarray:
+        """An orthonormal basis (K, d) of the combinations of columns that are zero."""
+        rows = np.concatenate(columns)
+        _, sizes, vectors = np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])
+        rank = int((sizes > self.threshold * np.sqrt(len(rows))).sum())
+        return vectors[rank:].T
+
+
+def _measured(scene: Scene, fields: Fields, states: State) -> _Measured:
+    """The columns where they are finite, and their noise: how much they differ between states that hardly do."""
+    of_lagrangian, of_others = _finite(*map(np.asarray, _columns(fields, states, *scene.arguments)))
+    beside = _finite(*map(np.asarray, _columns(fields, moved_by_rounding(states), *scene.arguments)))
+    pairs = [(a, b) for a, b in zip((of_lagrangian, of_others), beside, strict=True) if a.size and a.shape == b.shape]
+    noise = max(float(np.sqrt(np.mean((a - b) ** 2))) for a, b in pairs) if pairs else 0.0
+    return _Measured(of_lagrangian, of_others, min(max(_NULL, _CHANCE * noise), _LARGEST))
 
 
 def _own(generators, layout: Layout) -> dict[str, Callable]:
@@ -165,24 +224,6 @@ def _own(generators, layout: Layout) -> dict[str, Callable]:
 
 
 # ---- the columns -----------------------------------------------------------------------------------------------------
-
-
-def _states(scene: Scene, scale: np.ndarray, count: int, seed: int) -> State:
-    """Random states about that of the scene, (count, …) each, on the constraints if there are any."""
-    draws = np.random.default_rng(seed).uniform(-1, 1, (3, count, scene.layout.size))
-    speed = 0.3 + np.abs(np.asarray(scene.qdot))
-    q, qdot = np.asarray(scene.q) + scale * draws[0], np.asarray(scene.qdot) + speed * draws[1]
-    t = np.random.default_rng(seed + 100).uniform(-1, 1, count)
-    if scene.constrained:
-        q, qdot = _projected(q, qdot, t, scene.system, scene.layout, scene.params)
-    dtype = scene.layout.dtype
-    return State(*(jnp.asarray(x, dtype) for x in (q, qdot, speed * draws[2], t)))
-
-
-@eqx.filter_jit
-def _projected(q, qdot, t, system, layout, params):
-    motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
-    return jax.vmap(lambda *y: motion.nearest_consistent(*y, numbers))(q, qdot, t)
 
 
 @eqx.filter_jit
@@ -241,13 +282,6 @@ def _finite(of_lagrangian: np.ndarray, of_others: np.ndarray) -> tuple[np.ndarra
 # ---- the null space --------------------------------------------------------------------------------------------------
 
 
-def _null_space(columns: np.ndarray) -> np.ndarray:
-    """An orthonormal basis (K, d) of the combinations of columns that are zero."""
-    _, sizes, vectors = np.linalg.svd(columns, full_matrices=len(columns) < columns.shape[1])
-    rank = int((sizes > _NULL * np.sqrt(len(columns))).sum())
-    return vectors[rank:].T
-
-
 def _chosen(
     space: np.ndarray, known: list[tuple[str, np.ndarray]], fields: Fields, names: tuple[str, ...]
 ) -> list[tuple[str, np.ndarray]]:
@@ -280,28 +314,32 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
 
 
 def _readable(weights: np.ndarray, fields: Fields) -> np.ndarray:
-    """The weights in the units of q: the largest entry of α, b, c, A, β is 1."""
+    """The weights in the units of q and t: the largest entry of α, b, c, A, β is 1."""
+    return weights / max(np.abs(x).max(initial=0) for x in _in_units_of_user(weights, fields))
+
+
+def _in_units_of_user(weights: np.ndarray, fields: Fields) -> tuple:
+    """α, b (n,), c (n,), A (n, n), β and the user's own of a combination."""
     alpha, b, c, of_maps, beta, own = fields.apart(weights)
-    a = np.tensordot(of_maps, fields.maps, 1)
-    return weights / max(np.abs(x).max(initial=0) for x in (alpha, b * fields.scale, c * fields.scale, a, beta, own))
+    shift, drift = b * fields.scale, c * fields.scale / fields.time
+    return alpha * fields.time, shift, drift, np.tensordot(of_maps, fields.maps, 1), beta, own
 
 
-def _composed(weights: np.ndarray, fields: Fields, layout_names: tuple[str, ...]) -> str:
-    """A combination in words: its parts by size, six at most."""
-    alpha, b, c, of_maps, beta, own = fields.apart(_readable(weights, fields))
-    names, a = layout_names, np.tensordot(of_maps, fields.maps, 1)
+def _composed(weights: np.ndarray, fields: Fields, names: tuple[str, ...]) -> str:
+    """A combination in words: its parts by size, six at most. What is zero is so beside the sizes of coordinates."""
+    alpha, b, c, a, beta, own = _in_units_of_user(_readable(weights, fields), fields)
     parts = [(alpha, "time translation"), (beta, "scaling of the time")]
-    parts += [(x, f"translation of {name}") for x, name in zip(b * fields.scale, names, strict=True)]
-    parts += [(x, f"boost of {name}") for x, name in zip(c * fields.scale, names, strict=True)]
+    parts += [(x, f"translation of {name}") for x, name in zip(b, names, strict=True)]
+    parts += [(x, f"boost of {name}") for x, name in zip(c, names, strict=True)]
     parts += list(zip(own, fields.names[len(fields.names) - len(own) :], strict=True))
     for i in range(len(a)):
         parts.append((a[i, i], f"scaling of {names[i]}"))
         for j in range(i):
-            if abs(a[i, j] + a[j, i]) < 1e-9:
+            if abs(a[i, j] + a[j, i]) < 1e-9 * abs(a[i, j]):
                 parts.append((a[i, j], f"rotation from {names[j]} to {names[i]}"))
             else:
                 parts += [(a[i, j], f"d{names[i]} = {names[j]}"), (a[j, i], f"d{names[j]} = {names[i]}")]
-    parts = sorted([part for part in parts if abs(part[0]) > 1e-9], key=lambda part: -abs(part[0]))
+    parts = sorted([part for part in parts if part[0] != 0], key=lambda part: -abs(part[0]))
     return _COMBINATION + ", ".join(f"{x:+.6g} {name}" for x, name in parts[:6]) + (", …" if len(parts) > 6 else "")
 
 
@@ -353,6 +391,7 @@ def _charge(scene: Scene, fields: Fields, weights: np.ndarray, gauge: Callable |
     """p·ξ − h τ − G of the symmetry with these weights (K,)."""
     system, layout = scene.system, scene.layout
 
+    @accepts_singles(("q", "qdot"), ("t", "params"))
     def charge(q, qdot, t=0.0, params=None):
         here = system.motion(layout, params)
         numbers = eqx.filter(params, eqx.is_array_like)

@@ -19,7 +19,9 @@ from jaxtyping import Float
 from lagjax._check import _ahead, _borders, _constraints, _derivatives, _mass, _stiffness
 from lagjax._check._findings import Finding, Findings, listed
 from lagjax._check._measure import Scene
+from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
+from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
 from lagjax._validate import is_concrete, not_finite
@@ -41,11 +43,11 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
 
     **Kinds** of findings, by level (`Finding.level` may be lower for a mild case):
 
-    - error: `not_finite` (a number given), `value_not_finite` (of L, a force, D), `derivative_not_finite`, `kink` (no
-      derivative, although one is computed), `wrong_derivative` (of a custom rule), `constraint_not_finite`,
-      `constraint_zero_gradient`, `inconsistent_start`; for a singular mass matrix `velocity_unused`,
-      `linear_in_velocity`, `velocity_combination`, `gauge`, `coordinate_singularity`, `singular_at_velocity`,
-      `singular_saddle_point`; `acceleration_not_finite`.
+    - error: `not_finite` (a number given), `value_not_finite` (of L, a force, D), `derivative_not_finite`, `kink` (of L
+      by a velocity, or of a constraint, at this state; where the acceleration jumps it is advice), `wrong_derivative`
+      (of a custom rule), `constraint_not_finite`, `constraint_zero_gradient`, `inconsistent_start`; for a singular mass
+      matrix `velocity_unused`, `linear_in_velocity`, `velocity_combination`, `gauge`, `coordinate_singularity`,
+      `singular_at_velocity`, `singular_saddle_point`; `acceleration_not_finite`.
     - warning: `creates_energy` (a dissipation function of the wrong sign), `indefinite_mass_matrix`,
       `near_coordinate_singularity`, `velocity_constraint_not_affine`, `discontinuity`.
     - advice: `single_precision`, `integer_parameter`, `small_state`, `ill_conditioned`, `dependent_constraints`,
@@ -66,7 +68,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     assert not findings.ok
     ```
     """
-    require_system(system)
+    system = require_system(system)
     layout = Layout.of(q, qdot)
     if jnp.ndim(t) != 0:
         raise ValueError(f"t must be one number; got shape {jnp.shape(t)}.")
@@ -75,16 +77,23 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     reported = _inputs(layout, q, qdot, t, params)
     if any(finding.level == "error" for finding in reported):
         return Findings.of(reported)
-    scene = Scene.of(system, layout, q, qdot, t, params)
-    reported += _derivatives.findings(scene)
+    return Findings.of([*reported, *_about_scene(system, q, qdot, t, params)])
+
+
+@accepts_singles(("q", "qdot"), ("t", "params"))
+def _about_scene(system, q, qdot, t, params) -> list[Finding]:
+    scene = Scene.of(system, Layout.of(q, qdot), q, qdot, t, params)
+    reported = _derivatives.findings(scene)
     reported += _dissipation(scene)
     reported += _constraints.findings(scene)
     reported += _mass.findings(scene)
     if not any(finding.level == "error" for finding in reported):
-        nearby = _borders.findings(scene)
-        ahead = [finding for finding in _ahead.findings(scene) if finding.where not in [f.where for f in nearby]]
+        known = {finding.where for finding in reported if finding.kind == "kink"}  # one finding for each direction
+        nearby = [finding for finding in _borders.findings(scene) if finding.where not in known]
+        known |= {finding.where for finding in nearby}
+        ahead = [finding for finding in _ahead.findings(scene) if finding.where not in known]
         reported += [*_acceleration(scene), *nearby, *ahead, *_stiffness.findings(scene)]
-    return Findings.of([*reported, *_time(scene)])
+    return [*reported, *_time(scene)]
 
 
 # ---- the arguments ---------------------------------------------------------------------------------------------------
@@ -97,16 +106,27 @@ def _inputs(layout: Layout, q, qdot, t, params) -> list[Finding]:
             message = f"{where} is {value}: every number must be finite."
             reported.append(Finding("not_finite", "error", (where,), message))
     reported += _precision(layout, q, qdot, params)
-    state = np.abs([float(x) for leaf in jax.tree.leaves((q, qdot)) for x in np.ravel(leaf)])
-    atol = 1e-3 * DEFAULT_RTOL[layout.dtype]
-    if state.any() and state.max() < _SMALLEST * atol:
-        message = (
-            f"The largest number of the state is {state.max():.1e}, near the default atol of {atol:.0e}, which is in "
-            "the units of the state: errors of that size are allowed in every step. Use units in which the motion is "
-            f"of order one, or pass atol={1e-3 * DEFAULT_RTOL[layout.dtype] * state.max():.0e}."
-        )
-        reported.append(Finding("small_state", "advice", layout.names, message))
-    return reported
+    return reported + _small(layout, q)
+
+
+def _small(layout: Layout, q) -> list[Finding]:
+    """Advice where an array of coordinates is so small beside another one that the default atol loses its digits."""
+    rtol, eps = DEFAULT_RTOL, float(np.finfo(layout.dtype).eps)
+    paths = jax.tree_util.tree_leaves_with_path(q)
+    leaves = {"q" + jax.tree_util.keystr(path): float(np.abs(np.asarray(leaf)).max(initial=0)) for path, leaf in paths}
+    largest = max(leaves.values(), default=0.0)
+    atol = rtol * min(ATOL_OVER_RTOL, ATOL_OVER_MOTION * largest)
+    # What is no more than the rounding of the others stands for zero.
+    small = tuple(name for name, size in leaves.items() if eps * largest < size < _SMALLEST * atol)
+    if not small:
+        return []
+    size = max(leaves[name] for name in small)
+    message = (
+        f"{listed(small)}: {size:.1e} at most beside coordinates as large as {largest:.1e}, near the default atol of "
+        f"{atol:.0e}, which is for all of them: errors of that size are allowed in every step. Use units in which all "
+        f"coordinates are of one size, or pass atol={ATOL_OVER_RTOL * rtol * size:.0e}."
+    )
+    return [Finding("small_state", "advice", small, message)]
 
 
 def _precision(layout: Layout, q, qdot, params) -> list[Finding]:
@@ -116,8 +136,9 @@ def _precision(layout: Layout, q, qdot, params) -> list[Finding]:
         what = "float64 was given, but JAX makes float32 of it" if wide else "The state is in float32"
         do = "" if jax.config.jax_enable_x64 else "call jax.config.update('jax_enable_x64', True) first and "  # pyright: ignore[reportAttributeAccessIssue]
         message = (
-            f"{what}: a run keeps about {DEFAULT_RTOL[layout.dtype]:.0e} per step, and machine code is for float64. "
-            f"For more, {do}pass float64."
+            f"{what}: machine code computes in float64 and rounds the result to {np.finfo(np.float32).eps / 2:.0e} of "
+            f"its size; solvers of diffrax, on a GPU or where they are asked for, compute in float32. For more digits, "
+            f"{do}pass float64."
         )
         reported.append(Finding("single_precision", "advice", layout.names, message))
     integers = [

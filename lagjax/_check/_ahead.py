@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._check._borders import OF_FORCE
 from lagjax._check._findings import Finding, listed
 from lagjax._check._measure import Scene
 from lagjax._derivation import numbers_of
@@ -132,7 +133,7 @@ def _nearest(places: np.ndarray, start: float, name: str) -> str:
 def _finding(kind: str, places: str, names: tuple[str, ...]) -> Finding:
     where = f"{listed(names)} = {places}"
     message = {
-        "border": f"The accelerations jump at {where}. Machine code ends a step there; steps of diffrax go across.",
+        "border": f"The accelerations jump at {where}. {OF_FORCE}",
         "narrow_feature": (
             f"An exponential of one number alone, zero to rounding at this state, has its peak at {where}. Machine "
             "code looks out for it; with a solver of diffrax bound the steps."

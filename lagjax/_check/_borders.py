@@ -18,6 +18,11 @@ from lagjax._check._measure import Scene
 from lagjax._derivation import numbers_of
 from lagjax._program import Unlowerable, lower
 
+# What a jump of the acceleration means for a motion.
+OF_FORCE = (
+    "A motion across it is right: machine code ends a step there, and what is pushed onto it from both sides rests on "
+    "it; steps of diffrax shrink, and a motion of diffrax that crosses it has no derivatives."
+)
 _REACH = 10  # the steps of the search: 2⁻⁹, 2⁻⁸ … 1 sizes of a coordinate
 
 
@@ -104,7 +109,9 @@ def _first_jump(sides: Callable, evaluate: Callable, start, vector, axis, labels
         return start + np.asarray(steps, start.dtype)[:, None] * vector
 
     # One step so small that only a border at the state itself lies within it, then longer and longer ones.
-    reach = [4 * eps * (1 + float(np.max(np.abs(start)))), *2.0 ** np.arange(1 - _REACH, 1)]
+    moving = vector != 0
+    least = 4 * eps * float(np.max(np.abs(start[moving] / vector[moving]), initial=1.0))
+    reach = [min(least, 2.0**-_REACH), *2.0 ** np.arange(1 - _REACH, 1)]
     here, *ahead = np.asarray(sides(at([0.0, *reach])))
     past = next((k for k, side in enumerate(ahead) if not np.array_equal(side, here, True)), None)
     if past is None:
@@ -132,12 +139,14 @@ def _first_jump(sides: Callable, evaluate: Callable, start, vector, axis, labels
 def _finding(jump: Jump) -> Finding:
     here = jump.sizes == 0
     where = "at this state" if here else f"{jump.distance:.3g} away along {jump.direction}"
-    serious = here or jump.what in ("L", "the momentum")
+    serious = jump.what in ("L", "the momentum")
     mend = " Smooth it (tanh(v/w) for sign(v)), or make two modes of it with a Transition for lagjax.simulate_hybrid."
     consequence = {
         "L": "No force shows a jump of L itself: the motion goes through it as if it were not there." + mend,
         "the momentum": "The kick that a jump of the momentum gives to the velocity is not seen." + mend,
-    }.get(jump.what, "Machine code ends a step there, and a motion may rest on it; steps of diffrax shrink.")
+    }.get(jump.what, OF_FORCE)
+    if here and not serious:
+        consequence = "At this very state `acceleration` is that of one side or between them. " + consequence
     return Finding(
         "discontinuity", "warning" if serious else "advice", (jump.direction,),
         f"{jump.what[0].upper()}{jump.what[1:]} jumps {where}, at {jump.operation}. {consequence}",

@@ -3,6 +3,7 @@
 import numpy as np
 
 from lagjax._blame import Offender, offenders, pieces_of
+from lagjax._check._borders import OF_FORCE
 from lagjax._check._differences import Slopes, differ, ladder, slopes
 from lagjax._check._findings import Finding, listed
 from lagjax._check._measure import Scene, Sides
@@ -184,17 +185,28 @@ def _compared(scene: Scene, sides: Sides, name, role, derivative, directions, ou
         sides.minus[chosen], m.here[list(outputs)], sides.plus[chosen], scene.steps[:, list(directions)], place,
         float(np.finfo(dtype).eps), sides.noise[list(outputs)],
     )  # fmt: skip
-    kinks = differ(ahead, behind, dtype)
+    kinks, n = differ(ahead, behind, dtype), scene.layout.size
     derivative, wrong = derivative.value, differ(derivative, both, dtype) & ~kinks
     names, reported = [names[i] for i in directions], []
     for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
-        message = (
+        slope = (
             f"The slope of {name} along {names[i]} is {behind.value[i, k]:.6g} below this state and "
-            f"{ahead.value[i, k]:.6g} above it: a kink, where automatic differentiation says {derivative[i, k]:.6g}"
-            f"{_blame_for_kink(scene, role) if role in ('lagrangian', 'dissipation') else ''}. Smooth it (sqrt(x**2 + "
-            "w**2) for abs(x)), or start beside it; a motion across it is one of two modes of simulate_hybrid."
+            f"{ahead.value[i, k]:.6g} above it"
+            f"{_blame_for_kink(scene, role) if role in ('lagrangian', 'dissipation') else ''}"
         )
-        reported.append(Finding("kink", "error", (names[i],), message))
+        of_force = role == "dissipation" or (role == "lagrangian" and not (name == "L" and directions[i] >= n))
+        if of_force:
+            rest = (
+                ": the acceleration jumps here. At this very state `acceleration` and derivatives are those of one "
+                f"side, or between them, by the slope {derivative[i, k]:.6g}. {OF_FORCE}"
+            )
+        else:
+            rest = (
+                f": a kink, where automatic differentiation says {derivative[i, k]:.6g}. No force shows the kick that "
+                "it gives to velocities. Smooth it (sqrt(x**2 + w**2) for abs(x)), or make two modes of it with a "
+                "Transition for lagjax.simulate_hybrid."
+            )
+        reported.append(Finding("kink", "advice" if of_force else "error", (names[i],), slope + rest))
     for i, k in list(zip(*np.nonzero(wrong), strict=True))[:_SHOWN]:
         message = (
             f"The derivative of {name} along {names[i]} is {derivative[i, k]:.6g} by automatic differentiation, and "

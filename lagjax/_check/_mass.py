@@ -30,7 +30,7 @@ def findings(scene: Scene) -> list[Finding]:
     if len(null_velocities(augmented[0])):
         return _singular(scene, augmented, usable)
     others = [augmented[k] for k in usable]
-    condition = _condition(augmented[0], names, DEFAULT_RTOL[scene.layout.dtype])
+    condition = _condition(augmented[0], names, DEFAULT_RTOL)
     return [*_nearly_singular(augmented[0], others, names), *_signs(m.mass[0], m.jacobian[0], names), *condition]
 
 

@@ -17,6 +17,7 @@ from lagjax._layout import Layout
 from lagjax._linear import augment
 from lagjax._motion import Motion
 from lagjax._program import Unlowerable
+from lagjax._scales import Scales
 from lagjax._system import System
 from lagjax._validate import as_arrays
 
@@ -45,8 +46,10 @@ class Scene(NamedTuple):
         """Measure `system` at a state."""
         q, qdot, t, params = as_arrays((q, qdot, 1.0 * t, params), layout.dtype)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)
-        sizes, derivation = _sizes(q, qdot), derivation_of(system, layout, params)
-        steps, offsets = ladder(sizes, layout.dtype), _offsets(layout, q, sizes)
+        derivation = derivation_of(system, layout, params)
+        scales = _scales(derivation, state)
+        sizes = _sizes(q, qdot, scales)
+        steps, offsets = ladder(sizes, layout.dtype), _offsets(sizes, scales, layout.dtype)
         try:
             measured = _evaluated(derivation, state, offsets)
         except Unlowerable:
@@ -188,39 +191,53 @@ class Sides(NamedTuple):
     round_off: Any  # how far it may move by_q, momentum, mass, drift, by_v_of_dissipation and the rows of G, each alike
 
 
-def _sizes(q: PyTree, qdot: PyTree) -> np.ndarray:
+def _scales(derivation: Derivation, state) -> Scales:
+    """How large coordinates, velocities and the time are at the state; one, where the scene does not tell."""
+    q, v, t, numbers = *(np.asarray(x, np.float64) for x in state[:3]), numbers_of(state[3])
+
+    def evaluated(name, q, v):
+        return derivation.evaluate((name,), columns_of(q, v, t, numbers))[name]
+
+    try:
+        mass = np.diagonal(evaluated("mass_matrix", q[None], v[None])[0])
+        scales = Scales.of(lambda q, v: evaluated("force", q, v), mass, q, v)
+    except Unlowerable:
+        scales = Scales(np.abs(q), np.abs(v), 1.0)
+    return scales._replace(**{name: np.where(np.isfinite(x) & (x > 0), x, 1.0) for name, x in scales._asdict().items()})
+
+
+def _sizes(q: PyTree, qdot: PyTree, scales: Scales) -> np.ndarray:
     """The size of every coordinate, of every velocity, and of the time along the motion, (2n + 1,).
 
-    A coordinate has its absolute value as its size; where that is zero, the largest in its array, or 1. One that is
-    tiny beside the others (an angle that was projected to 1e-20) counts as a thousandth of the largest. The size of the
-    time is what the fastest coordinate takes to move by its size.
+    A coordinate has its absolute value as its size; where that is zero, the largest in its array, or its scale. One
+    that is tiny beside the others (an angle that was projected to 1e-20) counts as a thousandth of that scale. The size
+    of the time is what the fastest coordinate takes to move by its size, or its scale if that is shorter.
     """
 
-    def of(tree):
-        leaves = [np.abs(np.asarray(leaf, np.float64)) for leaf in jax.tree.leaves(tree)]
-        least = 1e-3 * min(1.0, max(x.max(initial=0) for x in leaves))
-        return np.concatenate(
-            [np.ravel(np.maximum(np.where(x > 0, x, x.max(initial=0) or 1.0), least)) for x in leaves]
-        )
+    def of(tree, scale):
+        leaves = [np.abs(np.ravel(np.asarray(leaf, np.float64))) for leaf in jax.tree.leaves(tree)]
+        largest = np.concatenate([np.full(x.size, x.max(initial=0.0)) for x in leaves])
+        own = np.concatenate(leaves)
+        return np.maximum(np.where(own > 0, own, np.where(largest > 0, largest, scale)), 1e-3 * scale)
 
-    of_q, of_v = of(q), of(qdot)
+    of_q, of_v = of(q, scales.q), of(qdot, scales.qdot)
     speed = np.abs(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(qdot)]))
-    time = np.min(of_q / np.where(speed > of_q, speed, of_q))
+    time = np.min(of_q / np.where(speed > 0, speed, np.inf), where=speed > 0, initial=float(scales.t))
     return np.concatenate([of_q, of_v, [time]])
 
 
-def _offsets(layout: Layout, q: PyTree, sizes: np.ndarray) -> np.ndarray:
+def _offsets(sizes: np.ndarray, scales: Scales, dtype) -> np.ndarray:
     """Offsets (1 + 2 · _NEARBY, 2n) from the state: zero, then random ones of q alone, then of q̇ alone.
 
-    Their deviation is a tenth of the sizes. A coordinate that is small beside the others moves by a tenth of theirs: it
-    may be next to where the chart is singular, and has to leave that.
+    Their deviation is a tenth of the sizes. A coordinate that is small beside the others moves by a tenth of its scale:
+    it may be next to where the chart is singular, and has to leave that.
     """
-    n, whole = layout.size, np.abs(layout.flatten(q)).max()
-    sizes = np.concatenate([np.maximum(sizes[:n], min(1.0, whole)), sizes[n:-1]])
+    n = len(scales.q)
+    sizes = np.concatenate([np.maximum(sizes[:n], scales.q), sizes[n:-1]])
     moved = 0.1 * np.random.default_rng(0).standard_normal((2 * _NEARBY, 2 * n)) * sizes
     moved[:_NEARBY, n:] = 0
     moved[_NEARBY:, :n] = 0
-    return np.concatenate([np.zeros((1, 2 * n)), moved]).astype(layout.dtype)
+    return np.concatenate([np.zeros((1, 2 * n)), moved]).astype(dtype)
 
 
 _COMPARED = ("lagrangian", "momentum", "dissipation", "residual")

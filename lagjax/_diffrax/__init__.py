@@ -4,6 +4,8 @@ What diffrax reports of a motion that stopped ("the step became too small") is c
 matrix that is singular, a force that is not finite or jumps, constraints that became dependent.
 """
 
+from typing import ClassVar
+
 import diffrax
 import equinox as eqx
 import jax
@@ -15,15 +17,19 @@ from lagjax._constraints import rank_lost
 from lagjax._diffrax._equations import Equations, form_of
 from lagjax._diffrax._integrate import Jumps, Method, WithJumps, integrate
 from lagjax._diffrax._solvers import FineOutput, Projected
+from lagjax._doubles import DOUBLE, SINGLE
 from lagjax._failures import differentiable_where, lost_unless
 from lagjax._layout import Layout, halves
-from lagjax._problem import LEAST_RTOL_OF_DIFFRAX, AbstractEngine, Batch, Problem, PyTree, Solution, too_tight
+from lagjax._problem import AbstractEngine, Batch, Problem, PyTree, Solution, too_tight
 from lagjax._program import Unlowerable
 from lagjax._program._borders import CLOCK
 from lagjax._program._look_ups import table_of
 from lagjax._results import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, result_from
 from lagjax._stopped import End, what_stopped
 from lagjax._validate import is_concrete, require_number
+
+# Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
+LEAST_RTOL = 10
 
 
 class Diffrax(AbstractEngine, eqx.Module):
@@ -32,6 +38,8 @@ class Diffrax(AbstractEngine, eqx.Module):
     `solver` None is Dopri8, with better states between its steps where they are wanted; `adjoint` None goes back over
     the recorded steps in reverse mode.
     """
+
+    default_rtol: ClassVar = {DOUBLE: 1e-9, SINGLE: 1e-5}  # in the arithmetic of the state
 
     solver: diffrax.AbstractSolver | None = None
     dt: jax.Array | np.ndarray | None = None
@@ -58,7 +66,7 @@ class Diffrax(AbstractEngine, eqx.Module):
     def refuses(self, problem: Problem) -> str | None:
         """Why the tolerance, or the number of fixed steps, cannot be met, as the end of a sentence."""
         if self.dt is None:
-            return too_tight(problem.tolerances[0], problem.layout.dtype, LEAST_RTOL_OF_DIFFRAX)
+            return too_tight(self.rtol(problem), problem.layout.dtype, LEAST_RTOL)
         if not (is_concrete(self.dt) and is_concrete(problem.ts)):
             return None
         ts = np.asarray(problem.ts)
@@ -87,7 +95,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         if self.dt is not None:
             dt0 = jnp.asarray(self.dt, dtype) * jnp.sign(ts[-1] - ts[0])
             return Method(solver, diffrax.ConstantStepSize(), dt0, problem.max_steps, self.progress)
-        rtol, atol = problem.tolerances
+        rtol, atol = self.tolerances(problem, problem.y0)
         # Below this a step no longer moves the time reliably.
         smallest = 4 * jnp.finfo(dtype).eps * jnp.maximum(abs(ts[0]), abs(ts[-1]))
         controller = diffrax.PIDController(rtol, atol, norm=_norm_or_inf, dtmin=smallest, force_dtmin=False)

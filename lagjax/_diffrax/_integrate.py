@@ -18,11 +18,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from lagjax._diffrax._crossings import AdaptiveWrapper, Noting, may_jump, noting
 from lagjax._diffrax._equations import Equations
 from lagjax._diffrax._solvers import Projected
+from lagjax._failures import differentiable_where
 from lagjax._layout import halves
 from lagjax._problem import Solution
-from lagjax._results import RESULTS, SUCCESSFUL
+from lagjax._results import ENDED_WELL, RESULTS, SUCCESSFUL, code_of
 
 PyTree = Any
 
@@ -74,10 +76,28 @@ def _of_arrays(function):
 def _differentiable(moving, method: Method, adjoint, event) -> Solution:
     if adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-        return _solve(moving, method, adjoint, event)
+        if isinstance(adjoint, diffrax.BacksolveAdjoint) or not may_jump(*_at_start(moving)):
+            return _solve(moving, method, adjoint, event)
+        # Whether it is differentiated, and by what, nobody knows here: parameters count as fixed.
+        solution, _, crossed = _call(moving, _noting(moving, method, None), adjoint, event)
+        y_end, path = (differentiable_where(~crossed, x) for x in (solution.y_end, solution.path))
+        return solution._replace(path=path, y_end=y_end)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
     frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, method)
     return _over_recorded_steps(moving, frozen)
+
+
+def _at_start(moving) -> tuple:
+    """The field, and its arguments where the motion begins."""
+    field, _, ts, y0, params = moving
+    return field, ts[0], y0, params
+
+
+def _noting(moving, method: Method, varied) -> Method:
+    """The method with a note whether a step crosses a jump of the field that moves with the state or what is varied."""
+    field, _, _, _, params = moving
+    varied = jax.tree.map(lambda _: False, (field, params)) if varied is None else varied
+    return eqx.tree_at(lambda m: m.controller, method, noting(method.controller, field, varied))
 
 
 def _solve(moving, method: Method, adjoint, event=None) -> Solution:
@@ -85,11 +105,12 @@ def _solve(moving, method: Method, adjoint, event=None) -> Solution:
     return _call(moving, method, adjoint, event)[0]
 
 
-def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any]:
-    """Call diffrax: the solution, and what else it is to save."""
+def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any, Any]:
+    """Call diffrax: the solution, what else it is to save, and where that is noted whether a step crossed a jump."""
     field, project, ts, y0, params = moving
     solver = method.solver if project is None else Projected(method.solver, project)
     saved = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True), *more]
+    notes = isinstance(method.controller, Noting)
     done: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
         _looping(solver, adjoint),
@@ -98,7 +119,7 @@ def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt)
         dt0=method.dt0,
         y0=y0,
         args=params,
-        saveat=diffrax.SaveAt(subs=saved),
+        saveat=diffrax.SaveAt(subs=saved, controller_state=notes),
         stepsize_controller=method.controller,
         adjoint=adjoint,
         event=event,
@@ -108,7 +129,8 @@ def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt)
     )
     accepted, rejected = (done.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
     result = RESULTS.promote(done.result)._value
-    return Solution(done.ys[0], done.ys[1][0], done.ts[1][0], result, accepted, rejected), done.ys[2:]
+    crossed = done.controller_state[1] if notes else None
+    return Solution(done.ys[0], done.ys[1][0], done.ts[1][0], result, accepted, rejected), done.ys[2:], crossed
 
 
 def _looping(solver, adjoint):
@@ -134,16 +156,25 @@ def _over_recorded_steps(moving, method):
 
 @_over_recorded_steps.def_fwd
 def _forward(perturbed, moving, method):
-    del perturbed
     record = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t)
-    solution, (times,) = _call(moving, method, diffrax.ForwardMode(), None, record)
-    return solution, (times, solution.t_end, solution.result)
+    of_field, _, _, of_start, of_params = perturbed
+    varied = of_field, of_params
+    moves = any(jax.tree.leaves((varied, of_start)))
+    if moves and may_jump(*_at_start(moving)):
+        method = _noting(moving, method, varied)
+    solution, (times,), crossed = _call(moving, method, diffrax.ForwardMode(), None, record)
+    if crossed is None:
+        crossed = jnp.array(False)
+    residuals = times, solution.t_end, solution.result, crossed
+    well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL, solution.result.dtype))
+    lost = jnp.asarray(code_of(RESULTS.derivatives_lost), solution.result.dtype)
+    return solution._replace(result=jnp.where(crossed & well, lost, solution.result)), residuals
 
 
 @_over_recorded_steps.def_bwd
 def _backward(residuals, cotangents, perturbed, moving, method):
     del perturbed
-    times, t_end, result = residuals
+    times, t_end, result, crossed = residuals
 
     def replay(moving):
         field, project, ts, y0, params = moving
@@ -159,6 +190,7 @@ def _backward(residuals, cotangents, perturbed, moving, method):
 
     replayed, pull_back = eqx.filter_vjp(replay, moving)
     filled = jax.tree.map(lambda x, c: jnp.zeros_like(x) if c is None else c, replayed, tuple(cotangents[:3]))
+    filled = jax.tree.map(lambda c: jnp.where(crossed & (c != 0), jnp.nan, c), filled)
     return pull_back(filled)[0]
 
 
@@ -233,7 +265,7 @@ def _exchanged(t, old, new):
     return jnp.where(jnp.isfinite(t) & (old[place] == t), new[place], t)
 
 
-class WithJumps(diffrax.AbstractAdaptiveStepSizeController):
+class WithJumps(AdaptiveWrapper):
     """The steps of a controller, which end before every jump and go on behind it."""
 
     controller: Any  # an adaptive one: `wrap` of diffrax does not say so of what it returns
@@ -241,18 +273,6 @@ class WithJumps(diffrax.AbstractAdaptiveStepSizeController):
 
     def __init__(self, controller: Any, jumps: Jumps):
         self.controller, self.jumps = controller, jumps
-
-    @property
-    def rtol(self):
-        return self.controller.rtol
-
-    @property
-    def atol(self):
-        return self.controller.atol
-
-    @property
-    def norm(self):
-        return self.controller.norm
 
     def wrap(self, direction):
         """diffrax integrates backward motion with its time reversed."""

@@ -214,8 +214,8 @@ def _contracts(start: PyTree, near: PyTree, nearer: PyTree) -> jax.Array:
         jnp.max(jnp.stack([jnp.max(jnp.abs(b - a)) for a, b in zip(*map(jax.tree.leaves, pair), strict=True)]))
         for pair in ((start, near), (near, nearer))
     )
-    leaves = jax.tree.leaves(nearer)
-    size = 1 + jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in leaves]))
+    leaves = jax.tree.leaves((nearer, start))
+    size = jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in leaves]))
     return second <= jnp.maximum(0.01 * first, 1e3 * float(jnp.finfo(leaves[0].dtype).eps) * size)
 
 

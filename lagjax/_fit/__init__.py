@@ -6,15 +6,18 @@
                           begins                  directions
 
 Files: `_records`, `_parameters` and `_transforms` take what the user gives; `_motions` and `_signals` follow motions
-and sensors with their derivatives; `_residuals` and `_noise` say how far off a trial is, and `_systems` how far one of
-several systems; `_segments` says where to begin, and `_weak` where that is far off; `_solve` goes down from there, or
-`_gradient`, from many starts by `_many`, one after the other by `_search`; `_correlation`, `_uncertainty`, `_joint`,
-`_unseen`, `_profile`, `_density`, `_surrogate`, `_sample`, `_next`, `_report` and `_result` say what that means.
+and sensors with their derivatives, `_wrapped` sensors that show angles less whole turns; `_residuals` and `_noise` say
+how far off a trial is, and `_systems` how far one of several systems; `_segments` says where to begin, and `_weak`
+where that is far off; `_solve` goes down from there, or `_gradient`, from many starts by `_many`, one after the other
+by `_search`; `_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_verdict`, `_suspects`, `_profile`, `_density`,
+`_chart`, `_surrogate`, `_sample`, `_next`, `_report` and `_result` say what that means.
 """
 
 import functools
 import sys
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._consistent import has_constraints
+from lagjax._doubles import DOUBLE, with_doubles
 from lagjax._fit._blame import reading_params
 from lagjax._fit._delays import Delayed
 from lagjax._fit._inputs import HOLDS, Form, asks
@@ -42,17 +46,19 @@ from lagjax._fit._records import (
 from lagjax._fit._residuals import AbstractQuestion, Failure, Question
 from lagjax._fit._result import Covariance, Fit, SignalNoise
 from lagjax._fit._scene import Scene, first_law, require_scene
-from lagjax._fit._search import by_gradient, roomy, search_records, searches, weakly
-from lagjax._fit._segments import Reader, whole
+from lagjax._fit._search import Unfollowed, by_gradient, reader_of, roomy, search_records, searches, weakly
+from lagjax._fit._segments import Reader, TimeScales, time_scales, whole
 from lagjax._fit._signals import Signals, looks_like_positions
 from lagjax._fit._solve import Descent
 from lagjax._fit._starts import Manifold
+from lagjax._fit._suspects import SECONDS, find_mistake, hanging, suspects
 from lagjax._fit._systems import asked, by_name, naming
 from lagjax._fit._timings import Timings, clock_of
 from lagjax._fit._transforms import angle, between, inertia, positive, simplex
 from lagjax._fit._uncertainty import Information, information
 from lagjax._fit._unseen import sentences
-from lagjax._fit._verdict import verdict
+from lagjax._fit._verdict import Unexplained, Verdict, verdict
+from lagjax._fit._wrapped import UNCLEAR, require_no_jumps, sensors, wrapped
 from lagjax._hybrid import Hybrid
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL
@@ -71,12 +77,14 @@ __all__ = [
     "inertia",
     "positive",
     "simplex",
+    "wrapped",
 ]  # fmt: skip
 PyTree = Any
 
 METHODS = ("auto", "segments", "whole", "gradient")
 
 
+@with_doubles
 def fit(
     system: Scene | dict[str, Scene],
     records: Record | Timings | list | dict[str, Any],
@@ -105,8 +113,10 @@ def fit(
     - `records`: one `Record` or several, of any lengths; and `lagjax.Timings`, beside them or alone.
     - `params0`: where the search for the parameters begins, in the structure that the scene's functions ask for.
     - `observe`: a function of (q, qdot), and of `t`, `params`, `inputs` by name, that returns what the sensors show in
-      the structure of a record's `values`; by default q. `lagjax.Delayed` is for sensors with a delay.
-    - `free`: True or False for every parameter, or for whole branches of `params0`; by default all floats are free.
+      the structure of a record's `values`; by default q. `lagjax.Delayed` is for sensors with a delay, `lagjax.wrapped`
+      for those that show angles less whole turns.
+    - `free`: True or False for every parameter, or for whole branches of `params0`, or a Boolean array for the numbers
+      of an array; by default all floats are free.
     - `transforms`: `lagjax.positive`, `lagjax.between(a, b)`, `lagjax.angle` or None for every parameter or branch;
       `lagjax.simplex` and `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
       its search and its interval are then relative.
@@ -156,23 +166,75 @@ def fit(
     if not isinstance(noise, AbstractNoise):
         raise TypeError(f"noise must be lagjax.Gaussian() or lagjax.StudentT(); got {noise!r}.")
     scenes = _scenes(system, records, params0, observe, hold)
-    parameters = Parameters.of(params0, free, transforms, np.result_type(*(scene.layout.dtype for scene in scenes)))
+    parameters = Parameters.of(params0, free, transforms)
+    how = _How(system, observe, noise, int(starts), method, int(seed), progress)
+    begun = time.process_time()
+    try:
+        done, came_to = _answer(how, scenes, params0, parameters)
+    except Unfollowed as reason:
+        nothing = Unexplained([str(reason)], [], np.inf, True, list(range(len(scenes[0].records))))
+        more = _mistakes(how, scenes, params0, parameters, nothing, time.process_time() - begun)
+        raise Unfollowed(" ".join([str(reason), *more])) from reason.__cause__
+    if not came_to.left.doubted:
+        return done
+    more = _mistakes(how, scenes, params0, parameters, came_to.left, time.process_time() - begun)
+    return replace(done, ok=done.ok and not more, message=" ".join([done.message, *more]))
+
+
+def _mistakes(
+    how: "_How", scenes: list["_Scene"], params0: PyTree, parameters: Parameters, left: Unexplained, spent: float
+) -> list[str]:
+    """What is wrong with records of which a fit leaves so much, as far as fits of other records tell; `spent` is the
+    processor time that it took, and the tries may take, or more where it explains nothing."""
+    if len(scenes) > 1 or how.method == "gradient":
+        return []
+    [scene] = scenes
+    once, about = how._replace(starts=1, progress=False), _question(scene, parameters)
+    reading = [reader for reader in _readers(scenes, about) or [] if reader is not None]
+    if not about.signals.names:
+        return []
+
+    def share(records: list[Any]) -> float | None:
+        try:
+            _, came_to = _answer(once, [scene._replace(records=records)], params0, parameters)
+        except ValueError:
+            return None
+        return None if came_to.left.motion else came_to.left.share
+
+    scales = time_scales(reading, about.motions, parameters.first) if reading else TimeScales(1.0, 1.0)
+    slower = scales.data / scales.scene if np.isfinite(scales.data) else 1.0
+    possible = suspects(scene.records, about.signals.names, left.worst, slower)
+    return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent)
+
+
+class _How(NamedTuple):
+    """What a user asks of a search."""
+
+    system: Any
+    observe: Any
+    noise: AbstractNoise
+    starts: int
+    method: str
+    seed: int
+    progress: bool
+
+
+def _answer(how: _How, scenes: list["_Scene"], params0: PyTree, parameters: Parameters) -> tuple[Fit, Verdict]:
+    """The fit of records that were checked. Raises `Unfollowed` where the first trial cannot be followed."""
     question = asked({scene.name: _question(scene, parameters) for scene in scenes})
-    _require_one_beginning(question, starts, method)
-    readers = _readers(scenes)
-    if progress:
+    _require_one_beginning(question, how.starts, how.method)
+    readers = _readers(scenes, question)
+    if how.progress:
         question.watch = _Printer(question.size)
     y0 = _starts(scenes, readers, question.states, params0)
-    readers = _to_cut(scenes, readers, method)
-    first, told = parameters.moved(parameters.first), (system, observe, question)
+    readers = _to_cut(scenes, readers, how.method)
+    first, noise = parameters.moved(parameters.first), how.noise
     systems = {scene.name: scene.system for scene in scenes}
-    if method == "gradient":
-        return _told(*told, by_gradient(question, systems, first, y0, noise, readers), noise, None)
+    if how.method == "gradient":
+        return _told(how, by_gradient(question, systems, first, y0, noise, readers), None)
     weak = functools.partial(weakly, question, list(systems.values()), readers=readers or [])
-    search = functools.partial(search_records, question, noise=noise, method=method, readers=readers, weak=weak)
-    descent, waterfall = searches(question, search, first, y0, starts, seed)
-    question.watch = None
-    return _told(*told, descent, noise, waterfall)
+    search = functools.partial(search_records, question, noise=noise, method=how.method, readers=readers, weak=weak)
+    return _told(how, *searches(question, search, first, y0, how.starts, how.seed))
 
 
 class _Scene(NamedTuple):
@@ -190,12 +252,12 @@ class _Scene(NamedTuple):
 def _scenes(system, records, params0, observe, hold: str) -> list[_Scene]:
     """The systems with their records, checked."""
     scenes = []
-    for name, one, own, sensors in by_name(system, records, observe):
+    for name, one, own, shown in by_name(system, records, observe):
         with naming(name):
-            require_scene(one)
+            one = require_scene(one)
             own = require_alike(own)
             form = _form(one, own, hold)
-            scenes.append(_Scene(name, one, own, sensors, form, _layout(one, own, params0, form)))
+            scenes.append(_Scene(name, one, own, shown, form, _layout(one, own, params0, form)))
     return scenes
 
 
@@ -258,7 +320,7 @@ def _layout(system: Scene, records: list[Record], params0, form: Form | None) ->
             f"have where no record has a start ({type(reason).__name__}: {str(reason).splitlines()[0]}). If the values "
             "are something else, give every record start=(q0, qdot0), or lagjax.Guess(q0, qdot0) to fit it."
         ) from reason
-    return Layout.of(q, qdot)
+    return replace(Layout.of(q, qdot), dtype=DOUBLE)
 
 
 def _question(scene: _Scene, parameters: Parameters) -> Question:
@@ -268,12 +330,14 @@ def _question(scene: _Scene, parameters: Parameters) -> Question:
 
 
 def _about(system, records, observe, form, layout, parameters) -> Question:
-    rtol = DEFAULT_RTOL[layout.dtype]
+    rtol = DEFAULT_RTOL
     motions = motions_of(system, layout, parameters, rtol, None, form)
     recordings = [record for record in records if isinstance(record, Record)]
     if isinstance(observe, Delayed):
         _require_longer(recordings, observe.longest)
     signals = Signals(observe, layout, parameters, recordings[0] if recordings else None, form)
+    _require_no_jumps(system, records, observe, signals)
+    _require_motion(recordings, signals.names, records)
     size = _sizes(recordings)
     timings = {k: record for k, record in enumerate(records) if isinstance(record, Timings)}
     clocks = {k: clock_of(system, layout, parameters, record, rtol) for k, record in timings.items()}
@@ -291,6 +355,22 @@ def _about(system, records, observe, form, layout, parameters) -> Question:
         records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol, clocks,
         manifold,
     )  # fmt: skip
+
+
+def _require_no_jumps(scene: Scene, records: list[Any], observe, signals: Signals) -> None:
+    """Raise `ValueError` where a signal jumps by a period that nobody spoke of; motion through modes may jump."""
+    if isinstance(scene, Hybrid) or sensors(observe)[1] is not None:
+        return
+    for place, record in enumerate(records):
+        if isinstance(record, Record):
+            require_no_jumps(record, f"records[{place}]", signals.names, sensors(observe)[0] is None)
+
+
+def _require_motion(recordings: list[Record], names: tuple[str, ...], records: list[Any]) -> None:
+    """Raise `ValueError` where starts are fitted, and no signal of any record ever changes."""
+    still = hanging(recordings, names)
+    if still and len(still) == len(names) * len(records) and all(record.start is None for record in records):
+        raise ValueError(f"{still[0]} So it is with all signals of all records: nothing moves that could be fitted.")
 
 
 def _require_plain(scene: Hybrid, fitted: np.ndarray, observe) -> None:
@@ -318,18 +398,17 @@ def _sizes(recordings: list[Record]) -> np.ndarray:
     return np.sqrt(np.nanmean(np.concatenate([record.matrix for record in recordings]) ** 2, axis=0))
 
 
-def _readers(scenes: list[_Scene]) -> list[Reader | None] | None:
+def _readers(scenes: list[_Scene], question: AbstractQuestion) -> list[Reader | None] | None:
     """What reads states off the data, for each record whose signals are positions; None where there is no such record.
 
     All records of a system together try windows at a few hundred places.
     """
-    readers = []
-    for scene in scenes:
-        first = next((record for record in scene.records if isinstance(record, Record)), None)
-        reads, probes = first is not None and looks_like_positions(scene.observe, first, scene.layout), 256
-        probes = max(8, probes // len(scene.records))
+    readers, numbers = [], question.parameters.first
+    for scene, part in zip(scenes, question.parts, strict=True):
+        probes = max(8, 256 // len(scene.records))
         readers += [
-            Reader.of(record, probes) if reads and isinstance(record, Record) else None for record in scene.records
+            reader_of(record, scene.observe, part.question, numbers, probes) if isinstance(record, Record) else None
+            for record in scene.records
         ]
     return readers if any(reader is not None for reader in readers) else None
 
@@ -354,17 +433,19 @@ def _starts(scenes: list[_Scene], readers: list[Reader | None] | None, states: i
     for scene in scenes:
         own = None if readers is None else readers[first : first + len(scene.records)]
         with naming(scene.name):
-            found += [_start(record, own, scene.layout, k, params0) for k, record in enumerate(scene.records)]
+            found += [_start(record, own, scene, k, params0) for k, record in enumerate(scene.records)]
         first += len(scene.records)
     return np.stack([roomy(state, states) for state in found])
 
 
-def _start(record: Measured, readers: list[Reader | None] | None, layout: Layout, place: int, params0) -> np.ndarray:
+def _start(record: Measured, readers: list[Reader | None] | None, scene: _Scene, place: int, params0) -> np.ndarray:
     """Where the search for the start of one record begins, (2n,)."""
-    state = known_start(record, layout, place, params0)
+    state = known_start(record, scene.layout, place, params0)
     if state is not None:
         return state
     reader = None if readers is None else readers[place]
+    if reader is None and isinstance(record, Record) and looks_like_positions(scene.observe, record, scene.layout):
+        raise ValueError(UNCLEAR.format(f"records[{place}]"))
     if reader is None:
         raise ValueError(
             f"records[{place}] needs a start, because its values do not have the structure of q: give "
@@ -392,22 +473,22 @@ class _Printer:
 # ---- what came out ---------------------------------------------------------------------------------------------------
 
 
-def _told(
-    system, observe, question: AbstractQuestion, descent: Descent, law: AbstractNoise, waterfall: Waterfall | None
-) -> Fit:
+def _told(how: _How, descent: Descent, waterfall: Waterfall | None) -> tuple[Fit, Verdict]:
     """The result in the user's structures and in words."""
-    point, widths, parameters = descent.point, descent.widths, question.parameters
+    point, widths, question = descent.point, descent.widths, descent.question
+    parameters, question.watch = question.parameters, None
     known = information(question, point, widths)
-    unseen = sentences(question, point, widths, known.null)
-    return Fit(
+    unseen = sentences(question, point, widths, known)
+    found = verdict(descent, unseen, known, question)
+    done = Fit(
         params=parameters.restore(parameters.numbers(point.u)),
-        starts=question.by_system([question.restored(k, y) for k, y in enumerate(point.starts)]),
+        starts=question.by_system([question.restored(k, point.starts[row]) for k, row in enumerate(question.firsts)]),
         covariance=Covariance(parameters.names, parameters.covariance(point.u, known.covariance)),
         noise=_noise_by_name(question, widths, known),
         residuals=question.by_system(_by_record(question, point)),
         unseen=unseen,
-        ok=descent.converged and not unseen,
-        message=verdict(descent, unseen, known, question),
+        ok=found.ok,
+        message=found.message,
         log_likelihood=log_likelihood(widths, point.flat(), question.weights),
         trials=descent.trials,
         waterfall=waterfall,
@@ -415,13 +496,14 @@ def _told(
         parameters=parameters,
         u=point.u,
         states=point.starts,
-        law=law,
+        law=how.noise,
         information=known,
         widths=widths,
         question=question,
-        system=system,
-        observe=observe,
+        system=how.system,
+        observe=how.observe,
     )
+    return done, found
 
 
 def _noise_by_name(question: AbstractQuestion, widths, known: Information) -> dict[str, SignalNoise]:
@@ -434,10 +516,14 @@ def _noise_by_name(question: AbstractQuestion, widths, known: Information) -> di
 
 
 def _by_record(question: AbstractQuestion, point) -> list[PyTree]:
-    found: dict[int, PyTree] = {}
+    """The residuals of every record in its structure, NaN where nothing was measured."""
+    columns = [question.columns(k) for k in range(len(question.records))]
+    found = [
+        np.full((len(record), c.stop - c.start), np.nan) for record, c in zip(question.records, columns, strict=True)
+    ]
     for batch, residuals in zip(question.batches, point.residuals, strict=True):
         for row, left, weights in zip(batch.rows.tolist(), residuals, batch.weights, strict=True):
-            record = question.records[row]
-            matrix = np.where(weights > 0, left, np.nan)[: len(record), question.columns(row)]
-            found[row] = in_structure(matrix, record)
-    return [found[row] for row in range(len(question.records))]
+            record, places = question.pieces[row]
+            matrix = np.where(weights > 0, left, np.nan)[: len(places), columns[record]]
+            found[record][places] = matrix
+    return [in_structure(matrix, record) for matrix, record in zip(found, question.records, strict=True)]

@@ -35,9 +35,7 @@ def correlation(question: AbstractQuestion, point: Point, widths: Widths, signal
         if not np.isinf(dof):
             z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
         counted = batch.weights[..., signal] > 0
-        z, count = together(z, counted), count + int(counted.sum())
-        spectrum = np.abs(np.fft.rfft(z, 2 * z.shape[1])) ** 2
-        own = np.fft.irfft(spectrum.sum(axis=0), 2 * z.shape[1])[: z.shape[1]]
+        own, count = lag_products(z, counted), count + int(counted.sum())
         longer = np.zeros(max(len(sums), len(own)))
         longer[: len(sums)] += sums
         longer[: len(own)] += own
@@ -49,6 +47,31 @@ def correlation(question: AbstractQuestion, point: Point, widths: Widths, signal
         return Correlation(np.ones(1), 1.0, count, float(law[1]) if len(law) > 1 else 0.0)
     lags = law[: 3 * cut] * _parzen(np.arange(min(3 * cut, len(law))) / (3 * cut))
     return Correlation(lags, float(max(1.0, lags[0] + 2 * lags[1:].sum())), count, float(law[1]))
+
+
+def lag_products(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """Σ zᵢ zᵢ₊ₖ over rows (N, T) for the lags k = 0 … T − 1, of samples that count."""
+    rows = together(rows, counted)
+    spectrum = np.abs(np.fft.rfft(rows, 2 * rows.shape[1])) ** 2
+    return np.fft.irfft(spectrum.sum(axis=0), 2 * rows.shape[1])[: rows.shape[1]]
+
+
+_LAGS = 20  # of residuals that hold motion some are correlated over the first lags, unless a period has two samples
+_CHANCE = 4.0  # standard errors of a correlation: white residuals show it at one of so many lags in 1 of 800 fits
+
+
+def structure(rows: np.ndarray, counted: np.ndarray) -> float:
+    """The mean square of what is no white noise in residuals (N, T), zero where no correlation is beyond chance.
+
+    Motion that changes little from one sample to the next has its whole mean square in the product of neighbours, to
+    which white noise adds nothing.
+    """
+    count = int(counted.sum())
+    sums = lag_products(np.where(counted, rows, 0.0), counted)[: _LAGS + 1]
+    if count < 2 or not sums[0] > 0:
+        return 0.0
+    highest = np.abs(sums[1:]).max(initial=0.0)
+    return float(highest / count) if highest > _CHANCE / np.sqrt(count) * sums[0] else 0.0
 
 
 def together(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:

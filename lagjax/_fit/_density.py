@@ -18,12 +18,14 @@ import numpy as np
 from jax.scipy.special import gammaln
 from scipy.special import polygamma
 
+from lagjax._doubles import accepts_singles
 from lagjax._fit._inputs import Driven, asks
 from lagjax._fit._noise import AbstractNoise, StudentT, Widths
 from lagjax._fit._records import Samples, started
 from lagjax._fit._residuals import AbstractQuestion, Part, Point
 from lagjax._fit._scene import Scene
 from lagjax._fit._scene import follow as follow_scene
+from lagjax._fit._wrapped import on_circle
 from lagjax._layout import halves
 from lagjax._system import System
 
@@ -91,7 +93,7 @@ class OfSystem:
         table = None if batch.table is None else tuple(jnp.asarray(x, at.u.dtype) for x in batch.table)
         shown = jax.vmap(follow)(ts, starts, inputs, table)
         shown = jnp.zeros(values.shape, values.dtype).at[..., : shown.shape[-1]].set(shown)
-        return jnp.where(batch.weights > 0, shown - values, 0.0)
+        return jnp.where(batch.weights > 0, on_circle(shown - values, self.question.periods, jnp), 0.0)
 
 
 class Density:
@@ -159,6 +161,7 @@ class Density:
         """The user's pytree of parameters at u (F,)."""
         return self.question.parameters.restore(self.question.parameters.numbers(u, jnp))
 
+    @accepts_singles(("x",))
     def __call__(self, x):
         """log p(x), up to a constant; −∞ where a motion could not be followed."""
         return self.posterior(x, self.log_likelihood(x))

@@ -110,7 +110,7 @@ def ended(
     text = f"The descent by gradients came to rest within {steps} steps."
     if not rest:
         text = f"The descent by gradients was stopped after {steps} steps, and the likelihood still grew."
-    return Descent(point, question.widths(point, noise), rest, steps, text)
+    return Descent(point, question.widths(point, noise), rest, steps, text, question)
 
 
 def _optax() -> Any:

@@ -16,6 +16,7 @@ import numpy as np
 
 from lagjax._arguments import Function
 from lagjax._fit._scene import Scene, laws
+from lagjax._reads import Edition
 from lagjax._samples import samples
 from lagjax._system import System
 
@@ -115,7 +116,7 @@ class _Looked(eqx.Module):
 
 def _wrapped(function: Function, form: Form) -> Function:
     arrays, code = eqx.partition(_Looked(function, form), eqx.is_array)
-    return Function(arrays, code, ("t", "params"))
+    return Function(arrays, Edition.of(code), ("t", "params"))
 
 
 def asks(scene: Scene) -> list[str]:

@@ -20,6 +20,7 @@ from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Piece
 from lagjax._fit._residuals import AbstractQuestion, Failure, Question, compressed
 from lagjax._fit._solve import eliminate
+from lagjax._fit._wrapped import on_circle
 
 _STEPS = 8  # of the short search
 _SAMPLES = 200  # of each record, in it
@@ -184,7 +185,8 @@ def _residuals(question: Question, batch, starts, numbers, directions, moved) ->
         values, slopes = both
         slopes = np.pad(slopes, ((0, 0), (0, 0), (0, 0), (missing, 0)))
         slopes[~question.fitted[batch.rows], ..., : question.states] = 0.0
-        found[k, ..., columns, :-1], found[k, ..., columns, -1] = slopes, values - batch.values[..., columns]
+        left = on_circle(values - batch.values[..., columns], question.periods[columns])
+        found[k, ..., columns, :-1], found[k, ..., columns, -1] = slopes, left
     return np.where((batch.weights > 0)[..., None] | np.isnan(found), found, 0.0)
 
 

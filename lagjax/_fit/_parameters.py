@@ -20,7 +20,7 @@ PyTree = Any
 
 
 class Part(NamedTuple):
-    """The numbers of one leaf that is free: where they stand among all numbers, and how they may move."""
+    """The numbers of one leaf that are free: where they stand among all numbers, and how they may move."""
 
     label: str
     shape: tuple[int, ...]
@@ -63,10 +63,14 @@ class Parameters:
                 continue
             values = np.asarray(leaf, np.float64).ravel()
             numbers.append(values)
-            if _is_fitted(label, leaf, may_move, free) and values.size:
-                transform = _transform_of(label, transform, values, np.shape(leaf))
-                parts.append(Part(label, np.shape(leaf), np.arange(count, count + values.size), transform))
-                names += _names(label, np.shape(leaf))
+            fitted = _which_are_fitted(label, leaf, may_move, free)
+            if fitted.any():
+                shape = np.shape(leaf)
+                transform = _transform_of(label, transform, values[fitted], shape)
+                if not (fitted.all() or transform.separable):
+                    raise ValueError(f"{label} is free as a whole or not at all: its transform is {transform!r}.")
+                parts.append(Part(label, shape, count + np.flatnonzero(fitted), transform))
+                names += [name for name, free_too in zip(_names(label, shape), fitted, strict=True) if free_too]
             count += values.size
         if not names:
             raise ValueError("No parameter is free: give params0 at least one float for which `free` is True.")
@@ -194,14 +198,30 @@ class Parameters:
         size = np.where(x != 0, np.abs(x), 1.0)
         return np.minimum(1.0 / np.maximum(np.abs(jacobian) / size[:, None], 1e-300).max(axis=0), self.reach)
 
+    def row(self, name: str) -> int:
+        """The place among the free numbers of the one of this name, or of the only one whose name ends in it.
+
+        `dry` is `params['joint']['dry']`, `l[1]` is `params['l'][1]`. Raises `ValueError` where none or several are.
+        """
+        if name in self.names:
+            return self.names.index(name)
+        cut = name.rfind("[") if name.endswith("]") else len(name)
+        key, index = name[:cut], name[cut:]
+        ends = f"[{key!r}]{index}", f".{key}{index}"
+        rows = [k for k, own in enumerate(self.names) if own.endswith(ends)]
+        if len(rows) != 1:
+            several = [self.names[k] for k in rows]
+            reason = f"{name!r} may be {', '.join(several)}" if rows else f"No free parameter is called {name!r}"
+            raise ValueError(f"{reason}; there are {', '.join(self.names)}.")
+        return rows[0]
+
     def unknown(self, name: str) -> int:
-        """The place of the unknown that moves the free number of this name alone.
+        """The place of the unknown that moves the free number of this name (`row`) alone.
 
         Raises `ValueError` where there is no such number, or where it moves only together with others.
         """
-        if name not in self.names:
-            raise ValueError(f"No free parameter is called {name!r}; there are {', '.join(self.names)}.")
-        row = self.names.index(name)
+        row = self.row(name)
+        name = self.names[row]
         own, rows, part = next(cut for cut in self._cuts if cut[1].start <= row < cut[1].stop)
         if not part.transform.separable:
             raise ValueError(
@@ -249,15 +269,21 @@ def _spread(prefix: PyTree, tree, leaves: list, name: str) -> list:
         ) from None
 
 
-def _is_fitted(label: str, leaf, may_move, free) -> bool:
-    """Whether a leaf is fitted. Raises where the user asks for that of one that cannot move."""
-    if not isinstance(may_move, bool | np.bool_):
+def _which_are_fitted(label: str, leaf, may_move, free) -> np.ndarray:
+    """Which numbers of a leaf (n,) are fitted. Raises where the user asks for that of one that cannot move."""
+    wanted = np.asarray(may_move)
+    if wanted.dtype != bool:
         raise TypeError(f"free must hold True or False; got {may_move!r} for {label}.")
+    if wanted.shape not in ((), np.shape(leaf)):
+        raise ValueError(
+            f"free must hold True, False, or an array of them of the shape {np.shape(leaf)} for {label}; got one of "
+            f"the shape {wanted.shape}."
+        )
     if not np.issubdtype(np.asarray(leaf).dtype, np.floating):
-        if may_move and free is not None and free is not True:
+        if wanted.any() and free is not None and free is not True:
             raise TypeError(f"{label} is free but not a float: write 1.0 instead of 1, or leave it out of `free`.")
-        return False
-    return bool(may_move)
+        return np.zeros(np.size(leaf), bool)
+    return np.broadcast_to(wanted, np.shape(leaf)).ravel()
 
 
 def _transform_of(label: str, transform, values: np.ndarray, shape: tuple[int, ...]) -> AbstractTransform:

@@ -124,7 +124,7 @@ def profile(
     threshold = float(stdtrit(dof, 0.5 + 0.5 * level) ** 2)
     ends = [_end(line, side, threshold, parameters.room[line.which]) for side in (-1.0, 1.0)]
     minima = _minima(line, threshold)
-    row = parameters.names.index(name)
+    row = parameters.row(name)
 
     def value(at: float) -> float:
         moved = line.u.copy()
@@ -136,8 +136,9 @@ def profile(
         verdict = "two minima"
     places = sorted(line.places, key=lambda place: place.at)
     return Profile(
-        name, np.array([value(place.at) for place in places]), np.array([place.deviance for place in places]), level,
-        threshold, (_end_value(value, ends[0]), _end_value(value, ends[1])), verdict,
+        parameters.names[row], np.array([value(place.at) for place in places]),
+        np.array([place.deviance for place in places]), level, threshold,
+        (_end_value(value, ends[0]), _end_value(value, ends[1])), verdict,
         tuple((value(at), d) for at, d in minima),
     )  # fmt: skip
 

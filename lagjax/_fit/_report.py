@@ -82,10 +82,11 @@ def _of_records(records, residuals: list[np.ndarray], names, sigma) -> dict[str,
     """Data over fit of the records of one system, whose residuals are (T, S), by their headings."""
     count = min(len(names), _SIGNALS)
 
-    def one(record, left):
+    def one(k):
         def draw(figure):
             axes = figure.subplots(2, count, squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
-            draw_record(axes, record, left, names[:count], sigma)
+            draw_record(axes, records[k], residuals[k], names[:count], sigma)
+            figure.suptitle(f"records[{k}]", fontsize="medium")
 
         return _picture((max(6.4, 3.6 * count), 4.2), draw)
 
@@ -95,7 +96,7 @@ def _of_records(records, residuals: list[np.ndarray], names, sigma) -> dict[str,
         heading = "Data over fit, and residuals"
         if len(shown) < len(records) or count < len(names):
             heading += f" (records {', '.join(map(str, shown))} of {len(records)}; {count} of {len(names)} signals)"
-        figures[heading] = [one(records[k], residuals[k]) for k in shown]
+        figures[heading] = [one(k) for k in shown]
         every = np.concatenate(residuals)
         figures["Residuals against the normal distribution"] = [
             _picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))

@@ -22,6 +22,7 @@ from lagjax._fit._records import Piece, Record, Samples, batches
 from lagjax._fit._signals import Signals
 from lagjax._fit._starts import Manifold, Origins, Placed
 from lagjax._fit._timings import AbstractClock
+from lagjax._fit._wrapped import on_circle
 from lagjax._layout import Layout
 
 
@@ -160,6 +161,12 @@ class AbstractQuestion(abc.ABC):
         begin = self.records[piece.record].ts[piece.places[0]]
         return f"The motion of {self.called(piece.record)} from t = {begin:g} failed. {failure.text}"
 
+    @property
+    def firsts(self) -> list[int]:
+        """Of every record the place of its first piece."""
+        places = {piece.record: k for k, piece in reversed(list(enumerate(self.pieces)))}
+        return [places[k] for k in range(len(self.records))]
+
     def restored(self, record: int, state: np.ndarray) -> tuple:
         """The pair (q, q̇) of a state of a record, of which other systems may leave the last numbers unused."""
         layout = next(part.question.layout for part in self.parts if record < part.records.stop)
@@ -180,7 +187,8 @@ class Question(AbstractQuestion):
     """Pieces of records, the scene and its sensors, and what is free.
 
     `fitted` (N,) says of each piece whether its start is free; `size` (S,) is the root mean square
-    of the signals, and that times `rtol`, the tolerance of the motion, the smallest noise that can be told. Where some
+    of the signals, and that times `rtol`, the tolerance of the motion, the smallest noise that can be told; `periods`
+    (S,) are those of wrapped signals, up to which residuals are known. Where some
     pieces are `Timings`, with `clocks` by the number of the record, crossing times are one more signal, the last.
     """
 
@@ -202,6 +210,7 @@ class Question(AbstractQuestion):
         self.clocks, self.manifold = {} if clocks is None else clocks, manifold
         timed = any(piece.record in self.clocks for piece in pieces)
         self.names = (*signals.names, *(("times",) if timed else ()))
+        self.periods = np.append(signals.periods, [np.inf] * timed)
         self.size, self.rtol, self.least = size[: len(self.names)], rtol, rtol * size[: len(self.names)]
         self.motions, self.signals, self.parameters = motions, signals, parameters
         self.layout: Layout = signals.layout
@@ -389,7 +398,7 @@ class Question(AbstractQuestion):
         by_unknowns[~self.fitted[batch.rows], ..., : self.states] = 0.0
         left, moved = np.zeros(counted.shape), np.zeros(counted.shape + by_unknowns.shape[3:])
         left[..., columns], moved[..., columns, :] = values, by_unknowns
-        residuals.append(np.where(counted, left - batch.values, 0.0))
+        residuals.append(np.where(counted, on_circle(left - batch.values, self.periods), 0.0))
         slopes.append(np.where(counted[..., None], moved, 0.0))
 
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
+from lagjax._doubles import with_doubles
 from lagjax._fit._compare import Comparison, comparison, effective_share
 from lagjax._fit._density import Density
 from lagjax._fit._figures import draw_record
@@ -24,11 +25,11 @@ from lagjax._fit._report import Drawn, page, pictures_of
 from lagjax._fit._residuals import AbstractQuestion, Failure, Part, Point, Question
 from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._scene import follow
-from lagjax._fit._segments import Reader
+from lagjax._fit._search import reader_of
 from lagjax._fit._signals import looks_like_positions
 from lagjax._fit._solve import minimise
 from lagjax._fit._uncertainty import Information
-from lagjax._layout import Layout
+from lagjax._fit._wrapped import UNCLEAR, on_circle
 from lagjax._notebook import cell
 from lagjax._tables import intervals
 from lagjax._trajectory import Trajectory
@@ -101,8 +102,10 @@ class Fit:
     - `covariance`: of the free numbers, by name (`Covariance`). Intervals are computed in the transformed numbers.
     - `noise`: the scatter of each signal, by name (`SignalNoise`).
     - `residuals`: fitted minus measured values per record, in the structure of `values`; NaN where a sample is missing.
-    - `unseen`: a sentence for each free parameter or combination of them that the data do not determine.
-    - `ok`: whether the search converged and the data determine everything that is free; `message`: what happened.
+    - `unseen`: a sentence for each free parameter or combination of them that the data do not determine, and one for
+      those of which rounding hides what a chaotic record says.
+    - `ok`: whether the search converged, the data determine everything that is free, the fit leaves less than some 30 %
+      of every signal beyond white noise, and the records agree; `message`: what happened.
     - `log_likelihood`: as if all samples were independent; `trials`: how often the motions were computed.
     - `waterfall`: where the search from each of several starts ended (`Waterfall`); None for a single start.
     """
@@ -132,6 +135,7 @@ class Fit:
     def __repr__(self) -> str:
         return _lab_book(self)
 
+    @with_doubles
     def _repr_html_(self) -> str | None:
         """The lab book, and data over fit of the first record, for notebooks; None where nothing can be drawn."""
         return cell(repr(self), self._draw_first, (5.2, 2.8))
@@ -165,7 +169,8 @@ class Fit:
     def intervals(self, level: float = 0.95) -> tuple[PyTree, PyTree]:
         """The ends (low, high) of the intervals that hold each free number with probability `level`, as two pytrees.
 
-        They stay inside the sets of the transforms; the interval of a parameter that the data do not determine is the
+        They stay inside the sets of the transforms, relative to the bounds; one that does not exclude a bound is that
+        of the number itself, and ends at the bound. The interval of a parameter that the data do not determine is the
         whole set. A parameter that is not free is both ends of its own interval.
 
         Raises `ValueError` for a level that is not between 0 and 1.
@@ -178,6 +183,7 @@ class Fit:
             ends.append(self.parameters.restore(numbers))
         return ends[0], ends[1]
 
+    @with_doubles
     def start_intervals(self, level: float = 0.95) -> tuple[Any, Any]:
         """The ends (low, high) of the intervals of the starts, each in the structure of `starts`.
 
@@ -191,12 +197,13 @@ class Fit:
                 of_starts(self.question, self._point, self.widths, self.information).covariance, axis1=1, axis2=2
             )
         )
-        ends = (enumerate(self.states + s * wide) for s in (-1, 1))
+        ends = (enumerate((self.states + s * wide)[self.question.firsts]) for s in (-1, 1))
         low, high = (self.question.by_system([self.question.restored(k, y) for k, y in end]) for end in ends)
         return low, high
 
+    @with_doubles
     def profile(self, name: str, level: float = 0.95) -> Profile:
-        """The profile likelihood of the parameter called `name`.
+        """The profile likelihood of the parameter called `name`: "params['dry']", or "dry" where that is the only one.
 
         It says how much likelihood is lost where the parameter is kept at another value and all other free parameters
         and starts are fitted anew. The interval is read off the profile itself, with the effective number of samples
@@ -221,19 +228,23 @@ class Fit:
         systems: dict = self.system if isinstance(self.system, dict) else {None: self.system}
         return Density(self.question, systems, self.law, self._point, self.widths, shares, prior)
 
+    @with_doubles
     def sample(self, draws: int = 1000, seed: int = 0, *, chains: int = 4, prior: Callable | None = None) -> Any:
         """Draws of the posterior by the No-U-Turn sampler, `draws` of each chain, as `arviz.InferenceData`.
 
         The density is that of `log_density(prior)`, π. The sampler walks in the fit's own metric along π*, the density
         whose residuals are expanded to second order about the fit, r(0) + J z + ½ zᵀ H z; then one motion of each chain
         accepts or refuses the draw, with min(1, π(y) π*(x) / [π(x) π*(y)]), so that draws are those of π. Where the
-        expansion is too far from π, the sampler follows π itself, with gradients through the motions.
-        `attrs["sampler"]` of the result says which of the two it was, and the share of draws that was accepted.
+        expansion is too far from π, the sampler follows π itself, with gradients through the motions. Beside a bound of
+        `positive` or `between` both are functions of the number itself, not of its logarithm; the density is the same.
+
+        `attrs` of the result says which of the two it was ("sampler"), how many independent draws those of the worst
+        number are worth ("effective_draws"), and the largest r-hat of chains ("r_hat"). A warning tells of fewer than
+        100, which intervals cannot be read off, and of an r-hat above 1.05.
 
         All chains are integrated as one batch of motions: many chains with few draws are cheaper than few with many.
         The variables are the free parameters by their names, `q0` and `qdot0` of the records whose starts are fitted
-        (`a: q0` where the fit is of several systems), and `sigma`, `dof` of the signals. `arviz.summary` tells whether
-        chains agree.
+        (`a: q0` where the fit is of several systems), and `sigma`, `dof` of the signals.
 
         Source: Hoffman & Gelman, JMLR 15 (2014) 1593; Christen & Fox, J. Comput. Graph. Stat. 14 (2005) 795.
 
@@ -278,6 +289,7 @@ class Fit:
         wide = self._quantile(level) * np.sqrt(np.diag(self.covariance.matrix))
         return self.parameters.ends(self.u, wide)
 
+    @with_doubles
     def predict(self, record: Record, *, system: str | None = None) -> Prediction:
         """The motion of the fitted scene over a record, which need not be one of those that were fitted.
 
@@ -301,7 +313,7 @@ class Fit:
         state = known_start(record, layout, 0, self.params)
         is_known = state is not None and not isinstance(record.start, Guess)
         if state is None:
-            state = _start_read_off(record, self._by_name(self.observe, part), layout)
+            state = _start_read_off(record, self._by_name(self.observe, part), about, self.parameters.numbers(self.u))
         piece = [Piece(0, np.arange(len(record)))]
         question = Question(
             [record], piece, np.array([not is_known]), about.motions, about.signals, fixed, about.size, about.rtol,
@@ -323,7 +335,8 @@ class Fit:
         scene, params = (scene, params) if form is None else form.along(scene, params, *driven)
         trajectory = follow(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
         values, deviation = self._shown(part, record, question, point)
-        left = np.where(record.weight_matrix > 0, values - record.matrix, np.nan)
+        left = on_circle(values - record.matrix, about.signals.periods)
+        left = np.where(record.weight_matrix > 0, left, np.nan)
         noise = self._of_sensors(part)
         noise = noise._replace(sigma=noise.sigma * np.sqrt(self.information.lost))
         shown, missed, uncertain = (in_structure(matrix, record) for matrix in (values, left, deviation))
@@ -352,6 +365,7 @@ class Fit:
         shown = np.where(about.batches[0].weights[0] > 0, full.residuals[0][0], np.nan)  # NaN before a delay is over
         return replace(record, values=in_structure(shown, record)), full.slopes[0][0]
 
+    @with_doubles
     def next_experiment(
         self, candidates: Sequence[Record] | dict[str, Record], *, system: str | None = None
     ) -> Experiments:
@@ -390,6 +404,7 @@ class Fit:
             own = own - rows[..., :states] @ start_alone(rows, states, self.information, 1.0)[1]
         return own.reshape(-1, own.shape[-1])
 
+    @with_doubles
     def report(self, path: str | os.PathLike, experiments: Sequence[Record] | dict[str, Record] = ()) -> None:
         """Write one file of HTML: parameters, noise, what is not seen, data over fit, residuals, correlations, starts.
 
@@ -415,6 +430,7 @@ class Fit:
         """What there is for one system: by its name, or for all."""
         return of_all[part.name] if isinstance(of_all, dict) else of_all
 
+    @with_doubles
     def compare(self, other: "Fit | dict[str, Fit]", *, folds: int = 0) -> Comparison:
         """Which of several fits of the same records the data prefer: this one against another, or a dict of others.
 
@@ -443,11 +459,14 @@ def _half_widths(deviation: np.ndarray, widths: Widths, level: float, columns) -
     return np.sqrt((ndtri(0.5 + 0.5 * level) * flat) ** 2 + noise**2).reshape(deviation.shape)
 
 
-def _start_read_off(record: Record, observe, layout: Layout) -> np.ndarray:
+def _start_read_off(record: Record, observe, about: Question, numbers: np.ndarray) -> np.ndarray:
     """The first state of a record from local polynomials. Raises where its signals are no positions."""
-    if not looks_like_positions(observe, record, layout):
-        raise ValueError("This record needs a start: give start=(q0, qdot0), or lagjax.Guess(q0, qdot0) to fit it.")
-    return Reader.of(record).states(np.array([0]))[0]
+    reader = reader_of(record, observe, about, numbers)
+    if reader is not None:
+        return reader.states(np.array([0]))[0]
+    if looks_like_positions(observe, record, about.layout):
+        raise ValueError(UNCLEAR.format("This record"))
+    raise ValueError("This record needs a start: give start=(q0, qdot0), or lagjax.Guess(q0, qdot0) to fit it.")
 
 
 def record_matrix(values: PyTree, record) -> np.ndarray:

@@ -1,6 +1,6 @@
 """`sample`: draws from the posterior of a fit, by the No-U-Turn sampler in the fit's own metric.
 
-The covariance of the fit, C = L Lᵀ, turns its posterior π into one that is nearly round: x = x̂ + L z.
+`_chart` has coordinates z in which the posterior π is nearly round, beside a bound too.
 
 By rule, where that can be had: the sampler moves along π*, the density whose residuals are expanded to second order
 (`_surrogate`), which costs no motions, so many of its steps that y is nearly independent of the x where it began; then
@@ -10,17 +10,20 @@ one exact density decides. The chain goes to y with the probability
 
 and else stays at x. Its draws are those of π itself, whatever π* is, because the inner steps are reversible for π*: a
 poor expansion makes a slow chain, not a wrong one. Nothing of π* is changed after warming. How well it does is
-measured before, on independent pairs of its draws: where less than `_LEAST` of them would be accepted the sampler
-follows π itself, with gradients through the motions at every step.
+measured before, on independent pairs of its draws, and after: where less than `_LEAST` of them would be accepted, where
+the weights π/π* have no variance because π* is too narrow, and where chains are worth few independent draws, the
+sampler follows π itself, with gradients through the motions at every step.
 
-All chains go side by side in one batch of motions.
+All chains go side by side in one batch of motions. What the draws are worth is told with them, and warned of where it
+is little.
 
 Which library: blackjax, whose kernels are plain functions of a log density, so that chains, the loop and what is kept
-are a few lines here. numpyro does the same behind a language for models, of which nothing is needed.
+are a few lines here; arviz for what draws are worth. numpyro does the same behind a language for models, of which
+nothing is needed.
 
 Source: Hoffman & Gelman, *The No-U-Turn sampler*, JMLR 15 (2014) 1593; Christen & Fox, *MCMC using an approximation*,
-J. Comput. Graph. Stat. 14 (2005) 795; Vehtari et al., Bayesian Analysis 16 (2021) 667, for dispersed chains and what
-arviz tells of them.
+J. Comput. Graph. Stat. 14 (2005) 795; Vehtari et al., Bayesian Analysis 16 (2021) 667, for dispersed chains, r-hat and
+effective draws.
 """
 
 import functools
@@ -33,16 +36,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._fit._chart import Chart
 from lagjax._fit._density import Density
 from lagjax._fit._surrogate import Surrogate, expanded
 
-_WARM, _ACCEPTED = 200, 0.85  # draws for the step of every chain; the mean acceptance it is tuned for
+_ACCEPTED = 0.85  # the mean acceptance that steps are tuned for
 _ROUNDS = (400, 800, 3200)  # draws of all chains from π*: each round has the metric of the one before
+_ROUNDS_OF_MOTIONS = (200, 400, 800)  # of π, where each costs as many motions as draws do later
 _FEWEST = 50  # of them of one chain: its step needs so many
 _MOST_INNER = 64  # steps of the sampler along π* for one draw: a motion is waited for no longer than that
 _PILOT = 64  # draws of π* that are weighed with π before the first draw
 _LEAST = 0.2  # of them are accepted, or π* is given up: fewer, and a chain may stay where π* is too small
+# π* is too narrow where weights π/π* have a Pareto tail of this shape: means of them do not settle then (Vehtari et
+# al., J. Mach. Learn. Res. 25 (2024) 72). The shape means nothing where nearly all draws are accepted.
+_HEAVY, _NEARLY_ALL = 0.7, 0.9
+_WORTH = 0.1  # of the draws along π* must be independent, or π is followed: so do draws of the exact density everywhere
+_DOUBLINGS = 6  # of one trajectory: 64 steps. In a metric that fits 3 do; a metric that does not would take thousands
 _TRIED = 100  # draws for the start of a chain where the density is not zero
+_FEWEST_TO_TELL = 4  # draws of a chain, halves of which are compared
+# Quantiles at 2.5 % of 100 independent draws are known to 1.6 %: half as many, and an end of an interval may be the
+# largest draw of all. Chains of 100 good draws have r-hat up to 1.03; ones that sit in different places, 1.1 and more.
+_RELIABLE, _APART = 100, 1.05
 _SETTLING = 10  # draws that are thrown away: chains begin at draws of π*, which the exact density has not judged
 
 
@@ -63,27 +77,39 @@ class Draws(NamedTuple):
 def draw(density: Density, draws: int, chains: int, seed: int) -> Draws:
     """Draws of the posterior, from starts that are dispersed as the posterior is."""
     _blackjax()
-    surrogate = expanded(density)
-    if isinstance(surrogate, str):
-        return _along_exact(density, draws, chains, seed, surrogate)
-    warming, weighing, going = jax.random.split(jax.random.key(seed), 3)
-    tuned = _tuned(surrogate, chains, warming)
-    if isinstance(tuned, str):
-        return _along_exact(density, draws, chains, seed, tuned)
-    sampler, state = tuned
-    exact = jax.jit(jax.vmap(lambda z: density(surrogate.x(z))))
-    share, start = _weighed(sampler, exact, state, weighing)
-    if share < _LEAST:
-        why = f"Of draws of the expansion of its residuals to second order the exact density accepts {share:.2f}."
-        return _along_exact(density, draws, chains, seed, why)
-    return _corrected(surrogate, sampler, exact, start, draws, going)
+    chart = Chart.of(density)
+    drawn = _along_expansion(chart, draws, chains, seed)
+    return _along_exact(chart, draws, chains, seed, drawn) if isinstance(drawn, str) else drawn
 
 
 # ---- along the expansion, each draw accepted or refused by the exact density -----------------------------------------
 
 
+def _along_expansion(chart: Chart, draws: int, chains: int, seed: int) -> Draws | str:
+    """Draws that the exact density accepts or refuses; or a sentence that says why the expansion is not good enough."""
+    surrogate = expanded(chart)
+    if isinstance(surrogate, str):
+        return surrogate
+    warming, weighing, going = jax.random.split(jax.random.key(seed), 3)
+    sampler, state, many = _tuned(surrogate, chart, _ROUNDS, chains, warming)
+    if math.isinf(many):
+        return "Along the expansion of its residuals to second order the chains did not move."
+    sampler = sampler._replace(inner=min(max(math.ceil(many), 1), _MOST_INNER))
+    exact = jax.jit(jax.vmap(chart.log_density))
+    share, start = _weighed(sampler, exact, state, weighing)
+    if share < _LEAST:
+        return f"Of draws of the expansion of its residuals to second order the exact density accepts {share:.2f}."
+    drawn, tail = _corrected(surrogate, sampler, exact, start, draws, going)
+    if drawn.acceptance.mean() < _NEARLY_ALL and tail > _HEAVY:
+        return f"The expansion of its residuals to second order is too narrow: π/π* has a Pareto tail of {tail:.2f}."
+    if (worth := agreement(drawn.x).effective.min()) < _WORTH * draws * chains:
+        return f"Of {draws * chains} draws along the expansion of its residuals {worth:.0f} were independent."
+    return drawn
+
+
 class Sampler(NamedTuple):
-    """The sampler along π*: `move` (keys, state, step, metric), its step and metric (D, D), and how many make a draw.
+    """The sampler along a density: `move` (keys, state, step, metric), its step and metric (D, D), and how many steps
+    make a draw.
 
     A state is that of C chains; the program of one step of all of them is compiled once for warming and drawing.
     """
@@ -106,42 +132,38 @@ def _keys(key, k: int, state):
     return jax.random.split(jax.random.fold_in(key, k), len(state.position))
 
 
-def _tuned(surrogate: Surrogate, chains: int, key) -> tuple[Sampler, Any] | str:
-    """The sampler with a step and a metric from its own draws of π*, and where its chains are; or a sentence that says
-    that these do not move."""
+def _tuned(of_z: Callable, chart: Chart, rounds: tuple[int, ...], chains: int, key) -> tuple[Sampler, Any, float]:
+    """The sampler along the logarithm of a density with a step and a metric from its own draws, where its chains are,
+    and how many draws of theirs are worth an independent one: infinitely many where a chain does not move."""
     blackjax = _blackjax()
     kernel = blackjax.nuts.build_kernel()
-    size, dtype = len(surrogate.centre), surrogate.density.dtype
+    size, dtype = len(chart.centre), chart.density.dtype
 
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, 0, None, None))
     def move(key, state, step, metric):
-        return kernel(key, state, logdensity_fn=surrogate, step_size=step, inverse_mass_matrix=metric)
+        return kernel(key, state, of_z, step, metric, _DOUBLINGS)
 
     start, update, _ = blackjax.adaptation.step_size.dual_averaging_adaptation(_ACCEPTED)
     update = jax.jit(update)
-    z, metric, step = _possible(surrogate, (chains, size), dtype, key), jnp.eye(size, dtype=dtype), 0.25
-    state = jax.jit(jax.vmap(lambda z: blackjax.nuts.init(z, surrogate)))(z)
+    z, metric, step = _possible(of_z, (chains, size), dtype, key), jnp.eye(size, dtype=dtype), 0.25
+    state = jax.jit(jax.vmap(lambda z: blackjax.nuts.init(z, of_z)))(z)
     late = np.zeros((chains, 0, size))
-    for part, pooled in enumerate(_ROUNDS):
+    for part, pooled in enumerate(rounds):
         if part > 0:
             metric = jnp.asarray(_shrunk(late.reshape(-1, size)), dtype)
-        count, path, tuning, own = (
-            max(_FEWEST, math.ceil(pooled / chains)),
-            [],
-            start(step),
-            jax.random.fold_in(key, part),
-        )
+        count, own = max(_FEWEST, math.ceil(pooled / chains)), jax.random.fold_in(key, part)
+        path, tuning = [], start(step)
         for k in range(count):
             state, info = move(_keys(own, k, state), state, jnp.exp(tuning.log_step_size), metric)
             tuning = update(tuning, info.acceptance_rate.mean())
             path.append(np.asarray(state.position, float))
         late, step = np.stack(path[count // 2 :], axis=1), float(jnp.exp(tuning.log_step_size_avg))
+    sampler = Sampler(move, step, metric, 1)
     if not (np.ptp(late, axis=1) > 0).all():  # there is no effective number of draws then
-        return "Along the expansion of its residuals to second order the chains did not move."
+        return sampler, state, math.inf
     effective = float(np.asarray(blackjax.ess(late, chain_axis=0, sample_axis=1)).min())
-    inner = math.ceil(late.shape[0] * late.shape[1] / max(effective, 1.0))
-    return Sampler(move, step, metric, min(max(inner, 1), _MOST_INNER)), state
+    return sampler, state, late.shape[0] * late.shape[1] / max(effective, 1.0)
 
 
 def _possible(of_z: Callable, shape: tuple[int, int], dtype, key):
@@ -203,12 +225,15 @@ def _choices(key) -> np.random.Generator:
     return np.random.default_rng(np.asarray(jax.random.key_data(key)))
 
 
-def _corrected(surrogate: Surrogate, sampler: Sampler, exact: Callable, at: Chains, draws: int, key) -> Draws:
-    """Draws of π: every proposal of π* accepted or refused by the exact density."""
-    kept, choices = [], _choices(key)
+def _corrected(
+    surrogate: Surrogate, sampler: Sampler, exact: Callable, at: Chains, draws: int, key
+) -> tuple[Draws, float]:
+    """Draws of π, every proposal of π* accepted or refused by the exact density; and the Pareto tail of π/π*."""
+    kept, choices, ratios = [], _choices(key), []
     for k in range(_SETTLING + draws):
         state, steps, diverged = sampler.draw(jax.random.fold_in(key, k), at.state)
         proposed = Chains.at(state, exact)
+        ratios.append(proposed.ratio)
         with np.errstate(invalid="ignore"):
             change = proposed.ratio - at.ratio  # −∞ where the motion cannot be followed, +∞ where that of x cannot
         accepted = np.where(np.isfinite(proposed.exact), np.exp(np.minimum(0.0, change)), 0.0)
@@ -220,45 +245,73 @@ def _corrected(surrogate: Surrogate, sampler: Sampler, exact: Callable, at: Chai
         f"{sampler.inner} steps of the No-U-Turn sampler along the second-order expansion of the residuals for every "
         f"draw, which the exact density then accepts or refuses; it accepts {accepted.mean():.2f}."
     )
-    x = np.asarray(surrogate.centre + z @ surrogate.root.T)
-    return Draws(x, log_density, steps, diverged, accepted, words)
+    ratios = np.concatenate(ratios)
+    _, tail = _arviz().psislw(ratios[np.isfinite(ratios)])
+    return Draws(*_unknowns(surrogate.chart, z, log_density), steps, diverged, accepted, words), float(tail)
 
 
 # ---- along the exact density -----------------------------------------------------------------------------------------
 
 
-def _along_exact(density: Density, draws: int, chains: int, seed: int, why: str) -> Draws:
+def _along_exact(chart: Chart, draws: int, chains: int, seed: int, why: str) -> Draws:
     """Draws by gradients through the motions; `why` says what speaks against the expansion."""
-    blackjax = _blackjax()
-    root = jnp.asarray(np.linalg.cholesky(density.covariance()), density.dtype)
-    centre = jnp.asarray(density.first, root.dtype)
-    of_z = lambda z: density(centre + root @ z)  # noqa: E731
-    kernel = blackjax.nuts.build_kernel()
-    start, update, _ = blackjax.adaptation.step_size.dual_averaging_adaptation(_ACCEPTED)
-    metric = jnp.ones(len(centre), root.dtype)
-    moved = functools.partial(kernel, logdensity_fn=of_z, inverse_mass_matrix=metric)
-
-    def go(carry, key_and_place):  # one loop for warming and drawing: the trajectory is compiled once
-        state, tuning = carry
-        key, warms = key_and_place
-        step = jnp.exp(jnp.where(warms, tuning.log_step_size, tuning.log_step_size_avg))
-        state, info = moved(key, state, step_size=step)
-        tuned = update(tuning, info.acceptance_rate)
-        tuning = jax.tree.map(lambda new, old: jnp.where(warms, new, old), tuned, tuning)
-        kept = state.position, state.logdensity, info.num_integration_steps, info.is_divergent, info.acceptance_rate
-        return (state, tuning), kept
-
-    def chain(key, first):
-        state, keys = blackjax.nuts.init(first, of_z), jax.random.split(key, _WARM + draws)
-        _, kept = jax.lax.scan(go, (state, start(0.5)), (keys, jnp.arange(_WARM + draws) < _WARM))
-        return jax.tree.map(lambda leaf: leaf[_WARM:], kept)
-
-    begin, going = jax.random.split(jax.random.key(seed))
-    starts = _possible(of_z, (chains, len(centre)), root.dtype, begin)
-    z, *rest = jax.jit(jax.vmap(chain))(jax.random.split(going, chains), starts)
+    warming, going = jax.random.split(jax.random.key(seed))
+    sampler, state, _ = _tuned(chart.log_density, chart, _ROUNDS_OF_MOTIONS, chains, warming)
+    kept = []
+    for k in range(draws):
+        state, info = sampler.move(_keys(going, k, state), state, sampler.step, sampler.metric)
+        kept.append((state.position, state.logdensity, info.num_integration_steps, info.is_divergent,
+                     info.acceptance_rate))  # fmt: skip
+    z, log_density, steps, diverged, accepted = (np.stack(part, axis=1) for part in zip(*kept, strict=True))
     words = f"The No-U-Turn sampler along the exact density, with gradients through the motions. {why}"
-    log_density, steps, diverged, acceptance = (np.asarray(leaf) for leaf in rest)
-    return Draws(np.asarray(centre + z @ root.T), log_density, steps, diverged, acceptance, words)
+    return Draws(*_unknowns(chart, z, log_density), steps, diverged, accepted, words)
+
+
+def _unknowns(chart: Chart, z: np.ndarray, log_density: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The unknowns x (C, K, D) at coordinates z (C, K, D), and log p of x where that of z is given (C, K)."""
+    x, _, volume = jax.jit(jax.vmap(jax.vmap(chart)))(jnp.asarray(z, chart.density.dtype))
+    return np.asarray(x), log_density - np.asarray(volume)
+
+
+# ---- what draws are worth --------------------------------------------------------------------------------------------
+
+
+class Agreement(NamedTuple):
+    """Of each unknown (D,): how many independent draws its draws are worth, and r-hat, how far chains disagree.
+
+    `effective` is the smaller of the numbers for the bulk and for the tails of the density. NaN where draws are too few
+    to tell, r-hat also for a single chain.
+    """
+
+    effective: np.ndarray
+    r_hat: np.ndarray
+
+
+def agreement(x: np.ndarray) -> Agreement:
+    """How well draws (C, K, D) of C chains agree."""
+    arviz = _arviz()
+    if x.shape[1] < _FEWEST_TO_TELL:
+        return Agreement(*np.full((2, x.shape[2]), np.nan))
+    ranked = arviz.convert_to_dataset(x)
+    bulk, tail = (np.asarray(arviz.ess(ranked, method=method).x) for method in ("bulk", "tail"))
+    r_hat = np.asarray(arviz.rhat(ranked).x) if len(x) > 1 else np.full(x.shape[2], np.nan)
+    return Agreement(np.minimum(bulk, tail), r_hat)
+
+
+def _warned(density: Density, drawn: Draws) -> dict[str, float]:
+    """The worst of the agreement of chains, by name; a warning where that is too little to read quantiles off draws."""
+    found = agreement(drawn.x)
+    worst, apart = int(np.argmin(found.effective)), float(np.max(found.r_hat))
+    effective = float(found.effective[worst])
+    count = drawn.x.shape[0] * drawn.x.shape[1]
+    if not effective >= _RELIABLE or apart > _APART:
+        at = density.names[worst if not effective >= _RELIABLE else int(np.argmax(found.r_hat))]
+        warnings.warn(
+            f"The {count} draws of {at} are worth {effective:.0f} independent ones, and r-hat is {apart:.2f}: do not "
+            f"read intervals off them. {_RELIABLE} and r-hat below {_APART} are the least; ask for more draws.",
+            stacklevel=4,
+        )
+    return {"effective_draws": effective, "r_hat": apart}
 
 
 def inference_data(density: Density, drawn: Draws) -> Any:
@@ -268,12 +321,14 @@ def inference_data(density: Density, drawn: Draws) -> Any:
     chains, draws, size = drawn.x.shape
     at = jax.jit(jax.vmap(lambda x: _told(density, x)))(jnp.asarray(drawn.x.reshape(-1, size)))
     values, starts, sigma, dof = (np.asarray(x).reshape(chains, draws, *x.shape[1:]) for x in at)
-    posterior, begin, dims, coords = {}, 0, {}, {}
+    posterior, dims, coords = {}, {}, {}
     for part in parameters.parts:
-        count, shape = len(part.places), part.shape
-        posterior[part.label] = values[..., begin : begin + count].reshape(chains, draws, *shape)
-        dims[part.label] = [f"{part.label} {axis}" for axis in range(len(shape))]
-        begin += count
+        if len(part.places) == math.prod(part.shape):
+            posterior[part.label] = values[..., part.places].reshape(chains, draws, *part.shape)
+            dims[part.label] = [f"{part.label} {axis}" for axis in range(len(part.shape))]
+        else:  # numbers of the array that are kept have no draws: the others go by their own names
+            names = dict(zip(parameters.places.tolist(), parameters.names, strict=True))
+            posterior |= {names[place]: values[..., place] for place in part.places.tolist()}
     for one, (part, _) in zip(density.systems, question.apart, strict=True):
         fitted, layout = one.question.fitted, one.question.layout
         of = "" if part.name is None else f"{part.name}: "
@@ -290,14 +345,14 @@ def inference_data(density: Density, drawn: Draws) -> Any:
         "lp": drawn.log_density, "n_steps": drawn.steps, "diverging": drawn.diverged,
         "acceptance_rate": drawn.acceptance,
     }  # fmt: skip
-    attributes = {"sampler": drawn.sampler}
+    attributes = {"sampler": drawn.sampler, **_warned(density, drawn)}
     return arviz.from_dict(posterior=posterior, sample_stats=stats, dims=dims, coords=coords, attrs=attributes)
 
 
 def _told(density: Density, x):
     at = density.unknowns(x)
     numbers = density.question.parameters.numbers(at.u, jnp)
-    return numbers[density.question.parameters.places], at.starts, at.sigma, jnp.broadcast_to(at.dof, at.sigma.shape)
+    return numbers, at.starts, at.sigma, jnp.broadcast_to(at.dof, at.sigma.shape)
 
 
 def _blackjax() -> Any:

@@ -11,10 +11,12 @@ PyTree = Any
 Scene = System | Hybrid
 
 
-def require_scene(scene: Any) -> None:
-    """Raise `TypeError` for what is neither a `System` nor a `Hybrid`."""
-    if not isinstance(scene, Hybrid):
-        require_system(scene)
+def require_scene(scene: Any) -> Scene:
+    """The scene with its functions as they are now.
+
+    Raises `TypeError` for what is neither a `System` nor a `Hybrid`.
+    """
+    return scene.now() if isinstance(scene, Hybrid) else require_system(scene)
 
 
 def first_law(scene: Scene) -> System:

@@ -13,14 +13,17 @@ import numpy as np
 
 from lagjax._fit._gradient import descend, ended
 from lagjax._fit._many import Waterfall, distinct, drawn, misfit, short_search
-from lagjax._fit._noise import log_likelihood
-from lagjax._fit._records import Piece
+from lagjax._fit._noise import Widths, log_likelihood
+from lagjax._fit._records import Piece, Record
 from lagjax._fit._residuals import AbstractQuestion, Failure, Question
 from lagjax._fit._scene import Scene
-from lagjax._fit._segments import Reader, glimpses, levels, time_scale, whole
+from lagjax._fit._segments import Reader, complete, glimpses, levels, time_scales, whole
+from lagjax._fit._signals import looks_like_positions
 from lagjax._fit._solve import Anchor, Descent, minimise
 from lagjax._fit._systems import asked
+from lagjax._fit._verdict import unexplained
 from lagjax._fit._weak import balanced
+from lagjax._fit._wrapped import continued
 from lagjax._hybrid import Hybrid
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
@@ -30,8 +33,17 @@ _ENOUGH_OF_GLIMPSES = 0.1
 _POOR, _COARSE = 2.0, 0.02  # times scatter or size of signals: beyond, the shortest segments were not fitted
 _LOOSE = 3.0  # standard deviations of u about its first value on these levels, where u is a logarithm or the like
 _TRIALS, _TRIALS_OF_LEVEL = 60, 20
+_WORSE = (
+    5.0  # times more that a join may leave; measured: 3 where friction was left out, 10 and more beyond the horizon
+)
+_LOST = 2  # levels that may be lost: after one the next may find the motion again, with better parameters
+_LYAPUNOV = 5.0  # times 1/λ that a record is long: shorter ones are followed whole
 _STEPS = 3000  # of a descent by gradients
 _BEST = 4  # of many starts go through the whole search
+
+
+class Unfollowed(ValueError):
+    """Records whose motion cannot be followed from the first trial."""
 
 
 def searches(question: AbstractQuestion, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
@@ -50,20 +62,99 @@ def searches(question: AbstractQuestion, search, u, y0, starts: int, seed: int) 
             continue
         if place is not None:
             misfits[place] = misfit(done[-1].widths, question)
-    best = max(done, key=lambda one: log_likelihood(one.widths, one.point.flat(), question.weights))
+    best = max(done, key=lambda one: (one.question is question, _likelihood(one)))
     misfits = np.sort(misfits)
     misfits[0] = min(misfits[0], misfit(best.widths, question))
     return best, Waterfall(misfits)
+
+
+def _likelihood(done: Descent) -> float:
+    return log_likelihood(done.widths, done.point.flat(), done.question.weights)
+
+
+def reader_of(record: Record, observe, about: Question, numbers: np.ndarray, probes: int = 256) -> Reader | None:
+    """What reads states off a record; None where its signals are no positions, or go round too fast to tell."""
+    if not looks_like_positions(observe, record, about.layout):
+        return None
+    periods = about.signals.periods
+    smooth = continued(record, periods)
+    if smooth is None:
+        return None
+    read = about.signals.positions(smooth, numbers)
+    if np.isfinite(periods).any():  # in the units of coordinates
+        gain = np.nanstd(read.matrix, axis=0) / np.maximum(np.nanstd(smooth.matrix, axis=0), np.finfo(float).tiny)
+        periods = np.where(np.isfinite(periods), gain * periods, np.inf)
+    return Reader.of(read, probes, periods)
 
 
 def search_records(question: AbstractQuestion, u, starts, noise, method: str, readers, weak) -> Descent:
     """The search of whole records, after that of growing segments where the method asks for it."""
     if method == "segments" and readers is None:
         raise ValueError('method="segments" reads starts off the data: for that values must have the structure of q.')
-    if method != "whole" and readers is not None:
-        u, starts = _grown(question, u, starts, noise, readers, weak)
+    if method == "whole" or readers is None:
+        return _followed(question, minimise(question, u, starts, noise, _ENOUGH, _TRIALS))
+    u, starts, levels_done = _grown(question, u, starts, noise, readers, weak)
+    good = _last_good(levels_done)
+    if len(levels_done) - good > _LOST:
+        return _in_pieces(question, levels_done[good], levels_done[-1].widths, noise)
     done = minimise(question, u, starts, noise, _ENOUGH, _TRIALS)
+    if levels_done and (
+        isinstance(done, Failure) or not done.converged or unexplained(question, done.point, done.widths).motion
+    ):
+        good = _last_good([*levels_done, *([] if isinstance(done, Failure) else [done])])
+        if good < len(levels_done) and misfit(levels_done[good].widths, question) < _COARSE:
+            return _in_pieces(question, levels_done[good], None if isinstance(done, Failure) else done.widths, noise)
     return _followed(question, done)
+
+
+def _last_good(levels_done: list[Descent]) -> int:
+    """The place of the last level from which on joining did not lose the motion.
+
+    A scene that lacks something leaves up to three times more at each join, and motion that is lost some ten times.
+    """
+    good, last = 0, np.inf
+    for k, done in enumerate(levels_done):
+        now = misfit(done.widths, done.question)
+        if now <= _WORSE ** (k - good) * last:
+            good, last = k, now
+    return good
+
+
+def _parting(done: Descent) -> float:
+    """The logarithm of how far motions part that begin side by side, over the longest record: λ times its length.
+
+    λ is the median over the pieces, from the mean square of the derivatives by the start over the first and the last
+    third of each.
+    """
+    rates, states = [], done.question.states
+    for batch, slopes in zip(done.question.batches, done.point.slopes, strict=True):
+        for ts, weights, by_start in zip(batch.ts, batch.weights, slopes[..., :states], strict=True):
+            squares = (by_start[weights.any(axis=-1)] ** 2).sum(axis=1)
+            third = len(squares) // 3
+            if third and (squares[:third].sum(axis=0) > 0).all():
+                growth = np.log(squares[-third:].sum(axis=0) / squares[:third].sum(axis=0)).mean() / 2
+                rates.append(growth / (ts[2 * third] - ts[0]))
+    longest = max(record.ts[-1] - record.ts[0] for record in done.question.records)
+    return float(np.median(rates) * longest) if rates else 0.0
+
+
+def _in_pieces(question: AbstractQuestion, level: Descent, joined: Widths | None, noise) -> Descent:
+    """The search on the pieces of a level, with all samples of these and a start for each."""
+    pieces = complete(level.question.pieces, question.records)
+    part = question.of(pieces, level.question.fitted)
+    done = minimise(part, level.point.u, level.point.starts, noise, _ENOUGH, _TRIALS)
+    if isinstance(done, Failure):
+        return _followed(part, done)
+    worse = (
+        "fails" if joined is None else f"leaves {misfit(joined, question) / misfit(done.widths, part):.2g} times more"
+    )
+    text = f"The records are followed in {len(pieces)} pieces, each with a start of its own: to join them {worse}"
+    growth = _parting(done)
+    if growth > _LYAPUNOV:
+        text += f", because motions that begin side by side part e^{growth:.0f}-fold over a record."
+        return done._replace(message=f"{done.message} {text}")
+    text += ", though the motion does not forget its start: the scene lacks something that lasts longer."
+    return done._replace(message=f"{done.message} {text}", converged=False)
 
 
 def by_gradient(
@@ -84,38 +175,46 @@ def by_gradient(
 
 
 def _followed(question: AbstractQuestion, done: Descent | Failure) -> Descent:
-    """What a search came to. Raises `ValueError` where its motions could not be followed."""
+    """What a search came to. Raises `Unfollowed` where its motions could not be followed."""
     if isinstance(done, Failure):
-        raise ValueError(question.where(done) + " Begin nearer: other params0, or starts that are known.")
+        raise Unfollowed(question.where(done) + " Begin nearer: other params0, or starts that are known.")
     return done
 
 
 def _grown(
     question: AbstractQuestion, u, starts, noise, readers: list[Reader | None], weak: Callable
-) -> tuple[np.ndarray, np.ndarray]:
-    """Better first values of u and of the starts, from segments that grow together to whole records."""
+) -> tuple[np.ndarray, np.ndarray, list[Descent]]:
+    """Better first values of u and of the starts, from segments that grow together to whole records; and the levels.
+
+    Where joining loses the motion twice in a row, no longer segment is tried.
+    """
     anchor = Anchor(u, np.where(np.isfinite(question.parameters.reach), 1.0 / _LOOSE, 0.0))
     search = functools.partial(_level, question, noise=noise, readers=readers, anchor=anchor)
     begun = _begun(question, u, starts, readers, search)
     for other in (lambda: weak(u), lambda: _glimpsed(question, u, noise, readers, anchor)):
         if begun.misfit > 0.0:  # the shortest segments were not fitted from here
             begun = min(begun, _begun(question, other(), starts, readers, search), key=lambda one: one.misfit)
-    u, best = begun.u, begun.best
+    u, best, levels_done = begun.u, begun.best, [] if begun.first is None else [begun.first]
     for pieces in begun.cuts[1:]:
         done = search(pieces, u, best)
         if isinstance(done, Failure):
             break  # whole records then begin from the best so far, and say so if they fail as well
         u = done.point.u
-    return u, np.stack([best[k, 0] for k in range(len(question.records))])
+        levels_done.append(done)
+        if len(levels_done) - _last_good(levels_done) > _LOST:
+            break
+    return u, np.stack([best[k, 0] for k in range(len(question.records))]), levels_done
 
 
 class _Begun(NamedTuple):
-    """Where growing segments begin: u, the cuts, the states at the first samples, and how far off that is."""
+    """Where growing segments begin: u, the cuts, the states at the first samples, how far off that is, and the search
+    on the shortest segments where it came to an end."""
 
     u: np.ndarray
     cuts: list[list[Piece]]
     best: dict[tuple[int, int], np.ndarray]
     misfit: float
+    first: Descent | None = None
 
 
 def _begun(question: AbstractQuestion, u, starts, readers: list[Reader | None], search) -> _Begun:
@@ -138,7 +237,7 @@ def _begun(question: AbstractQuestion, u, starts, readers: list[Reader | None], 
             scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in reading], axis=0))
             near.append(np.maximum(_POOR * scatter, _COARSE * part.question.size[: len(scatter)]))
     ratio = done.widths.sigma / np.concatenate(near)
-    return _Begun(done.point.u, cuts, best, float(np.mean(np.log(ratio))))
+    return _Begun(done.point.u, cuts, best, float(np.mean(np.log(ratio))), done)
 
 
 def _level(question: AbstractQuestion, pieces: list[Piece], u, best, noise, readers, anchor) -> Descent | Failure:
@@ -218,7 +317,7 @@ def _time_scales(question: AbstractQuestion, readers: list[Reader | None], u) ->
     scales, numbers = [], question.parameters.numbers(u)
     for part in question.parts:
         reading = [reader for reader in readers[part.records] if reader is not None]
-        scale = time_scale(reading, part.question.motions, numbers) if reading else np.inf
+        scale = min(time_scales(reading, part.question.motions, numbers)) if reading else np.inf
         scales += [scale] * len(part.question.records)
     return scales
 

@@ -30,27 +30,33 @@ _WORSE = 1.3  # what a window may leave, in units of what the shortest leaves
 _PER_SCALE = 24  # samples per time scale that early levels look at: more cost time and find the same
 _GLIMPSES = 256  # places of all records where curvature is looked at
 _FEWEST = 8  # samples in a segment
+_QUARTER = (
+    0.25  # of a period, by which the motion over a segment may be wrong: beyond a half residuals have false minima
+)
 
 
 class Reader(NamedTuple):
     """Positions and velocities of one record from local cubics: each signal is a coordinate.
 
-    `windows` (S,) are the samples in one cubic, `scatter` (S,) what the shortest leave.
+    `windows` (S,) are the samples in one cubic, `scatter` (S,) what the shortest leave, `periods` (S,) those of signals
+    that are known less whole periods, else infinite.
     """
 
     record: Record
     windows: tuple[int, ...]
     scatter: tuple[float, ...]
+    periods: tuple[float, ...]
 
     @classmethod
-    def of(cls, record: Record, probes: int = 256) -> "Reader":
+    def of(cls, record: Record, probes: int = 256, periods: np.ndarray | None = None) -> "Reader":
         """A reader with the longest windows whose cubics leave no more than `_WORSE` times what the shortest leave.
 
         Beyond these they no longer follow the motion. They are tried at `probes` places.
         """
         places = some_of(record, probes)
         windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
-        return cls(record, windows, scatter)
+        each = np.full(len(windows), np.inf) if periods is None else periods
+        return cls(record, windows, scatter, tuple(each.tolist()))
 
     def states(self, places) -> np.ndarray:
         """(q, q̇) at the samples `places` (M,) of the record, (M, 2n)."""
@@ -139,11 +145,19 @@ def glimpses(readers: list[Reader], length: float) -> tuple[list[Record], np.nda
     return found, np.concatenate(states)
 
 
-def time_scale(readers: list[Reader], motions: AbstractMotions, numbers: np.ndarray) -> float:
-    """How long a motion looks like a straight line: the shortest of what the data and the scene at `numbers` say.
+class TimeScales(NamedTuple):
+    """How long a motion looks like a straight line, by what the data say and by what the scene says of their states."""
 
-    It is the ratio of the spread of a coordinate to its rate, about 1/ω; and of the spread of the coordinates, in units
-    of each, to the accelerations there, its root. Where nothing moves it is infinite.
+    data: float
+    scene: float
+
+
+def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.ndarray) -> TimeScales:
+    """The shortest times over which a motion looks like a straight line, with the parameters `numbers` (P,).
+
+    That of the data is the ratio of the spread of a coordinate to its rate, about 1/ω; that of the scene the root of
+    the spread of the coordinates, in units of each, over the accelerations there. Where nothing moves, they are
+    infinite.
     """
     places = [some_of(reader.record, _PROBES) for reader in readers]
     states = [reader.states(some) for reader, some in zip(readers, places, strict=True)]
@@ -154,10 +168,10 @@ def time_scale(readers: list[Reader], motions: AbstractMotions, numbers: np.ndar
     pulled = motions.rate(t, y, numbers, at_instants(t, inputs))
     pulled = np.where(np.isfinite(pulled), pulled, 0.0)
     spread, rate, pulled = (np.sqrt(np.mean(x**2, axis=0)) for x in (within, y[:, n:], pulled))
+    spread = np.minimum(spread, _QUARTER * np.array(readers[0].periods))
     with np.errstate(divide="ignore", invalid="ignore"):
-        both = np.concatenate([spread / rate, np.sqrt(spread / pulled)])
-    both = both[np.isfinite(both) & (both > 0)]
-    return float(both.min()) if len(both) else np.inf
+        both = spread / rate, np.sqrt(spread / pulled)
+    return TimeScales(*(float(one[np.isfinite(one) & (one > 0)].min(initial=np.inf)) for one in both))
 
 
 def levels(records: list[Record | None], scales: list[float]) -> list[list[Piece]]:
@@ -194,6 +208,19 @@ def _thinned(record: Record, which: int, begin: int, end: int, scale: float) -> 
     step = int(scale / (_PER_SCALE * spacing)) if np.isfinite(scale) and spacing > 0 else 1
     step = max(1, min(step, (end - begin) // _FEWEST))
     return Piece(which, np.arange(begin, end, step))
+
+
+def complete(pieces: list[Piece], records: list[Record]) -> list[Piece]:
+    """The same pieces of records with all of their samples, up to the first of the next piece."""
+    firsts = {(piece.record, int(piece.places[0])) for piece in pieces}
+    ends = [
+        min((place for k, place in firsts if k == piece.record and place > piece.places[0]), default=None)
+        for piece in pieces
+    ]
+    return [
+        Piece(piece.record, np.arange(piece.places[0], len(records[piece.record]) if end is None else end))
+        for piece, end in zip(pieces, ends, strict=True)
+    ]
 
 
 def whole(records: list[Record]) -> list[Piece]:

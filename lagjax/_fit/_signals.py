@@ -5,6 +5,7 @@ bias or a mounting position can be fitted, too, and for the sampled `inputs` of 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -16,17 +17,21 @@ from lagjax._fit._delays import Delayed, Delays
 from lagjax._fit._inputs import Form
 from lagjax._fit._motions import Motion
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Record
+from lagjax._fit._records import Record, in_structure
+from lagjax._fit._wrapped import on_circle, sensors
 from lagjax._layout import Layout, halves
 
 PyTree = Any
 _AT_ONCE = 2048  # samples in one call of the compiled sensors: one program for records of any length
+_NEWTON, _CLOSE = 8, 1e-6  # steps from what sensors show to positions, and the last of them: noise is larger
+_SINGULAR = 1e8  # condition from which sensors do not tell positions: that of units which differ by a million is less
 
 
 class Signals:
     """The sensors of a fit: `names` (S,), and the map from motions to signals and their derivatives.
 
-    `at_one_time` is the map (y, t, numbers, inputs) → signals (S,) of one state, for JAX.
+    `periods` (S,) are infinite where a signal is not wrapped; `at_one_time` is the map (y, t, numbers, inputs) →
+    signals (S,) of one state, for JAX.
     """
 
     def __init__(
@@ -40,11 +45,13 @@ class Signals:
         self.layout, self.parameters, self.form = layout, parameters, form
         self.delays: Delays | None = None
         if record is None:
-            self.names, self._at = (), None
+            self.names, self._at, self.periods = (), None, np.zeros(0)
             return
         if isinstance(observe, Delayed):
-            self.delays, observe = Delays(observe, parameters, record), observe.observe
-        if observe is None:
+            self.delays = Delays(observe, parameters, record)
+        of_state, wrap = sensors(observe)
+        self.periods = np.full(record.matrix.shape[1], np.inf) if wrap is None else wrap.periods(record)
+        if of_state is None:
             self.names, self._at, self.at_one_time = layout.names, None, lambda y, *_: y[: layout.size]
             if record.structure != (layout.tree, layout.shapes):
                 raise ValueError(
@@ -52,7 +59,7 @@ class Signals:
                     f"`observe`; records[0] has {record.structure[0]} of {record.structure[1]}."
                 )
             return
-        function = accept(observe, "observe", extras=("t", "params", "inputs"))
+        function = accept(of_state, "observe", extras=("t", "params", "inputs"))
         if form is None and "inputs" in function.extras:
             raise ValueError("observe asks for `inputs`, which records[0] has none of: give Record(..., inputs=...).")
         self.names = tuple("values" + name for name in record.names)
@@ -97,6 +104,39 @@ class Signals:
             slopes += rate.reshape(shape)[..., None] * ts_dot
         return values.reshape(shape), slopes
 
+    def positions(self, record: Record, numbers: np.ndarray) -> Record:
+        """The record with the coordinates that make sensors of the structure of q show its values, by Newton's method.
+
+        They are those of the record itself where there is no `observe`, and where these steps do not end: sensors that
+        show a gain, a bias, degrees do with two. Sensors that wrap by themselves, as `atan2` does, never show what was
+        made continuous: for these whole periods do not count.
+        """
+        if self._at is None:
+            return record
+        there = np.isfinite(record.matrix).all(axis=1)
+        instants = record.ts[there], record.input_matrix[there]
+        for periods in (np.full(len(self.periods), np.inf), self.periods):
+            q = self._newton(record.matrix[there], instants, numbers, periods)
+            if q is not None:
+                found = np.full(record.matrix.shape, np.nan)
+                found[there] = q
+                return replace(record, values=in_structure(found, record), weights=None)
+        return record
+
+    def _newton(self, shown: np.ndarray, instants: tuple, numbers: np.ndarray, periods: np.ndarray):
+        """q (M, n) for which sensors show `shown` (M, n), up to whole periods; None where the steps do not end."""
+        q, rest, n = shown.copy(), np.zeros_like(shown), self.layout.size
+        for _ in range(_NEWTON):
+            values, by_state, *_ = self._in_portions((np.concatenate([q, rest], axis=1), *instants), numbers)
+            left, slope = on_circle(values - shown, periods), by_state[..., :n]
+            if not (np.isfinite(left).all() and (np.linalg.cond(slope) < _SINGULAR).all()):
+                return None
+            step = np.linalg.solve(slope, left[..., None])[..., 0]
+            q -= step
+            if np.abs(step).max(initial=0.0) <= _CLOSE * np.abs(q).max(initial=0.0):
+                return q
+        return None
+
     def _in_portions(self, samples, numbers):
         assert self._at is not None
         parts = []
@@ -129,6 +169,4 @@ def _is_complex(leaf) -> bool:
 
 def looks_like_positions(observe: Callable | Delayed | None, record: Record, layout: Layout) -> bool:
     """Whether the signals are positions, or something of their structure (with a gain, a bias): a start for q."""
-    if isinstance(observe, Delayed):
-        observe = observe.observe
-    return observe is None or record.structure == (layout.tree, layout.shapes)
+    return sensors(observe)[0] is None or record.structure == (layout.tree, layout.shapes)

@@ -42,13 +42,15 @@ _KINK = (
 
 
 class Descent(NamedTuple):
-    """Where a search ended: the last trial, its noise, whether it converged, how many trials, and a sentence."""
+    """Where a search ended: the last trial, its noise, whether it converged, how many trials, a sentence, and the
+    question about which it was."""
 
     point: Point
     widths: Widths
     converged: bool
     trials: int
     message: str
+    question: AbstractQuestion
 
 
 class Step(NamedTuple):
@@ -105,19 +107,20 @@ def minimise(
         left = model.step(_LEAST).gain
         near = left <= _NEAR * question.measured
         if left <= enough or (near and left * share(question, point, model.widths) <= enough):
-            return Descent(point, model.widths, True, trials, f"The search converged after {trials} trials.")
+            return Descent(point, model.widths, True, trials, f"The search converged after {trials} trials.", question)
         recent = sum(fall for trial, fall in falls if trial > trials - _PATIENCE)
         if trials > _PATIENCE and recent * share(question, point, model.widths) <= enough:
-            return Descent(point, model.widths, False, trials, _KINK.format(trials, left, _PATIENCE, recent))
+            text = _KINK.format(trials, left, _PATIENCE, recent)
+            return Descent(point, model.widths, False, trials, text, question)
         better, damping, trials = _descended(question, point, model, anchor, damping, trials, limit)
         if better is not None:
             falls.append((trials, model.cost - question.cost(better, model.factors) - anchor.cost(better.u)))
         if better is None and trials < limit:
             text = f"The search stopped where rounding hides what is left, after {trials} trials."
-            return Descent(point, model.widths, True, trials, text)
+            return Descent(point, model.widths, True, trials, text, question)
         if better is None:
             text = f"The search was stopped after {trials} trials: half the sum of squares may fall by {left:.2g}."
-            return Descent(point, model.widths, False, trials, text)
+            return Descent(point, model.widths, False, trials, text, question)
         point = better
 
 

@@ -95,10 +95,10 @@ def _by_steps(projection: Projection, y: np.ndarray, t: np.ndarray, numbers: np.
     rows = np.broadcast_to(numbers, (count, len(numbers)))
     before = np.full_like(y, np.inf)
     for _ in range(_STEPS):
-        if np.nanmax(np.abs(y - before), initial=0.0) <= _STILL * np.nanmax(np.abs(y), initial=1.0):
+        if np.nanmax(np.abs(y - before), initial=0.0) <= _STILL * np.nanmax(np.abs(y), initial=0.0):
             break
         before, y = y, evaluate(projection.state.line, [*y.T, t, *rows.T]).T
-    still = np.abs(y - before).max(axis=1) <= _STILL * np.maximum(np.abs(y).max(axis=1), 1.0)
+    still = np.abs(y - before).max(axis=1) <= _STILL * np.abs(y).max(axis=1)
     y = np.where(still[:, None], y, np.nan)
     along = np.zeros((count, states + len(directions), states)), np.zeros((states + len(directions), len(numbers)))
     along[0][:, :states], along[1][states:] = np.eye(states), directions

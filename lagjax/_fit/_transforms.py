@@ -10,7 +10,7 @@ The search moves numbers u that may be any real, the scene gets x = x(u):
 
 so that no step leaves the set and no bound is ever active: a parameter that the data push onto a bound comes near it,
 with an interval that says so. The first three move every number by itself. The others move all numbers of one leaf
-together, and there may be fewer u than x. Intervals end inside the set.
+together, and there may be fewer u than x. Intervals end inside the set, or at its bound where that is not excluded.
 """
 
 import abc
@@ -80,6 +80,11 @@ class AbstractTransform(abc.ABC):
         """Whether every number moves by itself, so that one can be kept and the others moved."""
         return False
 
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Between which two numbers each number moves by itself; ∓∞ where there is no such bound."""
+        return -np.inf, np.inf
+
 
 class AbstractSeparable(AbstractTransform):
     """A map that moves every number by itself, x_i = x(u_i), and increases."""
@@ -98,11 +103,17 @@ class AbstractSeparable(AbstractTransform):
         return np.diag(self.slope(u))
 
     def ends(self, x, spread):
-        """x(u ± spread / slope): relative for logarithms, and inside of the bounds."""
+        """x(u ± spread / slope): relative for logarithms, and inside of the bounds.
+
+        Where x ± spread does not exclude a bound, its logarithm says nothing: the ends are those of x ± spread then,
+        cut off at the bounds.
+        """
+        low, high = np.maximum(x - spread, self.bounds[0]), np.minimum(x + spread, self.bounds[1])
+        excluded = (low > self.bounds[0]) & (high < self.bounds[1])
         u = self.inverse(x)
-        with np.errstate(over="ignore", divide="ignore"):
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             wide = spread / self.slope(u)
-            return self.value(u - wide), self.value(u + wide)
+            return np.where(excluded, self.value(u - wide), low), np.where(excluded, self.value(u + wide), high)
 
     def log_volume(self, u, xp: Any = np):
         """Σ log dx/du."""
@@ -148,6 +159,11 @@ class Positive(AbstractSeparable):
     ```
     """
 
+    @property
+    def bounds(self):
+        """Zero and infinity."""
+        return 0.0, np.inf
+
     def value(self, u, xp: Any = np):
         """x(u)."""
         return xp.exp(u)
@@ -187,6 +203,11 @@ class Between(AbstractSeparable):
 
     lower: float
     upper: float
+
+    @property
+    def bounds(self):
+        """Both."""
+        return self.lower, self.upper
 
     def value(self, u, xp: Any = np):
         """x(u)."""
@@ -455,8 +476,8 @@ class Inertia(AbstractTransform):
 
 
 def _logistic(u, xp: Any = np):
-    """1 / (1 + e⁻ᵘ), without overflow."""
-    return 0.5 * (1.0 + xp.tanh(0.5 * u))
+    """1 / (1 + e⁻ᵘ), without overflow, and right to rounding where it is small."""
+    return xp.exp(-xp.logaddexp(0.0, -u))
 
 
 def _helmert(n: int) -> np.ndarray:

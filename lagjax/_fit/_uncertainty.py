@@ -10,6 +10,12 @@ intervals many times too small. Source: Newey & West, Econometrica 55 (1987) 703
 
 Directions that nothing depends on have no variance: they are found as null directions of G (`seen`), their parameters
 have infinite variance, and nothing is inverted there.
+
+Over a chaotic record sensitivities grow by so many powers of ten that all columns point along the one direction that
+grows fastest, and rounding hides the rest: G seems to have null directions where it has none. Null directions are the
+same whatever the rows are multiplied by, so they are looked for a second time where every row has length one
+(`confirmed`): what is null there is not seen, and what is not was drowned. Where rows grow by more than there are
+digits, all are.
 """
 
 from typing import NamedTuple
@@ -23,6 +29,12 @@ from lagjax._fit._residuals import AbstractQuestion, Point, compressed
 # Singular values below this fraction of the largest, of columns of length one, are null: derivatives are as accurate
 # as the motion, to 1e-9, and a direction that is really seen so little would need a million times the data.
 NULL = 1e-7
+# By how much the rows of a record grow before they can drown each other: a hundredth of what `NULL` tells from nothing,
+# so that two columns which grow like this are still told apart by their early rows where this says nothing.
+_GROWTH = 1e-2 / NULL
+# By how much they grow before the last digit of a number moves signals by their size: what was computed then is one
+# motion of many, and no derivative of it says how well anything is known.
+_LOST = 1.0 / np.finfo(float).eps
 # The length of a column below which it is zero: one over it must have a square, and some room, among finite numbers.
 _NOTHING = 1e-140
 
@@ -31,7 +43,8 @@ class Information(NamedTuple):
     """What the data say about F free parameters.
 
     - `covariance` (F, F) of u; infinite variance and NaN beside it where a parameter is not seen.
-    - `null` (F, K): the K directions of u that nothing depends on.
+    - `null` (F, K): the K directions of u that nothing depends on, as far as rounding lets one tell; `confirmed` are
+      those among them that nothing depends on.
     - `effective` (S,): the number of samples of each signal that independent ones would need to say as much.
     - `correlation` (S,): the correlation of neighbouring residuals.
     - `white` (F, F): the covariance if residuals were white, zero where nothing is seen; `lost`: by how much variances
@@ -40,6 +53,7 @@ class Information(NamedTuple):
 
     covariance: np.ndarray
     null: np.ndarray
+    confirmed: np.ndarray
     effective: np.ndarray
     correlation: np.ndarray
     white: np.ndarray
@@ -51,41 +65,89 @@ def information(question: AbstractQuestion, point: Point, widths: Widths) -> Inf
     factors = [np.sqrt(b.weights) / widths.sigma for b in question.batches]
     triangles = question.triangles(point, factors)
     null, basis = seen(triangles, question.states)
+    if _is_lost(question, point):
+        null, basis = np.eye(len(point.u)), np.zeros((len(point.u), 0))
     laws = [correlation(question, point, widths, s) for s in range(len(widths.sigma))]
     lags = [law.lags for law in laws]
     effective = np.array([law.count / law.time for law in laws])
-    free = len(point.u)
+    free, unit = len(point.u), _lengths(triangles, question.states)  # of columns: their squares may be no numbers
     middle = np.zeros((free, free))
     for batch, factor, slopes in zip(question.batches, factors, point.slopes, strict=True):
-        own = orthogonal(triangles[batch.rows], factor[..., None] * slopes, question.states)
+        own = orthogonal(triangles[batch.rows], factor[..., None] * slopes, question.states) / unit
         for s, law in enumerate(lags):
             middle += correlated_square(together(own[:, :, s], batch.weights[..., s] > 0), law)
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + question.unknowns
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in widths.dof])
-    half = basis @ np.linalg.solve(basis.T @ _square(triangles, question.states) @ basis, basis.T)
-    white = robust * half
-    covariance = lost * white @ middle @ half.T
+    rows, basis = _eliminated(triangles, question.states) / unit, basis * unit[:, None]
+    half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
+    white = robust * half / unit / unit[:, None]
+    covariance = lost * robust * half @ middle @ half.T / unit / unit[:, None]
     unseen = np.linalg.norm(null, axis=1) > 1e-6 if null.size else np.zeros(free, bool)
     covariance[unseen] = np.nan
     covariance[:, unseen] = np.nan
     covariance[unseen, unseen] = np.inf
-    return Information(covariance, null, effective, np.array([law.neighbour for law in laws]), white, float(lost))
+    confirmed = null if not null.size else confirmed_null(question, point, null)
+    return Information(
+        covariance, null, confirmed, effective, np.array([law.neighbour for law in laws]), white, float(lost)
+    )
 
 
 def seen(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
     rows = _eliminated(triangles, states)
-    before = np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
-    unit = np.where(before > _NOTHING, before, 1.0)
+    unit = _lengths(triangles, states)
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
     _, values, directions = np.linalg.svd(rows / unit)
     values = np.append(values, np.zeros(len(unit) - len(values)))
     small = values <= NULL * max(values.max(initial=0.0), 1.0)
     null = directions[small].T / unit[:, None]
-    null = null / np.where(small.any(), np.linalg.norm(null, axis=0), 1.0)
+    null = null / np.abs(null).max(axis=0, initial=0.0)  # before squares of it are no numbers
+    null = null / np.linalg.norm(null, axis=0)
     return null, directions[~small].T / unit[:, None]
+
+
+def _is_lost(question: AbstractQuestion, point: Point) -> bool:
+    """Whether the last digit of a parameter moves a signal by its size, because motions grow apart.
+
+    Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
+    """
+    sizes, states = question.parameters.sizes(point.u), question.states
+    moved = max(
+        np.abs(slopes[..., states:] * sizes / question.size[:, None]).max(initial=0.0) for slopes in point.slopes
+    )
+    return moved > _LOST and growth(row_sizes(question, point)) > _LOST
+
+
+def confirmed_null(question: AbstractQuestion, point: Point, null: np.ndarray) -> np.ndarray:
+    """Those of the null directions (F, K) that are no work of rounding, (F, K′)."""
+    sizes = row_sizes(question, point)
+    if growth(sizes) < _GROWTH:
+        return null
+    with np.errstate(divide="ignore"):
+        level = [np.where(size > 0, 1.0 / size, 0.0) for size in sizes]
+    return seen(question.triangles(point, level), question.states)[0]
+
+
+def row_sizes(question: AbstractQuestion, point: Point) -> list[np.ndarray]:
+    """The length of the row of each sample (N, T, S) of every batch, its columns as fractions of their largest."""
+    largest = np.max([np.abs(slopes).max(axis=(0, 1, 2)) for slopes in point.slopes], axis=0)
+    columns = np.where(largest > 0, largest, 1.0)
+    return [
+        np.where(batch.weights > 0, _norm(slopes / columns, -1), 0.0)
+        for batch, slopes in zip(question.batches, point.slopes, strict=True)
+    ]
+
+
+def growth(sizes: list[np.ndarray]) -> float:
+    """By how much rows (N, T, S) grow along the record in which they grow most, from the first that is not zero."""
+    found = 1.0
+    for row in (row for batch in sizes for row in batch.max(axis=2)):
+        (places,) = np.nonzero(row)
+        if len(places):
+            found = max(found, float(row.max() / row[places[0]]))
+    return found
 
 
 def _eliminated(triangles: np.ndarray, states: int) -> np.ndarray:
@@ -94,9 +156,17 @@ def _eliminated(triangles: np.ndarray, states: int) -> np.ndarray:
     return compressed(own.reshape(1, -1, own.shape[-1]))[0]
 
 
-def _square(triangles: np.ndarray, states: int) -> np.ndarray:
-    rows = _eliminated(triangles, states)
-    return rows.T @ rows
+def _lengths(triangles: np.ndarray, states: int) -> np.ndarray:
+    """The length of the column of each parameter (F,), one for a column of nothing."""
+    length = _norm(triangles[..., states:-1], (0, 1))
+    return np.where(length > _NOTHING, length, 1.0)
+
+
+def _norm(x: np.ndarray, axis) -> np.ndarray:
+    """The Euclidean norm along axes, also where squares are no numbers."""
+    largest = np.abs(x).max(axis=axis, keepdims=True)
+    unit = np.where(largest > 0, largest, 1.0)
+    return np.sqrt(np.sum((x / unit) ** 2, axis=axis)) * unit.squeeze(axis)
 
 
 def orthogonal(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.ndarray:

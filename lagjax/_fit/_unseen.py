@@ -14,24 +14,50 @@ import numpy as np
 from lagjax._fit._noise import Widths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._residuals import AbstractQuestion, Failure, Point
-from lagjax._fit._uncertainty import seen
+from lagjax._fit._uncertainty import Information, confirmed_null, growth, row_sizes, seen
 
 _MOST_NAMES = 12  # in one sentence
 _LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
 
 
-def sentences(question: AbstractQuestion, point: Point, widths: Widths, null: np.ndarray) -> tuple[str, ...]:
-    """A sentence for every set of parameters of which something is not seen, given the null directions (F, K) of u."""
+def sentences(question: AbstractQuestion, point: Point, widths: Widths, known: Information) -> tuple[str, ...]:
+    """A sentence for every set of parameters of which something is not seen, and one for those that rounding hides."""
+    hidden = _hidden(question, point, known)
+    null, parameters = known.confirmed, question.parameters
     if not null.shape[1]:
-        return ()
-    parameters = question.parameters
+        return hidden
     elsewhere = _null_elsewhere(question, point, widths)
     spaces = [(parameters.jacobian(point.u) @ null, parameters.values(point.u))]
     if elsewhere is not None:
         u, other = elsewhere
         spaces.append((parameters.jacobian(u) @ other, parameters.values(u)))
     found = [_sentence(parameters, block, spaces) for block in _blocks(spaces[0][0])]
-    return tuple(found)
+    if not found:
+        ended = dict.fromkeys(parameters.labels[i] for i in np.flatnonzero(np.abs(null).max(axis=1) > 1e-6))
+        found = [f"At the end of its set, where nothing that was measured depends on it: {', '.join(ended)}."]
+    return (*found, *hidden)
+
+
+def _hidden(question: AbstractQuestion, point: Point, known: Information) -> tuple[str, ...]:
+    """The sentence for parameters whose columns are drowned where sensitivities grow."""
+    if known.confirmed.shape[1] == known.null.shape[1]:
+        return ()
+    basis = np.linalg.qr(known.confirmed)[0]
+    left = known.null / np.linalg.norm(known.null, axis=0)
+    left = left - basis @ (basis.T @ left)
+    labels = question.parameters.labels
+    names = list(dict.fromkeys(labels[k] for k in np.flatnonzero(np.linalg.norm(left, axis=1) > 1e-5)))
+    sizes = row_sizes(question, point)
+    grown, record = max(
+        (growth([row[None]]), question.pieces[batch.rows[k]].record)
+        for batch, size in zip(question.batches, sizes, strict=True)
+        for k, row in enumerate(size)
+    )
+    return (
+        f"{question.called(record)} is chaotic: motions grow apart within it by a factor of {grown:.0e}, and rounding "
+        f"hides what it says about {_listed(names)}. There are no intervals from records that long: cut it into "
+        "several shorter ones.",
+    )
 
 
 def _null_elsewhere(question: AbstractQuestion, point: Point, widths: Widths):
@@ -42,7 +68,8 @@ def _null_elsewhere(question: AbstractQuestion, point: Point, widths: Widths):
     if isinstance(other, Failure):
         return None
     factors = [np.sqrt(batch.weights) / widths.sigma for batch in question.batches]
-    return near, seen(question.triangles(other, factors), question.states)[0]
+    null = seen(question.triangles(other, factors), question.states)[0]
+    return near, confirmed_null(question, other, null)
 
 
 def _blocks(null: np.ndarray) -> list[np.ndarray]:
@@ -64,6 +91,9 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
     for i in range(len(rows)):
         rest = np.abs(rows[i:])
         k, column = np.unravel_index(np.argmax(rest), rest.shape)
+        if not rest[k, column] > 0:  # a direction along which numbers at the end of their sets no longer change
+            rows = rows[:i]
+            break
         rows[[i, i + k]] = rows[[i + k, i]]
         rows[i] /= rows[i, column]
         others = np.arange(len(rows)) != i

@@ -1,4 +1,8 @@
-"""What a search came to, in words: how it ended, parameters at the end of their sets, records that disagree.
+"""What a search came to, in words: how it ended, what it leaves, parameters at the end of their sets, records that
+disagree.
+
+A search may converge where it explains nothing. So the residuals of every signal are compared with the signal itself,
+about its mean: what they hold beyond white noise must be a small share of that. Noise alone may be as large as it is.
 
 At the end of a search every number is asked where it would go on a straight line: x + δx, the full step of Gauss and
 Newton without bounds. A positive number that is smaller than its standard error is one that the data do not need; one
@@ -10,11 +14,16 @@ are zero. If the records agree, that shift has the covariance (H − Hₖ)⁻¹ 
 Influence in Regression* (1982), §3.4, for one observation.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
+from lagjax._fit._correlation import structure
+from lagjax._fit._noise import Widths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._residuals import AbstractQuestion, Point, compressed
 from lagjax._fit._solve import Descent, eliminate
+from lagjax._fit._suspects import hanging
 from lagjax._fit._transforms import Between, Positive
 from lagjax._fit._uncertainty import Information, orthogonal
 
@@ -23,16 +32,28 @@ _DISAGREE = (
     5.0  # standard deviations of a shift: twenty records of ten parameters that agree show it in one of 1e4 fits
 )
 _MOST_NAMED = 3
+_UNEXPLAINED = 0.3  # of a signal's size, left as motion: sound fits leave 1e-3 to 0.1, a false minimum 0.4 to 1
+_DOUBTED = 0.05  # of a signal's size, left as motion, from which a fit of other records is tried
+_FAINT = 0.1  # of a signal's size over all records: what is left of a record that hardly moves is not looked at
 _CORRELATED = 0.5
 
 
-def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, question: AbstractQuestion) -> str:
-    """Sentences about a search that ended, and about what it found."""
+class Verdict(NamedTuple):
+    """Whether a fit can be relied upon, and the sentences that say why; and what it leaves."""
+
+    ok: bool
+    message: str
+    left: "Unexplained"
+
+
+def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, question: AbstractQuestion) -> Verdict:
+    """What a search came to that ended there."""
     parts = [descent.message]
-    if unseen:
+    if known.confirmed.shape[1]:
         parts.append("Not everything that is free is seen: fix it, or measure more.")
-    factors = [np.sqrt(batch.weights) / descent.widths.sigma for batch in question.batches]
-    triangles = question.triangles(descent.point, factors)
+    left = unexplained(question, descent.point, descent.widths)
+    parts += left.motion + left.noise
+    triangles = question.triangles(descent.point, question.factors(descent.point, descent.widths))
     at_ends, named = _at_ends(question.parameters, descent.point, triangles, question.states, known)
     parts += at_ends
     # Half a step of the search is one standard deviation: the interval then spans more than a factor of fifty.
@@ -40,10 +61,102 @@ def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, quest
     labels = dict.fromkeys(question.parameters.labels[i] for i in np.flatnonzero(wide & ~named))
     if labels:
         parts.append(f"Hardly seen, or at the end of what its transform allows: {', '.join(labels)}.")
-    parts += _disagreements(question, triangles, known, ~named)
+    apart = _disagreements(question, triangles, known, ~named)
+    parts += apart
     if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
-    return " ".join(parts)
+    ok = descent.converged and not (unseen or left.motion or apart)
+    if not ok or at_ends or labels:
+        still = [text for part in question.parts for text in hanging(part.question.records, part.question.names)]
+        parts, ok = parts + still, ok and not still
+    return Verdict(ok, " ".join(parts), left)
+
+
+class Unexplained(NamedTuple):
+    """What a trial leaves: sentences for the signals of which motion is left, and for those whose noise is as large as
+    they are; the largest share of a signal that is left, whether it holds motion at all, and the records, the worst
+    first."""
+
+    motion: list[str]
+    noise: list[str]
+    share: float
+    doubted: bool
+    worst: list[int]
+
+
+def unexplained(question: AbstractQuestion, point: Point, widths: Widths) -> Unexplained:
+    """What a trial leaves of the signals, where that is much."""
+    left, noisy, shares, doubted, many = [], [], [0.0], False, len(question.records) > 1
+    of_records = np.zeros(len(question.records))
+    for signal, name in enumerate(question.names):
+        parts = {k: _parts(*rows) for k, rows in _rows_of_signal(question, point, widths, signal).items()}
+        if not parts:
+            continue
+        samples = sum(part.samples for part in parts.values())
+        rms, own, motion = (
+            np.sqrt(sum(part.samples * getattr(part, kind) for part in parts.values()) / samples)
+            for kind in ("left", "own", "motion")
+        )
+        shares.append(rms / own if own > 0 else np.inf if rms > 0 else 0.0)
+        doubted |= bool(motion > _DOUBTED * own)
+        for k, part in parts.items():
+            of_records[k] = max(of_records[k], part.motion / own**2 if own > 0 else 0.0)
+        if motion > _UNEXPLAINED * own:
+            left.append(f"The fit leaves {_percent(rms, own)} of {name}: its motion is not that of the scene.")
+        elif rms > _UNEXPLAINED * own:
+            noisy.append(f"The noise is {_percent(rms, own)} of {name}.")
+        each = {
+            k: np.sqrt(part.motion / part.own) if part.own > 0 else np.inf
+            for k, part in parts.items()
+            if part.motion > max(_UNEXPLAINED**2 * part.own, (_FAINT * own) ** 2)
+        }
+        worst = sorted(each, key=lambda k: -each[k])[:_MOST_NAMED] if many and len(each) < len(parts) else []
+        left += [
+            f"The fit leaves {_percent(np.sqrt(parts[k].left), np.sqrt(parts[k].own))} of {name} in "
+            f"{question.called(k)}, and less in others: is it a record of this scene, with the signs of the others?"
+            for k in worst
+        ]
+    return Unexplained(left, noisy, float(max(shares)), doubted, np.argsort(-of_records, kind="stable").tolist())
+
+
+def _percent(part: float, whole: float) -> str:
+    return f"{100 * part / whole:.3g} %" if part < 10.0 * whole else "far more than all"
+
+
+class _Parts(NamedTuple):
+    """Of one signal in one record: the samples that count, and mean squares of the residuals, of what these hold beyond
+    white noise, and of the signal about its mean."""
+
+    samples: float
+    left: float
+    motion: float
+    own: float
+
+
+def _parts(rows: np.ndarray, values: np.ndarray, counts: np.ndarray) -> _Parts:
+    samples, root = counts.sum(), np.sqrt(counts)
+    mean = np.sum(counts * values) / samples
+    motion = structure(root * rows, counts > 0) * (counts > 0).sum() / samples
+    return _Parts(samples, np.sum(counts * rows**2) / samples, motion, np.sum(counts * (values - mean) ** 2) / samples)
+
+
+def _rows_of_signal(question: AbstractQuestion, point: Point, widths: Widths, signal: int) -> dict[int, tuple]:
+    """Of every record that has a signal: residuals, values and how much each counts, (M, T) for its M pieces."""
+    found: dict[int, list] = {}
+    columns = zip(question.batches, point.residuals, question.factors(point, widths), strict=True)
+    for batch, residuals, factors in columns:
+        counts = (factors[..., signal] * widths.sigma[signal]) ** 2
+        for row, place in enumerate(batch.rows):
+            if counts[row].any():
+                each = residuals[row, :, signal], batch.values[row, :, signal], counts[row]
+                found.setdefault(question.pieces[place].record, []).append(each)
+    return {k: tuple(_padded([one[i] for one in pieces]) for i in range(3)) for k, pieces in found.items()}
+
+
+def _padded(rows: list[np.ndarray]) -> np.ndarray:
+    """Rows of different lengths as one array, with zeros behind the shorter ones."""
+    longest = max(map(len, rows))
+    return np.stack([np.pad(row, (0, longest - len(row))) for row in rows])
 
 
 def _deviations(known: Information) -> np.ndarray:

@@ -390,7 +390,7 @@ _SENTENCES = {
     ),
     "borders": (
         "Borders: this engine does not locate them, its steps go across what is pieced together in the scene{0}. A "
-        "narrow piece may be missed, and derivatives lack what the border adds: `System.explain` says why the motion "
+        "narrow piece may be missed, and there are no derivatives across a jump: `System.explain` says why the motion "
         "is not in machine code, where steps end at borders."
     ),
     "global_error": (

@@ -88,6 +88,15 @@ class Law(NamedTuple):
         width = sum(self.derivation.count(name) for name in _QUANTITIES)
         return _in_parts(self._powers, max(1, _CHUNK // width), len(q), q, qdot, t, numbers)
 
+    def accelerations(self, q, qdot, t, numbers: Sequence) -> np.ndarray:
+        """q̈ at S states, shape (S, n)."""
+        width = sum(self.derivation.count(name) for name in _SYSTEM)
+        return _in_parts(self._accelerations, max(1, _CHUNK // width), len(q), q, qdot, t, numbers)
+
+    def _accelerations(self, q, qdot, t, numbers) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            return _solved(self.derivation.evaluate(_SYSTEM, columns_of(q, qdot, t, numbers)))[0]
+
     @property
     def decides(self) -> bool:
         """Whether the accelerations are known to be made of pieces."""

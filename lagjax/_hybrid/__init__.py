@@ -15,13 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._consistent import require_consistent
+from lagjax._doubles import DOUBLE, in_doubles
 from lagjax._hybrid._mode import Transition
 from lagjax._hybrid._rounds import Ending, Plan, Record, hybrid_motion
 from lagjax._layout import Layout, halves
+from lagjax._machine_code import MachineCode
 from lagjax._problem import Problem
 from lagjax._results import SimulationError, result_from
 from lagjax._simulate import raise_unless_ok
-from lagjax._system import System
+from lagjax._system import System, present_system
 from lagjax._trajectory import State, Trajectory, Transitions
 from lagjax._validate import as_arrays, is_concrete, require_budget, require_flag
 
@@ -53,6 +55,10 @@ class Hybrid:
     start: str
     max_transitions: int = 32
 
+    def now(self) -> "Hybrid":
+        """The scene with its functions as they are now."""
+        return Hybrid(*_present(self.modes, self.transitions), self.start, self.max_transitions)
+
     def __post_init__(self):
         _require_modes(self.modes, self.transitions, self.start, self.max_transitions)
 
@@ -76,8 +82,10 @@ def simulate_hybrid(
 
     - `modes`: a `System` for each name; all share the structure of `q0` and `params`.
     - `transitions`: from which mode to which, and where. The earliest transition happens; of several at one instant,
-      the first in the list. The others follow at once if the mode is the same and the reset has not changed their
-      guards.
+      the first in the list. After it the same law holds as at the start (see `Transition.direction`), for guards at
+      zero to rounding: those that go on in their direction follow at once, as do blows along a row of balls that
+      touch. What a stretch knows the next one remembers: from which side a guard comes that the reset has not moved,
+      and that one without a reset has been crossed.
     - `max_transitions`: the budget of transitions. A motion that needs more ends there, with the result
       `max_transitions_reached`; or with `zeno` where no budget is enough because the times accumulate, as the bounces
       of a ball do. Intervals that shrink steadily to a sum before `ts[-1]`, or below the rounding of the time, count as
@@ -91,14 +99,16 @@ def simulate_hybrid(
 
     `jax.vmap`, `jax.jit` and `jax.grad` work around it, and every member of a batch switches at its own time. Times and
     states of transitions have first and second derivatives with respect to the initial state and params; third
-    derivatives are not right.
+    derivatives are not right. Of several transitions at one instant they are those in the order in which these
+    happened: where resets do not commute, or the start touches a guard, derivatives from the other side are others. The
+    time at which a guard jumps through zero is not varied.
 
     A guard is examined along the whole of every step, and a step is shortened until the guard is smooth there: a guard
     that touches zero, or crosses it and comes back between two steps, is resolved. A reset to a state off the
     constraints of the new mode ends the motion with the result `inconsistent_start`.
 
     **Raises** `TypeError`, `ValueError` for arguments that cannot be right, `SimulationError` as `simulate` does. It
-    needs scenes that have machine code (see `System.explain`): float64, on the CPU.
+    needs scenes that have machine code (see `System.explain`), on the CPU.
 
     ```python
     import jax.numpy as jnp, lagjax
@@ -112,6 +122,7 @@ def simulate_hybrid(
     require_flag(throw, "throw")
     layout = Layout.of(q0, qdot0)
     _require_modes(modes, transitions, start, max_transitions)
+    modes, transitions = _present(modes, transitions)
     problem = Problem.of(modes[start], layout, q0, qdot0, ts, params, rtol, atol, max_steps)
     if not all(map(is_concrete, problem.tolerances)):
         raise ValueError("rtol and atol of simulate_hybrid must be numbers: they decide the order of the method.")
@@ -119,11 +130,20 @@ def simulate_hybrid(
         raise ValueError("simulate_hybrid goes forward in time: a reset cannot be undone; ts must increase.")
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
     require_consistent(modes[start], layout, problem.ts, q0, qdot0, problem.params)
-    rtol, atol = (float(np.asarray(x)) for x in problem.tolerances)
+    rtol, atol = float(MachineCode().rtol(problem.in_doubles)), None if atol is None else float(atol)
     plan = Plan(modes, tuple(transitions), start, max_transitions, rtol, atol, max_steps)
-    ending, record = hybrid_motion(plan, layout, problem.ts, problem.y0, problem.params)
+    ending, record = _motion(plan, problem)
     trajectory = _trajectory(modes, problem, ending, record)
     return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory
+
+
+def _motion(plan: Plan, problem: Problem) -> tuple[Ending, Record]:
+    """The rounds of a problem, in float64, in its own precision."""
+    given = problem.ts, problem.y0, problem.params
+    if not problem.is_single:
+        return hybrid_motion(plan, problem.layout, *given)
+    layout = dataclasses.replace(problem.layout, dtype=DOUBLE)
+    return in_doubles(lambda *given: hybrid_motion(plan, layout, *given), *given)
 
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: Record) -> Trajectory:
@@ -150,7 +170,7 @@ def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, reco
         mode=ending.modes,
         transitions=transitions,
         mode_names=tuple(modes),
-        tolerances=problem.tolerances,
+        tolerances=MachineCode().tolerances(problem, problem.y0),
     )
 
 
@@ -164,6 +184,12 @@ def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: L
         return raise_unless_ok(dataclasses.replace(trajectory, system=system), layout)
     except SimulationError as error:
         raise SimulationError(f"{error}\nIt was in the mode {name!r}.", trajectory) from None
+
+
+def _present(modes: dict[str, System], transitions) -> tuple[dict[str, System], list[Transition]]:
+    """Modes and transitions with their functions as they are now."""
+    systems = {name: present_system(mode) for name, mode in modes.items()}
+    return systems, [transition.now() for transition in transitions]
 
 
 def _require_modes(modes, transitions, start, max_transitions) -> None:

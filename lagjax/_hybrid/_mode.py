@@ -11,6 +11,7 @@ these are the jump of a sensitivity at an event ("saltation matrix").
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,11 +20,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._arguments import Function, accept
+from lagjax._arguments import Function, accept, present
 from lagjax._custom import differentiated_as
 from lagjax._derivation import Derivation
 from lagjax._layout import Layout, halves
-from lagjax._machine_code import MachineCode, Surfaces, flow_of, moved_with, require_one_number, vector_of
+from lagjax._machine_code import (
+    Guarded,
+    Guards,
+    MachineCode,
+    Surfaces,
+    flow_of,
+    moved_with,
+    require_one_number,
+    vector_of,
+)
 from lagjax._problem import Problem, Solution
 from lagjax._program import Unlowerable
 from lagjax._system import System
@@ -38,8 +48,10 @@ class Transition(eqx.Module):
 
     - `guard`: a real function; it may also ask, by name, for `t`, `params` and `multipliers`, the last as the
       constraints of the mode return them.
-    - `direction`: −1 only where the guard falls, +1 only where it rises, 0 for both. A motion that begins where the
-      guard is zero has to leave that surface first.
+    - `direction`: −1 only where the guard falls, +1 only where it rises, 0 for both. A guard that is zero to rounding
+      where a motion begins, and goes on in that direction, has been met: the transition happens at once, that of a
+      ball on the floor with a velocity into it. One that goes the other way, or a guard of both directions, has to
+      leave zero first. Give contacts a direction.
     - `reset(q, qdot)` → (q, qdot): the state after the transition; it may also ask for `t` and `params`. None keeps it.
 
     Raises `TypeError` or `ValueError` for names, guards and directions that are invalid.
@@ -69,6 +81,14 @@ class Transition(eqx.Module):
         self.guard = accept(guard, "guard", extras=("t", "params", "multipliers"))
         self.reset = None if reset is None else accept(reset, "reset")
 
+    def now(self) -> "Transition":
+        """The transition with its functions as they are now."""
+        functions = self.guard, self.reset
+        now = present(self.guard), None if self.reset is None else present(self.reset)
+        if all(map(operator.is_, functions, now)):
+            return self
+        return eqx.tree_at(lambda t: (t.guard, t.reset), self, now, is_leaf=lambda x: x is None)
+
 
 class Mode(NamedTuple):
     """One mode: a problem that lacks a state and times, and the transitions that leave it, with their numbers.
@@ -96,7 +116,7 @@ class Mode(NamedTuple):
                 raise Unlowerable(refusal)
             transitions = tuple(transition for _, transition in leaving)
             surfaces = _surfaces(problem.derivation, problem.system, transitions, tuple(code), structure)
-            guarded = problem if surfaces is None else dataclasses.replace(problem, guards=surfaces.guards())
+            guarded = dataclasses.replace(problem, guards=_watched(surfaces))
             if refusal := MachineCode().refuses(guarded):
                 raise Unlowerable(refusal)
         except Unlowerable as why:
@@ -119,19 +139,19 @@ class Mode(NamedTuple):
         """The motion over the times `ts`, with its derivatives."""
         return MachineCode().solve(dataclasses.replace(self.problem, ts=ts, y0=y0))
 
-    def solve_to_event(self, ts, y0) -> Solution:
-        """The motion to the last of the times `ts`, or to the first zero of a guard; it has no derivatives."""
-        guards = None if self.surfaces is None else self.surfaces.guards()
-        solution = MachineCode().solve(dataclasses.replace(self.problem, ts=ts, y0=y0, guards=guards))
-        return jax.tree.map(jax.lax.stop_gradient, solution)
+    def solve_to_event(self, ts, y0, sides) -> Solution:
+        """The motion to the last of the times `ts`, or to the first zero of a guard; it has no derivatives.
+
+        Where it begins on a surface it comes from that one of the `sides` (see `_native.Guards`).
+        """
+        guarded = dataclasses.replace(self.problem, ts=ts, y0=y0, guards=_watched(self.surfaces))
+        return MachineCode().solve_to_event(guarded, sides)
 
     # ---- through a transition ----
 
-    def guards_at(self, t, y) -> tuple:
-        """The guards, their rates along the motion and their sizes at a state, without derivatives."""
-        t, y, numbers = jax.lax.stop_gradient((t, y, self.vector))
-        out, count = self._surfaces.complete.at(jnp.append(y, t), numbers), len(self.leaving)
-        return out[:count], out[count : 2 * count], out[2 * count : 3 * count]
+    def guards_at(self, t, y, latest) -> Guarded:
+        """The guards at a state, without derivatives, of a run that ends at `latest`."""
+        return self._surfaces.at(t, y, self.vector, latest)
 
     def crossing(self, k: int) -> Callable:
         """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero and stays so as what went in varies.
@@ -148,7 +168,13 @@ class Mode(NamedTuple):
             return jnp.asarray(False)
         motion = system.motion(self.layout, self.params)
         t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(self.params, eqx.is_array_like)))
-        return motion.constraints.inconsistent(*halves(y), t, numbers)
+        state = *halves(y), t, numbers
+        return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, jnp.inf)
+
+
+def _watched(surfaces: Surfaces | None) -> Guards | None:
+    """Surfaces as machine code watches them along a mode."""
+    return None if surfaces is None else surfaces.guards(remembers=True)
 
 
 @functools.lru_cache(maxsize=64)

@@ -14,6 +14,7 @@ import numpy as np
 from lagjax._failures import lost_unless
 from lagjax._hybrid._mode import Mode, Transition, state_after
 from lagjax._layout import Layout
+from lagjax._machine_code import Guarded
 from lagjax._problem import Problem
 from lagjax._results import RESULTS, SUCCESSFUL, code_of
 from lagjax._system import System
@@ -24,12 +25,10 @@ TOO_MANY, INCONSISTENT, ZENO, NOT_FINITE = map(
     code_of,
     (RESULTS.max_transitions_reached, RESULTS.inconsistent_start, RESULTS.zeno, RESULTS.nonfinite_state),
 )
-# A reset has left a guard alone when it changes by less than this part of its size: the round-off of evaluating it at
-# two states that are equal but for the last digits. A larger one would follow guards that the reset has moved.
-SAME = 64 * np.finfo(np.float64).eps
 # How far the logarithms of two ratios of a geometric sequence may differ, as a part of them. Times of a Zeno motion
 # approach a geometric sequence; twice this would take a slowly changing rhythm for one.
 STEADY = 0.05
+_LEAST = 1e-300  # a side of a guard that is exactly zero still has a sign
 
 
 class Plan(eqx.Module):
@@ -41,7 +40,7 @@ class Plan(eqx.Module):
     start: str = eqx.field(static=True)
     max_transitions: int = eqx.field(static=True)
     rtol: float = eqx.field(static=True)
-    atol: float = eqx.field(static=True)
+    atol: float | None = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
 
     def __init__(self, modes: dict[str, System], transitions, start, max_transitions, rtol, atol, max_steps):
@@ -68,7 +67,18 @@ class Ending(NamedTuple):
     modes: jax.Array  # (T,), −1 where not reached
     steps: jax.Array  # accepted, rejected
     latest: jax.Array  # the number of the transition before, −1 at the beginning
-    waiting: jax.Array  # the bits of guards that vanished at the same instant and have not been followed
+    memory: "Memory"
+
+
+class Memory(NamedTuple):
+    """What is known of every guard just before the last reset, (K,): its value, and the side of its surface.
+
+    Of a guard of another mode the value is NaN. `rounding` is that of the largest terms that a guard has had.
+    """
+
+    values: jax.Array
+    sides: jax.Array  # −1, +1, or 0 where it is unknown
+    rounding: jax.Array
 
 
 class Record(NamedTuple):
@@ -88,7 +98,6 @@ class Exit(NamedTuple):
     y_next: jax.Array
     target: jax.Array
     number: jax.Array  # of the transition
-    waiting: jax.Array
     piled_up: jax.Array  # whether time does not move any more
     inconsistent: jax.Array  # whether the state after the reset is off the constraints of its mode
     guards_defined: jax.Array
@@ -104,7 +113,7 @@ def hybrid_motion(plan: Plan, layout: Layout, ts, y0, params: PyTree) -> tuple[E
     first = Ending(
         t=ts[0], y=y0, mode=jnp.asarray(start), going=~inconsistent,
         result=jnp.where(inconsistent, INCONSISTENT, SUCCESSFUL), path=jnp.full((ts.size, y0.size), jnp.nan),
-        modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), waiting=jnp.asarray(0),
+        modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), memory=rounds.no_memory(0.0),
     )  # fmt: skip
     ending, record = jax.lax.scan(rounds.one, first, jnp.arange(plan.max_transitions + 1))
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
@@ -134,11 +143,11 @@ class _Rounds(NamedTuple):
     def _in_mode(self, index: int, before: Ending, here) -> tuple[Ending, jax.Array, Record]:
         """The round of the members that are in this mode (`here`), and whether it ended with a transition."""
         mode, t_start = self.modes[index], jax.lax.stop_gradient(before.t)
-        runs = here & (before.waiting == 0)
-        horizon = jnp.where(runs, self.ts[-1], t_start)
-        located = mode.solve_to_event(jnp.stack([t_start, horizon]), before.y)
-        changes = jnp.where(runs, located.event, jnp.where(here, before.waiting, 0))
-        t_end = jnp.where(runs & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
+        sides, rounding, lasting = self._sides(index, before)
+        horizon = jnp.where(here, self.ts[-1], t_start)
+        located = mode.solve_to_event(jnp.stack([t_start, horizon]), before.y, sides)
+        changes = jnp.where(here, located.event, 0)
+        t_end = jnp.where(here & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
 
         # The same stretch once more, with derivatives and outputs; where it ends is known better already.
         covered = here & ((self.ts > t_start) | (self.ts == jnp.where(t_start == self.ts[0], t_start, jnp.nan)))
@@ -147,9 +156,11 @@ class _Rounds(NamedTuple):
         moved = mode.solve(jnp.concatenate([before.t[None], inside, t_end[None]]), before.y)
         y_end = located.y_end + jnp.where(here, moved.y_end - jax.lax.stop_gradient(moved.y_end), 0.0)
 
-        exit = self._through(index, changes, before.latest, t_end, y_end)
+        at_once = here & (t_end == t_start)
+        known = before.memory._replace(rounding=rounding), sides, t_end <= lasting
+        exit, memory = self._through(index, changes, at_once, t_end, y_end, known)
         event = (changes > 0) & ~exit.piled_up
-        result = jnp.where(exit.piled_up, ZENO, jnp.where(runs & ~event, located.result, before.result))
+        result = jnp.where(exit.piled_up, ZENO, jnp.where(here & ~event, located.result, before.result))
         # A reset may give NaN, and a guard that is NaN never fires.
         sound = jnp.isfinite(jnp.where(event, exit.y_next, y_end)).all() & exit.guards_defined
         broken = here & ~sound & (event | (result == SUCCESSFUL))
@@ -164,48 +175,84 @@ class _Rounds(NamedTuple):
             modes=jnp.where(covered, index, before.modes),
             steps=before.steps + jnp.stack([located.accepted, located.rejected]),
             latest=exit.number,
-            waiting=exit.waiting,
+            memory=memory,
         )
         return after, event, Record(exit.t, exit.y, jnp.asarray(index), exit.target)
 
-    def _through(self, index: int, changes, latest, t, y) -> Exit:
+    def _through(self, index: int, changes, at_once, t, y, known) -> tuple[Exit, Memory]:
         """Through the first transition whose bits in `changes` say that its guard falls (1) or rises (2)."""
         mode, no, none = self.modes[index], jnp.asarray(False), jnp.asarray(-1)
-        exit = Exit(t, y, y, jnp.asarray(index), none, jnp.asarray(0), no, no, jnp.asarray(True))
+        exit = Exit(t, y, y, jnp.asarray(index), none, no, no, jnp.asarray(True))
         if mode.surfaces is None:
-            return exit
-        kinds = [(changes >> (2 * k)) & 3 for k in range(len(mode.leaving))]
+            return exit, self.no_memory(known[0].rounding)
+        kinds = jnp.stack([(changes >> (2 * k)) & 3 for k in range(len(mode.leaving))])
         y_here, numbers = _constant_unless(changes > 0, (y, mode.vector))
-        values = mode.surfaces.values.at(jnp.append(y_here, t), numbers)
-        _, rates, sizes = mode.guards_at(t, y)
+        guarded = mode.guards_at(t, y, self.ts[-1])
         earlier = jnp.asarray(False)
         for k, (number, transition) in enumerate(mode.leaving):
             taken = (kinds[k] > 0) & ~earlier
             earlier = earlier | taken
-            # It changes sign against its rate: the motion since the last time is lost in rounding.
-            against = jnp.where(kinds[k] == 2, rates[k] < 0, rates[k] > 0) & (latest == number)
+            # It changes sign at once, against its rate: the motion that turns it round is lost in rounding.
+            against = jnp.where(kinds[k] == 2, guarded.rates[k] < 0, guarded.rates[k] > 0) & at_once
             t_zero, y_zero = mode.crossing(k)(taken, t, y_here, numbers)
             y_next = state_after(transition, mode.layout, *_constant_unless(taken, (t_zero, y_zero, mode.params)))
             target = self.plan.names.index(transition.target)
-            waiting = self._waiting(mode, kinds, k, t, y_next, values, sizes) if target == index else jnp.asarray(0)
             inconsistent = self.modes[target].is_inconsistent(t_zero, y_next)
-            this = Exit(
-                t_zero, y_zero, y_next, jnp.asarray(target), jnp.asarray(number), waiting, against, inconsistent, no
-            )
+            this = Exit(t_zero, y_zero, y_next, jnp.asarray(target), jnp.asarray(number), against, inconsistent, no)
             exit = _where(taken, this, exit)
-        return exit._replace(guards_defined=~jnp.isnan(jnp.stack(values)).any())
+        exit = exit._replace(guards_defined=~jnp.isnan(guarded.values).any())
+        return exit, self._memory(mode, guarded, kinds, *known)
 
-    def _waiting(self, mode: Mode, kinds, taken: int, t, y_next, values, sizes):
-        """The bits of the other guards that changed sign at that instant and go on to, unmoved by the reset."""
-        waiting = jnp.asarray(0)
-        if len(kinds) == 1:
-            return waiting
-        after, rates, _ = mode.guards_at(t, y_next)
-        for k, kind in enumerate(kinds):
-            unmoved = jnp.abs(after[k] - jax.lax.stop_gradient(values[k])) <= SAME * sizes[k]
-            goes_on = jnp.where(kind == 2, rates[k] > 0, rates[k] < 0)
-            waiting = waiting + jnp.where((kind > 0) & unmoved & goes_on & (k != taken), kind << (2 * k), 0)
-        return waiting
+    # ---- on which side of its surface every guard is ----
+
+    def no_memory(self, rounding) -> Memory:
+        """Nothing is known of any guard but its rounding."""
+        count = len(self.plan.transitions)
+        return Memory(jnp.full(count, jnp.nan), jnp.zeros(count), jnp.broadcast_to(rounding, (count,)))
+
+    def _memory(self, mode: Mode, guarded: Guarded, kinds, before: Memory, sides, stays) -> Memory:
+        """What is known before a reset of the guards of this mode, which began on these `sides`.
+
+        A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where it
+        began, if it `stays` there since or has no rate, and else from where its rate does.
+        """
+        numbers = _numbers(mode)
+        rounding = jnp.maximum(before.rounding[numbers], guarded.rounding)
+        since = jnp.where(stays | (guarded.rates == 0), jnp.sign(sides), -jnp.sign(guarded.rates))
+        here = jnp.where(jnp.abs(guarded.values) > rounding + guarded.of_time, jnp.sign(guarded.values), since)
+        here = jnp.where(kinds > 0, jnp.where(kinds == 1, 1.0, -1.0), here)
+        nothing = self.no_memory(before.rounding)
+        new = guarded.values, here, rounding
+        return Memory(*(x.at[numbers].set(of_mode) for x, of_mode in zip(nothing, new, strict=True)))
+
+    def _sides(self, index: int, before: Ending) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The sides from which a motion comes that begins in a mode, the rounding of guards, and until when they stay.
+
+        A guard is on the side where it was, if the reset has not moved it. One that has been followed is on the side
+        where it goes; without a reset it has been crossed, and so has a jump. Of others on their surface it is known
+        that they can change in their direction, if in one. A side is as large as what rounding does.
+        """
+        mode, memory = self.modes[index], before.memory
+        if mode.surfaces is None:
+            return jnp.zeros(0), memory.rounding, jnp.zeros(0)
+        numbers, guarded = _numbers(mode), mode.guards_at(before.t, before.y, self.ts[-1])
+        values, was, rounding = (x[numbers] for x in memory)
+        rounding = jnp.maximum(rounding, guarded.rounding)
+        unmoved, followed = jnp.abs(guarded.values - values) <= rounding, numbers == before.latest
+        noise, goes = rounding + guarded.of_time, jnp.sign(guarded.rates)
+        unknown = np.array([-float(transition.direction) for _, transition in mode.leaving])
+        crossed = np.array([transition.reset is None for _, transition in mode.leaving]) | mode.surfaces.only_jump
+        beyond = jnp.where(goes != 0, goes, jnp.where(crossed, -was, unknown))
+        sides = jnp.where(jnp.abs(guarded.values) > noise, jnp.sign(guarded.values), unknown)
+        sides = jnp.where(unmoved & (was != 0), jnp.where(followed, beyond, was), sides)
+        sides = sides * jnp.maximum(noise, _LEAST)
+        stays = jnp.where(goes == 0, before.t, before.t + 2.0 * noise / jnp.abs(guarded.rates))
+        return sides, memory.rounding.at[numbers].set(rounding), jax.lax.stop_gradient(stays)
+
+
+def _numbers(mode: Mode) -> np.ndarray:
+    """The numbers of the transitions that leave a mode."""
+    return np.array([number for number, _ in mode.leaving], int)
 
 
 def _where(condition, new: PyTree, old: PyTree) -> PyTree:

@@ -1,11 +1,12 @@
-"""`MachineCode`: the engine of float64 on CPUs, Taylor series in machine code that is made for the scene.
+"""`MachineCode`: the engine on CPUs, Taylor series in machine code that is made for the scene.
 
 Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is traced; ─► `_transforms`, the flow as primitives
-of JAX, where something is.
+of JAX, where something is. All of that is in float64; a problem in float32 goes through the door of `_doubles` first.
 """
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -13,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._derivation import Derivation
+from lagjax._doubles import in_doubles
 from lagjax._machine_code import _transforms
 from lagjax._machine_code._events import MOST_GUARDS, Noted, along_crossings, surfaces_of, surfaces_of_event, to_event
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
-from lagjax._machine_code._surfaces import Surfaces, moved_with, require_one_number, vector_of
+from lagjax._machine_code._surfaces import Guarded, Surfaces, moved_with, require_one_number, vector_of
 from lagjax._native import Guards, watched
 from lagjax._platform import default_platform
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
@@ -26,6 +28,8 @@ from lagjax._validate import is_concrete
 __all__ = [
     "MOST_GUARDS",
     "Flow",
+    "Guarded",
+    "Guards",
     "MachineCode",
     "Noted",
     "Surfaces",
@@ -55,7 +59,9 @@ class MachineCode(AbstractEngine):
     with the coefficients (q̈)ₖ by recurrences through the scalar operations of the acceleration. Four or eight members
     of a batch stand side by side in the vector registers of every core.
 
-    Machine code requires float64 on a CPU, a scene whose acceleration is a scalar program of smooth or piecewise smooth
+    It computes in float64, also for a state in float32, whose results it rounds once.
+
+    Machine code requires a CPU, a scene whose acceleration is a scalar program of smooth or piecewise smooth
     operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;
     derivatives are by its own adjoint. `System.explain` says whether a scene has machine code.
 
@@ -75,6 +81,9 @@ class MachineCode(AbstractEngine):
 
     def refuses(self, problem: Problem) -> str | None:
         """Why it cannot solve the problem, as the end of a sentence; None where it can."""
+        if problem.is_single:
+            with jax.enable_x64(True):
+                return self.refuses(problem.in_doubles)
         if not all(map(is_concrete, problem.tolerances)):
             return "the tolerances are being traced"
         if (platform := default_platform()) != "cpu":
@@ -86,6 +95,8 @@ class MachineCode(AbstractEngine):
 
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
+        if problem.is_single:
+            return _in_doubles(self.solve, problem)
         flow, tolerances = flow_of(problem), _tolerances(problem)
         if problem.is_known:
             _require_increasing(flow.program, problem.vector)
@@ -96,12 +107,23 @@ class MachineCode(AbstractEngine):
             return _transforms.run(flow, tolerances, ts, y0, params)
         return to_event(flow, _without_guards(problem), _surfaces_of(problem), tolerances)(ts, y0, params)
 
+    def solve_to_event(self, problem: Problem, sides) -> Solution:
+        """The motion of one member to the first change of its guards; it remembers `sides` (see `Guards`).
+
+        It has no derivatives.
+        """
+        ts, y0, numbers = map(jax.lax.stop_gradient, (problem.ts, problem.y0, problem.vector))
+        numbers = jnp.concatenate([numbers, jnp.asarray(sides, float)])
+        return _transforms.run(flow_of(problem), _tolerances(problem), ts, y0, numbers)
+
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
         """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""
         return self.refuses(dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True)))
 
     def crossings(self, problem: Problem, surfaces: Surfaces, room: int) -> tuple[Solution, Noted]:
         """The motion of one member, and the crossings of its surfaces, `room` for each, on the way."""
+        if problem.is_single:
+            return _in_doubles(lambda problem: self.crossings(problem, surfaces, room), problem)
         noting = dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True))
         flow, tolerances = flow_of(noting), _tolerances(problem)._replace(notes=room)
         if problem.is_known:
@@ -116,12 +138,32 @@ class MachineCode(AbstractEngine):
         """The motions of all members, in the lanes of vectors and on all cores."""
         if not batch.is_known:
             return batch.over_members(self.solve)
-        ts, y0, params = np.asarray(batch.member.ts)[None], np.asarray(batch.y0), np.asarray(batch.vectors)
-        return flow_of(batch.member).run(ts, y0, params, _tolerances(batch.member))
+        member = batch.member
+        given = np.asarray(member.ts)[None], np.asarray(batch.y0), np.asarray(batch.vectors)
+        if member.is_single:
+            return in_doubles(lambda *given: _run(member.in_doubles, given), *given)
+        return _run(member, given)
+
+
+def _run(problem: Problem, given: tuple) -> Solution:
+    ts, y0, params = given
+    return flow_of(problem).run(ts, y0, params, _tolerances(problem))
+
+
+def _in_doubles(solve: Callable, problem: Problem):
+    """What `solve` makes of the problem in float64, in the precision of the problem."""
+
+    def of_numbers(ts, y0, params):
+        return solve(dataclasses.replace(problem.in_doubles, ts=ts, y0=y0, params=params))
+
+    return in_doubles(of_numbers, problem.ts, problem.y0, problem.params)
 
 
 def flow_of(problem: Problem) -> Flow:
     """The flow of a problem's scene. Raises `ValueError` where it has none, saying why."""
+    if problem.is_single:
+        with jax.enable_x64(True):
+            return flow_of(problem.in_doubles)
     flow = _flow_of(problem)
     if isinstance(flow, str):
         raise ValueError(f"There is no machine code for this scene: {flow}.")
@@ -155,7 +197,9 @@ def _made(derivation: Derivation, path: str, guards: Guards | None) -> Flow | st
     except Unlowerable as reason:
         return str(reason)
     n = derivation.layout.size
-    if reason := unfit(program, n, derivation.layout.dtype):
+    if guards is not None and guards.remembers:
+        program = program.with_inputs(guards.inputs)
+    if reason := unfit(program, n):
         return reason
     try:
         if guards is not None:
@@ -166,7 +210,7 @@ def _made(derivation: Derivation, path: str, guards: Guards | None) -> Flow | st
 
 
 def _require_increasing(program: Program, vector) -> None:
-    """Raise `ValueError` where the instants of samples, among the parameters, do not increase."""
+    """Raise `ValueError` where the knots of a look-up, among the parameters, do not increase."""
     for op, _, attribute in program.nodes if program.looks_up else ():
         if op == "locate" and attribute.table.numbers is None:
             knots = np.asarray(vector)[np.array(attribute.table.positions) - (program.size - len(vector))]
@@ -174,11 +218,12 @@ def _require_increasing(program: Program, vector) -> None:
             if wrong.size:
                 i = int(wrong[0])
                 raise ValueError(
-                    f"The knots of samples must increase, but in params one that is {knots[i + 1]:g} comes after one "
-                    f"that is {knots[i]:g}. Sort the samples by time, and keep one of those at the same time."
+                    f"The knots of a look-up (samples, jnp.interp, searchsorted) must increase, but in params one that "
+                    f"is {knots[i + 1]:g} comes after one that is {knots[i]:g}. Sort them, and keep one of those that "
+                    "are equal."
                 )
 
 
 def _tolerances(problem: Problem) -> Tolerances:
-    rtol, atol = (float(np.asarray(x)) for x in problem.tolerances)
-    return Tolerances(rtol, atol, problem.max_steps)
+    atol = problem.tolerances[1]
+    return Tolerances(float(MachineCode().rtol(problem)), 0.0 if atol is None else float(atol), problem.max_steps)

@@ -88,7 +88,7 @@ def _jvp_over_steps(
         times = ts if len(ts) == 1 else ts[rows]
         path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(
             times, params[rows], steps.table, steps.first[members], steps.counts[members], dy0[rows], dparams[rows],
-            steps.order, tolerances.atol / tolerances.rtol,
+            steps.order, tolerances.floor,
         )  # fmt: skip
         return excess / (EXCESS * tolerances.rtol)
 
@@ -188,7 +188,7 @@ def _probed(flow: Flow, ts, params, tolerances, steps: Steps, rows, members) -> 
     y_dot, params_dot = (np.tile(x, (len(rows), 1, 1)) for x in np.split(direction, [flow.states]))
     excess = steps.kernel.jvp(
         ts if len(ts) == 1 else ts[rows], params[rows], steps.table, steps.first[members], steps.counts[members], y_dot,
-        params_dot, steps.order, tolerances.atol / tolerances.rtol,
+        params_dot, steps.order, tolerances.floor,
     )[2]  # fmt: skip
     return excess / (EXCESS * tolerances.rtol)
 

@@ -100,8 +100,6 @@ def _lowered(derivation: Derivation, functions, directions, code, structure, wha
 
         return of
 
-    if derivation.layout.dtype != np.float64:
-        raise Unlowerable(f"the coordinates are {derivation.layout.dtype.name}, not float64")
     return Surfaces.of(derivation, [value(function) for function in functions], directions, code, structure)
 
 

@@ -8,7 +8,6 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from lagjax import _native
@@ -31,7 +30,10 @@ _GIVEN_UP = (_SINGULAR, _NOT_FINITE, _SHRANK, _NOT_PROJECTED)  # what another va
 
 
 class Tolerances(NamedTuple):
-    """The local error of a step, what a run may cost, and how often each guard may be noted on the way."""
+    """The local error of a step, what a run may cost, and how often each guard may be noted on the way.
+
+    An atol of 0 stands for none given: it follows the size of the motion.
+    """
 
     rtol: float
     atol: float
@@ -45,17 +47,18 @@ class Tolerances(NamedTuple):
         return self._replace(rtol=0.7 * self.rtol, atol=0.7 * self.atol, tries=self.tries - 1)
 
     @property
+    def floor(self) -> float:
+        """atol in units of rtol."""
+        return _native.floor_of(self.rtol, self.atol)
+
+    @property
     def with_larger_budget(self) -> "Tolerances":
         """For a motion with its tangents, which takes more steps."""
         return self._replace(max_steps=4 * self.max_steps)
 
 
-def unfit(program: Program, size: int, dtype) -> str | None:
+def unfit(program: Program, size: int) -> str | None:
     """Why there is no machine code for a scene, as the end of a sentence; None where there is."""
-    if dtype != np.float64:
-        is_on = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-        more = "" if is_on else " (jax.config.update('jax_enable_x64', True) first makes them that)"
-        return f"the coordinates are {np.dtype(dtype).name}, not float64{more}"
     if program.operations > LARGEST_PROGRAM:
         return (
             f"its acceleration takes {program.operations} operations, more than the {LARGEST_PROGRAM} whose kernel and "

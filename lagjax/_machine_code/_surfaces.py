@@ -14,13 +14,26 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lagjax._derivation import Derivation
 from lagjax._machine_code._lines import outputs
-from lagjax._native import Guards
+from lagjax._native import GUARD_NOISE, INSTANT, SMALLEST_STEP, Guards
 from lagjax._program import Program, lower
 
 PyTree = Any
+
+
+class Guarded(NamedTuple):
+    """The guards at a state, all (G,): their `values`; their `rates` along the motion, 0 where rounding decides these.
+
+    And how far a value is moved by its own `rounding`, and by that of the time (`of_time`).
+    """
+
+    values: jax.Array
+    rates: jax.Array
+    rounding: jax.Array
+    of_time: jax.Array
 
 
 class Surfaces(NamedTuple):
@@ -34,9 +47,28 @@ class Surfaces(NamedTuple):
     complete: Program
     directions: tuple[int, ...]
 
-    def guards(self, notes: bool = False) -> Guards:
-        """They as machine code watches them: a change ends the motion or, with `notes`, is written down."""
-        return Guards(self.values, self.complete, self.directions, notes)
+    def guards(self, notes: bool = False, remembers: bool = False) -> Guards:
+        """They as machine code watches them: a change ends the motion or, with `notes`, is written down.
+
+        A motion that `remembers` is told the side of each surface from which it comes (see `Guards`).
+        """
+        return Guards(self.values, self.complete, self.directions, notes, remembers)
+
+    @property
+    def only_jump(self) -> np.ndarray:
+        """Which guards have no rate anywhere, (G,): they change their sign by jumps."""
+        count = len(self.directions)
+        return np.array([self.complete.constant(count + k) == 0.0 for k in range(count)])
+
+    def at(self, t, y, numbers, latest) -> Guarded:
+        """The guards at a state (2n,), as machine code takes a start there in a run that ends at `latest`."""
+        count, still = len(self.directions), jax.lax.stop_gradient
+        t, y, numbers, latest = still((t, y, numbers, latest))
+        out = outputs(self.complete, 4 * count, jnp.append(y, t), numbers)
+        values, rates, sizes, rate_sizes = out.reshape(4, count)
+        instant = INSTANT * SMALLEST_STEP * jnp.maximum(jnp.abs(t), jnp.abs(latest))
+        clear = jnp.where(jnp.abs(rates) > GUARD_NOISE * rate_sizes, rates, 0.0)
+        return Guarded(values, clear, GUARD_NOISE * sizes, jnp.abs(rates) * instant)
 
     @classmethod
     def of(

@@ -27,25 +27,41 @@ Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._se
 """
 
 from lagjax._native._constants import (
+    ATOL_OVER_MOTION,
+    ATOL_OVER_RTOL,
     DISCONTINUOUS,
     DONE,
     EVENT,
+    GUARD_NOISE,
+    INSTANT,
     NOT_FINITE,
     OUT_OF_STEPS,
     PROJECTION_FAILED,
     SINGULAR,
+    SMALLEST_STEP,
     STEP_TOO_SMALL,
 )
 from lagjax._native._guards import Guards, watched
 from lagjax._native._handler import Plan, handler, unavailable
 from lagjax._native._ir import lanes
-from lagjax._native._kernel import Begun, Kernel, Outcome, Projection, cores, order_for, pieces_of, recurrences
+from lagjax._native._kernel import (
+    Begun,
+    Kernel,
+    Outcome,
+    Projection,
+    cores,
+    floor_of,
+    order_for,
+    pieces_of,
+    recurrences,
+)
 from lagjax._native._series import is_large
 from lagjax._native._sweep import SweepPlan, sweep_handler
 from lagjax._native._threads import each_of
 
 __all__ = [
-    "DISCONTINUOUS", "DONE", "EVENT", "NOT_FINITE", "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "STEP_TOO_SMALL",
-    "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "SweepPlan", "cores", "each_of", "handler",
-    "is_large", "lanes", "order_for", "pieces_of", "recurrences", "sweep_handler", "unavailable", "watched",
+    "ATOL_OVER_MOTION", "ATOL_OVER_RTOL", "DISCONTINUOUS", "DONE", "EVENT", "GUARD_NOISE", "INSTANT", "NOT_FINITE",
+    "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "SMALLEST_STEP", "STEP_TOO_SMALL",
+    "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "SweepPlan", "cores", "each_of", "floor_of",
+    "handler", "is_large", "lanes", "order_for", "pieces_of", "recurrences", "sweep_handler", "unavailable", "watched",
 ]  # fmt: skip

@@ -10,6 +10,9 @@ What a piece is, and a guard, `_program._borders` says. That a border has been c
 does not decide on which side the next step begins.
 """
 
+import itertools
+from collections.abc import Iterator
+
 from lagjax._native._clocks import Clocks
 from lagjax._native._constants import (
     ABRUPT,
@@ -38,6 +41,7 @@ from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._roots import Roots
 from lagjax._native._saltation import NUMBERS, GuardTable, Saltation
 from lagjax._native._series import Motion, double, integer
+from lagjax._native._step import absolute_tolerance
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
 from lagjax._program._saltation import Jump, looks_up
@@ -116,7 +120,8 @@ class Borders:
         lane["approach"] = 0.0
         if not self.pieces:
             return
-        for _, _, table in self.clocks.tables:  # of entries that do not increase nothing can be made
+        located = [of.table for of in self.borders.tables if of is not None and of.table.numbers is None]
+        for table in dict.fromkeys(located):  # of entries that do not increase nothing can be made
             first = frame.code.as_integer(lane["first_number"])
             with frame.code.only_if(~self.motion.look_up.increases(frame, table, first)):
                 lane["y", 0] = float("nan")
@@ -171,8 +176,9 @@ class Borders:
             with code.loop(len(self.guards)) as g:
                 self._look(frame, g, degree, h)
         frame["next_approach"] = 0.0
-        for i, feature in enumerate(self.borders.features):
-            self._look_ahead(frame, i, feature, degree, h)
+        for feature, first, end in self._rows_of_features():
+            with code.loop(integer(code, end), start=first) as i:
+                self._look_ahead(frame, i, feature, degree, h)
         frame["approach"] = frame["next_approach"]
         cut = frame["nearest"] < 1.0
         frame["h"] = code.select(cut, frame["nearest"] * h, h)
@@ -207,9 +213,9 @@ class Borders:
         code, leads = frame.code, self._leads(frame, degree)
         self._divide(frame, g, degree)
         # A border that it touches is not left, or gone back over, by less than what nobody asks for.
-        nothing = self.roots.size(frame, degree) <= NEGLIGIBLE * code.lanes_of(frame.job("atol"))
+        nothing = self.roots.size(frame, degree) <= NEGLIGIBLE * code.lanes_of(absolute_tolerance(frame))
         idle = idle | (nothing & (frame["touching", g] > 0.0) & ~undecided)
-        self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), frame.job("atol"))
+        self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame))
         frame.call(self.roots.first_root, degree)
         self._look_closer(frame, degree)
         # At rest but for what it gains in so little time: u̇ is of the size of ü t.
@@ -295,7 +301,7 @@ class Borders:
         after = self.motion.evaluate_now(frame, line) if shaken else []
         for k, j in enumerate(shaken):
             jump = code.intrinsic("fabs", after[k] - code.load(before[k], frame.vector))
-            least = code.intrinsic("fabs", after[k]) * ROUND_OFF + code.lanes_of(frame.job("atol"))
+            least = code.intrinsic("fabs", after[k]) * ROUND_OFF + code.lanes_of(absolute_tolerance(frame))
             jumps = going & (jump > least)
             frame["stays", j] = code.select(jumps, 0.0, frame["stays", j])
             for g, guard in enumerate(self.guards):
@@ -315,9 +321,20 @@ class Borders:
             frame["params", place] = frame["params", place] + code.select(passes, frame["forward"], 0.0)
             frame["stays", j] = 1.0
 
-    def _look_ahead(self, frame: Frame, i: int, feature: Feature, degree: Value, h: Value) -> None:
-        """The step ends where the argument of a feature has come as near as one step may bring it."""
-        code, j = frame.code, integer(frame.code, self.pieces + i)
+    def _rows_of_features(self) -> Iterator[tuple[Feature, int, int]]:
+        """Every kind of feature, and the numbers of the first one of a row of these and of the next one after it.
+
+        A row shares its code: a chain has a feature in every bond.
+        """
+        first = 0
+        for feature, row in itertools.groupby(self.borders.features):
+            end = first + len(list(row))
+            yield feature, first, end
+            first = end
+
+    def _look_ahead(self, frame: Frame, i: Value, feature: Feature, degree: Value, h: Value) -> None:
+        """The step ends where the argument of feature number i has come as near as one step may bring it."""
+        code, j = frame.code, i + self.pieces
         moves, last = self._moves(frame, j, degree, h)
         rise = code.lanes_of(code.as_double(degree)) * (RISE / feature.scale)
         near = ~((moves < rise) & (last < ARGUMENT))
@@ -452,7 +469,7 @@ class Borders:
             state = motion.moved(frame, motion.increments(frame, order, frame["h"])[0])
             inputs = state, [frame["t"] + frame["h"]], frame.vectors("params", motion.numbers)
             slopes = motion.form.run(frame, line, *inputs, frame.vectors("hit", self.pieces))
-            error, rtol, atol = code.variable(frame.constant(0.0)), frame.job("rtol"), frame.job("atol")
+            error, rtol, atol = code.variable(frame.constant(0.0)), frame.job("rtol"), absolute_tolerance(frame)
             for part in range(2):
                 for i in motion.form.each(code, base):
                     size = rtol * code.intrinsic("fabs", state[i + part * n]) + code.lanes_of(atol)

@@ -32,7 +32,12 @@ LARGEST_ANGLE = 2.0**20
 # 0.3 s for the walk along tables, which runs 1.2 times as long on chains and as long on bodies; with half of the border
 # 1.4 times and as long. With twice as many operations LLVM takes 3 to 4 s. From 8000 on tables run faster, but for
 # dense mechanisms, whose numbers fit into registers: an arm of six joints, 5200 operations, takes 1.6 times as long.
-LARGEST_LINE = 1200
+LARGEST_LINE = 1500
+# A coordinate counts as so many operations there: what control, output and sums do with it is written out too. Measured
+# on rows of masses with springs: LLVM takes 0.8 s for a straight line with 32 of them, 1.8 s with 60 and 8 s with 200,
+# and 0.3 s for tables, which run 1.1 times as long with 16, 1.0 to 1.2 with 32, 0.8 to 1.0 with 60. Doubled, it would
+# put 26 masses into tables in place of 44.
+OPERATIONS_PER_COORDINATE = 30
 # How many alike operations are written out for one step along a table. Measured: eight as well run as long, two at most
 # 7 % longer.
 TIMES = 4, 2, 1
@@ -57,6 +62,14 @@ LEAST_FILLED = 0.5
 # 2 MiB. Measured there, lanes for members take 0.6 times as long at 1.7 MB (20 bodies), 0.85 times at 2.0 MB (20
 # charges on a sphere), 1.3 times at 2.5 MB (24 bodies), 1.8 times at 3.9 MB (30), 2.7 times at 11 MB (50 bodies).
 LARGEST_SHARED = 2**21
+
+# ---- tolerances ------------------------------------------------------------------------------------------------------
+
+# The absolute tolerance where none is given, in parts of rtol: for components that pass through zero. It is at most
+# this part of the largest coordinate, or velocity, so far (`_step`), so that a small motion has its digits in any
+# units. Measured on a Morse oscillator of size 1e-12: 1 costs a digit, 1/16 a third of one, 1/256 none and two steps in
+# eighty more; the larger it is, the fewer motions of ordinary size are touched by it: here those below 1/60.
+ATOL_OVER_RTOL, ATOL_OVER_MOTION = 1e-3, 1 / 16
 
 # ---- step control ----------------------------------------------------------------------------------------------------
 

@@ -58,7 +58,9 @@ class Events:
         piecewise: tuple[bool, ...],
         first: int,
         notes: bool,
+        remembers: bool,
     ):
+        self.directions, self.remembers = directions, remembers
         self.motion, self.step, self.output, self.roots = motion, step, output, roots
         self.values, self.complete, self.count, self.first, self.notes = values, complete, len(directions), first, notes
         self.can_jump = any(piecewise)
@@ -72,20 +74,20 @@ class Events:
     def fields(guards: int) -> dict:
         """What a thread remembers for it.
 
-        For every guard its value, the side before the step and at its end, whether a motion begins on it, where it
-        changes and how; how often it has been noted, when it was last gone through, and whether it was zero at the
-        border where the step before ended. For all of them the step before it was cut, how far they can be seen, as a
-        part of it, the first change, and the event.
+        For every guard its value, the side before the step and at its end, whether a motion begins on it, how it
+        changes where the motion begins, where it changes on the way and how; how often it has been noted, when it was
+        last gone through, and whether it was zero at the border where the step before ended. For all of them the step
+        before it was cut, how far they can be seen, as a part of it, the first change, and the event.
         """
-        each = ("guard", "side", "side_begin", "resting", "root_at", "change", "noted", "noted_begin", "passed_at")
-        each = (*each, "waits", "waited")
+        each = ("guard", "side", "side_begin", "resting", "met", "root_at", "change", "noted", "noted_begin")
+        each = (*each, "passed_at", "waits", "waited")
         return dict.fromkeys(each, guards) | dict.fromkeys(("planned", "seen", "is_cut", "first_at", "event"), 1)
 
     def begin(self, frame: Frame, lane: Lane) -> None:
         """A lane has taken a member."""
         with frame.code.loop(self.count) as g:
             lane["passed_at", g] = float("inf")
-            for name in ("noted", "resting", "waits"):
+            for name in ("noted", "resting", "met", "waits"):
                 lane[name, g] = 0.0
 
     # ---- the guards ----
@@ -108,30 +110,54 @@ class Events:
     def _begin_sides(self) -> Code:
         """`(order)`: for lanes at the start of a run, the side of each surface they are on, into `side`.
 
-        On the surface, to rounding, it is the side that the motion goes to: by its rate or, where that is zero to
-        rounding too, by where it is a little later.
+        On the surface, to rounding, that is the side from which the motion comes. Where it goes to the other side, and
+        does so in the direction of the guard, that is a change at the start, into `met`. Otherwise, and where nobody
+        knows from where it comes, it is the side that the motion goes to. Where it goes its rate says or, where that is
+        zero to rounding too, where it is a little later.
         """
         frame = self.motion.function("begin_sides", INTEGER)
         code, (order,), count = frame.code, frame.arguments, self.count
         fresh = code.compare("==", frame["steps"], 0.0)
         with code.loop(count) as g:
-            frame["resting", g] = 0.0
+            frame["resting", g] = frame["met", g] = 0.0
         with code.only_if(code.any_lane(fresh)):
             frame.call(self.guard, order, LITTLE * frame["h"])
             instant = INSTANT * frame["smallest"]
             out = self.motion.evaluate_now(frame, self.complete)
             for i in range(count):
-                value, rate, size, rate_size = (out[i + k * count] for k in range(4))
-                moved = code.intrinsic("fabs", rate)
-                on_it = code.intrinsic("fabs", value) <= GUARD_NOISE * size + moved * instant
+                before, (value, rate, size, rate_size) = (
+                    self._side_before(frame, i),
+                    (out[i + k * count] for k in range(4)),
+                )
+                moved, later, noise = code.intrinsic("fabs", rate), frame["guard", i], GUARD_NOISE * size
+                on_it = code.intrinsic("fabs", value) <= noise + moved * instant
+                if self.remembers:
+                    on_it = on_it | (code.intrinsic("fabs", value) <= code.intrinsic("fabs", before))
                 leaves = moved > GUARD_NOISE * rate_size
-                rate = rate * frame["forward"]
-                going = code.select(leaves, rate, frame["guard", i])
-                side = self._sign(frame, code.select(on_it, going, value))
-                frame["side", i] = code.select(fresh, side, frame["side", i])
+                turn = later - value
+                bends = code.intrinsic("fabs", turn) > noise
+                before = self._sign(frame, before)
+                unclear = code.select(code.compare("!=", before, 0.0), 0.0, later)
+                going = code.select(leaves, rate * frame["forward"], code.select(bends, turn, unclear))
+                met = fresh & on_it & (going * before < 0.0) & (before * float(self.directions[i]) <= 0.0)
+                kind = code.select(before > 0.0, frame.constant(_FALLS), _RISES)
+                frame["met", i] = code.select(met, kind, 0.0)
+                stays = met | code.compare("==", going, 0.0)
+                side = code.select(on_it, code.select(stays, before, going), value)
+                frame["side", i] = code.select(fresh, self._sign(frame, side), frame["side", i])
                 rests = code.select(on_it, code.select(leaves, frame.constant(_ON), _ALONG), 0.0)
                 frame["resting", i] = code.select(fresh, rests, 0.0)
         return frame.finish()
+
+    def _side_before(self, frame: Frame, i: int) -> Value:
+        """The side of surface i from which a motion comes that begins on it, as a sign; 0 where that is unknown.
+
+        It comes from where it can change in the direction of the guard. To note what changes, it begins here. What is
+        remembered is as large as rounding may have made the guard, before it came near zero.
+        """
+        if self.remembers:
+            return frame["params", self.motion.parameters - self.count + i]
+        return frame.constant(0.0 if self.notes else -float(self.directions[i]))
 
     def _sign(self, frame: Frame, x: Value) -> Value:
         code = frame.code
@@ -187,7 +213,11 @@ class Events:
         code, (order,) = frame.code, frame.arguments
         frame["seen"], frame["first_at"] = 1.0, float("inf")
         with code.loop(self.count) as g:
-            frame["root_at", g], frame["change", g] = float("inf"), 0.0
+            met = frame["met", g]
+            at = code.select(met > 0.0, frame.constant(0.0), float("inf"))
+            frame["root_at", g], frame["change", g] = at, met
+            frame["first_at"] = code.select(met > 0.0, 0.0, frame["first_at"])
+        with code.loop(self.count) as g:
             self._look_at(frame, order, g)
         return frame.finish()
 
@@ -195,7 +225,7 @@ class Events:
         """The changes of guard g along the step."""
         code, roots, h = frame.code, self.roots, frame["h"]
         degree, j = self.motion.followed_degree(code, order), g + self.first
-        moving, value = code.compare("!=", h, 0.0), self.motion.followed_value(frame, j)
+        moving, value = code.compare("!=", h, 0.0) & (frame["met", g] <= 0.0), self.motion.followed_value(frame, j)
         side = frame["side", g]
         side = code.select(code.compare("==", side, 0.0), self._sign(frame, value), side)
         roots.polynomial(frame, j, degree, h, side, 0.0)
@@ -221,7 +251,7 @@ class Events:
         code, roots, h = frame.code, self.roots, frame["h"]
         size, value = roots.size(frame, degree), frame["poly", 0]
         self._leave_surface(frame, g, size)
-        moving = code.compare("!=", h, 0.0)
+        moving = code.compare("!=", h, 0.0) & (frame["met", g] <= 0.0)
         unknown = moving & ~(code.intrinsic("fabs", value) < float("inf"))
         frame["code"] = code.select(unknown, float(NOT_FINITE), frame["code"])
         frame["last"] = code.select(unknown, 0.0, frame["last"])
@@ -238,7 +268,7 @@ class Events:
         instant = 0.25 * frame["smallest"]  # no time is known better than this
         frame["instant"] = instant / (code.intrinsic("fabs", h) * frame["part"])
         rounding = (ROOT_NOISE * EPS) * frame["kept", g]
-        rounding = code.select((rounding < float("inf")) & ~(frame["resting", g] > 0.0), rounding, 0.0)
+        rounding = code.select((rounding < float("inf")) & code.compare("!=", frame["resting", g], _ON), rounding, 0.0)
         frame["unsure"] = code.intrinsic("fabs", frame["poly", 1]) * frame["instant"] + rounding
         ahead = code.variable(side)
         self._along(frame, order, g, degree, ahead, moving & sound)

@@ -35,6 +35,7 @@ class FirstSaltation:
         self.parameters = motion.parameters * self.base // n  # of the motion alone
         self.by = [*range(self.base), *range(n, n + self.base), *(2 * n + i for i in range(1 + self.parameters))]
         self.line, self.tables = gradient(borders, self.by)
+        self.levels_move = borders.levels_move
 
     @property
     def slopes(self) -> int:
@@ -43,16 +44,16 @@ class FirstSaltation:
 
     @staticmethod
     def fields(pieces: int, levels: tuple[int, ...]) -> dict:
-        """What a thread remembers for it: a⁻, and which switching number is crossed."""
-        return {"rate_before": levels[-1], "hit": pieces, "is_hit": 1}
+        """What a thread remembers for it: a⁻, which switching number is crossed, and at which entry of its table."""
+        return {"rate_before": levels[-1], "hit": pieces, "entry": pieces, "is_hit": 1}
 
     # ---- what both directions need ----
 
     def gradient_at(self, frame: Frame, state: Numbers, time: Numbers) -> tuple[Numbers, Value]:
         """∂u/∂(q, q̇, t, params) of the switching number that is `hit`, and its rate u̇ with the accelerations a⁻."""
         motion, code = self.motion, frame.code
-        hit = frame.vectors("hit", self.pieces)
-        out = motion.form.run(frame, self.line, state, time, frame.vectors("params", motion.numbers), hit)
+        chosen = [frame.vectors(name, self.pieces) for name in (("entry", "hit") if self.levels_move else ("hit",))]
+        out = motion.form.run(frame, self.line, state, time, frame.vectors("params", motion.numbers), *chosen)
         rate = code.variable(out[2 * self.base])
         for i in motion.form.each(code, self.base):
             moved = out[i] * state[i + motion.n] + out[i + self.base] * frame["rate_before", i]
@@ -64,7 +65,7 @@ class FirstSaltation:
         code = frame.code
         frame["is_hit"] = 0.0
         with code.loop(self.pieces) as j:
-            frame["hit", j] = 0.0
+            frame["hit", j] = frame["entry", j] = 0.0
         with code.loop(table.guards) as g:
             j = table.place(code, g, "piece")
             piece = frame["params", j + self.motion.parameters]
@@ -72,6 +73,7 @@ class FirstSaltation:
             hit = code.compare("==", frame["crossed"], code.lanes_of(code.as_double(g + 1)))
             hit = hit & code.compare("!=", side, 0.0)
             frame["hit", j] = code.select(hit, frame.constant(1), frame["hit", j])
+            frame["entry", j] = code.select(hit, piece + table.number(code, g, "e"), frame["entry", j])
             frame["is_hit"] = code.select(hit, frame.constant(1), frame["is_hit"])
 
     def jump(self, frame: Frame, after: Numbers) -> Callable:

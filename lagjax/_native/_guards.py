@@ -6,9 +6,7 @@ from typing import NamedTuple
 from lagjax._native._lanes import INTEGERS
 from lagjax._program._borders import Borders, borders, with_outputs
 from lagjax._program._graph import Unlowerable
-from lagjax._program._look_ups import table_of
 from lagjax._program._memory import without_collections
-from lagjax._program._operations import OPERATIONS
 from lagjax._program._series import Recurrent, Series, StraightLine, series
 
 
@@ -17,13 +15,20 @@ class Guards(NamedTuple):
 
     That ends the motion or, with `notes`, is written down. `values` gives all g. With y the state and the time, the
     outputs of `program` are all g; their rates ġ = Σ ∂g/∂yᵢ ẏᵢ; then Σ |∂g/∂yᵢ yᵢ| and Σ |∂g/∂yᵢ ẏᵢ|, of which
-    round-off is a part.
+    round-off is a part. A motion that `remembers` has a number more for each guard, behind its parameters: how far
+    rounding may have moved it, with the sign of the side from which the motion comes, 0 where that is unknown.
     """
 
     values: Recurrent
     program: Recurrent
     directions: tuple[int, ...]
     notes: bool = False
+    remembers: bool = False
+
+    @property
+    def inputs(self) -> int:
+        """How many numbers of a member are sides."""
+        return len(self.directions) if self.remembers else 0
 
 
 class Watched(NamedTuple):
@@ -43,7 +48,7 @@ def watched(program: Recurrent, size: int, values: Recurrent, slides: bool) -> W
     with without_collections():
         count = len(values.line.outputs)
         whole = with_outputs(program, values.line, 2 * size + 1)
-        require_lanes(whole.line, 2 * size)
+        require_lanes(whole.line)
         try:
             if (found := borders(whole, size, slides, count)) is not None:
                 return Watched(found.program, _followed(found.program, size, found.followed, count), found)
@@ -59,28 +64,11 @@ def along_pieces(found: Borders, size: int) -> tuple[Recurrent, Series]:
     return program, series(program, size, moving=2 * size + 1, followed=found.followed)
 
 
-def require_lanes(line: StraightLine, time: int) -> None:
+def require_lanes(line: StraightLine) -> None:
     """Raise `Unlowerable` where the lanes of a kernel cannot run a program."""
     for (op, _, _), kind in zip(line.nodes, line.kinds, strict=True):
         if kind not in ("float", "bool") and op not in ("input", "constant", "convert", *INTEGERS):
             raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
-    if any(op == "locate" for op, *_ in line.nodes):
-        _require_known_knots(line, time)
-
-
-def _require_known_knots(line: StraightLine, time: int) -> None:
-    """Raise `Unlowerable` where the state is located among parameters: what follows from moving these is not known."""
-    moves: list[bool] = []
-    for op, operands, attribute in line.nodes:
-        if op == "locate" and table_of(attribute).numbers is None and moves[operands[0]]:
-            of, _, which = line.nodes[operands[0]]
-            if (of, which) != ("input", time):
-                raise Unlowerable(
-                    "it looks up where a moving number is among knots that are parameters: of the time itself they may "
-                    "be, otherwise give the knots as known numbers"
-                )
-        step = op not in ("input", "constant") and OPERATIONS[op].is_step
-        moves.append(attribute <= time if op == "input" else not step and any(moves[i] for i in operands))
 
 
 def _followed(program: Recurrent, size: int, nodes: tuple[int, ...], count: int) -> Series:

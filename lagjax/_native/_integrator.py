@@ -28,7 +28,7 @@ from lagjax._native._projection import Projector
 from lagjax._native._roots import Roots
 from lagjax._native._saltation import jump_over
 from lagjax._native._series import Chosen, Motion, double, integer, is_large
-from lagjax._native._step import StepControl
+from lagjax._native._step import PARTS, StepControl
 from lagjax._program import _borders
 from lagjax._program._borders import reads_inputs
 from lagjax._program._series import Recurrent, Series
@@ -88,7 +88,8 @@ class Integrator:
         self.projector = projection and Projector(
             motion, projection.state, projection.velocity_scale, self.base_size
         )  # fmt: skip
-        self.step = StepControl(motion, tuple(range(n)) if error_groups is None else error_groups, self.projector)
+        groups = tuple(range(n)) if error_groups is None else error_groups
+        self.step = StepControl(motion, groups, self.projector, self.base_size)
         self.borders = borders and Borders(motion, borders, levels or (n,), projection is not None, jump)
         self.output = Output(motion, self.projector)
         self.events = guards and self._events(program, guards)
@@ -105,7 +106,8 @@ class Integrator:
         lines = guards.values.line, guards.program.line
         first = self.motion.series.followed - self.guards
         return Events(
-            self.motion, self.step, self.output, roots, *lines, guards.directions, piecewise, first, self.notes
+            self.motion, self.step, self.output, roots, *lines, guards.directions, piecewise, first, self.notes,
+            guards.remembers,
         )  # fmt: skip
 
     # ---- members ----
@@ -119,6 +121,8 @@ class Integrator:
         lane["member"] = code.select(there, member, -1)
         for name in ("h", "t_low", "steps", "rejected", *(_rank_drops.AT_FIRST_ZERO if self.projector else ())):
             lane[name] = 0.0
+        for k in range(2 * PARTS):
+            lane["reach", k] = 0.0
         lane["active"] = code.select(there, double(code, 1.0), 0.0)
         lane["code"], lane["due"], lane["event"] = float(RUNNING), float("inf"), -1.0
         with code.only_if(there):
@@ -130,10 +134,10 @@ class Integrator:
         code, motion = frame.code, self.motion
         begin, end = (frame.time(member, i) for i in (0, frame.job("times") - 1))
         lane["t"], lane["t_end"] = begin, end
-        lane["forward"] = code.select(end > begin, double(code, 1.0), -1.0)
+        lane["forward"] = code.select(end < begin, double(code, -1.0), 1.0)
         largest = code.maximum(code.intrinsic("fabs", begin), code.intrinsic("fabs", end))
         lane["smallest"] = SMALLEST_STEP * largest
-        lane["longest"] = code.intrinsic("fabs", end - begin) * FIRST_STEP
+        lane["longest"] = code.maximum(code.intrinsic("fabs", end - begin) * FIRST_STEP, lane["smallest"])
         self.output.await_next(frame, lane, integer(code, 1))
         for i in motion.form.each(code, self.base_size if self.projector else 0):
             lane["velocity_scale", i] = 0.0

@@ -14,6 +14,7 @@ import numpy as np
 from lagjax._native._adjoint import Adjoint
 from lagjax._native._alone import fills_lanes
 from lagjax._native._constants import (
+    ATOL_OVER_RTOL,
     DONE,
     LARGEST_SHARED,
     LEAST_ORDER,
@@ -355,7 +356,7 @@ class Kernel:
         return SweepPlan(
             *motion.places, *sweep.places, memory, integers, memory_of_sweep, integers_of_sweep, self.states,
             self.numbers, order_for(rtol), max_steps, rounds, rounds * motion.layout.width, directions, others, rtol,
-            atol, atol / rtol,
+            atol, floor_of(rtol, atol),
         )  # fmt: skip
 
     @property
@@ -492,6 +493,7 @@ def parameters_chosen(
         return program, projection, guards, None
     read = {node[2] - first for one in programs for node in one.line.nodes if node[0] == "input"}
     of = program.size - first
+    read |= set() if guards is None else set(range(of - guards.inputs, of))
     own = of // rows
     columns = sorted({i % own for i in read if i >= 0}) if own else []
     positions = tuple(row * own + i for row in range(rows) for i in columns)
@@ -517,7 +519,7 @@ def parameters_chosen(
 @functools.lru_cache(maxsize=16)  # asked for when it is decided what runs, and when that is compiled
 def recurrences(program: Recurrent, size: int) -> Series:
     """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
-    require_lanes(program.line, 2 * size)
+    require_lanes(program.line)
     with without_collections():
         return series(program, size, moving=2 * size + 1)
 
@@ -546,6 +548,11 @@ def pieces_of(
     except Unlowerable:  # a switching number without a series, or more operations than that takes
         pass
     return None
+
+
+def floor_of(rtol: float, atol: float) -> float:
+    """atol / rtol; by default (an atol of 0) what it is where nothing is small."""
+    return atol / rtol if atol > 0 else ATOL_OVER_RTOL
 
 
 def order_for(rtol: float) -> int:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._constants import LARGEST_LINE, MAX_ORDER
+from lagjax._native._constants import LARGEST_LINE, MAX_ORDER, OPERATIONS_PER_COORDINATE
 from lagjax._native._frame import Frame, Index, Layout, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
@@ -291,7 +291,8 @@ def is_large(program: Recurrent, projection=None, guards=None, times: int = 1, m
         lines += [projection.state.line, projection.velocity_scale.line]
     if guards is not None:
         lines.append(guards.program.line)
-    return times * sum(len(line.nodes) for line in lines) + sum(len(line.nodes) for line in more) > LARGEST_LINE
+    operations = sum(len(line.nodes) for line in lines) + OPERATIONS_PER_COORDINATE * len(program.line.outputs)
+    return times * operations + sum(len(line.nodes) for line in more) > LARGEST_LINE
 
 
 def integer(code: Code, x: int) -> Value:

@@ -1,6 +1,6 @@
 """Step control: how long a step may be, whether its series keeps what it promises, and the step itself.
 
-With the scaled norm ‖c‖ = max |cᵢ| / (atol + rtol·sᵢ), sᵢ the size of component i over the step,
+With the scaled norm ‖c‖ = max |cᵢ| / (a + rtol·sᵢ), sᵢ the size of component i over the step,
 
     h = 0.9 min(‖yₚ‖^(−1/p), ‖yₚ₋₁‖^(−1/(p−1)))
 
@@ -8,11 +8,21 @@ makes the last terms of the series as small as the tolerance. Source: Jorba & Zo
 is ours: the scaled defect of the polynomial P, d = P″ − q̈(P, P′) at the middle and at the end of the step, must obey
 h ‖d‖ / (p+1) ≤ 1. It costs two accelerations, and sees what no coefficient shows: a border of a piecewise function, a
 narrow feature ahead.
+
+The floor a is atol where it was given. By default (an atol of 0) it is rtol·min(1/1000, S/16), S the largest
+coordinate, or velocity, that the motion has had: a motion of 1e-10 metres is followed as the same one in ångströms is.
+A velocity moves a coordinate by h times as much, so that S of the velocities is no less than S of the coordinates
+over h: a motion at rest has velocities that are rounding. A motion that starts at rest at q = 0 has no size that could
+be known, and S is infinite. Of the alternatives, a floor for every component would follow
+rounding where a component is zero by symmetry, and one for every array of the user would not be the same for the
+coordinates of two arrays and of one.
 """
 
 from collections.abc import Callable
 
 from lagjax._native._constants import (
+    ATOL_OVER_MOTION,
+    ATOL_OVER_RTOL,
     CHECKS,
     EPS,
     GROWTH,
@@ -32,12 +42,19 @@ from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._projection import Projector, end_of_step
 from lagjax._native._series import Motion, double, integer
 
+PARTS = 2  # the motion, and derivatives of it
+
 
 class StepControl:
-    """The steps of a motion. Coordinates of one of the `error_groups` are measured by the largest of them."""
+    """The steps of a motion. Coordinates of one of the `error_groups` are measured by the largest of them.
 
-    def __init__(self, motion: Motion, error_groups: tuple[int, ...], projector: Projector | None):
+    The first `base_size` coordinates are the motion, the others derivatives of it.
+    """
+
+    def __init__(self, motion: Motion, error_groups: tuple[int, ...], projector: Projector | None, base_size: int):
         self.motion, self.error_groups, self.projector = motion, error_groups, projector
+        # The motion, and the derivatives that follow it, whose units are others.
+        self.parts = [(0, base_size)] + [(base_size, motion.n - base_size)] * (motion.n > base_size)
         self.defect = self._defect()
 
     @staticmethod
@@ -45,7 +62,8 @@ class StepControl:
         """What a thread remembers for it; `active`, `last` and `singular` are 1 or 0."""
         return {
             "low": 2 * n,  # what rounding took from the state
-            "scale": 2 * n,  # 1 / (atol + rtol·size)
+            "scale": 2 * n,  # 1 / (floor + rtol·size)
+            "reach": 2 * PARTS,  # the largest coordinate, and the largest velocity, so far
             "increment": 2 * n,  # P(h) − y
             **dict.fromkeys(("t_low", "t_end", "forward", "smallest", "longest", "growth", "last"), 1),
             **dict.fromkeys(("defect", "series_defect", "code", "steps", "rejected"), 1),
@@ -76,24 +94,51 @@ class StepControl:
         frame["last"] = code.select(going & is_last, frame.constant(1), 0.0)
 
     def _errors(self, frame: Frame, order: Value) -> tuple[Value, Value]:
-        """The scaled norms of the last two coefficients; `scale` keeps 1 / (atol + rtol·size)."""
-        code = frame.code
-        rtol, atol = (code.lanes_of(frame.job(name)) for name in ("rtol", "atol"))
+        """The scaled norms of the last two coefficients; `scale` keeps 1 / (floor + rtol·size)."""
+        code, n = frame.code, self.motion.n
+        rtol = code.lanes_of(frame.job("rtol"))
         errors = [code.variable(frame.constant(0.0)) for _ in range(2)]
         for half in range(2):
-            sizes, first = self._sizes(frame, half), half * self.motion.n
-            for i in self.motion.form.each(code, self.motion.n):
-                rate = code.intrinsic("fabs", frame["y", i + first, 1])
-                scale = 1.0 / (atol + rtol * sizes[i])
-                frame["scale", i + first] = scale
-                for k in range(2):
-                    error = code.intrinsic("fabs", frame["y", i + first, order - k]) * scale
-                    before = code.load(errors[k], frame.vector)
-                    code.store(code.select(error <= before, before, error), errors[k])  # NaN goes through
-                # An infinite slope may leave no trace in the last coefficients.
-                sound = code.select(rate < float("inf"), code.load(errors[0], frame.vector), float("nan"))
-                code.store(sound, errors[0])
+            sizes = self._sizes(frame, half)
+            for part, (first, count) in enumerate(self.parts):
+                floor = self._floor(frame, half, part, sizes)
+                for j in self.motion.form.each(code, count):
+                    i = first + j
+                    rate = code.intrinsic("fabs", frame["y", i + half * n, 1])
+                    scale = 1.0 / (floor + rtol * sizes[i])
+                    frame["scale", i + half * n] = scale
+                    for k in range(2):
+                        error = code.intrinsic("fabs", frame["y", i + half * n, order - k]) * scale
+                        before = code.load(errors[k], frame.vector)
+                        code.store(code.select(error <= before, before, error), errors[k])  # NaN goes through
+                    # An infinite slope may leave no trace in the last coefficients.
+                    sound = code.select(rate < float("inf"), code.load(errors[0], frame.vector), float("nan"))
+                    code.store(sound, errors[0])
         return code.load(errors[0], frame.vector), code.load(errors[1], frame.vector)
+
+    def _floor(self, frame: Frame, half: int, part: int, sizes: Numbers) -> Value:
+        """The absolute tolerance of the coordinates, or of the velocities (half 1), of a part of the motion."""
+        code, form, (first, count), place = frame.code, self.motion.form, self.parts[part], 2 * part + half
+        given, rtol = (code.lanes_of(frame.job(name)) for name in ("atol", "rtol"))
+        largest = form.largest(code, lambda i: sizes[first + i], count)
+        step = code.intrinsic("fabs", frame["h"])
+        step = code.select(step > 0.0, step, frame["longest"])  # before the first step
+        if half:
+            frame["reach", place] = largest = code.maximum(frame["reach", place], largest)
+            by_position = frame["reach", 2 * part] / step
+            largest = code.select(by_position < largest, largest, by_position)
+        else:
+            speed = form.largest(code, lambda i: code.intrinsic("fabs", frame["y", first + i, 1]), count)
+            at_rest = code.compare("==", frame["steps"], 0.0) & code.compare("==", code.maximum(largest, speed), 0.0)
+            # From rest at zero, where nothing tells a size, what moves first may be rounding.
+            frame["reach", place] = largest = code.select(
+                at_rest, frame.constant(float("inf")), code.maximum(frame["reach", place], largest)
+            )
+            largest = code.select(largest > 0.0, largest, speed * step)
+        share = ATOL_OVER_MOTION * largest
+        is_small = (share > 0.0) & (share < ATOL_OVER_RTOL)
+        floor = rtol * code.select(is_small, share, frame.constant(ATOL_OVER_RTOL))
+        return code.select(given > 0.0, given, floor)
 
     def _sizes(self, frame: Frame, half: int) -> Numbers:
         """How large every coordinate, or every velocity (half 1), is over the step, or the largest one of its group."""
@@ -212,6 +257,12 @@ class StepControl:
             frame["y", i] = code.select(moving, total, y)
             frame["low", i] = code.select(moving, rest, low)
         frame["steps"] = frame["steps"] + code.select(moving, frame.constant(1), 0.0)
+
+
+def absolute_tolerance(frame: Frame) -> Value:
+    """The absolute tolerance of numbers whose units are not those of the state, as of a border."""
+    given = frame.job("atol")
+    return frame.code.select(given > 0.0, given, ATOL_OVER_RTOL * frame.job("rtol"))
 
 
 def note_halved(frame: Frame, where: Value) -> None:

@@ -44,6 +44,31 @@ class Arc(NamedTuple):
         return (self.result == SUCCESSFUL) & np.isfinite(self.by_start).all(axis=(1, 2))
 
 
+class Units(NamedTuple):
+    """The sizes of states, `state` (R, 2n), and of times, `time` (R,): q and q̇ of all units become comparable by them.
+
+    That of coordinate i is l/√Mᵢᵢ, `length` (R,) being l, which is alike for coordinates of any units, and that of its
+    velocity is as much in a unit of time.
+    """
+
+    state: np.ndarray
+    time: np.ndarray
+    length: np.ndarray
+
+    def repeated(self, count: int) -> "Units":
+        """Each so many times, (R count, 2n)."""
+        return Units(*(np.repeat(x, count, axis=0) for x in self))
+
+    def growth(self, growth: np.ndarray) -> np.ndarray:
+        """Derivatives of states by states, (R, …, 2n, 2n), in these units."""
+        state = self.state.reshape(len(self.state), *[1] * (growth.ndim - 3), -1)
+        return growth * state[..., None, :] / state[..., :, None]
+
+
+def _or_one(x: np.ndarray) -> np.ndarray:
+    return np.where((x > 0) & np.isfinite(x), x, 1.0)
+
+
 class Arcs:
     """What follows the motions of one scene with one set of parameters, `numbers` (P,)."""
 
@@ -62,7 +87,7 @@ class Arcs:
 
         Raises `ValueError`, for `what` was asked, where the scene has constraints or no machine code.
         """
-        require_system(system)
+        system = require_system(system)
         require_untraced((system, params), "A parameter")
         layout = Layout.of(q0, qdot0)
         if has_constraints(system):
@@ -128,6 +153,26 @@ class Arcs:
         moved = np.swapaxes(moved, 1, 2)
         return Arc(end, moved[..., :states], moved[..., states:], run.result, run.t_end, run.accepted)
 
+    def units(self, y0: np.ndarray, time: np.ndarray | None = None) -> "Units":
+        """In what states (R, 2n) are measured, from the largest coordinate and velocity there, in the metric of M.
+
+        `time` (R,) is that of a change; by default it is read off the velocities and accelerations.
+        """
+        n = self.size
+        mass = np.abs(self.quantities(("mass_matrix",), 0.0, y0)["mass_matrix"][:, np.arange(n), np.arange(n)])
+        root = np.sqrt(np.where(mass > 0, mass, mass.max(axis=1, initial=0.0)[:, None]))
+        root = np.where((root > 0) & np.isfinite(root), root, 1.0)
+        far, fast, bend = (np.abs(x * root).max(axis=1) for x in (*halves(y0), halves(self.rate(0.0, y0))[1]))
+        with np.errstate(all="ignore"):
+            if time is None:
+                length = np.where(far > 0, far, fast**2 / bend)
+                rate = _or_one(np.maximum(fast / length, np.sqrt(bend / length)))
+            else:
+                rate = 2 * np.pi / time
+                length = np.maximum(far, fast / rate)
+        of_q = (length := _or_one(length))[:, None] / root
+        return Units(np.concatenate([of_q, rate[:, None] * of_q], axis=1), 1 / rate, length)
+
     def rate(self, t, y: np.ndarray) -> np.ndarray:
         """ẏ = (q̇, q̈), (R, 2n), at states (R, 2n) and times () or (R,)."""
         values = self.flow.anywhere.evaluate(*y.T, np.asarray(t), *self.numbers)[: self.size]
@@ -150,14 +195,19 @@ class Arcs:
         of = self.quantities(("energy_by_q", "mass_matrix"), t, y)
         return np.concatenate([of["energy_by_q"], np.einsum("rij,rj->ri", of["mass_matrix"], halves(y)[1])], axis=1)
 
-    def canonical(self, t, y: np.ndarray) -> np.ndarray:
-        """∂(q, p)/∂(q, q̇) (R, 2n, 2n)."""
+    def canonical(self, t, y: np.ndarray, units: Units) -> np.ndarray:
+        """∂(q, p)/∂(q, q̇) (R, 2n, 2n), q and q̇ in units (R, 2n), and p in those that l² and the time belong to.
+
+        The product of the units of qᵢ and pᵢ is then the same for all i, so that the symplectic form is the usual one.
+        """
         n = self.size
         by_q = np.moveaxis(np.array(self._momentum_by_q(t, y)).reshape(n, n, len(y)), 2, 0)
         chart = np.zeros((len(y), 2 * n, 2 * n))
         chart[:, :n, :n], chart[:, n:, :n] = np.eye(n), by_q
         chart[:, n:, n:] = self.quantities(("mass_matrix",), t, y)["mass_matrix"]
-        return chart
+        of_q = units.state[:, :n]
+        of_p = (units.length**2 / units.time)[:, None] / of_q
+        return chart * units.state[:, None, :] / np.concatenate([of_q, of_p], axis=1)[:, :, None]
 
     def _momentum_by_q(self, t, y: np.ndarray) -> list:
         program = self.derivation.momenta_by_q(tuple(range(self.size)))

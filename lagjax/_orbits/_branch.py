@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._doubles import accepts_singles
 from lagjax._layout import halves
 from lagjax._orbits._arcs import Arcs
 from lagjax._orbits._family import Family, begun, place_of
@@ -25,6 +26,7 @@ from lagjax._validate import require_tolerance
 PyTree = Any
 
 
+@accepts_singles(("family",), ("params",))
 def branch_off(
     system: System, family: Family, index: int, params: PyTree = None, *, by: str = "energy", size: float = 0.01
 ) -> Orbit:
@@ -35,7 +37,7 @@ def branch_off(
     - `index`: of an orbit where `family.branch` or `family.doubling` is True; of the latter the new orbits have twice
       the period.
     - `params`, `by`: those with which `family` was followed.
-    - `size`: how far off the new orbit is, in the units of (q, qdot, T) of a state.
+    - `size`: how far off the new orbit is, in parts of the size of the old one, as `step` of `family`.
 
     By symmetry there often are two such families, mirror images, of which this is one.
 
@@ -84,7 +86,7 @@ def _orbit_of(system: System, family: Family, k: int, turns: int, params, by: st
     place = None if by == "energy" else place_of(params, by)
     if place is not None:
         arcs = arcs.with_numbers(np.where(np.arange(len(arcs.numbers)) == place, float(family.value[k]), arcs.numbers))
-    follower = Follower(arcs, place)
+    follower = Follower(arcs, place, y0, period.ravel())
     return follower, begun(follower, y0, period.ravel())
 
 

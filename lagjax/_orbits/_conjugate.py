@@ -13,48 +13,48 @@ import itertools
 
 import numpy as np
 
-from lagjax._orbits._arcs import Arcs
+from lagjax._orbits._arcs import Arcs, Units
 
 _GLANCES = 64  # of each arc: between two of them no phase may turn by half a turn
 _TRIALS = 60  # bisections, which end at the rounding of the time
 _AT_END = 1e-9  # of the time: a conjugate time so near to the end counts as the end
 
 
-def conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, bool]:
+def conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units) -> tuple[np.ndarray, bool]:
     """The conjugate times (k,) before the last time, ascending, and whether the last time is one.
 
-    The path is arcs from states `y` (K, 2n) at `times` (K + 1,).
+    The path is arcs from states `y` (K, 2n) at `times` (K + 1,); tangents are in the `units` (1, 2n) of states.
     """
     n, found, duration = arcs.size, [], times[-1] - times[0]
     frame = np.concatenate([np.zeros((n, n)), np.eye(n)])  # (δq, δq̇) of all velocities
     for k, start in enumerate(y):
         ts = np.linspace(times[k], times[k + 1], _GLANCES + 1)
-        frames = _frames(arcs, start, ts, frame)
-        counts = _crossed(arcs, start, ts, frames)
+        frames = _frames(arcs, start, ts, frame, units)
+        counts = _crossed(arcs, start, ts, frames, units)
         for j in range(_GLANCES):
             if k == j == 0:
                 continue  # the start itself, where all paths meet
             for nth in range(counts[j]):
-                found.append(_located(arcs, start, ts[0], ts[j], ts[j + 1], frame, frames[j], nth))
+                found.append(_located(arcs, start, ts[0], ts[j], ts[j + 1], frame, frames[j], nth, units))
         frame = frames[-1]
     found = np.sort(np.array(found))
     at_end = bool((found > times[-1] - _AT_END * duration).any()) or _is_singular(frame, n)
     return found[found <= times[-1] - _AT_END * duration], at_end
 
 
-def _frames(arcs: Arcs, start, ts, frame) -> np.ndarray:
+def _frames(arcs: Arcs, start, ts, frame, units: Units) -> np.ndarray:
     """The tangents (T, 2n, n) at times (T,) that begin as `frame` at the first one."""
     later = ts[1:]
     arc = arcs.follow(np.stack([np.full_like(later, ts[0]), later], axis=1), np.repeat(start[None], len(later), axis=0))
-    frames = np.concatenate([frame[None], arc.by_start @ frame])
+    frames = np.concatenate([frame[None], units.growth(arc.by_start) @ frame])
     # The plane is what counts: its vectors are made orthonormal, so that none outgrows the others.
     return np.linalg.qr(frames)[0]
 
 
-def _phases(arcs: Arcs, y, t, frames) -> np.ndarray:
+def _phases(arcs: Arcs, y, t, frames, units: Units) -> np.ndarray:
     """The phases (T, n), ascending in [0, 2π), of the unitary matrices of planes (T, 2n, n) at states y (T, 2n)."""
     n = arcs.size
-    canonical = np.linalg.qr(arcs.canonical(t, y) @ frames)[0]
+    canonical = np.linalg.qr(arcs.canonical(t, y, units) @ frames)[0]
     b, d = canonical[:, :n], canonical[:, n:]
     unitary = (d + 1j * b) @ np.linalg.inv(d - 1j * b)
     return np.sort(np.mod(np.angle(np.linalg.eigvals(unitary)), 2 * np.pi), axis=1)
@@ -71,22 +71,24 @@ def _turned(before: np.ndarray, after: np.ndarray) -> int:
     return int(np.argmin([np.abs(shift).max() for shift in shifts]))
 
 
-def _crossed(arcs: Arcs, start, ts, frames) -> list[int]:
+def _crossed(arcs: Arcs, start, ts, frames, units: Units) -> list[int]:
     """How many conjugate times there are between neighbouring ones of these times."""
-    phases = _phases(arcs, _states(arcs, start, ts), ts, frames)
+    phases = _phases(arcs, _states(arcs, start, ts), ts, frames, units)
     return [_turned(a, b) for a, b in itertools.pairwise(phases)]
 
 
-def _located(arcs: Arcs, start, t_first, low, high, frame, frame_low, nth: int) -> float:
+def _located(arcs: Arcs, start, t_first, low, high, frame, frame_low, nth: int, units: Units) -> float:
     """The time of the nth conjugate time between `low` and `high`, counted from 0, by bisection."""
     ts = np.array([t_first, low]) if low > t_first else np.array([t_first])
-    before = _phases(arcs, _states(arcs, start, ts)[-1:] if len(ts) > 1 else start[None], ts[-1:], frame_low[None])[0]
+    state = _states(arcs, start, ts)[-1:] if len(ts) > 1 else start[None]
+    before = _phases(arcs, state, ts[-1:], frame_low[None], units)[0]
     for _ in range(_TRIALS):
         middle = (low + high) / 2
         if not low < middle < high:
             break
         ts = np.array([t_first, middle])
-        after = _phases(arcs, _states(arcs, start, ts)[1:], ts[1:], _frames(arcs, start, ts, frame)[1:])[0]
+        frames = _frames(arcs, start, ts, frame, units)[1:]
+        after = _phases(arcs, _states(arcs, start, ts)[1:], ts[1:], frames, units)[0]
         if _turned(before, after) > nth:
             high = middle
         else:

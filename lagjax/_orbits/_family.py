@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._doubles import accepts_singles
 from lagjax._layout import halves, taken_apart
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
@@ -56,6 +57,7 @@ class Family(NamedTuple):
     message: str
 
 
+@accepts_singles(("orbit",), ("params",))
 def family(
     system: System,
     orbit: Orbit,
@@ -71,8 +73,9 @@ def family(
     - `by`: "energy"; or the name of a parameter, such as "g" for `params["g"]`, one number.
     - `until`: the energy or the parameter at which the family ends; it also fixes the direction of the first step.
       Without it the family begins towards larger values and ends after `count` orbits.
-    - `step`: the arc length of the first step, in the units of (q, qdot, T); it and later steps adapt to how fast
-      Newton's method contracts, how far it moves an orbit, and how much the family turns.
+    - `step`: the arc length of the first step, in parts of the size of `orbit` (of its coordinates, its velocities, its
+      period over 2π and the parameter); it and later steps adapt to how fast Newton's method contracts, how far it
+      moves an orbit, and how much the family turns.
 
     Folds, branch points and doublings between two orbits are located on the arc between them, as well as multipliers
     and slopes are known there, and are orbits of the family as others are. `branch_off` goes on from there.
@@ -98,7 +101,8 @@ def family(
     period, layout, y0 = starts(orbit.q0, orbit.qdot0, orbit.period, "period")
     q, qdot = map(layout.restore, halves(y0[0]))
     arcs = Arcs.of(system, q, qdot, params, RTOL, "Families")
-    follower = Follower(arcs, None if by == "energy" else place_of(params, by), until)
+    place = None if by == "energy" else place_of(params, by)
+    follower = Follower(arcs, place, y0, period.ravel(), until)
     if by == "energy" and not arcs.conserves:
         raise ValueError(
             "The energy of this scene is not conserved, so that there is no family by energy: name a parameter."
@@ -143,13 +147,15 @@ def _member(follower: Follower, point: Point, tangent: Tangent, most: int | None
     found = told(follower.closing(point.numbers), point.chain, count)
     reduced = reduce(point.chain.growth[0], *symmetries)
     through = [passing(reduced, sign) if not found.message[0] else np.nan for sign in (1, -1)]
-    beyond = np.nan if follower.until is None else follower.value(point) - follower.until
+    beyond = np.nan if follower.until is None else (follower.value(point) - follower.until) / follower.of_value
     return _Member(point, tangent, count, found, np.array([follower.slope(point) @ tangent.vector, *through, beyond]))
 
 
 def _followed(follower: Follower, y0, period, step: float, count: int) -> tuple[list[_Member], str]:
     """The orbits of a family, and why it ends."""
     point, shortest, until = begun(follower, y0, period), _SHORTEST * step, follower.until
+    if until is not None:
+        follower.of_value = abs(until - follower.value(point)) or 1.0
     tangent = tangent_at(follower, point, None)
     if tangent is None:
         alone = Tangent(np.zeros(point.matrix.shape[1]), 0, np.zeros((point.matrix.shape[1], 0)))
@@ -177,9 +183,8 @@ def _followed(follower: Follower, y0, period, step: float, count: int) -> tuple[
 
 def begun(follower: Follower, y0: np.ndarray, period: np.ndarray) -> Point:
     """The orbit from which a family is followed, in as many arcs as it needs."""
-    closing = follower.closing(follower.arcs.numbers)
-    parts, y = _shooting.guesses(closing, y0, period, int(arcs_each(follower.arcs, y0, period)[0]))
-    return follower.within_growth(follower.point(y, period, parts, follower.arcs.numbers))
+    count = int(arcs_each(follower.arcs, y0, period)[0])
+    return follower.within_growth(follower.begun(y0, period, count, follower.arcs.numbers))
 
 
 def _in_more_arcs(follower: Follower, member: _Member) -> _Member:
@@ -192,7 +197,7 @@ def _in_more_arcs(follower: Follower, member: _Member) -> _Member:
 
 
 def _end(follower: Follower, last: Point, stopped: bool) -> str:
-    where = f"{follower.value(last):.9g}, with a period of {last.chain.period[0]:.6g}"
+    where = f"{follower.value(last):.9g}, with a period of {last.chain.periods()[0]:.6g}"
     if stopped:
         return f"The family ends at an equilibrium, near {where}."
     return (

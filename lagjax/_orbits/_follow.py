@@ -95,11 +95,15 @@ class Whole(NamedTuple):
 class Follower:
     """What is free along a family: the first state; the period, unless it stays; a parameter, if it has a place.
 
+    All three are in the units of the first orbit, (1, 2n) and (1,), and the parameter in that of its first value.
     `until` is the value where the family is to end.
     """
 
-    def __init__(self, arcs: Arcs, place: int | None, until: float | None = None):
+    def __init__(self, arcs: Arcs, place: int | None, y0: np.ndarray, period: np.ndarray, until: float | None = None):
         self.arcs, self.place, self.until = arcs, place, until
+        self.units = arcs.units(y0, period)
+        self.of_parameter = 1.0 if place is None else abs(float(arcs.numbers[place])) or 1.0
+        self.of_value = 1.0
         self.period_is_free = not arcs.driven and (place is None or not arcs.conserves)
 
     def closing(self, numbers: np.ndarray) -> Closing:
@@ -109,7 +113,7 @@ class Follower:
     def point(self, y, period, parts, numbers) -> Point:
         """The chain through these states, (1, K, 2n), and its equations."""
         closing = self.closing(numbers)
-        chain = _shooting.follow(closing, y, period, parts)
+        chain = _shooting.follow(closing, y, period, parts, self.units)
         columns = [chain.rate[..., None] * np.diff(chain.parts)[..., None, None]] if self.period_is_free else []
         if self.place is not None:
             columns.append(self._by_parameter(closing, y, period, parts, self.place))
@@ -123,11 +127,13 @@ class Follower:
     def _by_parameter(self, closing: Closing, y, period, parts, place: int) -> np.ndarray:
         """The derivatives (1, K, 2n, 1) of the ends of the arcs by the parameter at this place."""
         direction = np.eye(len(closing.arcs.numbers))[place][None]
-        spans = period[:, None] * parts[0] if self.arcs.driven else np.zeros((1, len(parts[0])))
-        times = np.stack([spans[0, :-1], spans[0, 1:]], axis=1)
+        whole, state = period[0] * self.units.time[0], self.units.state[0]
+        spans = whole * parts[0] if self.arcs.driven else np.zeros(len(parts[0]))
+        times = np.stack([spans[:-1], spans[1:]], axis=1)
         if not self.arcs.driven:
-            times[:, 1] = period[0] * np.diff(parts[0])
-        return closing.arcs.follow(times, y[0], direction).by_params[None]
+            times[:, 1] = whole * np.diff(parts[0])
+        by_params = closing.arcs.follow(times, y[0] * state, direction).by_params
+        return by_params[None] * self.of_parameter / state[:, None]
 
     def whole(self, point: Point, first: np.ndarray, right: float) -> "Whole":
         """The change of all states that goes with one of what is free, (2n + F,), as the linear equations have it."""
@@ -136,7 +142,7 @@ class Follower:
         dy = point.condensed.inner(first[None, :states, None], first[None, :states, None], z)[..., 0]
         by = np.zeros(len(point.numbers))
         if self.place is not None:
-            by[self.place] = first[-1]
+            by[self.place] = self.of_parameter * first[-1]
         return Whole(dy, first[states : states + 1] if self.period_is_free else np.zeros(1), by)
 
     def moved(self, point: Point, first: np.ndarray, right: float) -> Point:
@@ -149,32 +155,37 @@ class Follower:
 
     def within_growth(self, point: Point) -> Point:
         """The same orbit in more arcs where errors grow much along one; the same point where they do not."""
-        y, period, count = point.chain.y[:, 0], point.chain.period, point.chain.y.shape[1]
+        count = point.chain.y.shape[1]
         growth = np.log(max(np.linalg.norm(one, 2) for one in point.chain.growth[0])) / np.log(_LONGEST_GROWTH)
         more = int(2 ** np.ceil(np.log2(max(growth, 1.0))))
         if more == 1 or count * more > _MOST_ARCS:
             return point
-        parts, y = _shooting.guesses(self.closing(point.numbers), y, period, count * more)
-        return self.point(y, period, parts, point.numbers)
+        return self.begun(point.chain.states(), point.chain.periods(), count * more, point.numbers)
+
+    def begun(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> Point:
+        """The orbit from a state (1, 2n) in so many arcs, both in the units of the user."""
+        parts, y = _shooting.guesses(self.closing(numbers), y0, period, count)
+        return self.point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
 
     def slope(self, point: Point) -> np.ndarray:
-        """The derivative (2n + F,) of the value by what is free."""
+        """The direction (2n + F,), a unit vector, in which the value rises."""
         slope = np.zeros(point.matrix.shape[1])
         if self.place is not None:
             slope[-1] = 1.0
         else:
-            slope[: point.chain.y.shape[2]] = self.arcs.energy_slope(0.0, point.chain.y[:, 0])[0]
+            by_state = self.arcs.energy_slope(0.0, point.chain.states())[0] * self.units.state[0]
+            slope[: len(by_state)] = by_state / (np.linalg.norm(by_state) or 1.0)
         return slope
 
     def value(self, point: Point) -> float:
         """The energy, or the parameter."""
         if self.place is not None:
             return float(point.numbers[self.place])
-        return float(self.arcs.energy(0.0, point.chain.y[:, 0])[0])
+        return float(self.arcs.energy(0.0, point.chain.states())[0])
 
     def energy(self, point: Point) -> float:
         """h = p·q̇ − L."""
-        return float(self.arcs.with_numbers(point.numbers).energy(0.0, point.chain.y[:, 0])[0])
+        return float(self.arcs.with_numbers(point.numbers).energy(0.0, point.chain.states())[0])
 
 
 _MOST_ARCS = 128
@@ -275,7 +286,8 @@ def _chord(follower: Follower, last: Point, point: Point, step: float) -> np.nda
     if not follower.period_is_free:
         change = change[:-1]
     if follower.place is not None:
-        change = np.append(change, point.numbers[follower.place] - last.numbers[follower.place])
+        by = point.numbers[follower.place] - last.numbers[follower.place]
+        change = np.append(change, by / follower.of_parameter)
     return change / step
 
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._doubles import accepts_singles
 from lagjax._failures import sentence
 from lagjax._layout import halves
 from lagjax._orbits._arcs import Arcs
@@ -47,6 +48,7 @@ class LyapunovExponent(NamedTuple):
     ok: jax.Array
 
 
+@accepts_singles(("q0", "qdot0"), ("duration", "params"))
 def lyapunov_spectrum(
     system: System,
     q0: PyTree,
@@ -112,7 +114,10 @@ def _spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: int) -> n
     moved = np.full((members * pieces, states, states), np.nan)
     if well.any():
         moved[rows] = arcs.follow(spans[rows], path[:, :-1].reshape(-1, states)[rows]).by_start
-    chart = arcs.canonical(times.ravel(), path.reshape(-1, states)).reshape(members, pieces + 1, states, states)
+    units = arcs.units(y0)
+    moved = units.repeated(pieces).growth(moved)
+    chart = arcs.canonical(times.ravel(), path.reshape(-1, states), units.repeated(pieces + 1))
+    chart = chart.reshape(members, pieces + 1, states, states)
     order = np.append(np.arange(states // 2), np.arange(states - 1, states // 2 - 1, -1))
     growth, frame = np.zeros((members, states)), np.tile(np.eye(states), (members, 1, 1))
     moved = moved.reshape(members, pieces, states, states)
@@ -124,6 +129,7 @@ def _spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: int) -> n
     return -np.sort(-growth / duration[:, None], axis=1)
 
 
+@accepts_singles(("q0", "qdot0"), ("duration", "params"))
 def lyapunov_exponent(
     system: System,
     q0: PyTree,
@@ -171,15 +177,17 @@ def _largest(arcs: Arcs, y0: np.ndarray, duration: np.ndarray) -> tuple[np.ndarr
     (members, states), n = y0.shape, arcs.size
     flow = arcs.flow.tangent(1)
     numbers = np.concatenate([arcs.numbers, np.zeros_like(arcs.numbers)])[None]
+    unit = arcs.units(y0).state
     tangent = np.tile(np.cos(np.arange(1.0, states + 1.0)), (members, 1))
     rates, y = np.empty((_BLOCKS, members)), y0
     for block in range(_BLOCKS):
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
-        start = np.concatenate([y[:, :n], tangent[:, :n], y[:, n:], tangent[:, n:]], axis=1)
+        along = tangent * unit
+        start = np.concatenate([y[:, :n], along[:, :n], y[:, n:], along[:, n:]], axis=1)
         times = duration[:, None] * (np.array([block, block + 1]) / _BLOCKS)
         run = flow.run(times, start, numbers, arcs.tolerances.with_larger_budget)
         end = np.where((run.result == SUCCESSFUL)[:, None], run.y_end, np.nan)
         y = np.concatenate([end[:, :n], end[:, 2 * n : 3 * n]], axis=1)
-        tangent = np.concatenate([end[:, n : 2 * n], end[:, 3 * n :]], axis=1)
+        tangent = np.concatenate([end[:, n : 2 * n], end[:, 3 * n :]], axis=1) / unit
         rates[block] = np.log(np.linalg.norm(tangent, axis=1)) * _BLOCKS / duration
     return rates.mean(axis=0), rates.std(axis=0, ddof=1) / np.sqrt(_BLOCKS)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._doubles import accepts_singles
 from lagjax._layout import halves
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
@@ -24,7 +25,7 @@ RTOL = 2.3e-16
 # The largest defect of an orbit that counts as closed, in units of its largest number: a thousand roundings of arcs
 # along which errors grow a thousandfold. Beyond, Newton's method came to rest at something that is no orbit.
 CLOSED = 1e-10
-# Where more arcs are not tried: in the units of the state, whose rounding a hundred steps magnify so far.
+# Where more arcs are not tried: in parts of the state, whose rounding a hundred steps magnify so far.
 WELL_CLOSED = 1e-12
 # Steps of one arc: with a series of order twenty some hundred of them make errors grow a thousandfold at most.
 _STEPS_OF_ARC, _MOST_ARCS, _MORE = 400, 128, 8
@@ -37,7 +38,8 @@ class Orbit(NamedTuple):
     - `q0`, `qdot0`: a state of it, in the user's structure; `period` ().
     - `multipliers` (2n,): the eigenvalues of the monodromy matrix, complex, each beside its reciprocal where the energy
       is conserved, the largest first, and last of all those that are 1 by the time shift and by conserved momenta.
-    - `closure` (): the largest defect of its arcs, in the units of the state; of a single arc |φ(y; T) − y|.
+    - `closure` (): the largest defect of its arcs, of a single arc φ(y; T) − y, in parts of the size of the coordinate,
+      or velocity: the largest one at the guess, or what that makes of it in T/2π, alike in the kinetic energy.
     - `stable`: whether no multiplier is larger than 1, so that errors do not grow exponentially; False also where
       rounding leaves that open, because the product of a pair that should be 1 is off by more than 1e-3.
     - `ok`: whether it closes; `message`: a sentence that says why not (all numbers are then those of the best trial),
@@ -87,6 +89,7 @@ def _lines(orbit: Orbit) -> list[str]:
 _SHOWN = 6  # leaves of q0, which may have any number of them
 
 
+@accepts_singles(("q0", "qdot0"), ("period", "params"))
 def periodic_orbit(
     system: System,
     q0: PyTree,
@@ -103,7 +106,8 @@ def periodic_orbit(
     Solves φ_T(y) = y, with φ_T the motion over the time T, by Newton's method on states at equal parts of the period
     and on T; for a driven scene, one in which anything reads `t`, the period is kept as given. Derivatives of the arcs
     are exact. Where the orbit is one of many (shifted in time, at another energy, or translated or rotated where
-    momenta are conserved), each correction is the one of least norm, in the units of (q, qdot, T). The rank of the
+    momenta are conserved), each correction is the one of least norm: of changes of (q, qdot, T) in parts of their
+    sizes, so that the same orbit is found in any units. The rank of the
     equations is decided by their singular values: those below 1e-8 of the largest count as zero.
 
     - `period`: a number; or an array (N,) for N guesses at once, with the members as first axis of every leaf of `q0`
@@ -164,8 +168,9 @@ def _closing(arcs: Arcs, energy, image) -> Closing:
 
     shift = flat(np.zeros(states))
     matrix = np.stack([flat(row) - shift for row in np.eye(states)], axis=1)
-    somewhere = np.cos(np.arange(1.0, states + 1.0))
-    if not np.allclose(flat(somewhere), matrix @ somewhere + shift, rtol=1e-12, atol=1e-12):
+    somewhere = np.cos(np.arange(1.0, states + 1.0)) * (np.abs(shift) + 1.0)
+    terms = np.abs(matrix) @ np.abs(somewhere) + np.abs(shift)
+    if not (np.abs(flat(somewhere) - matrix @ somewhere - shift) <= 1e-12 * terms).all():
         raise ValueError("image must be affine in (q, qdot): a linear map and a shift. Use coordinates in which it is.")
     if np.linalg.matrix_rank(matrix) < states:
         raise ValueError("image must be invertible: it sends different states to the same one.")
@@ -196,7 +201,8 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> Found:
             members = waiting[counts[waiting] == count]
             for some in np.array_split(members, -(-len(members) * count // _PORTION)):
                 parts, y = _shooting.guesses(closing, y0[some], period[some], count)
-                trial = told(closing, _shooting.close(closing, y, period[some], parts))
+                units = closing.arcs.units(y0[some], period[some])
+                trial = told(closing, _shooting.close(closing, y, period[some], parts, units))
                 better = ~(found.closure[some] <= trial.closure)
                 gained[some] = better | ~found.ok[some]
                 found = _put(found, some[better], Found._make(np.array(x)[better] for x in trial))
@@ -257,23 +263,23 @@ def told(closing: Closing, chain: Chain, most: int | None = None) -> Found:
             f"The orbit closes, but its multipliers are uncertain: pairs that should multiply to 1 miss it by "
             f"{off[place]:.2g}, so that nothing is known of its stability."
         )
-    return Found(chain.y[:, 0], chain.period, multipliers, closure, stable & ok, ok, tuple(message))
+    return Found(chain.states(), chain.periods(), multipliers, closure, stable & ok, ok, tuple(message))
 
 
 def _sentence(chain: Chain, k: int) -> str:
     """Why a chain is no orbit; "" where it is one."""
     if not chain.ok[k]:
-        return f"The motion from the guess cannot be followed for a period of {chain.period[k]:.6g}. {chain.why[k]}"
-    size, closure = chain.size()[k], chain.merit()[k]
-    if not closure <= CLOSED * max(size, 1e-300):
-        return (
-            f"No periodic orbit was found near the guess: after {chain.y.shape[1]} arcs per period and a period of "
-            f"{chain.period[k]:.6g} the largest defect is {closure:.2g}, where the state is as large as {size:.2g}. "
-            "Begin nearer: another state or period."
-        )
+        return f"The motion from the guess cannot be followed for a period of {chain.periods()[k]:.6g}. {chain.why[k]}"
     if _shooting.stopped(chain.at(np.array([k])))[0]:
         return (
             "The search ended at an equilibrium, which closes after any time: begin at a larger amplitude, or with a "
             "period nearer to that of the orbit."
+        )
+    share = chain.merit()[k] / max(chain.size()[k], 1e-300)
+    if not share <= CLOSED:
+        return (
+            f"No periodic orbit was found near the guess: after {chain.y.shape[1]} arcs per period and a period of "
+            f"{chain.periods()[k]:.6g} the largest defect is {share:.2g} of the size of the state. Begin nearer: "
+            "another state or period."
         )
     return ""

@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout, halves
-from lagjax._orbits._arcs import Arc, Arcs
+from lagjax._orbits._arcs import Arc, Arcs, Units
 from lagjax._orbits._conjugate import conjugate_times
 from lagjax._problem import end_to_end
 from lagjax._results import SimulationError
@@ -43,7 +44,8 @@ class Path(NamedTuple):
     - `index`: how many independent variations with fixed ends lower the action: the conjugate times before the end.
     - `minimum`: whether the action is least among nearby paths (`index` 0, and the end not conjugate); otherwise it is
       a saddle.
-    - `closure` (): the largest defect; `ok`, and `message`, a sentence that says why not.
+    - `closure` (): the largest defect, in parts of the size of the ends and of the velocities that join them; `ok`, and
+      `message`, a sentence that says why not.
     """
 
     qdot_start: PyTree
@@ -76,15 +78,14 @@ def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None
     lagjax.action(oscillator, jnp.cos, 0.0, 1.0)  # −sin(2)/4
     ```
     """
-    require_system(system)
+    system = require_system(system)
     if isinstance(path, Trajectory):
         params = path.params if params is None else params
         ts, states = _along_motion(system, path, params)
     else:
         ts, states = _along_function(path, t_start, t_end)
     coarse, fine = (_integral(system, states, edges, params) for edges in (ts, _halved(ts)))
-    scale = max(1e-300, abs(float(fine[1])))
-    if not abs(float(coarse[0] - fine[0])) <= _RESOLVED * scale:
+    if not abs(float(coarse[0] - fine[0])) <= _RESOLVED * abs(float(fine[1])):
         raise ValueError(
             f"The action is not resolved: {float(coarse[0]):.9g} and, on parts half as long, {float(fine[0]):.9g}. The "
             "path has features narrower than that, or corners: give a trajectory with more output times, or take the "
@@ -134,6 +135,7 @@ def _integral(system: System, states: Callable, edges: np.ndarray, params) -> tu
     return jnp.sum(values @ _WEIGHTS), jnp.sum(jnp.abs(values) @ _WEIGHTS)
 
 
+@accepts_singles(("q_start", "q_end"), ("params",))
 def find_path(
     system: System,
     q_start: PyTree,
@@ -175,7 +177,8 @@ def find_path(
         np.asarray(end_to_end(jax.tree.leaves(as_arrays(q, layout.dtype)), np.dtype(float))) for q in (q_start, q_end)
     ]
     times = np.linspace(float(t_start), float(t_end), _ARCS + 1)
-    joined = _joined(arcs, times, _guessed(layout, guess, ends, times), ends)
+    first = _guessed(layout, guess, ends, times)
+    joined = _joined(arcs, times, first, ends, _units(arcs, first, ends, times))
     message = _why_not(arcs, joined, times)
     if message:
         if throw:
@@ -184,12 +187,27 @@ def find_path(
     return _told(system, arcs, joined, times, params)
 
 
+def _units(arcs: Arcs, y, ends, times) -> Units:
+    """The units of the first state, (1, 2n), with the farther one of both ends as the size of q."""
+    n, duration = arcs.size, times[-1:] - times[:1]
+    farther = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    velocity = np.maximum(np.abs(y[0, n:]), np.abs(ends[1] - ends[0]) / duration)
+    here = arcs.units(y[:1], duration)
+    root = here.length[:, None] / here.state[:, :n]
+    length = np.maximum((farther * root).max(axis=1), (velocity * root).max(axis=1) * duration) or 1.0
+    return Units(np.concatenate([length / root, length / root / duration], axis=1), duration, np.ravel(length))
+
+
 class _Joined(NamedTuple):
-    """States `y` (K, 2n) at the first times of K arcs, the arcs, and the defects (K, 2n), in the end of q alone."""
+    """States `y` (K, 2n) at the first times of K arcs, the arcs, and the defects (K, 2n), in the end of q alone.
+
+    The defects are in `units` (1, 2n), the others in those of the user.
+    """
 
     y: np.ndarray
     arc: Arc
     defect: np.ndarray
+    units: Units
 
     def size(self) -> float:
         return float(np.abs(self.defect).max()) if self.arc.ok.all() else np.inf
@@ -211,25 +229,25 @@ def _guessed(layout: Layout, guess, ends, times) -> np.ndarray:
     return y
 
 
-def _followed(arcs: Arcs, times, y, ends) -> _Joined:
+def _followed(arcs: Arcs, times, y, ends, units: Units) -> _Joined:
     arc = arcs.follow(np.stack([times[:-1], times[1:]], axis=1), y)
     n = arcs.size
     target = np.concatenate([y[1:], np.concatenate([ends[1], arc.end[-1, n:]])[None]])
-    return _Joined(y, arc, arc.end - target)
+    return _Joined(y, arc, (arc.end - target) / units.state, units)
 
 
-def _joined(arcs: Arcs, times, y, ends) -> _Joined:
+def _joined(arcs: Arcs, times, y, ends, units: Units) -> _Joined:
     """The arcs that join, as far as they do, by Newton's method with steps that are shortened until defects fall."""
-    joined = _followed(arcs, times, y, ends)
+    joined = _followed(arcs, times, y, ends, units)
     for _ in range(_TRIALS):
         size = joined.size()
-        if not np.isfinite(size) or size <= 1e-15 * np.abs(joined.y).max():
+        if not np.isfinite(size) or size <= 1e-15:
             break
         step = _step(joined, arcs.size)
         if step is None:
             break
         for halving in range(_HALVINGS):
-            trial = _followed(arcs, times, joined.y + 0.5**halving * step, ends)
+            trial = _followed(arcs, times, joined.y + 0.5**halving * step, ends, units)
             if trial.size() < (1 - 0.25 * 0.5**halving) * size:
                 break
         if not trial.size() < 0.9 * size:
@@ -244,7 +262,7 @@ def _step(joined: _Joined, n: int) -> np.ndarray | None:
     matrix = np.zeros((count * states, count * states))
     for k in range(count):
         rows = slice(k * states, (k + 1) * states)
-        matrix[rows, rows] = joined.arc.by_start[k]
+        matrix[rows, rows] = joined.units.growth(joined.arc.by_start[k : k + 1])[0]
         if k + 1 < count:
             matrix[rows, (k + 1) * states : (k + 2) * states] = -np.eye(states)
     # Without the columns of the first q, which is given, and the rows of the last q̇, which is not.
@@ -252,7 +270,8 @@ def _step(joined: _Joined, n: int) -> np.ndarray | None:
     values = np.linalg.svd(matrix, compute_uv=False)
     if not values[-1] > len(values) * np.finfo(float).eps * values[0]:
         return None
-    return np.concatenate([np.zeros(n), np.linalg.solve(matrix, right)]).reshape(count, states)
+    step = np.concatenate([np.zeros(n), np.linalg.solve(matrix, right)]).reshape(count, states)
+    return step * joined.units.state
 
 
 def _why_not(arcs: Arcs, joined: _Joined, times) -> str:
@@ -264,13 +283,13 @@ def _why_not(arcs: Arcs, joined: _Joined, times) -> str:
             f"No path was found {between}: from the guess the motion cannot be followed. Give another guess=..., a "
             f"function of the time. {arcs.why_not(row, joined.arc, joined.y, times[row + 1])}"
         )
-    if joined.size() <= _CLOSED * max(1e-300, np.abs(joined.y).max()):
+    if joined.size() <= _CLOSED:
         return ""
     singular = _step(joined, arcs.size) is None
     end = " The ends are conjugate to each other: neighbouring paths all meet there, or none does." if singular else ""
     return (
-        f"No path was found {between}: the motions that were tried miss each other by {joined.size():.2g}. There may "
-        f"be none, or it may be far from the guess: give another guess=..., a function of the time.{end}"
+        f"No path was found {between}: the motions that were tried miss each other by {joined.size():.2g} of their "
+        f"size. There may be none, or it may be far from the guess: give another guess=..., a function of time.{end}"
     )
 
 
@@ -282,7 +301,7 @@ def _nothing(joined: _Joined, message: str) -> Path:
 def _told(system: System, arcs: Arcs, joined: _Joined, times, params) -> Path:
     """The path in the user's structure, with its action and its second variation."""
     restore = arcs.layout.restore
-    conjugate, at_end = conjugate_times(arcs, joined.y, times)
+    conjugate, at_end = conjugate_times(arcs, joined.y, times, joined.units)
     (q, qdot), qdot_end = map(restore, halves(joined.y[0])), restore(joined.arc.end[-1, arcs.size :])
     ts = np.linspace(times[0], times[-1], 16 * _ARCS + 1)
     trajectory = simulate(system, q, qdot, ts, params, rtol=RTOL, throw=False)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._orbits._arcs import Arc, Arcs
+from lagjax._orbits._arcs import Arc, Arcs, Units
 from lagjax._orbits._condense import condense
 from lagjax._orbits._rank import Decided, decide
 
@@ -62,6 +62,7 @@ class Closing(NamedTuple):
 class Chain(NamedTuple):
     """B closed chains of K arcs: states `y` (B, K, 2n) at `parts` (B, K + 1) of the periods `period` (B,).
 
+    All is in the `units` of each chain, in which metres and seconds do not matter.
     `defect` (B, K, 2n) is end of an arc minus the next state, `growth` (B, K, 2n, 2n) the derivatives of the arcs,
     `rate` (B, K, 2n) that of the ends in time; those of the last arc are taken back by S. `off` (B, m) and `slope`
     (B, m, 2n) are conditions on the first state. `ok` (B,) tells whether all arcs could be followed.
@@ -70,6 +71,9 @@ class Chain(NamedTuple):
     y: np.ndarray
     period: np.ndarray
     parts: np.ndarray
+    of_state: np.ndarray
+    of_time: np.ndarray
+    of_length: np.ndarray
     defect: np.ndarray
     growth: np.ndarray
     rate: np.ndarray
@@ -77,6 +81,19 @@ class Chain(NamedTuple):
     slope: np.ndarray
     ok: np.ndarray
     why: tuple[str, ...]
+
+    @property
+    def units(self) -> Units:
+        """The units of all."""
+        return Units(self.of_state, self.of_time, self.of_length)
+
+    def states(self) -> np.ndarray:
+        """The first states (B, 2n) in the units of the user."""
+        return self.y[:, 0] * self.of_state
+
+    def periods(self) -> np.ndarray:
+        """The periods (B,) in the unit of the user."""
+        return self.period * self.of_time
 
     def size(self) -> np.ndarray:
         """The largest number of a state, (B,)."""
@@ -107,7 +124,7 @@ class Chain(NamedTuple):
         return Chain._make([*arrays, tuple(why)])
 
 
-_ARRAYS = 9  # of the fields of a chain
+_ARRAYS = 12  # of the fields of a chain
 
 
 def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -129,15 +146,14 @@ def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) ->
     return parts, np.concatenate([first, second[:, -2:0:-1]], axis=1)
 
 
-def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray) -> Chain:
-    """The chains through these states, (B, K, 2n)."""
+def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
+    """The chains through these states, (B, K, 2n), all in these units."""
     arcs, (chains, count, states) = closing.arcs, y.shape
-    times, rows = (
-        (period[:, None, None] * np.stack([parts[:, :-1], parts[:, 1:]], axis=2)).reshape(-1, 2),
-        y.reshape(-1, states),
-    )
+    of_state, spans = units.state[:, None], (period * units.time)[:, None]
+    times = np.stack([spans * parts[:, :-1], spans * parts[:, 1:]], axis=2).reshape(-1, 2)
+    rows = (y * of_state).reshape(-1, states)
     if not arcs.driven:  # each begins at zero, where times have the most digits
-        times = (period[:, None] * np.diff(parts)).reshape(-1, 1) * np.array([0.0, 1.0])
+        times = (spans * np.diff(parts)).reshape(-1, 1) * np.array([0.0, 1.0])
     arc = arcs.follow(times, rows)
     rate = arcs.rate(times[:, 1], arc.end).reshape(y.shape)
     ok = np.asarray(arc.ok.reshape(chains, count).all(axis=1))
@@ -145,9 +161,11 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
     inverse = np.linalg.inv(closing.matrix)
     end[:, -1], rate[:, -1] = closing.taken_back(end[:, -1]), rate[:, -1] @ inverse.T
     growth[:, -1] = inverse @ growth[:, -1]
-    defect = end - np.roll(y, -1, axis=1)
-    off, slope = closing.conditions(y[:, 0])
-    return Chain(y, period, parts, defect, growth, rate, off, slope, ok, _why(arcs, arc, rows, times, ok))
+    defect = end / of_state - np.roll(y, -1, axis=1)
+    off, slope = closing.conditions(y[:, 0] * units.state)
+    rate, slope = rate * units.time[:, None, None] / of_state, slope * of_state
+    why = _why(arcs, arc, rows, times, ok)
+    return Chain(y, period, parts, *units, defect, units.growth(growth), rate, off, slope, ok, why)
 
 
 def _why(arcs: Arcs, arc: Arc, rows, times, ok) -> tuple[str, ...]:
@@ -184,9 +202,9 @@ def correction(chain: Chain, driven: bool) -> tuple[np.ndarray, np.ndarray]:
     return condensed.inner(first, first, z)[..., 0], period
 
 
-def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray) -> Chain:
+def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
     """The closed chains near these states, as far as they are found: look at `Chain.closure`."""
-    chain = follow(closing, y, period, parts)
+    chain = follow(closing, y / units.state[:, None], period / units.time, parts, units)
     active = chain.ok.copy()
     for _ in range(TRIALS):
         active &= chain.merit() > _ENOUGH * chain.size()
@@ -209,7 +227,8 @@ def _improved(closing: Closing, chain: Chain) -> Chain:
     for _ in range(_HALVINGS):
         y = chain.y[waiting] + scale[waiting, None, None] * dy[waiting]
         period = chain.period[waiting] + scale[waiting] * dperiod[waiting]
-        trial = follow(closing, y, period, chain.parts[waiting])
+        some = Units(*(x[waiting] for x in chain.units))
+        trial = follow(closing, y, period, chain.parts[waiting], some)
         lower = trial.merit() < (1 - 0.25 * scale[waiting]) * chain.merit()[waiting]
         near = chain.merit()[waiting] < 1e3 * _ENOUGH * chain.size()[waiting]  # where rounding decides
         best = best.with_rows(waiting[lower], trial.at(lower))
@@ -253,5 +272,5 @@ def _null(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
 
 
 def stopped(chain: Chain) -> np.ndarray:
-    """Whether nothing moves along a chain: an equilibrium closes after any time, (B,)."""
-    return np.abs(chain.rate).max(axis=(1, 2)) * chain.period <= 1e-6 * np.maximum(chain.size(), 1e-300)
+    """Whether nothing moves along a chain, beside its states and the guess: an equilibrium closes after any time."""
+    return np.abs(chain.rate).max(axis=(1, 2)) * chain.period <= 1e-6 * np.maximum(chain.size(), 1.0)

@@ -37,6 +37,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 
+from lagjax._program import _complex, _matrices, _special  # noqa: F401  (they register what they lower)
 from lagjax._program._differentiate import Derivatives, has_own_rules
 from lagjax._program._emit import Rows, emit, emit_rows, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
@@ -346,6 +347,16 @@ class Program:
             return None
         same = [self.origin.graph.position(i) for i in stacked(scalars).ids.tolist()] == list(range(self.size))
         return Scalars(first.expansion, np.array(self.origin.outputs, dtype=np.int64)) if same else None
+
+    def with_inputs(self, count: int) -> "Program":
+        """The program with so many more floats behind its own inputs, none of which it reads."""
+        more, other = jax.ShapeDtypeStruct((count,), jnp.result_type(float)), self.otherwise
+        return replace(
+            self,
+            function=lambda *leaves: self.function(*leaves[:-1]),
+            shapes=(*self.shapes, more),
+            otherwise=None if other is None else functools.cache(lambda: other().with_inputs(count)),
+        )
 
     def only(self, positions: Sequence[int], function: Callable) -> "Program":
         """The program of some of the outputs; `function` is the JAX function that gives just these, leaf by leaf."""

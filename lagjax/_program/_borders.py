@@ -99,7 +99,7 @@ class Borders(NamedTuple):
     """The borders of a program with m pieces, and its features.
 
     `program` takes the inputs, then the pieces; `switches` (m,) are the nodes of the switching numbers in it, and
-    `arguments` those of the arguments of `features`. `decide`
+    `arguments` those of the arguments of `features`, of which alike ones stand side by side. `decide`
     takes the same and then m flags: it gives the pieces of a state, or the piece that is given where the flag is 1.
     `nested` says whether switching numbers depend on pieces. `tables` (m,) has that of every piece that is one of a
     table; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one with
@@ -121,6 +121,16 @@ class Borders(NamedTuple):
     def clocks(self) -> tuple[int, ...]:
         """The pieces that change at instants that are known."""
         return tuple(j for j, kind in enumerate(self.kinds) if kind == CLOCK)
+
+    def moving_table(self, j: int) -> Table | None:
+        """The table of parameters whose entries are the levels of piece j; None where it has none."""
+        located = self.tables[j] if self.kinds[j] == TABLE else None
+        return None if located is None or located.table.numbers is not None else located.table
+
+    @property
+    def levels_move(self) -> bool:
+        """Whether the levels of any piece are parameters."""
+        return any(self.moving_table(j) is not None for j in range(len(self.switches)))
 
     @property
     def shaken(self) -> tuple[int, ...]:
@@ -375,7 +385,7 @@ class _Rewriting:
 
     def finished(self) -> Borders:
         """The parts of the result."""
-        program, features = self.program, self.features
+        program, features = self.program, dict(sorted(self.features.items(), key=lambda item: item[1]))
         line = StraightLine(
             tuple(self.graph.nodes), tuple(self.graph.kinds), tuple(self.places[i] for i in program.line.outputs)
         )
@@ -608,10 +618,19 @@ def _floor_divisions(line: StraightLine) -> dict[int, tuple[int, int]]:
 
 
 def gradient(borders: Borders, by: Sequence[int]) -> tuple[StraightLine, tuple[Table, ...]]:
-    """The derivatives by the inputs `by` of Σ hⱼ uⱼ, with numbers hⱼ after the inputs of the program.
+    """The derivatives by the inputs `by` of Σ hⱼ (uⱼ − levelⱼ), with numbers hⱼ after the inputs of the program.
 
-    Behind them come those by entries of tables (`_transpose.pullback_and_entries`).
+    Where levels are parameters (`levels_move`), the m numbers of the entries that they are stand before the numbers hⱼ.
+    Behind the derivatives come those by entries of tables (`_transpose.pullback_and_entries`).
     """
-    program = borders.program
-    line = StraightLine(*live(program.line.nodes, program.line.kinds, borders.switches))
-    return pullback_and_entries(line, program.dtypes, by, range(len(borders.switches)))
+    program, dtypes = borders.program, borders.program.dtypes
+    graph, switches = Graph.of(program.line, program.budget + _LARGEST * len(borders.switches) + 1000), []
+    for j, node in enumerate(borders.switches):
+        if (table := borders.moving_table(j)) is not None:
+            entry = graph.input(program.size + j, "float")
+            node = graph.apply("sub", node, graph.apply("take", entry, attribute=table))
+        switches.append(node)
+    if borders.levels_move:
+        dtypes = (*dtypes, *[np.dtype(float)] * len(switches))
+    line = StraightLine(*live(tuple(graph.nodes), tuple(graph.kinds), switches))
+    return pullback_and_entries(line, dtypes, by, range(len(switches)))

@@ -17,6 +17,7 @@ from jax.extend import core
 
 from lagjax._program._graph import Graph, Node, Tape
 from lagjax._program._operations import OPERATIONS
+from lagjax._program._rules import determinant_of, live_equations
 
 _Rule = Callable[[int], int]
 Tangents = dict[int, int]  # by the number of the direction; a direction that is not there has none
@@ -27,12 +28,16 @@ _OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "
 def has_own_rules(jaxpr) -> bool:
     """Whether a jaxpr, or one that it calls, asks for other derivatives than those of its operations."""
     return any(
-        equation.primitive.name in _OWN_RULES or any(has_own_rules(inner) for inner in _inner(equation.params))
-        for equation in jaxpr.eqns
+        determinant_of(equation) is None
+        and (equation.primitive.name in _OWN_RULES or any(has_own_rules(inner) for inner in _inner(equation)))
+        for equation in live_equations(jaxpr)
     )
 
 
-def _inner(params) -> list:
+def _inner(equation) -> list:
+    params = equation.params
+    if equation.primitive.name == "custom_linear_solve":  # how JAX solves it is not what is lowered
+        params = {"matvec": params["jaxprs"].matvec}
     leaves = jax.tree.leaves(list(params.values()), is_leaf=lambda x: isinstance(x, core.Jaxpr | core.ClosedJaxpr))
     closed = (x.jaxpr if isinstance(x, core.ClosedJaxpr) else x for x in leaves)
     return [x for x in closed if isinstance(x, core.Jaxpr)]

@@ -127,8 +127,17 @@ def _paired(nodes) -> frozenset[int]:
     return frozenset(sines & cosines)
 
 
+def _binade(x):
+    one = jnp.ones_like(x)
+    power = jnp.where(x == 0, one, jnp.ldexp(one, jnp.frexp(lax.stop_gradient(x))[1] - 1))
+    return jnp.where(jnp.isfinite(x), power, jnp.abs(x))
+
+
+WRITTEN: dict[str, Callable] = {"binade": _binade}  # operations that `lax` does not have
+
+
 def _apply(op: str, xs: list, attribute) -> jax.Array:
-    function = getattr(lax, OPERATIONS[op].lax or op)
+    function = WRITTEN.get(op) or getattr(lax, OPERATIONS[op].lax or op)
     return function(*xs) if attribute is None else function(*xs, lax.RoundingMethod(attribute))
 
 

@@ -42,6 +42,8 @@ MANY = 20_000
 # Ids from here on are inputs by their positions, and those from `NUMBERS` on numbers of long arrays, as long as nothing
 # computes with them: of an array that is only looked up in, no entry becomes a node.
 INPUTS, NUMBERS = 2**40, 2**50
+# Ids from here on are pairs, each a complex number (`_complex`). No node has one as an operand.
+PAIRS = 2**60
 
 Node = tuple[str, tuple[int, ...], Any]
 _ARITHMETIC = frozenset(("add", "sub", "mul"))
@@ -175,6 +177,8 @@ class Graph:
             return i
         if i < NUMBERS:
             return self.input(i - INPUTS, "float")
+        if i >= PAIRS:
+            raise Unlowerable("a complex number is there where a real one is needed")
         numbers, first = self.array_of(i)
         return self.constant(float(np.frombuffer(numbers)[i - first]), "float")
 

@@ -41,7 +41,7 @@ class Operation:
       argument where a node has one.
     - `llvm`: the name of a function of the C library, called lane by lane; or `(code, *xs)` → value, with a
       `_native._ir.Code`, whose values are vectors with the operators of Python. None: this is done elsewhere.
-    - `lax`: the name of the function in `jax.lax`, if it is not `name`.
+    - `lax`: the name of the function in `jax.lax`, if it is not `name`; `_emit` writes what is not there.
     - `simplify(graph, name, *operands)`: a node that is simpler for some operands (see `_simplify`).
     - `commutative`: the order of two operands does not matter.
     - `is_logical`: the result is a bool, whatever the operands are.
@@ -104,6 +104,11 @@ def _divide(x, y):
 
 def _unfolded(x, attribute):
     raise TypeError("a look-up has no value without its table")
+
+
+def _binade(x):
+    power = np.where(x == 0, 1, np.ldexp(np.ones_like(x), np.frexp(x)[1] - 1))
+    return np.where(np.isfinite(x), power, np.abs(x))[()]
 
 
 def _select(predicate, no, yes):
@@ -311,6 +316,13 @@ _ROWS = (
     _step("sign", np.sign, lambda code, x: code.select(x > 0.0, 1.0, code.select(x < 0.0, -1.0, x)), _odd),
     _step("floor", np.floor, _intrinsic("floor")),
     _step("ceil", np.ceil, _intrinsic("ceil")),
+    # The largest power of two that is at most |x|, and 1 for 0: for weights that do not change what is computed with
+    # them. It has therefore no side: no step has to end where it jumps.
+    Operation(
+        "binade", 1, _binade,
+        lambda code, x: code.library("exp2", code.library("logb", code.select(code.compare("==", x, 0.0), 1.0, x))),
+        is_step=True, exact=True,
+    ),
     _step("round", _round, lambda code, x, method: code.intrinsic("rint" if method == 1 else "round", x)),
     Operation(
         "select", 3, _select, lambda code, predicate, no, yes: code.select(predicate, yes, no), lax="select_n",

@@ -4,10 +4,11 @@ An array in the traced function becomes a NumPy array of ids here. An elementwis
 ids; a primitive that only moves data is NumPy's own function of the ids; a loop or a call runs its body again.
 
 To support another primitive: an elementwise one needs a row in `_operations`, one that moves data a line in `MOVES`,
-anything else a function marked `@_lowers("its_name")`, which gets the expansion, the parameters of the equation and the
+anything else a function marked `@lowers("its_name")`, which gets the expansion, the parameters of the equation and the
 id arrays, and returns an id array (or a list of them). Each needs a row in `tests/test_program.py`.
 """
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -17,7 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend import core
 
-from lagjax._program._graph import INPUTS, Graph, Unlowerable
+from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
 from lagjax._program._indexing import known, located, looked_up
 from lagjax._program._operations import OPERATIONS
 
@@ -36,6 +37,8 @@ class Expansion:
     def __init__(self, graph: Graph):
         self.graph = graph
         self.traced_operations = 0
+        self.moduli: dict[int, int] = {}  # |z| of complex numbers, and |z|², which is smooth at zero
+        self._pairs: list[tuple[int, int]] = []
         self._work = 0
 
     def run(self, jaxpr, constants, arguments) -> list[np.ndarray]:
@@ -45,9 +48,9 @@ class Expansion:
         def read(atom):
             return self.constants(atom.val) if isinstance(atom, core.Literal) else scope[atom]
 
-        for equation in _live(jaxpr):
+        for equation in live_equations(jaxpr):
             scope |= zip(
-                equation.outvars, self._equation(equation, [read(atom) for atom in equation.invars]), strict=True
+                equation.outvars, self._equation(equation, [read(atom) for atom in read_by(equation)]), strict=True
             )
         return [read(atom) for atom in jaxpr.outvars]
 
@@ -59,17 +62,38 @@ class Expansion:
         if not array.size or array.max() < INPUTS:
             return array
         self.work(array.size)
-        return _ids([self.graph.real(i) for i in array.ravel().tolist()], array.shape)
+        return _ids([i if i >= PAIRS else self.graph.real(i) for i in array.ravel().tolist()], array.shape)
 
     def constants(self, value) -> np.ndarray:
         if isinstance(value, Tracer):
             raise Unlowerable("the function closes over a traced value; pass it as an argument")
-        kind = kind_of(value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype)
-        value = np.asarray(value)
+        dtype = value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
+        if is_complex(dtype):
+            return self.pair(self.constants(np.real(value)), self.constants(np.imag(value)))
+        kind, value = kind_of(dtype), np.asarray(value)
         if kind == "float" and value.size > LARGEST_UNFOLDED:
             return self.graph.array(value)
         self.work(value.size)
         return _ids([self.graph.constant(x, kind) for x in value.ravel().tolist()], value.shape)
+
+    def pair(self, re: np.ndarray, im: np.ndarray) -> np.ndarray:
+        """The complex numbers with these parts."""
+        first = PAIRS + len(self._pairs)
+        self._pairs += zip(self.real(re).ravel().tolist(), self.real(im).ravel().tolist(), strict=True)
+        self.work(re.size)
+        return np.arange(first, first + re.size, dtype=np.int64).reshape(re.shape)
+
+    def parts(self, array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The real and the imaginary parts of numbers that may be complex."""
+        zero = self.graph.constant(0.0, "float")
+        ids = self.real(array).ravel().tolist()
+        pairs = [self._pairs[i - PAIRS] if i >= PAIRS else (i, zero) for i in ids]
+        return _ids([re for re, _ in pairs], array.shape), _ids([im for _, im in pairs], array.shape)
+
+    @staticmethod
+    def has_pairs(array: np.ndarray) -> bool:
+        """Whether any of these numbers is complex."""
+        return bool(array.size) and array.max() >= PAIRS
 
     def map(self, op: str, *arrays: np.ndarray, attribute=None) -> np.ndarray:
         """`op` elementwise."""
@@ -104,21 +128,43 @@ class Expansion:
             )
 
     def _equation(self, equation, arguments) -> list[np.ndarray]:
-        name = equation.primitive.name
+        name = determinant_of(equation) or equation.primitive.name
         for variable in equation.outvars:
-            kind_of(variable.aval.dtype)
             self.work(variable.aval.size)
+        if name == "mul" and equation.invars[0] is equation.invars[1]:
+            name, arguments = "square", arguments[:1]
+        if (
+            name not in MOVES
+            and name not in _WITH_BODIES
+            and any(map(_is_complex, [*equation.invars, *equation.outvars]))
+        ):
+            if name not in COMPLEX:
+                raise Unlowerable(f"the primitive `{name}` of complex numbers has no scalar form here")
+            result = COMPLEX[name](self, equation.params, *arguments)
+        else:
+            result = self.lowered(name, equation.params, arguments)
+        return list(result) if equation.primitive.multiple_results else [result]
+
+    def lowered(self, name: str, params, arguments):
+        """The result of a primitive of real numbers, or of one that has other functions in it or only moves numbers."""
         if name not in MOVES and name not in _PASSING_ON:
             arguments = [self.real(x) for x in arguments]
         if name in MOVES:
-            result = MOVES[name](equation.params, *arguments)
-        elif name in LOWER:
-            result = LOWER[name](self, equation.params, *arguments)
-        elif name in OPERATIONS:
-            result = self.map(name, *arguments)
-        else:
-            raise Unlowerable(f"the primitive `{name}` has no scalar form here")
-        return list(result) if equation.primitive.multiple_results else [result]
+            return MOVES[name](params, *arguments)
+        if name in LOWER:
+            return LOWER[name](self, params, *arguments)
+        if name in OPERATIONS:
+            return self.map(name, *arguments)
+        raise Unlowerable(f"the primitive `{name}` has no scalar form here")
+
+
+def is_complex(dtype) -> bool:
+    """Whether numbers of this type are complex."""
+    return jnp.issubdtype(dtype, jnp.complexfloating)
+
+
+def _is_complex(atom) -> bool:
+    return is_complex(atom.aval.dtype)
 
 
 def kind_of(dtype) -> str:
@@ -153,13 +199,49 @@ def _ids(ids: list[int], shape) -> np.ndarray:
     return np.array(ids, dtype=np.int64).reshape(shape)
 
 
-def _live(jaxpr) -> list:
+def live_equations(jaxpr) -> list:
+    """The equations of a jaxpr that something depends on, in order."""
     needed, equations = {v for v in jaxpr.outvars if isinstance(v, core.Var)}, []
     for equation in reversed(jaxpr.eqns):
         if needed.intersection(equation.outvars):
             equations.append(equation)
-            needed.update(v for v in equation.invars if isinstance(v, core.Var))
+            needed.update(v for v in read_by(equation) if isinstance(v, core.Var))
     return equations[::-1]
+
+
+def read_by(equation) -> list:
+    """What the lowered equation reads: of a linear system the matrix and the right-hand side, not JAX's own factors."""
+    if equation.primitive.name != "custom_linear_solve":
+        return equation.invars
+    lengths = equation.params["const_lengths"]
+    return equation.invars[: lengths.matvec] + equation.invars[sum(lengths) :]
+
+
+def determinant_of(equation) -> str | None:
+    """Which of JAX's determinants a call is, "det" or "slogdet", or None.
+
+    JAX has rules of its own for their derivatives, which agree with those of any formula for them.
+    """
+    if equation.primitive.name != "custom_jvp_call" or len(equation.invars) != 1:
+        return None
+    (variable,), body = equation.invars, equation.params["call_jaxpr"]
+    shape, dtype = variable.aval.shape, variable.aval.dtype
+    if len(shape) < 2 or shape[-2] != shape[-1] or not jnp.issubdtype(dtype, jnp.floating):
+        return None
+    text = str(body)
+    return next((name for name in ("det", "slogdet") if text in _determinant(name, shape, dtype)), None)
+
+
+@functools.cache
+def _determinant(name: str, shape: tuple[int, ...], dtype) -> tuple[str, ...]:
+    """The calls with rules of their own in one of JAX's determinants, also under `vmap`, as texts of their bodies."""
+    function, texts = getattr(jnp.linalg, name), []
+    for _ in range(len(shape) - 1):
+        (equation,) = jax.make_jaxpr(function)(jax.ShapeDtypeStruct(shape, dtype)).eqns
+        bodies = [e.params.get("call_jaxpr") for e in equation.params["jaxpr"].eqns]
+        texts += [str(body) for body in bodies if body is not None]
+        function = jax.vmap(function)
+    return tuple(texts)
 
 
 # ---- primitives that only move data ---------------------------------------------------------------------------------
@@ -217,14 +299,17 @@ MOVES: dict[str, Callable] = {
 # ---- primitives that compute ----------------------------------------------------------------------------------------
 
 LOWER: dict[str, Callable] = {}
+COMPLEX: dict[str, Callable] = {}  # the same for complex operands or results (`_complex`)
+_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call",
+          "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
+_WITH_BODIES = frozenset((*_CALLS, "scan", "while", "cond"))
 # What passes arrays on, or looks up entries in them: these may have ids without nodes.
-_PASSING_ON = frozenset((
-    "gather", "dynamic_slice", "lagjax_locate", "convert_element_type", "jit", "pjit", "closed_call", "core_call",
-    "remat", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
-))  # fmt: skip
+_PASSING_ON = frozenset(("gather", "dynamic_slice", "lagjax_locate", "convert_element_type", *_CALLS))
 
 
-def _lowers(*names):
+def lowers(*names):
+    """The decorator of the function that lowers these primitives."""
+
     def register(rule):
         LOWER.update(dict.fromkeys(names, rule))
         return rule
@@ -232,45 +317,55 @@ def _lowers(*names):
     return register
 
 
-@_lowers("add_any")
+@lowers("add_any")
 def _add_any(expansion, params, x, y):
     return expansion.map("add", x, y)
 
 
-@_lowers("lt_to")
+@lowers("lt_to")
 def _is_less_in_total_order(expansion, params, x, y):
     return expansion.map("lt", x, y)
 
 
-@_lowers("le_to")
+@lowers("le_to")
 def _is_not_more_in_total_order(expansion, params, x, y):
     return expansion.map("le", x, y)
 
 
-@_lowers("square")
+@lowers("square")
 def _square(expansion, params, x):
-    return expansion.map("mul", x, x)
+    moduli = expansion.moduli
+    if not moduli or moduli.keys().isdisjoint(ids := x.ravel().tolist()):
+        return expansion.map("mul", x, x)
+    return _ids([moduli[i] if i in moduli else expansion.graph.apply("mul", i, i) for i in ids], x.shape)
 
 
-@_lowers("integer_pow")
+@lowers("integer_pow")
 def _integer_pow(expansion, params, x):
-    exponent, graph = params["y"], expansion.graph
+    exponent, graph, moduli = params["y"], expansion.graph, expansion.moduli
     expansion.work(x.size)
     expansion.traced_operations += x.size
-    return _ids([graph.power(i, exponent) for i in x.ravel().tolist()], x.shape)
+    half = exponent // 2
+    return _ids(
+        [
+            graph.power(moduli[i], half) if exponent == 2 * half and i in moduli else graph.power(i, exponent)
+            for i in x.ravel().tolist()
+        ],
+        x.shape,
+    )
 
 
-@_lowers("pow")
+@lowers("pow")
 def _pow(expansion, params, x, y):
     return expansion.map("pow", x, expansion.map("convert", y, attribute="float"))
 
 
-@_lowers("round")
+@lowers("round")
 def _round(expansion, params, x):
     return expansion.map("round", x, attribute=int(params["rounding_method"]))
 
 
-@_lowers("convert_element_type")
+@lowers("convert_element_type")
 def _convert_element_type(expansion, params, x):
     kind = kind_of(params["new_dtype"])
     if kind == "float" and x.size and x.min() >= INPUTS:  # of floats without nodes
@@ -282,14 +377,14 @@ def _convert_element_type(expansion, params, x):
     return expansion.map("convert", x, attribute=kind)
 
 
-@_lowers("clamp")
+@lowers("clamp")
 def _clamp(expansion, params, low, x, high):
     # Not min and max, whose derivatives at the bounds are a half where JAX has none.
     above = expansion.map("select", expansion.map("le", x, low), x, low)
     return expansion.map("select", expansion.map("ge", x, high), above, high)
 
 
-@_lowers("select_n")
+@lowers("select_n")
 def _select_n(expansion, params, which, *cases):
     if len(cases) == 1:
         return cases[0]
@@ -300,6 +395,9 @@ def _select_n(expansion, params, which, *cases):
 
 def _choose(expansion, which, cases):
     """The case an integer counts to; below the first is the first, beyond the last the last."""
+    if any(map(expansion.has_pairs, cases)):
+        parts = zip(*map(expansion.parts, cases), strict=True)
+        return expansion.pair(*(_choose(expansion, which, list(of)) for of in parts))
     result = cases[0]
     for k, case in enumerate(cases[1:], 1):
         bound = [expansion.graph.constant(k, expansion.graph.kinds[i]) for i in which.ravel().tolist()]
@@ -307,7 +405,7 @@ def _choose(expansion, which, cases):
     return result
 
 
-@_lowers("iota")
+@lowers("iota")
 def _iota(expansion, params):
     shape = [1] * len(params["shape"])
     shape[params["dimension"]] = -1
@@ -315,7 +413,7 @@ def _iota(expansion, params):
     return np.broadcast_to(expansion.constants(numbers).reshape(shape), params["shape"])
 
 
-@_lowers("platform_index")
+@lowers("platform_index")
 def _platform_index(expansion, params):
     # Which of the equivalent branches: that for CPUs, or the default. A program has no platform of its own.
     cases = params["platforms"]
@@ -323,7 +421,7 @@ def _platform_index(expansion, params):
     return expansion.constants(np.int32((fits + [i for i, platforms in enumerate(cases) if platforms is None])[0]))
 
 
-@_lowers("dot_general")
+@lowers("dot_general")
 def _dot_general(expansion, params, x, y):
     if (dtype := params["preferred_element_type"]) is not None:  # JAX multiplies matrices of two dtypes
         kind, kinds = kind_of(dtype), expansion.graph.kinds
@@ -401,7 +499,7 @@ def _first_extreme(better):
 LOWER.update({"argmax": _first_extreme("gt"), "argmin": _first_extreme("lt")})
 
 
-@_lowers("sort")
+@lowers("sort")
 def _sort(expansion, params, *operands):
     """Neighbours are exchanged until all are in order: n (n − 1) / 2 comparisons, for a few numbers."""
     if params["num_keys"] != 1:
@@ -423,7 +521,7 @@ def _sort(expansion, params, *operands):
 # ---- indexing with arrays: the indices must fold to numbers ---------------------------------------------------------
 
 
-@_lowers("dynamic_slice")
+@lowers("dynamic_slice")
 def _dynamic_slice(expansion, params, x, *starts):
     sizes, starts = params["slice_sizes"], expansion.real(np.array(starts[: x.ndim]))
     if not known(expansion, starts):
@@ -433,7 +531,7 @@ def _dynamic_slice(expansion, params, x, *starts):
     return x[tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))]
 
 
-@_lowers("dynamic_update_slice")
+@lowers("dynamic_update_slice")
 def _dynamic_update_slice(expansion, params, x, update, *starts):
     starts = expansion.known(np.array(starts), "the start of a slice")
     starts = [min(max(start, 0), n - size) for start, n, size in zip(starts, x.shape, update.shape, strict=True)]
@@ -470,12 +568,20 @@ def _clips(mode) -> bool:
     return jax.lax.GatherScatterMode.from_any(mode) == jax.lax.GatherScatterMode.CLIP
 
 
-@_lowers("lagjax_locate")
+@lowers("lagjax_locate")
 def _locate(expansion, params, knots, x):
-    return located(expansion, knots, x, params["closed"])
+    if (found := located(expansion, knots, x, params["closed"])) is not None:
+        return found
+    at_most = expansion.map("le", knots.reshape(-1, *[1] * x.ndim), np.broadcast_to(x, (len(knots), *x.shape)))
+    counted = expansion.fold("add", expansion.map("convert", at_most, attribute="int32"))
+    found = expansion.map("sub", counted, expansion.constants(np.int32(1)))
+    if not params["closed"]:
+        return found
+    at_end = expansion.map("eq", x, expansion.real(knots[-1]))
+    return expansion.map("select", at_end, found, expansion.constants(np.int32(len(knots) - 2)))
 
 
-@_lowers("gather")
+@lowers("gather")
 def _gather(expansion, params, x, indices):
     d, indices = params["dimension_numbers"], expansion.real(indices)
     if not known(expansion, indices) and not d.operand_batching_dims:
@@ -523,13 +629,12 @@ LOWER.update({name: _scatter(op) for name, op in {**SCATTERS, "scatter-min": "mi
 # ---- calls, loops and branches --------------------------------------------------------------------------------------
 
 
-@_lowers("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call",
-         "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
+@lowers(*_CALLS)
 def _call(expansion, params, *arguments):
     body = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
     if params.get("name") == "searchsorted" and _searches_from_the_right(body, arguments):
-        knots, x = arguments
-        return [expansion.map("add", located(expansion, knots, x, closed=False), expansion.constants(np.int32(1)))]
+        if (found := located(expansion, *arguments, closed=False)) is not None:
+            return [expansion.map("add", found, expansion.constants(np.int32(1)))]
     if isinstance(body, core.ClosedJaxpr):
         return expansion.run_closed(body, arguments)
     return expansion.run(body, (), arguments)
@@ -557,7 +662,7 @@ def _searches_from_the_right(body, arguments) -> bool:
     return True
 
 
-@_lowers("scan")
+@lowers("scan")
 def _scan(expansion, params, *arguments):
     consts, carry = _parts_of_scan(params)
     constants, state, columns = arguments[:consts], arguments[consts : consts + carry], arguments[consts + carry :]
@@ -580,7 +685,7 @@ def _parts_of_scan(params) -> tuple[int, int]:
     return len(consts), len(carry)
 
 
-@_lowers("while")
+@lowers("while")
 def _while(expansion, params, *arguments):
     split = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
     condition, body, state = arguments[: split[0]], arguments[split[0] : split[1]], arguments[split[1] :]
@@ -592,7 +697,7 @@ def _while(expansion, params, *arguments):
         state = expansion.run_closed(params["body_jaxpr"], [*body, *state])
 
 
-@_lowers("cond")
+@lowers("cond")
 def _cond(expansion, params, which, *operands):
     branches = params["branches"]
     if (value := expansion.graph.value(int(which))) is not None:

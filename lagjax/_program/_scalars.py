@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._program._emit import in_jax
+
 
 class Scalars:
     """Nodes of a graph as an array: arithmetic, comparisons of numbers, indexing by numbers."""
@@ -88,6 +90,8 @@ def _function(op: str, in_jax: Callable) -> Callable:
     return function
 
 
+binade = _function("binade", lambda x: in_jax("binade", x))
+exponential, logarithm, root = _function("exp", jnp.exp), _function("log", jnp.log), _function("sqrt", jnp.sqrt)
 minimum, maximum, absolute = _function("min", jnp.minimum), _function("max", jnp.maximum), _function("abs", jnp.abs)
 
 
@@ -131,12 +135,12 @@ def spread(x, index, size: int):
     return replaced(zeros, index, x)
 
 
-def stacked(scalars: Sequence) -> Any:
-    """A vector of scalars."""
-    first = _scalars(*scalars)
+def stacked(parts: Sequence) -> Any:
+    """Scalars as a vector, or vectors as the rows of a matrix."""
+    first = _scalars(*parts)
     if first is None:
-        return jnp.stack([jnp.asarray(x) for x in scalars])
-    return Scalars(first.expansion, np.array([int(first._ids(x)) for x in scalars], dtype=np.int64))
+        return jnp.stack([jnp.asarray(x) for x in parts])
+    return Scalars(first.expansion, np.stack([first._ids(x) for x in parts]))
 
 
 def applied(function: Callable, *arguments):

@@ -5,7 +5,7 @@ over, q0, keep, … ──► Motions, Grid ──► Store ──► units, cla
 _designs, _members   what is swept: axes and rules, the grid of members, its units
 _statistics          what is said of all members without a list
 _sections            motions of a batch with their crossings
-_identity, _scene    the user's functions: what they are, in words; their way to another process
+_scene               the user's functions: what they are, in words; their way to another process
 _store, _claims      the files; who has which unit
 _batch, _job, _unit  what computes a unit
 _begin, _extend      stores that are begun; those that take members of another one
@@ -15,6 +15,7 @@ _status              how far it is
 """
 
 import os
+import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -35,7 +36,7 @@ from lagjax._sweep._scene import Motions
 from lagjax._sweep._sections import Sections
 from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merged, summary
 from lagjax._sweep._status import Failure, Progress, Status, status
-from lagjax._sweep._store import Store
+from lagjax._sweep._store import NOT_DONE, RESULT, Store
 from lagjax._sweep._unit import compute
 from lagjax._system import System, require_system
 from lagjax._validate import require_flag
@@ -63,13 +64,27 @@ class Sweep:
     def open(self):
         """The members as an `xarray.Dataset`, with the names of `over` as coordinates; read when it is looked at.
 
+        Members of units whose chunks are not there have the `result` −1, "not_done", and a warning names them;
+        `xarray.open_zarr(store)`, which looks at each array alone, would show their numbers as missing and their
+        `result` as it was. A chunk whose bytes have changed raises an error of zarr when it is read.
+
         Raises `ImportError` when xarray is not installed.
         """
         try:
             import xarray
         except ImportError:
             raise ImportError("Sweep.open() needs the package xarray: pip install xarray.") from None
-        return xarray.open_zarr(self.store)
+        data, store = xarray.open_zarr(self.store), Store(self.store)
+        spec = store.spec()
+        damaged = store.damaged(spec, store.done())
+        if not damaged:
+            return data
+        for text in damaged.values():
+            warnings.warn(f"{self.store}: {text}. Run the sweep again: it computes them again.", stacklevel=2)
+        result = data[RESULT.name].load()  # attributes and coordinates stay
+        for unit in damaged:
+            result.values[store.grid(spec).box(unit)] = NOT_DONE
+        return data.assign({RESULT.name: result})
 
     def status(self) -> Status:
         """How far it has come, how members ended, which failed, and the worst change of energy."""
@@ -155,6 +170,10 @@ def sweep(
     - `progress`: a line on stderr.
     - `rtol`, `atol`, `max_steps`, `event`, `solver`: as in `simulate_batch`.
 
+    A store knows the scene and `keep` by their code and by all that this reads: helpers, globals, closures, classes
+    with all their attributes, modules imported inside. What it cannot know is what a function reads from files, from
+    the environment, or by names that it makes up (`globals()["c"]`): after such a change take another store.
+
     Members that fail cost the others nothing: `result` says how each ended, `print(sweep)` names them. Functions
     written in jax.numpy are compiled for all members at once. Others are called member by member, and the status says
     so; a member for which `keep` then raises, or returns another shape, is `keep_failed`. On machines of one kind of
@@ -187,7 +206,7 @@ def sweep(
     assert swept.open().fastest.dims == ("length", "angle")
     ```
     """
-    require_system(system)
+    system = require_system(system)
     require_flag(progress, "progress")
     settings = dict(rtol=rtol, atol=atol, max_steps=max_steps, event=event, solver=solver)
     sections = Sections.of(crossings, _callable(keep), settings)

@@ -18,7 +18,7 @@ from lagjax._sweep._job import Job, cpu, goes_on_from, in_doubles, require_versi
 from lagjax._sweep._later import states
 from lagjax._sweep._members import RESERVED, Axis, Grid, in_words, points_of
 from lagjax._sweep._scene import Motions, difference, packed, texts, users_path
-from lagjax._sweep._store import FORMAT, RESULT, Quantity, Store
+from lagjax._sweep._store import FORMAT, NOT_DONE, RESULT, Quantity, Store
 
 SECONDS = 20.0  # of a unit, by default: what a worker that dies loses
 UNIT_BYTES = 64 * 2**20  # of what is kept of a unit, by default; two of them are in memory, one being written
@@ -75,7 +75,7 @@ def begin(
     if extend is not None:
         require_extensible(extend, extend.spec(), spec)
     with store.made_aside() as new:
-        new.create(spec, scene, axes, title, {-1: "not_done"} | {code: label(code) for code in codes})
+        new.create(spec, scene, axes, title, {NOT_DONE: "not_done"} | {code: label(code) for code in codes})
         if extend is not None:
             carry(extend, new)
 
@@ -180,4 +180,4 @@ def repair(job: Job) -> None:
     """Have units computed again whose chunks are not whole, as after a crash of the disk."""
     for unit, text in job.store.damaged(job.spec, job.store.done()).items():
         warnings.warn(f"{job.store.path}: {text}. It is computed again.", stacklevel=3)
-        job.store.undo(unit)
+        job.store.undo(job.spec, unit)

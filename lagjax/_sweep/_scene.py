@@ -3,7 +3,7 @@
 A worker in another shell gets the functions by cloudpickle: those of the user's script by value, those of modules by
 name, found along the same `sys.path`. Whether they still are what the store was begun with is told by their programs,
 as JAX traces them, with every constant: a change of a global number changes those, though not the text of a function.
-Of what JAX does not trace here, `keep` above all, `_identity` tells it: the code, and all that it uses.
+Of what JAX does not trace here, `keep` above all, `_reads.identity` tells it: the code, and all that it uses.
 """
 
 import difflib
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import accept
-from lagjax._sweep._identity import array_text, hash_of, identity, source, without_addresses
+from lagjax._reads import array_text, hash_of, identity, source, without_addresses
 from lagjax._sweep._sections import Sections
 from lagjax._sweep._statistics import Statistics
 from lagjax._system import System
@@ -103,7 +103,7 @@ def texts(motions: Motions, names: list[str]) -> dict[str, dict[str, str]]:
         function = getattr(motions.system, role)
         if function is not None:
             arguments = (q,) if role == "constraints" else (q, qdot)
-            found[role] = _entry(function.code, _traced(function, arguments, params), function.arrays)
+            found[role] = _entry(function.code.function, _traced(function, arguments, params), function.arrays)
     event = motions.settings.get("event")
     if event is not None:
         condition = getattr(event, "cond_fn", event)

@@ -102,7 +102,7 @@ def run_batch(
     solution, noted = _along(batch, sections)
     if len(ts) == 2 and not has_constraints(system):
         params = as_arrays(params, batch.member.layout.dtype)
-        run = _trajectory(batch.member, MachineCode(), _with_ends(solution, batch), params, axes[2])
+        run = _trajectory(batch.member, MachineCode(), _with_ends(solution, batch), batch.y0, params, axes[2])
     else:
         run = simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings)
         noted = _of_those_that_start(noted, np.asarray(run.result._value) != _INCONSISTENT)

@@ -37,6 +37,8 @@ class Status(NamedTuple):
     - `drift`: the largest change of the energy of a member that ended well, as (change, member, point); None where
       energy is not conserved, or none is known.
     - `slow`: functions that are called member by member because they are not written in jax.numpy, and why not.
+    - `damaged`: finished units whose chunks are not there, or not whole, in words by units. They do not count as done;
+      the sweep, run again, computes them again. Contents are not read: `Sweep.damaged` does that.
     - `cpus`: the kinds of CPU that computed units; members of several differ as by a change of rounding.
     """
 
@@ -53,6 +55,7 @@ class Status(NamedTuple):
     drift: tuple[float, int, dict[str, float]] | None
     slow: dict[str, str]
     cpus: tuple[str, ...] = ()
+    damaged: dict[int, str] = {}  # noqa: RUF012  (a field of a NamedTuple, and nobody writes to it)
 
     _repr_pretty_ = as_printed
 
@@ -73,6 +76,12 @@ class Status(NamedTuple):
             change, member, point = self.drift
             lines.append(f"energy     changes by at most {change:.1e}, of member {member}, at {text_of(point)}")
         lines += [f"slow       {name} is called member by member: {why}" for name, why in self.slow.items()]
+        for k, text in enumerate(list(self.damaged.values())[:_NAMED]):
+            lines.append(f"{'damaged' if not k else '':10} {text}")
+        if len(self.damaged) > _NAMED:
+            lines.append(f"{'':10} and {len(self.damaged) - _NAMED} units more")
+        if self.damaged:
+            lines.append(f"{'':10} Run the sweep again: it computes them again.")
         if len(self.cpus) > 1:
             lines.append(f"CPUs       {', '.join(self.cpus)}: their members may differ as by a change of rounding")
         return "\n".join(lines)
@@ -81,7 +90,9 @@ class Status(NamedTuple):
 def status(store: Store) -> Status:
     """How far a store has come."""
     spec = store.spec()
-    grid, done = store.grid(spec), sorted(store.done())
+    grid, finished = store.grid(spec), store.done()
+    damaged = store.damaged(spec, finished)
+    done = sorted(finished - set(damaged))
     records = [store.record(unit) for unit in done]
     results: dict[str, int] = {}
     for record in records:
@@ -98,7 +109,7 @@ def status(store: Store) -> Status:
         claimed=len(set(claimed(store)) - set(done)), rate=rate,
         left=None if rate is None else (grid.members - members) / rate, results=results, failures=failures,
         drift=None if worst is None else (worst[0], worst[1], point(store, spec, worst[1])), slow=slow,
-        cpus=tuple(dict.fromkeys(record["cpu"] for record in records if "cpu" in record)),
+        cpus=tuple(dict.fromkeys(record["cpu"] for record in records if "cpu" in record)), damaged=damaged,
     )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """`Store`: a folder that is a zarr group for readers, and the job for workers.
 
-    STORE/zarr.json, <name>/zarr.json, <name>/c/…    arrays, one chunk a unit, no compression: chunks are plain numbers
+    STORE/zarr.json, <name>/zarr.json, <name>/c/…    arrays, one chunk a unit: plain numbers and their checksum
     STORE/.sweep/spec.json, scene.pkl                what is swept
     STORE/.sweep/done/UNIT.json, UNIT.npz            a unit that is finished: counts, hashes, statistics
     STORE/.sweep/claims/, workers/, crashed/         who works on what; members that end their process
@@ -32,7 +32,9 @@ from lagjax._sweep import _designs
 from lagjax._sweep._designs import Design
 from lagjax._sweep._members import Axis, Grid
 
-FORMAT = 2
+FORMAT = 3
+_FORMATS = (2, 3)  # that can be gone on with; chunks of format 2 have no checksum
+_CHECKSUM = 4  # bytes of it, at the end of a chunk
 JOB = ".sweep"
 KNOWN = "known"  # the folder of members that were taken from another store
 _LEFT = 3600.0  # seconds after which a file that nobody has touched is of a dead worker; those who live beat
@@ -65,7 +67,7 @@ class Quantity:
         return np.iinfo(self.dtype).min if kind == "i" else np.iinfo(self.dtype).max
 
 
-RESULT = Quantity("result", (), np.dtype("int16"))
+RESULT, NOT_DONE = Quantity("result", (), np.dtype("int16")), -1
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ class Store:
             raise ValueError(
                 f"{file} cannot be read ({why}): the store is damaged. Its arrays are untouched."
             ) from None
-        if spec.get("format") != FORMAT:
+        if spec.get("format") not in _FORMATS:
             raise ValueError(
                 f"{self.path} is a store of format {spec.get('format')}, written by lagjax "
                 f"{spec.get('versions', {}).get('lagjax')}; this lagjax writes format {FORMAT}. xarray can read it as "
@@ -159,8 +161,9 @@ class Store:
             if q == RESULT:
                 about = {"flag_values": list(codes), "flag_meanings": " ".join(codes.values())}
             group.create_array(
-                q.name, shape=grid.shape + q.shape, chunks=grid.chunk + q.shape, dtype=q.dtype, compressors=None,
-                filters=None, fill_value=-1 if q == RESULT else q.nothing, dimension_names=dimensions + q.dimensions,
+                q.name, shape=grid.shape + q.shape, chunks=grid.chunk + q.shape, dtype=q.dtype,
+                compressors=zarr.codecs.Crc32cCodec(), filters=None,
+                fill_value=NOT_DONE if q == RESULT else q.nothing, dimension_names=dimensions + q.dimensions,
                 attributes=about,
             )  # fmt: skip
         with warnings.catch_warnings():
@@ -222,6 +225,7 @@ class Store:
         with self.explained(f"unit {unit} was not written"):
             for q in self.quantities(spec):
                 data = self._chunk(grid, unit, q, values[q.name])
+                data = _with_checksum(data) if spec["format"] >= 3 else data
                 hashes[q.name] = hashlib.sha256(data.data).hexdigest()
                 self.write(self.chunk_file(grid, unit, q.name, q.shape), data, f"{unit}-{q.name}")
             if statistics:
@@ -234,7 +238,7 @@ class Store:
         shape = grid.box_shape(unit)
         values = np.ascontiguousarray(values, q.dtype).reshape(shape + q.shape)
         if shape != grid.chunk:
-            whole = np.full(grid.chunk + q.shape, -1 if q == RESULT else q.nothing, q.dtype)
+            whole = np.full(grid.chunk + q.shape, NOT_DONE if q == RESULT else q.nothing, q.dtype)
             whole[tuple(map(slice, shape))] = values
             values = whole
         little = values.astype(values.dtype.newbyteorder("<"), copy=False)
@@ -244,13 +248,14 @@ class Store:
         """Where zarr looks for the chunk of a unit."""
         return self.path / name / "c" / "/".join(map(str, grid.place(unit) + (0,) * len(inner)))
 
-    def undo(self, unit: int) -> None:
-        """Make a unit one that is still to be done."""
+    def undo(self, spec: dict, unit: int) -> None:
+        """Make a unit one that is still to be done, for those who read `result` too."""
         (self.job / "done" / f"{unit}.json").unlink(missing_ok=True)
+        self.chunk_file(self.grid(spec), unit, RESULT.name, RESULT.shape).unlink(missing_ok=True)
 
     def damaged(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
         """What is wrong with finished units, in words: chunks that lack or have another size or, `whole`, hash."""
-        grid, found = self.grid(spec), {}
+        grid, found, tail = self.grid(spec), {}, _CHECKSUM if spec["format"] >= 3 else 0
         for unit in sorted(units):
             try:
                 hashes = self.record(unit)["sha256"]
@@ -259,7 +264,7 @@ class Store:
                 continue
             for q in self.quantities(spec):
                 file, size = self.chunk_file(grid, unit, q.name, q.shape), q.dtype.itemsize
-                size *= int(np.prod(grid.chunk + q.shape, dtype=np.int64))
+                size = tail + size * int(np.prod(grid.chunk + q.shape, dtype=np.int64))
                 there = file.stat().st_size if file.exists() else None
                 if there != size:
                     have = "is not there" if there is None else f"has {there} bytes"
@@ -326,6 +331,13 @@ class _Explained:
         ) from error
 
 
+def _with_checksum(data: np.ndarray) -> np.ndarray:
+    """The bytes of a chunk as the codec crc32c of zarr writes them: the checksum behind the numbers."""
+    import google_crc32c  # which zarr's codec takes it from
+
+    return np.append(data, np.frombuffer(google_crc32c.value(data.tobytes()).to_bytes(_CHECKSUM, "little"), np.uint8))
+
+
 def arrays_as_bytes(arrays: dict[str, np.ndarray]) -> bytes:
     """Arrays by name as one file."""
     file = io.BytesIO()
@@ -368,6 +380,7 @@ def require_zarr():
     """The package zarr. Raises `ImportError`, with a sentence, where it is not installed."""
     try:
         import zarr
+        import zarr.codecs
     except ImportError:
         raise ImportError('sweep() needs the package zarr, version 3: pip install "zarr>=3".') from None
     return zarr

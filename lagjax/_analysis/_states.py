@@ -1,0 +1,47 @@
+"""Random states about that of a scene, at which identities are tested that hold everywhere or nowhere."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._analysis._noether import State
+from lagjax._analysis._scene import Scene
+from lagjax._scales import Scales
+
+# How far states are drawn from that of the scene, in its scales: so that they do not come near an origin that is one
+# scale away, and terms of different powers differ by more than rounding. Halved or doubled, the same symmetries are
+# found in the ready scenes.
+_NEAR = 0.5
+# How much farther those of a piecewise scene are drawn: one piece may have what the next one has not.
+_FAR = 5.0
+# Every so manieth state is drawn as far off as it takes for the forces not to be linear.
+_THIRD = 3
+
+
+def random_states(scene: Scene, scales: Scales, count: int, seed: int, piecewise: bool) -> State:
+    """Random states about that of the scene, (count, …) each, on the constraints if there are any."""
+    size, random = scene.layout.size, np.random.default_rng(seed)
+    draws, t = random.uniform(-1, 1, (3, count, size)), random.uniform(-1, 1, count)
+    beyond = np.where(np.arange(count) % _THIRD, 1.0, scales.reach ** random.uniform(0, 1, count))[:, None]
+    q = np.asarray(scene.q) + (_FAR if piecewise else 1.0) * _NEAR * beyond * scales.q * draws[0]
+    qdot, t = np.asarray(scene.qdot) + _NEAR * scales.qdot * draws[1], scales.t * t
+    if scene.constrained:
+        q, qdot = _projected(q, qdot, t, scene.system, scene.layout, scene.params)
+    dtype = scene.layout.dtype
+    return State(*(jnp.asarray(x, dtype) for x in (q, qdot, scales.qdot / scales.t * draws[2], t)))
+
+
+@eqx.filter_jit
+def _projected(q, qdot, t, system, layout, params):
+    motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
+    return jax.vmap(lambda *y: motion.nearest_consistent(*y, numbers))(q, qdot, t)
+
+
+def moved_by_rounding(states: State) -> State:
+    """The same states but for a few units in the last place, other ones in every number."""
+    random = np.random.default_rng(0)
+    return State(*(x * (1 + _LAST * np.finfo(float).eps * random.choice([-1.0, 1.0], x.shape)) for x in states))
+
+
+_LAST = 4  # units in the last place, which change what rounding leaves and nothing else

@@ -1,0 +1,163 @@
+"""Whether a motion of diffrax crosses a jump of its acceleration, where derivatives over its steps are wrong.
+
+A border u(y, t, p) = 0 at which the acceleration jumps from a⁻ to a⁺ adds (a⁻ − a⁺) δt to a tangent of the velocities,
+with δt = −δu / u̇ (`_program._saltation`). Steps of diffrax go across it and lack that: the derivative is not
+inaccurate but another one. Where only the slope of the acceleration changes nothing is added to first derivatives, and
+those over steps are right to their tolerance; nor where u depends on the time alone, for then δu = 0.
+
+So every step that was taken is searched for a jump: on the straight line between its ends the half with the larger
+change of the acceleration is halved again and again. What is smooth, or has a kink, changes by less and less. Beside a
+jump that is found, the state or the parameters are moved a little, to see whether it moves with them.
+"""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+from lagjax._program import OPERATIONS
+
+# On double numbers a bracket is 1e-9 of a step after 30 halvings, and 1e-6 of the largest acceleration is a jump: what
+# is smooth would have to change a thousandfold within the step. On single numbers 14 halvings leave 6e-5 of a step.
+_HALVINGS = {np.dtype("float64"): 30, np.dtype("float32"): 14}
+_JUMPS = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-2}
+# How far a state or parameters are moved, of themselves: much more than a bracket, much less than what matters.
+_MOVED = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
+_DRAWS = 2  # directions in which they are moved; along one the border may lie
+_DECIDING = frozenset((
+    *(name for name, row in OPERATIONS.items() if row.side is not None), "argmax", "argmin", "clamp", "reduce_max",
+    "reduce_min", "scan", "while", "cond", "sort", "lagjax_locate",
+))  # fmt: skip
+
+
+def may_jump(field, *arguments) -> bool:
+    """Whether a function has operations in it that decide on something."""
+    return _decides(jax.make_jaxpr(lambda *xs: field(*xs))(*arguments).jaxpr)
+
+
+def _decides(jaxpr) -> bool:
+    for equation in jaxpr.eqns:
+        if equation.primitive.name in _DECIDING:
+            return True
+        for parameter in jax.tree.leaves(equation.params, is_leaf=_is_jaxpr):
+            if _is_jaxpr(parameter) and _decides(getattr(parameter, "jaxpr", parameter)):
+                return True
+    return False
+
+
+def _is_jaxpr(x) -> bool:
+    return isinstance(x, (core.Jaxpr, core.ClosedJaxpr))
+
+
+def crosses(field, varied, begin, end, params) -> jax.Array:
+    """Whether the step between two pairs (t, y) crosses a jump of the field that moves with the state or `varied`.
+
+    `field(t, y, params)` is ẏ (2n,) of y = (q, q̇); `varied` a pair like (field, params), of Booleans.
+    """
+    (t0, y0), (t1, y1), dtype = begin, end, begin[1].dtype
+    n = y0.size // 2
+
+    def at(s, moved: Any = 0.0):
+        return field(t0 + s * (t1 - t0), y0 + s * (y1 - y0) + moved, params)[n:]
+
+    def halve(_, bracket):
+        low, high, of_low, of_high = bracket
+        middle = 0.5 * (low + high)
+        of_middle = at(middle)
+        first = jnp.abs(of_middle - of_low).max() >= jnp.abs(of_high - of_middle).max()
+        earlier, later = (low, middle, of_low, of_middle), (middle, high, of_middle, of_high)
+        return jax.tree.map(lambda a, b: jnp.where(first, a, b), earlier, later)
+
+    ends = jnp.zeros((), dtype), jnp.ones((), dtype)
+    whole = (*ends, at(ends[0]), at(ends[1]))
+    low, _, of_low, of_high = jax.lax.fori_loop(0, _HALVINGS[dtype], halve, whole)
+    change = jnp.abs(of_high - of_low).max()
+    jumps = change > _JUMPS[dtype] * jnp.maximum(jnp.abs(whole[2]), jnp.abs(whole[3])).max()
+    size = _MOVED[dtype] * (jnp.abs(y0) + jnp.abs(y1 - y0) + 1e-3 * jnp.abs(y0).max())
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, y0.size))
+    beside = [
+        at(low, s * size) for signs_of in signs for s in (jnp.asarray(signs_of, dtype), -jnp.asarray(signs_of, dtype))
+    ]
+    t, y = t0 + low * (t1 - t0), y0 + low * (y1 - y0)
+    for s in (1, -1):
+        other, numbers = _moved((field, params), varied, s * _MOVED[dtype])
+        beside.append(other(t, y, numbers)[n:])
+    return jumps & (jnp.abs(jnp.stack(beside) - of_low).max(axis=1) > 0.5 * change).any()
+
+
+def _moved(tree, varied, by: float):
+    """The tree with the floats of its varied leaves a little larger or smaller, by different amounts."""
+    draws = np.random.default_rng(1)
+
+    def move(leaf, moves):
+        if not (moves and eqx.is_inexact_array(leaf)):
+            return leaf
+        factors = draws.choice([-1.0, 1.0], np.shape(leaf)) * draws.uniform(0.5, 1.0, np.shape(leaf))
+        return leaf * (1 + by * jnp.asarray(factors, leaf.dtype))
+
+    return jax.tree.map(move, tree, varied)
+
+
+class AdaptiveWrapper(diffrax.AbstractAdaptiveStepSizeController):
+    """A controller of adaptive steps around another one, whose tolerances it has."""
+
+    controller: eqx.AbstractVar[Any]
+
+    @property
+    def rtol(self):
+        return self.controller.rtol
+
+    @property
+    def atol(self):
+        return self.controller.atol
+
+    @property
+    def norm(self):
+        return self.controller.norm
+
+
+class Noting(diffrax.AbstractStepSizeController):
+    """The steps of a controller; its state stands beside a flag, whether a step that was accepted crossed a jump."""
+
+    controller: Any
+    field: Any
+    varied: Any
+    direction: Any = 1
+
+    def wrap(self, direction):
+        """diffrax integrates backward motion with its time reversed."""
+        return type(self)(self.controller.wrap(direction), self.field, self.varied, direction)
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The end of the first step, and the state."""
+        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return end, (state, jnp.array(False))
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        """What the controller says of a step; and whether that went across a jump."""
+        state, crossed = controller_state
+        keep, *more, state, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, state
+        )
+        fixed = jax.tree.map(
+            lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x,
+            (self.field, (t0 * self.direction, y0), (t1 * self.direction, y1_candidate), args),
+        )
+        field, begin, end, params = fixed
+        here = keep & crosses(field, self.varied, begin, end, params)
+        return keep, *more, (state, crossed | here), result
+
+
+class NotingAdaptive(Noting, AdaptiveWrapper):
+    """`Noting` of a controller whose steps adapt."""
+
+
+def noting(controller, field, varied) -> Noting:
+    """The same steps, with a note whether one of them crosses a jump of the field; see `crosses`."""
+    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    kind: Any = NotingAdaptive if adaptive else Noting
+    return kind(controller, field, varied)

@@ -1,0 +1,100 @@
+"""Functions of one number that are series: log Γ, its derivative, and the modified Bessel functions I₀ and I₁.
+
+log Γ obeys no differential equation from which a Taylor series would follow, and the others would need the powers of
+their argument anyway. So all are written out in operations that are there already, to rounding:
+
+    log Γ(x), x > 0    Stirling's series at y = x + 10, less log x(x + 1) … (x + 9)
+    Iₙ(x)              the power series up to |x| = 25, whose terms have one sign, and the asymptotic series beyond
+
+Abramowitz & Stegun, *Handbook of Mathematical Functions* (1964), 6.1.40, 6.1.17, 6.3.7, 9.6.10 and 9.7.1.
+"""
+
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from lagjax._program import _scalars as xp
+from lagjax._program._rules import lowers
+from lagjax._program._scalars import Scalars
+
+# Steps by which log Γ is shifted, and Bernoulli's numbers B₂ₖ: at y = 10 the next term of the series is 2e-18. With
+# twice the shift four of them would do, and the product would be twice as long.
+_SHIFT = 10
+_BERNOULLI = [Fraction(1, 6), Fraction(-1, 30), Fraction(1, 42), Fraction(-1, 30), Fraction(5, 66),
+              Fraction(-691, 2730), Fraction(7, 6), Fraction(-3617, 510)]  # fmt: skip
+# Where Bessel's series change over, and their terms: those left out are below 1e-17 of the sum there. Further out the
+# power series would need more terms, further in the asymptotic one would never be as exact.
+_CHANGE, _POWERS, _ASYMPTOTIC = 25.0, 50, 26
+
+
+def _polynomial(coefficients: Sequence[float], x: Any) -> Any:
+    """Σ cₖ xᵏ, by Horner's rule."""
+    total = x * 0.0 + coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        total = total * x + c
+    return total
+
+
+def _reflected(x: Scalars) -> tuple[Any, Any, Any]:
+    """Whether x is negative, what is positive of x and 1 − x, and x where it is negative, else ½."""
+    negative = x.map("lt", x, 0.0)
+    return negative, xp.where(negative, 1.0 - x, x), xp.where(negative, x, 0.5)
+
+
+def log_gamma(x: Scalars) -> Any:
+    """log |Γ(x)|, to 1e-14 of its largest term; for x < 0 by Γ(x) Γ(1 − x) = π / sin πx."""
+    negative, z, reflected = _reflected(x)
+    y = z + float(_SHIFT)
+    inverse = 1.0 / y
+    series = _polynomial([float(b / (2 * k * (2 * k - 1))) for k, b in enumerate(_BERNOULLI, 1)], inverse * inverse)
+    product = z * inverse  # of (z + i) / y, which cannot overflow
+    for i in range(1, _SHIFT):
+        product = product * ((z + float(i)) * inverse)
+    value = (z - 0.5) * xp.logarithm(y) - y + 0.5 * math.log(2 * math.pi) + series * inverse - xp.logarithm(product)
+    sine = reflected.map("sin", math.pi * reflected)
+    return xp.where(negative, math.log(math.pi) - 0.5 * xp.logarithm(sine * sine) - value, value)
+
+
+def digamma(x: Scalars) -> Any:
+    """ψ(x) = d/dx log Γ(x); for x < 0 ψ(1 − x) − π cot πx."""
+    negative, z, reflected = _reflected(x)
+    y = z + float(_SHIFT)
+    inverse = 1.0 / y
+    square = inverse * inverse
+    series = _polynomial([float(b / (2 * k)) for k, b in enumerate(_BERNOULLI, 1)], square)
+    value = xp.logarithm(y) - 0.5 * inverse - series * square
+    for i in range(_SHIFT):
+        value = value - 1.0 / (z + float(i))
+    tangent = reflected.map("tan", math.pi * reflected)
+    return xp.where(negative, value - math.pi / tangent, value)
+
+
+def scaled_bessel(order: int, x: Scalars) -> Any:
+    """e^(−|x|) Iₙ(x) for n = 0 or 1."""
+    size = xp.absolute(x)
+    is_small = x.map("lt", size, _CHANGE)
+    near, far = xp.where(is_small, x, 0.0), xp.where(is_small, _CHANGE, size)
+    powers = [1.0 / (math.factorial(k) * math.factorial(k + order)) for k in range(_POWERS)]
+    small = _polynomial(powers, 0.25 * near * near) * xp.exponential(-xp.absolute(near))
+    asymptotic = [1.0]
+    for k in range(1, _ASYMPTOTIC):
+        asymptotic.append(-asymptotic[-1] * (4 * order**2 - (2 * k - 1) ** 2) / (8 * k))
+    large = _polynomial(asymptotic, 1.0 / far) / xp.root(2 * math.pi * far)
+    if order:
+        small, large = 0.5 * near * small, x.map("sign", x) * large
+    return xp.where(is_small, small, large)
+
+
+def _register(name: str, formula) -> None:
+    @lowers(name)
+    def rule(expansion, params, x: np.ndarray) -> np.ndarray:
+        return formula(Scalars(expansion, x)).ids
+
+
+_register("lgamma", log_gamma)
+_register("digamma", digamma)
+_register("bessel_i0e", lambda x: scaled_bessel(0, x))
+_register("bessel_i1e", lambda x: scaled_bessel(1, x))

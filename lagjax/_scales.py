@@ -1,0 +1,91 @@
+"""How large the coordinates, the velocities and the time of a scene are at a state: what "small" is measured by there.
+
+A number of a state has the units of its author, who may write a molecule in metres and a planet in seconds. So no
+number is small by itself, and nothing here compares one with 1. What coordinates of different units have in common is
+the kinetic energy, ½ Mᵢᵢ q̇ᵢ² of each: with |x| = maxᵢ √|Mᵢᵢ| |xᵢ| a length l in that metric is l/√|Mᵢᵢ| of coordinate
+i, a radian for an angle φ beside a radius r, whose Mᵢᵢ is m r². The forces do the rest, by how they vary along a line
+through the state, F(q + εu) with |u| = 1:
+
+    l    the larger of |q| and |q̇|/√(∂F/∂ε), but the latter no larger than r, the smallest ε at which F is not linear
+         any more; where both are zero r, else |F|/(∂F/∂ε)
+    ω    the largest of |q̇|/l, of √(∂F/∂ε), and of ∂F/∂q̇; else √(|F|/l)
+    qᵢ ~ max(|qᵢ|, l/√|Mᵢᵢ|),   q̇ᵢ ~ max(|q̇ᵢ|, ω l/√|Mᵢᵢ|),   t ~ 1/ω
+
+F is measured as |F| = maxᵢ |Fᵢ|/√|Mᵢᵢ|. A scene that has none of these has no size, and any is as good: it is 1. Other
+units of any coordinate, of time and of mass change all of it as they change the state. Of the alternatives, an array of
+the user as a unit of its own would take r and φ of one array as alike; exact dimensions would have to be declared.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+Numbers = Float[np.ndarray, " n"]
+States = Float[np.ndarray, "S n"]
+
+# Where along the line the forces are looked at, in parts of l: steps by two, which is how well a reach is known. Where
+# l is not known these are all sizes a double can have, but for those whose squares it has not.
+_STEPS, _ALL_STEPS = 2.0 ** np.arange(-10.0, 41.0), 2.0 ** np.arange(-400.0, 401.0, 2.0)
+# F is not linear where it is off by this part of its change; a change that rounding may have made does not count.
+_BENT, _SEEN = 0.25, 1e-6
+
+
+class Scales(NamedTuple):
+    """The sizes of the coordinates `q` (n,), of the velocities `qdot` (n,) and of the time `t` at a state.
+
+    `reach` tells by how many times those of q a state may be moved until the forces are not linear, 1 at least.
+    """
+
+    q: Numbers
+    qdot: Numbers
+    t: float
+    reach: float = 1.0
+
+    @classmethod
+    def of(cls, force: Callable[[States, States], States], mass: Numbers, q: Numbers, qdot: Numbers) -> "Scales":
+        """Those at (q, qdot) of a scene with the forces `force(q, qdot)` there and the diagonal `mass` of M, (n,)."""
+        with np.errstate(all="ignore"):
+            return _measured(force, np.sqrt(np.abs(mass)), np.asarray(q, float), np.asarray(qdot, float))
+
+
+def _measured(force, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
+    heaviest = root.max(where=np.isfinite(root), initial=0.0) or 1.0
+    root = np.where((root > 0) & np.isfinite(root), root, heaviest)
+    along = np.cos(np.arange(1.0, len(q) + 1)) / root  # no symmetry moves all coordinates like this
+    along = along / np.abs(along * root).max()
+
+    def forces(steps, of_q, of_v):
+        steps = np.asarray(steps)[:, None]
+        moved = force(q + steps * of_q, qdot + steps * of_v)
+        return np.max(np.abs(moved) / root, axis=1), moved / root
+
+    far, fast = np.abs(q * root).max(), np.abs(qdot * root).max()
+    steps = far * _STEPS if far > 0 else _ALL_STEPS
+    slope, bent = _line(lambda s: forces(s, along, 0.0)[1], steps)
+    here = float(np.nan_to_num(forces([0.0], along, 0.0)[0][0]))
+    swing = fast / np.sqrt(slope) if slope > 0 else 0.0
+    length = max(far, min(swing, bent or np.inf)) or bent or (here / slope if slope > 0 else 0.0) or heaviest
+    rate = max(fast / length, np.sqrt(slope))
+    step = (rate or 1.0) * length
+    low, high = forces([-step, step], 0.0, along)[1]
+    rate = max(rate, float(np.nan_to_num(np.abs(high - low).max() / (2 * step)))) or np.sqrt(here / length) or 1.0
+    reach = max(1.0, (bent or 0.0) / length)
+    return Scales(np.maximum(np.abs(q), length / root), np.maximum(np.abs(qdot), rate * length / root), 1 / rate, reach)
+
+
+def _line(force: Callable, steps: np.ndarray) -> tuple[float, float]:
+    """∂F/∂ε along a line, and the smallest step at which F is not linear; 0 where there is none."""
+    ahead, back, here = force(steps), force(-steps), force(np.zeros(1))
+    odd, even = (ahead - back) / 2, (ahead + back) / 2 - here
+    change, size = np.abs(odd).max(axis=1), np.maximum(np.abs(ahead), np.abs(back)).max(axis=1)
+    doubled = np.abs(odd[1:] - steps[1:, None] / steps[:-1, None] * odd[:-1]).max(axis=1)
+    off = np.maximum(np.abs(even).max(axis=1), np.append(doubled, 0.0))
+    seen = (np.maximum(change, np.abs(even).max(axis=1)) > _SEEN * size) & np.isfinite(off)
+    linear = seen & (off <= _BENT * change) & (change > 0)
+    if not linear.any():  # a jump or a power, which are the same at all scales
+        return 0.0, 0.0
+    first = int(np.argmax(linear))
+    bent = steps[first:][(seen & ~linear)[first:]]
+    return float(change[first] / steps[first]), float(bent[0]) if len(bent) else 0.0

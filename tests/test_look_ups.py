@@ -1,0 +1,190 @@
+"""Look-ups of the state in tables that are parameters, knots and values: exact motions, with derivatives by both."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+RNG = np.random.default_rng(5)
+MACHINE = lagjax.MachineCode()
+END = jnp.array([0.0, 1.2])
+KNOTS = np.array([-1.0, -0.63, -0.34, 0.07, 0.41, 0.72, 1.13, 1.5])
+VALUES = np.array([0.5, -0.3, 0.4, 0.1, 0.6, 0.2, 0.7, 0.3])
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def valley(q, qdot, params):
+    return 0.5 * qdot**2 - jnp.interp(q, params["x"], params["u"])
+
+
+def end_of(scene, params, **options):
+    return lagjax.simulate(scene, -0.9, 1.6, END, params, **options).q[-1]
+
+
+def exact_end(params):
+    """The same in closed form, of a motion to the right: between two knots the acceleration is constant."""
+    x, u = params["x"], params["u"]
+    k = jnp.searchsorted(x, -0.9, side="right") - 1
+    slopes = (u[1:] - u[:-1]) / (x[1:] - x[:-1])
+    energy = 0.5 * 1.6**2 + u[k] + slopes[k] * (-0.9 - x[k])
+
+    def over(state, piece):
+        q, v, left = state
+        i, knot, potential, slope = piece
+        ahead = jnp.sqrt(2 * (energy - potential))
+        time = 2 * (knot - q) / (v + ahead)
+        ends = (i >= k) & (left > 0) & (time >= left)
+        passes = (i >= k) & (left > 0) & (time < left)
+        stop = q + v * left - 0.5 * slope * left**2
+        q = jnp.where(passes, knot, jnp.where(ends, stop, q))
+        return (q, jnp.where(passes, ahead, v), jnp.where(passes, left - time, jnp.where(ends, 0.0, left))), None
+
+    start = jnp.array(-0.9), jnp.array(1.6), END[-1]
+    return jax.lax.scan(over, start, (jnp.arange(len(slopes)), x[1:], u[1:], slopes))[0][0]
+
+
+def table(count):
+    """Knots and values, so many of them on the same stretch."""
+    if count == len(KNOTS):
+        return {"x": jnp.asarray(KNOTS), "u": jnp.asarray(VALUES)}
+    x = np.interp(np.linspace(0, 1, count) + 0.3 / count * RNG.uniform(-1, 1, count), [0, 1], [-1.0, 1.5])
+    return {"x": jnp.asarray(x), "u": jnp.asarray(0.3 * np.sin(4 * x) + 0.01 * RNG.normal(size=count))}
+
+
+@pytest.mark.parametrize("count", [8, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_potential_by_a_table_of_parameters(count):
+    # The local error is rtol = 1e-9 a step or below rounding of one, here of constant accelerations; over a thousand
+    # borders the slopes by entries, of pieces a thousandth long, lose three digits of sixteen.
+    scene, params = lagjax.System(valley), table(count)
+    np.testing.assert_allclose(end_of(scene, params, solver=MACHINE), exact_end(params), atol=1e-11)
+    slopes, closed = jax.grad(lambda p: end_of(scene, p))(params), jax.grad(exact_end)(params)
+    for name in "xu":
+        assert np.abs(closed[name]).max() > 0.1 / count
+        np.testing.assert_allclose(slopes[name], closed[name], atol=1e-10)
+    along = {name: jnp.cos(jnp.arange(count)) for name in "xu"}
+    forward = jax.jvp(lambda p: end_of(scene, p), (params,), (along,))[1]
+    np.testing.assert_allclose(forward, sum(jnp.vdot(closed[name], along[name]) for name in "xu"), atol=1e-9)
+
+
+def test_members_with_tables_of_their_own():
+    scene, base = lagjax.System(valley), table(8)
+    params = {
+        "x": jnp.stack([base["x"], base["x"] + 0.05, 1.02 * base["x"]]),
+        "u": base["u"] * jnp.array([[1], [0.9], [1.1]]),
+    }
+    members = [jax.tree.map(lambda leaf, i=i: leaf[i], params) for i in range(3)]
+    found = jax.jit(jax.vmap(jax.value_and_grad(lambda p: end_of(scene, p))))(params)
+    for i, member in enumerate(members):
+        np.testing.assert_allclose(found[0][i], exact_end(member), atol=1e-11)
+        np.testing.assert_allclose(found[1]["x"][i], jax.grad(exact_end)(member)["x"], atol=1e-10)
+
+
+def test_knots_that_do_not_increase_are_said():
+    scene, params = lagjax.System(valley), table(8)
+    with pytest.raises(ValueError, match=r"0\.34 comes after .* 0\.41.*Sort them"):
+        end_of(scene, params | {"x": params["x"].at[5].set(0.34)})
+    with pytest.raises(ValueError, match=r"params\['x'\]\[5\] is nan"):
+        end_of(scene, params | {"x": params["x"].at[5].set(jnp.nan)})
+    run = jax.jit(lambda x: end_of(scene, params | {"x": x}, throw=False))
+    assert np.isnan(run(params["x"].at[5].set(0.34))) and np.isfinite(run(params["x"]))
+    with pytest.raises(lagjax.SimulationError, match="knots of a look-up that do not increase"):
+        jax.vmap(lambda x: end_of(scene, params | {"x": x}))(params["x"].at[5].set(0.34)[None])
+
+
+@pytest.mark.slow
+def test_second_derivatives_by_knots_of_a_force():
+    """The force is continuous at its knots: second derivatives exist, and are those of differences."""
+    force = lambda q, qdot, params: -2 * q - jnp.interp(q, params["x"], params["u"])
+    scene, params = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=force), table(8)
+    slope = jax.grad(lambda p: end_of(scene, p, solver=MACHINE))
+    along = {"x": jnp.cos(jnp.arange(8.0)), "u": jnp.sin(jnp.arange(8.0))}
+    curved = jax.jvp(slope, (params,), (along,))[1]
+    ahead, behind = (slope(jax.tree.map(lambda p, d, s=s: p + s * d, params, along)) for s in (1e-6, -1e-6))
+    for name in "xu":  # differences of slopes that are right to 1e-13: half of them from rounding
+        np.testing.assert_allclose(curved[name], (ahead[name] - behind[name]) / 2e-6, atol=2e-6)
+
+
+STEEP = np.array([0.5, -0.3, 0.0, 1.0, 0.6, 0.2, 0.7, 0.3])
+# The knots and the values that a scene computes of its parameters.
+COMPUTED = {
+    "values times a number": lambda p: (p["x"], p["a"] * p["u"]),
+    "a known table times a number": lambda p: (p["x"], p["a"] * STEEP - p["u"][0]),
+    "a function of every value": lambda p: (p["x"], jnp.exp(p["a"] * STEEP) * p["u"][1]),
+    "a cumulative sum of values": lambda p: (p["x"], jnp.cumsum(p["u"])),
+    "knots times a number": lambda p: (p["a"] * p["x"] + 0.3, p["u"]),
+    "a cumulative sum of knots": lambda p: (jnp.cumsum(0.3 + 0.1 * jnp.abs(p["u"])) - 1.3, p["u"]),
+    "joined": lambda p: (jnp.concatenate([p["x"], p["a"][None] + 2]), jnp.concatenate([p["u"], p["a"][None]])),
+    "in reverse": lambda p: (-p["x"][::-1] - 0.1, p["u"][::-1]),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [name if i in (1, 5) else pytest.param(name, marks=pytest.mark.slow) for i, name in enumerate(COMPUTED)]
+)
+def test_tables_that_are_computed(name):
+    """Knots and values that L computes give the motion, and the slopes, of those that are parameters themselves."""
+    tables = COMPUTED[name]
+
+    def computed(q, qdot, params):
+        return 0.5 * qdot**2 - jnp.interp(q, *tables(params))
+
+    scene, direct, params = lagjax.System(computed), lagjax.System(valley), table(8) | {"a": jnp.array(0.8)}
+    given = lambda p: end_of(direct, dict(zip("xu", tables(p), strict=True)))
+    np.testing.assert_allclose(end_of(scene, params, solver=MACHINE), given(params), atol=1e-10)
+    slopes, chained = jax.grad(lambda p: end_of(scene, p))(params), jax.grad(given)(params)
+    for of in params:
+        np.testing.assert_allclose(slopes[of], chained[of], atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("right", [False, True])
+def test_a_step_by_digitize(right):
+    """A force that is another one between any two edges, to the right; the closed form is that of the potential."""
+    force = lambda q, qdot, params: -params["f"][jnp.digitize(q, params["x"], right=right) - 1]
+    scene, params = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=force), table(8)
+    slopes = (params["u"][1:] - params["u"][:-1]) / (params["x"][1:] - params["x"][:-1])
+
+    def closed(f, x):
+        return exact_end({"x": x, "u": jnp.append(0.0, jnp.cumsum(f * (x[1:] - x[:-1])))})
+
+    def end(f, x):
+        return end_of(scene, {"f": f, "x": x}, solver=MACHINE)
+
+    for k in range(2):
+        found, known = (jax.value_and_grad(g, k)(slopes, params["x"]) for g in (end, closed))
+        np.testing.assert_allclose(found[0], known[0], atol=1e-11)
+        np.testing.assert_allclose(found[1], known[1], atol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_field_on_a_grid():
+    """Bilinear between knots of two axes; axes and heights that are not separable, by differences."""
+
+    def height(x, y, g, a, b):
+        i, j = (jnp.clip(jnp.searchsorted(k, z, side="right") - 1, 0, len(k) - 2) for k, z in ((x, a), (y, b)))
+        s, t = (a - x[i]) / (x[i + 1] - x[i]), (b - y[j]) / (y[j + 1] - y[j])
+        low, high = (1 - t) * g[i, j] + t * g[i, j + 1], (1 - t) * g[i + 1, j] + t * g[i + 1, j + 1]
+        return (1 - s) * low + s * high
+
+    def force(q, qdot, params):
+        return -q - jnp.stack([height(params["x"], params["y"], g, *q) for g in (params["g"], params["g"].T)])
+
+    scene = lagjax.System(lambda q, qdot: 0.5 * jnp.sum(qdot**2), forces=force)
+    params = {"x": jnp.asarray(KNOTS), "y": jnp.asarray(KNOTS + 0.03), "g": jnp.outer(VALUES, VALUES**2)}
+
+    def end(p):
+        ts = jnp.array([0.0, 2.0])
+        return lagjax.simulate(scene, jnp.array([-0.3, 0.2]), jnp.array([0.8, 0.5]), ts, p, solver=MACHINE).q[-1, 0]
+
+    slopes = jax.grad(end)(params)
+    for name in params:
+        along = jnp.asarray(RNG.normal(size=params[name].shape))
+        ahead, behind = (end(params | {name: params[name] + s * along}) for s in (1e-5, -1e-5))
+        np.testing.assert_allclose(jnp.vdot(slopes[name], along), (ahead - behind) / 2e-5, atol=1e-8)

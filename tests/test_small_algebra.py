@@ -1,0 +1,284 @@
+"""Lagrangians with small matrices and complex numbers: closed forms, and the same scene written with real numbers."""
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+import mpmath
+import numpy as np
+import pytest
+import scipy.linalg
+from jax import lax
+
+import lagjax
+from lagjax._program import OPERATIONS, in_jax, lower
+from lagjax._program._matrices import determinant, solution
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def in_machine_code(system, q, v, params=None):
+    return system.explain(q, v, params=params).solver.startswith("Taylor series in machine code")
+
+
+# ---- matrices -------------------------------------------------------------------------------------------------------
+
+
+def symmetric(x):
+    return x[jnp.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
+
+
+def by_inverse(q, v):
+    rate = jnp.linalg.inv(symmetric(q)) @ symmetric(v)
+    return 0.5 * jnp.trace(rate @ rate)
+
+
+def by_cholesky(q, v):
+    rate = jsl.cho_solve(jsl.cho_factor(symmetric(q)), symmetric(v))
+    return 0.5 * jnp.trace(rate @ rate)
+
+
+Q, V = jnp.array([1.0, 1.5, 2.0, 0.1, 0.2, 0.3]), jnp.array([0.3, -0.2, 0.1, 0.4, -0.1, 0.2])
+TS = jnp.array([0.0, 0.5, 1.0])
+
+
+def geodesic(scale):
+    """g(1) = g exp(g⁻¹ ġ) from g = `symmetric(Q)`, with ġ = scale `symmetric(V)`."""
+    g, rate = symmetric(Q), scale * symmetric(V)
+    return (g @ jsl.expm(jnp.linalg.solve(g, rate)))[jnp.array([0, 1, 2, 0, 0, 1]), jnp.array([0, 1, 2, 1, 2, 2])]
+
+
+@pytest.mark.parametrize("lagrangian", [by_inverse, pytest.param(by_cholesky, marks=pytest.mark.slow)])
+def test_geodesics_of_positive_matrices(lagrangian):
+    system = lagjax.System(lagrangian)
+    assert in_machine_code(system, Q, V)
+    end = lambda scale: lagjax.simulate(system, Q, scale * V, TS, rtol=1e-12).q[-1]
+    np.testing.assert_allclose(end(1.0), geodesic(1.0), rtol=1e-11)
+    batch = lagjax.simulate_batch(system, jnp.stack([Q, Q]), jnp.stack([V, -0.5 * V]), TS, rtol=1e-12)
+    np.testing.assert_allclose(batch.q[:, -1], [geodesic(1.0), geodesic(-0.5)], rtol=1e-11)
+
+
+@pytest.mark.slow
+def test_derivatives_of_geodesics():
+    system = lagjax.System(by_inverse)
+    end = lambda scale: lagjax.simulate(system, Q, scale * V, TS, rtol=1e-12).q[-1]
+    np.testing.assert_allclose(jax.jacfwd(end)(1.0), jax.jacfwd(geodesic)(1.0), rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(jax.jacrev(end)(1.0), jax.jacfwd(geodesic)(1.0), rtol=1e-9, atol=1e-10)
+    second = jax.jacfwd(jax.jacfwd(end))(1.0)
+    np.testing.assert_allclose(second, jax.jacfwd(jax.jacfwd(geodesic))(1.0), rtol=1e-7, atol=1e-8)
+
+
+def matrix_with_vanishing_minors(x):
+    """Regular for all x (its determinant is −0.85 − x²); its first entry vanishes at x = 0."""
+    return jnp.array([[x, 1.0, 0.0], [1.0, -x, 0.5], [0.3, 0.0, 1.0]])
+
+
+def test_a_motion_through_vanishing_minors():
+    # The same potential by an adjugate, written out: no pivot, no border, the same steps.
+    b = jnp.array([1.0, -0.5, 0.3])
+
+    def by_solve(q, v):
+        return 0.5 * v**2 - b @ jnp.linalg.solve(matrix_with_vanishing_minors(q), b) - 0.2 * q**2
+
+    def by_adjugate(q, v):
+        first, second, third = matrix_with_vanishing_minors(q)
+        inverse = jnp.stack([jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)], 1)
+        return 0.5 * v**2 - b @ inverse @ b / (first @ jnp.cross(second, third)) - 0.2 * q**2
+
+    ts = jnp.linspace(0.0, 12.0, 13)
+    one, other = (lagjax.simulate(lagjax.System(of), -1.0, 1.5, ts, rtol=1e-12) for of in (by_solve, by_adjugate))
+    assert one.q.min() < 0 < one.q.max()
+    np.testing.assert_allclose(one.q, other.q, rtol=1e-9, atol=1e-9)
+    assert abs(int(one.stats["num_steps"]) - int(other.stats["num_steps"])) <= 3
+    assert lagjax.System(by_solve).explain(-1.0, 1.5).borders == ()
+
+
+@pytest.mark.parametrize("matrix", [
+    [[0.0, 1.0], [1.0, 0.0]], [[0.0, 1.0, 2.0], [1.0, 0.0, 3.0], [2.0, 3.0, 0.0]],
+    [[1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]],
+    np.fliplr(np.diag(np.arange(1.0, 9.0))), np.diag([1e-9, 2.0, 3e5, 1.0]), np.eye(5)[[1, 2, 0, 4, 3]] * 3,
+])  # fmt: skip
+def test_regular_matrices_without_pivots(matrix):
+    matrix = np.array(matrix)
+    program = lower(jnp.linalg.inv, matrix)
+    found = np.reshape(program.evaluate(*matrix.ravel()), matrix.shape)
+    np.testing.assert_allclose(found, np.linalg.inv(matrix), rtol=1e-13, atol=1e-15 * np.abs(found).max())
+    found = lower(jnp.linalg.slogdet, matrix).evaluate(*matrix.ravel())
+    np.testing.assert_allclose(found, np.linalg.slogdet(matrix), rtol=1e-13, atol=1e-14)
+
+
+def exact_solution(a, b):
+    with mpmath.workdps(60):
+        return np.array([float(x) for x in mpmath.lu_solve(mpmath.matrix(a.tolist()), mpmath.matrix(b.tolist()))])
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 8])
+@pytest.mark.parametrize("condition", [1e3, 1e8, 1e13])
+def test_digits_lost_are_those_of_the_condition(n, condition):
+    # One direction much longer than all others is where Cramer's rule would lose the square of the condition.
+    rng = np.random.default_rng(n)
+    u, v = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
+    b, scale = rng.normal(size=n), np.where(np.arange(n) == 0, 1.0, 1 / condition)
+    for a in ((u * scale) @ v.T, (u * np.geomspace(1, 1 / condition, n)) @ v.T):
+        found = np.array(lower(jnp.linalg.solve, a, b).evaluate(*a.ravel(), *b))
+        error = np.abs(found - exact_solution(a, b)).max() / np.abs(found).max()
+        assert error < 10 * n * condition * np.finfo(float).eps
+        (determinant,) = lower(jnp.linalg.det, a).evaluate(*a.ravel())
+        if n != 3:  # which JAX itself expands
+            with mpmath.workdps(60):
+                exact = float(mpmath.det(mpmath.matrix(a.tolist())))
+            assert abs(determinant / exact - 1) < 10 * n * condition * np.finfo(float).eps
+    # Units of rows and columns lose nothing: |X| of a well-conditioned matrix is what counts.
+    rows, columns = np.geomspace(1.0, condition, n), rng.permutation(np.geomspace(1.0, condition, n))
+    a = rng.normal(size=(n, n)) + 3 * np.eye(n)
+    found = np.array(lower(jnp.linalg.solve, a, b).evaluate(*(a * rows[:, None] * columns).ravel(), *(b * rows)))
+    np.testing.assert_allclose(found * columns, exact_solution(a, b), rtol=1e-12, atol=1e-13)
+
+
+def test_singular_matrices_are_never_solved_silently():
+    for matrix in (np.zeros((3, 3)), np.diag([1.0, 0.0, 2.0]), np.ones((4, 4)), np.outer([1, 2, 3.0], [1, 1, 1.0])):
+        found = lower(jnp.linalg.inv, matrix).evaluate(*matrix.ravel())
+        assert not np.isfinite(found).all() or np.abs(found).max() > 1e14
+    found = lower(jnp.linalg.cholesky, np.eye(3)).evaluate(*np.diag([1.0, -1.0, 2.0]).ravel())
+    assert np.isnan(found).any()
+
+
+def test_formulas_hold_for_arrays_of_jax():
+    a, b = np.random.default_rng(0).normal(size=(2, 4, 4))
+    np.testing.assert_allclose(jax.jit(solution)(a, b), np.linalg.solve(a, b), rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(determinant)(a), np.linalg.det(a), rtol=1e-12)
+
+
+def test_a_matrix_falls_into_blocks():
+    blocks = lambda x: scipy.linalg.block_diag(*[np.ones((2, 2))] * 3) * x
+    x = np.random.default_rng(0).uniform(1.0, 2.0, (6, 6)) + np.eye(6)
+    program = lower(lambda x: jnp.linalg.solve(blocks(x), jnp.arange(6.0)), x)
+    np.testing.assert_allclose(program.evaluate(*x.ravel()), np.linalg.solve(blocks(x), np.arange(6.0)), rtol=1e-13)
+    assert program.operations <= 36  # twelve for each
+
+
+def test_large_matrices_are_left_to_diffrax():
+    def lagrangian(q, v):
+        mass = jnp.eye(30) + 0.1 * jnp.outer(q, q)
+        return 0.5 * v @ v - 0.5 * q @ jnp.linalg.solve(mass, q)
+
+    facts = lagjax.System(lagrangian).explain(jnp.ones(30), jnp.zeros(30))
+    assert "a linear system of 30 rows is larger than the 8" in facts.solver and facts.path == "array"
+
+
+def test_weights_jump_without_a_border():
+    for x in (0.0, 1.0, -3.0, 0.7, 1e-300, 5e300):
+        expected = 2.0 ** np.floor(np.log2(abs(x))) if x else 1.0
+        assert OPERATIONS["binade"].value(np.float64(x)) == in_jax("binade", x) == expected
+
+
+# ---- complex numbers ------------------------------------------------------------------------------------------------
+
+
+def well(q, v):
+    z = q[0] + 1j * q[1]
+    return 0.5 * v @ v - jnp.abs(z**2 - 1) ** 2
+
+
+def real_well(q, v):
+    x, y = q
+    return 0.5 * v @ v - ((x * x - y * y - 1) ** 2 + 4 * x * x * y * y)
+
+
+@pytest.mark.parametrize("q, v", [((0.3, 0.4), (0.1, -0.2)), ((1.0, 0.0), (0.3, 0.0))])  # the second in its minimum
+def test_a_complex_well_is_the_real_one(q, v):
+    ts, system = jnp.linspace(0.0, 5.0, 6), lagjax.System(well)
+    one, other = (lagjax.simulate(of, jnp.array(q), jnp.array(v), ts) for of in (system, lagjax.System(real_well)))
+    assert in_machine_code(system, jnp.array(q), jnp.array(v))
+    np.testing.assert_allclose(one.q, other.q, rtol=1e-11, atol=1e-12)
+    slopes = [jax.grad(lambda a, of=of: lagjax.simulate(of, a * jnp.array(q), jnp.array(v), ts).q[-1, 0])(1.0)
+              for of in (system, lagjax.System(real_well))]  # fmt: skip
+    np.testing.assert_allclose(*slopes, rtol=1e-8)
+
+
+def joukowski(q, v):
+    z, speed = q[0] + 1j * q[1], v[0] + 1j * v[1]
+    image, rate = z + 1 / z, speed * (1 - 1 / z**2)
+    return 0.5 * jnp.abs(rate) ** 2 - 0.5 * (image.real**2 + 4 * image.imag**2)
+
+
+def test_oscillators_behind_a_conformal_map():
+    ts, q, v = jnp.linspace(0.0, 3.0, 7), jnp.array([1.5, 0.7]), jnp.array([0.1, -0.2])
+    path = lagjax.simulate(lagjax.System(joukowski), q, v, ts, rtol=1e-12)
+    z = path.q[:, 0] + 1j * path.q[:, 1]
+    start = complex(q[0], q[1])
+    image, rate = start + 1 / start, complex(v[0], v[1]) * (1 - start**-2)
+    np.testing.assert_allclose((z + 1 / z).real, image.real * np.cos(ts) + rate.real * np.sin(ts), atol=1e-10)
+    np.testing.assert_allclose(
+        (z + 1 / z).imag, image.imag * np.cos(2 * ts) + 0.5 * rate.imag * np.sin(2 * ts), atol=1e-10
+    )
+
+
+def test_waves_of_a_ring_by_their_fourier_transform():
+    # Ω_k of each wave is given: L = ½ v² − ½ Σ Ωₖ² |q̂ₖ|²/n, so that a wave of number 2 turns with Ω₂ alone.
+    n = 6
+    squares = jnp.array([0.5, 1.0, 3.0, 4.0, 3.0, 1.0])
+    lagrangian = lambda q, v: 0.5 * v @ v - 0.5 * squares @ jnp.abs(jnp.fft.fft(q)) ** 2 / n
+    wave, ts = jnp.cos(4 * jnp.pi * jnp.arange(n) / n), jnp.linspace(0.0, 4.0, 5)
+    path = lagjax.simulate(lagjax.System(lagrangian), wave, jnp.zeros(n), ts, rtol=1e-12)
+    np.testing.assert_allclose(path.q, jnp.outer(jnp.cos(jnp.sqrt(3.0) * ts), wave), atol=1e-11)
+
+
+FUNCTIONS = {
+    "exp": mpmath.exp, "log": mpmath.log, "sqrt": mpmath.sqrt, "sin": mpmath.sin, "cos": mpmath.cos, "tan": mpmath.tan,
+    "sinh": mpmath.sinh, "cosh": mpmath.cosh, "tanh": mpmath.tanh, "asin": mpmath.asin, "acos": mpmath.acos,
+    "atan": mpmath.atan, "asinh": mpmath.asinh, "acosh": mpmath.acosh, "atanh": mpmath.atanh, "expm1": mpmath.expm1,
+    "log1p": lambda z: mpmath.log(1 + z),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_complex_functions_have_the_digits_of_real_ones(name):
+    def parts(x, y):
+        w = getattr(lax, name)(lax.complex(x, y))
+        return w.real, w.imag
+
+    program = lower(parts, 0.5, 0.5)
+    for z in (0.3 + 0.4j, -1.7 + 0.2j, 2.5 - 3.1j, -0.4 - 0.9j, 1e-9 + 2e-9j, 5 + 30j, -40 + 0.1j):
+        with mpmath.workdps(40):
+            found, exact = complex(*program.evaluate(z.real, z.imag)), complex(FUNCTIONS[name](mpmath.mpc(z)))
+        assert abs(found - exact) <= 1e-14 * max(abs(exact), 1.0 if name in ("log", "acos", "acosh") else 0.0), z
+
+
+# ---- functions that are series --------------------------------------------------------------------------------------
+
+ARGUMENTS = (1e-8, 0.3, 1.0, 1.5, 2.0, 7.7, 24.9, 25.1, 90.0, 400.0, -0.3, -3.7, -26.0)
+SERIES = {
+    "i0": lambda x: mpmath.besseli(0, x),
+    "i1": lambda x: mpmath.besseli(1, x),
+    "i0e": lambda x: mpmath.besseli(0, x) * mpmath.exp(-abs(x)),
+    "i1e": lambda x: mpmath.besseli(1, x) * mpmath.exp(-abs(x)),
+    "gammaln": lambda x: mpmath.log(abs(mpmath.gamma(x))),
+    "digamma": mpmath.digamma,
+}
+
+
+@pytest.mark.parametrize("name", SERIES)
+def test_series_hold_everywhere(name):
+    of_gamma = name in ("gammaln", "digamma")
+    program = lower(getattr(jax.scipy.special, name), 0.5)
+    for x in ARGUMENTS[:-1] if of_gamma else ARGUMENTS:  # −26 is a pole
+        with mpmath.workdps(40):
+            exact = float(SERIES[name](mpmath.mpf(x)))
+        # Functions of Γ have zeros, next to which rounding is that of terms of order one.
+        assert abs(float(program.evaluate(x)[0]) - exact) <= 1e-14 * max(abs(exact), float(of_gamma)), x
+
+
+def test_a_motion_between_functions_of_gamma():
+    # Rather than a closed form, its energy, and ψ = (log Γ)' by differences of values.
+    system = lagjax.System(lambda q, v: 0.5 * v**2 - jax.scipy.special.gammaln(q) - jax.scipy.special.i0(q - 1.5))
+    assert in_machine_code(system, 0.7, 0.5)
+    path = lagjax.simulate(system, 0.7, 0.5, jnp.linspace(0.0, 5.0, 6), rtol=1e-12)
+    assert path.q.max() > 1.5 > path.q.min()  # through the border that i0 = e^|x| (e^-|x| i0) is written with
+    energy = [0.5 * v**2 + float(mpmath.loggamma(float(q)) + mpmath.besseli(0, float(q) - 1.5))
+              for q, v in zip(path.q, path.qdot, strict=True)]  # fmt: skip
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-10)  # some tens of steps at a tolerance of 1e-12
+    np.testing.assert_allclose(system.acceleration(2.0, 0.0), -float(mpmath.digamma(2)) - float(mpmath.besseli(1, 0.5)))
