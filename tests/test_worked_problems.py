@@ -121,11 +121,11 @@ def test_a_symmetric_top_nods_and_sleeps(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_restricted_problem_of_three_bodies(tmp_path, monkeypatch):
-    scope = run("restricted_three_body", tmp_path, monkeypatch, ORBITS=25)
+    scope = run("restricted_three_body", tmp_path, monkeypatch, ORBITS=20)
     np.testing.assert_allclose(scope["ours"], scope["book"], rtol=1e-12)
     np.testing.assert_allclose(scope["routh"], scope["book_routh"], rtol=1e-9)
     for orbits in scope["families"]:
-        assert (orbits.closure < 1e-9).all() and orbits.period.size == 25
+        assert (orbits.closure < 1e-9).all() and orbits.period.size == 20
         assert np.all(np.diff(orbits.energy) > 0)
 
 

@@ -97,8 +97,8 @@ def require_steady(scene: Scene) -> None:
 # Damped steps; 10 to 30 are usual. Twice as many change nothing where there is an equilibrium.
 _STEPS = 200
 
-# Newton steps at the end, of which two reach rounding.
-_POLISH = 3
+# A step that is nothing, in parts of the numbers of z; and Newton steps at the end, of which two reach rounding.
+_AT_REST, _POLISH = 1e-10, 3
 
 
 @eqx.filter_jit
@@ -110,15 +110,33 @@ def _found(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
     def residual(z: Unknowns) -> Unknowns:
         return balance(scene, z[:n], z[n:])
 
-    def find(_, start):
-        return _polished(residual, _damped(residual, start))
+    start = jax.lax.stop_gradient(jnp.concatenate([scene.q, least_multipliers(scene, scene.q)]))
+    unit = _units(jax.lax.stop_gradient(scene.mass_matrix(scene.q, scene.qdot)), jax.jacfwd(residual)(start))
 
-    start = jnp.concatenate([scene.q, least_multipliers(scene, scene.q)])
-    z = jax.lax.custom_root(residual, jax.lax.stop_gradient(start), find, shortest_preimage)
+    def find(_, start):
+        return _polished(residual, _damped(residual, start, unit), start, unit)
+
+    def shortest(linear, right):
+        return unit * shortest_preimage(lambda x: linear(unit * x), right)
+
+    z = jax.lax.custom_root(residual, start, find, shortest)
     q = z[:n]
-    ok = _is_root(residual, jax.lax.stop_gradient(z))
+    ok = _is_root(residual, jax.lax.stop_gradient(z), start)
     multipliers = least_multipliers(scene, q)
     return nan_unless(ok, q), nan_unless(ok, multipliers), ok
+
+
+def _units(mass: Float[Array, "n n"], jacobian: Float[Array, "n+m n+m"]) -> Unknowns:
+    """A unit of each number of z, so that lengths of z mean the same in all units of a user: 1/√Mᵢᵢ for qᵢ.
+
+    λ has those that make as much of the forces as q does.
+    """
+    inertia, n = jnp.abs(jnp.diagonal(mass)), len(mass)
+    root = jnp.sqrt(jnp.where((inertia > 0) & jnp.isfinite(inertia), inertia, 1))
+    scaled = jax.lax.stop_gradient(jacobian)[:n] / root[:, None]
+    of_q, of_multipliers = jnp.max(jnp.abs(scaled[:, :n] / root), initial=0.0), jnp.max(jnp.abs(scaled[:, n:]), axis=0)
+    found = (of_q > 0) & (of_multipliers > 0)
+    return jnp.concatenate([1 / root, jnp.where(found, of_q / jnp.where(found, of_multipliers, 1), 1)])
 
 
 def balance(scene: Scene, q: Vector, multipliers: Array) -> Unknowns:
@@ -136,15 +154,14 @@ def least_multipliers(scene: Scene, q: Vector) -> Array:
     return -least_norm(jacobian @ jacobian.T, jacobian @ scene.force(q, scene.qdot))
 
 
-def _damped(residual, start: Unknowns) -> Unknowns:
+def _damped(residual, start: Unknowns, unit: Unknowns) -> Unknowns:
     """z after steps of Levenberg and Marquardt for |r|², until they are small or nothing helps.
 
     Rows are weighed by the size of their gradient at the start, columns by the largest they had so far (Moré): a
     change of units changes nothing. The damping goes down with |r|, which keeps the convergence quadratic where
     solutions are not isolated (Fan & Yuan, Computing 74 (2005) 23).
     """
-    first = jax.jacfwd(residual)(start)
-    lengths = jnp.sqrt(jnp.sum(first**2, axis=1))
+    lengths = jnp.sqrt(jnp.sum((jax.jacfwd(residual)(start) * unit) ** 2, axis=1))
     weights = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1), 1)
 
     def weighted(z):
@@ -152,16 +169,17 @@ def _damped(residual, start: Unknowns) -> Unknowns:
 
     def moves(carry):
         _, value, moved, _, _, count = carry
-        return (moved > 1e-10) & (count < _STEPS) & (jnp.sum(value**2) > 0)
+        return (moved > _AT_REST) & (count < _STEPS) & (jnp.max(jnp.abs(value)) > 0)
 
     def once(carry):
         z, value, moved, damping, scale, count = carry
         jacobian = jax.jacfwd(weighted)(z)
         scale = jnp.maximum(scale, jnp.sqrt(jnp.sum(jacobian**2, axis=0)))
-        d = jnp.where(scale > 0, scale, 1)
+        d = jnp.where(scale > 0, scale, unit)
         scaled = jacobian / d
         size = jnp.sqrt(jnp.sum(value**2))
-        normal = scaled.T @ scaled + (damping * size + 1e-15) * jnp.eye(z.size, dtype=z.dtype)
+        part = size / (size + jnp.max(jnp.abs(jacobian) @ jnp.maximum(jnp.abs(start), jnp.abs(z))))
+        normal = scaled.T @ scaled + (damping * part + 1e-15) * jnp.eye(z.size, dtype=z.dtype)
         step = -factorize(normal).solve(scaled.T @ value) / d
         new = weighted(z + step)
         gain = jnp.sum(value**2) - jnp.sum(new**2)
@@ -169,8 +187,8 @@ def _damped(residual, start: Unknowns) -> Unknowns:
         ratio = jnp.where(expected > 0, gain / jnp.where(expected > 0, expected, 1), 0.0)
         better = (gain > 0) & jnp.all(jnp.isfinite(new))
         damping = jnp.where(ratio > 0.75, damping / 4, jnp.where((ratio < 0.25) | ~better, damping * 4, damping))
-        length = jnp.max(jnp.abs(step) / (1 + jnp.abs(z)))
-        stuck = ~better & ((length < 1e-10) | ~jnp.isfinite(length))
+        length = _relative(jacobian, step, z, start)
+        stuck = ~better & ((length < _AT_REST) | ~jnp.isfinite(length))
         moved = jnp.where(better, length, jnp.where(stuck, 0.0, moved))
         return jnp.where(better, z + step, z), jnp.where(better, new, value), moved, damping, scale, count + 1
 
@@ -179,25 +197,31 @@ def _damped(residual, start: Unknowns) -> Unknowns:
     return jax.lax.while_loop(moves, once, carry)[0]
 
 
-def _polished(residual, z: Unknowns) -> Unknowns:
+def _polished(residual, z: Unknowns, start: Unknowns, unit: Unknowns) -> Unknowns:
     """z after Newton steps, as exact as rounding allows; each is taken where it is small."""
 
     def once(_, z):
-        step = shortest_solution(jax.jacfwd(residual)(z), residual(z))
-        small = jnp.max(jnp.abs(step) / (1 + jnp.abs(z))) < 1e-3
-        return jnp.where(small, z - step, z)
+        jacobian = jax.jacfwd(residual)(z)
+        step = unit * shortest_solution(jacobian * unit, residual(z))
+        return jnp.where(_relative(jacobian, step, z, start) < 1e-3, z - step, z)
 
     return jax.lax.fori_loop(0, _POLISH, once, z)
 
 
-def _is_root(residual, z: Unknowns) -> Bool[Array, ""]:
-    """Whether r(z) is zero: each number below √eps of what a change of z by its own size would make of it.
+def _relative(jacobian: Float[Array, "n+m n+m"], step: Unknowns, z: Unknowns, start: Unknowns) -> Float[Array, ""]:
+    """How large a step is: the most that it makes of a number of r, in parts of what the numbers of z make of it."""
+    change = jnp.abs(jacobian) @ jnp.abs(step)
+    whole = jnp.abs(jacobian) @ jnp.maximum(jnp.maximum(jnp.abs(start), jnp.abs(z)), jnp.abs(step))
+    return jnp.max(jnp.where(change == 0, 0.0, change / jnp.where(whole == 0, 1, whole)))
+
+
+def _is_root(residual, z: Unknowns, start: Unknowns) -> Bool[Array, ""]:
+    """Whether r(z) is zero: each number below √eps of what the numbers of z, or of the start, make of it.
 
     A converged one is at some eps of it; where forces only fade away with the distance it is of order one.
     """
-    value, jacobian = residual(z), jax.jacfwd(residual)(z)
-    size = jnp.sqrt(jnp.sum(jacobian**2, axis=1)) * (1 + jnp.max(jnp.abs(z)))
-    return jnp.all(jnp.abs(value) <= jnp.sqrt(jnp.finfo(z.dtype).eps) * size)
+    size = jnp.abs(jax.jacfwd(residual)(z)) @ jnp.maximum(jnp.abs(start), jnp.abs(z))
+    return jnp.all(jnp.abs(residual(z)) <= jnp.sqrt(jnp.finfo(z.dtype).eps) * size)
 
 
 def _sentence(scene: Scene) -> str:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._doubles import accepts_singles
-from lagjax._layout import halves
+from lagjax._layout import Layout, halves
 from lagjax._orbits._arcs import Arcs
 from lagjax._orbits._family import Family, begun, place_of
 from lagjax._orbits._follow import Follower, Point, Tangent, corrected, tangent_at
@@ -63,8 +63,9 @@ def branch_off(
         )
     turns = 2 if bool(family.doubling[index]) else 1
     beside = next(k for k in (index - 1, index + 1, index) if 0 <= k < len(family.value))
-    follower, here = _orbit_of(system, family, index, turns, params, by)
-    before = tangent_at(follower, _orbit_of(system, family, beside, turns, params, by)[1], None)
+    follower = _follower(system, family, index, turns, params, by)
+    here, neighbour = (_orbit_of(follower, family, k, turns) for k in (index, beside))
+    before = tangent_at(follower, neighbour, None)
     point = None if before is None else _beside(follower, here, before, float(size))
     if before is None or point is None:
         raise ValueError(
@@ -77,17 +78,31 @@ def branch_off(
     return Orbit._make([*arrays, found.message[0]])
 
 
-def _orbit_of(system: System, family: Family, k: int, turns: int, params, by: str) -> tuple[Follower, Point]:
-    """Orbit k of a family, traversed once or twice, and what is free along it."""
+def _follower(system: System, family: Family, k: int, turns: int, params, by: str) -> Follower:
+    """What follows orbits of this family, traversed once or twice, in the units of orbit k."""
+    period, layout, y0 = _start(family, k, turns)
+    arcs = Arcs.of(system, *map(layout.restore, halves(y0[0])), params, RTOL, "Families")
+    place = None if by == "energy" else place_of(params, by)
+    return Follower(arcs.with_numbers(_numbers(arcs, place, family, k)), place, y0, period)
+
+
+def _orbit_of(follower: Follower, family: Family, k: int, turns: int) -> Point:
+    """Orbit k of a family, traversed once or twice."""
+    period, _, y0 = _start(family, k, turns)
+    return begun(follower, y0, period, _numbers(follower.arcs, follower.place, family, k))
+
+
+def _start(family: Family, k: int, turns: int) -> tuple[np.ndarray, Layout, np.ndarray]:
     q0, qdot0 = jax.tree.map(lambda x: x[k], (family.q0, family.qdot0))
     period, layout, y0 = starts(q0, qdot0, turns * family.period[k], "period")
-    q, qdot = map(layout.restore, halves(y0[0]))
-    arcs = Arcs.of(system, q, qdot, params, RTOL, "Families")
-    place = None if by == "energy" else place_of(params, by)
+    return period.ravel(), layout, y0
+
+
+def _numbers(arcs: Arcs, place: int | None, family: Family, k: int) -> np.ndarray:
+    numbers = np.array(arcs.numbers)
     if place is not None:
-        arcs = arcs.with_numbers(np.where(np.arange(len(arcs.numbers)) == place, float(family.value[k]), arcs.numbers))
-    follower = Follower(arcs, place, y0, period.ravel())
-    return follower, begun(follower, y0, period.ravel())
+        numbers[place] = float(family.value[k])
+    return numbers
 
 
 def _beside(follower: Follower, here: Point, before: Tangent, size: float) -> Point | None:

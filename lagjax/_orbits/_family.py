@@ -153,7 +153,7 @@ def _member(follower: Follower, point: Point, tangent: Tangent, most: int | None
 
 def _followed(follower: Follower, y0, period, step: float, count: int) -> tuple[list[_Member], str]:
     """The orbits of a family, and why it ends."""
-    point, shortest, until = begun(follower, y0, period), _SHORTEST * step, follower.until
+    point, shortest, until = begun(follower, y0, period, follower.arcs.numbers), _SHORTEST * step, follower.until
     if until is not None:
         follower.of_value = abs(until - follower.value(point)) or 1.0
     tangent = tangent_at(follower, point, None)
@@ -181,10 +181,10 @@ def _followed(follower: Follower, y0, period, step: float, count: int) -> tuple[
     return members[:count], f"{count} orbits were found; the family goes on: raise count to follow it further."
 
 
-def begun(follower: Follower, y0: np.ndarray, period: np.ndarray) -> Point:
+def begun(follower: Follower, y0: np.ndarray, period: np.ndarray, numbers: np.ndarray) -> Point:
     """The orbit from which a family is followed, in as many arcs as it needs."""
-    count = int(arcs_each(follower.arcs, y0, period)[0])
-    return follower.within_growth(follower.begun(y0, period, count, follower.arcs.numbers))
+    count = int(arcs_each(follower.arcs.with_numbers(numbers), y0, period)[0])
+    return follower.within_growth(follower.begun(y0, period, count, numbers))
 
 
 def _in_more_arcs(follower: Follower, member: _Member) -> _Member:
@@ -275,7 +275,7 @@ def _at(
     guess = ends[0].times((1 + 2 * u) * (1 - u) ** 2).plus(ends[1], u**2 * (3 - 2 * u))
     guess = guess.plus(slopes[0], width * u * (1 - u) ** 2).plus(slopes[1], width * u**2 * (u - 1))
     there = corrected(follower, follower.at(asked[a].point, guess), across, left_out)
-    tangent = None if there is None else tangent_at(follower, there[0], asked[a].tangent)
+    tangent = None if there is None else tangent_at(follower, there[0], asked[a].tangent, left_out)
     if there is None or tangent is None or tangent.vector @ across.vector < _ALONG:
         return None
     return _member(follower, there[0], tangent, most)

@@ -191,10 +191,11 @@ class Follower:
 _MOST_ARCS = 128
 
 
-def tangent_at(follower: Follower, point: Point, before: Tangent | None) -> Tangent | None:
+def tangent_at(follower: Follower, point: Point, before: Tangent | None, left_out: int = 0) -> Tangent | None:
     """The direction of the family at a closed orbit: on from `before`, or at first that of a rising value.
 
-    None where there is none: the orbit is alone.
+    None where there is none: the orbit is alone. At a branch point, where the smallest `left_out` singular values are
+    zero, it is what is nearest to `before` of all directions.
     """
     states = point.matrix.shape[0]
     whole = decide(point.matrix[None], np.array([_shooting.RANK]))
@@ -209,7 +210,7 @@ def tangent_at(follower: Follower, point: Point, before: Tangent | None) -> Tang
     symmetries[:states] = still.right[0][:, states - count :]
     if before is None:
         symmetries = _without(symmetries, slope)
-    null = whole.right[0][:, rank:]
+    null = whole.right[0][:, rank - left_out :]
     left, sizes, _ = np.linalg.svd(null - symmetries @ (symmetries.T @ null), full_matrices=False)
     left = left[:, sizes > 0.5]
     vector = left @ (left.T @ (slope if before is None else before.vector))
