@@ -44,10 +44,12 @@ class Scales(NamedTuple):
     reach: float = 1.0
 
     @classmethod
-    def of(cls, force: Callable[[States, States], States], mass: Numbers, q: Numbers, qdot: Numbers) -> "Scales":
-        """Those at (q, qdot) of a scene with the forces `force(q, qdot)` there and the diagonal `mass` of M, (n,)."""
+    def of(cls, evaluate: Callable[[str, States, States], np.ndarray], q: Numbers, qdot: Numbers) -> "Scales":
+        """Those at (q, qdot) of a scene whose "force" (S, n) and "mass_matrix" (S, n, n) `evaluate` gives at states."""
+        q, qdot = np.asarray(q, float), np.asarray(qdot, float)
         with np.errstate(all="ignore"):
-            return _measured(force, np.sqrt(np.abs(mass)), np.asarray(q, float), np.asarray(qdot, float))
+            mass = np.diagonal(evaluate("mass_matrix", q[None], qdot[None])[0])
+            return _measured(lambda q, qdot: evaluate("force", q, qdot), np.sqrt(np.abs(mass)), q, qdot)
 
 
 def _measured(force, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:

@@ -145,9 +145,7 @@ class Scene(NamedTuple):
                     pass
             return np.asarray(_evaluated(name, q, qdot, *self.arguments))
 
-        q, qdot = np.asarray(self.q)[None], np.asarray(self.qdot)[None]
-        mass = np.diagonal(evaluated("mass_matrix", q, qdot)[0])
-        return Scales.of(lambda q, qdot: evaluated("force", q, qdot), mass, q[0], qdot[0])
+        return Scales.of(evaluated, np.asarray(self.q), np.asarray(self.qdot))
 
     # ---- quantities at a state (q, q̇) and the time zero ----
 

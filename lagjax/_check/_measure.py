@@ -199,8 +199,7 @@ def _scales(derivation: Derivation, state) -> Scales:
         return derivation.evaluate((name,), columns_of(q, v, t, numbers))[name]
 
     try:
-        mass = np.diagonal(evaluated("mass_matrix", q[None], v[None])[0])
-        scales = Scales.of(lambda q, v: evaluated("force", q, v), mass, q, v)
+        scales = Scales.of(evaluated, q, v)
     except Unlowerable:
         scales = Scales(np.abs(q), np.abs(v), 1.0)
     return scales._replace(**{name: np.where(np.isfinite(x) & (x > 0), x, 1.0) for name, x in scales._asdict().items()})

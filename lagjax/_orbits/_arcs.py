@@ -19,6 +19,7 @@ from lagjax._machine_code._steps import KEPT
 from lagjax._orbits._starts import require_untraced
 from lagjax._problem import Problem
 from lagjax._results import SUCCESSFUL
+from lagjax._scales import Scales
 from lagjax._system import System, require_system
 
 PyTree = Any
@@ -166,12 +167,24 @@ class Arcs:
         with np.errstate(all="ignore"):
             if time is None:
                 length = np.where(far > 0, far, fast**2 / bend)
-                rate = _or_one(np.maximum(fast / length, np.sqrt(bend / length)))
+                rate = np.maximum(fast / length, np.sqrt(bend / length))
+                for row in np.flatnonzero(~((length > 0) & (rate > 0) & np.isfinite(length * rate))):
+                    scales = self._scales(y0[row])
+                    length[row], rate[row] = np.abs(scales.q * root[row]).max(), 1 / scales.t
+                rate = _or_one(rate)
             else:
                 rate = 2 * np.pi / time
                 length = np.maximum(far, fast / rate)
         of_q = (length := _or_one(length))[:, None] / root
         return Units(np.concatenate([of_q, rate[:, None] * of_q], axis=1), 1 / rate, length)
+
+    def _scales(self, y: np.ndarray) -> Scales:
+        """Those of one state (2n,), which need some hundred forces."""
+
+        def evaluated(name, q, qdot):
+            return self.quantities((name,), 0.0, np.concatenate([q, qdot], axis=1))[name]
+
+        return Scales.of(evaluated, *halves(y))
 
     def rate(self, t, y: np.ndarray) -> np.ndarray:
         """ẏ = (q̇, q̈), (R, 2n), at states (R, 2n) and times () or (R,)."""
