@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 from lagjax._arguments import accept
 from lagjax._derivation import Derivation, derivation_of
 from lagjax._doubles import DOUBLE, SINGLE
-from lagjax._layout import Layout, as_vector, dtype_of, taken_apart
+from lagjax._layout import Layout, as_vector, dtype_of, halves, taken_apart
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._reads import Edition
 from lagjax._validate import (
@@ -252,17 +252,16 @@ class AbstractEngine(abc.ABC):
         Their size is, in these first states, the largest coordinate, or where they begin at zero how far the largest
         velocity would lead; or the largest velocity, if that is smaller and not zero.
         """
-        rtol, atol = self.rtol(problem), problem.tolerances[1]
+        rtol, atol, ts = self.rtol(problem), problem.tolerances[1], problem.ts
         if atol is not None:
             return rtol, as_arrays(atol, problem.layout.dtype)
-        library: Any = np if all(map(_is_on_host, (y0, problem.ts, rtol))) else jnp
+        library: Any = np if all(map(_is_on_host, (y0, ts, rtol))) else jnp
         # Within `jit` an operation on an array of JAX is traced, even where its numbers are known.
-        y0, ts, relative = map(library.asarray, (y0, problem.ts, rtol))
-        far, fast = library.moveaxis(library.abs(y0).reshape(*y0.shape[:-1], 2, -1).max(axis=-1), -1, 0)
+        ts, relative = library.asarray(ts), library.asarray(rtol)
+        far, fast = (library.abs(half).max(axis=-1) for half in halves(library.asarray(y0)))
         far = library.where(far > 0, far, fast * abs(ts[-1] - ts[0]))
-        sizes = library.stack([far, fast])
-        size = library.where(sizes > 0, sizes, library.inf).min(initial=library.inf)
-        return rtol, library.minimum(ATOL_OVER_RTOL * relative, ATOL_OVER_MOTION * relative * size)
+        size = library.minimum(*(library.where(x > 0, x, library.inf) for x in (far, fast))).min(initial=library.inf)
+        return rtol, relative * library.minimum(ATOL_OVER_RTOL, ATOL_OVER_MOTION * size)
 
     @abc.abstractmethod
     def refuses(self, problem: Problem) -> str | None:
