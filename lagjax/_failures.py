@@ -137,9 +137,9 @@ def lost_unless(reached, x, inputs):
     return nan_unless(reached, jnp.where(reached, x, anything))
 
 
-def differentiable_where(well, x):
-    """`x` itself, whose derivatives are NaN unless `well` holds."""
-    return differentiated_as(lambda well, x: (nan_unless(well, x),), (x,), well, x)[0]
+def differentiable_where(well, x, *inputs):
+    """`x` itself, whose derivatives by it and by `inputs` are NaN unless `well` holds."""
+    return differentiated_as(lambda well, x, *more: (lost_unless(well, x, (x, *more)),), (x,), well, x, *inputs)[0]
 
 
 def _nan_unless(reached, x):

@@ -90,3 +90,15 @@ def test_the_default_solver_and_other_adjoints_lose_them_too():
     np.testing.assert_array_equal(np.isnan(slopes), [False, True])
     exact = jax.grad(lambda v: lagjax.simulate(system, 0.3, v, TS, PARAMS).q[-1])(0.1)
     np.testing.assert_allclose(slopes[0], exact, atol=1e-4)
+
+
+def test_a_guard_that_only_jumps_has_no_derivatives():
+    """In machine code: the place of the jump is found, but a guard that is flat on both sides says not how it moves."""
+    oscillator = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2)
+
+    def time(p):
+        flat = lambda q, v, params: jnp.where(q < params, 1.0, -1.0)  # noqa: E731
+        return lagjax.crossings(oscillator, flat, 1.0, 0.0, (0.0, 3.0), p, count=1).t[0]
+
+    np.testing.assert_allclose(time(0.5), np.arccos(0.5), rtol=1e-12)
+    assert np.isnan(jax.grad(time)(0.5)) and np.isnan(jax.jvp(time, (0.5,), (1.0,))[1])

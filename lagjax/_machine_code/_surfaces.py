@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._derivation import Derivation
+from lagjax._failures import differentiable_where
 from lagjax._machine_code._lines import outputs
 from lagjax._native import GUARD_NOISE, INSTANT, SMALLEST_STEP, Guards
 from lagjax._program import Program, lower
@@ -121,7 +122,7 @@ def moved_with(surfaces: Surfaces, program: Program, k: int) -> Callable:
         s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
 
     up to third order in δg, which is zero itself: first and second derivatives are right. Where it is not `taken`
-    nothing moves.
+    nothing moves. Where g′ is zero, as of a guard that jumps and is flat on both sides, there are no derivatives: NaN.
     """
     still, count = jax.lax.stop_gradient, len(surfaces.directions)
 
@@ -136,9 +137,11 @@ def moved_with(surfaces: Surfaces, program: Program, k: int) -> Callable:
         value, (rate, slope) = surfaces.values.at(jnp.append(y, t), numbers)[k], rates(t, y, numbers)
         direction = jnp.ones_like(t), slope
         bend, turn = map(still, jax.jvp(lambda t, y: rates(t, y, numbers), (t, y), direction)[1])
-        rate = jnp.where(taken & (rate != 0), rate, 1.0)
+        crosses = ~taken | (rate != 0)
+        rate = jnp.where(taken & crosses, rate, 1.0)
         part = jnp.where(taken, value - still(value), 0.0) / rate
         later = -part - 0.5 * still(bend / rate) * part**2
-        return t + later, y + slope * later + 0.5 * turn * later**2
+        there = t + later, y + slope * later + 0.5 * turn * later**2
+        return tuple(differentiable_where(crosses, x, t, y, numbers) for x in there)
 
     return moved
