@@ -100,5 +100,5 @@ def test_a_guard_that_only_jumps_has_no_derivatives():
         flat = lambda q, v, params: jnp.where(q < params, 1.0, -1.0)  # noqa: E731
         return lagjax.crossings(oscillator, flat, 1.0, 0.0, (0.0, 3.0), p, count=1).t[0]
 
-    np.testing.assert_allclose(time(0.5), np.arccos(0.5), rtol=1e-12)
+    np.testing.assert_allclose(time(0.5), np.arccos(0.5), rtol=1e-9)
     assert np.isnan(jax.grad(time)(0.5)) and np.isnan(jax.jvp(time, (0.5,), (1.0,))[1])
