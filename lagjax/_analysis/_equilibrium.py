@@ -198,14 +198,18 @@ def _damped(residual, start: Unknowns, unit: Unknowns) -> Unknowns:
 
 
 def _polished(residual, z: Unknowns, start: Unknowns, unit: Unknowns) -> Unknowns:
-    """z after Newton steps, as exact as rounding allows; each is taken where it is small."""
+    """z after Newton steps, as exact as rounding allows; each is taken where it is small.
+
+    What converges to zero ends at any tiny number: zero is what is nothing beside the start even after three roundings.
+    """
 
     def once(_, z):
         jacobian = jax.jacfwd(residual)(z)
         step = unit * shortest_solution(jacobian * unit, residual(z))
         return jnp.where(_relative(jacobian, step, z, start) < 1e-3, z - step, z)
 
-    return jax.lax.fori_loop(0, _POLISH, once, z)
+    z = jax.lax.fori_loop(0, _POLISH, once, z)
+    return jnp.where(jnp.abs(z) < jnp.finfo(z.dtype).eps ** 3 * jnp.abs(start), 0.0, z)
 
 
 def _relative(jacobian: Float[Array, "n+m n+m"], step: Unknowns, z: Unknowns, start: Unknowns) -> Float[Array, ""]:

@@ -122,4 +122,10 @@ def steady_matrices(scene: Scene, q: Vector) -> tuple[Matrix, Matrix, Matrix, Ar
         return scene.force(q, qdot) + scene.jacobian(q, qdot).T @ multipliers
 
     stiffness, rates = jax.jacfwd(balance, argnums=(0, 1))(q, scene.qdot)
-    return scene.mass_matrix(q, scene.qdot), -rates, -stiffness, jacobian, force + jacobian.T @ multipliers
+    held, eps = jacobian.T @ multipliers, jnp.finfo(q.dtype).eps
+    left = jnp.where(jnp.abs(force + held) <= _ROUNDED * eps * (jnp.abs(force) + jnp.abs(held)), 0, force + held)
+    return scene.mass_matrix(q, scene.qdot), -rates, -stiffness, jacobian, left
+
+
+# Roundings of a force and of the constraint force that balances it, which are left where nothing is.
+_ROUNDED = 64
