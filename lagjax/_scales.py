@@ -7,7 +7,7 @@ i, a radian for an angle φ beside a radius r, whose Mᵢᵢ is m r². The force
 through the state, F(q + εu) with |u| = 1:
 
     l    the larger of |q| and |q̇|/√(∂F/∂ε), but the latter no larger than r, the smallest ε at which F is not linear
-         any more; where both are zero r, else |F|/(∂F/∂ε)
+         any more; where both are zero r, else |F|/(∂F/∂ε), else |q̇|²/|F|
     ω    the largest of |q̇|/l, of √(∂F/∂ε), and of ∂F/∂q̇; else √(|F|/l)
     qᵢ ~ max(|qᵢ|, l/√|Mᵢᵢ|),   q̇ᵢ ~ max(|q̇ᵢ|, ω l/√|Mᵢᵢ|),   t ~ 1/ω
 
@@ -68,7 +68,8 @@ def _measured(force, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
     slope, bent = _line(lambda s: forces(s, along, 0.0)[1], steps)
     here = float(np.nan_to_num(forces([0.0], along, 0.0)[0][0]))
     swing = fast / np.sqrt(slope) if slope > 0 else 0.0
-    length = max(far, min(swing, bent or np.inf)) or bent or (here / slope if slope > 0 else 0.0) or heaviest
+    length = max(far, min(swing, bent or np.inf)) or bent or (here / slope if slope > 0 else 0.0)
+    length = length or (fast**2 / here if here > 0 else 0.0) or heaviest
     rate = max(fast / length, np.sqrt(slope))
     step = (rate or 1.0) * length
     low, high = forces([-step, step], 0.0, along)[1]

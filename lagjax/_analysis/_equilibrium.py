@@ -100,6 +100,9 @@ _STEPS = 200
 # A step that is nothing, in parts of the numbers of z; and Newton steps at the end, of which two reach rounding.
 _AT_REST, _POLISH = 1e-10, 3
 
+# A multiplier that counts as rounding of the others.
+_TINY = 1e-6
+
 
 @eqx.filter_jit
 def _found(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
@@ -113,15 +116,18 @@ def _found(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
     start = jax.lax.stop_gradient(jnp.concatenate([scene.q, least_multipliers(scene, scene.q)]))
     unit = _units(jax.lax.stop_gradient(scene.mass_matrix(scene.q, scene.qdot)), jax.jacfwd(residual)(start))
 
+    # A multiplier that is nothing beside the others is rounding.
+    least = jnp.abs(start).at[n:].max(_TINY * unit[n:] * jnp.max(jnp.abs(start / unit)[n:], initial=0.0))
+
     def find(_, start):
-        return _polished(residual, _damped(residual, start, unit), start, unit)
+        return _polished(residual, _damped(residual, start, least, unit), start, least, unit)
 
     def shortest(linear, right):
         return unit * shortest_preimage(lambda x: linear(unit * x), right)
 
     z = jax.lax.custom_root(residual, start, find, shortest)
     q = z[:n]
-    ok = _is_root(residual, jax.lax.stop_gradient(z), start)
+    ok = _is_root(residual, jax.lax.stop_gradient(z), least)
     multipliers = least_multipliers(scene, q)
     return nan_unless(ok, q), nan_unless(ok, multipliers), ok
 
@@ -154,7 +160,7 @@ def least_multipliers(scene: Scene, q: Vector) -> Array:
     return -least_norm(jacobian @ jacobian.T, jacobian @ scene.force(q, scene.qdot))
 
 
-def _damped(residual, start: Unknowns, unit: Unknowns) -> Unknowns:
+def _damped(residual, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
     """z after steps of Levenberg and Marquardt for |r|², until they are small or nothing helps.
 
     Rows are weighed by the size of their gradient at the start, columns by the largest they had so far (Moré): a
@@ -178,7 +184,7 @@ def _damped(residual, start: Unknowns, unit: Unknowns) -> Unknowns:
         d = jnp.where(scale > 0, scale, unit)
         scaled = jacobian / d
         size = jnp.sqrt(jnp.sum(value**2))
-        part = size / (size + jnp.max(jnp.abs(jacobian) @ jnp.maximum(jnp.abs(start), jnp.abs(z))))
+        part = size / (size + jnp.max(jnp.abs(jacobian) @ jnp.maximum(least, jnp.abs(z))))
         normal = scaled.T @ scaled + (damping * part + 1e-15) * jnp.eye(z.size, dtype=z.dtype)
         step = -factorize(normal).solve(scaled.T @ value) / d
         new = weighted(z + step)
@@ -187,7 +193,7 @@ def _damped(residual, start: Unknowns, unit: Unknowns) -> Unknowns:
         ratio = jnp.where(expected > 0, gain / jnp.where(expected > 0, expected, 1), 0.0)
         better = (gain > 0) & jnp.all(jnp.isfinite(new))
         damping = jnp.where(ratio > 0.75, damping / 4, jnp.where((ratio < 0.25) | ~better, damping * 4, damping))
-        length = _relative(jacobian, step, z, start)
+        length = _relative(jacobian, step, z, least)
         stuck = ~better & ((length < _AT_REST) | ~jnp.isfinite(length))
         moved = jnp.where(better, length, jnp.where(stuck, 0.0, moved))
         return jnp.where(better, z + step, z), jnp.where(better, new, value), moved, damping, scale, count + 1
@@ -197,7 +203,7 @@ def _damped(residual, start: Unknowns, unit: Unknowns) -> Unknowns:
     return jax.lax.while_loop(moves, once, carry)[0]
 
 
-def _polished(residual, z: Unknowns, start: Unknowns, unit: Unknowns) -> Unknowns:
+def _polished(residual, z: Unknowns, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
     """z after Newton steps, as exact as rounding allows; each is taken where it is small.
 
     What converges to zero ends at any tiny number: zero is what is nothing beside the start even after three roundings.
@@ -206,25 +212,25 @@ def _polished(residual, z: Unknowns, start: Unknowns, unit: Unknowns) -> Unknown
     def once(_, z):
         jacobian = jax.jacfwd(residual)(z)
         step = unit * shortest_solution(jacobian * unit, residual(z))
-        return jnp.where(_relative(jacobian, step, z, start) < 1e-3, z - step, z)
+        return jnp.where(_relative(jacobian, step, z, least) < 1e-3, z - step, z)
 
     z = jax.lax.fori_loop(0, _POLISH, once, z)
     return jnp.where(jnp.abs(z) < jnp.finfo(z.dtype).eps ** 3 * jnp.abs(start), 0.0, z)
 
 
-def _relative(jacobian: Float[Array, "n+m n+m"], step: Unknowns, z: Unknowns, start: Unknowns) -> Float[Array, ""]:
-    """How large a step is: the most that it makes of a number of r, in parts of what the numbers of z make of it."""
+def _relative(jacobian: Float[Array, "n+m n+m"], step: Unknowns, z: Unknowns, least: Unknowns) -> Float[Array, ""]:
+    """The size of a step: the most that it makes of a number of r, in parts of what the numbers of z make of it."""
     change = jnp.abs(jacobian) @ jnp.abs(step)
-    whole = jnp.abs(jacobian) @ jnp.maximum(jnp.maximum(jnp.abs(start), jnp.abs(z)), jnp.abs(step))
+    whole = jnp.abs(jacobian) @ jnp.maximum(jnp.maximum(least, jnp.abs(z)), jnp.abs(step))
     return jnp.max(jnp.where(change == 0, 0.0, change / jnp.where(whole == 0, 1, whole)))
 
 
-def _is_root(residual, z: Unknowns, start: Unknowns) -> Bool[Array, ""]:
-    """Whether r(z) is zero: each number below √eps of what the numbers of z, or of the start, make of it.
+def _is_root(residual, z: Unknowns, least: Unknowns) -> Bool[Array, ""]:
+    """Whether r(z) is zero: each number below √eps of what the numbers of z, or the `least` ones, make of it.
 
     A converged one is at some eps of it; where forces only fade away with the distance it is of order one.
     """
-    size = jnp.abs(jax.jacfwd(residual)(z)) @ jnp.maximum(jnp.abs(start), jnp.abs(z))
+    size = jnp.abs(jax.jacfwd(residual)(z)) @ jnp.maximum(least, jnp.abs(z))
     return jnp.all(jnp.abs(residual(z)) <= jnp.sqrt(jnp.finfo(z.dtype).eps) * size)
 
 

@@ -147,6 +147,7 @@ def named(layout: Layout, fields: Fields) -> list[tuple[str, np.ndarray]]:
     known += [(f"centre of mass along axis {i}{space[d]}", fields.weights(c=-c)) for i, d, c in along]
     known += [("centre of all coordinates", fields.weights(c=-np.ones(n)))]
     known += [(f"start of {name}", fields.weights(c=-one[i])) for i, name in enumerate(layout.names)]
+    known += [("dilation", fields.weights(a=-0.5 * one, beta=-1.0))]  # h t − ½ p·q
     known += [(name, np.eye(fields.count)[first_own + k]) for k, name in enumerate(fields.names[first_own:])]
     return [(name, weights) for name, weights in known if weights is not None]
 

@@ -28,7 +28,8 @@ _ZERO, _RIGHT = 1e-10, 1e-9
 class Changes(NamedTuple):
     """How L changes under D transformations at S states: Λ (S, D), ∂Λ/∂q̇ (S, D, n), Λ at rest, the size of its terms.
 
-    `gradients` (S, D, 2n) are those of the charges p·ξ − h τ − G by q and q̇.
+    ∂Λ/∂q̇ is by velocities in units of their sizes, so that it compares with Λ. `gradients` (S, D, 2n) are those of the
+    charges p·ξ − h τ − G by q and q̇.
     """
 
     values: np.ndarray
@@ -63,12 +64,12 @@ def gauge_of(scene: Scene, fields: Fields, weights: np.ndarray, k: int, changes:
     return _function(scene, fields, weights, bool(spread and np.abs(at_rest).max() <= _ZERO * size))
 
 
-def is_right(gauge: Callable, scene: Scene, k: int, changes: Changes, states: State) -> bool:
+def is_right(gauge: Callable, scene: Scene, fields: Fields, k: int, changes: Changes, states: State) -> bool:
     """Whether ∂G/∂q and ∂G/∂t are what transformation number k asks for, at some of the states of `changes`.
 
     Of a piecewise L each piece may have a G of its own, and there is none for all.
     """
-    restore = scene.layout.restore
+    restore, speeds = scene.layout.restore, fields.scale / fields.time
 
     @jax.jit
     def gradient(q, t):
@@ -76,6 +77,7 @@ def is_right(gauge: Callable, scene: Scene, k: int, changes: Changes, states: St
 
     some = slice(0, 16)
     by_q, by_t = map(np.asarray, gradient(states.q[some], states.t[some]))
+    by_q = by_q * speeds
     off, allowed = np.abs(by_q - changes.slopes[some, k]), _ZERO * changes.sizes[:, k].max()
     off_rest = np.abs(by_t - changes.at_rest[some, k])
     return bool(
@@ -118,12 +120,12 @@ def _changes(weights: Array, fields: Fields, states: State, *arguments) -> tuple
     scene = Scene.flat(*arguments)
 
     def of_state(state):
-        return jax.lax.map(lambda w: _change(scene, fields.transform(w, scene.params), state), weights)
+        return jax.lax.map(lambda w: _change(scene, fields, fields.transform(w, scene.params), state), weights)
 
     return jax.lax.map(of_state, states)
 
 
-def _change(scene: Scene, transform: Callable, state: State) -> tuple:
+def _change(scene: Scene, fields: Fields, transform: Callable, state: State) -> tuple:
     q, qdot, t = state.q, state.qdot, state.t
 
     def change(qdot):
@@ -137,7 +139,9 @@ def _change(scene: Scene, transform: Callable, state: State) -> tuple:
     place = q, qdot, t, scene.numbers
     (moved, of_time), slope = transform(q, t), jax.grad(change)(jnp.zeros_like(qdot))
     by_q, by_qdot = jax.grad(charge, argnums=(0, 1))(q, qdot)
+    # Terms of Λ, and what they would be where it has none: translations of a cyclic coordinate.
     size = jnp.abs(scene.motion.generalized_force(*place)) @ jnp.abs(moved)
-    size = size + jnp.sum(jnp.abs(scene.motion.momentum(*place))) * jnp.max(jnp.abs(moved))
-    size = size + jnp.abs(of_time * scene.motion.lagrangian(*place))
-    return change(qdot), slope, change(jnp.zeros_like(qdot)), size, jnp.concatenate([by_q - slope, by_qdot])
+    size = size + jnp.abs(scene.motion.momentum(*place)) @ jnp.abs(moved) / fields.time
+    size = size + jnp.abs(of_time * scene.motion.lagrangian(*place)) / fields.time
+    speeds, gradient = fields.scale / fields.time, jnp.concatenate([by_q - slope, by_qdot])
+    return change(qdot), slope * speeds, change(jnp.zeros_like(qdot)), size, gradient

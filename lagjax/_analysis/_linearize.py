@@ -11,7 +11,7 @@ from lagjax._analysis._scene import Scene
 from lagjax._analysis._smooth import is_smooth, require_smooth
 from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
-from lagjax._linear import factorize, least_norm, saddle
+from lagjax._linear import diagonal_scale, factorize, least_norm, saddle
 from lagjax._system import System
 
 PyTree = Any
@@ -122,9 +122,14 @@ def steady_matrices(scene: Scene, q: Vector) -> tuple[Matrix, Matrix, Matrix, Ar
         return scene.force(q, qdot) + scene.jacobian(q, qdot).T @ multipliers
 
     stiffness, rates = jax.jacfwd(balance, argnums=(0, 1))(q, scene.qdot)
-    held, eps = jacobian.T @ multipliers, jnp.finfo(q.dtype).eps
-    left = jnp.where(jnp.abs(force + held) <= _ROUNDED * eps * (jnp.abs(force) + jnp.abs(held)), 0, force + held)
-    return scene.mass_matrix(q, scene.qdot), -rates, -stiffness, jacobian, left
+    mass, held = scene.mass_matrix(q, scene.qdot), jacobian.T @ multipliers
+    if scene.constrained:  # what rounding leaves of forces that balance is nothing
+        lengths = jnp.max(jnp.abs(jacobian * diagonal_scale(mass)), axis=1)
+        lengths = jnp.where(lengths > 0, lengths, 1)
+        largest = jnp.max(jnp.abs(multipliers) * lengths, initial=0)
+        rounding = _ROUNDED * jnp.finfo(q.dtype).eps * (jnp.abs(force) + jnp.abs(jacobian).T @ (largest / lengths))
+        held = jnp.where(jnp.abs(force + held) <= rounding, -force, held)
+    return mass, -rates, -stiffness, jacobian, force + held
 
 
 # Roundings of a force and of the constraint force that balances it, which are left where nothing is.

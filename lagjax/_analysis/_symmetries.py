@@ -166,7 +166,7 @@ def conserved_quantities(
 
 
 def _named(chosen: list[tuple[str, np.ndarray]]) -> list[str]:
-    return [name for name, _ in chosen if not name.startswith(_COMBINATION)]
+    return [name for name, _ in chosen if not name.startswith(_DEPENDENT)]
 
 
 def _verified(chosen: list[tuple[str, np.ndarray]], fresh: "_Measured") -> list[tuple[str, np.ndarray]]:
@@ -189,6 +189,8 @@ def _near_symmetries(measured: "_Measured", space: np.ndarray, known: list[tuple
 
 
 _COMBINATION = "combination: "
+# Names of what is given only where it is no function of other quantities, as it is for free particles.
+_DEPENDENT = (_COMBINATION, "dilation")
 
 
 class _Measured(NamedTuple):
@@ -326,21 +328,28 @@ def _in_units_of_user(weights: np.ndarray, fields: Fields) -> tuple:
 
 
 def _composed(weights: np.ndarray, fields: Fields, names: tuple[str, ...]) -> str:
-    """A combination in words: its parts by size, six at most. What is zero is so beside the sizes of coordinates."""
+    """A combination in words: its six largest parts, in units of the coordinates, in an order that has no units."""
     alpha, b, c, a, beta, own = _in_units_of_user(_readable(weights, fields), fields)
-    parts = [(alpha, "time translation"), (beta, "scaling of the time")]
-    parts += [(x, f"translation of {name}") for x, name in zip(b, names, strict=True)]
-    parts += [(x, f"boost of {name}") for x, name in zip(c, names, strict=True)]
-    parts += list(zip(own, fields.names[len(fields.names) - len(own) :], strict=True))
+    scale, time = fields.scale, fields.time
+    parts = [(alpha, 1 / time, "time translation"), (beta, 1.0, "scaling of the time")]
+    parts += [(x, 1 / one, f"translation of {name}") for x, one, name in zip(b, scale, names, strict=True)]
+    parts += [(x, time / one, f"boost of {name}") for x, one, name in zip(c, scale, names, strict=True)]
+    parts += [(x, 1.0, name) for x, name in zip(own, fields.names[len(fields.names) - len(own) :], strict=True)]
     for i in range(len(a)):
-        parts.append((a[i, i], f"scaling of {names[i]}"))
+        parts.append((a[i, i], 1.0, f"scaling of {names[i]}"))
         for j in range(i):
             if abs(a[i, j] + a[j, i]) < 1e-9 * abs(a[i, j]):
-                parts.append((a[i, j], f"rotation from {names[j]} to {names[i]}"))
+                parts.append((a[i, j], scale[j] / scale[i], f"rotation from {names[j]} to {names[i]}"))
             else:
-                parts += [(a[i, j], f"d{names[i]} = {names[j]}"), (a[j, i], f"d{names[j]} = {names[i]}")]
-    parts = sorted([part for part in parts if part[0] != 0], key=lambda part: -abs(part[0]))
-    return _COMBINATION + ", ".join(f"{x:+.6g} {name}" for x, name in parts[:6]) + (", …" if len(parts) > 6 else "")
+                parts.append((a[i, j], scale[j] / scale[i], f"d{names[i]} = {names[j]}"))
+                parts.append((a[j, i], scale[i] / scale[j], f"d{names[j]} = {names[i]}"))
+    parts = [part for part in parts if part[0] != 0]
+    least = sorted((abs(x) * unit for x, unit, _ in parts), reverse=True)[:_SHOWN][-1]
+    shown = [f"{x:+.6g} {name}" for x, unit, name in parts if abs(x) * unit >= least]
+    return _COMBINATION + ", ".join(shown[:_SHOWN]) + (", …" if len(parts) > _SHOWN else "")
+
+
+_SHOWN = 6
 
 
 # ---- the charge ------------------------------------------------------------------------------------------------------
@@ -355,7 +364,7 @@ def _quantities(scene: Scene, fields: Fields, chosen: list, states: State) -> tu
     quantities, notes = [], []
     for k in _independent(names, changes.gradients):
         gauge = gauge_of(scene, fields, weights[k], k, changes)
-        if gauge is None or is_right(gauge, scene, k, changes, states):
+        if gauge is None or is_right(gauge, scene, fields, k, changes, states):
             quantities.append(Conserved(names[k], _charge(scene, fields, weights[k], gauge), gauge))
         else:
             notes.append(f"not given: {names[k]}, by a symmetry whose gauge term could not be integrated")
@@ -363,13 +372,13 @@ def _quantities(scene: Scene, fields: Fields, chosen: list, states: State) -> tu
 
 
 def _independent(names: list[str], gradients: np.ndarray) -> list[int]:
-    """Which to keep of D charges with these gradients (S, D, 2n): all that have a name, and of combinations those that
-    are no function of the others.
+    """Which to keep of D charges with these gradients (S, D, 2n): all that have a name, and of combinations and
+    dilations those that are no function of the others.
 
     A function of others has a gradient in the space of theirs at every state. So the angular momentum of the centre of
     mass is left out where its momentum and its start are there.
     """
-    kept = [k for k, name in enumerate(names) if not name.startswith(_COMBINATION)]
+    kept = [k for k, name in enumerate(names) if not name.startswith(_DEPENDENT)]
     for k in range(len(names)):
         if k not in kept and any(_outside(of_state[kept], of_state[k]) > 1e-6 for of_state in gradients):
             kept.append(k)
