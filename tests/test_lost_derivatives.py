@@ -97,7 +97,7 @@ def test_a_guard_that_only_jumps_has_no_derivatives():
     oscillator = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2)
 
     def time(p):
-        flat = lambda q, v, params: jnp.where(q < params, 1.0, -1.0)  # noqa: E731
+        flat = lambda q, v, params: jnp.where(q < params, 1.0, -1.0)
         return lagjax.crossings(oscillator, flat, 1.0, 0.0, (0.0, 3.0), p, count=1).t[0]
 
     np.testing.assert_allclose(time(0.5), np.arccos(0.5), rtol=1e-9)
