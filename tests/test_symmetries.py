@@ -138,9 +138,38 @@ def test_combinations():
         return 0.5 * v @ v - jnp.cos(jnp.arctan2(q[1], q[0]) - 2 * q[2]) * (q[0] ** 2 + q[1] ** 2)
 
     found = names(lagjax.System(screw), jnp.array([1.0, 0.3, 0.2]), jnp.array([1.0, 0.5, 0.2]))
-    assert found == ["energy", "combination: +1 rotation from q[0] to q[1], +0.5 translation of q[2]"]
+    assert found == ["energy", "combination: +0.5 translation of q[2], +1 rotation from q[0] to q[1]"]
     wave = lagjax.System(lambda q, v, t: 0.5 * v @ v - jnp.cos(q[0] - t) - q[1] ** 2)
-    assert names(wave, jnp.ones(2), jnp.ones(2)) == ["combination: +1 translation of q[0], +1 time translation"]
+    assert names(wave, jnp.ones(2), jnp.ones(2)) == ["combination: +1 time translation, +1 translation of q[0]"]
+
+
+def test_forces_with_a_potential_conserve_what_l_would():
+    """Kepler's force, on an orbit whose chords pass the centre: the energy is that of L = T − V but for a constant."""
+
+    def force(q, v, params):
+        return -params * q / jnp.sum(q**2) ** 1.5
+
+    state = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.2])
+    kepler = lagjax.System(lambda q, v: 0.5 * v @ v, forces=force)
+    found = {c.name: c for c in lagjax.conserved_quantities(kepler, *state, 1.3)}
+    assert list(found) == ["energy", "angular momentum in the plane 01"]
+    run = lagjax.simulate(kepler, *state, jnp.linspace(0.0, 20.0, 50), 1.3)
+    energy = jax.vmap(lambda q, v: found["energy"].charge(q, v, params=1.3))(run.q, run.qdot)
+    exact = 0.5 * np.sum(run.qdot**2, axis=1) - 1.3 / np.linalg.norm(run.q, axis=1)
+    np.testing.assert_allclose(energy - energy[0], exact - exact[0], atol=1e-9)
+    by_params = jax.grad(lambda k: found["energy"].charge(run.q[7], run.qdot[7], params=k))(1.3)
+    np.testing.assert_allclose(by_params, 1.0 - 1 / np.linalg.norm(run.q[7]), rtol=1e-9)
+    curl = lagjax.System(lambda q, v: 0.5 * v @ v, forces=lambda q, v: jnp.array([q[1], -q[0]]))
+    assert "energy" not in names(curl, *state)
+
+
+def test_a_dilation():
+    """De Alfaro, Fubini & Furlan, Nuovo Cimento A 34 (1976) 569: D = h t − ½ p·q of an inverse square."""
+    inverse_square = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 / (q @ q))
+    state = jnp.array([1.0, 0.0]), jnp.array([0.2, 1.2])
+    found = {c.name: c for c in lagjax.conserved_quantities(inverse_square, *state)}
+    assert list(found) == ["energy", "angular momentum in the plane 01", "dilation"]
+    np.testing.assert_allclose(found["dilation"].charge(*state, 2.0), 2.0 * (0.5 * 1.48 + 0.5) - 0.5 * 0.2, rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -1,7 +1,8 @@
 """The gauge G(q, t) of a symmetry, from the change of L that is its time derivative.
 
 Λ = ∂G/∂q·q̇ + ∂G/∂t is affine in q̇, so that ∂G/∂q = ∂Λ/∂q̇ and ∂G/∂t = Λ(q, 0, t). G is their integral along the
-straight line from a state of reference, where it is zero, by Gauss's rule; where ∂G/∂q is constant, G = ∂G/∂q·q.
+straight line from a state of reference, where it is zero; where ∂G/∂q is constant, G = ∂G/∂q·q. What the rule of
+integration misses, `is_right` finds.
 """
 
 from collections.abc import Callable
@@ -15,11 +16,9 @@ from jaxtyping import Array
 
 from lagjax._analysis._fields import Fields
 from lagjax._analysis._noether import State, variation
+from lagjax._analysis._potential import along_line
 from lagjax._analysis._scene import Scene
 from lagjax._doubles import accepts_singles
-
-# Nodes of Gauss's rule: exact for polynomials of degree 63. What it misses, `is_right` finds.
-_NODES = 32
 
 # Parts of the terms of Λ that count as zero, and what the gradient of G may be off.
 _ZERO, _RIGHT = 1e-10, 1e-9
@@ -88,8 +87,6 @@ def is_right(gauge: Callable, scene: Scene, fields: Fields, k: int, changes: Cha
 
 def _function(scene: Scene, fields: Fields, weights: np.ndarray, constant: bool) -> Callable:
     layout, system = scene.layout, scene.system
-    nodes, shares = np.polynomial.legendre.leggauss(_NODES)
-    nodes, shares = 0.5 * (nodes + 1), 0.5 * shares
     reference = np.asarray(scene.q)
 
     @accepts_singles(("q",), ("t", "params"))
@@ -106,10 +103,10 @@ def _function(scene: Scene, fields: Fields, weights: np.ndarray, constant: bool)
 
         if constant:
             return slope(start, jnp.zeros_like(t)) @ there.q
-        way = there.q - start
-        along = jax.vmap(lambda s: slope(start + s * way, t) @ way)(jnp.asarray(nodes, layout.dtype))
-        in_time = jax.vmap(lambda s: change(start, jnp.zeros_like(start), s * t) * t)(jnp.asarray(nodes, layout.dtype))
-        return jnp.asarray(shares, layout.dtype) @ (along + in_time)
+        in_time = along_line(
+            lambda t: change(start, jnp.zeros_like(start), t[0])[None], jnp.zeros_like(t)[None], t[None]
+        )
+        return along_line(lambda q: slope(q, t), start, there.q) + in_time
 
     return gauge
 

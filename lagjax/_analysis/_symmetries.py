@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from lagjax._analysis._fields import Fields, fields_of, named
 from lagjax._analysis._gauge import changes_of, gauge_of, is_right
 from lagjax._analysis._noether import State, euler_lagrange, flat_generator, variation
+from lagjax._analysis._potential import with_potential
 from lagjax._analysis._scene import Scene
 from lagjax._analysis._states import moved_by_rounding, random_states
 from lagjax._arguments import accept
@@ -114,11 +115,12 @@ def conserved_quantities(
 
     together with `generators`. A is any matrix for up to 12 coordinates; beyond, the rotations and scalings of each
     leaf. A transformation is a symmetry where it changes L by some dG(q, t)/dt, and neither forces nor constraints do
-    work on it. Energy, momenta, angular momenta and the like come first, under these names; what is left comes as
-    combinations ("translation of z, rotation": a helix). Each is verified at new random states. What a symmetry may
-    leave there is told from rounding by how it differs between states a few units in the last place apart; the
-    `threshold` of the result says what would not be seen. A symmetry that is broken by less than a millionth is named
-    in the notes ("nearly conserved").
+    work on it. Forces that have a potential count as part of L: the energy contains their work from the state that is
+    given, NaN where that is not resolved. Energy, momenta, angular momenta and the like come first, under these names;
+    what is left comes as combinations ("translation of z, rotation": a helix). Each is verified at new random states.
+    What a symmetry may leave there is told from rounding by how it differs between states a few units in the last place
+    apart; the `threshold` of the result says what would not be seen. A symmetry that is broken by less than a millionth
+    is named in the notes ("nearly conserved").
 
     - `q`, `qdot`: a state of numbers, not traced. The random states are drawn about it, as far as the size of its
       numbers and the forces there suggest, in any units; nothing else about it matters.
@@ -149,6 +151,7 @@ def conserved_quantities(
     fields = fields_of(scene.layout, scales.q, scales.t, _own(generators, scene.layout))
     count = 8 + 4 * fields.count // scene.layout.size
     here, fresh = (random_states(scene, scales, count, seed + k, piecewise) for k in range(2))
+    scene = with_potential(scene, scales, here)
     measured = _measured(scene, fields, here)
     known, names = named(scene.layout, fields), scene.layout.names
     space = measured.symmetries(measured.of_lagrangian, measured.of_others)

@@ -1,0 +1,124 @@
+"""Forces that have a potential, as part of L: what is conserved must not depend on where the author wrote them.
+
+Forces Q(q, t) are ∂W/∂q of their work W = ∫ Q·dq where ∂Qᵢ/∂qⱼ = ∂Qⱼ/∂qᵢ and nothing depends on q̇. The integral is
+taken from a state of reference along a straight line and along curves beside it, as the line may lead through a centre
+of force; the one that is known best counts.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from lagjax._analysis._noether import State
+from lagjax._analysis._scene import Scene
+from lagjax._scales import Scales
+from lagjax._system import System
+
+# Nodes of Gauss's rule: exact for polynomials of degree 63.
+_NODES = 32
+
+# How far beside the straight line curves lead, in parts of its length, into how many parts they are divided, and what
+# rules over parts of two lengths may differ by.
+_BESIDE, _PARTS, _RESOLVED = (0.0, 0.5, -0.5), 4, 1e-10
+
+# The part of forces by which they may fail to have a potential: some tens of roundings of sums.
+_CURL = 1e-12
+
+
+def along_line(slope: Callable, start: Array, end: Array) -> Array:
+    """∫ slope(q)·dq from `start` to `end`, (n,) or (), along a straight line."""
+    way = end - start
+    return _integral(lambda s: jnp.vdot(slope(start + s * way), way), 1, end.dtype)
+
+
+def _integral(rate: Callable, parts: int, dtype) -> Array:
+    """∫ rate(s) ds from 0 to 1 by Gauss's rule on so many parts."""
+    nodes, shares = np.polynomial.legendre.leggauss(_NODES)
+    places = (np.arange(parts)[:, None] + 0.5 * (nodes + 1)).ravel() / parts
+    values = jax.vmap(rate)(jnp.asarray(places, dtype))
+    return jnp.asarray(np.tile(0.5 * shares / parts, parts), dtype) @ values
+
+
+def _work(force: Callable, start: Array, end: Array, scale: np.ndarray) -> Array:
+    """∫ force(q)·dq from `start` to `end` (n,) by the best of some ways; NaN where none is resolved or they differ."""
+    way, size = end - start, jnp.asarray(scale, end.dtype)
+    across = jnp.cos(jnp.arange(1.0, len(scale) + 1)).astype(end.dtype)
+    length = jnp.sqrt(jnp.sum((way / size) ** 2))
+    along = (way / size) / jnp.where(length > 0, length, 1)
+    across = across - (across @ along) * along
+    across = size * length * across / jnp.maximum(jnp.sqrt(jnp.sum(across**2)), 1e-3)
+
+    def along_curve(beside, parts):
+        def rate(s):
+            place = start + s * way + beside * jnp.sin(jnp.pi * s) * across
+            return force(place) @ (way + beside * jnp.pi * jnp.cos(jnp.pi * s) * across)
+
+        return jnp.stack([_integral(rate, parts, end.dtype), _integral(lambda s: jnp.abs(rate(s)), parts, end.dtype)])
+
+    curves = jnp.asarray(_BESIDE, end.dtype)
+    coarse, fine = (jax.vmap(lambda x, parts=parts: along_curve(x, parts))(curves) for parts in (_PARTS, 2 * _PARTS))
+    error = jnp.abs(fine[:, 0] - coarse[:, 0]) / jnp.where(fine[:, 1] > 0, fine[:, 1], 1)
+    error = jnp.where(jnp.isfinite(error), error, jnp.inf)
+    best = jnp.argmin(error)
+    others = jnp.abs(fine[:, 0] - fine[best, 0]) <= 1e3 * _RESOLVED * fine[:, 1]
+    sure = (error[best] <= _RESOLVED) & jnp.all(others | (error > _RESOLVED))
+    return jnp.where(sure, fine[best, 0], jnp.nan)
+
+
+def with_potential(scene: Scene, scales: Scales, states: State) -> Scene:
+    """The scene with its forces in L where they have a potential, as far as some states tell; else the scene."""
+    if scene.motion.forces is None or not _have_potential(scene, scales, states):
+        return scene
+    system, layout, reference = scene.system, scene.layout, np.asarray(scene.q)
+
+    def lagrangian(q, qdot, t, params):
+        motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
+        place = layout.flatten(q), layout.flatten(qdot), t, numbers
+
+        def force(q):
+            return motion.forces(q, jnp.zeros_like(q), t, numbers)
+
+        # The value is that of a long way; by q it changes as along the last, vanishing part of it, to every order.
+        here = jax.lax.stop_gradient(place[0])
+        start = jnp.asarray(reference, layout.dtype)
+        work = _work(force, start, here, scales.q) + along_line(force, here, place[0])
+        return motion.lagrangian(*place) + work
+
+    whole = System(
+        lagrangian,
+        dissipation=system.dissipation,
+        constraints=system.constraints,
+        velocity_constraints=system.velocity_constraints,
+    )
+    return Scene.of(whole, layout.restore(scene.q), layout.restore(scene.qdot), scene.params)
+
+
+def _have_potential(scene: Scene, scales: Scales, states: State) -> bool:
+    terms = [np.asarray(x) for x in _derivatives(states, *scene.arguments)]
+    well = np.logical_and.reduce([np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in terms])
+    if not well.any():
+        return False
+    force, by_q, by_qdot = (x[well] for x in terms)
+    work = np.abs(force) @ scales.q
+    by_q, by_qdot = by_q * scales.q[:, None] * scales.q, by_qdot * scales.q[:, None] * scales.qdot
+    size = max(float(work.max()), float(np.abs(by_q).max()))
+    off = max(float(np.abs(by_q - np.swapaxes(by_q, 1, 2)).max()), float(np.abs(by_qdot).max()))
+    return off <= _CURL * size
+
+
+@eqx.filter_jit
+def _derivatives(states: State, *arguments) -> tuple[Array, Array, Array]:
+    """Q (S, n), ∂Q/∂q and ∂Q/∂q̇ (S, n, n)."""
+    scene = Scene.flat(*arguments)
+
+    def of_state(state):
+        def force(q, qdot):
+            return scene.motion.forces(q, qdot, state.t, scene.numbers)
+
+        return force(state.q, state.qdot), *jax.jacfwd(force, argnums=(0, 1))(state.q, state.qdot)
+
+    return jax.lax.map(of_state, states)
