@@ -7,7 +7,8 @@ i, a radian for an angle φ beside a radius r, whose Mᵢᵢ is m r². The force
 through the state, F(q + εu) with |u| = 1:
 
     l    the larger of |q| and |q̇|/√(∂F/∂ε), but the latter no larger than r, the smallest ε at which F is not linear
-         any more; where both are zero r, else |F|/(∂F/∂ε), else |q̇|²/|F|
+         any more; where both are zero r, else |F|/(∂F/∂ε), else |q̇|²/|F|,
+         where |q̇| is at rest the speed at which momenta are not linear in it any more
     ω    the largest of |q̇|/l, of √(∂F/∂ε), and of ∂F/∂q̇; else √(|F|/l)
     qᵢ ~ max(|qᵢ|, l/√|Mᵢᵢ|),   q̇ᵢ ~ max(|q̇ᵢ|, ω l/√|Mᵢᵢ|),   t ~ 1/ω
 
@@ -45,34 +46,36 @@ class Scales(NamedTuple):
 
     @classmethod
     def of(cls, evaluate: Callable[[str, States, States], np.ndarray], q: Numbers, qdot: Numbers) -> "Scales":
-        """Those at (q, qdot) of a scene whose "force" (S, n) and "mass_matrix" (S, n, n) `evaluate` gives at states."""
+        """Those at (q, qdot) of a scene whose "force", "momentum" (S, n), "mass_matrix" (S, n, n) `evaluate` gives at states."""
         q, qdot = np.asarray(q, float), np.asarray(qdot, float)
         with np.errstate(all="ignore"):
             mass = np.diagonal(evaluate("mass_matrix", q[None], qdot[None])[0])
-            return _measured(lambda q, qdot: evaluate("force", q, qdot), np.sqrt(np.abs(mass)), q, qdot)
+            return _measured(evaluate, np.sqrt(np.abs(mass)), q, qdot)
 
 
-def _measured(force, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
+def _measured(evaluate, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
     heaviest = root.max(where=np.isfinite(root), initial=0.0) or 1.0
     root = np.where((root > 0) & np.isfinite(root), root, heaviest)
     along = np.cos(np.arange(1.0, len(q) + 1)) / root  # no symmetry moves all coordinates like this
     along = along / np.abs(along * root).max()
 
-    def forces(steps, of_q, of_v):
+    def moved(name, steps, of_q, of_v):
         steps = np.asarray(steps)[:, None]
-        moved = force(q + steps * of_q, qdot + steps * of_v)
-        return np.max(np.abs(moved) / root, axis=1), moved / root
+        return evaluate(name, q + steps * of_q, qdot + steps * of_v) / root
 
     far, fast = np.abs(q * root).max(), np.abs(qdot * root).max()
     steps = far * _STEPS if far > 0 else _ALL_STEPS
-    slope, bent = _line(lambda s: forces(s, along, 0.0)[1], steps)
-    here = float(np.nan_to_num(forces([0.0], along, 0.0)[0][0]))
+    slope, bent = _line(lambda s: moved("force", s, along, 0.0), steps)
+    here = float(np.nan_to_num(np.abs(moved("force", [0.0], along, 0.0)).max()))
     swing = fast / np.sqrt(slope) if slope > 0 else 0.0
     length = max(far, min(swing, bent or np.inf)) or bent or (here / slope if slope > 0 else 0.0)
-    length = length or (fast**2 / here if here > 0 else 0.0) or heaviest
+    if not length and here > 0:
+        limit = fast or _line(lambda s: moved("momentum", s, 0.0, along), _ALL_STEPS)[1]
+        length = limit**2 / here
+    length = length or heaviest
     rate = max(fast / length, np.sqrt(slope))
     step = (rate or 1.0) * length
-    low, high = forces([-step, step], 0.0, along)[1]
+    low, high = moved("force", [-step, step], 0.0, along)
     rate = max(rate, float(np.nan_to_num(np.abs(high - low).max() / (2 * step)))) or np.sqrt(here / length) or 1.0
     reach = max(1.0, (bent or 0.0) / length)
     return Scales(np.maximum(np.abs(q), length / root), np.maximum(np.abs(qdot), rate * length / root), 1 / rate, reach)
@@ -107,7 +110,7 @@ def _bends(force: Callable, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     odd, even = (ahead - back) / 2, (ahead + back) / 2 - here
     change, size = np.abs(odd).max(axis=1), np.maximum(np.abs(ahead), np.abs(back)).max(axis=1)
     doubled = np.abs((twice - twice_back) / 2 - 2 * odd).max(axis=1)
-    off = np.maximum(np.abs(even).max(axis=1), np.where(np.isfinite(doubled), doubled, 0.0))
-    seen = (np.maximum(change, np.abs(even).max(axis=1)) > _SEEN * size) & np.isfinite(off)
+    off = np.maximum(np.abs(even).max(axis=1), np.where(np.isfinite(doubled), doubled, np.inf))
+    seen = (np.maximum(change, np.abs(even).max(axis=1)) > _SEEN * size) & np.isfinite(size)
     linear = seen & (off <= _BENT * change) & (change > 0)
     return linear, seen & ~linear, change

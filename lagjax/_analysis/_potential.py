@@ -80,7 +80,7 @@ def with_potential(scene: Scene, scales: Scales, states: State) -> Scene:
         place = layout.flatten(q), layout.flatten(qdot), t, numbers
 
         def force(q):
-            return motion.forces(q, jnp.zeros_like(q), t, numbers)
+            return motion.forces(q, jnp.zeros_like(q), t, numbers)  # pyright: ignore[reportOptionalCall]
 
         # The value is that of a long way; by q it changes as along the last, vanishing part of it, to every order.
         here = jax.lax.stop_gradient(place[0])
@@ -117,7 +117,7 @@ def _derivatives(states: State, *arguments) -> tuple[Array, Array, Array]:
 
     def of_state(state):
         def force(q, qdot):
-            return scene.motion.forces(q, qdot, state.t, scene.numbers)
+            return scene.motion.forces(q, qdot, state.t, scene.numbers)  # pyright: ignore[reportOptionalCall]
 
         return force(state.q, state.qdot), *jax.jacfwd(force, argnums=(0, 1))(state.q, state.qdot)
 

@@ -168,7 +168,11 @@ class Scene(NamedTuple):
 
 @eqx.filter_jit
 def _evaluated(name: str, q, qdot, *arguments) -> Array:
-    """Forces, or mass matrices, at states (S, n), of a scene without scalar programs."""
+    """Forces, momenta or mass matrices at states (S, n), of a scene without scalar programs."""
     scene = Scene.flat(*arguments)
-    one = scene.force if name == "force" else scene.mass_matrix
+
+    def momentum(q, qdot):
+        return scene.motion.momentum(q, qdot, jnp.zeros((), q.dtype), scene.numbers)
+
+    one = {"force": scene.force, "momentum": momentum, "mass_matrix": scene.mass_matrix}[name]
     return jax.vmap(one)(jnp.asarray(q), jnp.asarray(qdot))

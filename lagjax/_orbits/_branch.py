@@ -81,7 +81,8 @@ def branch_off(
 def _follower(system: System, family: Family, k: int, turns: int, params, by: str) -> Follower:
     """What follows orbits of this family, traversed once or twice, in the units of orbit k."""
     period, layout, y0 = _start(family, k, turns)
-    arcs = Arcs.of(system, *map(layout.restore, halves(y0[0])), params, RTOL, "Families")
+    q, qdot = map(layout.restore, halves(y0[0]))
+    arcs = Arcs.of(system, q, qdot, params, RTOL, "Families")
     place = None if by == "energy" else place_of(params, by)
     return Follower(arcs.with_numbers(_numbers(arcs, place, family, k)), place, y0, period)
 
