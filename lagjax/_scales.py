@@ -46,7 +46,11 @@ class Scales(NamedTuple):
 
     @classmethod
     def of(cls, evaluate: Callable[[str, States, States], np.ndarray], q: Numbers, qdot: Numbers) -> "Scales":
-        """Those at (q, qdot) of a scene whose "force", "momentum" (S, n), "mass_matrix" (S, n, n) `evaluate` gives at states."""
+        """Those at (q, qdot) of a scene.
+
+        `evaluate(name, q, qdot)` gives the "force" and the "momentum" (S, n), and the "mass_matrix" (S, n, n), at S
+        states.
+        """
         q, qdot = np.asarray(q, float), np.asarray(qdot, float)
         with np.errstate(all="ignore"):
             mass = np.diagonal(evaluate("mass_matrix", q[None], qdot[None])[0])
