@@ -348,3 +348,41 @@ def test_nothing_is_linear_at_a_border(name):
 def test_borders_that_linearization_does_not_mind(force, frequency):
     found = lagjax.normal_modes(lagjax.System(_well, forces=force), 0.0).frequencies
     np.testing.assert_allclose(found, [frequency], atol=1e-12)
+
+
+# ---- where a scene comes to rest -------------------------------------------------------------------------------------
+
+
+def test_a_pendulum_comes_to_rest_below():
+    pendulum = lagjax.System(lambda q, v, params: 0.5 * v**2 + params * jnp.cos(q))
+    np.testing.assert_allclose(lagjax.equilibrium(pendulum, np.pi, 9.81).q, np.pi)  # where it is, upright
+    np.testing.assert_allclose(jnp.cos(lagjax.equilibrium(pendulum, np.pi, 9.81, stable=True).q), 1.0)
+    with pytest.raises(ValueError, match="leave qdot out"):
+        lagjax.equilibrium(pendulum, 0.1, 9.81, qdot=0.0, stable=True)
+    with pytest.raises(ValueError, match="cannot be traced"):
+        jax.jit(lambda q: lagjax.equilibrium(pendulum, q, 9.81, stable=True).q)(0.1)
+    with pytest.raises(ValueError, match="not come to rest"):
+        lagjax.equilibrium(lagjax.System(lambda q, v: 0.5 * v**2 - q), 0.3, stable=True)
+
+
+@pytest.mark.slow
+def test_a_chain_hangs():
+    """From a zig-zag and from above its supports: all rods below, and their angles those of a catenary of rods.
+
+    The force in all rods has one horizontal part H, and the vertical parts rise by a weight at each node, so that the
+    tangents of their angles are equally spaced.
+    """
+    n, span, weight = 12, 8.0, 9.81
+
+    def lengths(q):
+        nodes = jnp.concatenate([jnp.zeros((1, 2)), q, jnp.array([[span, 0.0]])])
+        return jnp.sum(jnp.diff(nodes, axis=0) ** 2, axis=1) - 1.0
+
+    chain = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - weight * jnp.sum(q[:, 1]), constraints=lengths)
+    x = np.linspace(0.0, span, n + 1)[1:-1]
+    for y in (0.7 * (-1.0) ** np.arange(n - 1), 2.0 * np.sin(np.pi * x / span)):
+        rest = lagjax.equilibrium(chain, np.stack([x, y], axis=1), stable=True)
+        nodes = np.concatenate([np.zeros((1, 2)), rest.q, [[span, 0.0]]])
+        rods = np.diff(nodes, axis=0)
+        assert (nodes[1:-1, 1] < 0).all()
+        np.testing.assert_allclose(np.diff(rods[:, 1] / rods[:, 0], n=2), 0.0, atol=1e-9)

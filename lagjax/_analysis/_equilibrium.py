@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._scene import Scene
-from lagjax._analysis._solve import shortest_preimage, shortest_solution
+from lagjax._analysis._settle import settle
+from lagjax._analysis._solve import levenberg_marquardt, relative_size, shortest_preimage, shortest_solution
 from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
-from lagjax._linear import factorize, least_norm
+from lagjax._linear import least_norm
 from lagjax._system import System
 from lagjax._validate import require_flag
 
@@ -36,7 +37,13 @@ class Equilibrium(NamedTuple):
 
 @accepts_singles(("q", "qdot"), ("params",))
 def equilibrium(
-    system: System, q: PyTree, params: PyTree = None, *, qdot: PyTree = None, throw: bool = True
+    system: System,
+    q: PyTree,
+    params: PyTree = None,
+    *,
+    qdot: PyTree = None,
+    stable: bool = False,
+    throw: bool = True,
 ) -> Equilibrium:
     r"""The equilibrium of `system` that Newton's method reaches from `q`.
 
@@ -45,14 +52,16 @@ def equilibrium(
     - `q`: the guess, in the user's pytree.
     - `qdot`: for a steady motion, its velocities in the structure of `q`: those of the cyclic coordinates, and zero for
       all others. The other coordinates are found: they then stay constant (a top that precesses, a bead on a hoop).
+    - `stable`: whether to look for one where the scene comes to rest, a minimum of the potential: from `q` it is first
+      followed with friction (a chain falls until it hangs). That takes numbers, not traced ones, and no `qdot`.
     - `throw`: whether to raise where no equilibrium is found. With False, and inside `jit` and `vmap`, `ok` is False
       and q is NaN.
 
-    Stable and unstable equilibria are found alike; `normal_modes` tells which it is. Where equilibria form a family
-    (along a coordinate that no force acts on), the result is the member that minimum-norm Newton steps reach, and its
-    derivatives are those of the nearest member. Far from an equilibrium the steps are damped (Levenberg–Marquardt). The
-    result is differentiated implicitly with respect to `params`, to every order. The function works under `jit`, `vmap`
-    and `grad`.
+    Without `stable`, stable and unstable equilibria are found alike; `normal_modes` tells which it is. Where equilibria
+    form a family (along a coordinate that no force acts on), the result is the member that minimum-norm Newton steps
+    reach, and its derivatives are those of the nearest member. Far from an equilibrium the steps are damped
+    (Levenberg–Marquardt). The result is differentiated implicitly with respect to `params`, to every order. The
+    function works under `jit`, `vmap` and `grad`.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a scene that depends on the time, a
     velocity of a coordinate that is not cyclic, or where no equilibrium is found.
@@ -67,9 +76,12 @@ def equilibrium(
     ```
     """
     require_flag(throw, "throw")
+    require_flag(stable, "stable")
     scene = Scene.of(system, q, qdot, params)
     scene.require_autonomous("An equilibrium")
     require_steady(scene)
+    if stable:
+        scene = _at_rest(scene, qdot)
     place, multipliers, ok = _found(*scene.arguments)
     if throw and scene.concrete and not ok:
         raise ValueError(_sentence(scene))
@@ -77,6 +89,18 @@ def equilibrium(
     if scene.constrained:
         of_user = scene.system.by_constraint(multipliers, scene.layout, scene.params)
     return Equilibrium(scene.layout.restore(place), of_user, ok)
+
+
+def _at_rest(scene: Scene, qdot: PyTree) -> Scene:
+    """The scene where it comes to rest with friction. Raises where that cannot be followed."""
+    if qdot is not None:
+        raise ValueError("stable=True finds where a scene comes to rest: leave qdot out, or look at normal_modes.")
+    if not scene.concrete:
+        raise ValueError(
+            "stable=True follows a motion until it rests, and cannot be traced: find q outside of jit, vmap and grad, "
+            "and give it to equilibrium(system, q, params) inside; derivatives by params are right there."
+        )
+    return Scene.of(scene.system, settle(scene), None, scene.params)
 
 
 def require_steady(scene: Scene) -> None:
@@ -94,11 +118,8 @@ def require_steady(scene: Scene) -> None:
 
 # ---- Newton's method -------------------------------------------------------------------------------------------------
 
-# Damped steps; 10 to 30 are usual. Twice as many change nothing where there is an equilibrium.
-_STEPS = 200
-
-# A step that is nothing, in parts of the numbers of z; and Newton steps at the end, of which two reach rounding.
-_AT_REST, _POLISH = 1e-10, 3
+# Newton steps at the end, of which two reach rounding.
+_POLISH = 3
 
 # A multiplier that counts as rounding of the others.
 _TINY = 1e-6
@@ -120,7 +141,7 @@ def _found(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
     least = jnp.abs(start).at[n:].max(_TINY * unit[n:] * jnp.max(jnp.abs(start / unit)[n:], initial=0.0))
 
     def find(_, start):
-        return _polished(residual, _damped(residual, start, least, unit), start, least, unit)
+        return _polished(residual, levenberg_marquardt(residual, start, least, unit), start, least, unit)
 
     def shortest(linear, right):
         return unit * shortest_preimage(lambda x: linear(unit * x), right)
@@ -160,49 +181,6 @@ def least_multipliers(scene: Scene, q: Vector) -> Array:
     return -least_norm(jacobian @ jacobian.T, jacobian @ scene.force(q, scene.qdot))
 
 
-def _damped(residual, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
-    """z after steps of Levenberg and Marquardt for |r|², until they are small or nothing helps.
-
-    Rows are weighed by the size of their gradient at the start, columns by the largest they had so far (Moré): a
-    change of units changes nothing. The damping goes down with |r|, which keeps the convergence quadratic where
-    solutions are not isolated (Fan & Yuan, Computing 74 (2005) 23).
-    """
-    lengths = jnp.sqrt(jnp.sum((jax.jacfwd(residual)(start) * unit) ** 2, axis=1))
-    weights = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1), 1)
-
-    def weighted(z):
-        return weights * residual(z)
-
-    def moves(carry):
-        _, value, moved, _, _, count = carry
-        return (moved > _AT_REST) & (count < _STEPS) & (jnp.max(jnp.abs(value)) > 0)
-
-    def once(carry):
-        z, value, moved, damping, scale, count = carry
-        jacobian = jax.jacfwd(weighted)(z)
-        scale = jnp.maximum(scale, jnp.sqrt(jnp.sum(jacobian**2, axis=0)))
-        d = jnp.where(scale > 0, scale, unit)
-        scaled = jacobian / d
-        size = jnp.sqrt(jnp.sum(value**2))
-        part = size / (size + jnp.max(jnp.abs(jacobian) @ jnp.maximum(least, jnp.abs(z))))
-        normal = scaled.T @ scaled + (damping * part + 1e-15) * jnp.eye(z.size, dtype=z.dtype)
-        step = -factorize(normal).solve(scaled.T @ value) / d
-        new = weighted(z + step)
-        gain = jnp.sum(value**2) - jnp.sum(new**2)
-        expected = jnp.sum(value**2) - jnp.sum((value + jacobian @ step) ** 2)
-        ratio = jnp.where(expected > 0, gain / jnp.where(expected > 0, expected, 1), 0.0)
-        better = (gain > 0) & jnp.all(jnp.isfinite(new))
-        damping = jnp.where(ratio > 0.75, damping / 4, jnp.where((ratio < 0.25) | ~better, damping * 4, damping))
-        length = _relative(jacobian, step, z, least)
-        stuck = ~better & ((length < _AT_REST) | ~jnp.isfinite(length))
-        moved = jnp.where(better, length, jnp.where(stuck, 0.0, moved))
-        return jnp.where(better, z + step, z), jnp.where(better, new, value), moved, damping, scale, count + 1
-
-    one = jnp.ones((), start.dtype)
-    carry = start, weighted(start), one, 0.1 * one, jnp.zeros_like(start), jnp.zeros((), int)
-    return jax.lax.while_loop(moves, once, carry)[0]
-
-
 def _polished(residual, z: Unknowns, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
     """z after Newton steps, as exact as rounding allows; each is taken where it is small.
 
@@ -212,17 +190,10 @@ def _polished(residual, z: Unknowns, start: Unknowns, least: Unknowns, unit: Unk
     def once(_, z):
         jacobian = jax.jacfwd(residual)(z)
         step = unit * shortest_solution(jacobian * unit, residual(z))
-        return jnp.where(_relative(jacobian, step, z, least) < 1e-3, z - step, z)
+        return jnp.where(relative_size(jacobian, step, z, least) < 1e-3, z - step, z)
 
     z = jax.lax.fori_loop(0, _POLISH, once, z)
     return jnp.where(jnp.abs(z) < jnp.finfo(z.dtype).eps ** 3 * jnp.abs(start), 0.0, z)
-
-
-def _relative(jacobian: Float[Array, "n+m n+m"], step: Unknowns, z: Unknowns, least: Unknowns) -> Float[Array, ""]:
-    """The size of a step: the most that it makes of a number of r, in parts of what the numbers of z make of it."""
-    change = jnp.abs(jacobian) @ jnp.abs(step)
-    whole = jnp.abs(jacobian) @ jnp.maximum(jnp.maximum(least, jnp.abs(z)), jnp.abs(step))
-    return jnp.max(jnp.where(change == 0, 0.0, change / jnp.where(whole == 0, 1, whole)))
 
 
 def _is_root(residual, z: Unknowns, least: Unknowns) -> Bool[Array, ""]:

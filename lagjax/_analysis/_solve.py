@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lagjax._linear import inverted, least_norm, singular_threshold
+from lagjax._linear import factorize, inverted, least_norm, singular_threshold
 
 Matrix = Float[Array, "n n"]
 Vector = Float[Array, " n"]
@@ -60,6 +60,63 @@ def is_root(f: Callable[[Vector], Vector], x: Vector, given: Vector) -> Bool[Arr
     """
     size = jnp.abs(jax.jacfwd(f)(x)) @ jnp.abs(x) + jnp.abs(given)
     return jnp.all(jnp.abs(f(x)) <= jnp.finfo(x.dtype).eps ** 0.6 * size)
+
+
+def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector) -> Vector:
+    """z (n,) after damped steps from `start` for the least |f(z)|², f (m,), until they are small or nothing helps.
+
+    `least` (n,) are the sizes below which numbers of z do not count, `unit` (n,) units in which they compare.
+
+    Rows are weighed by the size of their gradient at the start, columns by the largest they had so far (Moré): a
+    change of units changes nothing. The damping goes down with |r|, which keeps the convergence quadratic where
+    solutions are not isolated (Fan & Yuan, Computing 74 (2005) 23).
+    """
+    lengths = jnp.sqrt(jnp.sum((jax.jacfwd(f)(start) * unit) ** 2, axis=1))
+    weights = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1), 1)
+
+    def weighted(z):
+        return weights * f(z)
+
+    def moves(carry):
+        _, value, moved, _, _, count = carry
+        return (moved > _NO_STEP) & (count < _DAMPED_STEPS) & (jnp.max(jnp.abs(value)) > 0)
+
+    def once(carry):
+        z, value, moved, damping, scale, count = carry
+        jacobian = jax.jacfwd(weighted)(z)
+        scale = jnp.maximum(scale, jnp.sqrt(jnp.sum(jacobian**2, axis=0)))
+        d = jnp.where(scale > 0, scale, unit)
+        scaled = jacobian / d
+        size = jnp.sqrt(jnp.sum(value**2))
+        part = size / (size + jnp.max(jnp.abs(jacobian) @ jnp.maximum(least, jnp.abs(z))))
+        normal = scaled.T @ scaled + (damping * part + 1e-15) * jnp.eye(z.size, dtype=z.dtype)
+        step = -factorize(normal).solve(scaled.T @ value) / d
+        new = weighted(z + step)
+        gain = jnp.sum(value**2) - jnp.sum(new**2)
+        expected = jnp.sum(value**2) - jnp.sum((value + jacobian @ step) ** 2)
+        ratio = jnp.where(expected > 0, gain / jnp.where(expected > 0, expected, 1), 0.0)
+        better = (gain > 0) & jnp.all(jnp.isfinite(new))
+        damping = jnp.where(ratio > 0.75, damping / 4, jnp.where((ratio < 0.25) | ~better, damping * 4, damping))
+        length = relative_size(jacobian, step, z, least)
+        stuck = ~better & ((length < _NO_STEP) | ~jnp.isfinite(length))
+        moved = jnp.where(better, length, jnp.where(stuck, 0.0, moved))
+        return jnp.where(better, z + step, z), jnp.where(better, new, value), moved, damping, scale, count + 1
+
+    one = jnp.ones((), start.dtype)
+    carry = start, weighted(start), one, 0.1 * one, jnp.zeros_like(start), jnp.zeros((), int)
+    return jax.lax.while_loop(moves, once, carry)[0]
+
+
+def relative_size(jacobian: Float[Array, "m n"], step: Vector, z: Vector, least: Vector) -> Float[Array, ""]:
+    """The size of a step: the most that it makes of a number of f(z), in parts of what the numbers of z make of it."""
+    change = jnp.abs(jacobian) @ jnp.abs(step)
+    whole = jnp.abs(jacobian) @ jnp.maximum(jnp.maximum(least, jnp.abs(z)), jnp.abs(step))
+    return jnp.max(jnp.where(change == 0, 0.0, change / jnp.where(whole == 0, 1, whole)))
+
+
+# A step that is nothing, in parts of the numbers of z. Damped steps: 10 to 30 are usual, and twice as many change
+# nothing where there is a solution.
+_NO_STEP, _DAMPED_STEPS = 1e-10, 200
 
 
 def _shortened(f: Callable, x: Vector, value: Vector, step: Vector) -> Vector:

@@ -47,12 +47,15 @@ def suspects(records: list[Any], names: tuple[str, ...], worst: list[int], slowe
     ]
     yield from milliseconds if slower > _SLOW else []
     yield from degrees if max(ranges) > _WIDEST else []
-    for place in worst[:_MOST] if len(records) > 2 else []:
-        yield Suspect(f"without records[{place}]", [*records[:place], *records[place + 1 :]])
+    swaps = []
     for i, j in itertools.combinations(some, 2):
         order = np.arange(count)
         order[[i, j]] = j, i
-        yield Suspect(f"with {names[i]} and {names[j]} swapped", _reordered(records, order))
+        swaps.append(Suspect(f"with {names[i]} and {names[j]} swapped", _reordered(records, order)))
+    yield from swaps if len(swaps) == 1 else []  # one try tells
+    for place in worst[:_MOST] if len(records) > 2 else []:
+        yield Suspect(f"without records[{place}]", [*records[:place], *records[place + 1 :]])
+    yield from swaps if len(swaps) > 1 else []
     for k in some:
         yield Suspect(f"with the other sign of {names[k]}", _scaled(records, [k], -1.0))
     for turned in [list(some)] + [[k] for k in some if count > 1]:
