@@ -45,8 +45,8 @@ def settle(scene: Scene) -> PyTree:
         if (np.abs(np.asarray(layout.flatten(qdot))) <= _AT_REST * scales.qdot).all():
             return q
     raise ValueError(
-        f"With friction the scene has not come to rest after a time of {2**_STAGES * _TIMES * scales.t:.3g}: there may be "
-        "no minimum of the potential near the guess, as of a force that always pushes."
+        f"With friction the scene has not come to rest after a time of {2**_STAGES * _TIMES * scales.t:.3g}: there may "
+        "be no minimum of the potential near the guess, as of a force that always pushes."
     )
 
 
@@ -68,17 +68,16 @@ def _with_friction(system: System) -> System:
         own = 0.0 if system.dissipation is None else system.dissipation(q, qdot, t=0.0, params=params["of"])
         return own + params["rate"] * kinetic
 
-    def with_params(function, roles: int):
-        if function is None:
-            return None
-        if roles == 1:
-            return lambda q, params: function(q, t=0.0, params=params["of"])
+    def of_state(function):
         return lambda q, qdot, params: function(q, qdot, t=0.0, params=params["of"])
 
+    def of_place(function):
+        return lambda q, params: function(q, t=0.0, params=params["of"])
+
     return System(
-        with_params(system.lagrangian, 2),
-        forces=with_params(system.forces, 2),
+        of_state(system.lagrangian),
+        forces=None if system.forces is None else of_state(system.forces),
         dissipation=dissipation,
-        constraints=with_params(system.constraints, 1),
-        velocity_constraints=with_params(system.velocity_constraints, 2),
+        constraints=None if system.constraints is None else of_place(system.constraints),
+        velocity_constraints=None if system.velocity_constraints is None else of_state(system.velocity_constraints),
     )
