@@ -25,7 +25,7 @@ PyTree = Any
 
 
 class Lifted(NamedTuple):
-    """The parameters of the user, and numbers that functions closed over."""
+    """The parameters of the user, and numbers that functions closed over, or by which modes differ."""
 
     params: PyTree
     values: tuple
@@ -58,7 +58,7 @@ class _Trace:
 
 
 @dataclass(frozen=True, eq=False)
-class _Unchanged:
+class Unchanged:
     """A function of the user that reads no tracer, for parameters that are `Lifted`."""
 
     function: Function
@@ -113,7 +113,7 @@ def _is_function(x: Any) -> bool:
 def _lifted(function: Function, roles: int, problem: Problem, values: list) -> Function:
     extras = tuple(dict.fromkeys((*function.extras, "params")))
     if not function.code.tracers or "inputs" in function.extras:
-        unchanged = _Unchanged(function)
+        unchanged = Unchanged(function)
         return Function(None, Edition.of(unchanged), extras)
     numbers, rest = eqx.partition(problem.params, eqx.is_array_like)
     layout = problem.layout
@@ -125,5 +125,15 @@ def _lifted(function: Function, roles: int, problem: Problem, values: list) -> F
     closed, shapes = jax.make_jaxpr(of_numbers, return_shape=True)((state,) * roles, t, numbers)
     places = tuple(place_in(values, c) if isinstance(c, Tracer) else None for c in closed.consts)
     constants = tuple(None if isinstance(c, Tracer) else c for c in closed.consts)
-    trace = _Trace(function.name, closed.jaxpr, constants, places, jax.tree.structure(shapes))
-    return Function(None, function.code.with_tracers_as_arguments(trace, f"{places} {closed.in_avals}"), extras)
+    structure = jax.tree.structure(shapes)
+    return traced_with(function, closed.jaxpr, constants, places, structure, f"{places} {closed.in_avals}")
+
+
+def traced_with(function: Function, jaxpr, constants: tuple, places: tuple, structure, how: str) -> Function:
+    """A function as its trace, for parameters that are `Lifted`: the constants that have `places` are values there.
+
+    `how` says where the values stand in it, so that equal functions with equal places are one edition.
+    """
+    trace = _Trace(function.name, jaxpr, constants, places, structure)
+    extras = tuple(dict.fromkeys((*function.extras, "params")))
+    return Function(None, function.code.with_tracers_as_arguments(trace, how), extras)

@@ -1,5 +1,7 @@
 """Hybrid motion: transitions where and when they are in closed form, their derivatives, and what must not happen."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,8 @@ import pytest
 from sweeps import sweep
 
 import lagjax
+from lagjax._hybrid._families import families
+from lagjax._layout import Layout
 
 G = 9.81
 BALL = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q)
@@ -846,3 +850,89 @@ def test_a_new_value_never_recompiles():
     assert len(traces) == count > 0
     fall(1.0, 0.9, ts=jnp.array([0.0, 1.0]))  # machine code serves any number of output times
     assert len(traces) == count
+
+
+# ---- modes that differ by numbers -----------------------------------------------------------------------------------
+#
+# Stairs: the acceleration is g + n in mode n, until q = 1 + n/2; the reset halves the velocity and then adds n/10.
+
+STAIRS = 5
+
+
+def stair(n):
+    return lagjax.System(lambda q, v, params: 0.5 * v**2 + (params + 1.0 * n) * q)
+
+
+def edge(n, target=None):
+    return lagjax.Transition(
+        f"{n}",
+        f"{n + 1 if target is None else target}",
+        lambda q, v: q - (1.0 + 0.5 * n),
+        direction=1,
+        reset=lambda q, v: (q, 0.5 * v + 0.1 * n),
+    )
+
+
+def down_the_stairs(g, modes, v=0.2):
+    """The times at the edges, in closed form."""
+    t, q, times = 0.0, 0.0, []
+    for n in modes:
+        a, fall = g + n, 1.0 + 0.5 * n - q
+        fast = jnp.sqrt(v**2 + 2 * a * fall)
+        t, q, v = t + (fast - v) / a, q + fall, 0.5 * fast + 0.1 * n
+        times.append(t)
+    return jnp.stack(times)
+
+
+def test_modes_that_differ_by_numbers_are_one_program():
+    modes, edges = {f"{n}": stair(n) for n in range(STAIRS)}, [edge(n) for n in range(STAIRS - 1)]
+    leaving = [tuple(e for e in edges if e.source == name) for name in modes]
+    found = families(list(modes.values()), leaving, Layout.of(0.0, 0.2), 1.0)
+    assert [family.modes for family in found] == [(0, 1, 2, 3), (4,)]  # nothing leaves the last one
+
+    run = hybrid(modes, edges, v0=0.2, ts=(0.0, 4.0), params=1.3, rtol=1e-12)
+    assert run.transitions.source[:5].tolist() == [0, 1, 2, 3, -1] and run.mode.tolist() == [0, 4]
+    np.testing.assert_allclose(times(run), down_the_stairs(1.3, range(4)), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_derivatives_through_modes_of_one_program():
+    modes, edges = {f"{n}": stair(n) for n in range(STAIRS)}, [edge(n) for n in range(STAIRS - 1)]
+
+    def at_edges(g):
+        return hybrid(modes, edges, v0=0.2, ts=(0.0, 4.0), params=g, max_transitions=4, rtol=1e-12).transitions.t
+
+    exact = functools.partial(down_the_stairs, modes=range(4))
+    for derivative, tolerance in ((jax.jacrev, 1e-10), (jax.hessian, 1e-8)):
+        found, right = (derivative(lambda g, f=f: f(g)[3])(1.3) for f in (at_edges, exact))
+        np.testing.assert_allclose(found, right, rtol=tolerance)
+    many = jnp.array([0.5, 1.3, 2.9])
+    np.testing.assert_allclose(jax.vmap(at_edges)(many), jax.vmap(exact)(many), rtol=1e-12)
+
+
+def test_modes_of_a_family_keep_their_targets_and_constraints():
+    modes = {"0": stair(0), "1": stair(1), "2": stair(2), "3": stair(3)}
+    edges = [edge(0, target=2), edge(2, target=3), edge(1, target=0)]
+    modes |= {"line": lagjax.System(lambda q, v: 0.5 * v**2, constraints=lambda q: q - 2.5)}
+    edges += [edge(3, target="line")]
+    edges += [lagjax.Transition("line", "1", lambda q, v: q - 9.0)]  # never: it stands still
+    run = hybrid(modes, edges, v0=0.2, ts=(0.0, 1.0, 6.0), params=1.3, rtol=1e-12, throw=False)
+    np.testing.assert_allclose(times(run), down_the_stairs(1.3, (0, 2, 3)), rtol=1e-12)
+    assert run.transitions.target[:3].tolist() == [2, 3, 4]
+    assert run.result == lagjax.RESULTS.inconsistent_start  # it is not at rest there
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda q, v: 0.5 * v**2 - q**3,  # another operation
+        lambda q, v: 0.5 * v**2 - q**2 - jnp.abs(q) ** 1.5,  # an exponent
+        lambda q, v: 0.5 * v**2 - v * q,  # another variable
+        lambda q, v: 0.5 * v**2 - q**2 * (1 if q.shape else 2.0) + 0.1 * q,
+    ],
+)
+def test_modes_that_differ_otherwise_are_programs_of_their_own(other):
+    systems = [lagjax.System(lambda q, v: 0.5 * v**2 - q**2 - jnp.abs(q) ** 2.5), OSCILLATOR, lagjax.System(other)]
+    found = families(systems, [(), (), ()], Layout.of(0.0, 0.0), None)
+    assert [family.modes for family in found] == [(0,), (1,), (2,)]
+    assert found[2].system is systems[2]

@@ -91,19 +91,22 @@ class Transition(eqx.Module):
 
 
 class Mode(NamedTuple):
-    """One mode: a problem that lacks a state and times, and the transitions that leave it, with their numbers.
+    """One mode, or one of a family: a problem that lacks a state and times, and the transitions that leave it.
 
-    `surfaces` is None where none leaves.
+    Their `numbers` (K,) are their places among all transitions, their `targets` (K,) those of the modes that they lead
+    to. `surfaces` is None where none leaves.
     """
 
     problem: Problem
-    leaving: tuple[tuple[int, Transition], ...]
+    leaving: tuple[Transition, ...]
+    numbers: Any
+    targets: Any
     surfaces: Surfaces | None
     params: PyTree
     vector: jax.Array  # every number in params, (P,)
 
     @classmethod
-    def of(cls, name: str, problem: Problem, leaving: tuple[tuple[int, Transition], ...]) -> "Mode":
+    def of(cls, name: str, problem: Problem, leaving: tuple[Transition, ...], numbers, targets) -> "Mode":
         """A mode that is ready to run. Raises `ValueError` where it has no machine code."""
         if len(leaving) > MOST_GUARDS:
             raise ValueError(
@@ -114,14 +117,20 @@ class Mode(NamedTuple):
         try:
             if refusal := MachineCode().refuses(problem):
                 raise Unlowerable(refusal)
-            transitions = tuple(transition for _, transition in leaving)
-            surfaces = _surfaces(problem.derivation, problem.system, transitions, tuple(code), structure)
+            surfaces = _surfaces(problem.derivation, problem.system, leaving, tuple(code), structure)
             guarded = dataclasses.replace(problem, guards=_watched(surfaces))
             if refusal := MachineCode().refuses(guarded):
                 raise Unlowerable(refusal)
         except Unlowerable as why:
             raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
-        return cls(problem, leaving, surfaces, problem.params, jnp.asarray(problem.vector))
+        return cls(problem, leaving, numbers, targets, surfaces, problem.params, jnp.asarray(problem.vector))
+
+    def with_params(self, params: PyTree, numbers, targets) -> "Mode":
+        """Another mode of the same family."""
+        problem = dataclasses.replace(self.problem, params=params)
+        return self._replace(
+            problem=problem, numbers=numbers, targets=targets, params=params, vector=jnp.asarray(problem.vector)
+        )
 
     @property
     def layout(self) -> Layout:

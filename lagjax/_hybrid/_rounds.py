@@ -4,6 +4,7 @@ A round runs every member to the end of its time or to the next zero of a guard 
 the way, and puts it into the next mode. Along a round derivatives are those of machine code; at its end see `_mode`.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,8 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._failures import lost_unless
+from lagjax._hybrid._families import Family, families
 from lagjax._hybrid._mode import Mode, Transition, state_after
 from lagjax._layout import Layout
+from lagjax._lift import Lifted
 from lagjax._machine_code import Guarded
 from lagjax._problem import Problem
 from lagjax._results import RESULTS, SUCCESSFUL, code_of
@@ -48,11 +51,39 @@ class Plan(eqx.Module):
         self.start, self.max_transitions = start, max_transitions
         self.rtol, self.atol, self.max_steps = rtol, atol, max_steps
 
-    def mode(self, index: int, layout: Layout, params: PyTree) -> Mode:
-        """A mode with the transitions that leave it."""
-        name, limits = self.names[index], {"rtol": self.rtol, "atol": self.atol, "max_steps": self.max_steps}
-        problem = Problem.about(self.systems[index], layout, params, **limits)
-        return Mode.of(name, problem, tuple((k, t) for k, t in enumerate(self.transitions) if t.source == name))
+    def groups(self, layout: Layout, params: PyTree) -> list["Group"]:
+        """The modes with the transitions that leave them; those that differ by numbers alone are one group."""
+        numbers = [tuple(k for k, t in enumerate(self.transitions) if t.source == name) for name in self.names]
+        leaving = [tuple(self.transitions[k] for k in of_mode) for of_mode in numbers]
+        limits = {"rtol": self.rtol, "atol": self.atol, "max_steps": self.max_steps}
+        groups = []
+        for family in families(self.systems, leaving, layout, params):
+            first, own = family.modes[0], params
+            if len(family.modes) > 1:
+                own = Lifted(params, tuple(row[0] for row in family.rows))
+            table = np.array([numbers[k] for k in family.modes], int).reshape(len(family.modes), -1)
+            targets = np.array([[self.names.index(self.transitions[k].target) for k in row] for row in table], int)
+            problem = Problem.about(family.system, layout, own, **limits)
+            mode = Mode.of(self.names[first], problem, family.leaving, table[0], targets.reshape(table.shape)[0])
+            groups.append(Group(family, mode, table, targets.reshape(table.shape)))
+        return groups
+
+
+class Group(NamedTuple):
+    """The modes of a family: the first of them, and for each the places (modes, K) of its transitions and targets."""
+
+    family: Family
+    first: Mode
+    numbers: np.ndarray
+    targets: np.ndarray
+
+    def mode(self, row) -> Mode:
+        """One of its modes."""
+        if len(self.family.modes) == 1:
+            return self.first
+        tables = self.family.rows, self.numbers, self.targets
+        values, numbers, targets = jax.tree.map(lambda table: jnp.asarray(table)[row], tables)
+        return self.first.with_params(Lifted(self.first.params.params, values), numbers, targets)
 
 
 class Ending(NamedTuple):
@@ -107,9 +138,8 @@ class Exit(NamedTuple):
 def hybrid_motion(plan: Plan, layout: Layout, ts, y0, params: PyTree) -> tuple[Ending, Record]:
     """The motion from y0 (2n,) at ts[0]: how it ended, and its transitions, with an axis of `max_transitions`."""
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
-    modes = [plan.mode(index, layout, params) for index in range(len(plan.names))]
-    rounds, start = _Rounds(plan, modes, ts), plan.names.index(plan.start)
-    inconsistent = modes[start].is_inconsistent(ts[0], y0)
+    rounds, start = _Rounds.of(plan, plan.groups(layout, params), ts), plan.names.index(plan.start)
+    inconsistent = rounds.is_inconsistent(start, ts[0], y0, [start])
     first = Ending(
         t=ts[0], y=y0, mode=jnp.asarray(start), going=~inconsistent,
         result=jnp.where(inconsistent, INCONSISTENT, SUCCESSFUL), path=jnp.full((ts.size, y0.size), jnp.nan),
@@ -119,31 +149,48 @@ def hybrid_motion(plan: Plan, layout: Layout, ts, y0, params: PyTree) -> tuple[E
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
     piled_up = (ending.result == TOO_MANY) & _pile_up(record.t, ts[-1])
     ending = ending._replace(result=jnp.where(piled_up, ZENO, ending.result))
-    return _without_silent_zeros(ending, record, (ts, y0, modes[0].vector))
+    return _without_silent_zeros(ending, record, (ts, y0, rounds.groups[0].first.vector))
 
 
 class _Rounds(NamedTuple):
     plan: Plan
-    modes: list[Mode]
+    groups: list[Group]
+    places: np.ndarray  # (modes, 2): of each mode its group, and which of that group it is
     ts: jax.Array
 
+    @classmethod
+    def of(cls, plan: Plan, groups: list[Group], ts) -> "_Rounds":
+        places = np.zeros((len(plan.names), 2), int)
+        for index, group in enumerate(groups):
+            places[list(group.family.modes)] = [(index, row) for row in range(len(group.family.modes))]
+        return cls(plan, groups, places, ts)
+
     def one(self, before: Ending, count) -> tuple[Ending, Record]:
-        """One round: every mode runs the members that are in it; the others are given no time."""
+        """One round: every group runs the members that are in its modes; the others are given no time."""
         after, fired = before, jnp.asarray(False)
         record = Record(jnp.asarray(jnp.nan), jnp.full_like(before.y, jnp.nan), jnp.asarray(-1), jnp.asarray(-1))
-        for index in range(len(self.modes)):
-            here = before.going & (before.mode == index)
-            ending, event, recorded = self._in_mode(index, before, here)
+        place, row = jnp.asarray(self.places)[before.mode]
+        for index, group in enumerate(self.groups):
+            here = before.going & (place == index)
+            ending, event, recorded = self._in_mode(group, row, before, here)
             after, record = _where(here, ending, after), _where(here & event, recorded, record)
             fired = fired | (here & event)
         spent = fired & (count == self.plan.max_transitions)
         after = after._replace(going=after.going & ~spent, result=jnp.where(spent, TOO_MANY, after.result))
         return after, record
 
-    def _in_mode(self, index: int, before: Ending, here) -> tuple[Ending, jax.Array, Record]:
-        """The round of the members that are in this mode (`here`), and whether it ended with a transition."""
-        mode, t_start = self.modes[index], jax.lax.stop_gradient(before.t)
-        sides, rounding, lasting = self._sides(index, before)
+    def is_inconsistent(self, mode, t, y, among: Sequence[int]) -> jax.Array:
+        """Whether a state is off the constraints of a mode, which is one `among` these."""
+        (place, row), off = jnp.asarray(self.places)[mode], jnp.asarray(False)
+        for index in np.unique(self.places[list(among), 0]).tolist():
+            this = place == index
+            off = off | (this & self.groups[index].mode(jnp.where(this, row, 0)).is_inconsistent(t, y))
+        return off
+
+    def _in_mode(self, group: Group, row, before: Ending, here) -> tuple[Ending, jax.Array, Record]:
+        """The round of the members that are `here`, in this mode of a group, and whether it ended with a transition."""
+        mode, t_start = group.mode(jnp.where(here, row, 0)), jax.lax.stop_gradient(before.t)
+        sides, rounding, lasting = self._sides(mode, before)
         horizon = jnp.where(here, self.ts[-1], t_start)
         located = mode.solve_to_event(jnp.stack([t_start, horizon]), before.y, sides)
         changes = jnp.where(here, located.event, 0)
@@ -158,7 +205,7 @@ class _Rounds(NamedTuple):
 
         at_once = here & (t_end == t_start)
         known = before.memory._replace(rounding=rounding), sides, t_end <= lasting
-        exit, memory = self._through(index, changes, at_once, t_end, y_end, known)
+        exit, memory = self._through(group, mode, before.mode, changes, at_once, t_end, y_end, known)
         event = (changes > 0) & ~exit.piled_up
         result = jnp.where(exit.piled_up, ZENO, jnp.where(here & ~event, located.result, before.result))
         # A reset may give NaN, and a guard that is NaN never fires.
@@ -168,37 +215,37 @@ class _Rounds(NamedTuple):
         after = Ending(
             t=jnp.where(event, exit.t, t_end),
             y=jnp.where(event, exit.y_next, y_end),
-            mode=jnp.where(event, exit.target, index),
+            mode=jnp.where(event, exit.target, before.mode),
             going=event & ~exit.inconsistent & ~broken,
             result=result,
             path=jnp.where(covered[:, None], moved.path[1:-1], before.path),
-            modes=jnp.where(covered, index, before.modes),
+            modes=jnp.where(covered, before.mode, before.modes),
             steps=before.steps + jnp.stack([located.accepted, located.rejected]),
             latest=exit.number,
             memory=memory,
         )
-        return after, event, Record(exit.t, exit.y, jnp.asarray(index), exit.target)
+        return after, event, Record(exit.t, exit.y, before.mode, exit.target)
 
-    def _through(self, index: int, changes, at_once, t, y, known) -> tuple[Exit, Memory]:
+    def _through(self, group: Group, mode: Mode, place, changes, at_once, t, y, known) -> tuple[Exit, Memory]:
         """Through the first transition whose bits in `changes` say that its guard falls (1) or rises (2)."""
-        mode, no, none = self.modes[index], jnp.asarray(False), jnp.asarray(-1)
-        exit = Exit(t, y, y, jnp.asarray(index), none, no, no, jnp.asarray(True))
+        no, none = jnp.asarray(False), jnp.asarray(-1)
+        exit = Exit(t, y, y, place, none, no, no, jnp.asarray(True))
         if mode.surfaces is None:
             return exit, self.no_memory(known[0].rounding)
         kinds = jnp.stack([(changes >> (2 * k)) & 3 for k in range(len(mode.leaving))])
         y_here, numbers = _constant_unless(changes > 0, (y, mode.vector))
         guarded = mode.guards_at(t, y, self.ts[-1])
         earlier = jnp.asarray(False)
-        for k, (number, transition) in enumerate(mode.leaving):
+        for k, transition in enumerate(mode.leaving):
             taken = (kinds[k] > 0) & ~earlier
             earlier = earlier | taken
             # It changes sign at once, against its rate: the motion that turns it round is lost in rounding.
             against = jnp.where(kinds[k] == 2, guarded.rates[k] < 0, guarded.rates[k] > 0) & at_once
             t_zero, y_zero = mode.crossing(k)(taken, t, y_here, numbers)
             y_next = state_after(transition, mode.layout, *_constant_unless(taken, (t_zero, y_zero, mode.params)))
-            target = self.plan.names.index(transition.target)
-            inconsistent = self.modes[target].is_inconsistent(t_zero, y_next)
-            this = Exit(t_zero, y_zero, y_next, jnp.asarray(target), jnp.asarray(number), against, inconsistent, no)
+            target, number = jnp.asarray(mode.targets[k]), jnp.asarray(mode.numbers[k])
+            inconsistent = self.is_inconsistent(target, t_zero, y_next, group.targets[:, k].tolist())
+            this = Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, no)
             exit = _where(taken, this, exit)
         exit = exit._replace(guards_defined=~jnp.isnan(guarded.values).any())
         return exit, self._memory(mode, guarded, kinds, *known)
@@ -216,7 +263,7 @@ class _Rounds(NamedTuple):
         A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where it
         began, if it `stays` there since or has no rate, and else from where its rate does.
         """
-        numbers = _numbers(mode)
+        numbers = mode.numbers
         rounding = jnp.maximum(before.rounding[numbers], guarded.rounding)
         since = jnp.where(stays | (guarded.rates == 0), jnp.sign(sides), -jnp.sign(guarded.rates))
         here = jnp.where(jnp.abs(guarded.values) > rounding + guarded.of_time, jnp.sign(guarded.values), since)
@@ -225,34 +272,29 @@ class _Rounds(NamedTuple):
         new = guarded.values, here, rounding
         return Memory(*(x.at[numbers].set(of_mode) for x, of_mode in zip(nothing, new, strict=True)))
 
-    def _sides(self, index: int, before: Ending) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def _sides(self, mode: Mode, before: Ending) -> tuple[jax.Array, jax.Array, jax.Array]:
         """The sides from which a motion comes that begins in a mode, the rounding of guards, and until when they stay.
 
         A guard is on the side where it was, if the reset has not moved it. One that has been followed is on the side
         where it goes; without a reset it has been crossed, and so has a jump. Of others on their surface it is known
         that they can change in their direction, if in one. A side is as large as what rounding does.
         """
-        mode, memory = self.modes[index], before.memory
+        memory = before.memory
         if mode.surfaces is None:
             return jnp.zeros(0), memory.rounding, jnp.zeros(0)
-        numbers, guarded = _numbers(mode), mode.guards_at(before.t, before.y, self.ts[-1])
+        numbers, guarded = mode.numbers, mode.guards_at(before.t, before.y, self.ts[-1])
         values, was, rounding = (x[numbers] for x in memory)
         rounding = jnp.maximum(rounding, guarded.rounding)
         unmoved, followed = jnp.abs(guarded.values - values) <= rounding, numbers == before.latest
         noise, goes = rounding + guarded.of_time, jnp.sign(guarded.rates)
-        unknown = np.array([-float(transition.direction) for _, transition in mode.leaving])
-        crossed = np.array([transition.reset is None for _, transition in mode.leaving]) | mode.surfaces.only_jump
+        unknown = np.array([-float(transition.direction) for transition in mode.leaving])
+        crossed = np.array([transition.reset is None for transition in mode.leaving]) | mode.surfaces.only_jump
         beyond = jnp.where(goes != 0, goes, jnp.where(crossed, -was, unknown))
         sides = jnp.where(jnp.abs(guarded.values) > noise, jnp.sign(guarded.values), unknown)
         sides = jnp.where(unmoved & (was != 0), jnp.where(followed, beyond, was), sides)
         sides = sides * jnp.maximum(noise, _LEAST)
         stays = jnp.where(goes == 0, before.t, before.t + 2.0 * noise / jnp.abs(guarded.rates))
         return sides, memory.rounding.at[numbers].set(rounding), jax.lax.stop_gradient(stays)
-
-
-def _numbers(mode: Mode) -> np.ndarray:
-    """The numbers of the transitions that leave a mode."""
-    return np.array([number for number, _ in mode.leaving], int)
 
 
 def _where(condition, new: PyTree, old: PyTree) -> PyTree:

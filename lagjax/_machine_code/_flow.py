@@ -65,7 +65,7 @@ def unfit(program: Program, size: int) -> str | None:
             f"derivatives fit into half of this machine's {machine_memory() / 1e9:.0f} GB of memory"
         )  # fmt: skip
     try:
-        _native.recurrences(program, size)
+        _native.require_recurrences(program, size)
     except Unlowerable as reason:
         return str(reason)
     return None

@@ -54,6 +54,7 @@ from lagjax._native._kernel import (
     order_for,
     pieces_of,
     recurrences,
+    require_recurrences,
 )
 from lagjax._native._series import is_large
 from lagjax._native._sweep import SweepPlan, sweep_handler
@@ -63,5 +64,6 @@ __all__ = [
     "ATOL_OVER_MOTION", "ATOL_OVER_RTOL", "DISCONTINUOUS", "DONE", "EVENT", "GUARD_NOISE", "INSTANT", "NOT_FINITE",
     "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "SMALLEST_STEP", "STEP_TOO_SMALL",
     "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "SweepPlan", "cores", "each_of", "floor_of",
-    "handler", "is_large", "lanes", "order_for", "pieces_of", "recurrences", "sweep_handler", "unavailable", "watched",
+    "handler", "is_large", "lanes", "order_for", "pieces_of", "recurrences", "require_recurrences",
+    "sweep_handler", "unavailable", "watched",
 ]  # fmt: skip
