@@ -28,7 +28,7 @@ from lagjax._consistent import has_constraints
 from lagjax._doubles import DOUBLE, with_doubles
 from lagjax._fit._blame import reading_params
 from lagjax._fit._delays import Delayed
-from lagjax._fit._inputs import HOLDS, Form, asks
+from lagjax._fit._inputs import Form, asks
 from lagjax._fit._many import Waterfall
 from lagjax._fit._motions import motions_of
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
@@ -40,6 +40,7 @@ from lagjax._fit._records import (
     in_structure,
     known_start,
     require_alike,
+    require_held,
     require_untraced,
     started,
 )
@@ -62,6 +63,7 @@ from lagjax._fit._wrapped import UNCLEAR, require_no_jumps, sensors, wrapped
 from lagjax._hybrid import Hybrid
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL
+from lagjax._samples import HOLDS
 
 __all__ = [
     "Delayed",
@@ -122,7 +124,8 @@ def fit(
       its search and its interval are then relative.
     - `noise`: `lagjax.Gaussian()`, the default, or `lagjax.StudentT()` where the data have outliers.
     - `hold`: how the `inputs` of records continue between samples: "zero" keeps the last sample, as a D/A converter
-      does; "linear" interpolates. Functions of the scene ask for `inputs` by name.
+      does; "linear", "cubic" and "band" interpolate as `lagjax.samples` does.
+      "band" is for inputs below the Nyquist frequency, evenly sampled. Functions of the scene ask for `inputs` by name.
     - `starts`: the number of parameter values from which to search, as one batch: `params0`, and random ones drawn with
       `seed`: about a positive number with a decade as standard deviation, uniform between bounds, on a circle or a
       simplex, and about any other number with its size as standard deviation. The best few go through the whole search,
@@ -160,7 +163,7 @@ def fit(
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}; got {method!r}.")
     if hold not in HOLDS:
-        raise ValueError(f"hold must be 'zero' or 'linear'; got {hold!r}.")
+        raise ValueError(f"hold must be one of {', '.join(map(repr, HOLDS))}; got {hold!r}.")
     require_untraced(params0, "params0")
     noise = Gaussian() if noise is None else noise
     if not isinstance(noise, AbstractNoise):
@@ -287,6 +290,8 @@ def _form(system: Scene, records: list[Record], hold: str) -> Form | None:
     structures = [record.input_structure for record in records if isinstance(record, Record)]
     if not structures or structures[0] is None:
         return None
+    for place, record in enumerate(records):
+        require_held(record, hold, f"records[{place}]")
     tree, shapes = structures[0]
     return Form(tree, shapes, hold)
 
