@@ -164,7 +164,8 @@ def _spacing(first, last, count: int) -> tuple:
 def continued(values: np.ndarray, count: int, hold: str) -> np.ndarray:
     """So many samples (count, …) behind the last of `values` (K, …), at even instants, which change nothing before it.
 
-    For "band" that takes 16 samples at least. It is what a table is filled up with: a parabola for "cubic", the reflection for "band", else the last sample.
+    For "band" that takes 16 samples at least. It is what a table is filled up with: a parabola for "cubic", the
+    reflection for "band", else the last sample.
     """
     last, behind = values[-1], np.arange(1, count + 1)
     if hold == "band":
@@ -211,7 +212,8 @@ def _cubic(knots, values, t):
 def _band(knots, values, t):
     t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
     (x0, x1), count = _window(knots, i, 2), len(knots)
-    spacing, tolerance = _spacing(*(_window(knots, jnp.full_like(i, k), 1)[0] for k in (0, count - 1)), count)
+    (begin,), (end,) = (_window(knots, jnp.full_like(i, k), 1) for k in (0, count - 1))
+    spacing, tolerance = _spacing(begin, end, count)
     inside &= abs(x1 - x0 - spacing) <= tolerance  # of known knots that was checked
     j = i[..., None] + np.arange(1 - _HALF, _HALF + 1, dtype=np.int32)
     # Inside the last two terms are zero; beyond an end they reflect.

@@ -118,9 +118,11 @@ def fit(
       the structure of a record's `values`; by default q. `lagjax.Delayed` is for sensors with a delay, `lagjax.wrapped`
       for those that show angles less whole turns.
     - `free`: True or False for every parameter, or for whole branches of `params0`, or a Boolean array for the numbers
-      of an array; by default all floats are free.
+      of an array; by default all floats are free. With False starts and noise alone are fitted: how good are published
+      parameters on these records?
     - `transforms`: `lagjax.positive`, `lagjax.between(a, b)`, `lagjax.angle` or None for every parameter or branch;
-      `lagjax.simplex` and `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
+      an array of these for the numbers of an array, `np.array([lagjax.positive, None])`; `lagjax.simplex` and
+      `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
       its search and its interval are then relative.
     - `noise`: `lagjax.Gaussian()`, the default, or `lagjax.StudentT()` where the data have outliers.
     - `hold`: how the `inputs` of records continue between samples: "zero" keeps the last sample, as a D/A converter
@@ -266,6 +268,11 @@ def _scenes(system, records, params0, observe, hold: str) -> list[_Scene]:
 
 def _require_one_beginning(question: AbstractQuestion, starts: int, method: str) -> None:
     """Raise `ValueError` where many starts, or a descent by gradients, are asked for and cannot be."""
+    if not len(question.parameters) and (method == "gradient" or starts > 1):
+        raise ValueError(
+            "No parameter is free, so there is one place to begin: leave `starts` at 1, and `method` at 'auto', which "
+            "fits the starts of records."
+        )
     if method == "gradient" and starts > 1:
         raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
     for one in [part.question for part in question.parts] if starts > 1 else []:

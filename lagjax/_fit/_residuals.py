@@ -425,6 +425,7 @@ def compressed(rows: np.ndarray) -> np.ndarray:
     Blocks stay in the cache, and are too small for a BLAS to start threads that wait for each other.
     """
     pieces, _, columns = rows.shape
+    rows = rows if columns else rows[:, :0]
     while rows.shape[1] > columns:
         height = min(_BLOCK * columns, rows.shape[1])
         missing = -rows.shape[1] % height

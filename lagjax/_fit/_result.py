@@ -2,6 +2,7 @@
 
 import functools
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, cast
@@ -527,14 +528,16 @@ def _cells_of_noise(fit: Fit) -> list[list[str]]:
 
 
 def _table_of_parameters(fit: Fit) -> list[str]:
+    if not fit.parameters.names:
+        return ["All parameters are kept: starts and noise were fitted."]
     low, high = fit._ends(0.95)
     values = fit.parameters.values(fit.u)
     width = max(len(name) for name in (*fit.parameters.names, "parameter"))
     rows = [f"{'parameter':<{width}}  {'value':>12}  {'95 % interval':>27}  relative"]
-    many = {part.label: len(part.places) for part in fit.parameters.parts if len(part.places) > _LISTED}
+    owners = [part.label for part in fit.parameters.parts for _ in part.places]
+    many = {label: count for label, count in Counter(owners).items() if count > _LISTED}
     for label, count in many.items():
         rows.append(f"{label:<{width}}  {f'{count} numbers':>12}")
-    owners = [part.label for part in fit.parameters.parts for _ in part.places]
     for owner, name, x, a, b in zip(owners, fit.parameters.names, values, low, high, strict=True):
         if owner in many:
             continue
