@@ -5,6 +5,7 @@ One scene, a damped pendulum, serves most tests, so that one kernel does.
 
 import importlib
 import itertools
+import warnings
 from pathlib import Path
 
 import diffrax
@@ -652,3 +653,15 @@ def test_transforms_by_element():
         lagjax.fit(scene, record, {"p": p0}, transforms={"p": np.array([lagjax.simplex, None, None])})
     with pytest.raises(TypeError, match=r"transforms must hold lagjax\.positive"):
         lagjax.fit(scene, record, {"p": p0}, transforms={"p": np.array([1.0, 2.0, 3.0])})
+
+
+@pytest.mark.slow
+def test_a_fit_of_very_many_numbers_names_the_method_that_is_meant_for_it():
+    scene = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * (1.0 + jnp.mean(params["w"])) * q**2)
+    ts = np.linspace(0.0, 2.0, 21)
+    record = lagjax.Record(ts, np.cos(1.1 * ts), start=(1.0, 0.0))
+    with pytest.warns(UserWarning, match=r"101 numbers are free.*method='gradient'"):
+        lagjax.fit(scene, record, {"w": np.full(101, 0.1)}, method="whole")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lagjax.fit(scene, record, {"w": np.full(50, 0.1)}, method="whole")

@@ -16,6 +16,7 @@ by `_search`; `_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_verdict`, `
 import functools
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -84,6 +85,9 @@ __all__ = [
 PyTree = Any
 
 METHODS = ("auto", "segments", "whole", "gradient")
+# Free numbers from which on a sentence says that another method may be meant. Of a network of 337 a trial takes half a
+# minute, and the gradient's whole descent as long; scenes of 50 need no such advice.
+_MANY = 100
 
 
 @with_doubles
@@ -137,7 +141,8 @@ def fit(
       its own read off the data, and joins these step by step; for that the signals must have the structure of q. "auto"
       does so where the signals allow it and the records are longer than the motion's time scale: then the search
       converges for long and chaotic records, and from parameters that are far off. "gradient" descends by reverse-mode
-      gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance.
+      gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With
+      more than a hundred free numbers the other methods say in a warning that this one is meant for them.
 
     Intervals take the correlation of residuals into account (`Fit.noise`). `Fit.unseen` says in words which parameters
     the data do not determine; their intervals are infinite.
@@ -173,6 +178,13 @@ def fit(
     scenes = _scenes(system, records, params0, observe, hold)
     parameters = Parameters.of(params0, free, transforms)
     how = _How(system, observe, noise, int(starts), method, int(seed), progress)
+    if len(parameters) > _MANY and method != "gradient":
+        warnings.warn(
+            f"{len(parameters)} numbers are free, and with method={method!r} every trial follows that many derivatives "
+            "of every motion, which may take minutes each. method='gradient' takes all of them at once, in reverse: it "
+            "is for networks and other functions of many numbers.",
+            stacklevel=2,
+        )
     begun = time.process_time()
     try:
         done, came_to = _answer(how, scenes, params0, parameters)
