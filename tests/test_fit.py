@@ -5,6 +5,7 @@ One scene, a damped pendulum, serves most tests, so that one kernel does.
 
 import importlib
 import itertools
+import warnings
 from pathlib import Path
 
 import diffrax
@@ -554,7 +555,6 @@ def bead(values, **more):
         ([bead(np.full(6, np.nan))], {}, "is NaN, or has no weight, at all times of all records"),
         ([bead(np.zeros(6)), bead(np.full(6, np.nan))], {}, r"records\[1\] holds no sample"),
         ([bead(np.zeros(6)), bead(np.zeros((6, 2)))], {}, r"records\[1\] has other signals"),
-        ([bead(np.zeros(6))], dict(free=False), "No parameter is free"),
         ([bead(np.zeros(6))], dict(free={"l": True}), "free must be one value for all parameters"),
         ([bead(np.zeros(6))], dict(free=1), "True or False"),
         ([bead(np.zeros(6))], dict(transforms=3), "transforms must hold lagjax.positive"),
@@ -588,3 +588,80 @@ def test_between_needs_an_interval():
         lagjax.between(2.0, 1.0)
     with pytest.raises(ValueError, match="at least 1"):
         lagjax.StudentT(0.5)
+
+
+def decaying(amplitude, seed, k=4.0, c=0.2):
+    ts = np.linspace(0.0, 20.0, 201)
+    q = amplitude * np.exp(-0.5 * c * ts) * np.cos(np.sqrt(k - 0.25 * c**2) * ts)
+    return lagjax.Record(ts, q + 0.01 * np.random.default_rng(seed).normal(size=len(ts)))
+
+
+DECAYING = lagjax.System(
+    lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2,
+    forces=lambda q, qdot, params: -params["c"] * qdot,
+)
+
+
+def test_with_nothing_free_starts_and_noise_are_fitted():
+    records, published = [decaying(1.0, 0), decaying(0.5, 1)], {"k": 4.0, "c": 0.2}
+    fit = lagjax.fit(DECAYING, records, published, free=False)
+    assert fit.ok and fit.params == published and "All parameters are kept" in str(fit)
+    # The motion is linear in its start: the closed form of the least squares.
+    for record, start in zip(records, fit.starts, strict=True):
+        w, decay = np.sqrt(4.0 - 0.01), np.exp(-0.1 * record.ts)
+        shapes = np.stack([decay * (np.cos(w * record.ts) + 0.1 / w * np.sin(w * record.ts)),
+                           decay * np.sin(w * record.ts) / w], axis=1)  # fmt: skip
+        expected, square = np.linalg.lstsq(shapes, record.values, rcond=None)[:2]
+        np.testing.assert_allclose(start, expected, atol=1e-6)
+        assert np.sum(fit.predict(record).residuals ** 2) == pytest.approx(square[0], rel=1e-6)
+    assert fit.noise["q"].sigma == pytest.approx(0.01, rel=0.1)
+    off = lagjax.fit(DECAYING, records, {"k": 3.8, "c": 0.2}, free={"k": False, "c": False})
+    assert off.noise["q"].sigma > 5 * fit.noise["q"].sigma
+    known = [lagjax.Record(r.ts, r.values, start=start) for r, start in zip(records, fit.starts, strict=True)]
+    assert lagjax.fit(DECAYING, known, published, free=False).noise["q"].sigma == pytest.approx(0.01, rel=0.1)
+    for wrong in ({"method": "gradient"}, {"starts": 3}):
+        with pytest.raises(ValueError, match="No parameter is free, so there is one place to begin"):
+            lagjax.fit(DECAYING, records, published, free=False, **wrong)
+    with pytest.raises(ValueError, match=r"No parameter is free: give params0 at least one float .* or free=False"):
+        lagjax.fit(DECAYING, records, {"k": 4, "c": 0})
+    with pytest.raises(ValueError, match="No free parameter is called 'k'; there are none: all are kept"):
+        fit.profile("k")
+
+
+def test_transforms_by_element():
+    scene = lagjax.System(
+        lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["p"][0] * q**2 + params["p"][2] * q,
+        forces=lambda q, qdot, params: -params["p"][1] * qdot,
+    )
+    record, p0 = decaying(1.0, 0), np.array([3.5, 0.1, -0.05])
+    each = np.array([lagjax.positive, lagjax.positive, None])
+    fit = lagjax.fit(scene, record, {"p": p0}, transforms={"p": each})
+    np.testing.assert_allclose(fit.params["p"], [4.0, 0.2, 0.0], atol=0.02)
+    low, high = (end["p"] for end in fit.intervals(0.95))
+    assert (low[:2] > 0).all() and low[2] < 0.0 < high[2]
+    assert low[0] * high[0] == pytest.approx(float(fit.params["p"][0]) ** 2)  # relative, where it is positive
+    assert 0.5 * (low[2] + high[2]) == pytest.approx(float(fit.params["p"][2]))
+    kept = lagjax.fit(scene, record, {"p": p0}, transforms={"p": each}, free={"p": np.array([True, False, True])})
+    assert kept.params["p"][1] == 0.1 and kept.params["p"][0] > 0
+    with pytest.raises(
+        ValueError, match=r"transforms must hold one for params\['p'\], or an array .* of its shape \(3,\)"
+    ):
+        lagjax.fit(scene, record, {"p": p0}, transforms={"p": each[:2]})
+    with pytest.raises(ValueError, match=r"params\['p'\] must start above zero"):
+        lagjax.fit(scene, record, {"p": p0}, transforms={"p": each[[0, 2, 1]]})
+    with pytest.raises(ValueError, match=r"params\['p'\] is free as a whole or not at all"):
+        lagjax.fit(scene, record, {"p": p0}, transforms={"p": np.array([lagjax.simplex, None, None])})
+    with pytest.raises(TypeError, match=r"transforms must hold lagjax\.positive"):
+        lagjax.fit(scene, record, {"p": p0}, transforms={"p": np.array([1.0, 2.0, 3.0])})
+
+
+@pytest.mark.slow
+def test_a_fit_of_very_many_numbers_names_the_method_that_is_meant_for_it():
+    scene = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * (1.0 + jnp.mean(params["w"])) * q**2)
+    ts = np.linspace(0.0, 2.0, 21)
+    record = lagjax.Record(ts, np.cos(1.1 * ts), start=(1.0, 0.0))
+    with pytest.warns(UserWarning, match=r"101 numbers are free.*method='gradient'"):
+        lagjax.fit(scene, record, {"w": np.full(101, 0.1)}, method="whole")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lagjax.fit(scene, record, {"w": np.full(50, 0.1)}, method="whole")

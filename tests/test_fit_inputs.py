@@ -1,5 +1,7 @@
 """`fit` with sampled inputs: an oscillator that is driven, whose motion has a closed form for both holds."""
 
+from pathlib import Path
+
 import diffrax
 import jax.numpy as jnp
 import numpy as np
@@ -55,7 +57,7 @@ def test_a_driven_oscillator_is_followed_and_recovered_from_records_of_any_lengt
 
 def test_pieces_of_a_record_have_tables_of_their_own_and_programs_are_made_for_few_lengths():
     u = np.arange(30.0)[:, None]
-    table = _inputs.table_of([(TS[:30], u), (TS[10:14], u[10:14])])
+    table = _inputs.table_of([(TS[:30], u), (TS[10:14], u[10:14])], "zero")
     assert table.knots.shape == (2, 64) and table.values.shape == (2, 64, 1)
     assert (np.diff(table.knots) > 0).all() and (table.values[1, 4:] == 13.0).all()
     assert {_inputs.room_for(count) for count in range(1, 25_000)} == {16, 64, 256, 1024, 4096, 16384, 65536}
@@ -89,7 +91,7 @@ def test_machine_code_and_diffrax_agree_and_derivatives_are_those_of_differences
     layout, parameters = Layout.of(0.0, 0.0), Parameters.of(TRUTH)
     form = _inputs.Form(*record_of(TS[:9], hold).input_structure, hold)
     pieces = [(TS[:9], inputs_of(TS[:9])[:, None]), (TS[3:8], inputs_of(TS[:5], 1)[:, None])]
-    table, ts = _inputs.table_of(pieces), np.stack([TS[0:7:3], TS[3:8:2]])
+    table, ts = _inputs.table_of(pieces, hold), np.stack([TS[0:7:3], TS[3:8:2]])
     y0, numbers = np.array([[1.0, 0.0], [0.3, -1.0]]), parameters.first
     y0_dot = np.concatenate([np.broadcast_to(np.eye(2), (2, 2, 2)), np.zeros((2, 3, 2))], axis=1)
     along = y0_dot, np.concatenate([np.zeros((2, 3)), np.eye(3)])
@@ -183,6 +185,105 @@ def test_what_is_wrong_with_delays_is_a_sentence():
         lagjax.Delayed(lambda params: 0.0, 0.0)
 
 
+def smooth(ts):
+    return np.sin(1.3 * ts) + 0.5 * np.cos(7.0 * ts + 0.4)
+
+
+def smooth_record(count, ts, **more):
+    """A record under a smooth input that was sampled `count` times, from a motion under it sampled a hundred times as
+    densely, in the closed form of `lsim`."""
+    fine = np.linspace(0.0, 4.0, 40_001)
+    values = np.interp(ts, fine, exact(fine, smooth(fine), "linear"))
+    at = np.linspace(-2.0, 6.0, count)
+    return lagjax.Record(ts, values, {"u": smooth(at)}, input_ts=at, **more)
+
+
+@pytest.mark.parametrize(("hold", "count", "error"), [("cubic", 321, 2e-4), ("band", 81, 2e-4)])
+def test_smooth_inputs_on_times_of_their_own(hold, count, error):
+    ts = np.sort(np.random.default_rng(0).uniform(0.0, 4.0, 120))
+    record = smooth_record(count, ts, start=None)
+    fit = lagjax.fit(SCENE, record, {"k": 3.0, "c": 0.1, "gain": 1.0}, hold=hold)
+    for name, value in TRUTH.items():
+        assert fit.params[name] == pytest.approx(value, rel=error)
+    again = fit.predict(smooth_record(count, ts, start=fit.starts[0]))
+    assert np.abs(again.residuals).max() < 1e-4
+    np.testing.assert_allclose(again.trajectory.q, again.values, atol=1e-8)
+    if hold == "cubic":  # on lines that is far worse
+        on_lines = lagjax.fit(SCENE, record, TRUTH, hold="linear")
+        assert abs(on_lines.params["gain"] - 1.5) > 10 * abs(fit.params["gain"] - 1.5)
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear", "cubic", "band"])
+@pytest.mark.parametrize("count", [17, 64])
+def test_tables_are_the_inputs_of_records_with_the_ends_they_have(hold, count):
+    ts, u = 1.0 + 0.1 * np.arange(count), np.random.default_rng(count).normal(size=(count, 1))
+    table = _inputs.table_of([(ts, u)], hold)
+    at = np.linspace(ts[0], ts[-1], 97)
+    expected = lagjax.samples(ts, u, hold)(at)
+    np.testing.assert_allclose(lagjax.samples(table.knots[0], table.values[0], hold)(at), expected, atol=1e-10)
+    part = _inputs.about(ts, 1.31, 1.55, hold)
+    table, at = _inputs.table_of([(ts[part], u[part])], hold), np.linspace(1.31, min(1.55, ts[-1]), 5)[None]
+    expected = lagjax.samples(ts, u, hold)(at[0])
+    np.testing.assert_allclose(_inputs.inputs_at(table, at, hold)[0][0], expected, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_sensors_see_inputs_between_their_samples():
+    ts = np.linspace(0.0, 4.0, 57)
+    record = smooth_record(81, ts, start=(0.3, -0.2))
+    at = np.asarray(lagjax.samples(record.input_ts, record.inputs["u"], "band")(ts))
+    record = lagjax.Record(ts, at, record.inputs, record.start, input_ts=record.input_ts)
+    shown = lambda q, qdot, params, inputs: params["scale"] * inputs["u"]
+    fit = lagjax.fit(SCENE, record, {**TRUTH, "scale": 0.5}, observe=shown,
+                     free={**dict.fromkeys(TRUTH, False), "scale": True}, hold="band")  # fmt: skip
+    assert fit.params["scale"] == pytest.approx(1.0, rel=1e-9)
+
+
+def test_what_is_wrong_with_times_of_inputs_is_a_sentence():
+    u, late = np.ones(50), 0.01 + TS[:50]
+    with pytest.raises(ValueError, match=r"input_ts begin at 0.01, after the record, which begins at t = 0"):
+        lagjax.Record(TS[:40], u[:40], u, input_ts=late)
+    with pytest.raises(ValueError, match=r"input_ts are the times of `inputs`, and there are none"):
+        lagjax.Record(TS, np.ones(200), input_ts=TS)
+    with pytest.raises(ValueError, match=r"input_ts must increase strictly; input_ts\[0\] = 0.98"):
+        lagjax.Record(TS, np.ones(200), u, input_ts=TS[:50][::-1])
+    with pytest.raises(ValueError, match=r"inputs must have the 49 times as its first axis"):
+        lagjax.Record(TS[:40], u[:40], u, input_ts=TS[:49])
+    short = lagjax.Record(TS, inputs_of(TS), {"u": u}, input_ts=TS[:50])
+    with pytest.raises(
+        ValueError, match=r"input_ts of records\[0\] end at 0.98, before the record, which ends at t = 3.98"
+    ):
+        lagjax.fit(SCENE, short, TRUTH, hold="linear")
+    uneven = np.sort(np.random.default_rng(0).uniform(0.0, 1.0, 50))
+    with pytest.raises(ValueError, match=r"The inputs of records\[0\]: hold='band' takes evenly spaced ts, but ts"):
+        lagjax.fit(SCENE, lagjax.Record(uneven, inputs_of(uneven), {"u": u}), TRUTH, hold="band")
+
+
+@pytest.mark.slow
+def test_a_silverbox_is_known_to_its_noise():
+    file = Path(__file__).parents[2] / "shared" / "data" / "silverbox_multisines.npz"
+    if not file.exists():
+        pytest.skip("the recording is not there")
+    data = np.load(file)
+    u, y, each = data["u"].ravel(), data["y"].ravel(), 8675
+    still = np.lib.stride_tricks.sliding_window_view(u, 20).std(axis=1) < 1e-3
+    begins = [each * k - 150 + np.flatnonzero(still[each * k - 150 : each * k + 150])[-1] + 10 for k in range(1, 10)]
+    ends, ts = np.array([*begins[1:], len(u)]) - 80, 1e3 / float(data["fs"]) * np.arange(each)  # milliseconds
+    records = [lagjax.Record(ts[: b - a], y[a:b], u[a:b], (0.0, 0.0)) for a, b in zip(begins, ends, strict=True)]
+
+    def lagrangian(q, qdot, params):
+        return 0.5 * qdot**2 - params["k"] * q**2 / 2 - params["k2"] * q**3 / 3 - params["k3"] * q**4 / 4
+
+    def forces(q, qdot, params, inputs):
+        return params["gain"] * inputs - params["c"] * qdot + params["bias"]
+
+    scene = lagjax.System(lagrangian, forces=forces)
+    first = {"k": 0.19, "c": 0.02, "k2": 0.0, "k3": 0.5, "gain": 0.1, "bias": 0.0}
+    fit = lagjax.fit(scene, records[:2], first, hold="band", method="whole")
+    left = np.concatenate([fit.predict(record).residuals for record in records[2:]])
+    assert fit.ok and np.sqrt(np.mean(left**2)) < 0.33e-3  # on lines 0.90 mV
+
+
 def test_what_is_wrong_with_inputs_is_a_sentence():
     u = inputs_of(TS)
     record, bare = lagjax.Record(TS, u, {"u": u}), lagjax.Record(TS, u)
@@ -192,8 +293,8 @@ def test_what_is_wrong_with_inputs_is_a_sentence():
         lagjax.fit(lagjax.System(SCENE.lagrangian.code.function), bare, TRUTH, observe=lambda q, qdot, inputs: q)
     with pytest.raises(ValueError, match=r"records\[1\] has other inputs than records\[0\]"):
         lagjax.fit(SCENE, [record, bare], TRUTH)
-    with pytest.raises(ValueError, match="hold must be 'zero' or 'linear'; got 'cubic'"):
-        lagjax.fit(SCENE, record, TRUTH, hold="cubic")
+    with pytest.raises(ValueError, match="hold must be one of 'zero', 'linear', 'cubic', 'band'; got 'spline'"):
+        lagjax.fit(SCENE, record, TRUTH, hold="spline")
     with pytest.raises(ValueError, match=r"inputs\['u'\]\[3\] is NaN, but what drives a scene must be known"):
         lagjax.Record(TS, u, {"u": np.where(np.arange(len(u)) == 3, np.nan, u)})
     with pytest.raises(TypeError, match=r"start must be .*a function of the parameters"):

@@ -79,6 +79,66 @@ def test_between_knots_it_is_what_scipy_says(count):
         np.testing.assert_allclose(lagjax.samples(x, v, hold)(t), values, atol=1e-13)
 
 
+def sinusoids(t, share, step):
+    """Three sinusoids up to a share of the Nyquist frequency of samples with this step."""
+    return sum(np.sin(part * share * np.pi / step * t + phase) for part, phase in ((1.0, 0.3), (0.7, 1.0), (0.2, 2.0)))
+
+
+@pytest.mark.parametrize("share", [0.05, 0.4, 0.8])
+def test_a_band_limited_input_comes_back_from_its_samples(share):
+    step, count = 0.1, 200
+    x = 3.0 + step * np.arange(count)
+    t = np.linspace(x[20], x[-21], 1001)
+    u = lagjax.samples(x, sinusoids(x, share, step), "band")
+    np.testing.assert_allclose(u(t), sinusoids(t, share, step), atol=3e-5)
+    rates = jax.vmap(jax.grad(u))(t)
+    closed = (sinusoids(t + 1e-6, share, step) - sinusoids(t - 1e-6, share, step)) / 2e-6
+    np.testing.assert_allclose(rates, closed, atol=1e-4 * np.pi / step)
+    np.testing.assert_allclose(u(x), sinusoids(x, share, step), atol=1e-13)
+
+
+@pytest.mark.parametrize("count", [2, 3, 10, 40])
+def test_at_its_ends_a_band_limited_input_is_reflected(count):
+    x, v = np.arange(float(count)), RNG.normal(size=(count, 2))
+    j = np.arange(-40, count + 40)
+    nearest = lambda j: v[np.clip(j, 0, count - 1)]  # what is farther away than the record is long stays
+    beyond = nearest(j) + (v[0] - nearest(-j)) + (v[-1] - nearest(2 * (count - 1) - j))
+    t = np.linspace(0.0, count - 1.0, 37)
+    inner = lagjax.samples(j.astype(float), beyond, "band")
+    np.testing.assert_allclose(lagjax.samples(x, v, "band")(t), inner(t), atol=1e-12)
+    np.testing.assert_allclose(lagjax.samples(x, np.full(count, 2.5), "band")(t), 2.5, rtol=1e-14)
+    assert np.isnan(lagjax.samples(x, v, "band")(np.array([-0.1, count - 0.9]))).all()
+
+
+def test_knots_of_a_band_are_even():
+    with pytest.raises(ValueError, match=r"knots\[3\] - knots\[2\] = 1.1 where the mean is 1.0.* Use hold='cubic'"):
+        lagjax.samples(np.array([0.0, 1.0, 2.0, 3.1, 4.1]), np.ones(5), "band")
+    u = jax.jit(lambda x, t: lagjax.samples(x, jnp.ones(5), "band")(t))
+    assert np.isnan(u(jnp.array([0.0, 1.0, 2.0, 3.1, 4.1]), 2.5)) and abs(u(jnp.arange(5.0), 2.5) - 1.0) < 1e-14
+    rounded = np.round(np.arange(50) / 610.3515625, 6)
+    assert np.isfinite(lagjax.samples(rounded, np.ones(50), "band")(0.01))
+
+
+@pytest.mark.slow
+def test_a_motion_under_a_band_limited_input_is_exact_with_derivatives():
+    step, count = 0.2, 80
+    x = step * np.arange(count)
+    v = sinusoids(x, 0.5, step)
+    fine = x[0] + (x[-1] - x[0]) * np.arange(400 * (count - 1) + 1) / (400 * (count - 1))
+    dense = np.asarray(lagjax.samples(x, v, "band")(fine))
+    closed = lambda v: exact("linear", fine, v)  # of 400 pieces in each of its own: (h / 400)² u″ / 12
+    np.testing.assert_allclose(end_of("band", x, v), closed(dense), atol=1e-5)
+    run = lagjax.simulate(driven("band"), 0.3, 0.1, jnp.array([0.0, x[-1]]), {"t": x, "u": v}, solver=MACHINE)
+    other = lagjax.simulate(
+        driven("band"), 0.3, 0.1, jnp.array([0.0, x[-1]]), {"t": x, "u": v}, solver=diffrax.Dopri8()
+    )
+    np.testing.assert_allclose(run.q, other.q, atol=1e-7)
+    slopes = jax.grad(lambda v: end_of("band", x, v)[0])(jnp.asarray(v))
+    direction = RNG.normal(size=count)
+    ahead = np.asarray(lagjax.samples(x, direction, "band")(fine))
+    np.testing.assert_allclose(slopes @ direction, (closed(dense + ahead) - closed(dense))[0], atol=1e-4)
+
+
 def test_outside_nothing_is_made_up():
     for hold, beyond in (("zero", VALUES[-1]), ("linear", np.nan), ("cubic", np.nan)):
         u = lagjax.samples(KNOTS, VALUES, hold)

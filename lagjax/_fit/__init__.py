@@ -16,6 +16,7 @@ by `_search`; `_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_verdict`, `
 import functools
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -28,7 +29,7 @@ from lagjax._consistent import has_constraints
 from lagjax._doubles import DOUBLE, with_doubles
 from lagjax._fit._blame import reading_params
 from lagjax._fit._delays import Delayed
-from lagjax._fit._inputs import HOLDS, Form, asks
+from lagjax._fit._inputs import Form, asks
 from lagjax._fit._many import Waterfall
 from lagjax._fit._motions import motions_of
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
@@ -40,6 +41,7 @@ from lagjax._fit._records import (
     in_structure,
     known_start,
     require_alike,
+    require_held,
     require_untraced,
     started,
 )
@@ -62,6 +64,7 @@ from lagjax._fit._wrapped import UNCLEAR, require_no_jumps, sensors, wrapped
 from lagjax._hybrid import Hybrid
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL
+from lagjax._samples import HOLDS
 
 __all__ = [
     "Delayed",
@@ -82,6 +85,9 @@ __all__ = [
 PyTree = Any
 
 METHODS = ("auto", "segments", "whole", "gradient")
+# Free numbers from which on a sentence says that another method may be meant. Of a network of 337 a trial takes half a
+# minute, and the gradient's whole descent as long; scenes of 50 need no such advice.
+_MANY = 100
 
 
 @with_doubles
@@ -116,13 +122,16 @@ def fit(
       the structure of a record's `values`; by default q. `lagjax.Delayed` is for sensors with a delay, `lagjax.wrapped`
       for those that show angles less whole turns.
     - `free`: True or False for every parameter, or for whole branches of `params0`, or a Boolean array for the numbers
-      of an array; by default all floats are free.
+      of an array; by default all floats are free. With False starts and noise alone are fitted: how good are published
+      parameters on these records?
     - `transforms`: `lagjax.positive`, `lagjax.between(a, b)`, `lagjax.angle` or None for every parameter or branch;
-      `lagjax.simplex` and `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
+      an array of these for the numbers of an array, `np.array([lagjax.positive, None])`; `lagjax.simplex` and
+      `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
       its search and its interval are then relative.
     - `noise`: `lagjax.Gaussian()`, the default, or `lagjax.StudentT()` where the data have outliers.
     - `hold`: how the `inputs` of records continue between samples: "zero" keeps the last sample, as a D/A converter
-      does; "linear" interpolates. Functions of the scene ask for `inputs` by name.
+      does; "linear", "cubic" and "band" interpolate as `lagjax.samples` does.
+      "band" is for inputs below the Nyquist frequency, evenly sampled. Functions of the scene ask for `inputs` by name.
     - `starts`: the number of parameter values from which to search, as one batch: `params0`, and random ones drawn with
       `seed`: about a positive number with a decade as standard deviation, uniform between bounds, on a circle or a
       simplex, and about any other number with its size as standard deviation. The best few go through the whole search,
@@ -132,7 +141,8 @@ def fit(
       its own read off the data, and joins these step by step; for that the signals must have the structure of q. "auto"
       does so where the signals allow it and the records are longer than the motion's time scale: then the search
       converges for long and chaotic records, and from parameters that are far off. "gradient" descends by reverse-mode
-      gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance.
+      gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With
+      more than a hundred free numbers the other methods say in a warning that this one is meant for them.
 
     Intervals take the correlation of residuals into account (`Fit.noise`). `Fit.unseen` says in words which parameters
     the data do not determine; their intervals are infinite.
@@ -160,7 +170,7 @@ def fit(
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}; got {method!r}.")
     if hold not in HOLDS:
-        raise ValueError(f"hold must be 'zero' or 'linear'; got {hold!r}.")
+        raise ValueError(f"hold must be one of {', '.join(map(repr, HOLDS))}; got {hold!r}.")
     require_untraced(params0, "params0")
     noise = Gaussian() if noise is None else noise
     if not isinstance(noise, AbstractNoise):
@@ -168,6 +178,13 @@ def fit(
     scenes = _scenes(system, records, params0, observe, hold)
     parameters = Parameters.of(params0, free, transforms)
     how = _How(system, observe, noise, int(starts), method, int(seed), progress)
+    if len(parameters) > _MANY and method != "gradient":
+        warnings.warn(
+            f"{len(parameters)} numbers are free, and with method={method!r} every trial follows that many derivatives "
+            "of every motion, which may take minutes each. method='gradient' takes all of them at once, in reverse: it "
+            "is for networks and other functions of many numbers.",
+            stacklevel=2,
+        )
     begun = time.process_time()
     try:
         done, came_to = _answer(how, scenes, params0, parameters)
@@ -263,6 +280,11 @@ def _scenes(system, records, params0, observe, hold: str) -> list[_Scene]:
 
 def _require_one_beginning(question: AbstractQuestion, starts: int, method: str) -> None:
     """Raise `ValueError` where many starts, or a descent by gradients, are asked for and cannot be."""
+    if not len(question.parameters) and (method == "gradient" or starts > 1):
+        raise ValueError(
+            "No parameter is free, so there is one place to begin: leave `starts` at 1, and `method` at 'auto', which "
+            "fits the starts of records."
+        )
     if method == "gradient" and starts > 1:
         raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
     for one in [part.question for part in question.parts] if starts > 1 else []:
@@ -287,6 +309,8 @@ def _form(system: Scene, records: list[Record], hold: str) -> Form | None:
     structures = [record.input_structure for record in records if isinstance(record, Record)]
     if not structures or structures[0] is None:
         return None
+    for place, record in enumerate(records):
+        require_held(record, hold, f"records[{place}]")
     tree, shapes = structures[0]
     return Form(tree, shapes, hold)
 

@@ -5,6 +5,7 @@ sum of the correlations over all lags. Source: Geyer, *Practical Markov chain Mo
 where correlations end; Newey & West, Econometrica 55 (1987) 703, for tapers whose spectrum has no negative parts.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -92,7 +93,7 @@ def _parzen(x: np.ndarray) -> np.ndarray:
 def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
     """Σ Gᵀ C G over N pieces `rows` (N, T, F), where C has the correlations `lags`."""
     if len(lags) == 1:
-        flat = rows.reshape(-1, rows.shape[-1])
+        flat = rows.reshape(math.prod(rows.shape[:-1]), rows.shape[-1])
         return flat.T @ flat
     lags = lags[: rows.shape[1]]
     size = rows.shape[1] + len(lags)

@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit._inputs import Table
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Record
 
@@ -105,17 +104,3 @@ class Delays:
             if not 0.0 <= one.value <= self.longest:
                 return f"A delay is {one.value:.4g}, but must lie between 0 and the longest one, {self.longest:g}."
         return None
-
-
-def inputs_at(table: Table | None, inputs: np.ndarray, ts: np.ndarray, hold: str) -> tuple[np.ndarray, np.ndarray]:
-    """The inputs (N, T, I) at other times `ts` (N, T), and their rates there. `inputs` (N, T, I) tells the shape."""
-    if table is None:
-        return inputs, np.zeros_like(inputs)
-    values, rates = np.empty_like(inputs), np.zeros_like(inputs)
-    for row, (knots, samples) in enumerate(zip(table.knots, table.values, strict=True)):
-        i = np.clip(np.searchsorted(knots, ts[row], side="right") - 1, 0, len(knots) - 2)
-        values[row] = samples[i]
-        if hold == "linear":
-            rates[row] = (samples[i + 1] - samples[i]) / (knots[i + 1] - knots[i])[:, None]
-            values[row] += rates[row] * (ts[row] - knots[i])[:, None]
-    return values, rates

@@ -7,6 +7,7 @@ derivatives go along the user's parameters only. Tables are filled up to a few l
 for a length, and serves all records.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,11 +18,10 @@ import numpy as np
 from lagjax._arguments import Function
 from lagjax._fit._scene import Scene, laws
 from lagjax._reads import Edition
-from lagjax._samples import samples
+from lagjax._samples import MARGINS, continued, samples
 from lagjax._system import System
 
 PyTree = Any
-HOLDS = ("zero", "linear")
 _LEAST_ROOM, _GROWTH = 16, 4  # of tables: at most four times what is needed, and six programs up to 16 000 samples
 _FUNCTIONS = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
 
@@ -29,7 +29,8 @@ _FUNCTIONS = ("lagrangian", "forces", "dissipation", "constraints", "velocity_co
 class Table(NamedTuple):
     """The inputs of N pieces of records: I numbers at K instants, `knots` (N, K) and `values` (N, K, I).
 
-    Beyond the last sample of a piece it stays, at instants that still increase.
+    Some samples about a piece are among them where its input asks for them, and behind the last one instants that still
+    increase (`table_of`).
     """
 
     knots: np.ndarray
@@ -60,7 +61,7 @@ class Driven(NamedTuple):
 
 
 class Form(NamedTuple):
-    """The structure of an input at one time, and how it goes on between samples: "zero" or "linear"."""
+    """The structure of an input at one time, and how it goes on between samples, one of `lagjax._samples.HOLDS`."""
 
     tree: Any
     shapes: tuple[tuple[int, ...], ...]
@@ -86,10 +87,10 @@ class Form(NamedTuple):
         return eqx.tree_at(lambda s: [getattr(s, name) for name in present], system, wrapped)
 
     def along(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
-        """The scene with the inputs (T, I) of a record at `ts` (T,), and its parameters, as `simulate` takes them."""
+        """The scene with inputs (K, I) sampled at `ts` (K,), and its parameters, as `simulate` takes them."""
         if not asks(system) or not isinstance(system, System):
             return system, params
-        table = table_of([(ts, inputs)])
+        table = table_of([(ts, inputs)], self.hold)
         return self.driven(system), Driven(params, table.knots[0], table.values[0])
 
     def params(self, params: PyTree, room: int) -> Driven:
@@ -133,15 +134,18 @@ def room_for(count: int) -> int:
     return room
 
 
-def table_of(pieces: list[tuple[np.ndarray, np.ndarray]]) -> Table:
-    """The tables of N pieces, each given by its times (k,) and inputs (k, I), side by side."""
-    room, size = room_for(max(len(ts) for ts, _ in pieces)), pieces[0][1].shape[1]
+def table_of(pieces: list[tuple[np.ndarray, np.ndarray]], hold: str) -> Table:
+    """The tables of N pieces, each given by its times (k,) and inputs (k, I), side by side.
+
+    What they are filled up with changes nothing up to the last sample: functions of time are those of (k,) samples.
+    """
+    room, size = room_for(max(len(ts) for ts, _ in pieces) + MARGINS[hold]), pieces[0][1].shape[1]
     knots, values = np.zeros((len(pieces), room)), np.zeros((len(pieces), room, size))
     for row, (ts, inputs) in enumerate(pieces):
         count = len(ts)
         spacing = (ts[-1] - ts[0]) / (count - 1) if count > 1 else max(1.0, abs(ts[0]))
         knots[row] = np.concatenate([ts, ts[-1] + spacing * np.arange(1, room - count + 1)])
-        values[row, :count], values[row, count:] = inputs, inputs[-1]
+        values[row, :count], values[row, count:] = inputs, continued(inputs, room - count, hold)
     return Table(knots, values)
 
 
@@ -154,3 +158,21 @@ def at_instants(ts: np.ndarray, inputs: np.ndarray) -> Table:
 def looked_up(ts: np.ndarray, inputs: np.ndarray, at: np.ndarray) -> np.ndarray:
     """The inputs (M, I) at the times `at` (M,), on lines between samples (T, I) at `ts` (T,)."""
     return np.stack([np.interp(at, ts, column) for column in inputs.T], axis=-1)
+
+
+def about(ts: np.ndarray, begin: float, end: float, hold: str) -> slice:
+    """Which of the samples at `ts` (K,) say what the input is from `begin` to `end`."""
+    margin = MARGINS[hold]
+    first = int(np.searchsorted(ts, begin, side="right")) - 1 - margin
+    last = int(np.searchsorted(ts, end, side="left")) + 1 + margin
+    return slice(max(first, 0), last)
+
+
+@functools.partial(jax.jit, static_argnames="hold")
+def inputs_at(table: Table, ts, hold: str) -> tuple[Any, Any]:
+    """The inputs (N, T, I) at the times `ts` (N, T) of the pieces of a table, and their rates there."""
+
+    def of(knots, values, ts):
+        return jax.jvp(samples(knots, values, hold), (ts,), (jnp.ones_like(ts),))
+
+    return jax.vmap(of)(table.knots, table.values, ts)

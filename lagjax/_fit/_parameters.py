@@ -66,15 +66,19 @@ class Parameters:
             fitted = _which_are_fitted(label, leaf, may_move, free)
             if fitted.any():
                 shape = np.shape(leaf)
-                transform = _transform_of(label, transform, values[fitted], shape)
-                if not (fitted.all() or transform.separable):
-                    raise ValueError(f"{label} is free as a whole or not at all: its transform is {transform!r}.")
-                parts.append(Part(label, shape, count + np.flatnonzero(fitted), transform))
+                for one, some in _pieces(label, transform, fitted, shape):
+                    if isinstance(one, AbstractTransform) and not (len(some) == values.size or one.separable):
+                        raise ValueError(f"{label} is free as a whole or not at all: its transform is {one!r}.")
+                    one = _transform_of(label, one, values[some], shape)
+                    parts.append(Part(label, shape, count + some, one))
                 names += [name for name, free_too in zip(_names(label, shape), fitted, strict=True) if free_too]
             count += values.size
-        if not names:
-            raise ValueError("No parameter is free: give params0 at least one float for which `free` is True.")
-        return cls(leaves, tree, np.concatenate(numbers), tuple(names), tuple(parts))
+        if not names and free is None:
+            raise ValueError(
+                "No parameter is free: give params0 at least one float for which `free` is True, or free=False to fit "
+                "starts and noise alone."
+            )
+        return cls(leaves, tree, np.concatenate([np.zeros(0), *numbers]), tuple(names), tuple(parts))
 
     @functools.cached_property
     def _cuts(self) -> list[tuple[slice, slice, Part]]:
@@ -151,7 +155,7 @@ class Parameters:
 
     def drawn(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Another u (F,) to begin a search from."""
-        return np.concatenate([part.transform.drawn(u[own], rng) for own, _, part in self._cuts])
+        return np.concatenate([u[:0], *(part.transform.drawn(u[own], rng) for own, _, part in self._cuts)])
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -196,7 +200,7 @@ class Parameters:
         """Changes of u (F,), each of which changes the free numbers by about their own size."""
         x, jacobian = self.values(u), self.jacobian(u)
         size = np.where(x != 0, np.abs(x), 1.0)
-        return np.minimum(1.0 / np.maximum(np.abs(jacobian) / size[:, None], 1e-300).max(axis=0), self.reach)
+        return np.minimum(1.0 / (np.abs(jacobian) / size[:, None]).max(axis=0, initial=1e-300), self.reach)
 
     def row(self, name: str) -> int:
         """The place among the free numbers of the one of this name, or of the only one whose name ends in it.
@@ -212,7 +216,7 @@ class Parameters:
         if len(rows) != 1:
             several = [self.names[k] for k in rows]
             reason = f"{name!r} may be {', '.join(several)}" if rows else f"No free parameter is called {name!r}"
-            raise ValueError(f"{reason}; there are {', '.join(self.names)}.")
+            raise ValueError(f"{reason}; there are {', '.join(self.names) or 'none: all are kept'}.")
         return rows[0]
 
     def unknown(self, name: str) -> int:
@@ -284,6 +288,21 @@ def _which_are_fitted(label: str, leaf, may_move, free) -> np.ndarray:
             raise TypeError(f"{label} is free but not a float: write 1.0 instead of 1, or leave it out of `free`.")
         return np.zeros(np.size(leaf), bool)
     return np.broadcast_to(wanted, np.shape(leaf)).ravel()
+
+
+def _pieces(label: str, transform, fitted: np.ndarray, shape: tuple[int, ...]) -> list[tuple[Any, np.ndarray]]:
+    """Neighbours among the fitted numbers of a leaf that share a transform, each with their places in it, in order."""
+    places = np.flatnonzero(fitted)
+    if not isinstance(transform, np.ndarray):
+        return [(transform, places)]
+    if transform.shape != shape:
+        raise ValueError(
+            f"transforms must hold one for {label}, or an array of them of its shape {shape}; got one of the shape "
+            f"{transform.shape}."
+        )
+    each = transform.ravel()
+    edges = [k for k in range(1, len(places)) if each[places[k]] != each[places[k - 1]]]
+    return [(each[some[0]], some) for some in np.split(places, edges)]
 
 
 def _transform_of(label: str, transform, values: np.ndarray, shape: tuple[int, ...]) -> AbstractTransform:

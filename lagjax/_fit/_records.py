@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit._inputs import Table, looked_up, table_of
+from lagjax._fit._inputs import Table, about, inputs_at, looked_up, table_of
 from lagjax._layout import Layout, taken_apart
+from lagjax._samples import unevenly_spaced
 from lagjax._validate import require_concrete
 
 PyTree = Any
@@ -50,13 +51,17 @@ class Record(Measured):
     - `ts` (T,): the times, strictly increasing, T ≥ 2. Records need not be equally long, nor equally spaced.
     - `values`: the measured signals in the structure that `observe` returns, with the times as first axis of every
       leaf; by default that of q. NaN where a sample is missing.
-    - `inputs`: what drove the scene, sampled at the same times, in any structure with the times as first axis of every
-      leaf: a voltage, the motion of a support. Functions of the scene, and `observe`, that take `inputs` get its value
-      at their time; `fit(..., hold=)` says how it continues between samples. No sample of it may be missing.
+    - `inputs`: what drove the scene, sampled at the same times or at `input_ts`, in any structure with the times as
+      first axis of every leaf: a voltage, the motion of a support. Functions of the scene, and `observe`, that take
+      `inputs` get its value at their time; `fit(..., hold=)` says how it continues between samples. No sample of it may
+      be missing.
     - `start`: the state at `ts[0]`. A pair (q0, qdot0) is known and kept fixed. With `lagjax.Guess(q0, qdot0)` it is
       fitted, and the search begins there. With None it is fitted too, and the search begins at local polynomials
       through the values. A function of the parameters that returns (q0, qdot0) computes the start from them, as orbital
       elements give the positions of planets.
+    - `input_ts` (K,): the times of the samples of `inputs`, where these are not `ts`: strictly increasing, from `ts[0]`
+      or before up to `ts[-1]` or beyond; with `hold="zero"` the last one stays. Samples beyond both ends help "cubic"
+      and "band".
     - `weights`: how much each sample counts, one number or a prefix of the structure of `values`: the variance of a
       sample is that of its signal over its weight. Zero leaves a sample out.
 
@@ -75,6 +80,7 @@ class Record(Measured):
     inputs: PyTree = None
     start: tuple[PyTree, PyTree] | Guess | Callable | None = None
     weights: PyTree = None
+    input_ts: np.ndarray | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "ts", _times(self.ts))
@@ -83,9 +89,12 @@ class Record(Measured):
         if not any(leaf.size for leaf in leaves):
             raise ValueError("values holds no signal: give an array with the times as first axis.")
         object.__setattr__(self, "values", tree.unflatten(leaves))
+        if self.input_ts is not None:
+            object.__setattr__(self, "input_ts", _times(self.input_ts, "input_ts"))
+            _require_covered(self)
         if self.inputs is not None:
             labels, leaves, tree = taken_apart(one_signal(self.inputs), "inputs")
-            leaves = [_input(leaf, label, len(self.ts)) for label, leaf in zip(labels, leaves, strict=True)]
+            leaves = [_input(leaf, label, len(self.sampled_at)) for label, leaf in zip(labels, leaves, strict=True)]
             object.__setattr__(self, "inputs", tree.unflatten(leaves))
         require_start(self.start)
         _matrix_of_weights(self)
@@ -105,10 +114,26 @@ class Record(Measured):
         return np.concatenate([leaf.reshape(len(self), -1) for leaf in jax.tree.leaves(self.values)], axis=1)
 
     @property
+    def sampled_at(self) -> np.ndarray:
+        """The times of the samples of inputs, (K,)."""
+        return self.ts if self.input_ts is None else self.input_ts
+
+    @property
+    def input_samples(self) -> np.ndarray:
+        """All inputs side by side as they were sampled, (K, I)."""
+        leaves, count = jax.tree.leaves(self.inputs), len(self.sampled_at)
+        return np.concatenate([np.zeros((count, 0)), *(x.reshape(count, -1) for x in leaves)], axis=1)
+
+    @property
     def input_matrix(self) -> np.ndarray:
-        """All inputs side by side, (T, I)."""
-        leaves = jax.tree.leaves(self.inputs)
-        return np.concatenate([np.zeros((len(self), 0)), *(x.reshape(len(self), -1) for x in leaves)], axis=1)
+        """All inputs at the times of the record, side by side, (T, I): on lines, where they have times of their own.
+
+        That is for where a search begins. What a trial sees is what `hold` makes of them (`_side_by_side`).
+        """
+        known = self.input_samples
+        if self.input_ts is None or not known.shape[1]:
+            return np.zeros((len(self), 0)) if not known.shape[1] else known
+        return looked_up(self.input_ts, known, self.ts)
 
     @property
     def input_structure(self) -> tuple | None:
@@ -138,16 +163,16 @@ class Record(Measured):
         return _matrix_of_weights(self)
 
 
-def _times(ts) -> np.ndarray:
-    times = real_numbers(ts, "ts", "an array of times")
+def _times(ts, name: str = "ts") -> np.ndarray:
+    times = real_numbers(ts, name, "an array of times")
     if times.ndim != 1 or len(times) < 2:
-        raise ValueError(f"ts must hold at least two times, in one dimension; got shape {times.shape}.")
+        raise ValueError(f"{name} must hold at least two times, in one dimension; got shape {times.shape}.")
     if not np.isfinite(times).all():
-        raise ValueError(f"ts[{int(np.argmin(np.isfinite(times)))}] is not finite: every time must be.")
+        raise ValueError(f"{name}[{int(np.argmin(np.isfinite(times)))}] is not finite: every time must be.")
     if not (np.diff(times) > 0).all():
         place = int(np.argmax(np.diff(times) <= 0))
         raise ValueError(
-            f"ts must increase strictly; ts[{place}] = {times[place]:g} is followed by {times[place + 1]:g}. "
+            f"{name} must increase strictly; {name}[{place}] = {times[place]:g} is followed by {times[place + 1]:g}. "
             "Sort the samples, and keep one of each time."
         )
     return times
@@ -197,6 +222,33 @@ def _signal(leaf, label: str, times: int) -> np.ndarray:
     return values
 
 
+def _require_covered(record: Record) -> None:
+    """Raise `ValueError` for times of inputs without inputs, or that begin after the record."""
+    times, begin = record.sampled_at, record.ts[0]
+    if record.inputs is None:
+        raise ValueError("input_ts are the times of `inputs`, and there are none: give both.")
+    if times[0] > begin:
+        raise ValueError(
+            f"input_ts begin at {times[0]:g}, after the record, which begins at t = {begin:g}: what the input was "
+            "before is not known. Give more of the input, or less of the record."
+        )
+
+
+def require_held(record: Measured, hold: str, name: str) -> None:
+    """Raise `ValueError` where the inputs of a record cannot go on between samples as `hold` says."""
+    if not isinstance(record, Record) or record.inputs is None or hold == "zero":
+        return
+    times, end = record.sampled_at, record.ts[-1]
+    if times[-1] < end:
+        raise ValueError(
+            f"input_ts of {name} end at {times[-1]:g}, before the record, which ends at t = {end:g}, and with "
+            f"hold={hold!r} nothing is extrapolated: give more of the input, or less of the record."
+        )
+    called = "ts" if record.input_ts is None else "input_ts"
+    if hold == "band" and (reason := unevenly_spaced(times, called)):
+        raise ValueError(f"The inputs of {name}: {reason}")
+
+
 def _input(leaf, label: str, times: int) -> np.ndarray:
     values = _signal(leaf, label, times)
     if np.isnan(values).any():
@@ -244,7 +296,7 @@ def inputs_between(record: Record, ts: np.ndarray) -> PyTree:
     """The inputs of a record at other times, on lines between the samples; None where it has none."""
     if record.input_structure is None:
         return None
-    return _taken_apart(looked_up(record.ts, record.input_matrix, ts), record.input_structure)
+    return _taken_apart(looked_up(record.sampled_at, record.input_samples, ts), record.input_structure)
 
 
 def _taken_apart(matrix: np.ndarray, structure: tuple) -> PyTree:
@@ -283,10 +335,10 @@ class Samples(NamedTuple):
     table: Table | None
 
 
-def batches(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16) -> list[Samples]:
+def batches(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16, hold: str = "zero") -> list[Samples]:
     """The pieces in batches, none of which is longer than twice its shortest piece: at most half of the room is empty.
 
-    `eps` is the round-off of the numbers that the motion is computed in.
+    `eps` is the round-off of the numbers that the motion is computed in, `hold` says what inputs are between samples.
     """
     lengths = np.array([len(piece.places) for piece in pieces])
     order, groups = np.argsort(-lengths, kind="stable"), []
@@ -294,29 +346,34 @@ def batches(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16) -> li
         if not groups or 2 * lengths[row] < lengths[groups[-1][0]]:
             groups.append([])
         groups[-1].append(row)
-    return [_side_by_side(records, pieces, np.sort(rows), eps) for rows in groups]
+    return [_side_by_side(records, pieces, np.sort(rows), eps, hold) for rows in groups]
 
 
-def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, eps: float) -> Samples:
+def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, eps: float, hold: str) -> Samples:
     longest, signals = max(len(pieces[row].places) for row in rows), records[pieces[rows[0]].record].matrix.shape[1]
     ts = np.zeros((len(rows), longest))
     values, weights = np.zeros((2, len(rows), longest, signals))
     matrices = {pieces[row].record: None for row in rows}
-    matrices = {k: (records[k].matrix, records[k].weight_matrix, records[k].input_matrix) for k in matrices}
+    matrices = {k: (records[k].matrix, records[k].weight_matrix, records[k].input_samples) for k in matrices}
     driven = matrices[pieces[rows[0]].record][2]
     inputs, sampled = np.zeros((len(rows), longest, driven.shape[1])), []
     for i, row in enumerate(rows):
         record, places = pieces[row]
         measured, weight = (matrix[places] for matrix in matrices[record][:2])
-        between, driven = slice(places[0], places[-1] + 1), matrices[record][2]
         times, count = records[record].ts[places], len(places)
         # Eight units of round-off apart: times that still increase.
         gap = 8 * eps * max(abs(times[0]), abs(times[-1]), times[-1] - times[0])
         ts[i] = np.concatenate([times, times[-1] + gap * np.arange(1, longest - count + 1)])
         values[i, :count], weights[i, :count] = np.where(weight > 0, measured, 0.0), weight
-        inputs[i, :count], inputs[i, count:] = driven[places], driven[places[-1]]
-        sampled.append((records[record].ts[between], driven[between]))
-    return Samples(rows, ts, values, weights, inputs, table_of(sampled) if driven.shape[1] else None)
+        at, samples = records[record].sampled_at, matrices[record][2]
+        between = about(at, times[0], times[-1], hold)
+        sampled.append((at[between], samples[between]))
+        if records[record].input_ts is None:
+            inputs[i, :count], inputs[i, count:] = samples[places], samples[places[-1]]
+    table = table_of(sampled, hold) if driven.shape[1] else None
+    if table is not None and any(records[pieces[row].record].input_ts is not None for row in rows):
+        inputs = np.asarray(inputs_at(table, ts, hold)[0])
+    return Samples(rows, ts, values, weights, inputs, table)
 
 
 def require_alike(records) -> list[Any]:

@@ -68,9 +68,10 @@ def pictures_of(systems: list[Drawn], covariance, waterfall) -> dict[str, list[s
         of_one = "" if system.name is None else f"{system.name}: "
         figures |= {of_one + heading: pictures for heading, pictures in _of_records(*system[1:]).items()}
     side = min(3.2 + 0.45 * len(covariance.names), 12.0)
-    figures["Correlations of the parameters"] = [
-        _picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), covariance.matrix, covariance.names))
-    ]
+    if covariance.names:
+        figures["Correlations of the parameters"] = [
+            _picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), covariance.matrix, covariance.names))
+        ]
     if waterfall is not None:
         figures["Waterfall of the starts"] = [
             _picture((6.4, 3.2), lambda figure: draw_waterfall(figure.subplots(), waterfall.misfits))

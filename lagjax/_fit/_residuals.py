@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._fit._delays import inputs_at
-from lagjax._fit._inputs import at_instants
+from lagjax._fit._inputs import at_instants, inputs_at
 from lagjax._fit._motions import AbstractMotions, Motion
 from lagjax._fit._noise import AbstractNoise, Widths, counts
 from lagjax._fit._parameters import Parameters
@@ -263,7 +262,11 @@ class Question(AbstractQuestion):
     def _in_batches(self) -> list[Samples]:
         """The records in batches, then each of the timings as a batch of its own, all with a column for each signal."""
         sensed = [row for row, piece in enumerate(self.pieces) if piece.record not in self.clocks]
-        some = batches(self.records, [self.pieces[row] for row in sensed], float(np.finfo(self.layout.dtype).eps))
+        eps, hold = (
+            float(np.finfo(self.layout.dtype).eps),
+            "zero" if self.signals.form is None else self.signals.form.hold,
+        )
+        some = batches(self.records, [self.pieces[row] for row in sensed], eps, hold)
         found = [batch._replace(rows=np.array(sensed)[batch.rows]) for batch in some]
         for row, (k, _) in enumerate(self.pieces):
             if k in self.clocks:
@@ -364,13 +367,12 @@ class Question(AbstractQuestion):
             return Failure(int(batch.rows[0]), text)
         values = np.zeros((*batch.ts.shape, len(signals.names)))
         slopes = np.zeros((*values.shape, len(numbers_dot)))
-        hold = "zero" if signals.form is None else signals.form.hold
         for delay in each:
             ts = np.maximum(batch.ts - delay.value, batch.ts[:, :1])
             motion = self._follow(batch, ts, y0, numbers, y0_dot, numbers_dot)
             if isinstance(motion, Failure):
                 return motion
-            inputs, rates = inputs_at(batch.table, batch.inputs, ts, hold)
+            inputs, rates = self._inputs_at(batch, ts)
             ts_dot = -numbers_dot @ delay.slopes
             y, n = motion.path.reshape(-1, self.states), self.layout.size
             pulled = self.motions.rate(ts.ravel(), y, numbers, at_instants(ts.ravel(), inputs.reshape(len(y), -1)))
@@ -379,6 +381,13 @@ class Question(AbstractQuestion):
             some = signals.of(motion, ts, inputs, numbers, numbers_dot, ts_dot, rates)
             values[..., delay.signals], slopes[..., delay.signals, :] = (x[:, :, delay.signals] for x in some)
         return values, slopes
+
+    def _inputs_at(self, batch: Samples, ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The inputs (N, T, I) at other times `ts` (N, T) of the pieces of a batch, and their rates there."""
+        if batch.table is None or self.signals.form is None:
+            return batch.inputs, np.zeros_like(batch.inputs)
+        values, rates = inputs_at(batch.table, ts, self.signals.form.hold)
+        return np.asarray(values), np.asarray(rates)
 
     def _time(self, clock: AbstractClock, batch: Samples, y0, numbers, y0_dot, numbers_dot):
         """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D); or a failure."""
@@ -416,6 +425,7 @@ def compressed(rows: np.ndarray) -> np.ndarray:
     Blocks stay in the cache, and are too small for a BLAS to start threads that wait for each other.
     """
     pieces, _, columns = rows.shape
+    rows = rows if columns else rows[:, :0]
     while rows.shape[1] > columns:
         height = min(_BLOCK * columns, rows.shape[1])
         missing = -rows.shape[1] % height

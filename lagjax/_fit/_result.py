@@ -2,6 +2,7 @@
 
 import functools
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, cast
@@ -20,7 +21,7 @@ from lagjax._fit._next import Experiments, ranked
 from lagjax._fit._noise import AbstractNoise, Known, Widths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._profile import Profile, profile
-from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike
+from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike, require_held
 from lagjax._fit._report import Drawn, page, pictures_of
 from lagjax._fit._residuals import AbstractQuestion, Failure, Part, Point, Question
 from lagjax._fit._sample import draw, inference_data
@@ -309,6 +310,8 @@ class Fit:
             raise ValueError("The record has other signals than those of the fit.")
         if record.input_structure != first.input_structure:
             raise ValueError("The record has other inputs than those of the fit.")
+        if about.signals.form is not None:
+            require_held(record, about.signals.form.hold, "the record")
         layout, fixed = about.layout, self.parameters.kept(self.u)
         state = known_start(record, layout, 0, self.params)
         is_known = state is not None and not isinstance(record.start, Guess)
@@ -330,7 +333,8 @@ class Fit:
         start = layout.restore(point.starts[0, :n]), layout.restore(point.starts[0, n:])
         ts = np.asarray(record.ts, layout.dtype)
         q0, qdot0 = (jax.tree.map(lambda x: np.asarray(x, layout.dtype), half) for half in start)
-        form, driven, scene, params = about.signals.form, (record.ts, record.input_matrix), self.system, self.params
+        form, driven = about.signals.form, (record.sampled_at, record.input_samples)
+        scene, params = self.system, self.params
         scene = self._by_name(scene, part)
         scene, params = (scene, params) if form is None else form.along(scene, params, *driven)
         trajectory = follow(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
@@ -524,14 +528,16 @@ def _cells_of_noise(fit: Fit) -> list[list[str]]:
 
 
 def _table_of_parameters(fit: Fit) -> list[str]:
+    if not fit.parameters.names:
+        return ["All parameters are kept: starts and noise were fitted."]
     low, high = fit._ends(0.95)
     values = fit.parameters.values(fit.u)
     width = max(len(name) for name in (*fit.parameters.names, "parameter"))
     rows = [f"{'parameter':<{width}}  {'value':>12}  {'95 % interval':>27}  relative"]
-    many = {part.label: len(part.places) for part in fit.parameters.parts if len(part.places) > _LISTED}
+    owners = [part.label for part in fit.parameters.parts for _ in part.places]
+    many = {label: count for label, count in Counter(owners).items() if count > _LISTED}
     for label, count in many.items():
         rows.append(f"{label:<{width}}  {f'{count} numbers':>12}")
-    owners = [part.label for part in fit.parameters.parts for _ in part.places]
     for owner, name, x, a, b in zip(owners, fit.parameters.names, values, low, high, strict=True):
         if owner in many:
             continue

@@ -37,7 +37,7 @@ def suspects(records: list[Any], names: tuple[str, ...], worst: list[int], slowe
     """The mistakes that may be in the records, the likeliest first, where the data move so many times slower than the
     scene does, and `worst` has the places of the records in the order of what is left of them."""
     count, some = len(names), range(min(len(names), _MOST))
-    by_time = [replace(r, ts=r.ts / 1e3) if isinstance(r, Record) else r for r in records]
+    by_time = [_in_milliseconds(r) if isinstance(r, Record) else r for r in records]
     milliseconds = [Suspect("with the times in milliseconds", by_time)]
     ranges = [max(np.ptp(_there(r, k)) for r in records if isinstance(r, Record)) for k in range(count)]
     wide = [k for k in range(count) if ranges[k] > _WIDE]
@@ -63,6 +63,11 @@ def suspects(records: list[Any], names: tuple[str, ...], worst: list[int], slowe
         yield Suspect(text, _changed(records, turned, lambda x: x + np.pi))
     yield from degrees if max(ranges) <= _WIDEST else []
     yield from milliseconds if slower <= _SLOW else []
+
+
+def _in_milliseconds(record: Record) -> Record:
+    """A record whose times were taken for seconds."""
+    return replace(record, ts=record.ts / 1e3, input_ts=None if record.input_ts is None else record.input_ts / 1e3)
 
 
 def find_mistake(

@@ -98,6 +98,8 @@ def seen(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
     rows = _eliminated(triangles, states)
     unit = _lengths(triangles, states)
+    if not len(unit):
+        return np.zeros((0, 0)), np.zeros((0, 0))
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
     _, values, directions = np.linalg.svd(rows / unit)
     values = np.append(values, np.zeros(len(unit) - len(values)))
@@ -153,7 +155,7 @@ def growth(sizes: list[np.ndarray]) -> float:
 def _eliminated(triangles: np.ndarray, states: int) -> np.ndarray:
     """The rows of the parameters, orthogonal to those of the starts: a triangle with F columns."""
     own = orthogonal(triangles, triangles[..., :-1], states)
-    return compressed(own.reshape(1, -1, own.shape[-1]))[0]
+    return compressed(own.reshape(1, own.shape[0] * own.shape[1], own.shape[-1]))[0]
 
 
 def _lengths(triangles: np.ndarray, states: int) -> np.ndarray:
