@@ -98,7 +98,6 @@ class StepControl:
         code, n = frame.code, self.motion.n
         rtol = code.lanes_of(frame.job("rtol"))
         errors = [code.variable(frame.constant(0.0)) for _ in range(2)]
-        rounded = PLACES * EPS / self._step_before(frame)
         for half in range(2):
             sizes = self._sizes(frame, half)
             for part, (first, count) in enumerate(self.parts):
@@ -106,10 +105,7 @@ class StepControl:
                 for j in self.motion.form.each(code, count):
                     i = first + j
                     rate = code.intrinsic("fabs", frame["y", i + half * n, 1])
-                    least = floor
-                    if half:  # what rounding of its coordinate leaves of a velocity
-                        least = code.maximum(floor, rounded * code.intrinsic("fabs", frame["y", i, 0]))
-                    scale = 1.0 / (least + rtol * sizes[i])
+                    scale = 1.0 / (floor + rtol * sizes[i])
                     frame["scale", i + half * n] = scale
                     for k in range(2):
                         error = code.intrinsic("fabs", frame["y", i + half * n, order - k]) * scale
@@ -125,7 +121,8 @@ class StepControl:
         code, form, (first, count), place = frame.code, self.motion.form, self.parts[part], 2 * part + half
         given, rtol = (code.lanes_of(frame.job(name)) for name in ("atol", "rtol"))
         largest = form.largest(code, lambda i: sizes[first + i], count)
-        step = self._step_before(frame)
+        step = code.intrinsic("fabs", frame["h"])
+        step = code.select(step > 0.0, step, frame["longest"])  # before the first step
         if half:
             frame["reach", place] = largest = code.maximum(frame["reach", place], largest)
             by_position = frame["reach", 2 * part] / step
@@ -142,12 +139,6 @@ class StepControl:
         is_small = (share > 0.0) & (share < ATOL_OVER_RTOL)
         floor = rtol * code.select(is_small, share, frame.constant(ATOL_OVER_RTOL))
         return code.select(given > 0.0, given, floor)
-
-    @staticmethod
-    def _step_before(frame: Frame) -> Value:
-        """The length of the last step; of the longest, before the first one."""
-        step = frame.code.intrinsic("fabs", frame["h"])
-        return frame.code.select(step > 0.0, step, frame["longest"])
 
     def _sizes(self, frame: Frame, half: int) -> Numbers:
         """How large every coordinate, or every velocity (half 1), is over the step, or the largest one of its group."""
