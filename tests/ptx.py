@@ -248,6 +248,9 @@ class PtxOnCpu:
             value = b.fneg(read(0)) if floating else b.neg(read(0))
         elif name == "rcp":
             value = b.fdiv(ir.Constant(D, 1.0), read(0))
+        elif name in ("min", "max"):
+            compare = b.icmp_signed if signed else b.icmp_unsigned
+            value = b.select(compare("<" if name == "min" else ">", read(0), read(1)), read(0), read(1))
         elif name in ("add", "sub"):
             value = getattr(b, name)(read(0), read(1))
         elif name == "mul" and "lo" in parts:

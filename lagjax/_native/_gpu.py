@@ -70,13 +70,19 @@ def _assembly(text: str, size: int) -> str:
     machine = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3)
     text = text.replace('target triple = ""', f'target triple = "{machine.triple}"')
     text = text.replace('target datalayout = ""', f'target datalayout = "{machine.target_data}"')
-    library = libdevice()
-    external = re.findall(r'^declare double @"?(\w+)"?\(', text, re.MULTILINE)
-    for name in external:
-        text = _without_c_library(text, name, library)
+    external, library = re.findall(r'^declare double @"?(\w+)"?\(', text, re.MULTILINE), None
+    text = _without_far_angles(text)
+    if external := sorted({*external} - {*_FAR_ANGLES} - {"llvm"}):
+        library = libdevice()
+        if library is None:
+            raise Unlowerable(
+                f"its {', '.join(external)} come from NVIDIA's libdevice, which is not here; "
+                "`pip install nvidia-cuda-nvcc-cu12` has it"
+            )
+        text = re.sub(rf'@"?({"|".join(external)})"?\(', r"@__nv_\1(", text)
     public = r'define (?:internal )?(void|i64) (@"\w+"\([^)]*\))(?=\s*\{)'
     module = llvm.parse_assembly(re.sub(public, r"define internal \1 \2", text) + _entry(size))
-    if library is not None and external:
+    if library is not None:
         other = llvm.parse_bitcode(library)
         other.triple, other.data_layout = machine.triple, str(machine.target_data)
         module.link_in(other)
@@ -87,17 +93,16 @@ def _assembly(text: str, size: int) -> str:
     return machine.emit_assembly(_optimised(module, machine))
 
 
-def _without_c_library(text: str, name: str, library: bytes | None) -> str:
-    """The text of a module that calls libdevice for a function of the C library."""
-    if library is not None:
-        return re.sub(rf'@"?{name}"?\(', f"@__nv_{name}(", text)
-    if name not in _FAR_ANGLES:
-        raise Unlowerable(
-            f"its `{name}` comes from NVIDIA's libdevice, which is not here; `pip install nvidia-cuda-nvcc-cu12` has it"
-        )  # fmt: skip
-    # A step to such an angle is refused, so that the motion ends there and says so.
-    nan = f'define internal double @"{name}"(double %x) {{\n  ret double 0x7FF8000000000000\n}}'
-    return re.sub(rf'declare double @"{name}"\([^)]*\)', nan, text)
+def _without_far_angles(text: str) -> str:
+    """The text of a module in which the sine of an angle beyond 2**20 is NaN.
+
+    A step to there is refused, so that the motion ends and says so. libdevice has such sines, with a reduction that
+    every thread would keep room for.
+    """
+    for name in _FAR_ANGLES:
+        nan = f'define internal double @"{name}"(double %x) {{\n  ret double 0x7FF8000000000000\n}}'
+        text = re.sub(rf'declare double @"{name}"\([^)]*\)', nan, text)
+    return text
 
 
 def _entry(size: int) -> str:
