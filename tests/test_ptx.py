@@ -1,7 +1,7 @@
 """Machine code for GPUs, without a GPU: its lowering, and its PTX run on the CPU against the CPU's own machine code.
 
-Under `on_the_ptx` the rules for CUDA stand in the place of those for CPUs, and what XLA would launch on a GPU runs here,
-translated from the PTX (`ptx.PtxOnCpu`), so that all of `simulate` around it is the one of a GPU.
+Under `on_the_ptx` the rules for CUDA stand in the place of those for CPUs, and what XLA would launch on a GPU runs
+here, translated from the PTX (`ptx.PtxOnCpu`), so that all of `simulate` around it is the one of a GPU.
 """
 
 import functools
@@ -101,6 +101,7 @@ def test_a_batch_is_that_of_the_cpu(on_the_ptx):
     assert on_the_ptx.launches == [7]
 
 
+@pytest.mark.slow
 def test_every_member_may_have_its_own_times_and_parameters(on_the_ptx):
     scene = scenes.pendulum()
     params = jax.tree.map(lambda x: jnp.asarray(x) * jnp.linspace(0.5, 1.5, 3), scene.params)
@@ -128,6 +129,7 @@ def test_a_failure_has_the_result_of_the_cpu(on_the_ptx):
         np.testing.assert_array_equal(np.isnan(here[0]), np.isnan(there[0]))
 
 
+@pytest.mark.slow
 def test_an_event_and_its_gradient(on_the_ptx):
     scene = scenes.pendulum()
 
@@ -152,6 +154,7 @@ def test_borders_of_a_piecewise_scene(on_the_ptx):
     agree(here, jax.jit(lambda q0: motion(system, q0, 0.0, 5.0 * TS))(1.0))
 
 
+@pytest.mark.slow
 def test_derivatives_forward_and_reverse(on_the_ptx):
     scene = scenes.double_pendulum()
 
@@ -163,6 +166,7 @@ def test_derivatives_forward_and_reverse(on_the_ptx):
         agree(on_the_ptx(derivative, scene.q0, scene.params), jax.jit(derivative)(scene.q0, scene.params), 1e-7)
 
 
+@pytest.mark.slow
 def test_second_derivatives(on_the_ptx):
     scene = scenes.pendulum()
     second = jax.hessian(lambda q0: motion(scene, q0, 0.0)[0][-1])

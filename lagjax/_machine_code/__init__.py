@@ -1,4 +1,4 @@
-"""`MachineCode`: the engine on CPUs (`_gpu`: on GPUs, if asked for), Taylor series in machine code that is made for the scene.
+"""`MachineCode`: the engine on CPUs (`_gpu`: on GPUs), Taylor series in machine code made for the scene.
 
 Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is traced; ─► `_transforms`, the flow as primitives
 of JAX, where something is. All of that is in float64; a problem in float32 goes through the door of `_doubles` first.
@@ -61,15 +61,15 @@ class MachineCode(AbstractEngine):
 
     It computes in float64, also for a state in float32, whose results it rounds once.
 
-    On an NVIDIA GPU it integrates where it is asked for, one thread a member: `MachineCode()` is lowered for CUDA as for
-    CPUs, by `jax.export` too. That form is assembled and checked on a CPU, and not yet run on a GPU. There, members
-    that fail are not tried once more by another variant of the equations, a first derivative takes a motion with its
-    tangents for every direction, in reverse mode for every number of the start and of the parameters, and higher ones
-    are composed of these; crossings and hybrid motion require a CPU.
+    On an NVIDIA GPU it integrates where it is asked for, one thread a member: `MachineCode()` is lowered for CUDA as
+    for CPUs, by `jax.export` too. That form is assembled and checked on a CPU, not yet run on a GPU. There, members
+    that fail are not tried once more by another variant of the equations, and an angle beyond 2²⁰ ends a motion. A
+    first derivative takes a motion with its tangents for every direction, in reverse mode for every number of the
+    start and of the parameters; higher ones are composed of these. Crossings and hybrid motion require a CPU.
 
-    Machine code requires a CPU or that GPU, a scene whose acceleration is a scalar program of smooth or piecewise smooth
-    operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;
-    derivatives are by its own adjoint. `System.explain` says whether a scene has machine code.
+    Machine code requires a CPU or such a GPU, a scene whose acceleration is a scalar program of smooth or piecewise
+    smooth operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;
+    on a CPU derivatives are by its own adjoint. `System.explain` says whether a scene has machine code.
 
     **Raises** nothing itself; a run without machine code raises `ValueError` before anything is integrated.
 
