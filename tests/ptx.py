@@ -83,6 +83,9 @@ class PtxOnCpu:
             for name, targets in re.findall(r"(\$L_brx_\d+): \.branchtargets(.*?);", body, re.DOTALL)
         }
         body = re.sub(r"\$L_brx_\d+: \.branchtargets.*?;", "", body, flags=re.DOTALL)
+        word = r"\{\s*\.reg \.b32 \w+;\s*mov\.b64 \{%s\}, (%%\w+);\s*\}"  # one half of a register
+        body = re.sub(word % r"(%\w+), \w+", r"cvt.u32.u64 \1, \2;", body)
+        body = re.sub(word % r"\w+, (%\w+)", r"high.b32 \1, \2;", body)
         for line in re.split(r";|(?<=:)\n", re.sub(r"^\s*\.(?:reg|local|pragma|loc|file)[^;]*;", "", body, flags=re.M)):
             if line := line.strip():
                 self._line(line, labels, function)
@@ -149,6 +152,9 @@ class PtxOnCpu:
             return b.bitcast(value, t) if value.type != t else value
         if x in self.names:
             return b.ptrtoint(self.names[x], I64)
+        if x.startswith("0f"):
+            number = struct.unpack(">f", bytes.fromhex(x[2:]))[0]
+            return ir.Constant(t, number) if isinstance(t, ir.FloatType) else ir.Constant(I32, int(x[2:], 16))
         if x.startswith("0d"):
             number = struct.unpack(">d", bytes.fromhex(x[2:]))[0]
             return ir.Constant(D, number) if t is D else ir.Constant(I64, int(x[2:], 16))
@@ -167,8 +173,9 @@ class PtxOnCpu:
         return self.b.inttoptr(where, P), None
 
     def _intrinsic(self, name, *xs):
-        kind = ir.FunctionType(D, [D] * len(xs))
-        f = self.module.globals.get(f"llvm.{name}.f64") or ir.Function(self.module, kind, f"llvm.{name}.f64")
+        kind, width = xs[0].type, "f64" if xs[0].type == D else "f32"
+        kind, full = ir.FunctionType(kind, [kind] * len(xs)), f"llvm.{name}.{width}"
+        f = self.module.globals.get(full) or ir.Function(self.module, kind, full)
         return self.b.call(f, xs)
 
     def _operation(self, parts, operands, line):
@@ -197,7 +204,15 @@ class PtxOnCpu:
         to, *others = operands
         read = lambda i, k=kind: self._read(others[i], k)
         floating, signed = kind.startswith("f"), kind.startswith("s")
-        if name in ("mov", "cvta"):
+        if name == "high":
+            value = b.trunc(b.lshr(self._read(others[0], "b64"), I64(32)), I32)
+        elif name == "bfe":
+            assert kind == "u32", line
+            value = b.and_(b.lshr(read(0), I32(int(others[1]))), I32(2 ** int(others[2]) - 1))
+        elif name == "mov" and others[0].startswith("{"):
+            low, high = (b.zext(self._read(x, "b32"), I64) for x in re.findall(r"[%\w]+", others[0]))
+            value = b.or_(low, b.shl(high, I64(32)))
+        elif name in ("mov", "cvta"):
             k = "b64" if name == "cvta" else kind
             value = self._read(others[0], k)
         elif name == "setp":
