@@ -59,6 +59,9 @@ class Function(eqx.Module):
             with self.code.traced():
                 return function(*roles, **{name: extras[name] for name in self.extras})
         except (AttributeError, TypeError) as reason:
+            if isinstance(reason, jax.errors.TracerIntegerConversionError):
+                _note(reason, self.name, _NO_COUNT)
+                raise
             if isinstance(reason, _NO_VALUES):
                 _note(reason, self.name, _USE_JAX)
                 raise
@@ -86,6 +89,11 @@ _NO_VALUES = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversi
 _USE_JAX = (
     "its arguments have no values while it is differentiated: write jnp.cos(q) for math.cos(q) or numpy.cos(q), "
     "jnp.where(q > 0, a, b) for `if q > 0`, and no float(q)."
+)
+
+_NO_COUNT = (
+    "numbers in params have no values while it is traced, so that none can count a loop, index a list or be a shape: "
+    "let the function close over that integer (n = 3 beside it, or functools.partial), and keep params for what varies."
 )
 
 

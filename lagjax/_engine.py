@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from lagjax._diffrax import Diffrax
 from lagjax._machine_code import MachineCode
+from lagjax._platform import default_platform
 from lagjax._problem import AbstractEngine, Problem
 
 
@@ -39,6 +40,7 @@ def asked_for(solver=None, dt=None, adjoint=None, progress: Any = False, rtol=No
 
 
 _MACHINE_CODE = MachineCode()
+ON_GPUS = "solver=lagjax.MachineCode() is for GPUs too, assembled and checked on a CPU, not yet run on a GPU"
 
 
 def choose(problem: Problem, asked: AbstractEngine | None = None) -> Choice:
@@ -46,11 +48,14 @@ def choose(problem: Problem, asked: AbstractEngine | None = None) -> Choice:
     if isinstance(asked, Diffrax):
         choice = Choice(asked, "diffrax was asked for")
     else:
-        refusal = _MACHINE_CODE.refuses(problem)
+        # On a GPU it is not the default: its results there have not been verified on one.
+        refusal = _MACHINE_CODE.refuses(problem) if asked is None else _MACHINE_CODE.lacks(problem)
         if refusal is None:
             return Choice(_MACHINE_CODE, None)
         if asked is not None:
             raise ValueError(_refused(refusal))
+        if default_platform() == "gpu" and _MACHINE_CODE.lacks(problem) is None:
+            refusal += f"; {ON_GPUS}"
         choice = Choice(Diffrax(), refusal)
     if refusal := choice.engine.refuses(problem):
         raise ValueError(f"{refusal}.")

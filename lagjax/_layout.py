@@ -4,6 +4,7 @@ A `Layout` is read off one state (q, qdot): the tree, the shape of every leaf, o
 scalar coordinate, such as `q['theta']` or `q.r` or `q[1]`, by which error messages call it.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -93,7 +94,11 @@ def _structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tup
         try:
             dtype = dtype_of(leaf)
         except (TypeError, ValueError):
-            raise TypeError(f"{path} must be a real number or array; got {leaf!r}.") from None
+            more = ""
+            if dataclasses.is_dataclass(leaf):
+                name = type(leaf).__name__
+                more = f" JAX does not know the fields of {name}: call jax.tree_util.register_dataclass({name}) once."
+            raise TypeError(f"{path} must be a real number or array; got {leaf!r}.{more}") from None
         if dtype != _DOUBLE and not jnp.issubdtype(dtype, jnp.floating):
             raise TypeError(f"{path} must hold real floating-point numbers; got {dtype} (write 1.0 instead of 1).")
         dtypes.append(dtype)

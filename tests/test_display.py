@@ -1,5 +1,6 @@
 """`print(trajectory)`: three lines that say what it holds, how far it came and how it ended, wherever it is printed."""
 
+import dataclasses
 import sys
 
 import equinox as eqx
@@ -150,3 +151,30 @@ def test_a_newcomer_sees_that_the_switch_for_doubles_is_off(fallen):
     with jax.enable_x64(False):
         run = eqx.tree_at(lambda t: t.ts, fallen, fallen.ts.astype(jnp.float32))
         assert lines(run)[0] == "Trajectory of 6 members, float32, as jax_enable_x64 is off: q (6, 5), and qdot"
+
+
+def test_results_of_the_analysis_read_as_sentences():
+    pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+    same = lagjax.same_motion(pendulum, pendulum, 0.5, 0.1)
+    assert str(same).startswith("The same motions: E_a = 1 E_b; ")
+    other = lagjax.same_motion(pendulum, lagjax.System(lambda q, v: 0.5 * v**2), 0.5, 0.1)
+    assert str(other).startswith("Other motions: with the best factor") and "the equation of q at q" in str(other)
+    assert repr(list(lagjax.conserved_quantities(pendulum, 0.5, 0.1))) == "[Conserved('energy')]"
+    path = lagjax.find_path(pendulum, 0.0, 0.5, 0.0, 1.0)
+    assert repr(path).startswith("Path: action 1.08090018, a minimum among nearby paths, 0 conjugate times")
+    along = lagjax.family(pendulum, lagjax.periodic_orbit(pendulum, 0.5, 0.0, 6.3), count=3)
+    assert repr(along).startswith("Family of 3 orbits, 3 of them stable\nfrom -0.88") and "array" not in repr(along)
+
+
+def test_an_integer_of_params_and_an_unknown_dataclass_are_explained():
+    counted = lagjax.System(lambda q, v, params: 0.5 * v**2 - sum(q**2 for _ in range(params["n"])))
+    with pytest.raises(TypeError) as error:
+        lagjax.simulate(counted, 1.0, 0.0, jnp.array([0.0, 1.0]), {"n": 3})
+    assert "let the function close over that integer" in "".join(error.value.__notes__)
+
+    @dataclasses.dataclass
+    class Place:
+        x: float
+
+    with pytest.raises(TypeError, match=r"call jax.tree_util.register_dataclass\(Place\) once"):
+        lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v.x**2), Place(1.0), Place(0.0), jnp.array([0.0, 1.0]))

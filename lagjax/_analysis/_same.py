@@ -11,6 +11,7 @@ from jaxtyping import Array
 from lagjax._analysis._noether import State, euler_lagrange
 from lagjax._analysis._scene import Scene
 from lagjax._analysis._states import moved_by_rounding, random_states
+from lagjax._display import as_printed
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
 from lagjax._system import System, require_system
@@ -44,6 +45,15 @@ class SameMotion(NamedTuple):
 
     def __bool__(self) -> bool:
         return self.same
+
+    _repr_pretty_ = as_printed
+
+    def __str__(self) -> str:
+        """The verdict, the factor and what is left, in a sentence."""
+        left = f"{self.residual:.1g} of the terms are left, and {self.threshold:.1g} may be rounding"
+        if self.same:
+            return f"The same motions: E_a = {self.factor:.9g} E_b; {left}."
+        return f"Other motions: with the best factor, {self.factor:.9g}, {left}: {self.where}."
 
 
 @accepts_singles(("q", "qdot"), ("params",))

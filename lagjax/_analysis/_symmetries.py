@@ -70,6 +70,10 @@ class Conserved(NamedTuple):
 
         return trajectory.over_members(of_member)
 
+    def __repr__(self) -> str:
+        """Its name, and whether it has a gauge term; the functions have nothing to read."""
+        return f"Conserved({self.name!r}{'' if self.gauge is None else ', with a gauge term'})"
+
 
 class ConservedQuantities(list[Conserved]):
     """A list of `Conserved`.

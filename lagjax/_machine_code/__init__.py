@@ -1,4 +1,4 @@
-"""`MachineCode`: the engine on CPUs, Taylor series in machine code that is made for the scene.
+"""`MachineCode`: the engine on CPUs (`_gpu`: on GPUs), Taylor series in machine code made for the scene.
 
 Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is traced; ─► `_transforms`, the flow as primitives
 of JAX, where something is. All of that is in float64; a problem in float32 goes through the door of `_doubles` first.
@@ -61,9 +61,15 @@ class MachineCode(AbstractEngine):
 
     It computes in float64, also for a state in float32, whose results it rounds once.
 
-    Machine code requires a CPU, a scene whose acceleration is a scalar program of smooth or piecewise smooth
-    operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;
-    derivatives are by its own adjoint. `System.explain` says whether a scene has machine code.
+    On an NVIDIA GPU it integrates where it is asked for, one thread a member: `MachineCode()` is lowered for CUDA as
+    for CPUs, by `jax.export` too. That form is assembled and checked on a CPU, not yet run on a GPU. There, members
+    that fail are not tried once more by another variant of the equations, and an angle beyond 2²⁰ ends a motion. A
+    first derivative takes a motion with its tangents for every direction, in reverse mode for every number of the
+    start and of the parameters; higher ones are composed of these. Crossings and hybrid motion require a CPU.
+
+    Machine code requires a CPU or such a GPU, a scene whose acceleration is a scalar program of smooth or piecewise
+    smooth operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;
+    on a CPU derivatives are by its own adjoint. `System.explain` says whether a scene has machine code.
 
     **Raises** nothing itself; a run without machine code raises `ValueError` before anything is integrated.
 
@@ -80,14 +86,22 @@ class MachineCode(AbstractEngine):
     """
 
     def refuses(self, problem: Problem) -> str | None:
-        """Why it cannot solve the problem, as the end of a sentence; None where it can."""
+        """Why it cannot solve the problem on a CPU, as the end of a sentence; None where it can."""
+        lacks = self.lacks(problem)
+        if lacks is None and (platform := default_platform()) != "cpu":
+            return f"the default device is a {platform}, and `jax.default_device(jax.devices('cpu')[0])` chooses a CPU"
+        return lacks
+
+    def lacks(self, problem: Problem) -> str | None:
+        """Why there is no machine code for the problem, as the end of a sentence; None where there is.
+
+        Whether a GPU can run it is seen when it is lowered for one.
+        """
         if problem.is_single:
             with jax.enable_x64(True):
-                return self.refuses(problem.in_doubles)
+                return self.lacks(problem.in_doubles)
         if not all(map(is_concrete, problem.tolerances)):
             return "the tolerances are being traced"
-        if (platform := default_platform()) != "cpu":
-            return f"the default device is a {platform}, and `jax.default_device(jax.devices('cpu')[0])` chooses a CPU"
         if problem.event is not None and isinstance(surfaces := surfaces_of_event(problem), str):
             return surfaces
         flow = _flow_of(problem)
@@ -98,7 +112,7 @@ class MachineCode(AbstractEngine):
         if problem.is_single:
             return _in_doubles(self.solve, problem)
         flow, tolerances = flow_of(problem), _tolerances(problem)
-        if problem.is_known:
+        if problem.is_known and default_platform() == "cpu":
             _require_increasing(flow.program, problem.vector)
             ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
             return Solution._make([*(x[0] for x in flow.run(ts, y0, params, tolerances)[:-1]), None])
@@ -136,7 +150,7 @@ class MachineCode(AbstractEngine):
 
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, in the lanes of vectors and on all cores."""
-        if not batch.is_known:
+        if not batch.is_known or default_platform() != "cpu":
             return batch.over_members(self.solve)
         member = batch.member
         given = np.asarray(member.ts)[None], np.asarray(batch.y0), np.asarray(batch.vectors)

@@ -21,11 +21,12 @@ from lagjax._stopped import End, what_stopped
 # Operations of an acceleration: making its kernel takes some 4 KB for each, with the derivatives some 10 KB.
 LARGEST_PROGRAM = operations_that_fit(10_000)
 # The codes of the kernel, in their order, as results. Beyond `EVENT` they say which guards changed sign.
-_RESULT_OF_CODE = np.array([code_of(result) for result in (
+RESULT_OF_CODE = np.array([code_of(result) for result in (
     RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,
     RESULTS.mass_matrix_singular, RESULTS.projection_failed, RESULTS.acceleration_discontinuous, RESULTS.event_occurred,
 )])  # fmt: skip
-_SPENT, _SHRANK, _NOT_FINITE, _SINGULAR, _NOT_PROJECTED, _JUMPS = _RESULT_OF_CODE[1:7].tolist()
+_SPENT, _SHRANK, _NOT_FINITE, _SINGULAR, _NOT_PROJECTED, _JUMPS = RESULT_OF_CODE[1:7].tolist()
+NOT_FINITE_RESULT = _NOT_FINITE
 _GIVEN_UP = (_SINGULAR, _NOT_FINITE, _SHRANK, _NOT_PROJECTED)  # what another variant of the program may still follow
 
 
@@ -194,7 +195,7 @@ class Flow:
         if store is not None and room is None:
             room = min(max_steps * len(y0), LARGEST_KEPT // (self.states + 4))
         done = self.kernel.to_run(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes)
-        result, event = _RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
+        result, event = RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:
             assert done.complete is not None and done.table is not None

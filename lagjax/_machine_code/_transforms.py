@@ -35,6 +35,7 @@ from jax.interpreters import ad, batching, mlir
 from lagjax._machine_code import _derivatives
 from lagjax._machine_code._call import has_handler, has_sweep, on_host, run_by_handler, sweep_by_handler
 from lagjax._machine_code._flow import Flow, Tolerances
+from lagjax._machine_code._gpu import run_on_gpu
 from lagjax._machine_code._rates import rate
 from lagjax._machine_code._steps import KEPT
 from lagjax._machine_code._tangent import from_rows, to_rows
@@ -486,6 +487,44 @@ def _vjp_compiled(*args, **settings):
     return _swept_compiled(on_rows, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
 
 
+# ---- on a GPU: runs only, of the motion and of its tangents ----------------------------------------------------------
+
+
+def _run_for_gpus(ts, y0, params, *, flow, tolerances, **_):
+    rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2), library=jnp)
+    with jax.enable_x64(True):  # whatever was set where this is lowered
+        return _in_batch(run_on_gpu(flow, tolerances, *rows), batch)
+
+
+def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
+    """`jvp`: a member of the tangent flow for each direction, NaN where that was not followed to its end."""
+    with jax.enable_x64(True):
+        ts, y0, params = (x[..., None, :] for x in (ts, y0, params))
+        inputs, length = _tangent_inputs(flow, ts, y0, params, *given[-2:])
+        larger = flow.tangent(1)
+        solution = _run(*inputs, flow=larger, tolerances=tolerances.with_larger_budget, keep=False)
+        path, end = (to_rows(y, flow.size)[..., 1, :] for y in (solution.path, solution.y_end))
+        done = (solution.result == SUCCESSFUL)[..., None]
+        return [path * length[..., None], jnp.where(done, end * length, jnp.nan)]
+
+
+def _vjp_for_gpus(ts, y0, params, *given, flow, tolerances):
+    """`vjp`: the derivative along every number of the start and the parameters, times the cotangents."""
+    *run, path_ct, end_ct = given
+    with jax.enable_x64(True):
+        batch = _batch_of((ts, y0, params), (1, 1, 1))
+        basis = jnp.broadcast_to(jnp.eye(count := flow.states + flow.numbers), (*batch, count, count))
+        along = basis[..., : flow.states], basis[..., flow.states :]
+        path, end = _jvp_for_gpus(ts, y0, params, *run, *along, flow=flow, tolerances=tolerances)
+
+        def weighted(cotangent, values):  # what nobody asks about does not matter, even where it is not finite
+            return jnp.where(cotangent != 0, cotangent * values, 0.0)
+
+        total = jnp.sum(weighted(path_ct[..., :, None, :, :], path[..., None, :, :, :]), axis=(-1, -2))
+        total += jnp.sum(weighted(end_ct[..., :, None, :], end[..., None, :, :]), axis=-1)
+        return [total[..., : flow.states], total[..., flow.states :]]
+
+
 _on_host(run_p, _run_on_host, _run_shapes)
 _on_host(jvp_p, _jvp_on_host, _jvp_shapes)
 _on_host(vjp_p, _vjp_on_host, _vjp_shapes)
@@ -494,7 +533,11 @@ for _primitive, _compiled_form in ((run_p, _run_compiled), (jvp_p, _jvp_compiled
 curvature_p.multiple_results = True
 curvature_p.def_abstract_eval(_curvature_shapes)
 curvature_p.def_impl(_curvature_composed)
-mlir.register_lowering(curvature_p, mlir.lower_fun(_curvature_composed, multiple_results=True), platform="cpu")
+for _platform in ("cpu", "cuda"):
+    _rule = mlir.lower_fun(_curvature_composed, multiple_results=True)
+    mlir.register_lowering(curvature_p, _rule, platform=_platform)
+for _primitive, _form in ((run_p, _run_for_gpus), (jvp_p, _jvp_for_gpus), (vjp_p, _vjp_for_gpus)):
+    mlir.register_lowering(_primitive, mlir.lower_fun(_form, multiple_results=True), platform="cuda")
 
 for _primitive, _jvp, _transpose, _batching in (
     (run_p, _derivative_of_run, None, _batched(run_p)),

@@ -22,6 +22,7 @@ one Taylor series, of the order that the tolerance asks for.
     _integrator  all of these, round by round;  _tangent, _adjoint: its derivatives, forward and back
     _kernel      both as functions of arrays;  _threads: on several cores, interruptible;  _handler: as a call of XLA
     _sweep       derivatives of short motions as calls of XLA
+    _gpu         the motion of one lane as a program for NVIDIA GPUs
 
 Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).
 """

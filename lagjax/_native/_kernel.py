@@ -23,6 +23,7 @@ from lagjax._native._constants import (
     VECTORS_PER_THREAD,
 )
 from lagjax._native._frame import LANE, Layout
+from lagjax._native._gpu import program_for_gpus
 from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
@@ -168,15 +169,24 @@ class Kernel:
     def _alone(self) -> "Kernel":
         return Kernel(*self._given, width=1, motion=self._motion)
 
-    @functools.cached_property
-    def _forward(self) -> "_Compiled":
+    def _integrator(self) -> Integrator:
         with without_collections():
             integrator = Integrator(
                 *self._parts, *self._options, self.borders, self._levels, self._chosen, width=self.width
             )
-            motion = integrator.motion
         forget_joined()
         forget_stages()
+        return integrator
+
+    @functools.cached_property
+    def program_for_gpus(self) -> str:
+        """The motion of a member in PTX (`_gpu`). Raises `Unlowerable` where a GPU cannot run it."""
+        return program_for_gpus(self.of_members(1)._integrator())
+
+    @functools.cached_property
+    def _forward(self) -> "_Compiled":
+        integrator = self._integrator()
+        motion = integrator.motion
         more = motion.recorded_pieces
         return _Compiled(motion, motion.layout, integrator.job, self._rounds, pointers=4, more=more)
 

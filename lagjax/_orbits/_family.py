@@ -56,6 +56,16 @@ class Family(NamedTuple):
     doubling: jax.Array
     message: str
 
+    def __repr__(self) -> str:
+        """Three lines: how many orbits and between which values, what happens on the way, and why it ends."""
+        count, periods = len(self.value), np.asarray(self.period)
+        first = f"Family of {count} orbits, {int(np.sum(self.stable))} of them stable"
+        span = f"from {float(self.value[0]):.9g} to {float(self.value[-1]):.9g}" if count else "empty"
+        span += f", periods from {periods.min():.6g} to {periods.max():.6g}" if count else ""
+        events = (("fold", self.fold), ("branch point", self.branch), ("doubling", self.doubling))
+        places = [f"{name} at orbit {', '.join(map(str, np.flatnonzero(x)))}" for name, x in events if np.any(x)]
+        return "\n".join([first, f"{span}; {'; '.join(places)}" if places else span, self.message])
+
 
 @accepts_singles(("orbit",), ("params",))
 def family(

@@ -59,6 +59,17 @@ class Path(NamedTuple):
     ok: bool
     message: str
 
+    def __repr__(self) -> str:
+        """Two lines: its action and what kind of extremum that is, and how well it joins; or why there is none."""
+        if not self.ok:
+            return f"Path: none was found. {self.message}"
+        kind = "a minimum" if self.minimum else f"a saddle of index {self.index}"
+        met = len(self.conjugate_times)
+        return (
+            f"Path: action {float(self.action):.9g}, {kind} among nearby paths, {met} conjugate times\n"
+            f"joined to {float(self.closure):.2g} of its size"
+        )
+
 
 def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None, params: PyTree = None) -> jax.Array:
     """∫ L(q, q̇, t) dt along a `path`, a scalar.

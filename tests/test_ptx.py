@@ -1,0 +1,299 @@
+"""Machine code for GPUs, without a GPU: its lowering, and its PTX run on the CPU against the CPU's own machine code.
+
+Under `on_the_ptx` the rules for CUDA stand in the place of those for CPUs, and what XLA would launch on a GPU runs
+here, translated from the PTX (`ptx.PtxOnCpu`), so that all of `simulate` around it is the one of a GPU.
+"""
+
+import functools
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.interpreters import mlir
+from ptx import PtxOnCpu
+
+import lagjax
+from lagjax import scenes
+from lagjax._machine_code import _gpu, _transforms
+from lagjax._machine_code._call import on_host
+from lagjax._native._gpu import RESULTS, grid, libdevice, words
+
+TS, MACHINE_CODE = np.linspace(0.0, 1.0, 5), lagjax.MachineCode()
+translated = functools.lru_cache(maxsize=64)(PtxOnCpu)
+
+
+def transforms_are_new():
+    """What was lowered by other rules is forgotten."""
+    _transforms._compiled.cache_clear()
+    jax.clear_caches()
+
+
+@pytest.fixture
+def on_the_ptx(monkeypatch):
+    """A function that runs another one on the PTX; and then `launches`, the members of each launch."""
+    launches = []
+
+    def launch(program, operands, results):
+        def host(*arrays):
+            arrays = [np.array(x) for x in arrays]
+            outputs = [arrays[4], arrays[5], *(np.full(x.shape, np.nan) for x in results[2:])]
+            places = [x.ctypes.data for x in (*arrays, *outputs)]
+            launches.append(len(outputs[2]))
+            for thread in range(3):  # the first one takes all members, the others find none
+                translated(program).thread(thread, 3, 0, 1, *places)
+            assert outputs[0][0] == len(outputs[2]) + 3, "threads share the counter"
+            return outputs
+
+        return on_host(host, results, *operands)
+
+    def run(function, *args):
+        places = {
+            _transforms.run_p: (_transforms._run_for_gpus, _transforms._run_compiled),
+            _transforms.jvp_p: (_transforms._jvp_for_gpus, _transforms._jvp_compiled),
+            _transforms.vjp_p: (_transforms._vjp_for_gpus, _transforms._vjp_compiled),
+        }
+
+        def register(which):
+            for primitive, forms in places.items():
+                rule = mlir.lower_fun(forms[which], multiple_results=True)
+                mlir.register_lowering(primitive, rule, platform="cpu")
+            transforms_are_new()
+
+        register(0)
+        try:
+            return jax.tree.map(np.asarray, jax.jit(function)(*args))
+        finally:
+            register(1)
+
+    monkeypatch.setattr(_gpu, "launch", launch)
+    run.launches = launches
+    return run
+
+
+def motion(scene, q0, qdot0, ts=TS, params=None, **how):
+    """The results of a motion; `scene` may be a system."""
+    params = getattr(scene, "params", None) if params is None else params
+    system = getattr(scene, "system", scene)
+    run = lagjax.simulate(system, q0, qdot0, ts, params, solver=MACHINE_CODE, throw=False, **how)
+    return run.q, run.qdot, run.end, run.result._value, run.stats["num_accepted_steps"]
+
+
+def agree(here, there, tolerance=1e-9):
+    for mine, other in zip(jax.tree.leaves(here), jax.tree.leaves(there), strict=True):
+        scale = max(1.0, np.nanmax(np.abs(np.asarray(other, float)), initial=0.0))
+        np.testing.assert_allclose(np.asarray(mine, float), np.asarray(other, float), atol=tolerance * scale, rtol=0)
+
+
+# ---- the numbers -----------------------------------------------------------------------------------------------------
+
+
+def test_a_batch_is_that_of_the_cpu(on_the_ptx):
+    scene = scenes.double_pendulum()
+    q0 = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 2))
+    batch = jax.vmap(lambda q0: motion(scene, q0, 0 * q0))
+    here = on_the_ptx(batch, q0)
+    agree(here, jax.jit(batch)(q0))
+    assert on_the_ptx.launches == [7]
+
+
+@pytest.mark.slow
+def test_every_member_may_have_its_own_times_and_parameters(on_the_ptx):
+    scene = scenes.pendulum()
+    params = jax.tree.map(lambda x: jnp.asarray(x) * jnp.linspace(0.5, 1.5, 3), scene.params)
+    ends = np.array([1.0, 2.0, -1.0])
+
+    def one(end, params):
+        return motion(scene, 1.0, 0.0, end * TS, params)
+
+    agree(on_the_ptx(jax.vmap(one), ends, params), jax.jit(jax.vmap(one))(ends, params))
+
+
+def test_a_failure_has_the_result_of_the_cpu(on_the_ptx):
+    scene = scenes.double_pendulum()
+
+    def spent(q0):
+        return motion(scene, q0, 0 * q0, 100.0 * TS, max_steps=9)
+
+    def singular(q0):  # a mass that vanishes
+        system = lagjax.System(lambda q, qdot: 0.5 * q * qdot**2 - q)
+        return motion(system, q0, 0.0)
+
+    for run, start in ((spent, scene.q0), (singular, 0.0)):
+        here, there = on_the_ptx(run, start), jax.jit(run)(start)
+        assert here[3] == there[3] != 0
+        np.testing.assert_array_equal(np.isnan(here[0]), np.isnan(there[0]))
+
+
+@pytest.mark.slow
+def test_an_event_and_its_gradient(on_the_ptx):
+    scene = scenes.pendulum()
+
+    def swung(q0):
+        run = lagjax.simulate(
+            scene.system, q0, 0.0, 3.0 * TS, scene.params, solver=MACHINE_CODE, event=lambda q, qdot: q
+        )
+        return run.end.t
+
+    agree(on_the_ptx(jax.value_and_grad(swung), 1.0), jax.jit(jax.value_and_grad(swung))(1.0), 1e-7)
+
+
+def test_constraints(on_the_ptx):
+    scene = scenes.cartesian_pendulum()
+    here = on_the_ptx(lambda q0: motion(scene, q0, scene.qdot0), scene.q0)
+    agree(here, jax.jit(lambda q0: motion(scene, q0, scene.qdot0))(scene.q0))
+
+
+def test_borders_of_a_piecewise_scene(on_the_ptx):
+    system = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+    here = on_the_ptx(lambda q0: motion(system, q0, 0.0, 5.0 * TS), 1.0)
+    agree(here, jax.jit(lambda q0: motion(system, q0, 0.0, 5.0 * TS))(1.0))
+
+
+@pytest.mark.slow
+def test_derivatives_forward_and_reverse(on_the_ptx):
+    scene = scenes.double_pendulum()
+
+    def total(q0, params):
+        q, qdot, *_ = motion(scene, q0, 0 * q0, TS, params)
+        return jnp.sum(q * jnp.arange(1.0, 6.0)[:, None]) + jnp.sum(qdot[2])
+
+    for derivative in (jax.grad(total, (0, 1)), jax.jacfwd(total, (0, 1))):
+        agree(on_the_ptx(derivative, scene.q0, scene.params), jax.jit(derivative)(scene.q0, scene.params), 1e-7)
+
+
+@pytest.mark.slow
+def test_second_derivatives(on_the_ptx):
+    scene = scenes.pendulum()
+    second = jax.hessian(lambda q0: motion(scene, q0, 0.0)[0][-1])
+    agree(on_the_ptx(second, 1.0), jax.jit(second)(1.0), 1e-6)
+
+
+def test_single_precision(on_the_ptx):
+    scene = scenes.double_pendulum()
+    q0 = np.asarray(scene.q0, np.float32)
+    params = jax.tree.map(np.float32, scene.params)
+
+    def single(q0):
+        return motion(scene, q0, 0 * q0, TS.astype(np.float32), params)[:2]
+
+    here, there = on_the_ptx(single, q0), jax.jit(single)(q0)
+    assert here[0].dtype == np.float32
+    agree(here, there, 1e-6)
+
+
+def program_of(scene):
+    """The PTX of a scene's motion. Skips the test where that needs libdevice, which is not here."""
+    programs = []
+    transforms_are_new()
+
+    def launch(program, operands, results):
+        programs.append(program)
+        return [jnp.zeros(x.shape, x.dtype) for x in results]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_gpu, "launch", launch)
+        try:
+            jax.jit(lambda q0: motion(scene, q0, scene.qdot0)[0]).trace(scene.q0).lower(lowering_platforms=("cuda",))
+        except ValueError as reason:
+            if "a CPU is the better choice" in str(reason):
+                assert scene.q0 is not None and len(jax.flatten_util.ravel_pytree(scene.q0)[0]) > 20, reason
+                pytest.skip(str(reason))
+            if libdevice() is None and "libdevice" in str(reason):
+                pytest.skip(str(reason))
+            raise
+        finally:
+            transforms_are_new()
+    return programs[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", scenes.ALL, ids=lambda make: make.__name__)
+def test_every_ready_scene(make, on_the_ptx):
+    scene = make()
+    if "begin inline asm" in program_of(scene):
+        pytest.skip("libdevice has assembly of its own for a tangent, which is not translated")
+    function = jax.jit(lambda q0: motion(scene, q0, scene.qdot0)[:4])
+    agree(on_the_ptx(lambda q0: motion(scene, q0, scene.qdot0)[:4], scene.q0), function(scene.q0), 1e-8)
+
+
+# ---- the lowering ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_lowering_launches_and_calls_nothing_else(dtype):
+    scene = scenes.pendulum()
+    params = jax.tree.map(dtype, scene.params)
+
+    def one(q0, **how):
+        ts = TS.astype(dtype)
+        return lagjax.simulate(scene.system, q0, 0 * q0, ts, params, solver=MACHINE_CODE, throw=False, **how).q[-1]
+
+    def to_event(q0):
+        return one(q0, event=lambda q, qdot: q)
+
+    one_member, many = dtype(1), np.ones(1000, dtype)
+    # A derivative needs the motion itself and its tangents.
+    for function, q0, calls in (
+        (one, one_member, 1), (jax.vmap(one), many, 1), (to_event, one_member, None), (jax.grad(one), one_member, 2),
+    ):  # fmt: skip
+        text = jax.export.export(jax.jit(function), platforms=["cuda"], disabled_checks=[
+            jax.export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.ptx")])(q0).mlir_module()  # fmt: skip
+        assert "callback" not in text
+        targets = [line for line in text.splitlines() if "custom_call @" in line]
+        assert targets and all("@__gpu$xla.gpu.ptx" in line for line in targets)
+        assert calls is None or len(targets) == calls
+
+
+def test_the_grid_covers_the_members_and_is_bounded():
+    assert grid(1) == (1, 64) and grid(65) == (2, 64) and grid(10**8) == (528, 64)
+
+
+def test_words_are_the_bits_of_doubles():
+    given = words(members=3, times=2, ts_stride=0, params_stride=0, order=13, max_steps=9, room_of_notes=0, rtol=0.5,
+                  atol=0.0)  # fmt: skip
+    assert given[:2] == [3, 2] and np.array(given[-2:]).view(float).tolist() == [0.5, 0.0]
+    assert RESULTS[:2] == ("next_member", "path")
+
+
+def test_a_scene_that_cannot_go_to_a_gpu_says_why():
+    knots = np.linspace(0.0, 1.0, 4)
+    system = lagjax.System(lambda q, qdot, t: 0.5 * qdot**2 - q * jnp.interp(t, knots, knots**2))
+
+    def function(q0):
+        return lagjax.simulate(system, q0, 0.0, TS, solver=MACHINE_CODE, throw=False).q
+
+    with pytest.raises(ValueError, match="on a GPU: its tables of numbers"):
+        jax.jit(function).trace(1.0).lower(lowering_platforms=("cuda",))
+
+
+# ---- assembled -------------------------------------------------------------------------------------------------------
+
+
+def ptxas():
+    found = (file for folder in sys.path for file in Path(folder or ".").glob("nvidia/*/bin/ptxas"))
+    return next(found, None)
+
+
+# The most that a ready scene takes on any of these processors; a thread has 255 registers at most.
+STACK, SPILLS = 40_000, 4_000
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(ptxas() is None, reason="there is no ptxas: `pip install nvidia-cuda-nvcc-cu12` has it")
+@pytest.mark.parametrize("make", scenes.ALL, ids=lambda make: make.__name__)
+def test_ptxas_assembles_every_ready_scene(make, tmp_path):
+    program, source = program_of(make()), tmp_path / "k.ptx"
+    source.write_text(program)
+    for processor in ("sm_80", "sm_90", "sm_120"):
+        command = [ptxas(), "-v", "-arch", processor, source, "-o", tmp_path / "k.cubin"]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        report = done.stdout + done.stderr
+        stack, *spills = (int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", report))
+        assert stack <= STACK and max(spills) <= SPILLS, report
