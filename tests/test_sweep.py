@@ -832,3 +832,41 @@ def test_example(tmp_path, monkeypatch):
     flip = lagjax.Sweep(tmp_path / "flips.zarr").open().flip.values
     np.testing.assert_array_equal(flip, flip[::-1, ::-1])  # mirrored starts flip at the same time
     assert 0 < np.isfinite(flip).sum() < flip.size
+
+
+def test_the_first_look_finds_a_type_for_all_members(tmp_path):
+    """1 of one member and 1.5 of another are floats: `keep` in plain Python, called member by member."""
+
+    def keep(trajectory):
+        fastest = float(np.abs(trajectory.qdot).max())
+        return {"speed": 1 if fastest < 0.5 else 1.5, "count": len(trajectory.ts)}
+
+    pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+    angles = np.array([0.1, 0.2, 1.0, 2.0])
+    swept = lagjax.sweep(
+        pendulum, {"angle": angles}, jnp.linspace(0.0, 5.0, 6), q0=lambda p: p["angle"], qdot0=0.0, keep=keep,
+        store=tmp_path / "types.zarr", progress=False,
+    )  # fmt: skip
+    data = swept.open()
+    np.testing.assert_array_equal(data["speed"], [1.0, 1.0, 1.5, 1.5])
+    assert data["count"].dtype.kind == "i" and swept.status().results == {"successful": 4}
+
+
+def test_a_store_opens_without_its_script_and_without_a_writable_disk(tmp_path):
+    pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+
+    def again():
+        return lagjax.sweep(
+            pendulum, {"angle": np.linspace(0.1, 1.0, 4)}, jnp.linspace(0.0, 1.0, 3), q0=lambda p: p["angle"],
+            qdot0=0.0, keep=lambda trajectory: {"q": trajectory.q[-1]}, store=tmp_path / "s.zarr", progress=False,
+        )  # fmt: skip
+
+    swept = again()
+    there = lagjax.Sweep(str(tmp_path / "s.zarr"))
+    assert there == swept and there.status().done == 4 and there.damaged() == {} and there.statistics() == {}
+    writes = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Store, "write", lambda self, file, data, name: writes.append(name))
+        assert again() == swept and not writes
+    with pytest.raises(FileNotFoundError, match="is no store of a sweep"):
+        lagjax.Sweep(tmp_path / "other.zarr")

@@ -51,12 +51,18 @@ PyTree = Any
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that has been run: the path of its `store`, and what can be asked of it.
+    """A sweep that has been begun: the path of its `store`, and what can be asked of it.
 
-    `print` it for its status.
+    `lagjax.Sweep(path)` opens a store without the script that made it. `print` it for its status.
+
+    **Raises** `FileNotFoundError` or `ValueError` where there is no store that can be read.
     """
 
     store: Path
+
+    def __post_init__(self):
+        object.__setattr__(self, "store", Path(self.store))
+        Store(self.store).spec()
 
     def __repr__(self) -> str:
         return str(self.status())

@@ -234,7 +234,7 @@ class Batches:
         if not self.quantities and not any(rows):
             raise errors[0]  # at the first look, of all members
         complaints = {k: f"keep raised {type(error).__name__}: {_first_line(error)}" for k, error in errors.items()}
-        expected = self.quantities or _quantities(next(row for row in rows if row))
+        expected = self.quantities or _common([row for row in rows if row])
         for k, row in enumerate(rows):
             if row is not None and (wrong := _misfit(expected, row)):
                 rows[k], complaints[k] = None, wrong
@@ -287,8 +287,20 @@ def quantities_of(kept: Kept) -> list[Quantity]:
     return [Quantity(name, x.shape[1:], x.dtype) for name, x in kept.values.items()]
 
 
-def _quantities(row: dict[str, np.ndarray]) -> list[Quantity]:
-    return [Quantity(name, x.shape, x.dtype) for name, x in row.items()]
+def _common(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
+    """The quantities of the first of some members, of the type that holds what all of them keep: 1 and 1.5 are floats.
+
+    Where there is no such type it is that of the first; the others then have a misfit.
+    """
+    common = []
+    for name, first in rows[0].items():
+        types = [row[name].dtype for row in rows if name in row]
+        try:
+            dtype = np.result_type(*types)
+        except TypeError:
+            dtype = first.dtype
+        common.append(Quantity(name, first.shape, dtype))
+    return common
 
 
 def _arrays(run: Trajectory) -> tuple:

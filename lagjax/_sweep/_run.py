@@ -25,9 +25,14 @@ Tell = Callable[[], None]
 
 
 def work(job: Job, tell: Tell = lambda: None, compute_unit: Compute = compute, most: int | None = None) -> int:
-    """Do units of a job in this process until all are done, by whomever, or `most` by it; how many it did."""
-    job.store.require_writable()
+    """Do units of a job in this process until all are done, by whomever, or `most` by it; how many it did.
+
+    Nothing is written where all are done: a finished store may lie on a disk that is read-only.
+    """
     count = 0
+    if len(job.store.done()) == job.grid.units:
+        return count
+    job.store.require_writable()
     with Worker(job.store) as worker, _Writer(job, worker, tell) as writer, precision(bool(job.spec["x64"])):
         for unit in _to_do(job, worker, tell):
             writer.put(unit, compute_unit(job, unit))
@@ -113,6 +118,8 @@ def run_unit(path: str, unit: int) -> bool:
 def submit(job: Job, executor: Any, tell: Tell) -> None:
     """Have all units done by an executor, some at a time; goes on until all are, by whomever."""
     _require_no_fork(executor)
+    if len(job.store.done()) == job.grid.units:
+        return
     job.store.require_writable()
     running: set[Any] = set()
     try:
