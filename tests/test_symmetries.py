@@ -143,6 +143,7 @@ def test_combinations():
     assert names(wave, jnp.ones(2), jnp.ones(2)) == ["combination: +1 time translation, +1 translation of q[0]"]
 
 
+@pytest.mark.slow
 def test_forces_with_a_potential_conserve_what_l_would():
     """Kepler's force, on an orbit whose chords pass the centre: the energy is that of L = T − V but for a constant."""
 
