@@ -333,3 +333,17 @@ def test_reference_without_heyoka(monkeypatch):
     exact = case.q0 + case.qdot0 * case.duration + 0.5 * constant * case.duration**2
     np.testing.assert_allclose(truth[:, :2], exact, rtol=1e-11)
     np.testing.assert_allclose(check, truth, rtol=1e-11)
+
+
+def test_a_change_of_emitted_text_is_seen(tmp_path, monkeypatch, capsys):
+    emitted = of_benchmarks("emitted")
+    fresh = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["emitted"] * q**2)  # nobody has its kernel yet
+    monkeypatch.setattr(emitted, "scenes", lambda: {"fresh": (fresh, 1.0, 0.0, {"emitted": 0.7})})
+    monkeypatch.setattr(emitted, "FORMS", (emitted.motion,))
+    found = emitted.texts()
+    for name, text in found.items():
+        (tmp_path / name).write_text(text)
+    assert found and emitted.compare(found, tmp_path) == 0
+    first = min(found)
+    (tmp_path / first).write_text(found[first].replace("fmul", "fadd", 1))
+    assert emitted.compare(found, tmp_path) == 1 and f"{first}: " in capsys.readouterr().out
