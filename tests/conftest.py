@@ -2,6 +2,7 @@
 
 import gc
 import hashlib
+import itertools
 import os
 from pathlib import Path
 
@@ -30,6 +31,23 @@ jax.config.update("jax_compilation_cache_dir", str(COMPILED))
 os.environ["LAGJAX_CACHE"] = str(COMPILED.parent.parent / "objects")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+# Every program of XLA takes some entries of the table of memory that a process has, 65 530 by Linux's default; without one
+# it ends in a segmentation fault, as a worker did after some hundred of the slow tests. Kept programs come back fast.
+_MAPS, _MOST_MAPS, _BETWEEN = Path("/proc/self/maps"), 25_000, 20
+_tests_run = itertools.count(1)
+
+
+@pytest.fixture(autouse=True)
+def _room_for_programs():
+    yield
+    if next(_tests_run) % _BETWEEN == 0 and _MAPS.exists():
+        with _MAPS.open("rb") as maps:
+            crowded = sum(1 for _ in maps) > _MOST_MAPS
+        if crowded:
+            jax.clear_caches()
+            gc.collect()
 
 
 @pytest.hookimpl(optionalhook=True)
