@@ -33,8 +33,8 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
-# Every program of XLA takes some entries of the table of memory that a process has, 65 530 by Linux's default; without one
-# it ends in a segmentation fault, as a worker did after some hundred of the slow tests. Kept programs come back fast.
+# Every program of XLA takes some entries of the table of memory that a process has, 65 530 by Linux's default. Without
+# one it ends in a segmentation fault, as a worker did after some hundred of the slow tests. Kept programs come back fast.
 _MAPS, _MOST_MAPS, _BETWEEN = Path("/proc/self/maps"), 25_000, 20
 _tests_run = itertools.count(1)
 
