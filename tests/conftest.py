@@ -34,7 +34,7 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 # Every program of XLA takes some entries of the table of memory that a process has, 65 530 by Linux's default. Without
-# one it ends in a segmentation fault, as a worker did after some hundred of the slow tests. Kept programs come back fast.
+# one it ends in a segmentation fault, as a worker did after hundreds of slow tests. Kept programs come back fast.
 _MAPS, _MOST_MAPS, _BETWEEN = Path("/proc/self/maps"), 25_000, 20
 _tests_run = itertools.count(1)
 
