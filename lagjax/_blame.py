@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core, source_info_util
 
-from lagjax._program import OPERATIONS, in_jax
+from lagjax._program import OPERATIONS, in_jax, written_out
 
 _PACKAGE = os.path.dirname(os.path.abspath(__file__))
 
@@ -146,7 +146,7 @@ def _side_of(name: str) -> Callable | None:
 
 # ---- following a jaxpr -----------------------------------------------------------------------------------------------
 
-_CALLS = ("jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2")
+_CALLS = ("jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2", "call_hi_primitive")
 _RULES = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 
 
@@ -193,6 +193,9 @@ def _run(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside
 
 def _body(equation) -> tuple | None:
     """The jaxpr that an equation calls, and its constants."""
+    if equation.primitive.name == "call_hi_primitive":
+        closed = written_out(equation.params["_prim"])
+        return closed.jaxpr, closed.consts
     body = next((equation.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in equation.params), None)
     if body is None:
         return None

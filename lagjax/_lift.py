@@ -36,7 +36,7 @@ class _Trace:
     """A function of the user as it was traced, for parameters that are `Lifted`."""
 
     name: str
-    jaxpr: Any
+    jaxpr: Any  # whose first arguments are the constants
     constants: tuple[Any, ...]  # what it took from outside; None for tracers
     places: tuple[int | None, ...]  # those of tracers among the values
     structure: Any  # of what it returns
@@ -48,13 +48,9 @@ class _Trace:
     def __call__(self, *roles: Any, params: Lifted, t: Any = 0.0) -> PyTree:
         pairs = zip(self.constants, self.places, strict=True)
         constants = [c if k is None else params.values[k] for c, k in pairs]
-        given = jax.tree.leaves((roles, t, eqx.filter(params.params, eqx.is_array_like)))
-        variables = self.jaxpr.constvars, self.jaxpr.invars
-        constants, given = (
-            [jnp.asarray(x, v.aval.dtype) for x, v in zip(values, of, strict=True)]
-            for values, of in zip((constants, given), variables, strict=True)
-        )
-        return jax.tree.unflatten(self.structure, core.jaxpr_as_fun(core.ClosedJaxpr(self.jaxpr, constants))(*given))
+        values = *constants, *jax.tree.leaves((roles, t, eqx.filter(params.params, eqx.is_array_like)))
+        values = [jnp.asarray(x, v.aval.dtype) for x, v in zip(values, self.jaxpr.invars, strict=True)]
+        return jax.tree.unflatten(self.structure, core.jaxpr_as_fun(core.ClosedJaxpr(self.jaxpr, []))(*values))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,13 +122,20 @@ def _lifted(function: Function, roles: int, problem: Problem, values: list) -> F
     places = tuple(place_in(values, c) if isinstance(c, Tracer) else None for c in closed.consts)
     constants = tuple(None if isinstance(c, Tracer) else c for c in closed.consts)
     structure = jax.tree.structure(shapes)
-    return traced_with(function, closed.jaxpr, constants, places, structure, f"{places} {closed.in_avals}")
+    return traced_with(function, open_jaxpr(closed), constants, places, structure, f"{places} {closed.in_avals}")
+
+
+def open_jaxpr(closed: core.ClosedJaxpr, more=(), **changes) -> core.Jaxpr:
+    """A trace whose first arguments are what it took from outside and `more` variables; and with other `changes`."""
+    jaxpr = closed.jaxpr
+    return jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *more, *jaxpr.invars], **changes)
 
 
 def traced_with(function: Function, jaxpr, constants: tuple, places: tuple, structure, how: str) -> Function:
     """A function as its trace, for parameters that are `Lifted`: the constants that have `places` are values there.
 
-    `how` says where the values stand in it, so that equal functions with equal places are one edition.
+    The first arguments of the jaxpr are these constants. `how` says where the values stand in it, so that equal
+    functions with equal places are one edition.
     """
     trace = _Trace(function.name, jaxpr, constants, places, structure)
     extras = tuple(dict.fromkeys((*function.extras, "params")))

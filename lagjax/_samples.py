@@ -303,7 +303,7 @@ def _found(knots, t, *, closed):
 
 def _of_batch(arguments, axes, *, closed):
     knots, t = arguments
-    if axes[0] is batching.not_mapped:
+    if axes[0] is None:  # knots that all share
         return _locate_p.bind(knots, t, closed=closed), axes[1]
     return jax.vmap(functools.partial(_found, closed=closed), in_axes=tuple(axes))(knots, t), 0
 

@@ -272,6 +272,17 @@ def test_series_hold_everywhere(name):
         assert abs(float(program.evaluate(x)[0]) - exact) <= 1e-14 * max(abs(exact), float(of_gamma)), x
 
 
+@pytest.mark.parametrize("order", [1, 2, 6])
+def test_derivatives_of_digamma(order):
+    program = lower(lambda x: jax.scipy.special.polygamma(order, x), 0.5)
+    for x in (1e-3, 0.3, 1.0, 7.7, 90.0, -0.3, -3.7):
+        with mpmath.workdps(40):
+            exact = float(mpmath.polygamma(order, mpmath.mpf(x)))
+            # Beside a pole rounding of x counts: its derivative is the next function.
+            condition = abs(float(mpmath.polygamma(order + 1, mpmath.mpf(x)) * x))
+        assert abs(float(program.evaluate(x)[0]) - exact) <= 1e-14 * max(abs(exact), condition), x
+
+
 def test_a_motion_between_functions_of_gamma():
     # Rather than a closed form, its energy, and ψ = (log Γ)' by differences of values.
     system = lagjax.System(lambda q, v: 0.5 * v**2 - jax.scipy.special.gammaln(q) - jax.scipy.special.i0(q - 1.5))

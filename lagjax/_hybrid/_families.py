@@ -18,7 +18,7 @@ from jax.extend import core
 from lagjax._arguments import Function
 from lagjax._hybrid._mode import Transition
 from lagjax._layout import Layout
-from lagjax._lift import Unchanged, traced_with
+from lagjax._lift import Unchanged, open_jaxpr, traced_with
 from lagjax._reads import Edition
 from lagjax._system import ROLES, System, with_functions
 
@@ -115,7 +115,7 @@ def _shared(column: tuple, rows: list[np.ndarray]) -> Function | None:
 
 
 def _with_arguments(closed: core.ClosedJaxpr, places: dict) -> tuple[core.Jaxpr, tuple, tuple]:
-    """A trace with constants for the numbers at these places, the constants, and which of the rows they are."""
+    """A trace with arguments for the numbers at these places, its constants, and which of the rows they are."""
     jaxpr, more, rows = closed.jaxpr, [], []
 
     def argument(kind, place, atom):
@@ -132,7 +132,7 @@ def _with_arguments(closed: core.ClosedJaxpr, places: dict) -> tuple[core.Jaxpr,
     results = [argument("result", (j,), x) for j, x in enumerate(jaxpr.outvars)]
     own = [places.get(("constant", (k,))) for k in range(len(closed.consts))]
     constants = [None if row is not None else x for x, row in zip(closed.consts, own, strict=True)]
-    jaxpr = jaxpr.replace(constvars=[*jaxpr.constvars, *more], eqns=equations, outvars=results)
+    jaxpr = open_jaxpr(closed, more, eqns=equations, outvars=results)
     return jaxpr, (*constants, *[None] * len(more)), (*own, *rows)
 
 

@@ -11,6 +11,7 @@ What is here needs no GPU: it is assembled and checked on CPUs, and has not run 
 
 import ctypes
 import functools
+import os
 import re
 import sys
 import threading
@@ -156,9 +157,11 @@ def _target() -> llvm.Target:
 
 @functools.cache
 def libdevice() -> bytes | None:
-    """NVIDIA's library of functions, as pip has put it beside other packages; None where it is not."""
-    for folder in sys.path:
-        for file in Path(folder or ".").glob("nvidia/*/nvvm/libdevice/libdevice.10.bc"):
+    """NVIDIA's library of functions, as pip or CUDA's own installer has put it; None where it is not."""
+    toolkits = [os.environ[name] for name in ("CUDA_HOME", "CUDA_PATH") if name in os.environ] + ["/usr/local/cuda"]
+    places = [(folder or ".", "nvidia/*/nvvm") for folder in sys.path] + [(folder, "nvvm") for folder in toolkits]
+    for folder, inside in places:
+        for file in Path(folder).glob(f"{inside}/libdevice/libdevice.10.bc"):
             return file.read_bytes()
     return None
 

@@ -47,7 +47,7 @@ from lagjax._program._memory import machine_memory, operations_that_fit, without
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
 from lagjax._program._pushforward import pushforward, with_tangents
-from lagjax._program._rules import LARGEST_UNFOLDED, Expansion, inputs_of
+from lagjax._program._rules import LARGEST_UNFOLDED, Expansion, inputs_of, written_out
 from lagjax._program._scalars import Scalars, stacked
 from lagjax._program._series import LinearSystem, Series, StraightLine, series
 from lagjax._program._transpose import copied, pullback
@@ -82,6 +82,7 @@ __all__ = [
     "traced",
     "with_tangents",
     "without_collections",
+    "written_out",
 ]
 
 

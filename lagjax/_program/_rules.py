@@ -340,6 +340,21 @@ def _square(expansion, params, x):
     return _ids([moduli[i] if i in moduli else expansion.graph.apply("mul", i, i) for i in ids], x.shape)
 
 
+@lowers("one_minus_square")
+def _one_minus_square(expansion, params, x):
+    one = expansion.constants(1.0)
+    return expansion.map("mul", expansion.map("add", one, x), expansion.map("sub", one, x))
+
+
+@lowers("polynomial")
+def _polynomial(expansion, params, x, *coefficients):
+    """Σ cₖ xᵏ, by Horner's rule."""
+    total = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        total = expansion.map("add", expansion.map("mul", total, x), c)
+    return total
+
+
 @lowers("integer_pow")
 def _integer_pow(expansion, params, x):
     exponent, graph, moduli = params["y"], expansion.graph, expansion.moduli
@@ -638,6 +653,20 @@ def _call(expansion, params, *arguments):
     if isinstance(body, core.ClosedJaxpr):
         return expansion.run_closed(body, arguments)
     return expansion.run(body, (), arguments)
+
+
+@lowers("call_hi_primitive")
+def _expanded(expansion, params, *arguments):
+    return expansion.run_closed(written_out(params["_prim"]), arguments)
+
+
+def written_out(primitive) -> core.ClosedJaxpr:
+    """An operation that JAX itself writes in others, such as `searchsorted` since 0.12, in these."""
+
+    def by_others(*flat):
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, flat)))
+
+    return jax.make_jaxpr(by_others)(*primitive.in_avals_flat)
 
 
 def _searches_from_the_right(body, arguments) -> bool:

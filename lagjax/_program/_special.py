@@ -1,4 +1,4 @@
-"""Functions of one number that are series: log Γ, its derivative, and the modified Bessel functions I₀ and I₁.
+"""Functions of one number that are series: log Γ, its derivatives, and the modified Bessel functions I₀ and I₁.
 
 log Γ obeys no differential equation from which a Taylor series would follow, and the others would need the powers of
 their argument anyway. So all are written out in operations that are there already, to rounding:
@@ -6,7 +6,8 @@ their argument anyway. So all are written out in operations that are there alrea
     log Γ(x), x > 0    Stirling's series at y = x + 10, less log x(x + 1) … (x + 9)
     Iₙ(x)              the power series up to |x| = 25, whose terms have one sign, and the asymptotic series beyond
 
-Abramowitz & Stegun, *Handbook of Mathematical Functions* (1964), 6.1.40, 6.1.17, 6.3.7, 9.6.10 and 9.7.1.
+Abramowitz & Stegun, *Handbook of Mathematical Functions* (1964), 6.1.40, 6.1.17, 6.4.6, 6.4.7, 6.4.11, 9.6.10 and
+9.7.1.
 """
 
 import math
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from lagjax._program import _scalars as xp
+from lagjax._program._graph import Unlowerable
 from lagjax._program._rules import lowers
 from lagjax._program._scalars import Scalars
 
@@ -25,6 +27,7 @@ from lagjax._program._scalars import Scalars
 _SHIFT = 10
 _BERNOULLI = [Fraction(1, 6), Fraction(-1, 30), Fraction(1, 42), Fraction(-1, 30), Fraction(5, 66),
               Fraction(-691, 2730), Fraction(7, 6), Fraction(-3617, 510)]  # fmt: skip
+_MOST_DERIVATIVES = 10  # of ψ: further ones are of no use in mechanics, and long
 # Where Bessel's series change over, and their terms: those left out are below 1e-17 of the sum there. Further out the
 # power series would need more terms, further in the asymptotic one would never be as exact.
 _CHANGE, _POWERS, _ASYMPTOTIC = 25.0, 50, 26
@@ -58,18 +61,39 @@ def log_gamma(x: Scalars) -> Any:
     return xp.where(negative, math.log(math.pi) - 0.5 * xp.logarithm(sine * sine) - value, value)
 
 
-def digamma(x: Scalars) -> Any:
-    """ψ(x) = d/dx log Γ(x); for x < 0 ψ(1 − x) − π cot πx."""
+def polygamma(order: int, x: Scalars) -> Any:
+    """ψ⁽ⁿ⁾(x), the derivative n of ψ = (log Γ)'; for x < 0 as (−1)ⁿ ψ⁽ⁿ⁾(1 − x) − π dⁿ/dxⁿ cot πx.
+
+    With y = x + s it is (−1)ⁿ⁺¹ (n! Σ (x + i)⁻ⁿ⁻¹ + (n − 1)! y⁻ⁿ + n! y⁻ⁿ⁻¹ / 2 + Σ B₂ₖ (2k + n − 1)! / (2k)! y⁻²ᵏ⁻ⁿ),
+    i below s, where −log y stands in the place of the second term for n = 0. With n the shift s grows, so that the
+    first term left out stays below 1e-17.
+    """
+    n, factorial, shift = order, float(math.factorial(order)), _SHIFT + 5 * order
     negative, z, reflected = _reflected(x)
-    y = z + float(_SHIFT)
+    y = z + float(shift)
     inverse = 1.0 / y
-    square = inverse * inverse
-    series = _polynomial([float(b / (2 * k)) for k, b in enumerate(_BERNOULLI, 1)], square)
-    value = xp.logarithm(y) - 0.5 * inverse - series * square
-    for i in range(_SHIFT):
-        value = value - 1.0 / (z + float(i))
-    tangent = reflected.map("tan", math.pi * reflected)
-    return xp.where(negative, value - math.pi / tangent, value)
+    series = [float(b * math.factorial(2 * k + n - 1) / math.factorial(2 * k)) for k, b in enumerate(_BERNOULLI, 1)]
+    tail = inverse * (0.5 * factorial + inverse * _polynomial(series, inverse * inverse))
+    value = tail - xp.logarithm(y) if n == 0 else (tail + float(math.factorial(n - 1))) * _power(inverse, n)
+    for i in range(shift):
+        value = value + factorial * _power(1.0 / (z + float(i)), n + 1)
+    sign = (-1.0) ** (n + 1)
+    cotangent = 1.0 / reflected.map("tan", math.pi * reflected)
+    more = math.pi ** (n + 1) * _polynomial(_derivative_of_cotangent(n), cotangent)
+    return xp.where(negative, -value - more, sign * value)
+
+
+def _power(x: Any, n: int) -> Any:
+    """xⁿ, n ≥ 1."""
+    return math.prod([x] * (n - 1), start=x)
+
+
+def _derivative_of_cotangent(n: int) -> list[float]:
+    """The coefficients of dⁿ/dxⁿ cot x, a polynomial of c = cot x, by c' = −(1 + c²)."""
+    found = np.polynomial.Polynomial([0.0, 1.0])
+    for _ in range(n):
+        found = found.deriv() * np.polynomial.Polynomial([-1.0, 0.0, -1.0])
+    return found.coef.tolist()
 
 
 def scaled_bessel(order: int, x: Scalars) -> Any:
@@ -95,6 +119,16 @@ def _register(name: str, formula) -> None:
 
 
 _register("lgamma", log_gamma)
-_register("digamma", digamma)
+_register("digamma", lambda x: polygamma(0, x))
 _register("bessel_i0e", lambda x: scaled_bessel(0, x))
 _register("bessel_i1e", lambda x: scaled_bessel(1, x))
+
+
+@lowers("polygamma")
+def _polygamma(expansion, params, order: np.ndarray, x: np.ndarray) -> np.ndarray:
+    orders = set(expansion.known(order, "the order of a polygamma function").ravel().tolist())
+    if len(orders) != 1 or not 0 <= (n := orders.pop()) <= _MOST_DERIVATIVES:
+        raise Unlowerable(
+            f"polygamma functions of several orders, or of one beyond {_MOST_DERIVATIVES}, are not written out"
+        )
+    return polygamma(n, Scalars(expansion, x)).ids

@@ -229,8 +229,8 @@ class Walk:
             held = {name: getattr(thing, name) for name in slots if hasattr(thing, name)} | inside
             if users:
                 held = {name: x for name, x in held.items() if self.wants(name, x, thing)}
-            else:  # not its caches
-                held = {name: x for name, x in held.items() if not name.startswith("_") or _is_plain(x)}
+            else:  # not its caches, unless there is nothing else, as in what delegates to another object
+                held = {name: x for name, x in held.items() if not name.startswith("_") or _is_plain(x)} or held
         held = {name: self.read(inside if name in inside else thing, name, x) for name, x in held.items()}
         if held or users:
             self.counts(inside, users)
