@@ -137,8 +137,10 @@ one, many, k = dtype.type(1), np.ones(8, dtype), dtype.type(9.81)
 starts = {"motion": one, "batch": many, "gradient": one}
 for name in sys.argv[2:]:
     function, q0 = globals()[name], starts[name]
-    exported = jax.export.export(jax.jit(function), platforms=["cuda"])(q0, k)
-    assert exported.platforms == ("cuda",) and exported.out_avals[0].dtype == dtype
+    exported = jax.export.export(jax.jit(function), platforms=["cuda", "cpu"])(q0, k)
+    assert exported.platforms == ("cuda", "cpu") and exported.out_avals[0].dtype == dtype
+    for mine, other in zip(exported.call(q0, k), jax.jit(function)(q0, k), strict=True):
+        np.testing.assert_allclose(mine, other, rtol=10 * np.finfo(dtype).eps)  # compiled twice
     text = exported.mlir_module()
     assert "stablehlo.while" in text and "callback" not in text, function.__name__
 """

@@ -178,3 +178,9 @@ def test_second_derivatives_through_a_bounce():
     x = jnp.array([1.0, 9.81, 0.8, 0.1])
     np.testing.assert_allclose(jax.jit(jax.grad(run))(x), jax.grad(closed)(x), rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(jax.jit(jax.hessian(run))(x), jax.hessian(closed)(x), rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("derivative", [lambda f: f, jax.jacfwd, jax.jacrev])
+def test_machine_code_of_a_cpu_is_not_exported(derivative):  # lowers without compiling
+    with pytest.raises(ValueError, match=r"jax\.export cannot take a motion along .* solver of diffrax"):
+        jax.export.export(jax.jit(derivative(followed)))(X)

@@ -400,7 +400,7 @@ def _several_at_once(primitive, outputs_after):
 
 
 def _on_host(primitive, host, shapes) -> None:
-    """A primitive that `host` computes from NumPy arrays: at once, or in a callback of what XLA compiles."""
+    """A primitive that `host` computes from NumPy arrays, outside of `jit`."""
     primitive.multiple_results = True
     primitive.def_abstract_eval(shapes)
 
@@ -408,11 +408,23 @@ def _on_host(primitive, host, shapes) -> None:
         with jax.enable_x64(True):
             return jax.device_put([np.asarray(x) for x in host(*map(np.asarray, args), **settings)])
 
-    def compiled(*args, **settings):
-        return on_host(functools.partial(host, **settings), shapes(*args, **settings), *args)
-
     primitive.def_impl(at_once)
-    mlir.register_lowering(primitive, mlir.lower_fun(compiled, multiple_results=True), platform="cpu")
+
+
+def _for_cpus(form):
+    """The rule by which a primitive is lowered for CPUs: as `form`, which calls code that lies in this process."""
+    rule = mlir.lower_fun(form, multiple_results=True)
+
+    def lowered(context, *args, **settings):
+        if context.module_context.lowering_parameters.for_export:
+            raise ValueError(
+                "jax.export cannot take a motion along that runs in a CPU's machine code, which lies in this process: "
+                "give a solver of diffrax, as simulate(…, solver=diffrax.Dopri8(), throw=False), and set "
+                "EQX_ON_ERROR=nan before Python starts; or export for CUDA alone."
+            )
+        return rule(context, *args, **settings)
+
+    return lowered
 
 
 def _run_compiled(ts, y0, params, *, flow, tolerances, keep):
@@ -529,7 +541,7 @@ _on_host(run_p, _run_on_host, _run_shapes)
 _on_host(jvp_p, _jvp_on_host, _jvp_shapes)
 _on_host(vjp_p, _vjp_on_host, _vjp_shapes)
 for _primitive, _compiled_form in ((run_p, _run_compiled), (jvp_p, _jvp_compiled), (vjp_p, _vjp_compiled)):
-    mlir.register_lowering(_primitive, mlir.lower_fun(_compiled_form, multiple_results=True), platform="cpu")
+    mlir.register_lowering(_primitive, _for_cpus(_compiled_form), platform="cpu")
 curvature_p.multiple_results = True
 curvature_p.def_abstract_eval(_curvature_shapes)
 curvature_p.def_impl(_curvature_composed)
