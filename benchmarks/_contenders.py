@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lagjax
-from benchmarks import _mujoco, _numba, _rebound
+from benchmarks import _gradsolve, _mujoco, _numba, _rebound
 from benchmarks._cases import Case
 from lagjax._native import cores
 
@@ -364,6 +364,7 @@ BATCHED = (
     Contender("heyoka, SIMD", _heyoka_batch, **HEYOKA),
     Contender("heyoka, threads", _heyoka_threads, **HEYOKA),
     Contender("heyoka, single", _heyoka_single, **HEYOKA, members=128),
+    Contender("gradsolve", _gradsolve.prepare, ("gradsolve", "warp"), suits=_gradsolve.why_not),
     Contender("numba", _numba.prepare, ("numba", "scipy"), suits=_numba.why_not),
     Contender("REBOUND", _rebound.prepare, ("rebound",), suits=_rebound.why_not),
     Contender("MuJoCo", _mujoco.prepare, ("mujoco",), suits=_mujoco.why_not, members=32),

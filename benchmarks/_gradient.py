@@ -18,7 +18,8 @@ import numpy as np
 
 import lagjax
 from benchmarks._cases import Case, chain, with_params
-from benchmarks._contenders import autodiff_acceleration, diffeqsolve
+from benchmarks._contenders import autodiff_acceleration, diffeqsolve, installed
+from benchmarks._gradsolve import of_double_pendulums
 from benchmarks._measure import seconds
 
 TOLERANCES, DURATION, MAX_STEPS = (1e-9, 1e-11), 50.0, 4096
@@ -37,6 +38,8 @@ def gradient(options) -> Iterator[dict[str, Any]]:
         for row in (ours, theirs):  # the two programs against each other: they differ by their tolerance
             row["the other's, median"] = float(np.median(_difference(derivative[: len(check)], check)))
             yield row
+        if installed("gradsolve"):
+            yield _of_gradsolve(peer, tol, derivative, options)
 
 
 def _measured(name: str, run: Callable, tol: float, case: Case, options) -> tuple[dict[str, Any], np.ndarray]:
@@ -77,6 +80,33 @@ def _measured(name: str, run: Callable, tol: float, case: Case, options) -> tupl
         "largest": float(difference.max()),
     }
     return row, value["forward"]
+
+
+def _of_gradsolve(case: Case, tol: float, derivative: np.ndarray, options) -> dict[str, Any]:
+    """Its row: reverse mode, which records the steps and goes back over them; it has no forward mode."""
+    numbers = np.concatenate([np.ones((case.batch, 4)), case.states], axis=1)
+    solve, record = of_double_pendulums(case, numbers, tol)
+
+    def reverse():
+        end = record()
+        y0_ct, p_ct = jax.grad(lambda y0, p: jnp.sum(end(y0, p)[:, :2] ** 2), (0, 1))(numbers[:, 4:], numbers[:, :4])
+        return np.concatenate([p_ct, y0_ct], axis=1)
+
+    _, steps = seconds(solve)
+    compiled, value = seconds(reverse)
+    rounds = [(seconds(solve)[0], seconds(reverse)[0]) for _ in range(options.repeats)]
+    solves, reverses = map(list, zip(*rounds, strict=True))
+    return {
+        "contender": "gradsolve",
+        "tol": tol,
+        "members": case.batch,
+        "steps": float(steps.mean()),
+        "solve µs": 1e6 * statistics.median(solves) / case.batch,
+        "reverse/solve": _ratio(reverses, solves),
+        "forward/solve": float("nan"),
+        "compile reverse s": compiled - min(reverses),
+        "the other's, median": float(np.median(_difference(value, derivative[: case.batch]))),
+    }
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -48,6 +48,7 @@ CONTENDERS = {
     "heyoka, SIMD": ("heyoka",),
     "heyoka, threads": ("heyoka",),
     "heyoka, single": ("heyoka",),
+    "gradsolve": ("gradsolve", "warp"),
     "numba": ("numba", "scipy"),
     "MuJoCo": ("mujoco",),
     "SciPy + SymPy": ("scipy", "sympy"),
