@@ -154,7 +154,7 @@ class Adjoint:
             lane["step"] = frame.read("steps", code.select(there, member, 0), INTEGER)
         member = lane["member"]
         there = member >= 0
-        lane["active"] = code.select(there, double(code, 1.0), 0.0)
+        lane["active"] = code.flag(there)
         lane["h"], lane["excess"] = 0.0, 0.0
         if self.motion.pieces:
             lane["has_after"] = 0.0

@@ -148,13 +148,15 @@ class Borders:
             pieces = self.motion.form.run(frame, self.borders.decide, *inputs)
             for j in self.motion.form.each(code, self.pieces):
                 place = j + self.motion.parameters
-                frame["params", place] = code.select(undecided, pieces[j], frame["params", place])
-                frame["stays", j] = code.select(undecided, 0.0, frame["stays", j])
+                with frame.where(undecided):
+                    frame["params", place] = pieces[j]
+                    frame["stays", j] = 0.0
             with code.loop(len(self.guards)) as g:
                 slide = self.table.place(code, g, "slide")
                 with code.only_if(slide >= 0):
                     slides = undecided & (self._piece(frame, slide) > 0.0)
-                    frame["touching", g] = code.select(slides, frame.constant(SLIDING), frame["touching", g])
+                    with frame.where(slides):
+                        frame["touching", g] = SLIDING
             frame["undecided"] = 0.0
         return frame.finish()
 
@@ -183,9 +185,10 @@ class Borders:
         cut = frame["nearest"] < 1.0
         frame["h"] = code.select(cut, frame["nearest"] * h, h)
         frame["cut"] = frame["h"]
-        frame["last"] = code.select(cut, 0.0, frame["last"])
-        if self.returns:
-            frame["h_before"] = code.select(cut, 0.0, frame["h_before"])
+        with frame.where(cut):
+            frame["last"] = 0.0
+            if self.returns:
+                frame["h_before"] = 0.0
         return frame.finish()
 
     def _look(self, frame: Frame, g: Value, degree: Value, h: Value) -> None:
@@ -200,12 +203,12 @@ class Borders:
             is_table = code.lanes_of(code.as_double(self.table.place(code, g, "of_table"))) > 0.0
             level = code.select(is_table, frame["level", g], level)
         side, beyond = piece * a + b, piece * k + l
-        is_share = code.lanes_of(code.select(self.table.place(code, g, "on") >= 0, double(code, 1.0), 0.0)) > 0.0
+        is_share = code.lanes_of(code.flag(self.table.place(code, g, "on") >= 0)) > 0.0
         undecided = code.compare("==", side, 0.0)
         # Nothing is looked for along the border that the motion slides on, or in the share of one that does not.
         idle = (frame["touching", g] >= SLIDING) | (undecided & is_share)
         with code.only_if(code.any_lane(~idle)):
-            self.roots.polynomial(frame, j, degree, h, code.select(undecided, frame.constant(1.0), side), level)
+            self.roots.polynomial(frame, j, degree, h, code.select(undecided, 1.0, side), level)
             self._look_along(frame, g, degree, h, undecided, beyond, idle)
 
     def _look_along(self, frame: Frame, g: Value, degree: Value, h: Value, undecided: Value, beyond, idle) -> None:
@@ -223,16 +226,17 @@ class Borders:
         at_rest = (frame["touching", g] > 0.0) | (code.intrinsic("fabs", frame["poly", 1]) <= gain)
         # A number that is zero leaves zero as its first coefficient says, or stays.
         leaves = undecided & code.compare("!=", leads, 0.0)
-        root = code.select(undecided, code.select(leaves, frame.constant(0.0), 2.0), self._place(frame))
+        root = code.select(undecided, code.select(leaves, 0.0, 2.0), self._place(frame))
         is_root = leaves | (~undecided & (frame["is_root"] > 0.0) & (frame["root"] < 1.0))
         # Of two at one instant that of the piece on which the other one depends, which comes first, is crossed.
-        apart = code.select(frame["crossed"] > 0.0, 1.0 - AT_ONCE, frame.constant(1.0)) if self.borders.nested else 1.0
+        apart = code.select(frame["crossed"] > 0.0, 1.0 - AT_ONCE, 1.0) if self.borders.nested else 1.0
         sooner = (root < frame["nearest"] * apart) & code.compare("!=", h, 0.0) & ~idle
         number = code.select(is_root, code.lanes_of(code.as_double(g + 1)), 0.0)
-        frame["nearest"] = code.select(sooner, root, frame["nearest"])
-        frame["at_rest"] = code.select(sooner, code.select(at_rest, frame.constant(1), 0.0), frame["at_rest"])
-        frame["crossed"] = code.select(sooner, number, frame["crossed"])
-        frame["beyond"] = code.select(sooner, code.select(undecided, leads, beyond), frame["beyond"])
+        with frame.where(sooner):
+            frame["nearest"] = root
+            frame["at_rest"] = at_rest
+            frame["crossed"] = number
+            frame["beyond"] = code.select(undecided, leads, beyond)
 
     # ---- tables: borders at their entries ----
 
@@ -246,7 +250,7 @@ class Borders:
     def _until_next_knot(self, frame: Frame, j: int) -> tuple[Value, Value]:
         """How long it is to the next entry of the table that the time is on, and whether there is one."""
         code, forward = frame.code, frame["forward"]
-        index = self._piece(frame, integer(code, j)) + code.select(forward > 0.0, frame.constant(1), 0.0)
+        index = self._piece(frame, integer(code, j)) + code.flag(forward > 0.0)
         knot, inside = self._knot(frame, j, index)
         return ((knot - frame["t"]) - frame["t_low"]) * forward, inside
 
@@ -257,8 +261,9 @@ class Borders:
         left = code.maximum(left, frame.constant(0.0))
         size = code.intrinsic("fabs", h)
         sooner = inside & (left < frame["nearest"] * size)
-        frame["nearest"] = code.select(sooner, left / size, frame["nearest"])
-        frame["crossed"] = code.select(sooner, float(len(self.guards) + 1 + c), frame["crossed"])
+        with frame.where(sooner):
+            frame["nearest"] = left / size
+            frame["crossed"] = float(len(self.guards) + 1 + c)
 
     def _note_coincidence(self, frame: Frame, h: Value) -> None:
         """Entries of several tables at one instant, one of which may be moved."""
@@ -269,10 +274,11 @@ class Borders:
             left, inside = self._until_next_knot(frame, j)
             distance = code.intrinsic("fabs", left - frame["nearest"] * size)
             at_once = inside & (frame["crossed"] > 0.0) & (distance <= self._instant(frame))
-            count = count + code.select(at_once, frame.constant(1), 0.0)
+            count = count + code.flag(at_once)
             if j in movable:
-                moves = moves + code.select(at_once, frame.constant(1), 0.0)
-        frame["crossed"] = code.select((count > 1.0) & (moves > 0.0), self.clocks.coincide, frame["crossed"])
+                moves = moves + code.flag(at_once)
+        with frame.where((count > 1.0) & (moves > 0.0)):
+            frame["crossed"] = self.clocks.coincide
 
     def _instant(self, frame: Frame) -> Value:
         """What two times may differ by that are the same."""
@@ -303,22 +309,22 @@ class Borders:
             jump = code.intrinsic("fabs", after[k] - code.load(before[k], frame.vector))
             least = code.intrinsic("fabs", after[k]) * ROUND_OFF + code.lanes_of(absolute_tolerance(frame))
             jumps = going & (jump > least)
-            frame["stays", j] = code.select(jumps, 0.0, frame["stays", j])
-            for g, guard in enumerate(self.guards):
-                if guard.piece == j:
-                    frame["touching", g] = code.select(jumps, 0.0, frame["touching", g])
-                    if guard.slide >= 0:
-                        place = self.motion.parameters + guard.slide
-                        frame["params", place] = code.select(jumps, 0.0, frame["params", place])
+            with frame.where(jumps):
+                frame["stays", j] = 0.0
+                for g, guard in enumerate(self.guards):
+                    if guard.piece == j:
+                        frame["touching", g] = 0.0
+                        if guard.slide >= 0:
+                            frame["params", self.motion.parameters + guard.slide] = 0.0
 
     def _pass_knots(self, frame: Frame, going: Value) -> None:
         """The pieces of tables whose next entry the time has come to: all that are there at one instant."""
-        code, clocks = frame.code, self.borders.clocks
-        for j in clocks:
+        for j in self.borders.clocks:
             left, inside = self._until_next_knot(frame, j)
             passes = going & inside & (left <= self._instant(frame))
-            place = self.motion.parameters + j
-            frame["params", place] = frame["params", place] + code.select(passes, frame["forward"], 0.0)
+            with frame.where(passes):
+                place = self.motion.parameters + j
+                frame["params", place] = frame["params", place] + frame["forward"]
             frame["stays", j] = 1.0
 
     def _rows_of_features(self) -> Iterator[tuple[Feature, int, int]]:
@@ -361,7 +367,7 @@ class Borders:
         code, scale = frame.code, feature.scale
         u = frame["values", j + (self.motion.series.values - self.motion.series.followed)]
         rise = code.lanes_of(code.as_double(degree)) * RISE
-        side = code.select(u < 0.0, frame.constant(-1.0), 1.0)
+        side = code.select(u < 0.0, -1.0, 1.0)
         if feature.kind == UP_TO:
             matters, slope, start = code.compare("!=", u, 0.0), side, side * u
         elif feature.kind == SQUARED:
@@ -384,18 +390,20 @@ class Borders:
             far = way * code.intrinsic("fabs", h) > NEARBY * whole
             past = code.select(far, way * SHORT_OF, way * PAST + NEARBY)
             comes = matters & far & (frame["root"] < 1.0) & (frame["is_root"] > 0.0)
-            frame["next_approach"] = code.select(comes, whole, frame["next_approach"])
+            with frame.where(comes):
+                frame["next_approach"] = whole
             root = code.select((frame["root"] < 1.0) & (frame["is_root"] > 0.0), past, root)
         sooner = matters & (root > 0.0) & (root < frame["nearest"]) & code.compare("!=", h, 0.0)
-        frame["nearest"] = code.select(sooner, root, frame["nearest"])
-        frame["crossed"] = code.select(sooner, 0.0, frame["crossed"])
+        with frame.where(sooner):
+            frame["nearest"] = root
+            frame["crossed"] = 0.0
 
     def _leads(self, frame: Frame, degree: Value) -> Value:
         """The sign of the first coefficient behind c₀ that is not zero."""
         code, leads = frame.code, frame.code.variable(frame.constant(0.0))
         with code.loop(degree) as i:
             c = frame["poly", degree - i]
-            sign = code.select(c > 0.0, frame.constant(1), -1.0)
+            sign = code.select(c > 0.0, 1, -1.0)
             code.store(code.select(code.compare("!=", c, 0.0), sign, code.load(leads, frame.vector)), leads)
         return code.load(leads, frame.vector)
 
@@ -435,7 +443,8 @@ class Borders:
         divided = touching > 0.0
         for power in range(3):
             with code.only_if(code.any_lane(divided)), code.loop(degree + 1) as k:
-                frame["poly", k] = code.select(divided, frame["poly", k + 1], frame["poly", k])
+                with frame.where(divided):
+                    frame["poly", k] = frame["poly", k + 1]
             vanishes = code.compare("==", frame["poly", 0], 0.0)
             divided = divided & (vanishes | (touching > float(power + 1)))
 
@@ -446,11 +455,12 @@ class Borders:
         code = frame.code
         reached = code.compare("==", frame["h"], frame["cut"])
         frame["crossed"] = code.select(reached, frame["crossed"], 0.0)
-        frame["stepped"] = code.select(code.compare("!=", frame["h"], 0.0), frame.constant(1), 0.0)
+        frame["stepped"] = code.compare("!=", frame["h"], 0.0)
         at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > float(len(self.guards)))
-        frame["at_knots"] = frame["at_knots"] + code.select(at_knot, frame.constant(1), 0.0)
+        frame["at_knots"] = frame["at_knots"] + code.flag(at_knot)
         for name in ("is_hit", "grazes"):
-            frame[name] = code.select(frame["stepped"] > 0.0, 0.0, frame[name])
+            with frame.where(frame["stepped"] > 0.0):
+                frame[name] = 0.0
         if self.graze is not None:
             frame.call(self.graze)
 
@@ -478,7 +488,8 @@ class Borders:
             rate, bend = self._rates(frame, order)
             near = rate * rate <= 2.0 * (code.intrinsic("fabs", bend) * code.load(error, frame.vector))
             near = near & ends & (frame["is_hit"] > 0.0)
-            frame["grazes"] = code.select(near, frame.constant(1), frame["grazes"])
+            with frame.where(near):
+                frame["grazes"] = 1
         return frame.finish()
 
     def _rates(self, frame: Frame, order: Value) -> tuple[Value, Value]:
@@ -505,31 +516,37 @@ class Borders:
         crosses, was_cut = crossed > 0.0, code.compare("!=", frame["cut"], frame["planned_h"])
         with code.loop(len(self.guards)) as g:
             ends = stepped & (frame["touching", g] < SLIDING)
-            frame["touching", g] = code.select(ends, 0.0, frame["touching", g])
+            with frame.where(ends):
+                frame["touching", g] = 0.0
         with code.only_if(code.any_lane(crosses | was_cut)):
             # What a cut step was to be says more about the next one than what it became.
             planned = code.intrinsic("fabs", frame["planned_h"])
             reached = was_cut & code.compare("==", frame["h"], frame["cut"])
-            frame["longest"] = code.select(reached, GROWTH * planned, frame["longest"])
-            frame["h"] = code.select(reached, frame["planned_h"], frame["h"])
+            with frame.where(reached):
+                frame["longest"] = GROWTH * planned
+                frame["h"] = frame["planned_h"]
             if self.note is not None:
                 frame.call(self.note)
             if self.jump_at_knot is not None:
                 self.clocks.note(frame, self.motion.evaluate_now(frame, self.motion.acceleration))
             self._go_on(frame, crossed, crosses)
-            if self.returns:
-                frame["h_before"] = code.select(crosses, 0.0, frame["h_before"])
+            with frame.where(crosses):
+                if self.returns:
+                    frame["h_before"] = 0.0
+                if self.borders.nested:
+                    frame["undecided"] = 1
             if self.borders.nested:
-                frame["undecided"] = code.select(crosses, frame.constant(1), frame["undecided"])
                 frame.call(self.decide)
             if self.jump is not None:
                 frame.call(self.jump)
             if self.jump_at_knot is not None:
                 frame.call(self.jump_at_knot)
             idle = code.select(crosses & ~stepped, frame["idle_crossings"] + 1.0, 0.0)
-            frame["idle_crossings"] = code.select(stepped | crosses, idle, frame["idle_crossings"])
+            with frame.where(stepped | crosses):
+                frame["idle_crossings"] = idle
             many = frame["idle_crossings"] > float(MOST_CROSSINGS * (len(self.guards) + len(self.borders.clocks)))
-            frame["code"] = code.select(many, frame.constant(DISCONTINUOUS), frame["code"])
+            with frame.where(many):
+                frame["code"] = DISCONTINUOUS
         return frame.finish()
 
     def _go_beyond(self, frame: Frame, crossed: Value) -> None:
@@ -545,24 +562,24 @@ class Borders:
             hit = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
             j, back, slide = (self.table.place(code, g, name) for name in ("piece", "back", "slide"))
             place = j + self.motion.parameters
-            by_position = code.select(self.table.place(code, g, "order") > 1, double(code, 1.0), 0.0)
-            bounces = no_time & (code.lanes_of(by_position) > 0.0)
+            by_position = code.lanes_of(code.flag(self.table.place(code, g, "order") > 1)) > 0.0
+            bounces = no_time & by_position
             slides = hit & (bounces | (again & (frame["touching", g] > 0.0)))
             slides = slides & (code.lanes_of(code.as_double(slide)) >= 0.0)
-            frame["params", place] = code.select(hit & ~slides, frame["beyond"], frame["params", place])
-            touches = code.select(slides, frame.constant(SLIDING), 1.0)
+            with frame.where(hit & ~slides):
+                frame["params", place] = frame["beyond"]
             # A share jumps to where it is: it need not touch the border that it had crossed before.
-            is_share = code.select(self.table.place(code, g, "on") >= 0, double(code, 1.0), 0.0)
-            touches = code.select(code.lanes_of(is_share) > 0.0, 0.0, touches)
-            frame["touching", back] = code.select(hit, touches, frame["touching", back])
+            is_share = code.lanes_of(code.flag(self.table.place(code, g, "on") >= 0)) > 0.0
+            with frame.where(hit):
+                frame["touching", back] = code.select(is_share, 0.0, code.select(slides, SLIDING, 1.0))
             with code.only_if(slide >= 0):
-                place = slide + self.motion.parameters
-                frame["params", place] = code.select(slides, frame.constant(1), frame["params", place])
+                with frame.where(slides):
+                    frame["params", slide + self.motion.parameters] = 1
             self._leave(frame, g, hit, again)
         with code.loop(len(self.guards)) as g:
             j = self.table.place(code, g, "piece")
-            stays = frame["touching", g] > 0.0
-            frame["stays", j] = code.select(stays, frame.constant(1), frame["stays", j])
+            with frame.where(frame["touching", g] > 0.0):
+                frame["stays", j] = 1
 
     def _leave(self, frame: Frame, g: Value, hit: Value, again: Value) -> None:
         """Where the share of a sliding motion comes to 0 or 1, it goes on along one side.
@@ -573,8 +590,7 @@ class Borders:
         on = self.table.place(code, g, "on")
         with code.only_if(on >= 0):
             place = self.table.place(code, on, "piece") + self.motion.parameters
-            side = code.lanes_of(self.table.number(code, g, "goes_on"))
-            frame["params", place] = code.select(hit, side, frame["params", place])
             order = code.lanes_of(code.as_double(self.table.place(code, on, "order")))
-            leaves = code.select(again, order, order + 1.0)
-            frame["touching", on] = code.select(hit, leaves, frame["touching", on])
+            with frame.where(hit):
+                frame["params", place] = self.table.number(code, g, "goes_on")
+                frame["touching", on] = code.select(again, order, order + 1.0)

@@ -52,7 +52,7 @@ class Clocks:
     def index(self, frame: Frame, j: int) -> Value:
         """The number of the entry that the step ends at, of the table of piece j."""
         piece = frame["params", self.motion.parameters + j]
-        return piece + frame.code.select(frame["h"] > 0.0, frame.constant(1), 0.0)
+        return piece + frame.code.flag(frame["h"] > 0.0)
 
     def note(self, frame: Frame, accelerations: Numbers) -> None:
         """The accelerations before an entry, which table it is of, and its number."""
@@ -62,7 +62,8 @@ class Clocks:
             frame["before_knot", i] = accelerations[i]
         for c, j, _ in self.tables:
             of = code.compare("==", frame["knot_of"], float(self.first + c))
-            frame["knot"] = code.select(of, self.index(frame, j), frame["knot"])
+            with frame.where(of):
+                frame["knot"] = self.index(frame, j)
 
     def jump(self, code: Code, before: Numbers, after: Numbers) -> Callable:
         """`(i)`: a⁻ − a⁺ of coordinate i; zero where that is rounding."""

@@ -140,12 +140,13 @@ class Events:
                 unclear = code.select(code.compare("!=", before, 0.0), 0.0, later)
                 going = code.select(leaves, rate * frame["forward"], code.select(bends, turn, unclear))
                 met = fresh & on_it & (going * before < 0.0) & (before * float(self.directions[i]) <= 0.0)
-                kind = code.select(before > 0.0, frame.constant(_FALLS), _RISES)
+                kind = code.select(before > 0.0, _FALLS, _RISES)
                 frame["met", i] = code.select(met, kind, 0.0)
                 stays = met | code.compare("==", going, 0.0)
                 side = code.select(on_it, code.select(stays, before, going), value)
-                frame["side", i] = code.select(fresh, self._sign(frame, side), frame["side", i])
-                rests = code.select(on_it, code.select(leaves, frame.constant(_ON), _ALONG), 0.0)
+                with frame.where(fresh):
+                    frame["side", i] = self._sign(frame, side)
+                rests = code.select(on_it, code.select(leaves, _ON, _ALONG), 0.0)
                 frame["resting", i] = code.select(fresh, rests, 0.0)
         return frame.finish()
 
@@ -161,7 +162,7 @@ class Events:
 
     def _sign(self, frame: Frame, x: Value) -> Value:
         code = frame.code
-        return code.select(x > 0.0, frame.constant(1), code.select(x < 0.0, frame.constant(-1), 0.0))
+        return code.select(x > 0.0, 1, code.select(x < 0.0, -1, 0.0))
 
     # ---- a step ----
 
@@ -179,9 +180,10 @@ class Events:
         with code.only_if(code.any_lane(cut)):
             least = INSTANT * frame["smallest"]
             after = code.maximum(frame["seen"] * size, code.select(least < size, least, size))
-            frame["h"] = code.select(cut, after * frame["forward"], frame["h"])
-            frame["is_cut"] = code.select(cut, frame.constant(1), 0.0)
-            frame["last"] = code.select(cut, 0.0, frame["last"])
+            frame["is_cut"] = cut
+            with frame.where(cut):
+                frame["h"] = after * frame["forward"]
+                frame["last"] = 0.0
             with code.loop(self.count) as g:
                 frame["side", g], frame["noted", g] = frame["side_begin", g], frame["noted_begin", g]
             frame.call(self.look, order)
@@ -204,8 +206,9 @@ class Events:
             code.store(code.load(event, frame.vector) + more, event)
             code.store(4.0 * of, power)
         frame["event"] = code.select(happens, code.load(event, frame.vector), -1.0)
-        frame["last"] = code.select(happens, 0.0, frame["last"])
-        frame["h"] = code.select(happens, frame["first_at"] * frame["forward"], frame["h"])
+        with frame.where(happens):
+            frame["last"] = 0.0
+            frame["h"] = frame["first_at"] * frame["forward"]
 
     def _look(self) -> Code:
         """`(order)`: the changes of all guards along the step."""
@@ -214,9 +217,10 @@ class Events:
         frame["seen"], frame["first_at"] = 1.0, float("inf")
         with code.loop(self.count) as g:
             met = frame["met", g]
-            at = code.select(met > 0.0, frame.constant(0.0), float("inf"))
+            at = code.select(met > 0.0, 0.0, float("inf"))
             frame["root_at", g], frame["change", g] = at, met
-            frame["first_at"] = code.select(met > 0.0, 0.0, frame["first_at"])
+            with frame.where(met > 0.0):
+                frame["first_at"] = 0.0
         with code.loop(self.count) as g:
             self._look_at(frame, order, g)
         return frame.finish()
@@ -253,8 +257,9 @@ class Events:
         self._leave_surface(frame, g, size)
         moving = code.compare("!=", h, 0.0) & (frame["met", g] <= 0.0)
         unknown = moving & ~(code.intrinsic("fabs", value) < float("inf"))
-        frame["code"] = code.select(unknown, float(NOT_FINITE), frame["code"])
-        frame["last"] = code.select(unknown, 0.0, frame["last"])
+        with frame.where(unknown):
+            frame["code"] = float(NOT_FINITE)
+            frame["last"] = 0.0
         frame["h"] = code.select(unknown, 0.0, h)
         sound, moving = size < float("inf"), moving & ~unknown
 
@@ -273,7 +278,8 @@ class Events:
         ahead = code.variable(side)
         self._along(frame, order, g, degree, ahead, moving & sound)
         self._without_series(frame, order, g, ahead, moving & ~sound)
-        frame["side", g] = code.select(moving, code.load(ahead, frame.vector), frame["side", g])
+        with frame.where(moving):
+            frame["side", g] = code.load(ahead, frame.vector)
 
     def _is_long(self, last: Value, before: Value, size: Value) -> Value:
         """Where the last terms of a polynomial are large, or do not fall: it may leave out as much as they are."""
@@ -285,7 +291,8 @@ class Events:
         since = code.intrinsic("fabs", frame["t"] - frame["passed_at", g])
         known = (since <= INSTANT * frame["smallest"]) | (frame["waited", g] > 0.0)
         on = (rests > 0.0) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= CONTINUOUS * size))
-        frame["poly", 0] = code.select(on, 0.0, frame["poly", 0])
+        with frame.where(on):
+            frame["poly", 0] = 0.0
         rate = frame["poly", 1]
         frame["poly", 1] = code.select((rests >= _ALONG) & (rate < 0.0), 0.0, rate)
 
@@ -293,7 +300,7 @@ class Events:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""
         code = frame.code
         looking, left = (code.variable(x) for x in (
-            code.select(where, frame.constant(1), 0.0), integer(code, MOST_CHANGES),
+            code.flag(where), integer(code, MOST_CHANGES),
         ))  # fmt: skip
 
         def on():
@@ -304,25 +311,28 @@ class Events:
             frame.call(self.roots.next_root, degree)
             root, part = frame["root"], frame["part"]
             is_root = on() & (root < 1.0) & (frame["is_root"] > 0.0)
-            seen = code.select(root < 1.0, root * part, code.select(part < 1.0, part, frame.constant(1.0)))
+            seen = code.select(root < 1.0, root * part, code.select(part < 1.0, part, 1.0))
             self._see(frame, on() & ~is_root, seen)
             waits = is_root & self._waits(frame, g)
-            frame["waits", g] = code.select(waits, frame.constant(1), frame["waits", g])
+            with frame.where(waits):
+                frame["waits", g] = 1
             changes = is_root & ~waits
             with code.only_if(code.any_lane(changes)):
                 s = self._exact(frame, order, g, changes, code.load(ahead, frame.vector))
                 inside = code.intrinsic("fabs", s) <= code.intrinsic("fabs", frame["h"])  # else of the next step
                 goes_on = self._take(frame, order, g, changes & inside, s, ahead)
                 self.roots.turn(frame, degree, goes_on)
-                frame["begin"] = code.select(goes_on, root, frame["begin"])
-                code.store(code.select(goes_on, frame.constant(1), 0.0), looking)
+                with frame.where(goes_on):
+                    frame["begin"] = root
+                code.store(code.flag(goes_on), looking)
             code.store(code.select(changes, code.load(looking, frame.vector), 0.0), looking)
         self._see(frame, on(), frame["begin"] * frame["part"])
 
     def _see(self, frame: Frame, where: Value, seen: Value) -> None:
         """In some lanes a guard is seen only up to a part of the step, the first time it is looked at."""
         less = where & (seen < frame["seen"]) & ~(frame["is_cut"] > 0.0)
-        frame["seen"] = frame.code.select(less, seen, frame["seen"])
+        with frame.where(less):
+            frame["seen"] = seen
 
     def _waits(self, frame: Frame, g: Value) -> Value:
         """Whether what a guard does is for the next step to say: its own border is where this one ends."""
@@ -340,7 +350,7 @@ class Events:
         code, root = frame.code, frame["root"]
         scale = frame["part"] * frame["h"]
         start, rate = root * scale, frame["slope"] / scale
-        moving = code.select(where & (root > 0.0), frame.constant(1), 0.0)
+        moving = code.flag(where & (root > 0.0))
         at, going, left = (code.variable(x) for x in (start, moving, integer(code, MOST_CORRECTIONS)))
 
         def moves():  # each lane as long as it needs, so that its neighbours do not change its last digit
@@ -355,7 +365,7 @@ class Events:
             after = code.select(after * frame["forward"] > 0.0, after, 0.0)
             code.store(after, at)
             far = code.intrinsic("fabs", after - here) > INSTANT * frame["smallest"]
-            code.store(code.select(far & moves(), frame.constant(1), 0.0), going)
+            code.store(code.flag(far & moves()), going)
         at = code.load(at, frame.vector)
         lost = (frame["resting", g] > 0.0) & (code.intrinsic("fabs", at) <= 0.25 * INSTANT * frame["smallest"])
         return code.select(lost, 0.0, at)  # time does not move
@@ -368,21 +378,23 @@ class Events:
         counts = changes & ~(side * direction > 0.0)
         if self.notes:
             assert self.note is not None
-            frame["is_due"] = code.select(counts, frame.constant(1), 0.0)
+            frame["is_due"] = counts
             with code.only_if(code.any_lane(counts)):
                 frame.call(self.note, order, g, s)
             goes_on = changes
         else:
             size = code.intrinsic("fabs", s)
-            frame["root_at", g] = code.select(counts, size, frame["root_at", g])
-            kind = code.select(side > 0.0, frame.constant(_FALLS), _RISES)
-            frame["change", g] = code.select(counts, kind, frame["change", g])
+            with frame.where(counts):
+                frame["root_at", g] = size
+                frame["change", g] = code.select(side > 0.0, _FALLS, _RISES)
             sooner = counts & (size < frame["first_at"])
-            frame["first_at"] = code.select(sooner, size, frame["first_at"])
+            with frame.where(sooner):
+                frame["first_at"] = size
             goes_on = changes & ~counts
         code.store(code.select(goes_on, 0.0 - side, side), ahead)
         now = frame["t"] + (frame["t_low"] + s)
-        frame["passed_at", g] = code.select(goes_on, now, frame["passed_at", g])
+        with frame.where(goes_on):
+            frame["passed_at", g] = now
         return goes_on
 
     def _without_series(self, frame: Frame, order: Value, g: Value, ahead: Value, where: Value) -> None:

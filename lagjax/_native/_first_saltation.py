@@ -72,9 +72,10 @@ class FirstSaltation:
             side = piece * table.number(code, g, "a") + table.number(code, g, "b")
             hit = code.compare("==", frame["crossed"], code.lanes_of(code.as_double(g + 1)))
             hit = hit & code.compare("!=", side, 0.0)
-            frame["hit", j] = code.select(hit, frame.constant(1), frame["hit", j])
-            frame["entry", j] = code.select(hit, piece + table.number(code, g, "e"), frame["entry", j])
-            frame["is_hit"] = code.select(hit, frame.constant(1), frame["is_hit"])
+            with frame.where(hit):
+                frame["hit", j] = 1
+                frame["entry", j] = piece + table.number(code, g, "e")
+                frame["is_hit"] = 1
 
     def jump(self, frame: Frame, after: Numbers) -> Callable:
         """`(i)`: a⁻ − a⁺ of coordinate i; zero where that is rounding."""
@@ -198,5 +199,5 @@ class FirstSaltation:
             jump = self.jump(frame, after)
             for i in self.motion.form.each(code, n):
                 frame["jump", i] = code.select(frame["is_hit"] > 0.0, jump(i), 0.0)
-            frame["jumps"] = code.select(self.jumps(frame, jump), frame.constant(1), 0.0)
+            frame["jumps"] = self.jumps(frame, jump)
         return frame.finish()

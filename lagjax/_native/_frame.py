@@ -16,14 +16,15 @@ with.
 
 import copy
 import ctypes
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
+from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value
 
 Index = int | Value
 Numbers = Any  # vectors by their numbers: a list of values whose indices are known, or `Vectors`
@@ -128,6 +129,7 @@ class Frame:
         self.layout, self.width, self.vector = layout, layout.width, self.code.vector
         self._fields = dict(job._fields_)
         self._job, self._memory, self._integers, *self.arguments = self.code.arguments
+        self._mask: Value | None = None
 
     # ---- vectors, one element a lane ----
 
@@ -135,7 +137,19 @@ class Frame:
         return self.code.load(self.address(*_parts(key)), self.vector)
 
     def __setitem__(self, key: "str | tuple", value: "Value | float") -> None:
-        self.code.store(self.code.lanes_of(value), self.address(*_parts(key)))
+        value = self.code.lanes_of(value)
+        if value.it.type.element == BIT:
+            value = self.code.flag(value)
+        if self._mask is not None:
+            value = self.code.select(self._mask, value, self[key])
+        self.code.store(value, self.address(*_parts(key)))
+
+    @contextmanager
+    def where(self, mask: Value) -> Iterator[None]:
+        """Within it, assignments to vectors change the lanes of the mask alone, as `x[mask] = y` does in NumPy."""
+        before, self._mask = self._mask, mask if self._mask is None else self._mask & mask
+        yield
+        self._mask = before
 
     def address(self, name: str, *indices: Index) -> Value:
         """The address of a vector."""

@@ -123,7 +123,7 @@ class Integrator:
             lane[name] = 0.0
         for k in range(2 * PARTS):
             lane["reach", k] = 0.0
-        lane["active"] = code.select(there, double(code, 1.0), 0.0)
+        lane["active"] = code.flag(there)
         lane["code"], lane["due"], lane["event"] = float(RUNNING), float("inf"), -1.0
         with code.only_if(there):
             self._take(frame, lane, member)
@@ -211,8 +211,8 @@ class Integrator:
         counted = steps + rejected
         if self.motion.pieces:  # there are no more of those that end at entries of tables than there are entries
             counted = counted - frame["at_knots"]
-        ending = code.select(running & (counted >= limit), frame.constant(OUT_OF_STEPS), ending)
-        ending = code.select(frame["last"] > 0.0, frame.constant(DONE), ending)
+        ending = code.select(running & (counted >= limit), OUT_OF_STEPS, ending)
+        ending = code.select(frame["last"] > 0.0, DONE, ending)
         event = frame["event"]
         ending = code.select(event >= 0.0, event + float(EVENT), ending)
         frame["code"] = ending

@@ -231,9 +231,16 @@ class Code:
         return self.as_value(a, like), self.as_value(b, like)
 
     def select(self, condition: Value, yes, no) -> Value:
-        """`yes` where the condition holds, else `no`."""
+        """`yes` where the condition holds, else `no`; two numbers are doubles, in the lanes of the condition."""
+        if not isinstance(yes, Value) and not isinstance(no, Value):
+            vector = isinstance(condition.it.type, ir.VectorType)
+            yes = self.as_value(yes, self.vector if vector else DOUBLE)
         yes, no = self._alike(yes, no)
         return Value(self, self.builder.select(condition.it, yes.it, no.it))
+
+    def flag(self, condition: Value) -> Value:
+        """1 where the condition holds, else 0."""
+        return self.select(condition, 1.0, 0.0)
 
     def maximum(self, a, b) -> Value:
         """The larger; `b` where they cannot be compared."""

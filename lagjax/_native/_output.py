@@ -51,7 +51,7 @@ class Output:
             there = due()
             s = code.select(there, (frame["due"] * forward - t) - low, 0.0)
             self.interpolate(frame, order, s)
-            frame["is_due"] = code.select(there, frame.constant(1.0), 0.0)
+            frame["is_due"] = there
             with code.loop(self.motion.width) as j:
                 lane = frame.lane(j)
                 with code.only_if(lane["is_due"] > 0.0):

@@ -35,10 +35,11 @@ def return_or_remember(frame: Frame, form: Lines | Tables, states: int, guards: 
     undone = steps - frame["steps_before"]
     frame["h_before"] = code.select(new, size, long)
     frame["returns"] = code.select(back, returns + 1.0, code.select(new, 0.0, returns))
-    frame["returned"] = code.select(back, frame.constant(1.0), 0.0)
+    frame["returned"] = back
     frame["rejected"] = frame["rejected"] + code.select(back, undone + 1.0, 0.0)
-    frame["code"] = code.select(back, float(RUNNING), frame["code"])
-    frame["h"] = code.select(back, 0.0, frame["h"])
+    with frame.where(back):
+        frame["code"] = float(RUNNING)
+        frame["h"] = 0.0
     for now, then in _beginnings(frame, form, states, guards):
         here, there = code.load(now, frame.vector), code.load(then, frame.vector)
         code.store(code.select(back, there, here), now)
@@ -62,4 +63,5 @@ def shorten(frame: Frame) -> None:
     for k in range(1, MOST_RETURNS + 1):
         size = code.select(returns >= float(k), RETAKEN * size, size)
     for name in ("h", "longest"):
-        frame[name] = code.select(returned, size, frame[name])
+        with frame.where(returned):
+            frame[name] = size

@@ -76,7 +76,7 @@ class Roots:
             long = is_long()
             with code.only_if(code.any_lane(long)):
                 code.store(integer(code, 1), again)
-                self.stretch(frame, degree, code.select(long, frame.constant(0.5), 1.0))
+                self.stretch(frame, degree, code.select(long, 0.5, 1.0))
 
     def stretch(self, frame: Frame, degree: Value, part: Value) -> None:
         """The polynomial over a part of its interval."""
@@ -143,7 +143,7 @@ class Roots:
         at_start = (ROOT_NOISE * EPS) * code.intrinsic("fabs", frame["poly", 0]) + frame["unsure"]
         along = (ROOT_NOISE * EPS) * (frame["falls"] + frame["rises"])
         x, going, left = (code.variable(y) for y in (
-            frame["begin"], code.select(searching, frame.constant(1), 0.0), integer(code, MOST_MOVES),
+            frame["begin"], code.flag(searching), integer(code, MOST_MOVES),
         ))  # fmt: skip
 
         def active():
@@ -174,9 +174,10 @@ class Roots:
                 code.store(code.select(open, hop, code.load(after, frame.vector)), after)
             after = code.load(after, frame.vector)
             code.store(code.select(now, after, here), x)
-            code.store(code.select(now & ~ends & (after < 1.0), frame.constant(1), 0.0), going)
-        frame["is_root"] = code.select(active(), 0.0, frame["is_root"])
-        frame["root"] = code.select(active(), code.load(x, frame.vector), frame["root"])
+            code.store(code.flag(now & ~ends & (after < 1.0)), going)
+        with frame.where(active()):
+            frame["is_root"] = 0.0
+            frame["root"] = code.load(x, frame.vector)
 
     def _note_root(self, frame: Frame, here: Value, known: tuple[Value, ...], is_root: Value, ends: Value) -> None:
         """The place of a root, or where the search ends; near it one step of Newton's more, and not a long one."""
@@ -184,10 +185,11 @@ class Roots:
         hop, back = self._hop(frame, error, bend), value / slope
         back = code.select((slope < 0.0) & (here > frame["begin"]), code.select(back < hop, back, hop), 0.0)
         place = code.select(is_root, code.maximum(here - back, frame["begin"]), here)
-        of_root = (("root", place), ("is_root", code.select(is_root, frame.constant(1), 0.0)),
+        of_root = (("root", place), ("is_root", code.flag(is_root)),
                    ("slope", slope), ("error", error))  # fmt: skip
         for name, number in of_root:
-            frame[name] = code.select(ends, number, frame[name])
+            with frame.where(ends):
+                frame[name] = number
 
     def _hop(self, frame: Frame, error: Value, bend: Value) -> Value:
         """How far P does not come from zero to beyond what is known of it, and back."""

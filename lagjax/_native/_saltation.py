@@ -52,18 +52,19 @@ class GuardTable:
         """
         motion, code, crossed = self.motion, frame.code, frame.code.intrinsic("floor", frame["crossed"])
         where = frame.constant(0.0) <= 0.0 if where is None else where
-        frame["is_hit"] = code.select(where, 0.0, frame["is_hit"])
-        with code.loop(motion.pieces) as j:
-            frame["hit", j] = code.select(where, 0.0, frame["hit", j])
-            piece = frame["params", j + motion.parameters]
-            frame["pieces_before", j] = code.select(where, piece, frame["pieces_before", j])
+        with frame.where(where):
+            frame["is_hit"] = 0.0
+            with code.loop(motion.pieces) as j:
+                frame["hit", j] = 0.0
+                frame["pieces_before", j] = frame["params", j + motion.parameters]
         with code.loop(self.guards) as g:
             j = self.place(code, g, "piece")
             side = frame["pieces_before", j] * self.number(code, g, "a") + self.number(code, g, "b")
             hit = where & code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
             hit = hit & code.compare("!=", side, 0.0)
-            frame["hit", j] = code.select(hit, frame.constant(1), frame["hit", j])
-            frame["is_hit"] = code.select(hit, frame.constant(1), frame["is_hit"])
+            with frame.where(hit):
+                frame["hit", j] = 1
+                frame["is_hit"] = 1
 
 
 def jump_over(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
@@ -136,7 +137,8 @@ class Saltation:
         frame = self.motion.function("note_before")
         stepped = frame["stepped"] > 0.0
         for i in self.motion.form.each(frame.code, self.motion.states):
-            frame["edge", i] = frame.code.select(stepped, frame["y", i], frame["edge", i])
+            with frame.where(stepped):
+                frame["edge", i] = frame["y", i]
         return frame.finish()
 
     def apply(self) -> Code:
@@ -160,7 +162,8 @@ class Saltation:
                     for i in motion.form.each(code, base):
                         place = i + (part * n + row * base)
                         beyond = frame["edge", place] + added(row, i, part)
-                        frame["y", place] = code.select(is_hit, beyond, frame["y", place])
+                        with frame.where(is_hit):
+                            frame["y", place] = beyond
         return frame.finish()
 
     # ---- over steps that have been taken ----
@@ -174,7 +177,7 @@ class Saltation:
         motion, code = self.motion, frame.code
         self.table.note_hit(frame)
         grazes = frame["crossed"] > code.intrinsic("floor", frame["crossed"])
-        frame["grazes"] = code.select(grazes, frame.constant(1), 0.0)
+        frame["grazes"] = grazes
         moved = motion.moved(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
         for i in motion.form.each(code, motion.states):
             frame["edge", i] = moved[i]

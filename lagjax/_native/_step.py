@@ -88,10 +88,10 @@ class StepControl:
         sound = (last < float("inf")) & (before < float("inf")) & ~singular
         small = ~is_last & (step < frame["smallest"])
         going = active & sound & ~small
-        ending = code.select(small, frame.constant(STEP_TOO_SMALL), float(RUNNING))
-        frame["code"] = code.select(sound, ending, code.select(singular, frame.constant(SINGULAR), float(NOT_FINITE)))
+        ending = code.select(small, STEP_TOO_SMALL, float(RUNNING))
+        frame["code"] = code.select(sound, ending, code.select(singular, SINGULAR, float(NOT_FINITE)))
         frame["h"] = code.select(going, step * forward, 0.0)
-        frame["last"] = code.select(going & is_last, frame.constant(1), 0.0)
+        frame["last"] = going & is_last
 
     def _errors(self, frame: Frame, order: Value) -> tuple[Value, Value]:
         """The scaled norms of the last two coefficients; `scale` keeps 1 / (floor + rtol·size)."""
@@ -137,7 +137,7 @@ class StepControl:
             largest = code.select(largest > 0.0, largest, speed * step)
         share = ATOL_OVER_MOTION * largest
         is_small = (share > 0.0) & (share < ATOL_OVER_RTOL)
-        floor = rtol * code.select(is_small, share, frame.constant(ATOL_OVER_RTOL))
+        floor = rtol * code.select(is_small, share, ATOL_OVER_RTOL)
         return code.select(given > 0.0, given, floor)
 
     def _sizes(self, frame: Frame, half: int) -> Numbers:
@@ -218,8 +218,9 @@ class StepControl:
                 half = 0.5 * frame["h"]
                 small = bad & (code.intrinsic("fabs", half) < frame["smallest"])
                 frame["h"] = code.select(small, 0.0, code.select(bad, half, frame["h"]))
-                frame["code"] = code.select(small, self._reason(frame), frame["code"])
-                frame["rejected"] = frame["rejected"] + code.select(bad, frame.constant(1), 0.0)
+                with frame.where(small):
+                    frame["code"] = self._reason(frame)
+                frame["rejected"] = frame["rejected"] + code.flag(bad)
                 note_halved(frame, bad)
 
     def _reason(self, frame: Frame) -> Value:
@@ -227,7 +228,7 @@ class StepControl:
         reason = frame.constant(STEP_TOO_SMALL)
         if self.projector is None:
             return reason
-        return frame.code.select(frame["series_defect"] <= 1.0, frame.constant(PROJECTION_FAILED), reason)
+        return frame.code.select(frame["series_defect"] <= 1.0, PROJECTION_FAILED, reason)
 
     # ---- the step ----
 
@@ -246,8 +247,9 @@ class StepControl:
         """The time and the state at the end of the step, what rounding takes carried along; and one step more."""
         code, h = frame.code, frame["h"]
         moving = code.compare("!=", h, 0.0)
-        frame["t"] = code.select(moving, after, frame["t"])
-        frame["t_low"] = code.select(moving, rest, frame["t_low"])
+        with frame.where(moving):
+            frame["t"] = after
+            frame["t_low"] = rest
         frame["longest"] = code.intrinsic("fabs", h) * frame["growth"]
         for i in self.motion.form.each(code, self.motion.states):
             total, rest = end_of_step(frame, i)
@@ -256,7 +258,7 @@ class StepControl:
             y, low = frame["y", i], frame["low", i]
             frame["y", i] = code.select(moving, total, y)
             frame["low", i] = code.select(moving, rest, low)
-        frame["steps"] = frame["steps"] + code.select(moving, frame.constant(1), 0.0)
+        frame["steps"] = frame["steps"] + code.flag(moving)
 
 
 def absolute_tolerance(frame: Frame) -> Value:
@@ -267,8 +269,9 @@ def absolute_tolerance(frame: Frame) -> Value:
 
 def note_halved(frame: Frame, where: Value) -> None:
     """In some lanes the step has become shorter: it is not the last one any more, and the next grows less."""
-    frame["last"] = frame.code.select(where, 0.0, frame["last"])
-    frame["growth"] = frame.code.select(where, GROWTH_AFTER_REJECTION, frame["growth"])
+    with frame.where(where):
+        frame["last"] = 0.0
+        frame["growth"] = GROWTH_AFTER_REJECTION
 
 
 def _power(code: Code, x: Value, exponent: Value) -> Value:

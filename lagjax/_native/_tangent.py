@@ -239,7 +239,7 @@ class Tangent:
             lane["step"] = frame.read("steps", code.select(there, member, 0), INTEGER)
         member = lane["member"]
         there = member >= 0
-        lane["active"] = code.select(there, double(code, 1.0), 0.0)
+        lane["active"] = code.flag(there)
         lane["h"], lane["step"], lane["output"] = 0.0, 0, 1
         for tangents in self.lanes_of_tangents(frame, index):
             tangents["excess"] = 0.0
@@ -550,7 +550,7 @@ class Tangent:
         at = frame.time(code.select(inside, member, 0), code.select(inside, output, 0))
         due = inside & ((at - of_motion["next_begin"]) * of_motion["h"] <= 0.0)
         lane["s"] = code.select(due, at - of_motion["t"], 0.0)
-        lane["is_due"] = code.select(due, double(code, 1.0), 0.0)
+        lane["is_due"] = code.flag(due)
 
     def _write_output(self, frame: Frame, index: Value, group: Value) -> None:
         code, lane = frame.code, frame.lane(index)
