@@ -165,7 +165,7 @@ def _run(problem: Problem, given: tuple) -> Solution:
 
 
 def _in_doubles(solve: Callable, problem: Problem):
-    """What `solve` makes of the problem in float64, in the precision of the problem."""
+    """The solution by `solve` in float64, in the precision of the problem."""
 
     def of_numbers(ts, y0, params):
         return solve(dataclasses.replace(problem.in_doubles, ts=ts, y0=y0, params=params))

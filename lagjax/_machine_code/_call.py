@@ -30,7 +30,7 @@ _lock = threading.Lock()
 
 
 def on_host(host: Callable, shapes, *arrays) -> tuple:
-    """What `host` computes from NumPy arrays, in a callback of what XLA compiles; `shapes` are those of its results."""
+    """Call `host` on NumPy arrays, in a callback of what XLA compiles; `shapes` are those of its results."""
 
     # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
     # the callbacks themselves may occupy.
@@ -44,13 +44,13 @@ def on_host(host: Callable, shapes, *arrays) -> tuple:
 
 
 def has_handler(flow: Flow, members: int) -> bool:
-    """Whether a run of so many members begins in the handler."""
+    """True if a run of so many members begins in the handler."""
     notes = flow.guards is not None and flow.guards.notes
     return NO_HANDLER is None and not notes and flow.kernel.to_run(members).threads(members) == 1
 
 
 def has_sweep(flow: Flow, members: int) -> bool:
-    """Whether derivatives of so many members begin in a handler, with their motion run once more."""
+    """True if derivatives of so many members begin in a handler, with their motion run once more."""
     return has_handler(flow, members) and flow.projection is None and flow.kernel.rounds_of_sweep > 0
 
 
@@ -105,7 +105,7 @@ def sweep_by_handler(kind: str, flow: Flow, tolerances: Tolerances, ts, y0, para
 
 
 def _ended_well(begun: _native.Begun):
-    """Whether nothing is left to do, and no member failed."""
+    """True if nothing is left to do, and no member failed."""
     more = jax.lax.bitcast_convert_type(begun.rest[-1], np.int64)
     codes = (begun.code == _native.DONE) | (begun.code >= _native.EVENT)
     return (more == 0) & jnp.all(codes) & jnp.all(jnp.isfinite(begun.y_end))

@@ -183,7 +183,7 @@ def _vjp_over_steps(
 
 
 def _probed(flow: Flow, ts, params, tolerances, steps: Steps, rows, members) -> np.ndarray:
-    """How large the last terms of the series of a tangent are, in units of the limit: along any direction at all."""
+    """The size of the last terms of the series of a tangent, in units of the limit, along any direction at all."""
     direction = np.random.default_rng(0).normal(size=flow.states + flow.numbers)
     y_dot, params_dot = (np.tile(x, (len(rows), 1, 1)) for x in np.split(direction, [flow.states]))
     excess = steps.kernel.jvp(

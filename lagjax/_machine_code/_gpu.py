@@ -44,7 +44,7 @@ def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
 
 
 def launch(program: str, operands, results) -> list:
-    """What the entry of a program makes of its operands: `_native._gpu.RESULTS`, of these shapes."""
+    """Launch a program on its operands: `_native._gpu.RESULTS`, of these shapes."""
     blocks, threads = _gpu.grid(results[2].shape[0])
     sizes = dict(grid_x=blocks, grid_y=1, grid_z=1, block_x=threads, block_y=1, block_z=1, shared_mem_bytes=0)
     attributes = {name: np.int32(size) for name, size in sizes.items()}
@@ -55,7 +55,7 @@ def launch(program: str, operands, results) -> list:
 
 
 def _solution(path, y_end, t_end, code, steps, rejected, states: bool) -> tuple:
-    """What the kernel wrote, as the fields of a `Solution`; NaN in the path where a member did not come."""
+    """The results of the kernel as the fields of a `Solution`; NaN in the path where a member did not come."""
     code, steps, rejected = (x.astype(int) for x in (code, steps, rejected))
     result = jnp.asarray(RESULT_OF_CODE)[jnp.minimum(code, _native.EVENT)]
     result = jnp.where(jnp.isfinite(y_end).all(axis=1), result, NOT_FINITE_RESULT)

@@ -45,7 +45,7 @@ def outputs(program: Program, count: int, first, numbers):
 
 
 def is_large(program: Program) -> bool:
-    """Whether NumPy evaluates it: one of many operations, on floats alone, that looks up no tables."""
+    """True if NumPy evaluates it: one of many operations, on floats alone, that looks up no tables."""
     floats = all(dtype.kind == "f" for dtype in program.dtypes)
     return floats and program.operations > LARGEST_COMPILED and not program.looks_up
 
@@ -67,12 +67,12 @@ class Line:
 
     @property
     def outputs(self) -> int:
-        """How many numbers it gives."""
+        """The number of its outputs."""
         return len(self.line.outputs)
 
     @functools.cached_property
     def steps(self) -> Callable:
-        """What NumPy does one after the other, for a precision; it takes longer to write down than to do."""
+        """The calls of NumPy, one after the other, for a precision; they take longer to write down than to do."""
         return functools.cache(functools.partial(steps_of, self.line))
 
     @functools.cached_property

@@ -171,7 +171,7 @@ def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
 
 
 def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
-    """What the tangent flow runs from, for a direction of length one; and the length."""
+    """The start of the tangent flow, for a direction of length one; and the length."""
     length = jnp.max(jnp.abs(dy0), axis=-1, keepdims=True)
     if flow.numbers:
         length = jnp.maximum(*jnp.broadcast_arrays(length, jnp.max(jnp.abs(dparams), axis=-1, keepdims=True)))
@@ -182,7 +182,7 @@ def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
 
 
 def _residuals(solution: Solution):
-    """What `jvp` and `vjp` are told of a run: how it came out. Their values do not vary with that."""
+    """The outcome of a run that `jvp` and `vjp` take; their values do not vary with it."""
     given = solution.path, solution.result, solution.accepted, solution.ticket
     return tuple(jax.lax.stop_gradient(x) for x in given)
 
@@ -263,7 +263,7 @@ def _derivative_of_vjp(primals, tangents, **settings):
 
 
 def _vjp_moved(primals, tangents, outs, settings):
-    """How `vjp` changes with ts, y0 and params: each of its m cotangents for itself."""
+    """The change of `vjp` with ts, y0 and params, for each of its m cotangents."""
     dts, dy0, dparams = tangents
     (ts, y0, params), cts, total = primals[:3], primals[_GIVEN:], None
     dy0, dparams = _value(dy0), _value(dparams)
@@ -277,7 +277,7 @@ def _vjp_moved(primals, tangents, outs, settings):
 
 
 def _vjp_moved_in_time(primals, dts, outs, settings):
-    """How `vjp` changes with the output times, but for the curvature along the start's −f₀ δt₀.
+    """The change of `vjp` with the output times, but for the curvature along the start's −f₀ δt₀.
 
     Output i moves by f δtᵢ, so that its derivative by (y0, params) gains the part (∂f/∂y Dᵢ + ∂f/∂p) δtᵢ; and the start
     from which the others follow has the derivative −∂f₀ δt₀.

@@ -96,7 +96,7 @@ class Adjoint:
         self.motion.finish()
 
     def _back_at_end(self, borders: "Borders", levels: tuple[int, ...], jump) -> list[Code]:
-        """What is done back at the end of a step: over the border that it met, and over a knot of samples."""
+        """Go back over the end of a step: over the border that it met, and over a knot of samples."""
         clocks = Clocks(self.motion, borders)
         at_knot = [self._back_knot(clocks, levels)] if clocks.exist else []
         if jump is None:
@@ -255,7 +255,7 @@ class Adjoint:
         return frame.finish()
 
     def _measured(self) -> Code:
-        """How large the last terms of the series of a tangent may be, from the transpose of the last order."""
+        """The bound of the last terms of the series of a tangent, from the transpose of the last order."""
         frame = self.motion.function("measured")
         code, form, n, order = frame.code, self.motion.form, self.n, frame.job("order")
         h, p = code.intrinsic("fabs", frame["h"]), code.as_double(frame.job("order"))

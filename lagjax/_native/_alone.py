@@ -21,7 +21,7 @@ from lagjax._program._series import Series
 
 
 def fills_lanes(series: Series) -> bool:
-    """Whether a motion has enough alike operations for the lanes of one member."""
+    """True if a motion has enough alike operations for the lanes of one member."""
     return fills(series.order_recursion, lanes())
 
 
@@ -55,7 +55,7 @@ class MotionAlone(Motion):
 
     @functools.cached_property
     def _value_ranks(self) -> np.ndarray:
-        """Where every value of the zeroth order lies among them."""
+        """The place of every value of the zeroth order among them."""
         inputs = [self.layout.place(*at) for at in self._now()]
         return self.form.ranks(self.series.zeroth_order, inputs, self.series.values)
 
@@ -64,7 +64,7 @@ class MotionAlone(Motion):
 
     @functools.cached_property
     def _row_ranks(self) -> np.ndarray:
-        """Where every row lies among them: as if the sums lay in the order of their products, somewhere else."""
+        """The place of every row among them: as if the sums lay in the order of their products, somewhere else."""
         sums = self.layout.end + np.arange(len(self.series.cauchy_products))
         return self.form.ranks(self.series.order_recursion, self._order_inputs(sums), self.series.rows, keep=False)
 
@@ -95,12 +95,12 @@ class MotionAlone(Motion):
 
     @property
     def places_of_sums(self) -> int:
-        """How many sums of one order have a place."""
+        """The number of sums of one order that have a place."""
         last = max((run.results[0] + -(-run.count // lanes()) * lanes() for run in self._products[0]), default=0)
         return max(0, last - self.layout.place("sums", 0))
 
     def sum_indices(self, i: Index, k: Index) -> tuple[Index, ...]:
-        """Where in `sums` the sum with this number is, in the order of their places."""
+        """The place in `sums` of the sum with this number, in the order of their places."""
         return (i,)
 
     def _sums_function(self) -> Code:
@@ -171,7 +171,7 @@ class MotionAlone(Motion):
         return Vectors(len(ranks), column.read, column.write, lambda i: first + ranks[i], column.shift)
 
     def followed_value(self, frame: Frame, j: Value) -> Value:
-        """What the program gives for number j of those that are followed."""
+        """The value of number j of those that are followed."""
         first = self.layout.place("values", 0)
         return self._followed(frame, first + self._value_ranks, j)
 

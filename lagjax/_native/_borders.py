@@ -86,7 +86,7 @@ class Borders:
 
     @staticmethod
     def fields(borders: _borders.Borders, levels: tuple[int, ...]) -> dict:
-        """What a thread remembers for it.
+        """The fields of a thread's memory.
 
         `touching` is 1 for a guard that is zero where the step begins, 2 where its rate is, too, 3 with the next one,
         and 4 where it stays so; `stays` for a piece that is not decided anew; `crossed` is the number of the guard that
@@ -248,7 +248,7 @@ class Borders:
         return self.motion.look_up.take(frame, located.table, index), inside
 
     def _until_next_knot(self, frame: Frame, j: int) -> tuple[Value, Value]:
-        """How long it is to the next entry of the table that the time is on, and whether there is one."""
+        """The time to the next entry of the table that the time is on, and the lanes where there is one."""
         code, forward = frame.code, frame["forward"]
         index = self._piece(frame, integer(code, j)) + code.flag(forward > 0.0)
         knot, inside = self._knot(frame, j, index)
@@ -281,7 +281,7 @@ class Borders:
             frame["crossed"] = self.clocks.coincide
 
     def _instant(self, frame: Frame) -> Value:
-        """What two times may differ by that are the same."""
+        """The largest difference of two times that count as the same."""
         return frame.code.maximum(frame.code.intrinsic("fabs", frame["t"]), frame["smallest"]) * (4.0 * EPS)
 
     def _note_levels(self, frame: Frame) -> None:
@@ -350,7 +350,7 @@ class Borders:
             self._find_feature(frame, j, feature, degree, h)
 
     def _moves(self, frame: Frame, j: Value, degree: Value, h: Value) -> tuple[Value, Value]:
-        """How far a number may move along the step, Σ |cₖ| for k > 0, and the last of these terms."""
+        """The largest change of a number along the step, Σ |cₖ| for k > 0, and the last of these terms."""
         code, row = frame.code, j + (self.motion.series.rows - self.motion.series.followed)
         size, sum = code.intrinsic("fabs", h), frame.constant(0.0)
         for i in range(3):
@@ -437,7 +437,7 @@ class Borders:
         return code.select(root < 1.0, root * part, code.select(part < 1.0, part, 2.0))
 
     def _divide(self, frame: Frame, g: Value, degree: Value) -> None:
-        """Where guard g is zero at the beginning, divide its polynomial by as many powers as vanish."""
+        """Divide the polynomial of guard g, where it begins at zero, by as many powers as vanish."""
         code = frame.code
         touching = frame["touching", g]
         divided = touching > 0.0
@@ -582,7 +582,7 @@ class Borders:
                 frame["stays", j] = 1
 
     def _leave(self, frame: Frame, g: Value, hit: Value, again: Value) -> None:
-        """Where the share of a sliding motion comes to 0 or 1, it goes on along one side.
+        """Let a sliding motion whose share comes to 0 or 1 go on along one side.
 
         The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all.
         """

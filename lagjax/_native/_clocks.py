@@ -34,15 +34,15 @@ class Clocks:
 
     @property
     def exist(self) -> bool:
-        """Whether there are any."""
+        """True if there are any."""
         return bool(self.tables)
 
     def fields(self) -> dict:
-        """What a thread remembers from the end of one step to the beginning of the next: a⁻, which, and which entry."""
+        """The fields that a thread keeps from one step to the next: a⁻, the table, and its entry."""
         return {"before_knot": self.motion.n, "knot_of": 1, "knot": 1} if self.exist else {}
 
     def is_crossed(self, frame: Frame) -> Value:
-        """Whether a step ends at an entry of one of them, or of two tables."""
+        """True if a step ends at an entry of one of them, or of two tables."""
         crossed = frame.code.intrinsic("floor", frame["crossed"])
         found = frame.code.compare("==", crossed, self.coincide)
         for c, _, _ in self.tables:
@@ -120,7 +120,7 @@ class Clocks:
         return frame.finish()
 
     def moves(self, frame: Frame, levels: tuple[int, ...]) -> Value | None:
-        """Whether the tangents of a motion with tangents jump at the end of a step: it has no derivatives there."""
+        """True if the tangents of a motion with tangents jump at the end of a step: it has no derivatives there."""
         code, found, base = frame.code, None, levels[0]
         own = self.motion.of_member * base // self.motion.n
         for row in range(1, self.motion.n // base):

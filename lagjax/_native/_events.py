@@ -1,4 +1,4 @@
-"""Where a motion meets a surface: the changes of sign of its guards along a step, on their own series.
+"""The surfaces that a motion meets: the changes of sign of its guards along a step, on their own series.
 
     begin_sides   which side of every surface a motion begins on
     look          for every guard the roots of its polynomial, one after the other (`_roots`), each to the last digit of
@@ -72,7 +72,7 @@ class Events:
 
     @staticmethod
     def fields(guards: int) -> dict:
-        """What a thread remembers for it.
+        """The fields of a thread's memory.
 
         For every guard its value, the side before the step and at its end, whether a motion begins on it, how it
         changes where the motion begins, where it changes on the way and how; how often it has been noted, when it was
@@ -238,7 +238,7 @@ class Events:
             self._look_closely(frame, order, g, degree, side)
 
     def _is_clear(self, frame: Frame, degree: Value) -> Value:
-        """Where the polynomial has no root, as seen from its coefficients alone; most often that is all."""
+        """The lanes whose polynomial has no root, as its coefficients alone tell; most often that is all."""
         code, zero = frame.code, frame.constant(0.0)
         falls, rises = code.variable(zero), code.variable(zero)
         with code.loop(degree + 1, start=1) as k:
@@ -282,7 +282,7 @@ class Events:
             frame["side", g] = code.load(ahead, frame.vector)
 
     def _is_long(self, last: Value, before: Value, size: Value) -> Value:
-        """Where the last terms of a polynomial are large, or do not fall: it may leave out as much as they are."""
+        """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are."""
         return (last > GUARD_TERMS * size) | ((last > FALL * before) & (last > SEEN * size))
 
     def _leave_surface(self, frame: Frame, g: Value, size: Value) -> None:
@@ -335,7 +335,7 @@ class Events:
             frame["seen"] = seen
 
     def _waits(self, frame: Frame, g: Value) -> Value:
-        """Whether what a guard does is for the next step to say: its own border is where this one ends."""
+        """True if what a guard does is for the next step to say: its own border is where this one ends."""
         code = frame.code
         if not self.can_jump:
             return frame.constant(0.0) > 1.0
@@ -443,5 +443,5 @@ class Events:
 
 
 def _now(frame: Frame, variable: Value) -> Value:
-    """What a variable holds."""
+    """The value of a variable."""
     return frame.code.load(variable, frame.vector)

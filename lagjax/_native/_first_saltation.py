@@ -39,12 +39,12 @@ class FirstSaltation:
 
     @property
     def slopes(self) -> int:
-        """How many numbers its gradient has, with those of tables."""
+        """The length of its gradient, with the numbers of tables."""
         return len(self.by) + 2 * len(self.tables)
 
     @staticmethod
     def fields(pieces: int, levels: tuple[int, ...]) -> dict:
-        """What a thread remembers for it: a⁻, which switching number is crossed, and at which entry of its table."""
+        """The fields of a thread's memory: a⁻, which switching number is crossed, and at which entry of its table."""
         return {"rate_before": levels[-1], "hit": pieces, "entry": pieces, "is_hit": 1}
 
     # ---- what both directions need ----
@@ -90,7 +90,7 @@ class FirstSaltation:
         return of
 
     def jumps(self, frame: Frame, jump: Callable) -> Value:
-        """Whether the acceleration of the motion itself jumps."""
+        """True if the acceleration of the motion itself jumps."""
         code, sum = frame.code, frame.code.variable(frame.constant(0.0))
         for i in self.motion.form.each(code, self.base):
             code.store(code.load(sum, frame.vector) + code.intrinsic("fabs", jump(i)), sum)
@@ -163,7 +163,7 @@ class FirstSaltation:
         return self.gradient_at(frame, moved, [frame["t"] + frame["h"]])
 
     def gain(self, frame: Frame, rate: Value) -> Value:
-        """What of ∂u the cotangents gain: `after` holds a⁺, `state_ct` the cotangent behind the border."""
+        """The multiple of ∂u that the cotangents gain: `after` holds a⁺, `state_ct` the cotangent behind the border."""
         motion, code = self.motion, frame.code
         jump, total = self.jump(frame, frame.vectors("after", motion.n)), code.variable(frame.constant(0.0))
         for i in motion.form.each(code, motion.n):
@@ -176,7 +176,7 @@ class FirstSaltation:
         return code.select(frame["is_hit"] > 0.0, gain, 0.0)
 
     def fields_along(self) -> dict:
-        """What a thread remembers from the end of one step to the beginning of the next, for tangents."""
+        """The fields that a thread keeps from one step to the next, for tangents."""
         return {"slopes": self.slopes, "rate": 1, "jump": self.motion.n, "jumps": 1}
 
     def note_end(self, table: GuardTable) -> Code:

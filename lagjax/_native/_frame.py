@@ -1,4 +1,4 @@
-"""What a function of a kernel sees: the memory of its thread by name, one lane of it, and the job of all threads.
+"""A function of a kernel and its surroundings: the memory of its thread by name, one lane of it, the job of all threads.
 
 A thread works on as many members as a vector has lanes. Its memory is an array of vectors, one element a lane; a
 `Layout` gives each of them a name. A `Frame` is a function of the kernel under construction, which reads and writes
@@ -55,7 +55,7 @@ def integers(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
 
 
 class Layout:
-    """Where the vectors of a thread lie: `fields` gives each name a number of vectors, or rows and columns of them.
+    """The places of the vectors of a thread: `fields` gives each name a number of vectors, or rows and columns of them.
 
     `width` is the lanes of a vector. A layout `beside` another one has vectors of another width in the same memory.
     """
@@ -74,7 +74,7 @@ class Layout:
 
     @property
     def end(self) -> int:
-        """Where the next field will begin, in doubles."""
+        """The place of the next field, in doubles."""
         return -(-self._doubles[0] // self.width) * self.width
 
     def extend(self, name: str, rows: int, columns: int = 1) -> None:
@@ -217,7 +217,7 @@ class Frame:
         return self.next("next_member")
 
     def next(self, name: str) -> Value:
-        """What a counter of all threads shows, which goes on by one."""
+        """The value of a counter that all threads share, which goes on by one."""
         counter = self.job(name)
         return Value(self.code, self.code.builder.atomic_rmw("add", counter.it, ir.Constant(INTEGER, 1), "monotonic"))
 

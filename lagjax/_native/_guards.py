@@ -27,7 +27,7 @@ class Guards(NamedTuple):
 
     @property
     def inputs(self) -> int:
-        """How many numbers of a member are sides."""
+        """The number of sides among the numbers of a member."""
         return len(self.directions) if self.remembers else 0
 
 

@@ -77,7 +77,7 @@ def unavailable(include: str) -> str | None:
 
 
 class Plan(ctypes.Structure):
-    """What a handler is told of a kernel: where its functions are, how large its memory is, and how to run it.
+    """The plan of a kernel for its handler: the addresses of its functions, the size of its memory, and how to run it.
 
     `memory` counts the doubles of a thread, `rounds` the rounds until the handler returns.
     """
@@ -90,7 +90,7 @@ class Plan(ctypes.Structure):
 
 
 class Rest(NamedTuple):
-    """What a handler leaves behind of a run, for whoever goes on with it: the memory of the thread and its integers.
+    """The state of a run that a handler left unfinished: the memory of the thread and its integers.
 
     As an array of doubles, `size` of them, it begins with the memory, after as many doubles as are left before the next
     boundary of a cache line. At the end stand integers of 64 bits: those of the lanes, how many doubles were left, the
@@ -104,7 +104,7 @@ class Rest(NamedTuple):
 
     @staticmethod
     def size(layout: Layout) -> int:
-        """How many doubles it takes."""
+        """Its size in doubles."""
         return layout.size + CACHE_LINE + _INTEGERS
 
     @classmethod
@@ -118,7 +118,7 @@ class Rest(NamedTuple):
 
     @staticmethod
     def more(array: np.ndarray) -> bool:
-        """Whether more is to be done, from what a handler wrote."""
+        """True if more is to be done, from what a handler wrote."""
         return bool(array[-1:].view(np.int64)[0])
 
     @staticmethod

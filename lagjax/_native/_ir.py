@@ -109,7 +109,7 @@ def _object(text: str, level: int) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """What an instruction yields; `it` is llvmlite's value, which has no annotations that hold."""
+    """The result of an instruction; `it` is llvmlite's value, which has no annotations that hold."""
 
     code: "Code"
     it: Any
@@ -403,6 +403,6 @@ class Code:
         return Value(self, self.builder.call(function, [x.it for x in xs]))
 
     def any_lane(self, bits: Value) -> Value:
-        """Whether the bit is set in any lane."""
+        """True if the bit is set in any lane."""
         each = (self.builder.extract_element(bits.it, ir.Constant(INTEGER, lane)) for lane in range(self.lanes))
         return functools.reduce(Value.__or__, [Value(self, bit) for bit in each])

@@ -53,7 +53,7 @@ _SLICES_OF_SWEEP, _LEAST_ROUNDS = 30, 16
 
 
 class Outcome(NamedTuple):
-    """What `Kernel` returns of N members, T output times and 2n states.
+    """The results of a run of N members, T output times and 2n states.
 
     - `path` (N, T, 2n): the states (q, q̇) at the output times, NaN where a member did not come.
     - `y_end` (N, 2n), `t_end` (N,): where each member ended; `code` (N,): how.
@@ -92,7 +92,7 @@ class Begun(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """What keeps a motion on its constraints: two programs of (q, q̇, t, parameters).
+    """The programs that keep a motion on its constraints: two of (q, q̇, t, parameters).
 
     `state` gives the projected state (q, q̇), 2n numbers. `velocity_scale` gives n numbers: an error of a velocity
     counts relative to its scale where that is larger than the velocity itself.
@@ -252,7 +252,7 @@ class Kernel:
         return _outcome(path, y_end, t_end, code, steps, rejected, idle, table)
 
     def _begun(self, ts, y0, params, plan: Plan) -> Begun:
-        """What few members come to in a slice of time, by one call of machine code."""
+        """Run few members for a slice of time, by one call of machine code."""
         members, times, states = len(y0), ts.shape[1], self.states
         block, ends = np.empty(members * (times * states + states + 4) + self.rest_size), [0]
         for size in (members * times * states, members * states, *[members] * 4, self.rest_size):
@@ -338,7 +338,7 @@ class Kernel:
         return _Compiled(tangent.motion, tangent.motion.layout, tangent.job, self._rounds, pointers=3)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
-        """What a handler needs to begin a run; for as long as this kernel lives."""
+        """The plan by which a handler begins a run; it lives as long as this kernel."""
         begin, run = self._forward.places
         size, rounds = self._forward.layout.size, self._forward.rounds
         return Plan(begin, run, size, self.states, self.numbers, order_for(rtol), max_steps, rounds, rtol, atol)
@@ -357,7 +357,7 @@ class Kernel:
     def sweep_plan(
         self, kind: str, members: int, times: int, directions: int, rtol: float, atol: float, max_steps: int
     ) -> SweepPlan:
-        """What a handler needs for derivatives of so many members; for as long as this kernel lives."""
+        """The plan of derivatives of this many members; it lives as long as this kernel."""
         motion = self.of_members(members)._forward
         sweep, _ = self._forward_along(members, directions) if kind == "jvp" else self._back_over(members)
         rounds, others = self.rounds_of_sweep, self.numbers if kind == "vjp" else directions * times * self.states
@@ -371,7 +371,7 @@ class Kernel:
 
     @property
     def _along_steps(self) -> tuple:
-        """What derivatives over steps that have been taken are made of: features do not matter to these."""
+        """The parts of derivatives over steps that have been taken: features do not matter to these."""
         if self.borders is not None and self.borders.switches:
             parts = self._parts
             if self._options[0] is not None:
@@ -444,7 +444,7 @@ class _Compiled:
 
 
 def _outcome(path, y_end, t_end, code, steps, rejected, idle: int, table=None) -> Outcome:
-    """What is in the arrays when all is done; NaN in the path where a member did not come."""
+    """The results in the arrays of a finished run; NaN in the path where a member did not come."""
     ended_badly = code != DONE
     if ended_badly.any() and path.shape[2] == y_end.shape[1]:  # a start that is infinite was not reached either
         reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)

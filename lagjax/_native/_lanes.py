@@ -72,7 +72,7 @@ class Lines:
         return [largest[group] for group in groups]
 
     def prepare(self, frame: Frame) -> None:
-        """What has to be done once for the memory of a thread."""
+        """Prepare the memory of a thread, once."""
 
     def finish(self) -> None:
         """After all programs of the kernel."""

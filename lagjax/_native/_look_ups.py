@@ -63,14 +63,14 @@ class LookUps:
         return found
 
     def increases(self, frame: Frame, table: Table, first: Value) -> Value:
-        """Whether the entries of a table of the member whose numbers begin at `first` increase."""
+        """True if the entries of a table of the member whose numbers begin at `first` increase."""
         code = frame.code
         begin = code.element(frame.job("params"), first + (table.first - BESIDE))
         constants = (code.as_value(n, INTEGER) for n in (table.stride, table.count))
         return code.call(self._increases, begin, *constants) > 0
 
     def places(self, frame: Frame, table: Table, x: Value) -> list[Value]:
-        """Where the entries with these numbers lie among the numbers of a member, lane by lane."""
+        """The places of entries with these numbers among the numbers of a member, lane by lane."""
         x = self._clipped(frame.code, table, x) * float(table.stride) + float(table.first - BESIDE)
         return self._whole(frame.code, x)
 
@@ -81,7 +81,7 @@ class LookUps:
         return code.select(x < last, x, last)
 
     def _base(self, frame: Frame, table: Table) -> tuple[Value, Value]:
-        """Where doubles are counted from, and the number of the first entry in every lane."""
+        """The address that doubles are counted from, and the number of the first entry in every lane."""
         code = frame.code
         if table.numbers is not None:
             if table.numbers not in self._begins:

@@ -25,7 +25,7 @@ _DIGEST = hashlib.sha256
 
 
 def folder() -> Path | None:
-    """Where objects are kept; None where they are not."""
+    """The folder of kept objects; None where none are kept."""
     chosen = os.environ.get("LAGJAX_CACHE", "")
     if chosen:
         return None if chosen.lower() in ("off", "0", "no", "false") else Path(chosen)
@@ -61,7 +61,7 @@ def kept(make: Callable[[], bytes], *made_from: str) -> bytes:
 
 
 def _read(file: Path) -> bytes | None:
-    """What was written to a file; None where there is none, or not what was written."""
+    """The bytes that were written to a file; None where there is none, or it is damaged."""
     try:
         content = file.read_bytes()
     except OSError:

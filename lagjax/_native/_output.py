@@ -1,4 +1,4 @@
-"""What a run writes down: the states at the output times, the steps for a transpose, and how each member ended."""
+"""The records of a run: the states at the output times, the steps for a transpose, and how each member ended."""
 
 from lagjax._native._constants import DONE
 from lagjax._native._frame import Frame, Index, Lane
@@ -18,7 +18,7 @@ class Output:
 
     @staticmethod
     def fields(n: int) -> dict:
-        """What a thread remembers for it: the state at an output time, whether a lane has one, and times.
+        """The fields of a thread's memory: the state at an output time, whether a lane has one, and times.
 
         `due` and `reached` are times in the direction of time: that of the next output, and the end of the step.
         """
@@ -27,7 +27,7 @@ class Output:
     # ---- states at output times ----
 
     def place(self, frame: Frame, member: Value, time_index: Index, i: Index) -> Value:
-        """Where in `path` component i of the state at an output time belongs."""
+        """The place in `path` of component i of the state at an output time."""
         return (member * frame.job("times") + time_index) * self.motion.states + i
 
     def await_next(self, frame: Frame, lane: Lane, index: Value) -> None:
@@ -105,7 +105,7 @@ class Output:
     # ---- the end of a member ----
 
     def write_end(self, frame: Frame, lane: Lane, states: bool) -> None:
-        """Where a member has ended, how, and after how many steps; as its last output too, if there are `states`."""
+        """Write the end of a member, its code and its steps; the end is its last output too, if there are `states`."""
         code, member = frame.code, lane["member"]
         frame.write("t_end", member, lane["t"])
         for name in ("code", "steps", "rejected"):

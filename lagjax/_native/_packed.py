@@ -122,7 +122,7 @@ class Packed(Tables):
         return plan, name, len(line.outputs) - stored
 
     def _places_of(self, line: StraightLine, inputs: list[int]) -> np.ndarray:
-        """Where the inputs and the numbers of a program lie."""
+        """The places of the inputs and the numbers of a program."""
         places = np.full(len(line.nodes), -1)
         for i, (op, _, attribute) in enumerate(line.nodes):
             if op == "input":

@@ -80,12 +80,12 @@ def staged(same: Same) -> tuple[list[Kind], list[Stage]]:
 
 
 def forget_stages() -> None:
-    """What has been kept of programs for their compilation is large, and of no use afterwards."""
+    """Forget what was kept of programs for their compilation: it is large, and of no use afterwards."""
     staged.cache_clear()
 
 
 def fills(line: StraightLine, width: int) -> bool:
-    """Whether most lanes of so many have something to do where alike operations of a program stand in them."""
+    """True if most lanes of so many have something to do where alike operations of a program stand in them."""
     _, program = staged(Same(line))
     counts = np.array([stage.results.shape[1] for stage in program])
     return bool(counts.sum() >= LEAST_FILLED * width * (-(-counts // width)).sum())
@@ -136,7 +136,7 @@ class _Room:
         self.end, self._free = first, []
 
     def take(self, size: int) -> int:
-        """Where so many places begin: the smallest stretch that is long enough."""
+        """The first of this many places: the smallest stretch that is long enough."""
         fitting = [k for k, (length, _) in enumerate(self._free) if length >= size]
         if not fitting:
             begin, self.end = self.end, self.end + size
@@ -225,7 +225,7 @@ def runs_of(kind: int, at: np.ndarray, results: np.ndarray) -> list[Run]:
 
 
 def _stretches(at: np.ndarray) -> list[tuple[int, int]]:
-    """Where runs begin and end.
+    """The first and the last place of each run.
 
     Long ones in which every operand lies side by side or is one number; of the rest those that end where more operands
     than usual jump, as at the end of a row of a matrix; and what is left between.

@@ -25,14 +25,14 @@ class Projector:
 
     @staticmethod
     def fields(n: int) -> dict:
-        """What a thread remembers for it: the projected state at the end of the step, and velocity scales.
+        """The fields of a thread's memory: the projected state at the end of the step, and velocity scales.
 
         Those of derivatives stay zero.
         """
         return {"projected": 2 * n, "velocity_scale": n}
 
     def scales(self, i: Index) -> bool:
-        """Whether coordinate i may have a velocity scale; where i is not known, it may."""
+        """True if coordinate i may have a velocity scale; where i is not known, it may."""
         return not isinstance(i, int) or i < self.base_size
 
     def projected(self, frame: Frame, values: Numbers, increments: Numbers, s: Value) -> tuple[Numbers, Value]:

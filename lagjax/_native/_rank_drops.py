@@ -14,7 +14,7 @@ from lagjax._native._tables import Tables
 
 
 def fields(n: int, guards: int) -> dict:
-    """What a thread remembers: the beginning of the last long step, its size, and the returns to it."""
+    """The fields of a thread's memory: the beginning of the last long step, its size, and the returns to it."""
     before = {"y_before": 2 * n, "low_before": 2 * n, "side_before": guards, "noted_before": guards}
     return before | dict.fromkeys(("t_before", "t_low_before", "steps_before", "h_before", "returns", "returned"), 1)
 

@@ -37,7 +37,7 @@ class Roots:
 
     @staticmethod
     def fields(columns: int) -> dict:
-        """What a thread remembers for it."""
+        """The fields of a thread's memory."""
         numbers = ("root", "is_root", "slope", "error", "begin", "unsure", "doubt", "instant", "part")
         return {"poly": columns, **dict.fromkeys((*numbers, "falls", "rises", "down", "up"), 1)}
 
@@ -99,7 +99,7 @@ class Roots:
         return frame.finish()
 
     def sum_up(self, frame: Frame, degree: Value) -> None:
-        """How far P falls and rises, at most, and how much it bends down and up: for `next_root`."""
+        """The largest falls and rises of P, and its largest bends down and up: for `next_root`."""
         code, zero = frame.code, frame.constant(0.0)
         sums = {name: code.variable(zero) for name in ("falls", "rises", "down", "up")}
 
@@ -192,7 +192,7 @@ class Roots:
                 frame[name] = number
 
     def _hop(self, frame: Frame, error: Value, bend: Value) -> Value:
-        """How far P does not come from zero to beyond what is known of it, and back."""
+        """The distance on which P, from zero, cannot exceed its error by its bend alone."""
         code = frame.code
         return code.maximum(code.intrinsic("sqrt", 2.0 * error / bend), frame["instant"])
 

@@ -1,4 +1,4 @@
-"""What derivatives do at a border: the jump of tangents, and of cotangents, to every order (`_program._saltation`).
+"""Derivatives at a border: the jump of tangents, and of cotangents, to every order (`_program._saltation`).
 
 The border is crossed at another time when the motion is varied; up to then the acceleration is a⁻, and from then on a⁺.
 First tangents of a velocity jump by (a⁻ − a⁺) δt where the acceleration jumps, tangents of tangents also where only its
@@ -68,7 +68,7 @@ class GuardTable:
 
 
 def jump_over(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
-    """What becomes of tangents at a border; None without borders, without tangents, and where tables are looked up.
+    """The jump of tangents at a border; None without borders, without tangents, and where tables are looked up.
 
     `levels` holds the coordinates of the motion, then with its tangents, then with tangents of these, and so on; the
     last tangents may be those of a derivative over steps that have been taken.
@@ -97,7 +97,7 @@ class Saltation:
 
     @staticmethod
     def fields(pieces: int) -> dict:
-        """What a thread remembers for it: the pieces before the border, and which switching number is zero there.
+        """The fields of a thread's memory: the pieces before the border, and which switching number is zero there.
 
         `is_hit` is 1 where one is, `grazes` where its rate is zero to the tolerance.
         """
@@ -169,7 +169,7 @@ class Saltation:
     # ---- over steps that have been taken ----
 
     def fields_along(self) -> dict:
-        """What a thread remembers from the end of one step to the beginning of the next: the state at the border."""
+        """The fields that a thread keeps from one step to the next: the state at the border."""
         return {"edge": self.motion.states, "edge_t": 1}
 
     def note_edge(self, frame: Frame) -> None:

@@ -21,7 +21,7 @@ _JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))
 
 
 class Kind(NamedTuple):
-    """What an operation does: its name and attribute, and the kinds ("float", "bool", …) of operands and result.
+    """The kind of an operation: its name and attribute, and the kinds ("float", "bool", …) of operands and result.
 
     `parts` has an entry for each operand: the operation that it is the result of, if that belongs to this one, or None.
     """
@@ -34,12 +34,12 @@ class Kind(NamedTuple):
 
     @property
     def operands(self) -> int:
-        """How many numbers it reads."""
+        """The number of its operands."""
         return sum(1 if part is None else part.operands for part in self.parts)
 
     @property
     def results(self) -> int:
-        """How many numbers it makes."""
+        """The number of its results."""
         return 2 if self.op == "sincos" else 1
 
 
@@ -112,7 +112,7 @@ def _joined_of(same: Same) -> tuple["_Kinds", list[Operation]]:
 
 
 def forget_joined() -> None:
-    """What has been kept of programs for their compilation is large, and of no use afterwards."""
+    """Forget what was kept of programs for their compilation: it is large, and of no use afterwards."""
     _joined_of.cache_clear()
 
 

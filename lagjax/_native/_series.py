@@ -105,7 +105,7 @@ class Motion:
         self.look_up.finish()
 
     def place_of_number(self, code: Code, i: Index) -> Index:
-        """Where parameter i lies among the numbers of a member."""
+        """The place of parameter i among the numbers of a member."""
         if self._chosen is None:
             return i
         return code.load(code.element(Value(code, self._chosen), i, INTEGER), INTEGER)
@@ -114,11 +114,11 @@ class Motion:
 
     @property
     def places_of_sums(self) -> int:
-        """How many sums of one order have a place."""
+        """The number of sums of one order that have a place."""
         return len(self.series.cauchy_products)
 
     def sum_indices(self, i: Index, k: Index) -> tuple[Index, Index]:
-        """Where in `sums` product i is at order k."""
+        """The place of product i at order k in `sums`."""
         return (k if self.keep_sums else 0), i
 
     def _sums_function(self) -> Code:
@@ -178,7 +178,7 @@ class Motion:
         return frame.finish()
 
     def values(self, frame: Frame) -> Vectors:
-        """What the order recursion reads of the zeroth order."""
+        """The values of the zeroth order that the recursion of orders reads."""
         return frame.vectors("values", self.series.values)
 
     def sums(self, frame: Frame) -> Vectors:
@@ -190,7 +190,7 @@ class Motion:
         return frame.vectors_at("rows", self.series.rows, k)
 
     def followed_value(self, frame: Frame, j: Value) -> Value:
-        """What the program gives for number j of those that are followed."""
+        """The value of number j of those that are followed."""
         return frame["values", j + (self.series.values - self.series.followed)]
 
     def followed_coefficient(self, frame: Frame, j: Value, k: Index) -> Value:
@@ -285,7 +285,7 @@ class Motion:
 
 
 def is_large(program: Recurrent, projection=None, guards=None, times: int = 1, more: Sequence = ()) -> bool:
-    """Whether a kernel that has the operations of these programs so many times, and of `more` lines, is in tables."""
+    """True if a kernel that has the operations of these programs so many times, and of `more` lines, is in tables."""
     lines = [program.line]
     if projection is not None:
         lines += [projection.state.line, projection.velocity_scale.line]

@@ -59,7 +59,7 @@ class StepControl:
 
     @staticmethod
     def fields(n: int) -> dict:
-        """What a thread remembers for it; `active`, `last` and `singular` are 1 or 0."""
+        """The fields of a thread's memory; `active`, `last` and `singular` are 1 or 0."""
         return {
             "low": 2 * n,  # what rounding took from the state
             "scale": 2 * n,  # 1 / (floor + rtol·size)
@@ -141,7 +141,7 @@ class StepControl:
         return code.select(given > 0.0, given, floor)
 
     def _sizes(self, frame: Frame, half: int) -> Numbers:
-        """How large every coordinate, or every velocity (half 1), is over the step, or the largest one of its group."""
+        """The size over the step of every coordinate, or of every velocity (half 1); the largest one of a group."""
         code, first = frame.code, half * self.motion.n
         before = code.intrinsic("fabs", frame["h"])
 
@@ -182,7 +182,7 @@ class StepControl:
         return frame.finish()
 
     def _noise(self, frame: Frame, acceleration, increments, moved) -> Callable[[Index], Value]:
-        """What rounding may leave of component i of an acceleration at a place of the step."""
+        """The part of component i of an acceleration that rounding may leave at a place of the step."""
         code, n, form = frame.code, self.motion.n, self.motion.form
 
         def size_of(numbers):

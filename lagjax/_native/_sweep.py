@@ -28,7 +28,7 @@ _NUMBERS = ("states", "numbers", "order", "max_steps", "rounds", "room", "direct
 
 
 class SweepPlan(ctypes.Structure):
-    """What a handler is told: the functions of both kernels, doubles and integers of a thread of each, and how to run.
+    """The plan of a handler: the functions of both kernels, doubles and integers of a thread of each, and how to run.
 
     Steps of `room` are written down; `rounds` are those of the motion. `others` counts the doubles of a member in the
     second result.

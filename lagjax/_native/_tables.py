@@ -117,7 +117,7 @@ class Tables:
         return values
 
     def prepare(self, frame: Frame) -> None:
-        """What has to be done once for the memory of a thread: constants are numbers like all others."""
+        """Prepare the memory of a thread, once: constants are numbers like all others."""
         frame.call(self._prepare.code)
 
     def finish(self) -> None:
@@ -135,14 +135,14 @@ class Tables:
         return name
 
     def _constant(self, number: float) -> int:
-        """Where a constant lies."""
+        """The place of a constant."""
         key = struct.pack("d", number)  # 0.0 and -0.0 are equal but not the same
         if key not in self._constants:
             self._constants[key] = self._layout.place(self._field(1), 0)
         return self._constants[key]
 
     def _places(self, frame: Frame, inputs) -> list[int]:
-        """Where every input lies; those without a place of their own are given one."""
+        """The place of every input; those without one are given one."""
         places: list[int] = []
         for values in inputs:
             if getattr(values, "place", None) is None or values.shift is not None:

@@ -103,7 +103,7 @@ class Tangent:
         self.motion.finish()
 
     def _note_borders(self, borders: Borders, levels: tuple[int, ...], jump: Jump | None) -> None:
-        """What is done at the ends of steps, and where the next ones begin."""
+        """Build the functions that note a border at the end of a step, and jump over it."""
         if jump is not None:
             self.saltation = Saltation(self.motion, borders, levels[0], jump)
             self.motion.layout.extend_by(self.saltation.fields_along())
@@ -119,7 +119,7 @@ class Tangent:
             self.clocks, self.note_knot = clocks, clocks.note_end()
 
     def _fields(self) -> dict:
-        """What a thread remembers of the direction at hand, in every lane: the tangents of the motion's fields."""
+        """The fields of the direction at hand, in every lane: the tangents of the motion's fields."""
         series, states = self.series, self.states
         fields = {
             "dy": (states, MAX_ORDER + 1),
@@ -543,7 +543,7 @@ class Tangent:
         return frame.finish()
 
     def _await_output(self, frame: Frame, index: Value) -> None:
-        """Whether the next output of a lane lies in the step, and how far behind its beginning."""
+        """The lanes whose next output lies in the step, and its distance from the beginning."""
         code, lane, of_motion = frame.code, frame.lane(index), self.lane_of_motion(frame, index)
         member, output = of_motion["member"], code.as_integer(lane["next_output"])
         inside = (member >= 0) & (output < frame.job("times") - 1)

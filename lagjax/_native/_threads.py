@@ -76,7 +76,7 @@ def together(work: Callable[[Callable[[], bool]], int], count: int) -> int:
 
 
 def each_of(places: Sequence, work: Callable[[Any], Any], count: int) -> list:
-    """What `work(place)` returns for all places, which `count` threads take one after the other.
+    """The results of `work(place)` for all places, which `count` threads take one after the other.
 
     The first is done before the others begin: it compiles what all of them need.
     """

@@ -266,7 +266,7 @@ class Program:
 
     @functools.cached_property
     def looks_up(self) -> bool:
-        """Whether it reads tables (see `_look_ups`)."""
+        """True if it reads tables (see `_look_ups`)."""
         return any(op in LOOK_UPS for op, _, _ in self.nodes)
 
     def at(self, first, numbers) -> tuple:
@@ -284,7 +284,7 @@ class Program:
 
     @property
     def size(self) -> int:
-        """How many scalars it takes."""
+        """The number of its inputs."""
         return self._size
 
     @functools.cached_property
@@ -330,7 +330,7 @@ class Program:
         return functools.cache(functools.partial(steps_of, self.line))
 
     def round_off_many(self, columns) -> np.ndarray:
-        """How far rounding may move every output at S states, shape (outputs, S), to first order."""
+        """The rounding error of every output at S states, shape (outputs, S), to first order."""
         return round_off(self.line, columns)
 
     def vjp_many(self, columns, cotangents) -> list:
@@ -368,7 +368,7 @@ class Program:
 
     @functools.cached_property
     def operations(self) -> int:
-        """How many arithmetic operations one evaluation takes."""
+        """The number of arithmetic operations of one evaluation."""
         return sum(op not in ("input", "constant") for op, _, _ in self.nodes)
 
     def constant(self, output: int) -> float | None:

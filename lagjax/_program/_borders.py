@@ -1,4 +1,4 @@
-"""What a program decides on: its piecewise operations, each by a number whose series tells when the piece changes.
+"""The decisions of a program: its piecewise operations, each by a number whose series tells when the piece changes.
 
     comparisons, abs, max, min, sign    the sign of a switching number u: −1, 0 or 1
     floor, ceil, round, mod             the whole number below a switching number x
@@ -129,7 +129,7 @@ class Borders(NamedTuple):
 
     @property
     def levels_move(self) -> bool:
-        """Whether the levels of any piece are parameters."""
+        """True if the levels of any piece are parameters."""
         return any(self.moving_table(j) is not None for j in range(len(self.switches)))
 
     @property
@@ -234,7 +234,7 @@ class _Rewriting:
         return out
 
     def _base(self, i: int) -> int:
-        """What a node is a multiple of."""
+        """The node that this one is a multiple of."""
         nodes = self.program.line.nodes
         while True:
             op, operands, _ = nodes[i]
@@ -248,7 +248,7 @@ class _Rewriting:
                 return i
 
     def _decides(self, i: int) -> bool:
-        """Whether a node is a piecewise operation on floats."""
+        """True if a node is a piecewise operation on floats."""
         (op, operands, attribute), kinds = self.program.line.nodes[i], self.program.line.kinds
         if op == "convert":
             return kinds[operands[0]] == "float" and attribute not in ("float", "bool")
@@ -326,7 +326,7 @@ class _Rewriting:
         return self.graph.term(piece)[1]
 
     def _known_sign(self, a: int, b: int) -> int | None:
-        """What decides whether two numbers are equal, where that has a piece.
+        """The piece that decides whether two numbers are equal.
 
         Of x and max(x, y), say, which are equal where x is larger: 0 there, and else 1.
         """
@@ -362,7 +362,7 @@ class _Rewriting:
         return self._known[key]
 
     def _is_moving(self, x: int) -> bool:
-        """Whether a number changes along a piece of the motion."""
+        """True if a number changes along a piece of the motion."""
         nodes, moves = self.graph.nodes, self._moves
         for op, operands, attribute in nodes[len(moves) :]:
             if op == "input":
@@ -564,7 +564,7 @@ def _moduli(line: StraightLine) -> dict[int, tuple[int, int]]:
     nodes, found = line.nodes, {}
 
     def is_sign_apart(i: int, r: int, y: int) -> bool:
-        """Whether node i says that (r < 0) ≠ (y < 0)."""
+        """True if node i says that (r < 0) ≠ (y < 0)."""
         op, operands, _ = nodes[i]
         positive = nodes[y][2] > 0 if nodes[y][0] == "constant" else None
         if op == "lt":

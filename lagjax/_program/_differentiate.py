@@ -26,7 +26,7 @@ _OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "
 
 
 def has_own_rules(jaxpr) -> bool:
-    """Whether a jaxpr, or one that it calls, asks for other derivatives than those of its operations."""
+    """True if a jaxpr, or one that it calls, asks for other derivatives than those of its operations."""
     return any(
         determinant_of(equation) is None
         and (equation.primitive.name in _OWN_RULES or any(has_own_rules(inner) for inner in _inner(equation)))
@@ -50,7 +50,7 @@ class Derivatives:
         self.graph, self.operations = graph, 0
 
     def copied(self, tape: Graph, inputs: Sequence[int]) -> list[int]:
-        """What the scalars of a tape, or of another graph, are in the graph; `inputs` holds what its inputs are."""
+        """The scalars of a tape, or of another graph, in this graph; `inputs` are its inputs here."""
         nodes: list[int] = []
         for (op, operands, attribute), kind in zip(tape.nodes, tape.kinds, strict=True):
             nodes.append(self._copied(op, [nodes[x] for x in operands], attribute, kind, inputs))
@@ -101,7 +101,7 @@ class Derivatives:
         return [cotangents.get(i, self._number(0.0)) for i in by]
 
     def size(self, outputs: Sequence[int]) -> int:
-        """How many operations some nodes take together."""
+        """The number of operations of some nodes together."""
         return sum(bool(self.graph.nodes[i][1]) for i in self.graph.below(outputs))
 
     def _copied(self, op: str, operands: list[int], attribute, kind: str, inputs: Sequence[int]) -> int:

@@ -117,7 +117,7 @@ def _values(steps, columns) -> list:
 
 
 def round_off(line, columns: Sequence) -> np.ndarray:
-    """How far rounding may move every output, to first order, shape (outputs, S); the inputs count as exact.
+    """The rounding error of every output, to first order, shape (outputs, S); the inputs count as exact.
 
     Every operation adds one unit in the last place of its result to what its operands bring along: terms that cancel
     leave theirs behind. Source: Higham, *Accuracy and Stability of Numerical Algorithms*, §3.3 (running errors).

@@ -138,7 +138,7 @@ class Graph:
         return results
 
     def _plain_node(self, node: Node) -> int:
-        """What `node` gives for arithmetic of numbers that are `plain`, without a look at what is not there."""
+        """The result of `node` for arithmetic of numbers that are `plain`."""
         i = self._ids.setdefault(node, len(self.nodes))
         if i == len(self.nodes):
             self.nodes.append(node)

@@ -24,12 +24,12 @@ _WHOLE = ("locate", "floor", "ceil", "round")  # operations whose result is a wh
 
 
 def known(expansion: Any, ids: Ids) -> bool:
-    """Whether all of these scalars are numbers."""
+    """True if all of these scalars are numbers."""
     return all(expansion.graph.value(i) is not None for i in ids.ravel().tolist())
 
 
 def located(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None:
-    """How many of the increasing `knots` are at most x, less one, as integers; see `_look_ups.Located`.
+    """The number of the increasing `knots` that are at most x, less one, as integers; see `_look_ups.Located`.
 
     None where the knots are no table from its first entry to its last.
     """
@@ -127,7 +127,7 @@ def _operands(graph: Graph, ids: Ids) -> list[Ids] | None:
 
 
 def _place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) -> tuple[Ids, Ids]:
-    """Where windows begin, as floats: one index as it is, of several their place in the array; and which ones fit."""
+    """The beginnings of windows, as floats: one index as it is, of several their place in the array; and which fit."""
     f, number, place, inside = expansion.map, expansion.constants, None, None
     for k, (top, stride) in enumerate(zip(room, strides, strict=True)):
         index = [_as_float(expansion.graph, i) for i in indices[..., k].ravel().tolist()]

@@ -24,7 +24,7 @@ def machine_memory() -> int:
 
 
 def operations_that_fit(bytes_each: int) -> int:
-    """How many operations that take so many bytes fit into the `SHARE` of a scene."""
+    """The number of operations of this many bytes that fit into the `SHARE` of a scene."""
     return int(SHARE * machine_memory() / bytes_each)
 
 

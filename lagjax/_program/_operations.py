@@ -174,14 +174,14 @@ def _share(f, c, g, larger, smaller):
 
 
 def _power_by_base(f, c, g, w, u, v):
-    """Where the exponent is zero the power is constant, also at zero."""
+    """The cotangent of the base of a power: zero where the exponent is zero, at a base of zero too."""
     constant = f("eq", v, c(0.0))
     power = f("pow", u, _where(f, constant, c(1.0), f("sub", v, c(1.0))))
     return f("mul", g, _where(f, constant, c(0.0), f("mul", v, power)))
 
 
 def _power_by_exponent(f, c, g, w, u, v):
-    """Where the base is zero the power is constant."""
+    """The cotangent of the exponent of a power: zero where the base is zero."""
     return f("mul", g, f("mul", w, f("log", _where(f, f("eq", u, c(0.0)), c(1.0), u))))
 
 

@@ -56,7 +56,7 @@ def _rewritten(graph, outputs, uses, node_of: Callable, make: Callable) -> tuple
 
 
 def _factors(graph, uses, i) -> list[int]:
-    """What a product consists of, looking into products that have no other use, a few at most."""
+    """The factors of a product, looking into products that have no other use, a few at most."""
     factors, k = list(graph.nodes[i][1]), 0
     while k < len(factors):
         op, operands, _ = graph.nodes[factors[k]]
@@ -154,7 +154,7 @@ def replace_by_inputs(nodes, kinds, outputs, positions: dict[int, int]) -> Line:
 
 
 def count_uses(nodes: Sequence[Node], outputs: Sequence[int]) -> list[int]:
-    """How often each node is used, by a node that is needed or as an output."""
+    """The number of uses of each node, by nodes that are needed or as an output."""
     uses = [0] * len(nodes)
     for i in outputs:
         uses[i] += 1

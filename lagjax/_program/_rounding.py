@@ -1,4 +1,4 @@
-"""How far rounding may move numbers of a straight line, as nodes of a graph: running errors, to first order.
+"""The rounding errors of a straight line, as nodes of a graph: running errors, to first order.
 
 Every operation adds one unit in the last place of its result to what its operands bring along, so that terms that
 cancel leave theirs behind. `_evaluate.round_off` says the same of arrays. Source: Higham, *Accuracy and Stability of

@@ -1,4 +1,4 @@
-"""What a border does to derivatives of a motion, of any order, as a straight line.
+"""The jump of derivatives of a motion at a border, of any order, as a straight line.
 
 A motion that is varied crosses the border u = 0 a little later, by δ(y). Seen from the time at which the motion itself
 crosses it, the state jumps: along the field before the border to where u is zero, and the same time back along that
@@ -44,7 +44,7 @@ Jet = list  # of nodes of a graph, one a row: the number itself, then its deriva
 
 
 class Jump(NamedTuple):
-    """How the tangents of a motion over n coordinates jump: rows of them, as `line` takes and gives them.
+    """The jump of the tangents of a motion over n coordinates: rows of them, as `line` takes and gives them.
 
     `line` takes the lower rows of q, of q̇, t, the lower rows of the parameters, the m pieces before and behind the
     border, m numbers that choose the switching number Σ hⱼ uⱼ, then the upper rows of q, of q̇ and of the parameters:
@@ -89,7 +89,7 @@ class Jump(NamedTuple):
 
 
 def looks_up(program: Recurrent) -> bool:
-    """Whether a program reads tables, of which the jumps here know nothing."""
+    """True if a program reads tables, of which the jumps here know nothing."""
     return any(op in ("take", "locate") for op, *_ in program.line.nodes)
 
 
@@ -123,7 +123,7 @@ def with_levels(borders: Borders, size: int, directions: int) -> Borders:
 
 
 def _places(n: int, numbers: int, rows: int, row: int) -> list[int]:
-    """Where q, q̇, t and the numbers of a row are among the inputs of a motion with rows."""
+    """The places of q, q̇, t and the numbers of a row among the inputs of a motion with rows."""
     first = 2 * rows * n + 1
     return [
         *range(row * n, (row + 1) * n), *range((rows + row) * n, (rows + row + 1) * n), 2 * rows * n,
@@ -244,7 +244,7 @@ class _OverBorder:
         return [*place[self.n : 2 * self.n], *acceleration, one, *[none] * self.numbers]
 
     def _flow(self, place: list[Jet], pieces: Sequence[int], delay: Jet) -> list[Jet]:
-        """Where a state is after the `delay`, on these pieces."""
+        """The state after the `delay`, on these pieces."""
         rates: list[list[Jet]] = []
         for weights in self.stages:
             here = place

@@ -62,7 +62,7 @@ class LinearSystem(NamedTuple):
 
 
 class Recurrent(Protocol):
-    """What a Taylor series, and machine code, read of a program: `Program` without JAX.
+    """The part of a program that Taylor series and machine code read: `Program` without JAX.
 
     `dtypes` has the type of every input, `size` their number. Where the outputs are the solution of a linear system,
     `linear` is that (see `LinearSystem`). `budget` bounds the operations.

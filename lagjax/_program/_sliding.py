@@ -122,7 +122,7 @@ class _Unknowns:
         return [nodes[i] for i in line.outputs]
 
     def _effects(self, acts: Sequence[dict[int, int]], slopes: Sequence[list[int]]) -> list[list[int]]:
-        """What each piece does to the rate of each border, ∂u̇/∂p; zeros where nothing slides."""
+        """The slopes ∂u̇/∂p of the rate of each border by each piece; zeros where nothing slides."""
         size = len(self.linear.right)
         responses = [self._solved([act.get(i, self.zero) for i in range(size)])[: self.n] for act in acts]
         return [[dot(self.graph, d, response) for response in responses] for d in slopes]
@@ -154,7 +154,7 @@ class _Unknowns:
         return [f("sub", x, p) for x, p in zip(equations.solved(self.graph, there), self.pieces, strict=True)]
 
     def _are_dependent(self, slopes: Sequence[list[int]]) -> bool:
-        """Whether the rates of some borders are combinations of others, so that these can share what they hold."""
+        """True if the rates of some borders are combinations of others, so that these can share what they hold."""
         numbers = np.random.default_rng(0).uniform(0.5, 1.5, (len(slopes), self.n))
         for k, of_one in enumerate(slopes):
             for i, d in enumerate(of_one):
@@ -194,7 +194,7 @@ class _Unknowns:
         return acts
 
     def _of_sides(self) -> dict[int, dict[int, tuple[int, int]]] | None:
-        """What depends on pieces, and for each of them its values below and above, the others as they are."""
+        """The nodes that depend on pieces, and for each piece their values below and above, the others as they are."""
         graph, system = self.graph, self.linear
         pieces = {node: k for k, node in enumerate(self.pieces)}
         if not pieces.keys().isdisjoint(graph.below([*system.entries.values(), *system.factors])):
@@ -276,7 +276,7 @@ class _Unknowns:
 
 
 def _adds_up(op: str, operands: Sequence[int], sides: dict) -> bool:
-    """Whether what several pieces do to a result of this operation is the sum of what each of them does."""
+    """True if what several pieces do to a result of this operation is the sum of what each of them does."""
     moving = [x in sides for x in operands]
     if op in ("add", "sub", "neg", "convert"):
         return True

@@ -122,7 +122,7 @@ def _back(
 
 
 def zero_where_zero(graph: Graph, line: StraightLine, k: int, g: int, part: int) -> int:
-    """What node k passes on of `g`: 0 of 0, also where its slope is infinite, as that of u**0.5 at 0.
+    """The part of `g` that node k passes on: 0 of 0, also where its slope is infinite, as that of u**0.5 at 0.
 
     There a program has a number in the place of the slope (`_recurrences.finite`), so that g is 0.
     """
