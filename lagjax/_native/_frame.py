@@ -1,4 +1,4 @@
-"""A function of a kernel and its surroundings: the memory of its thread by name, one lane of it, the job of all threads.
+"""A function of a kernel, and what it reads: the memory of its thread by name, one lane of it, the job of all threads.
 
 A thread works on as many members as a vector has lanes. Its memory is an array of vectors, one element a lane; a
 `Layout` gives each of them a name. A `Frame` is a function of the kernel under construction, which reads and writes
