@@ -36,7 +36,7 @@ _INTERVALS = 8  # between numbers along a side of that length; twelve of six cha
 
 
 class Course(NamedTuple):
-    """Where one member is between K knots: times (K,), q (K, n), and q̇ (K, n) just before and after each.
+    """The places of one member between K knots: times (K,), q (K, n), and q̇ (K, n) just before and after each.
 
     NaN after a knot: the velocity there is not known.
     """

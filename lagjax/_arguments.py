@@ -1,4 +1,4 @@
-"""How a user's function is called: roles by position, extras by name.
+"""The call of a user's function: roles by position, extras by name.
 
 Every function a user hands to lagjax takes its main arguments by position, so that they may have any name, and asks
 for the time and the parameters by writing `t` and `params` in its signature, functions of a scene that is fitted to
@@ -159,7 +159,7 @@ def accept(
 
 
 def _meant(name: str, extras: tuple[str, ...]) -> bool:
-    """Whether a name may stand for one of the extras, whose default would then be a silent mistake."""
+    """True if a name may stand for one of the extras, whose default would then be a silent mistake."""
     known = [*extras, *(["time"] if "t" in extras else [])]
     return bool(difflib.get_close_matches(name.lower(), known, cutoff=0.7))
 

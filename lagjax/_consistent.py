@@ -1,4 +1,4 @@
-"""Whether the start of a motion satisfies its constraints, asked before any work is done.
+"""The test that the start of a motion satisfies its constraints, before any work is done.
 
 What a start is measured by, and how far off it may be, stands in `_constraints`. Here it is asked of the user's own
 arguments, and answered with a sentence. Values that are being traced, as under `jax.jit`, are not looked at.
@@ -55,7 +55,7 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
 
 
 class _Start(NamedTuple):
-    """What is asked of the state that a motion of n coordinates with m constraints starts from, in NumPy."""
+    """The conditions on the first state of a motion of n coordinates with m constraints, in NumPy."""
 
     values: np.ndarray  # f, and zero for constraints on velocities, (m,)
     rates: np.ndarray  # J q̇ + ∂f/∂t, then a, (m,)
@@ -110,7 +110,7 @@ def _contradiction(names, values, what, lengths, dependent, tolerance, size) -> 
 
 
 def _nothing_to_find(system, q0, qdot0, t, params) -> bool:
-    """Whether `project` finds no consistent q: constraints that ask for different steps may still meet somewhere."""
+    """True if `project` finds no consistent q: constraints that ask for different steps may still meet somewhere."""
     q, _ = eqx.filter_jit(system.project)(q0, qdot0, t, params)
     return not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(q))
 
@@ -173,12 +173,12 @@ def _compiled(system, layout: Layout, q, qdot, t, params: PyTree) -> dict[str, j
 
 
 def has_constraints(system) -> bool:
-    """Whether a motion of the scene can start off its constraints."""
+    """True if a motion of the scene can start off its constraints."""
     return system.constraints is not None or system.velocity_constraints is not None
 
 
 def _reads_time(system) -> bool:
-    """Whether a constraint asks for the time: it may prescribe a motion."""
+    """True if a constraint asks for the time: it may prescribe a motion."""
     functions = system.constraints, system.velocity_constraints
     return any("t" in function.extras for function in functions if function is not None)
 

@@ -42,7 +42,7 @@ class Constraints(eqx.Module):
 
     @property
     def exist(self) -> bool:
-        """Whether there are any constraints."""
+        """True if there are any constraints."""
         return self.on_positions is not None or self.on_velocities is not None
 
     def f(self, q: Vector, t: Time, params: PyTree) -> Float[Array, " k"]:
@@ -88,7 +88,7 @@ class Constraints(eqx.Module):
     def inconsistent(
         self, matrix: Float[Array, "n n"], q: Vector, qdot: Vector, t: Time, params: PyTree, span: Time
     ) -> Bool[Array, ""]:
-        """Whether no motion may start from a state: `TOLERANCE` off a constraint, or one of them has no gradient.
+        """True if no motion may start from a state: `TOLERANCE` off a constraint, or one of them has no gradient.
 
         Of a motion over this span of time, with the mass matrix M. A state that is not a number is inconsistent.
         """
@@ -137,7 +137,7 @@ def sizes(unit, q, qdot, span):
 
 
 def distances(residual, rates, jacobian, positions: int):
-    """How far positions and velocities are from each constraint, two arrays (..., m).
+    """The errors of positions and velocities in each constraint, two arrays (..., m).
 
     |fₖ|/|∂fₖ/∂q| has the units of a coordinate, which fₖ has not: it is, to first order, how far q has to move. The
     rates divided by the lengths of the same rows are, likewise, velocities. Constraints on velocities ask nothing of q.
@@ -174,7 +174,7 @@ def _largest_term(terms, weights):
 
 
 def rank_lost(schur_complement: Callable, start: tuple, end: tuple) -> Bool[Array, ""]:
-    """Whether fewer constraints are independent at `end` than at `start`, both (q, q̇, t, params).
+    """True if fewer constraints are independent at `end` than at `start`, both (q, q̇, t, params).
 
     Counted are the independent rows of S = `schur_complement`(state), with every row of G in units of its length at the
     start: a gradient that fades away on the way is lost as well.
@@ -302,7 +302,7 @@ def _until_at_rest(step: Callable, start: tuple[Vector, Row], at_rest: Callable)
 
 
 def _holds(residual: Row, jacobian: Float[Array, "m n"], unit: Vector, *states: Vector) -> Bool[Array, ""]:
-    """Whether constraints hold, in which case the steps did not just become small between some that contradict.
+    """True if constraints hold, in which case the steps did not just become small between some that contradict.
 
     A distance of √eps of the state is allowed: the last step of Newton's method was at the level of rounding, so that
     constraints which can hold do so far better, and those that contradict each other are off by far more. The second

@@ -27,7 +27,7 @@ _TOO_MANY = code_of(RESULTS.max_crossings_reached)
 
 
 class Crossings(NamedTuple):
-    """Where a section was crossed, in the order of the motion; NaN beyond the last crossing.
+    """The crossings of a section, in the order of the motion; NaN beyond the last crossing.
 
     - `t`, shape (count,): when; `q`, `qdot`: the state then, with that axis in front of every leaf.
     - `count`: how many crossings there were, which may be more than there is room for.
@@ -139,7 +139,7 @@ def _how_it_ended_traced(noted: Noted, solution: Solution, count: int) -> tuple:
 
 
 def _raise_unless_ok(problem: Problem, end: tuple, noted: Noted, result) -> Noted:
-    """What was noted, where all went well; else `SimulationError`, at run time where it is being traced."""
+    """The crossings, where all went well; else `SimulationError`, at run time where it is being traced."""
     names = problem.layout.names
     if not all(map(is_concrete, (result, *end, problem.ts))):
         t, y = raise_where_failed((noted.t, noted.y), result, end, problem.ts[-1], names)
@@ -150,7 +150,7 @@ def _raise_unless_ok(problem: Problem, end: tuple, noted: Noted, result) -> Note
 
 
 def _dressed(layout: Layout, names: tuple[str, ...] | None, noted: Noted, ok) -> Crossings | dict[str, Crossings]:
-    """What was noted in the pytree of the user, and by the names of the sections."""
+    """The crossings in the pytree of the user, and by the names of the sections."""
 
     def of_section(k: int) -> Crossings:
         q, qdot = map(layout.restore, halves(jnp.asarray(noted.y[k])))

@@ -93,7 +93,7 @@ def _lowered_once(make: Callable) -> property:
 
 
 class Derivation:
-    """What is derived from a scene: its programs, and the facts that can be read off them.
+    """The derivation of a scene: its programs, and the facts that can be read off them.
 
     Every program is lowered when it is first asked for. Each raises `Unlowerable`, with the end of a sentence, where
     the scene has none: it is too large, or takes operations that have no scalar form.
@@ -173,7 +173,7 @@ class Derivation:
         return self._shapes[name]
 
     def count(self, name: str) -> int:
-        """How many numbers one of `Motion.quantities` has."""
+        """The count of numbers in one of `Motion.quantities`."""
         return int(np.prod(self.shape(name), dtype=int))
 
     def evaluate(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
@@ -181,7 +181,7 @@ class Derivation:
         return self._by_name(names, self.program(*names).evaluate_many(columns))
 
     def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
-        """How far rounding may move these quantities at S states, each of shape (S, …)."""
+        """The rounding errors of these quantities at S states, each of shape (S, …)."""
         return self._by_name(names, self.program(*names).round_off_many(columns))
 
     def _by_name(self, names: Sequence[str], outputs: np.ndarray) -> dict[str, np.ndarray]:
@@ -275,7 +275,7 @@ class Derivation:
 
     @_lowered_once
     def projection(self) -> Projection | None:
-        """What machine code needs to keep a motion on its constraints; None without any."""
+        """The programs by which machine code keeps a motion on its constraints; None without any."""
         return None if self.projected is None else Projection(self.projected, self.velocity_scales)
 
     # ---- facts ----
@@ -296,7 +296,7 @@ class Derivation:
 
     @_lowered_once
     def works(self) -> bool:
-        """Whether anything does work: an explicit time, a force, a constraint that drives the motion."""
+        """True if anything does work: an explicit time, a force, a constraint that drives the motion."""
         return not all(self.absent(name).all() for name in ("lagrangian_by_t", "nonconservative_force", "driving"))
 
     @_lowered_once
@@ -307,7 +307,7 @@ class Derivation:
 
     @_lowered_once
     def borders(self) -> Borders | None:
-        """What the accelerations decide on along a motion, and their narrow features; None where there are none."""
+        """The decisions of the accelerations along a motion, and their narrow features; None where there are none."""
         return borders(self.acceleration, self.layout.size)
 
     @property
@@ -404,7 +404,7 @@ class Derivation:
         return program if self._agrees(program) else None
 
     def _agrees(self, program: Program) -> bool:
-        """Whether a program for q̈ gives that of M q̈ = F at the sampled states."""
+        """True if a program for q̈ gives that of M q̈ = F at the sampled states."""
         columns = self._columns()
         of = self.evaluate(["mass_matrix", "force"], columns)
         exact = solve_many(of["mass_matrix"], of["force"][:, :, None])[:, :, 0]
@@ -439,12 +439,12 @@ class Derivation:
         return parts
 
     def _rows(self, saddle: _Saddle) -> int:
-        """How many constraints belong to this system; those on positions come first."""
+        """The number of constraints of this system; those on positions come first."""
         return self.shape("jacobian")[0] if saddle.velocities else self.position_count
 
     @functools.cached_property
     def position_count(self) -> int:
-        """How many of the constraints are on positions; they come first."""
+        """The number of constraints on positions, which come first."""
         q, _, t, numbers = self.state_shapes
         return jax.eval_shape(self._traced_once.constraints.f, q, t, numbers).size
 
@@ -468,7 +468,7 @@ class Derivation:
         return [reach * x for x in columns[:n]] + list(columns[n:])
 
     def _regular(self, saddle: _Saddle) -> bool | None:
-        """Whether M is regular in general: at all of the sampled states; None where it need not be positive definite.
+        """True if M is regular in general: at all of the sampled states; None where it need not be positive definite.
 
         Elimination without pivoting is for positive definite M. With constraints M may be singular, and is then
         augmented by GᵀG. The choice is between right answers: a wrong guess is caught by the test on the pivots. A mass
@@ -481,7 +481,7 @@ class Derivation:
         return None
 
     def _definite(self, saddle: _Saddle, samples: list[tuple[np.ndarray, np.ndarray]]) -> bool | None:
-        """Whether M is regular at these samples; None where what is eliminated is not positive definite."""
+        """True if M is regular at these samples; None where what is eliminated is not positive definite."""
         n, m, regular = self.layout.size, self._rows(saddle), True
         for matrix, jacobian in samples:
             lowest, size, rows = _lowest_eigenvalue(matrix), np.abs(matrix).max(), jacobian[:m]
@@ -511,7 +511,7 @@ def numbers_of(params: PyTree) -> list:
 
 
 class _Number(NamedTuple):
-    """What decides about a number, or an array of them, among the parameters."""
+    """The key of a number, or of an array of them, among the parameters."""
 
     shape: tuple[int, ...]
     dtype: np.dtype

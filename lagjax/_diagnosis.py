@@ -1,4 +1,4 @@
-"""What a failed motion ran into, in words: `diagnosis`, from the state where it ended and the one where it began.
+"""The obstacle of a failed motion, in words: `diagnosis`, from the state where it ended and the one where it began.
 
 `_stopped` gives a failure its code, from numbers alone and for every member of a batch. Here the author of the scene is
 told about one motion: which force is not finite and from when on, the operation and the line of code that it comes
@@ -53,7 +53,7 @@ _OVERSTEPPED = (
 
 
 class Ended(NamedTuple):
-    """Where one motion began and ended, in NumPy: `y` (2n,) at `t`, of `t_first` … `t_last`; `numbers` in params."""
+    """Beginning and end of one motion, in NumPy: `y` (2n,) at `t`, of `t_first` … `t_last`; `numbers` in params."""
 
     code: int
     t: float
@@ -67,7 +67,7 @@ class Ended(NamedTuple):
 
 
 class Undefined(NamedTuple):
-    """What is not finite, at a state (2n,) and a time, at the end of a motion or just `ahead` of it."""
+    """The quantities that are not finite, at a state (2n,) and a time, at the end of a motion or just `ahead` of it."""
 
     what: str  # "the force on"
     role: str  # of the function of the scene that it comes from
@@ -80,7 +80,7 @@ class Undefined(NamedTuple):
 
 
 def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
-    """What is known about a failure, as sentences on a line of their own that begins with a line break; or nothing."""
+    """The facts about a failure, as sentences on a line of their own that begins with a line break; or nothing."""
     try:
         return _diagnosed(system, layout, params, ended) if ended.code in _CODES else ""
     except Exception as error:  # the message of the failure itself must come out
@@ -218,7 +218,7 @@ def _function(derivation: Derivation, role: str) -> Callable | None:
 
 
 def _is_short(function: Callable, arguments: tuple) -> bool:
-    """Whether a function has few enough equations to be gone through one by one."""
+    """True if a function has few enough equations to be gone through one by one."""
     return _equations(jax.make_jaxpr(function)(*arguments).jaxpr) <= LONGEST
 
 
@@ -282,7 +282,7 @@ def _running_away(derivation: Derivation, ended: Ended) -> int | None:
 
 
 def _escape(derivation: Derivation, ended: Ended, place: int, pole: Offender | None) -> str:
-    """What a coordinate that runs away runs to; `pole` is the operation that is near one, where that is known."""
+    """The place that a coordinate runs away to; `pole` is the operation that is near one, where that is known."""
     name, (q, v), (q_first, v_first) = derivation.layout.names[place], halves(ended.y), halves(ended.y_first)
     grown = f"its velocity was {v_first[place]:.3g} at the start and is {v[place]:.3g} where {name} = {q[place]:.3g}"
     if pole is not None:
@@ -348,7 +348,7 @@ def _borders(derivation: Derivation, params, ended: Ended) -> str:
 
 
 def _budget(ended: Ended) -> str:
-    """How far the steps have led, where their budget was spent."""
+    """The time that was reached when the budget of steps was spent."""
     reached, whole = abs(ended.t - ended.t_first), abs(ended.t_last - ended.t_first)
     if _CODES[ended.code] != "max_steps_reached" or not reached > 0:
         return ""
@@ -385,7 +385,7 @@ def _acceleration(derivation: Derivation, y: np.ndarray, t: float, numbers) -> n
 
 
 def ended_of(trajectory, layout: Layout, member: tuple[int, ...] = (), numbers: np.ndarray | None = None) -> Ended:
-    """Where a trajectory, or one member of a batch of them, began and ended; `numbers` (P,) are its parameters."""
+    """The beginning and the end of a trajectory, or of one member of a batch; `numbers` (P,) are its parameters."""
 
     def of_member(tree, *index):
         leaves = [numbers_at(leaf, (*member, *index)) for leaf in jax.tree.leaves(tree)]

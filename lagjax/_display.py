@@ -35,7 +35,7 @@ def summary(trajectory) -> str:
 
 
 def as_printed(result, printer, cycle: bool) -> None:
-    """What IPython shows of a result whose `str` is meant for reading: that, and not its fields.
+    """Let IPython show the `str` of a result, which is meant for reading, and not its fields.
 
     A class takes it as its `_repr_pretty_`. Where `str` has no values to show, inside `jax.jit`, it is the fields.
     """
@@ -114,7 +114,7 @@ def _verdict(trajectory) -> str:
 
 
 def is_known(x: Any) -> bool:
-    """Whether the values of an array can be read here: it is neither traced, nor a shape alone, nor deleted."""
+    """True if the values of an array can be read here: it is neither traced, nor a shape alone, nor deleted."""
     if isinstance(x, Tracer):
         return False
     if isinstance(x, jax.Array):

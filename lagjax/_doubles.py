@@ -98,7 +98,7 @@ def with_doubles(function: Callable) -> Callable:
 
 
 def _are_single(numbers: PyTree) -> bool:
-    """Whether JAX would compute with these numbers in float32. What is wrong with them is for others to say."""
+    """True if JAX would compute with these numbers in float32. What is wrong with them is for others to say."""
     kinds = set()
     for leaf in jax.tree.leaves(numbers):
         with contextlib.suppress(TypeError, ValueError):
@@ -107,7 +107,7 @@ def _are_single(numbers: PyTree) -> bool:
 
 
 def has_doubles() -> bool:
-    """Whether JAX has float64 at present."""
+    """True if JAX has float64 at present."""
     return jax.dtypes.canonicalize_dtype(DOUBLE) == DOUBLE
 
 

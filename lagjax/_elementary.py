@@ -49,7 +49,7 @@ ANGLE_LIMIT = 2.0**53
 
 
 def _is_fast(x) -> bool:
-    """Whether x is a strongly typed float64, and the platform a CPU."""
+    """True if x is a strongly typed float64, and the platform a CPU."""
     weak = getattr(x, "weak_type", type(x) in (bool, int, float, complex))
     return not weak and jnp.result_type(x) == jnp.float64 and default_platform() == "cpu"
 

@@ -1,4 +1,4 @@
-"""What a scene contains, and what was left out of its equations: facts read off the scalar programs.
+"""The contents of a scene, and what was left out of its equations: facts read off the scalar programs.
 
 Nothing here looks at numbers: a coordinate is cyclic when no operation of the reduced Lagrangian reads it, the energy
 is conserved when none reads the time, no force is given, and the constraints do no work: f does not read the time, and
@@ -142,7 +142,7 @@ def explain(problem: Problem) -> Explanation:
 
 
 def _engine(problem: Problem) -> dict[str, Any]:
-    """What integrates a motion by default, in what form the equations are evaluated there, and what that costs."""
+    """The default solver of a motion, the form in which it evaluates the equations, and the cost of that."""
     derivation, refusal = problem.derivation, choose(problem).refusal
     if refusal is None:
         solver, reason = "Taylor series in machine code", ""
@@ -192,7 +192,7 @@ def _borders_in_lines(problem: Problem) -> dict[str, Any]:
 
 
 def _counted(names: tuple[str, ...]) -> str:
-    """How many there are, and each once."""
+    """The count of names, and each of them once."""
     return f"{len(names)}: {_listed(tuple(dict.fromkeys(names)))}"
 
 

@@ -1,4 +1,4 @@
-"""What a motion that did not reach its end does to a program of JAX: it raises, or is NaN in values and derivatives.
+"""Motions that did not reach their end, in a program of JAX: it raises, or is NaN in values and derivatives.
 
 A failure is known when the numbers are: at once in plain Python and under `jax.vmap` or `jax.grad` alone, at run time
 inside `jax.jit`. `raise_where_failed` is one primitive for all of them. What it returns is passed through it, so that
@@ -44,7 +44,7 @@ def first_failed(result) -> tuple[int, ...] | None:
 
 
 def sentence(result, t_end, t_last, y_end, names: tuple[str, ...]) -> str | None:
-    """What failed first among members with any batch axes, when, and where it was; None where all ended well."""
+    """The first failure among members with any batch axes, its time and its state; None where all ended well."""
     result, t_end, t_last, y_end = map(np.asarray, (result, t_end, t_last, y_end))
     member = first_failed(result)
     if member is None:

@@ -310,7 +310,7 @@ def _inverse_on_range_jvp(primals, tangents):
 
 
 def rank(matrix: Matrix) -> Int[Array, ""]:
-    """How many rows of a symmetric matrix (m, m) are independent: `rank_tolerance` decides what counts as zero."""
+    """The number of independent rows of a symmetric matrix (m, m): `rank_tolerance` decides what counts as zero."""
     return jnp.sum(_independent(matrix, jnp.ones(len(matrix), matrix.dtype))[2]).astype(int)
 
 

@@ -81,7 +81,7 @@ class Motion(eqx.Module):
 
     @property
     def constrained(self) -> bool:
-        """Whether the scene has constraints."""
+        """True if the scene has constraints."""
         return self.constraints.exist
 
     def acceleration(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:

@@ -1,4 +1,4 @@
-"""What a notebook shows of a result: its text, and beside it a small picture where matplotlib is installed.
+"""The picture of a result in a notebook: its text, and beside it a small picture where matplotlib is installed.
 
 A picture is of a few members and a few hundred outputs, however many there are, so that it takes no longer for a large
 batch. Where there is none to be had, nothing has a value yet or matplotlib is missing, the text is shown alone; a

@@ -187,7 +187,7 @@ def work_precision(
 
 
 def _problem(system: System, q0: PyTree, qdot0: PyTree, ts, params: PyTree, batch_axes) -> Problem:
-    """What is to be integrated, as one problem or as that of one member."""
+    """The problem to be integrated, or that of one member."""
     system = require_system(system)
     if batch_axes is None:
         return Problem.of(system, Layout.of(q0, qdot0), q0, qdot0, ts, params)

@@ -56,7 +56,7 @@ LEAST_RTOL = 0.25
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """How does the motion of a scene go on from one state?
+    """The motion of a scene from one state, as a question to an engine.
 
     - `system`, `layout`, `params`: the scene, the structure of its coordinates, and its parameters as the user gave
       them, every number an array.
@@ -107,12 +107,12 @@ class Problem:
 
     @functools.cached_property
     def derivation(self) -> Derivation:
-        """What is derived from the scene: made once for all problems whose scene and structure are equal."""
+        """The derivation of the scene: made once for all problems whose scene and structure are equal."""
         return derivation_of(self.system, self.layout, self.params)
 
     @functools.cached_property
     def made(self) -> dict:
-        """What engines have made of it, by name: they ask for the same more than once."""
+        """The parts that engines have made of it, by name, and use more than once."""
         return {}
 
     @property
@@ -127,12 +127,12 @@ class Problem:
 
     @property
     def is_known(self) -> bool:
-        """Whether nothing in it is being traced, so that it can be solved at once."""
+        """True if nothing in it is being traced, so that it can be solved at once."""
         return all(map(is_concrete, (self.ts, self.y0, self.vector)))
 
     @property
     def is_single(self) -> bool:
-        """Whether its state is in float32."""
+        """True if its state is in float32."""
         return self.layout.dtype == SINGLE
 
     @functools.cached_property
@@ -199,7 +199,7 @@ class Batch(eqx.Module):
 
     @property
     def is_known(self) -> bool:
-        """Whether nothing in it is being traced."""
+        """True if nothing in it is being traced."""
         numbers = eqx.filter(self.params, eqx.is_array_like)
         return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.member.ts, self.y0, numbers)))
 
@@ -237,7 +237,7 @@ class Solution(NamedTuple):
 
 
 class AbstractEngine(abc.ABC):
-    """What integrates: `MachineCode` or `Diffrax`. `default_rtol` is what it takes where nothing is asked for."""
+    """The integrator: `MachineCode` or `Diffrax`. `default_rtol` is its tolerance where none is given."""
 
     default_rtol: ClassVar[Mapping[np.dtype, float]] = {DOUBLE: DEFAULT_RTOL, SINGLE: DEFAULT_RTOL}
 
@@ -280,7 +280,7 @@ class AbstractEngine(abc.ABC):
 
 
 def _is_on_host(leaf) -> bool:
-    """Whether NumPy can read an array without moving it between devices, or gathering it from several."""
+    """True if NumPy can read an array without moving it between devices, or gathering it from several."""
     if not isinstance(leaf, jax.Array):
         return True
     return is_concrete(leaf) and [device.platform for device in leaf.devices()] == ["cpu"]
@@ -430,7 +430,7 @@ def _made_event(event, dtype) -> diffrax.Event:
 
 
 def has_own_root_finder(event: diffrax.Event) -> bool:
-    """Whether the user has chosen how the instant of an event is found."""
+    """True if the user has chosen how the instant of an event is found."""
     return not isinstance(event.root_finder, _SignChange)
 
 

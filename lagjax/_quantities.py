@@ -100,7 +100,7 @@ class _State:
         return result
 
     def along(self, values: Ids, q: Ids | None = None, qdot: Ids | None = None, t: bool = False) -> Ids:
-        """How some numbers change while q, q̇ and t do, at these rates."""
+        """The rates of some numbers while q, q̇ and t change at these rates."""
         rates: dict[int, int] = {}
         for name, rate in (("q", q), ("qdot", qdot)):
             if rate is not None:

@@ -200,7 +200,7 @@ _LARGEST = 10_000_000  # operations that are counted
 
 
 class _Step(NamedTuple):
-    """What is eliminated, the unknowns that define it (none: a coordinate), and all others that it meets then."""
+    """The eliminated unknown, the unknowns that define it (none: a coordinate), and all others that it meets then."""
 
     unknown: int
     terms: tuple[int, ...]
@@ -222,11 +222,11 @@ class RecursiveElimination:
 
     @property
     def complete(self) -> bool:
-        """Whether everything can be eliminated: no pivot is zero whatever the state."""
+        """True if everything can be eliminated: no pivot is zero whatever the state."""
         return len(self.steps) == self.size + self.velocities
 
     def operations(self, numbers: Sequence[float | None]) -> tuple[int, int]:
-        """How many operations the elimination and one solution take, and the solution of an order of a Taylor series.
+        """The operations of the elimination and one solution, and of the solution of an order of a Taylor series.
 
         `numbers` has those of the entries that are known.
         """
@@ -249,7 +249,7 @@ class RecursiveElimination:
         return of_first, Derivatives(graph).size([*z.ids.tolist(), *factors.ids.tolist()]) - before
 
     def factors(self, values: Scalars) -> tuple[Any, Any]:
-        """What `solve` needs, a tree of vectors, and whether a pivot was lost."""
+        """The factors that `solve` needs, a tree of vectors, and whether a pivot was lost."""
         work = _Elimination(self, values)
         for step in self.steps:
             work.velocity(step) if step.terms else work.coordinate(step)

@@ -1,4 +1,4 @@
-"""What can become of a trajectory: result codes, what to try when one is bad, and the exception that carries it.
+"""The outcomes of a trajectory: result codes, what to try when one is bad, and the exception that carries it.
 
 The codes are diffrax's own and ours. They travel inside `jit` and `vmap` as arrays, one per member of a batch;
 only `simulate` turns one into an exception.
@@ -86,7 +86,7 @@ def name_of(code) -> str:
 
 
 def advice(result: RESULTS) -> str:
-    """What happened and what to try, for one concrete result."""
+    """The sentence for one concrete result: what happened, and what to try."""
     if result == RESULTS.dt_min_reached:
         return (
             "The step size shrank to nothing. The motion runs into a singularity or a discontinuity there (a "

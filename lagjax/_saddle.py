@@ -85,7 +85,7 @@ class SaddleElimination:
         self._place_all(filled)
 
     def _place_all(self, filled: np.ndarray) -> None:
-        """Where the entries of A on and below its diagonal stand in a vector: the diagonal, then L by columns."""
+        """The places in a vector of the entries of A on and below its diagonal: the diagonal, then L by columns."""
         total, place = len(self.order), np.argsort(self.order)
         self.slots = np.full((total, total), -1)
         self.slots[range(total), range(total)] = range(total)
@@ -116,7 +116,7 @@ class SaddleElimination:
     # ---- factors ----
 
     def factors(self, values) -> tuple[Any, Any]:
-        """What `solve` needs of M and G, a tree of vectors, and whether the saddle point is singular.
+        """The factors of M and G that `solve` needs, a tree of vectors, and whether the saddle point is singular.
 
         `values` holds what stands at `entries`.
         """
@@ -155,14 +155,14 @@ class SaddleElimination:
         return xp.joined(columns) if columns else a[:0], xp.stacked(inverse), lost
 
     def _pivot(self, j: int, diagonal, of_coordinates: list, of_constraints: list) -> tuple[Any, Any]:
-        """Whether a pivot was lost, None where that does not count, and its inverse."""
+        """A flag that a pivot was lost, None where that does not count, and its inverse."""
         if j < self.size:
             return self._mass_pivot(j, diagonal, of_coordinates + of_constraints)
         lost, inverse = self._constraint_pivot(of_coordinates, of_constraints)
         return (lost if self.regular_only else None), inverse
 
     def _mass_pivot(self, j: int, diagonal, terms: list) -> tuple[Any, Any]:
-        """Whether what is left of Mⱼⱼ is round-off, and its inverse; NaN where it is."""
+        """A flag that the rest of Mⱼⱼ is round-off, and its inverse; NaN where it is."""
         if not terms and not self.massless[j]:
             return diagonal == 0.0, 1.0 / diagonal
         pivot = diagonal
@@ -172,7 +172,7 @@ class SaddleElimination:
         return lost, 1.0 / xp.where(lost, np.nan, pivot)
 
     def _constraint_pivot(self, of_coordinates: list, of_constraints: list) -> tuple[Any, Any]:
-        """Whether a constraint depends on those before it, and its D⁻¹: it is left out then, or NaN if `regular_only`.
+        """A flag that a constraint depends on those before it, and D⁻¹: it is left out then, or NaN if `regular_only`.
 
         The pivot is −G M⁻¹ Gᵀ of this constraint, and what those before it take off that. A row that is left out
         changes nothing where the constraints are consistent.

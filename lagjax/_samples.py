@@ -290,7 +290,7 @@ def _beside(x, v):
 
 
 def _locate(knots, t, closed: bool):
-    """How many knots are at most t, less one, of int32; with `closed` the last knot belongs to the last piece."""
+    """Knots that are at most t, less one, of int32; with `closed` the last knot belongs to the last piece."""
     return _locate_p.bind(jnp.asarray(knots), t, closed=closed)
 
 

@@ -1,4 +1,4 @@
-"""How large the coordinates, the velocities and the time of a scene are at a state: what "small" is measured by there.
+"""The sizes of coordinates, velocities and time of a scene at a state: what "small" is measured by there.
 
 A number of a state has the units of its author, who may write a molecule in metres and a planet in seconds. So no
 number is small by itself, and nothing here compares one with 1. What coordinates of different units have in common is
@@ -109,7 +109,7 @@ _ROUNDS, _BETWEEN = 8, 25
 
 
 def _bends(force: Callable, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where F is linear up to a step and twice it, where it is not, and how much it changes."""
+    """The steps up to which F is linear, those where it is not, and its change."""
     ahead, back, twice, twice_back, here = (force(x) for x in (steps, -steps, 2 * steps, -2 * steps, np.zeros(1)))
     odd, even = (ahead - back) / 2, (ahead + back) / 2 - here
     change, size = np.abs(odd).max(axis=1), np.maximum(np.abs(ahead), np.abs(back)).max(axis=1)

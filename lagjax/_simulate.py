@@ -246,7 +246,7 @@ def _sent(arrays: tuple) -> tuple:
 
 
 def _comes_often(arrays: tuple) -> bool:
-    """Whether arrays of these shapes have been sent so often that a compilation pays, which takes as long as 200."""
+    """True if arrays of these shapes have been sent so often that a compilation pays, which takes as long as 200."""
     if sum(x.nbytes for x in jax.tree.leaves(arrays)) > _LARGEST_OFTEN:
         return False
     shapes = tuple(x.shape for x in jax.tree.leaves(arrays))

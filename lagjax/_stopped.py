@@ -32,7 +32,7 @@ NARROW = 64.0  # smallest steps, about a state from which no step leads on
 
 
 class End(NamedTuple):
-    """Where a motion ended, with any axes of members in front: `y` has a last axis of 2n, (q, q̇)."""
+    """The end of a motion, with any axes of members in front: `y` has a last axis of 2n, (q, q̇)."""
 
     t: jax.Array
     y: jax.Array
@@ -44,7 +44,7 @@ class End(NamedTuple):
 
 @np.errstate(all="ignore")
 def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Array, jax.Array]:
-    """Whether the acceleration is not finite just ahead, and whether it jumps, as Booleans of the members.
+    """Flags of the members: the acceleration is not finite just ahead; it jumps there.
 
     `acceleration(t, y)` gives q̈, with a last axis of n. `shrank` are the members whose step became too small, `spent`
     those whose budget of steps is spent; others are not looked at.
@@ -91,7 +91,7 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
 
 
 def _half_width(library, at: End, smallest, shrank):
-    """How far from the end, in time, a jump is looked for."""
+    """The time before the end in which a jump is looked for."""
     mean = abs(at.t - at.begin) / library.maximum(at.accepted, 1)
     fighting = at.rejected > FIGHTING * (at.accepted + at.rejected)
     wide = mean * library.where(fighting, FAR, NEAR)

@@ -207,7 +207,7 @@ class System(eqx.Module):
         return layout.restore(q), layout.restore(qdot)
 
     def explain(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Explanation:
-        """What this scene contains and what was left out of its equations; print it, or read its fields.
+        """The contents of this scene, and what was left out of its equations; print it, or read its fields.
 
         It is read from the scene's programs, so that all of it holds for every state and time, except which constraints
         depend on which. Raises the errors of `System` for invalid coordinates and functions.
@@ -356,7 +356,7 @@ class System(eqx.Module):
 
 
 def _structure_of(role: str, state: PyTree) -> str:
-    """What a function that fails was called with: a dict, where it expects a number, speaks of neither."""
+    """The arguments of a function that fails: a dict, where it expects a number, speaks of neither."""
     leaves = jax.tree_util.tree_leaves_with_path(state)
     shown = ", ".join(f"q{jax.tree_util.keystr(path)} of shape {leaf.shape}" for path, leaf in leaves[:8])
     return f"{role} was called with {shown}. Give q, qdot and params the structure that it reads."

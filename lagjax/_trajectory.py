@@ -129,7 +129,7 @@ class Trajectory(eqx.Module):
         return self._at_every_time("constraint_residual")
 
     def health(self, reference: "Trajectory | None" = None) -> Health:
-        """How far this motion can be trusted: conservation laws, constraints, the mass matrix, gradients.
+        """The trust that this motion deserves: conservation laws, constraints, the mass matrix, gradients.
 
         Print the result for a report with a verdict, or read its fields, which have the batch axes of the trajectory
         (`lagjax.Health`). `reference` is a trajectory of the same system from the same start at the same times, with a

@@ -1,4 +1,4 @@
-"""What can be wrong with a user's numbers, found before any work is done and answered with a sentence.
+"""The checks of a user's numbers, before any work is done, with a sentence for each mistake.
 
 Numbers become arrays, so that a new value is never a new program. Values that are being traced (inside the user's own
 `jit`) have no number yet: for them only shapes and dtypes are checked.
@@ -40,7 +40,7 @@ def _flattened(tree: PyTree, name: str) -> tuple[list, Any]:
 
 
 def _is_plain(leaf, dtype) -> bool:
-    """Whether nothing can be wrong with a leaf: a Python float, or an array that has the dtype of the state."""
+    """True if nothing can be wrong with a leaf: a Python float, or an array that has the dtype of the state."""
     return type(leaf) is float or ((type(leaf) is np.ndarray or isinstance(leaf, jax.Array)) and leaf.dtype == dtype)
 
 
@@ -118,7 +118,7 @@ def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
 
 
 def _is_finite(leaf) -> bool:
-    """Whether a leaf is an array of floats without NaN and infinity; false where that takes a closer look."""
+    """True if a leaf is an array of floats without NaN and infinity; false where that takes a closer look."""
     return isinstance(leaf, np.ndarray | jax.Array) and is_concrete(leaf) and leaf.dtype in _FLOATS and all_finite(leaf)
 
 
@@ -126,7 +126,7 @@ _FLOATS = (np.dtype("float64"), np.dtype("float32"))
 
 
 def all_finite(array) -> bool:
-    """Whether no number of a concrete array is NaN or infinite."""
+    """True if no number of a concrete array is NaN or infinite."""
     return bool(np.isfinite(np.asarray(array)).all())
 
 
@@ -190,7 +190,7 @@ def output_times(ts, dtype) -> jax.Array | np.ndarray:
 
 
 def _is_monotonic(values: np.ndarray) -> bool:
-    """Whether numbers increase or decrease strictly."""
+    """True if numbers increase or decrease strictly."""
     later, earlier = values[1:], values[:-1]
     return bool((later > earlier).all() or (later < earlier).all())
 

@@ -513,7 +513,7 @@ def _legend(ax, title: str | None = None):
 
 
 def _share(shown: int, layout: Layout) -> str | None:
-    """What to say where not all coordinates are shown."""
+    """The sentence that not all coordinates are shown; None where all are."""
     return None if shown == layout.size else f"{shown} of {layout.size} coordinates"
 
 
@@ -523,7 +523,7 @@ def _colorbar(mappable, ax, label):
 
 
 def _edges(centres) -> tuple[float, float]:
-    """Where the first and the last of evenly spaced cells end."""
+    """The outer edges of evenly spaced cells."""
     if len(centres) < 2:
         raise ValueError("A map needs two columns and two rows at least: x and y are the centres of its cells.")
     half = (centres[-1] - centres[0]) / (len(centres) - 1) / 2

@@ -1,4 +1,4 @@
-"""What a scene does, from its Lagrangian alone: where it stays, how it oscillates, what it conserves."""
+"""The behaviour of a scene, from its Lagrangian alone: where it stays, how it oscillates, what it conserves."""
 
 from lagjax._analysis._coordinates import ChangedCoordinates, change_coordinates
 from lagjax._analysis._equilibrium import Equilibrium, equilibrium

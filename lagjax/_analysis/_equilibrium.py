@@ -23,7 +23,7 @@ Unknowns = Float[Array, " n+m"]  # q, then λ
 
 
 class Equilibrium(NamedTuple):
-    """Where a scene stays.
+    """An equilibrium of a scene.
 
     - `q`: the coordinates, in the user's pytree; NaN where no equilibrium was found.
     - `multipliers`: λ there, in the structure the constraints return; None without constraints.
@@ -197,7 +197,7 @@ def _polished(residual, z: Unknowns, start: Unknowns, least: Unknowns, unit: Unk
 
 
 def _is_root(residual, z: Unknowns, least: Unknowns) -> Bool[Array, ""]:
-    """Whether r(z) is zero: each number below √eps of what the numbers of z, or the `least` ones, make of it.
+    """True if r(z) is zero: each number below √eps of what the numbers of z, or the `least` ones, make of it.
 
     A converged one is at some eps of it; where forces only fade away with the distance it is of order one.
     """
@@ -206,7 +206,7 @@ def _is_root(residual, z: Unknowns, least: Unknowns) -> Bool[Array, ""]:
 
 
 def _sentence(scene: Scene) -> str:
-    """What is wrong where no equilibrium was found from the guess."""
+    """The reason why no equilibrium was found from the guess."""
     force = scene.force(scene.q, scene.qdot)
     gradient = jax.jacfwd(scene.force)(scene.q, scene.qdot)
     names = scene.layout.names

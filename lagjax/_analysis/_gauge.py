@@ -25,7 +25,7 @@ _ZERO, _RIGHT = 1e-10, 1e-9
 
 
 class Changes(NamedTuple):
-    """How L changes under D transformations at S states: Λ (S, D), ∂Λ/∂q̇ (S, D, n), Λ at rest, the size of its terms.
+    """The change of L under D transformations at S states: Λ (S, D), ∂Λ/∂q̇ (S, D, n), Λ at rest, the size of its terms.
 
     ∂Λ/∂q̇ is by velocities in units of their sizes, so that it compares with Λ. `gradients` (S, D, 2n) are those of the
     charges p·ξ − h τ − G by q and q̇.
@@ -64,7 +64,7 @@ def gauge_of(scene: Scene, fields: Fields, weights: np.ndarray, k: int, changes:
 
 
 def is_right(gauge: Callable, scene: Scene, fields: Fields, k: int, changes: Changes, states: State) -> bool:
-    """Whether ∂G/∂q and ∂G/∂t are what transformation number k asks for, at some of the states of `changes`.
+    """True if ∂G/∂q and ∂G/∂t are what transformation number k asks for, at some of the states of `changes`.
 
     Of a piecewise L each piece may have a G of its own, and there is none for all.
     """

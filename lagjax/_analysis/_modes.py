@@ -71,7 +71,7 @@ class Modes(eqx.Module):
 
 
 def _kind(pair: np.ndarray, size: float) -> str:
-    """What a mode with these two exponents does, beside others of this size."""
+    """The kind of a mode with these two exponents, beside others of this size."""
     small, real, imaginary = _grows_beyond(size), np.real(pair), np.imag(pair)
     if np.abs(pair).max() <= small:
         return "zero mode: neutral, may drift"
@@ -154,7 +154,7 @@ _BALANCED = 1e-6
 
 
 def _rank(scene: Scene) -> int:
-    """How many constraints are independent at q; all of them where there are no numbers to ask."""
+    """The number of independent constraints at q; all of them where there are no numbers to ask."""
     if not scene.constrained:
         return 0
     jacobian = scene.jacobian(scene.q, scene.qdot)
@@ -202,7 +202,7 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
 
 
 def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
-    """Whether so many of the constraints are independent."""
+    """True if so many of the constraints are independent."""
     if not len(jacobian):
         return jnp.asarray(True)
     lengths = jnp.sqrt(jnp.sum(jacobian**2, axis=1, keepdims=True))
@@ -213,7 +213,7 @@ def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
 def _distance(
     scene: Scene, unit: Vector, jacobian: Float[Array, "m n"], left: Vector, stiffness: Matrix
 ) -> Float[Array, ""]:
-    """How far q is from an equilibrium, in units of its size: by the forces that are left, and by the constraints.
+    """The distance of q from an equilibrium, in units of its size: by the forces that are left, and by the constraints.
 
     All are given in the `unit` (n,) of each coordinate. Zero also where the distance changes no mode: where the forces
     are linear up to a thousand times as far.

@@ -28,7 +28,7 @@ _STATES = 64
 
 
 class SameMotion(NamedTuple):
-    """Whether two systems have the same Euler–Lagrange equations up to a factor.
+    """The answer whether two systems have the same Euler–Lagrange equations up to a factor.
 
     - `same`: True or False.
     - `factor`: the best f in E_a = f E_b; NaN where b has no equations.
@@ -58,7 +58,7 @@ class SameMotion(NamedTuple):
 
 @accepts_singles(("q", "qdot"), ("params",))
 def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, seed: int = 0) -> SameMotion:
-    r"""Whether L_a = f L_b + dG(q, t)/dt for a number f, so that both systems have the same motions.
+    r"""Test if L_a = f L_b + dG(q, t)/dt for a number f, so that both systems have the same motions.
 
         E = d/dt ∂L/∂q̇ − ∂L/∂q − Q,     E_a = f E_b  for all q, q̇, q̈ and t
 

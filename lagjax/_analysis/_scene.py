@@ -59,12 +59,12 @@ class Scene(NamedTuple):
 
     @property
     def concrete(self) -> bool:
-        """Whether there are numbers, and nothing is being traced."""
+        """True if there are numbers, and nothing is being traced."""
         return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.system, self.q, self.qdot, self.numbers)))
 
     @property
     def constrained(self) -> bool:
-        """Whether there are constraints."""
+        """True if there are constraints."""
         return has_constraints(self.system)
 
     @property
@@ -78,7 +78,7 @@ class Scene(NamedTuple):
 
     @property
     def piecewise(self) -> bool:
-        """Whether the motion decides on something: a comparison, an absolute value, a floor."""
+        """True if the motion decides on something: a comparison, an absolute value, a floor."""
         if self.lowered is None:
             return False
         try:
@@ -115,7 +115,7 @@ class Scene(NamedTuple):
 
     @property
     def reversible(self) -> bool:
-        """Whether nothing but L acts, and no momentum is left at rest: small motions backwards are motions.
+        """True if nothing but L acts, and no momentum is left at rest: small motions backwards are motions.
 
         Read off momenta at states, and with parameters, that nothing speaks for: they are zero at rest exactly, or as
         good as any other number, in whatever units. A wrong guess has to be caught by who relies on it.
@@ -134,7 +134,7 @@ class Scene(NamedTuple):
 
     @property
     def scales(self) -> Scales:
-        """How large its coordinates, velocities and the time are, of a scene of numbers."""
+        """The sizes of coordinates, velocities and the time, of a scene of numbers."""
         numbers = numbers_of(self.numbers)
 
         def evaluated(name, q, qdot):

@@ -1,4 +1,4 @@
-"""Where a scene comes to rest: its motion with friction, which ends at a minimum of the potential and at no saddle.
+"""The state of rest of a scene: its motion with friction, which ends at a minimum of the potential and at no saddle.
 
 Friction −c M q̇ takes the energy from all coordinates alike, in any units. It begins at the rate of the fastest ones and
 becomes less from stage to stage, so that slow ones are not overdamped.

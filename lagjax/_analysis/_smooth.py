@@ -1,4 +1,4 @@
-"""Whether the forces of a scene are smooth at a state: without that nothing is linear next to it.
+"""The smoothness of the forces of a scene at a state: without it nothing is linear next to it.
 
 At a jump of the force (dry friction at rest) or a kink (a spring that only pushes, where it begins) the two sides of a
 state have different derivatives, or none. Such places are borders of piecewise functions (`_blame.borders`); whether
@@ -35,7 +35,7 @@ class _Rough(NamedTuple):
 
 
 def is_smooth(scene: Scene) -> Bool[Array, ""]:
-    """Whether the forces have derivatives at the state of a scene."""
+    """True if the forces have derivatives at the state of a scene."""
     if not _pieces(scene):
         return jnp.asarray(True)
     rough = _rough(scene)

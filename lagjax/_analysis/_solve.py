@@ -54,7 +54,7 @@ def newton(f: Callable[[Vector], Vector], start: Vector) -> Vector:
 
 
 def is_root(f: Callable[[Vector], Vector], x: Vector, given: Vector) -> Bool[Array, ""]:
-    """Whether f(x) = 0: each number of it within eps^0.6 of what x makes of it, or of a term that is `given` (n,).
+    """True if f(x) = 0: each number of it within eps^0.6 of what x makes of it, or of a term that is `given` (n,).
 
     Newton's method comes to some eps; where it has gone astray it is off by more than half of the digits.
     """

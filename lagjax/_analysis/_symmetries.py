@@ -95,7 +95,7 @@ class ConservedQuantities(list[Conserved]):
         return "\n".join([*rows, *self.notes, told])
 
     def report(self, trajectory: Trajectory) -> str:
-        """How far each quantity drifts along a trajectory, a line each; the worst member of a batch."""
+        """The drift of each quantity along a trajectory, a line each; the worst member of a batch."""
         rows = [f"{'conserved':40s} {'largest drift':>14s}"]
         rows += [f"{c.name[:40]:40s} {float(jnp.max(c.drift(trajectory))):14.2e}" for c in self]
         return "\n".join(rows)
@@ -111,7 +111,7 @@ def conserved_quantities(
     generators: dict[str, Callable] | None = None,
     seed: int = 0,
 ) -> ConservedQuantities:
-    r"""What `system` conserves by a symmetry of its Lagrangian, found from L alone.
+    r"""The quantities that `system` conserves by symmetries of its Lagrangian, found from L alone.
 
     All linear combinations of these point transformations are tried,
 
@@ -237,7 +237,7 @@ def _own(generators, layout: Layout) -> dict[str, Callable]:
 
 @eqx.filter_jit
 def _columns(fields: Fields, states: State, *arguments) -> tuple[Array, Array]:
-    """What each of K transformations leaves at S states: of L (S, n, K), of forces and constraints (S, r, K).
+    """The change under each of K transformations at S states: of L (S, n, K), of forces and constraints (S, r, K).
 
     Both in units of the terms that would have to cancel, so that entries are of order one unless there is a symmetry.
     """

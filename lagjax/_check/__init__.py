@@ -35,7 +35,7 @@ _SMALLEST = 1e4
 
 
 def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0, params: PyTree = None) -> Findings:
-    r"""What is wrong with `system` at the state (q, qdot), or worth knowing before it is integrated.
+    r"""Check `system` at the state (q, qdot): what is wrong with it, or worth knowing before it is integrated.
 
     Derivatives are compared with finite differences, [L(x + hᵢ) − L(x − hᵢ)]/2hᵢ and those of higher order, with steps
     over many scales, centred and one-sided. Where the mass matrix M = ∂²L/∂q̇² is singular, it is examined in the

@@ -1,4 +1,4 @@
-"""What lies ahead of a motion and shows nowhere near its state: borders and narrow features that one number decides on.
+"""Borders and narrow features ahead of a motion that show nowhere near its state: one number decides on each.
 
 A force that is switched on at t = 5, or a barrier at q = 3, is found from the program before anything runs. A switching
 number u that reads one coordinate, one velocity or the time alone is followed by Newton's method from many places along
@@ -160,7 +160,7 @@ def _zeros(function: Callable, start: float) -> np.ndarray:
 
 
 def _tops(function: Callable, start: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where a function of (S,) is stationary, by parabolas through three places, and its second derivative there."""
+    """The stationary points of a function of (S,), by parabolas through three places; its second derivatives there."""
     x, step = start + _PLACES * max(1.0, abs(start)), 1e-2
     for _ in range(_NEWTON):
         low, middle, high = (function(x + k * step) for k in (-1, 0, 1))

@@ -117,7 +117,7 @@ def _blame_for_kink(scene: Scene, role: str) -> str:
 
 
 def _blocks(scene: Scene, round_off):
-    """What is compared, in blocks: a name, the role of the function, its derivatives, and which those are.
+    """The derivatives that are compared, in blocks: a name, the role of the function, its derivatives, their names.
 
     The derivatives have the shape (directions, outputs); the last two entries are these directions, of the 2n + 1, and
     these outputs, of `Measured.here`.
@@ -149,12 +149,12 @@ def _blocks(scene: Scene, round_off):
 
 
 def position_count(scene: Scene) -> int:
-    """How many of the constraints are on positions; they come first."""
+    """The number of constraints on positions, which come first."""
     return scene.derivation.position_count
 
 
 def _agree(scene: Scene) -> bool:
-    """Whether derivatives are the slopes along random directions, from both sides and from each."""
+    """True if derivatives are the slopes along random directions, from both sides and from each."""
     n, dtype, m = scene.layout.size, scene.layout.dtype, scene.measured
     directions = np.zeros((2 * _RANDOM + 1, 2 * n + 1))
     random = np.random.default_rng(0).standard_normal((2, _RANDOM, n)) * scene.sizes[:-1].reshape(2, 1, n)

@@ -73,7 +73,7 @@ def _best(estimates: np.ndarray, rounding: np.ndarray) -> Slopes:
 
 
 def _agrees_below(estimates: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Whether a rung agrees with all smaller steps, within errors: over many periods all slopes look like zero."""
+    """True if a rung agrees with all smaller steps, within errors: over many periods all slopes look like zero."""
     value, reach = np.where(np.isfinite(error), estimates, 0.0), _SAFETY * error
     lowest = np.maximum.accumulate((value - reach)[:, ::-1], axis=1)[:, ::-1]
     highest = np.minimum.accumulate((value + reach)[:, ::-1], axis=1)[:, ::-1]
@@ -81,7 +81,7 @@ def _agrees_below(estimates: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def differ(one: Slopes, other: Slopes, dtype) -> np.ndarray:
-    """Where two slopes differ by more than their errors and by more than eps^(1/3) of them."""
+    """The places where two slopes differ by more than their errors and by more than eps^(1/3) of them."""
     allowed = _SAFETY * (one.error + other.error) + np.finfo(dtype).eps ** (1 / 3) * (abs(one.value) + abs(other.value))
     with np.errstate(invalid="ignore"):
         return np.abs(one.value - other.value) > allowed

@@ -37,7 +37,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Findings:
-    """What `lagjax.check` found, errors first: iterate over it, or print it.
+    """The findings of `lagjax.check`, errors first: iterate over it, or print it.
 
     `ok` is True without an error; `kinds` are the kinds that were found.
     """
@@ -51,7 +51,7 @@ class Findings:
 
     @property
     def ok(self) -> bool:
-        """Whether there is no error among them."""
+        """True if there is no error among them."""
         return not any(finding.level == "error" for finding in self.found)
 
     @property

@@ -119,7 +119,7 @@ def _classified(scene: Scene, here: np.ndarray, nearby: dict[int, np.ndarray]) -
 
 
 def _homogeneous(scene: Scene, states: list[int]) -> bool:
-    """Whether M q̇ = 0 at all of these states: L is of degree one in the velocities."""
+    """True if M q̇ = 0 at all of these states: L is of degree one in the velocities."""
     m = scene.measured
 
     def annihilates(mass, v):
@@ -130,7 +130,7 @@ def _homogeneous(scene: Scene, states: list[int]) -> bool:
 
 
 def _same_space(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether the rows of two arrays (k, n) span the same space, up to √eps."""
+    """True if the rows of two arrays (k, n) span the same space, up to √eps."""
     if one.shape != other.shape:
         return False
     basis = np.linalg.qr(other.T)[0]

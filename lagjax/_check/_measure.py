@@ -166,7 +166,7 @@ class Scene(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What is measured. A first axis of states stands for the state itself, then others in q, then others in q̇."""
+    """The measurements. A first axis of states stands for the state itself, then others in q, then others in q̇."""
 
     by_q: Any  # ∂L/∂q, (n,)
     momentum: Any  # (states, n)
@@ -183,7 +183,7 @@ class Measured(NamedTuple):
 
 
 class Sides(NamedTuple):
-    """What derivatives are compared with: the outputs of `Measured.here` at states on both sides, and rounding."""
+    """The references of derivatives: the outputs of `Measured.here` at states on both sides, and rounding."""
 
     minus: Any  # at steps back, (directions, rungs, outputs)
     plus: Any  # at steps ahead, (directions, rungs, outputs)
@@ -192,7 +192,7 @@ class Sides(NamedTuple):
 
 
 def _scales(derivation: Derivation, state) -> Scales:
-    """How large coordinates, velocities and the time are at the state; one, where the scene does not tell."""
+    """The sizes of coordinates, velocities and the time at the state; one, where the scene does not tell."""
     q, v, t, numbers = *(np.asarray(x, np.float64) for x in state[:3]), numbers_of(state[3])
 
     def evaluated(name, q, v):
@@ -244,7 +244,7 @@ _DERIVED = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissip
 
 
 def _evaluated(derivation: Derivation, state, offsets: np.ndarray) -> Measured:
-    """What is measured, by the programs of a derivation; raises `Unlowerable` where it has none."""
+    """The measurements, by the programs of a derivation; raises `Unlowerable` where it has none."""
     q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
     n = len(q)
     names = ("momentum", "mass_matrix", "jacobian", "lagrangian_by_q", "force", "given_force", "gamma")
@@ -274,7 +274,7 @@ def _evaluated(derivation: Derivation, state, offsets: np.ndarray) -> Measured:
 
 
 def _program_variation(derivation: Derivation, state, acceleration, multipliers) -> np.ndarray:
-    """How M q̈ − Gᵀλ − F and G q̈ − γ vary with (q, q̇), (n + m, 2n), for constant q̈ and λ: by the programs.
+    """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: by the programs.
 
     It is one transposed derivative of the program of M, F, G and γ, for all n + m equations side by side.
     """
@@ -367,7 +367,7 @@ def _rounding(*terms):
 
 @eqx.filter_jit
 def _variation(system: System, q, qdot, t, params, acceleration, multipliers):
-    """How M q̈ − Gᵀλ − F and G q̈ − γ vary with (q, q̇), (n + m, 2n), for constant q̈ and λ: compiled by XLA."""
+    """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: compiled by XLA."""
     layout = Layout.of(q, qdot)
     motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
 

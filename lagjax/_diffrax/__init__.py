@@ -86,7 +86,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         return solution._replace(idle=steps.size * jnp.max(steps) - jnp.sum(steps))
 
     def method(self, problem: Problem) -> Method:
-        """How it steps over this problem."""
+        """The steps over this problem."""
         dtype, ts, solver = problem.layout.dtype, jnp.asarray(problem.ts), self.solver
         if solver is None:
             # States between steps are wanted for outputs inside and to locate an event.
@@ -177,7 +177,7 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
 
 
 def _state_result(y, acceleration, singular) -> RESULTS:
-    """Whether a motion can go on from a state with this acceleration, and if not, why."""
+    """The result code of a motion from a state with this acceleration: successful if it can go on."""
     finite = jax.tree.reduce(lambda all_, leaf: all_ & jnp.isfinite(leaf).all(), (y, acceleration), jnp.array(True))
     failed = jnp.where(singular, code_of(RESULTS.mass_matrix_singular), code_of(RESULTS.nonfinite_state))
     return result_from(jnp.where(finite, SUCCESSFUL, failed))

@@ -1,4 +1,4 @@
-"""Whether a motion of diffrax crosses a jump of its acceleration, where derivatives over its steps are wrong.
+"""Jumps of the acceleration that a motion of diffrax crosses: derivatives over its steps are wrong there.
 
 A border u(y, t, p) = 0 at which the acceleration jumps from a⁻ to a⁺ adds (a⁻ − a⁺) δt to a tangent of the velocities,
 with δt = −δu / u̇ (`_program._saltation`). Steps of diffrax go across it and lack that: the derivative is not
@@ -35,7 +35,7 @@ _DECIDING = frozenset((
 
 
 def may_jump(field, *arguments) -> bool:
-    """Whether a function has operations in it that decide on something."""
+    """True if a function has operations in it that decide on something."""
     return _decides(jax.make_jaxpr(lambda *xs: field(*xs))(*arguments).jaxpr)
 
 
@@ -54,7 +54,7 @@ def _is_jaxpr(x) -> bool:
 
 
 def crosses(field, varied, begin, end, params) -> jax.Array:
-    """Whether the step between two pairs (t, y) crosses a jump of the field that moves with the state or `varied`.
+    """True if the step between two pairs (t, y) crosses a jump of the field that moves with the state or `varied`.
 
     `field(t, y, params)` is ẏ (2n,) of y = (q, q̇); `varied` a pair like (field, params), of Booleans.
     """
@@ -138,7 +138,7 @@ class Noting(diffrax.AbstractStepSizeController):
         return end, (state, jnp.array(False))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """What the controller says of a step; and whether that went across a jump."""
+        """The controller's decision on a step; and whether that went across a jump."""
         state, crossed = controller_state
         keep, *more, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, state

@@ -42,7 +42,7 @@ class Equations(eqx.Module):
     @property
     @abc.abstractmethod
     def constrained(self) -> bool:
-        """Whether the scene has constraints to project to."""
+        """True if the scene has constraints to project to."""
 
     @abc.abstractmethod
     def projected(self, t: Float[Array, ""], y: State, params: PyTree) -> State:
@@ -62,7 +62,7 @@ class ArrayEquations(Equations):
 
     @property
     def constrained(self) -> bool:
-        """Whether the scene has constraints."""
+        """True if the scene has constraints."""
         return self.motion.constrained
 
     def projected(self, t, y, params):
@@ -91,7 +91,7 @@ class ScalarEquations(Equations):
 
     @property
     def constrained(self) -> bool:
-        """Whether the scene has constraints."""
+        """True if the scene has constraints."""
         return self.projection is not None
 
     def projected(self, t, y, params):

@@ -30,7 +30,7 @@ PyTree = Any
 
 
 class Method(eqx.Module):
-    """How diffrax steps: its solver, what sizes the steps, their fixed size (None where adaptive), and their budget.
+    """The stepping of diffrax: its solver, its controller, the fixed size of steps (None where adaptive), their budget.
 
     `jumps` are where adaptive steps end and begin anew, None without any.
     """
@@ -245,12 +245,12 @@ class Jumps(eqx.Module):
         return Jumps(*(jnp.sort(jnp.where(jnp.isfinite(x), x, jnp.inf)) for x in (low, high)))
 
     def beyond(self, t):
-        """Where the next step begins after one that ended at t, and whether that is behind a jump."""
+        """The time at which the step after one that ended at t begins, and whether that is behind a jump."""
         begin = _exchanged(t, self.before, self.behind)
         return begin, begin != t
 
     def ends(self, times):
-        """Where the steps end behind which others begin at these times."""
+        """The ends of the steps behind which others begin at these times."""
         return _exchanged(times, self.behind, self.before)
 
     def first(self, begin, end):
@@ -284,7 +284,7 @@ class WithJumps(AdaptiveWrapper):
         return self.jumps.first(t0, end), state
 
     def adapt_step_size(self, *arguments):
-        """What the controller says of a step; the next one ends at the first jump."""
+        """The controller's decision on a step; the next one ends at the first jump."""
         keep, begin, end, made_jump, state, result = self.controller.adapt_step_size(*arguments)
         behind, jumps = self.jumps.beyond(begin)
         return keep, behind, self.jumps.first(behind, end + (behind - begin)), made_jump | jumps, state, result

@@ -20,7 +20,7 @@ PyTree = Any
 
 
 class _Around(diffrax.AbstractAdaptiveSolver):
-    """What a wrapper leaves to the `solver` inside it: all but the step, its terms and its dense output."""
+    """The parts that a wrapper leaves to the `solver` inside it: all but the step, its terms and its dense output."""
 
     solver: eqx.AbstractVar[diffrax.AbstractSolver]
 
@@ -204,7 +204,7 @@ class Projected(_Around):
 
 
 def _contracts(start: PyTree, near: PyTree, nearer: PyTree) -> jax.Array:
-    """Whether Newton's method converges: its second step is a hundredth of its first, or rounding.
+    """True if Newton's method converges: its second step is a hundredth of its first, or rounding.
 
     Near a solution the method squares the distance; from too far away a step covers half of it at best, which a
     hundredth tells apart with room on both sides. A step of a thousand units of round-off counts as converged: so much

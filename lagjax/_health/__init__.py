@@ -72,7 +72,7 @@ def examine(trajectory, reference=None) -> "Health":
 
 
 def _diagnosis(trajectory) -> str:
-    """What the first member that failed ran into; nothing where none did, or where that is being traced."""
+    """The obstacle of the first member that failed; nothing where none did, or where that is being traced."""
     if not isinstance(trajectory.system, System):
         return ""
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
@@ -109,7 +109,7 @@ def _borders(trajectory) -> tuple[bool, Met[Array] | None]:
 
 
 class Health(eqx.Module):
-    """How far a trajectory can be trusted; made by `Trajectory.health`. Print it, or read its fields.
+    """The trust that a trajectory deserves; made by `Trajectory.health`. Print it, or read its fields.
 
     Every field has the batch axes of the trajectory, and is measured over the outputs that were reached. An `Extreme`
     is a pair of a `value` and the time `t` of the output that has it, NaN where nothing was reached.
@@ -180,12 +180,12 @@ class Health(eqx.Module):
 
     @property
     def suspicious(self) -> Bool[Array, "*batch"]:
-        """Whether any of the `checks` is, for each member."""
+        """True if any of the `checks` is, for each member."""
         flags, xp = self._flags()
         return jnp.asarray(xp.any(xp.stack(list(flags.values())), axis=0))
 
     def checks(self) -> dict[str, Bool[Array, "*batch"]]:
-        """What is suspicious, by name: a Boolean for each member. A NaN at a state that was reached is."""
+        """The suspicions, by name: a Boolean for each member. A NaN at a state that was reached is."""
         return {name: jnp.asarray(flag) for name, flag in self._flags()[0].items()}
 
     def _flags(self) -> tuple[dict, Any]:
@@ -218,7 +218,7 @@ class Health(eqx.Module):
         return flags, xp
 
     def findings(self) -> tuple[str, ...]:
-        """What is suspicious or cannot be told, as sentences that say what to do; none where all is well."""
+        """Sentences about what is suspicious or cannot be told, which say what to do; none where all is well."""
         flags = self._flags()[0]
         raised = {name: np.asarray(flags[name]) for name in _SENTENCES if name in flags and np.any(flags[name])}
         sides = "" if self.borders_located else "make it an event or a mode, or "
@@ -280,7 +280,7 @@ class Health(eqx.Module):
         return "\n".join(f"{name:17s} {text}" for name, text in rows)
 
     def _met(self) -> list[str]:
-        """How the motion met borders, where it did."""
+        """The borders that the motion met, and how."""
         if self.borders is None:
             return [] if self.borders_located else ["not located"]
         crossed, slid, grazed = (np.asarray(x) for x in self.borders[:3])

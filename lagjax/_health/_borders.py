@@ -1,4 +1,4 @@
-"""How a motion met the borders of its scene (`_program._borders`), from its steps taken once more.
+"""The borders that a motion met (`_program._borders`), from its steps taken once more.
 
 What a step ends at is written down for derivatives, and for them alone. So the motion is followed again as for one,
 over the time that it took. That costs as much as the motion did; scenes without borders pay nothing.
@@ -25,7 +25,7 @@ Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
 
 
 class Met(NamedTuple, Generic[Numbers]):
-    """How often each of N members crossed a border, began to slide along one, and grazed one; (N,) each.
+    """The number of times that each of N members crossed a border, began to slide along one, and grazed one; (N,) each.
 
     `t` is when it first grazed one, NaN where it did not.
     """
@@ -37,7 +37,7 @@ class Met(NamedTuple, Generic[Numbers]):
 
 
 def met(trajectory, members) -> tuple[bool, Met[np.ndarray] | None]:
-    """Whether steps ended at the borders of the scene; and how the motion met them, None where that is not known.
+    """A flag that steps ended at the borders of the scene; and how the motion met them, None where that is not known.
 
     `members` has the states and the parameters of all members (`_measure.Members`).
     """
@@ -68,7 +68,7 @@ def met(trajectory, members) -> tuple[bool, Met[np.ndarray] | None]:
 
 
 def is_piecewise(system: System, layout: Layout, params) -> bool:
-    """Whether the accelerations of a scene decide on something along a motion."""
+    """True if the accelerations of a scene decide on something along a motion."""
     derivation = derivation_of(system, layout, params)
     try:
         return derivation.borders is not None and bool(derivation.borders.switches)

@@ -52,7 +52,7 @@ def require_comparable(trajectory, reference) -> None:
 
 
 def _agree(ours, theirs, eps: float) -> bool:
-    """Whether two arrays agree to 4 eps; values that are being traced cannot be compared, and count as equal."""
+    """True if two arrays agree to 4 eps; values that are being traced cannot be compared, and count as equal."""
     if not (is_concrete(ours) and is_concrete(theirs)):
         return True
     ours, theirs = np.asarray(ours), np.asarray(theirs)

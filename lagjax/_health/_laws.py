@@ -1,4 +1,4 @@
-"""What can be asked of the states of a motion whose laws are known, in two ways.
+"""The measurements at the states of a motion whose laws are known, in two ways.
 
 `Law.samples` evaluates the programs of the scene in NumPy, for many states at once and without compiling anything.
 `sample_at` is the same for one state in JAX: for values that are being traced, and for scenes that have no programs.
@@ -26,7 +26,7 @@ _DERIVATIVE_BUDGET = 20_000  # operations of the program that computes a doubtfu
 
 
 class Sample(NamedTuple):
-    """What is measured at one state; at S states every field has a first axis (S, …)."""
+    """The measurements at one state; at S states every field has a first axis (S, …)."""
 
     conserved: Any  # c: h, then k − 1 momenta, (k,)
     slopes: Any  # Σ |∂c/∂yᵢ| (rtol|yᵢ| + atol), the error that one step may put into c, (k,)
@@ -63,7 +63,7 @@ class Law(NamedTuple):
     # ---- by programs, in NumPy ----
 
     def lowered(self) -> bool:
-        """Whether the scene has the programs that `samples` evaluates."""
+        """True if the scene has the programs that `samples` evaluates."""
         try:
             return bool(self.derivation.program("mass_matrix").shapes)
         except Unlowerable:
@@ -99,7 +99,7 @@ class Law(NamedTuple):
 
     @property
     def decides(self) -> bool:
-        """Whether the accelerations are known to be made of pieces."""
+        """True if the accelerations are known to be made of pieces."""
         try:
             borders = self.derivation.borders
         except Unlowerable:
@@ -157,7 +157,7 @@ class Law(NamedTuple):
             return _power_of(of, qdot, _solved(of)[1] if driven else np.zeros_like(of["driving"]))
 
     def _finite(self, columns) -> np.ndarray:
-        """Whether M, F, G and γ have finite derivatives by all inputs at S states, (S,).
+        """True if M, F, G and γ have finite derivatives by all inputs at S states, (S,).
 
         One transposed derivative of the sum of them all is taken, which a single NaN makes NaN. The program's own
         operations answer first. Where they say no, the program may have written a power as a root, or the user may have
@@ -253,7 +253,7 @@ def _eigenvalues(xp, matrix):
 
 
 def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int, ...] | None]:
-    """Whether anything does work, and the coordinates on which no force of any kind acts (None: not known)."""
+    """A flag that anything does work, and the coordinates on which no force of any kind acts (None: not known)."""
     try:
         return derivation.works, derivation.conserved
     except Unlowerable:

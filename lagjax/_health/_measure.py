@@ -527,7 +527,7 @@ def _interpolants(begin, end) -> tuple[list, list]:
 
 
 def _error_of_work(xp, found):
-    """How far the work of every piece may be off, from its values `found` (4, …) by rules of order 2, 4, 6 and 8.
+    """The error of the work of every piece, from its values `found` (4, …) by rules of order 2, 4, 6 and 8.
 
     Once pieces are short enough, errors fall from order to order by the same factor, or a larger one; one of the first
     two may be small by accident. Where they do not fall eightfold each, the pieces are longer than what they should
@@ -563,7 +563,7 @@ def _amplitude(xp, q, on_path):
 
 
 def _limits(path: Path, here: Sample, on_path) -> tuple[Any, Any]:
-    """What the errors of steps and round-off may add up to in h and the momenta, and their sizes, (…, k) each.
+    """The largest drift of h and the momenta by errors of steps and round-off, and their sizes, (…, k) each.
 
     Fixed steps have no tolerances: there `VISIBLE` of the size is the limit.
     """

@@ -71,7 +71,7 @@ def _or_one(x: np.ndarray) -> np.ndarray:
 
 
 class Arcs:
-    """What follows the motions of one scene with one set of parameters, `numbers` (P,)."""
+    """The follower of motions of one scene with one set of parameters, `numbers` (P,)."""
 
     def __init__(self, problem: Problem, numbers: np.ndarray):
         self.problem, self.numbers = problem, numbers
@@ -229,7 +229,7 @@ class Arcs:
         return [np.broadcast_to(value, (len(y),)) for value in values]
 
     def why_not(self, row: int, arc: Arc, y0: np.ndarray, t_last: float) -> str:
-        """What became of an arc that failed, in a sentence."""
+        """The failure of an arc, in a sentence."""
         if arc.result[row] == SUCCESSFUL:
             return "Its derivatives are not finite."
         return sentence(arc.result[row], arc.t_end[row], t_last, y0[row], self.layout.names) or ""

@@ -79,7 +79,7 @@ def branch_off(
 
 
 def _follower(system: System, family: Family, k: int, turns: int, params, by: str) -> Follower:
-    """What follows orbits of this family, traversed once or twice, in the units of orbit k."""
+    """The follower of orbits of this family, traversed once or twice, in the units of orbit k."""
     period, layout, y0 = _start(family, k, turns)
     q, qdot = map(layout.restore, halves(y0[0]))
     arcs = Arcs.of(system, q, qdot, params, RTOL, "Families")

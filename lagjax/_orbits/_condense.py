@@ -17,7 +17,7 @@ import numpy as np
 
 
 class Round(NamedTuple):
-    """What the eliminated unknowns are made of: `of_left`, `of_right` (B, K/2, s, s), `of_z` (B, K/2, s, c)."""
+    """The eliminated unknowns in terms of the others: `of_left`, `of_right` (B, K/2, s, s), `of_z` (B, K/2, s, c)."""
 
     of_left: np.ndarray
     of_right: np.ndarray

@@ -65,14 +65,14 @@ def _states(arcs: Arcs, start, ts) -> np.ndarray:
 
 
 def _turned(before: np.ndarray, after: np.ndarray) -> int:
-    """How many phases passed 2π between two sets of n that lie near each other on the circle."""
+    """The number of phases that passed 2π between two sets of n that lie near each other on the circle."""
     n = len(before)
     shifts = [np.concatenate([after[k:], after[:k] + 2 * np.pi]) - before for k in range(n + 1)]
     return int(np.argmin([np.abs(shift).max() for shift in shifts]))
 
 
 def _crossed(arcs: Arcs, start, ts, frames, units: Units) -> list[int]:
-    """How many conjugate times there are between neighbouring ones of these times."""
+    """The number of conjugate times between neighbouring ones of these times."""
     phases = _phases(arcs, _states(arcs, start, ts), ts, frames, units)
     return [_turned(a, b) for a, b in itertools.pairwise(phases)]
 
@@ -97,5 +97,5 @@ def _located(arcs: Arcs, start, t_first, low, high, frame, frame_low, nth: int, 
 
 
 def _is_singular(frame: np.ndarray, n: int) -> bool:
-    """Whether B, the first rows of an orthonormal plane (2n, n), is singular to the rounding of tangents."""
+    """True if B, the first rows of an orthonormal plane (2n, n), is singular to the rounding of tangents."""
     return bool(np.linalg.svd(frame[:n], compute_uv=False)[-1] < _AT_END)

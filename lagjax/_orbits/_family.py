@@ -121,7 +121,7 @@ def family(
 
 
 def place_of(params: PyTree, name: str) -> int:
-    """Where the parameter stands among all numbers."""
+    """The place of the parameter among all numbers."""
     labels, leaves, _ = taken_apart(params, "params")
     begin = 0
     for label, leaf in zip(labels, leaves, strict=True):
@@ -238,7 +238,7 @@ def _between(follower: Follower, last: _Member, following: _Member, step: float)
 
 
 def _located(follower: Follower, last: _Member, following: _Member, step: float, k: int) -> tuple[float, _Member]:
-    """Where test k is zero on the arc between two orbits, and the orbit there.
+    """The zero of test k on the arc between two orbits, and the orbit there.
 
     At a branch point the equations are singular, and about it Newton's method finds orbits of either family. So orbits
     are asked for beside it, nearer and nearer, from cubic guesses that are much nearer than the other family; the one
@@ -264,7 +264,7 @@ def _located(follower: Follower, last: _Member, following: _Member, step: float,
 
 
 def _zero(asked: dict[float, _Member], a: float, b: float, k: int) -> float:
-    """Where the inverse polynomial through the four orbits nearest to a bracket is zero; within it in any case."""
+    """The zero of the inverse polynomial through the four orbits nearest to a bracket; within it in any case."""
     near = sorted(asked, key=lambda s: abs(s - (a + b) / 2))[:4]
     values = [asked[s].tests[k] for s in near]
     shares = [np.prod([w / (w - v) for w in values[:j] + values[j + 1 :]]) for j, v in enumerate(values)]

@@ -1,4 +1,4 @@
-"""How a family of periodic orbits is followed: what is free along it, its tangent, steps of which none is a jump.
+"""The continuation of a family of periodic orbits: what is free along it, its tangent, steps of which none is a jump.
 
     predict   along the null vector of the closing equations that is no symmetry
     correct   by Newton's method within the plane across it, at the same length of arc
@@ -58,13 +58,13 @@ class Point(NamedTuple):
         return np.append(self.chain.y[0, 0], self.chain.period)
 
     def closed(self, share: float) -> bool:
-        """Whether all arcs could be followed and close to this share of the size of the state."""
+        """True if all arcs could be followed and close to this share of the size of the state."""
         return bool(self.chain.ok[0] and self.chain.closure()[0] <= share * self.chain.size()[0])
 
 
 class Tangent(NamedTuple):
-    """Where a family goes on: the unit `vector` (2n + F,), the rank of the closing equations at a closed orbit, and its
-    symmetries (2n + F, k), an orthonormal basis."""
+    """The direction in which a family continues: the unit `vector` (2n + F,), the rank of the closing equations at a
+    closed orbit, and its symmetries (2n + F, k), an orthonormal basis."""
 
     vector: np.ndarray
     rank: int
@@ -93,7 +93,7 @@ class Whole(NamedTuple):
 
 
 class Follower:
-    """What is free along a family: the first state; the period, unless it stays; a parameter, if it has a place.
+    """The unknowns along a family: the first state; the period, unless it stays; a parameter, if it has a place.
 
     All three are in the units of the first orbit, (1, 2n) and (1,), and the parameter in that of its first value.
     `until` is the value where the family is to end.
@@ -107,7 +107,7 @@ class Follower:
         self.period_is_free = not arcs.driven and (place is None or not arcs.conserves)
 
     def closing(self, numbers: np.ndarray) -> Closing:
-        """What closes an orbit with these parameters."""
+        """The closing conditions of an orbit with these parameters."""
         return Closing.plain(self.arcs.with_numbers(numbers))
 
     def point(self, y, period, parts, numbers) -> Point:

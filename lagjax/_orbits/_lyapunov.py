@@ -95,7 +95,7 @@ def _one(layout, y0) -> tuple[PyTree, PyTree]:
 
 
 def _pieces(arcs: Arcs, y0, duration, throw: bool) -> int:
-    """How many arcs each motion is divided into. Raises `SimulationError` for a motion that cannot be followed."""
+    """The number of arcs of each motion. Raises `SimulationError` for a motion that cannot be followed."""
     run = arcs.ends(np.stack([np.zeros_like(duration), duration], axis=1), y0)
     if throw and run.result[0] != SUCCESSFUL:
         names = arcs.layout.names

@@ -150,7 +150,7 @@ def periodic_orbit(
 
 
 def _closing(arcs: Arcs, energy, image) -> Closing:
-    """What an orbit has to meet. Raises for an energy that is no number, and an image that is not affine."""
+    """The conditions on an orbit. Raises for an energy that is no number, and an image that is not affine."""
     if energy is not None:
         require_number(energy, "energy")
         require_finite(energy, "energy")
@@ -213,7 +213,7 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> Found:
 
 
 def arcs_each(arcs: Arcs, y0, period) -> np.ndarray:
-    """How many arcs each orbit is divided into, powers of two: from the steps that its guess takes."""
+    """The number of arcs of each orbit, a power of two: from the steps that its guess takes."""
     run = arcs.ends(np.stack([np.zeros(len(period)), period], axis=1), y0)
     share = np.where(run.result == SUCCESSFUL, 1.0, np.clip(run.t_end / period, 1e-3, 1.0))
     count = np.maximum(1.0, run.accepted / share / _STEPS_OF_ARC)
@@ -241,7 +241,7 @@ def _put(found: Found, places: np.ndarray, others: Found) -> Found:
 
 
 def told(closing: Closing, chain: Chain, most: int | None = None) -> Found:
-    """What the search came to: multipliers, stability, and a sentence where it is no orbit.
+    """The result of the search: multipliers, stability, and a sentence where it is no orbit.
 
     At most `most` directions count as symmetries; without it all that monodromy − 1 sends to zero.
     """

@@ -31,7 +31,7 @@ _ENOUGH = 8e-15  # of the size of the state: round-off, below which trials canno
 
 
 class Closing(NamedTuple):
-    """What closes an orbit: arcs of this scene, S y = `matrix` y + `shift`, and an energy, if one is asked for."""
+    """The closing conditions of an orbit: arcs of a scene, S y = `matrix` y + `shift`, and an energy if given."""
 
     arcs: Arcs
     matrix: np.ndarray
@@ -52,7 +52,7 @@ class Closing(NamedTuple):
         return np.linalg.solve(self.matrix, (y - self.shift).T).T
 
     def conditions(self, y0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far off the energy of first states (B, 2n) is, (B, m), and its slopes (B, m, 2n); m is 0 or 1."""
+        """The error of the energy of first states (B, 2n), (B, m), and its slopes (B, m, 2n); m is 0 or 1."""
         if self.energy is None:
             return np.zeros((len(y0), 0)), np.zeros((len(y0), 0, y0.shape[1]))
         off = self.arcs.energy(0.0, y0) - self.energy
@@ -169,7 +169,7 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
 
 
 def _why(arcs: Arcs, arc: Arc, rows, times, ok) -> tuple[str, ...]:
-    """What stopped each chain, "" where nothing did."""
+    """The reason why each chain stopped, "" where none did."""
     count = len(arc.ok) // len(ok)
     texts = [""] * len(ok)
     for k in np.flatnonzero(~ok).tolist():
@@ -240,7 +240,7 @@ def _improved(closing: Closing, chain: Chain) -> Chain:
 
 
 class Symmetries(NamedTuple):
-    """What monodromy − 1 of a closed chain sends to zero, and its transpose: (K, 2n, k) at every state."""
+    """The null spaces of monodromy − 1 of a closed chain and of its transpose: (K, 2n, k) at every state."""
 
     null: np.ndarray
     of_transpose: np.ndarray
@@ -272,5 +272,5 @@ def _null(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
 
 
 def stopped(chain: Chain) -> np.ndarray:
-    """Whether nothing moves along a chain, beside its states and the guess: an equilibrium closes after any time."""
+    """True if nothing moves along a chain, beside its states and the guess: an equilibrium closes after any time."""
     return np.abs(chain.rate).max(axis=(1, 2)) * chain.period <= 1e-6 * np.maximum(chain.size(), 1.0)

@@ -1,4 +1,4 @@
-"""What a function reads: its code, and the values that it takes from outside, however far away they are.
+"""The values that a function reads: its code, and the values that it takes from outside, however far away they are.
 
     Walk      goes through a function and all that it uses: globals, closures, attributes, helpers, classes, arrays
     identity  that as a text, the same in every process: a store of a sweep tells by it whether `keep` has changed

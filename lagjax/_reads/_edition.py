@@ -118,7 +118,7 @@ class Edition:
 
 
 def _edition_of(function: Callable) -> Edition:
-    """What a pickle calls: cloudpickle would take the class with all that it reads for a method of it."""
+    """The function that a pickle calls: cloudpickle would take the class with all that it reads for a method of it."""
     return Edition.of(function)
 
 
@@ -204,7 +204,7 @@ class _Watch:
 
 
 def _new_places(before: Marks, now: "_LiveWalk") -> dict[tuple[int, str | None], Any]:
-    """Where something else is now than was before."""
+    """The place that has another value now than before."""
     known = before.keys
     new = {key: place for key, place in now.marks.keys.items() if key not in known}
     return new | {(id(place), key): place for place, key in before.changed() if key is not SIZE}
@@ -231,7 +231,7 @@ class _LiveWalk(Walk):
         self._of_libraries: set[int] = set()  # whose objects may remember what they like
 
     def is_own(self, place: Any, key: str | None) -> bool:
-        """Whether code that was met may have changed what is there."""
+        """True if code that was met may have changed what is there."""
         if key is None or self.names is None:
             return place is not None
         return key in self._stored or id(place) in self._of_libraries
@@ -313,7 +313,7 @@ def place_in(things: list, thing: Any) -> int:
 
 
 def _difference(old: Edition, now: Edition) -> str:
-    """What a function read once, and what it reads now."""
+    """The value that a function read once, and the one that it reads now."""
     name = getattr(old.function, "__name__", type(old.function).__name__)
     pairs = zip(old.text.split("\n"), now.text.split("\n"), strict=False)
     was, is_now = next(((a.strip(), b.strip()) for a, b in pairs if a != b), ("another value", "this one"))

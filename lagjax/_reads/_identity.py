@@ -1,4 +1,4 @@
-"""What a function or a value is, in words: its code, and all that it uses from outside, however far away that is.
+"""A function or a value in words: its code, and all that it uses from outside, however far away that is.
 
 Two values with one text compute the same; so a store can tell whether `keep` is still the function it was begun with.
 The text of a value that went to another process by cloudpickle is the same there: no address, no order of a set, and
@@ -66,14 +66,14 @@ class Walk:
         """The attributes of an object, of which some are read, and others may be added; `users`: of a user's class."""
 
     def wants(self, name: str, value: Any, owner: Any) -> bool:
-        """Whether an attribute of an object, a class or a function of the user is one of the things it reads."""
+        """True if an attribute of an object, a class or a function of the user is one of the things it reads."""
         return True
 
     def meets(self, names: Names) -> None:
         """Code that is among what is read names these."""
 
     def opaque(self, thing: Any) -> list[tuple[str, Any]]:
-        """What is said of an object whose inside cannot be seen."""
+        """The words for an object whose inside cannot be seen."""
         return [("shown", without_addresses(repr(thing)))]
 
     def of_array(self, value: Any) -> str:
@@ -130,7 +130,7 @@ class Walk:
         return kind + "[" + ", ".join(self.name(x, deep) for x in list(value)) + "]"
 
     def line(self, thing: Any) -> str:
-        """What a function, a class or an object consists of."""
+        """The parts of a function, a class or an object."""
         if isinstance(thing, types.FunctionType):
             return self._parts("function", self._of_function(thing))
         if isinstance(thing, type):
@@ -176,7 +176,7 @@ class Walk:
             return _NOT_FILLED
 
     def _hung_on(self, function: Any) -> list[tuple[str, Any]]:
-        """What was set as an attribute of a function."""
+        """The attributes that were set on a function."""
         held, is_plain = getattr(function, "__dict__", {}), isinstance(function, types.FunctionType)
         return [
             (f".{name}", self.read(held, name, x))
@@ -185,7 +185,7 @@ class Walk:
         ]
 
     def _with_attributes(self, used: dict[str, Any], names: frozenset[str]) -> dict[str, Any]:
-        """What is used by name, with what is asked of the user's modules among it: of `helpers.f` the function."""
+        """The values that are used by name, those of the user's modules among them: of `helpers.f` the function."""
         found, waiting, modules = dict(used), list(used.items()), set()
         for path, value in waiting:  # which grows meanwhile
             if isinstance(value, types.ModuleType) and _is_users(value.__name__) and value.__name__ not in modules:
@@ -209,7 +209,7 @@ class Walk:
                 yield name, CHANGING if self.read(kind, name, value) is CHANGING else inner
 
     def _state(self, thing: Any) -> list[tuple[str, Any]]:
-        """What an object holds; where it is of a library's class, what that shows."""
+        """The content of an object; where it is of a library's class, what that shows."""
         try:
             if hasattr(type(thing), "__array__") and not _is_users(type(thing).__module__):
                 return [("values", self.read(thing, None, np.asarray(thing)))]
@@ -289,7 +289,7 @@ def _library_name(value: Any) -> str | None:
 
 @functools.lru_cache(maxsize=1024)
 def _is_users(module: str | None) -> bool:
-    """Whether a module is the user's: not of Python, and not of an installed package."""
+    """True if a module is the user's: not of Python, and not of an installed package."""
     root = (module or "__main__").split(".")[0]
     if root == "__main__":  # whatever started it
         return True

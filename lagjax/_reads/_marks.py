@@ -78,7 +78,7 @@ class Marks:
         return {(id(place), key): place for place, key, _ in (*self._by_key, *self._classes, *self._attributes)}
 
     def hold(self) -> bool:
-        """Whether all is as it was."""
+        """True if all is as it was."""
         return next(self.changed(), None) is None
 
     def changed(self) -> Iterator[tuple[Any, str | None]]:

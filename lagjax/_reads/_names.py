@@ -14,7 +14,7 @@ _OF_GLOBALS = frozenset("LOAD_NAME STORE_NAME DELETE_NAME LOAD_FROM_DICT_OR_GLOB
 
 
 class Names(NamedTuple):
-    """What code names, the functions inside of it included.
+    """The names in code, those in the functions inside of it included.
 
     `globals`; `attributes`; `imports`, each (level, module, names taken from it); `stored`: globals, free variables and
     attributes that it sets; `reflects`: whether it makes names up.
