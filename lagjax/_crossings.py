@@ -66,7 +66,7 @@ def crossings(
     max_steps: int = 65_536,
     throw: bool = True,
 ) -> Crossings | dict[str, Crossings]:
-    r"""Where the motion of `system` from (q0, qdot0) at `ts[0]` crosses a section s(q, q̇, t) = 0 before `ts[-1]`.
+    r"""The crossings of a section s(q, q̇, t) = 0 by the motion of `system` from (q0, qdot0), from `ts[0]` to `ts[-1]`.
 
     - `section`: a function of (q, qdot), and of `t` and `params` by name, that returns one real number. A crossing is
       where that changes sign; to touch zero is not a crossing, nor is to begin on it. A dict of functions gives a dict

@@ -129,3 +129,15 @@ def test_a_name_is_imported_when_it_is_used():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+VAGUE = ("What ", "How ", "Whether ", "Where ")
+
+
+def test_docstrings_begin_with_their_subject():
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            text = ast.get_docstring(node) if isinstance(node, kinds) else None
+            name = getattr(node, "name", "its head")
+            assert not (text or "").startswith(VAGUE), f"{path}: {name} says {text!r}: name the subject first"

@@ -201,7 +201,7 @@ def fit(
 def _mistakes(
     how: "_How", scenes: list["_Scene"], params0: PyTree, parameters: Parameters, left: Unexplained, spent: float
 ) -> list[str]:
-    """What is wrong with records of which a fit leaves so much, as far as fits of other records tell; `spent` is the
+    """The mistakes in records of which a fit leaves much, as far as fits of other records tell; `spent` is the
     processor time that it took, and the tries may take, or more where it explains nothing."""
     if len(scenes) > 1 or how.method == "gradient":
         return []
@@ -225,7 +225,7 @@ def _mistakes(
 
 
 class _How(NamedTuple):
-    """What a user asks of a search."""
+    """The settings of a search."""
 
     system: Any
     observe: Any
@@ -423,7 +423,7 @@ def _sizes(recordings: list[Record]) -> np.ndarray:
 
 
 def _readers(scenes: list[_Scene], question: AbstractQuestion) -> list[Reader | None] | None:
-    """What reads states off the data, for each record whose signals are positions; None where there is no such record.
+    """Readers of states off the data, for each record whose signals are positions; None where there is no such record.
 
     All records of a system together try windows at a few hundred places.
     """
@@ -452,7 +452,7 @@ def _to_cut(scenes: list[_Scene], readers: list[Reader | None] | None, method: s
 
 
 def _starts(scenes: list[_Scene], readers: list[Reader | None] | None, states: int, params0) -> np.ndarray:
-    """Where the search for the starts of all records begins, (N, 2n) of the system with the most coordinates."""
+    """The first guess of the starts of all records, (N, 2n) of the system with the most coordinates."""
     found, first = [], 0
     for scene in scenes:
         own = None if readers is None else readers[first : first + len(scene.records)]
@@ -463,7 +463,7 @@ def _starts(scenes: list[_Scene], readers: list[Reader | None] | None, states: i
 
 
 def _start(record: Measured, readers: list[Reader | None] | None, scene: _Scene, place: int, params0) -> np.ndarray:
-    """Where the search for the start of one record begins, (2n,)."""
+    """The first guess of the start of one record, (2n,)."""
     state = known_start(record, scene.layout, place, params0)
     if state is not None:
         return state

@@ -114,7 +114,7 @@ class Chart(NamedTuple):
         return by_y[:, None] * self.root
 
     def room(self, ways: np.ndarray) -> np.ndarray:
-        """How far ζ may go from zero, both ways, along each of `ways` (D, K), (K,): nine tenths of the way to a bound.
+        """The reach of ζ from zero, both ways, along each of `ways` (D, K), (K,): nine tenths of the way to a bound.
 
         A number that is not bounded has room for one standard deviation.
         """

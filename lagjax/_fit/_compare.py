@@ -153,6 +153,6 @@ def _require_same_records(first, others) -> None:
 
 
 def effective_share(fit) -> float:
-    """How many independent samples one sample of a fit is worth."""
+    """The number of independent samples that one sample of a fit is worth."""
     samples = sum(noise.samples for noise in fit.noise.values())
     return sum(noise.effective for noise in fit.noise.values()) / samples

@@ -1,4 +1,4 @@
-"""How far the residuals of one sample say the same as those of its neighbours.
+"""The correlation of the residuals of one sample with those of its neighbours.
 
 At 1 kHz residuals hold what the scene lacks, and neighbours agree: n samples are worth n/τ independent ones, with τ the
 sum of the correlations over all lags. Source: Geyer, *Practical Markov chain Monte Carlo*, Stat. Sci. 7 (1992) 473, for
@@ -106,6 +106,6 @@ def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
 
 
 def share(question: AbstractQuestion, point: Point, widths: Widths) -> float:
-    """How many independent samples one sample is worth, over all signals: at most 1."""
+    """The number of independent samples that one sample is worth, over all signals: at most 1."""
     laws = [correlation(question, point, widths, signal) for signal in range(len(widths.sigma))]
     return sum(law.count / law.time for law in laws) / max(sum(law.count for law in laws), 1)

@@ -71,7 +71,7 @@ class OfSystem:
         return starts
 
     def residuals(self, batch: Samples, at: Unknowns):
-        """What the sensors show less what was measured, (N, T, S of this system), of the records of one batch."""
+        """The outputs of the sensors less the measurements, (N, T, S of this system), of the records of one batch."""
         layout, signals = self.question.layout, self.question.signals
         numbers = self.question.parameters.numbers(at.u, jnp)
         params = self.question.parameters.restore(numbers)
@@ -185,7 +185,7 @@ class Density:
         return self.of_weighted(weighted, [batch.weights > 0 for batch in self.question.batches], at)
 
     def residuals(self, at: Unknowns) -> list:
-        """What the sensors show less what was measured, (N, T, S), of every batch of the question."""
+        """The outputs of the sensors less the measurements, (N, T, S), of every batch of the question."""
         found, signals = [], len(self.question.names)
         for one in self.systems:
             for batch in one.question.batches:

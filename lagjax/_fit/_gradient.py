@@ -103,7 +103,7 @@ def _scales(density: Density, x: np.ndarray) -> np.ndarray:
 def ended(
     question: AbstractQuestion, u: np.ndarray, starts: np.ndarray, noise, steps: int, rest: bool
 ) -> Descent | Failure:
-    """What the descent came to, with the derivatives that intervals need."""
+    """The result of the descent, with the derivatives that intervals need."""
     point = question.at(u, starts)
     if isinstance(point, Failure):
         return point

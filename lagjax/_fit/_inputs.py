@@ -127,7 +127,7 @@ def asks(scene: Scene) -> list[str]:
 
 
 def room_for(count: int) -> int:
-    """How many instants a table has room for that is to hold `count` samples and one more."""
+    """The length of a table that is to hold `count` samples and one more."""
     room = _LEAST_ROOM
     while room <= count:
         room *= _GROWTH

@@ -1,4 +1,4 @@
-"""How well starts are known, beside the parameters: the covariance of what was eliminated.
+"""The uncertainty of starts, beside the parameters: the covariance of what was eliminated.
 
 A piece with rows A of its start and B of the parameters, in units of the noise ε, has the start
 
@@ -19,14 +19,14 @@ from lagjax._fit._uncertainty import Information
 
 
 class OfStarts(NamedTuple):
-    """What is known of N starts: `covariance` (N, 2n, 2n), and A⁺B (N, 2n, F), how they follow the parameters."""
+    """The uncertainty of N starts: `covariance` (N, 2n, 2n), and A⁺B (N, 2n, F), how they follow the parameters."""
 
     covariance: np.ndarray
     follows: np.ndarray
 
 
 def of_starts(question: AbstractQuestion, point: Point, widths: Widths, known: Information) -> OfStarts:
-    """What is known of the starts of all pieces at the end of a search; zero for those that are not fitted."""
+    """The uncertainty of the starts of all pieces at the end of a search; zero for those that are not fitted."""
     states, free, pieces = question.states, len(point.u), len(question.pieces)
     lags = [correlation(question, point, widths, s).lags for s in range(len(widths.sigma))]
     found = OfStarts(np.zeros((pieces, states, states)), np.zeros((pieces, states, free)))
@@ -62,7 +62,7 @@ def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Info
 
 
 def start_alone(rows: np.ndarray, states: int, known: Information, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """What weighted rows (T, S, 2n + F) say of their start: covariance (2n, 2n) for parameters that are kept, and A⁺B.
+    """The uncertainty of a start by weighted rows (T, S, 2n + F): covariance (2n, 2n) for fixed parameters, and A⁺B.
 
     Every sample is worth the `share` of an independent one.
     """
@@ -92,7 +92,7 @@ def _of_seen(known: Information) -> np.ndarray:
 
 
 def _moves(rows: np.ndarray, known: Information) -> np.ndarray:
-    """Whether rows (..., F) of derivatives depend on a direction that is not seen."""
+    """True if rows (..., F) of derivatives depend on a direction that is not seen."""
     if not known.null.size:
         return np.zeros(rows.shape[:-1], bool)
     return (np.abs(rows @ known.null) > 1e-6 * np.abs(rows).max(initial=0.0)).any(axis=-1)

@@ -30,7 +30,7 @@ _ALIKE = 0.02  # in the logarithm of the misfit: two starts in one minimum
 
 
 class Waterfall(NamedTuple):
-    """What many starts came to: `misfits` (K,), in order.
+    """The results of many starts: `misfits` (K,), in order.
 
     A misfit is the noise that is left, over the size of the signals: its geometric mean over them, of those that went
     through the whole search after that, of the others after the short one. It is infinite where a motion failed.
@@ -64,7 +64,7 @@ def drawn(parameters: Parameters, u: np.ndarray, count: int, seed: int) -> np.nd
 
 
 def short_search(question: AbstractQuestion, u: np.ndarray, starts: np.ndarray) -> Trials:
-    """What the starts u (K, F) come to in a few steps, with the records' starts (N, 2n) to begin from; in order."""
+    """The results of the starts u (K, F) after a few steps, from the records' starts (N, 2n); in order."""
     part = _sampled(question)
     at = _tried(part, u, np.repeat(starts[None], len(u), axis=0))
     damping = np.full(len(u), _FIRST)
@@ -213,7 +213,7 @@ def _sensed(question: Question, batch, starts, numbers, along):
 
 
 def _step(question: AbstractQuestion, at: _Tried, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where the damped step of one start leads."""
+    """The end of the damped step of one start."""
     triangles, states, none = at.triangles[k], question.states, np.zeros(at.u.shape[1])
     limits = question.parameters.limits(at.u[k])
     norms = np.linalg.norm(triangles[..., :states], axis=1), np.linalg.norm(triangles[..., states:-1], axis=(0, 1))

@@ -43,7 +43,7 @@ class Motion(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """Whether all reached their last time."""
+        """True if all reached their last time."""
         return bool(np.isin(self.result, ENDED_WELL).all() and np.isfinite(self.tangents).all())
 
     def why_not(self, ts: np.ndarray, layout: Layout) -> tuple[int, str]:
@@ -58,7 +58,7 @@ class Motion(NamedTuple):
 
 
 class AbstractMotions(abc.ABC):
-    """What follows motions and their tangents; `projection` puts states on the constraints, where it is a program."""
+    """Followers of motions and their tangents; `projection` puts states on the constraints, where it is a program."""
 
     projection: Projection | None = None
 
@@ -81,7 +81,7 @@ class AbstractMotions(abc.ABC):
 def motions_of(
     system: Scene, layout: Layout, parameters: Parameters, rtol, atol, form: Form | None = None
 ) -> AbstractMotions:
-    """What follows the motions of this scene: machine code where it has that, else diffrax. `form` is of its inputs."""
+    """Followers of the motions of a scene: machine code where it has that, else diffrax. `form` is of its inputs."""
     if isinstance(system, Hybrid):
         return _ByJAX(system, layout, parameters, {"rtol": rtol, "atol": atol})
     form = form if asks(system) else None  # inputs that only sensors ask for, or nothing

@@ -1,4 +1,4 @@
-"""What to measure next: how much each of several planned records would tell about the parameters.
+"""Experiment design: the information of each of several planned records about the parameters.
 
 With M the information that the fit has, and G the rows of a planned record in units of the noise, made orthogonal to
 those of its start where that has to be fitted too,
@@ -45,7 +45,7 @@ class Experiments(NamedTuple):
 
 
 def ranked(names: list[str], rows: list[np.ndarray], labels: tuple[str, ...], known: Information) -> Experiments:
-    """What planned records tell, whose rows (M, F) have their starts eliminated and are in units of the noise."""
+    """The information of planned records; their rows (M, F) have starts eliminated and are in units of the noise."""
     unseen = known.null
     basis = np.linalg.svd(unseen, full_matrices=True)[0][:, unseen.shape[1] :] if unseen.size else np.eye(len(labels))
     have = _information(known, basis)

@@ -1,4 +1,4 @@
-"""How measurements scatter about the motion: `Gaussian`, and `StudentT` with outliers.
+"""The scatter of measurements about the motion: `Gaussian`, and `StudentT` with outliers.
 
 A residual e of a signal with width σ and weight w has the standardised size z = √w e/σ. The density is
 
@@ -134,7 +134,7 @@ def _cost(scaled: np.ndarray, sigma: float, dof: float) -> float:
 
 
 def counts(widths: Widths, residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """How much each sample counts in the next weighted sum of squares of e/σ, in the shape of the residuals."""
+    """The weight of each sample in the next sum of squares of e/σ, in the shape of the residuals."""
     z = weights * (residuals / widths.sigma) ** 2
     with np.errstate(invalid="ignore"):  # ∞/∞ where the noise is Gaussian
         robust = np.where(np.isinf(widths.dof), 1.0, (widths.dof + 1) / (widths.dof + z))

@@ -92,7 +92,7 @@ class Parameters:
 
     @functools.cached_property
     def places(self) -> np.ndarray:
-        """Where the free numbers stand among all (X,)."""
+        """The places of the free numbers among all (X,)."""
         return np.concatenate([np.zeros(0, int), *(part.places for part in self.parts)])
 
     def __len__(self) -> int:
@@ -159,7 +159,7 @@ class Parameters:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What the unknowns are called (F,): as their numbers, or as the whole leaf that they move together."""
+        """The names of the unknowns (F,): as their numbers, or as the whole leaf that they move together."""
         found = []
         for own, rows, part in self._cuts:
             together = [part.label] * (own.stop - own.start)
@@ -173,7 +173,7 @@ class Parameters:
         return low, high
 
     def stepped(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Where a step (F,) leads from u (F,): along the tangent of x(u), where every number moves by itself."""
+        """The end of a step (F,) from u (F,): along the tangent of x(u), where every number moves by itself."""
         parts = [part.transform.stepped(u[own], step[own]) for own, _, part in self._cuts]
         return np.concatenate([np.zeros(0), *parts])
 
@@ -184,12 +184,12 @@ class Parameters:
 
     @property
     def reach(self) -> np.ndarray:
-        """How far one step may change each u (F,)."""
+        """The largest change of each u (F,) in one step."""
         return self._of_each("reach")
 
     @property
     def room(self) -> np.ndarray:
-        """How far from one value of each u (F,) others are told apart."""
+        """The distance from one value of each u (F,) at which others are told apart."""
         return self._of_each("room")
 
     def _of_each(self, name: str) -> np.ndarray:

@@ -148,7 +148,7 @@ def _end_value(value, end: float) -> float:
 
 
 def _end(line: _Line, side: float, threshold: float, room: float) -> float:
-    """Where the profile passes the threshold first on one side, ±∞ where it does not within `room`.
+    """The place where the profile first passes the threshold on one side, ±∞ where it does not within `room`.
 
     Its places go on behind the end, as far as other minima are looked for.
     """

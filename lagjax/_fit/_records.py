@@ -33,7 +33,7 @@ class Guess(NamedTuple):
 
 
 class Measured:
-    """What was measured of one motion: a `Record`, or `Timings`."""
+    """The measurements of one motion: a `Record`, or `Timings`."""
 
     ts: np.ndarray
     start: Any
@@ -137,13 +137,13 @@ class Record(Measured):
 
     @property
     def input_structure(self) -> tuple | None:
-        """What must be the same for the inputs of records of one fit; None without inputs."""
+        """The key that the inputs of all records of a fit share; None without inputs."""
         leaves, tree = jax.tree.flatten(self.inputs)
         return (tree, tuple(leaf.shape[1:] for leaf in leaves)) if leaves else None
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the signals are called, (S,): `['x'][0]` or empty for the only one."""
+        """The names of the signals, (S,): `['x'][0]` or empty for the only one."""
         labels, leaves, _ = taken_apart(self.values, "")
         return tuple(
             label + (f"[{', '.join(map(str, index))}]" if leaf.ndim > 1 else "")
@@ -153,7 +153,7 @@ class Record(Measured):
 
     @property
     def structure(self) -> tuple:
-        """What must be the same for records of one fit: the tree of the signals and their shapes."""
+        """The key that all records of a fit share: the tree of the signals and their shapes."""
         leaves, tree = jax.tree.flatten(self.values)
         return tree, tuple(leaf.shape[1:] for leaf in leaves)
 

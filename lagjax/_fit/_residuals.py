@@ -61,7 +61,7 @@ class Part(NamedTuple):
 
 
 class AbstractQuestion(abc.ABC):
-    """What a search sees: N pieces of records with S signals, what is free, and the residuals of a trial.
+    """The problem of a search: N pieces of records with S signals, the free numbers, and the residuals of a trial.
 
     - `records`, `pieces` (N,), `fitted` (N,): whether the start of a piece is free; `states`: the numbers of a start.
     - `names`, `size`, `least` (S,): signals, their root mean square, and the smallest noise that can be told of them.
@@ -96,7 +96,7 @@ class AbstractQuestion(abc.ABC):
 
     @abc.abstractmethod
     def called(self, record: int) -> str:
-        """How the user reaches a record: `records[0]`."""
+        """The name by which the user reaches a record: `records[0]`."""
 
     @property
     @abc.abstractmethod
@@ -111,7 +111,7 @@ class AbstractQuestion(abc.ABC):
     @property
     @abc.abstractmethod
     def unknowns(self) -> int:
-        """How many numbers of all starts are free."""
+        """The number of free numbers of all starts."""
 
     @abc.abstractmethod
     def follow(self, u: np.ndarray, starts: np.ndarray) -> Point | Failure:
@@ -172,13 +172,13 @@ class AbstractQuestion(abc.ABC):
         return layout.restore(state[: layout.size]), layout.restore(state[layout.size : 2 * layout.size])
 
     def by_system(self, of_records: Sequence) -> Any:
-        """What there is of every record as a tuple, or in a dict of tuples by the names of systems."""
+        """The values of every record as a tuple, or in a dict of tuples by the names of systems."""
         if self.parts[0].name is None:
             return tuple(of_records)
         return {part.name: tuple(of_records[part.records]) for part in self.parts}
 
     def end_to_end(self, of_systems: Any) -> list:
-        """What `by_system` returned, for all records in order."""
+        """The values that `by_system` returned, for all records in order."""
         return list(of_systems) if self.parts[0].name is None else [x for own in of_systems.values() for x in own]
 
 
@@ -222,7 +222,7 @@ class Question(AbstractQuestion):
 
     @property
     def unknowns(self) -> int:
-        """How many numbers of all starts are free."""
+        """The number of free numbers of all starts."""
         return self.states * int(self.fitted.sum())
 
     @property
@@ -236,7 +236,7 @@ class Question(AbstractQuestion):
         return [(self.parts[0], np.arange(len(self.pieces)))]
 
     def called(self, record: int) -> str:
-        """How the user reaches a record."""
+        """The name by which the user reaches a record."""
         return f"records[{record}]"
 
     def with_parameters(self, parameters: Parameters) -> "Question":
@@ -330,7 +330,7 @@ class Question(AbstractQuestion):
         return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
 
     def _sense(self, batch: Samples, y0, numbers, y0_dot, numbers_dot) -> tuple[np.ndarray, np.ndarray] | Failure:
-        """What the sensors show of a batch (N, T, S), and how that moves (N, T, S, D)."""
+        """The outputs of the sensors for a batch (N, T, S), and their tangents (N, T, S, D)."""
         shown = self._delayed(batch, y0, numbers, y0_dot, numbers_dot)
         if isinstance(shown, Failure):
             return shown

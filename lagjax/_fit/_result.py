@@ -96,7 +96,7 @@ class Prediction(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """What came out of `fit`. Print it for a table with intervals and a verdict.
+    """The result of `fit`. Print it for a table with intervals and a verdict.
 
     - `params`: the parameters in the user's pytree; the free ones are those of maximum likelihood.
     - `starts`: one (q0, qdot0) per record. For several systems `starts` and `residuals` are dicts by their names.
@@ -431,7 +431,7 @@ class Fit:
 
     @staticmethod
     def _by_name(of_all, part: Part) -> Any:
-        """What there is for one system: by its name, or for all."""
+        """The part for one system: by its name, or for all."""
         return of_all[part.name] if isinstance(of_all, dict) else of_all
 
     @with_doubles

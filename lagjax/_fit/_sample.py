@@ -188,7 +188,7 @@ def _shrunk(rows: np.ndarray) -> np.ndarray:
 
 
 class Chains(NamedTuple):
-    """Where C chains are: the sampler's state along π*, log π (C,) and log π − log π* (C,)."""
+    """The positions of C chains: the sampler's state along π*, log π (C,) and log π − log π* (C,)."""
 
     state: Any
     exact: np.ndarray
@@ -203,7 +203,7 @@ class Chains(NamedTuple):
 
 
 def _weighed(sampler: Sampler, exact: Callable, state, key) -> tuple[float, Chains]:
-    """How many of independent pairs of draws of π* are accepted, and where its chains are then.
+    """The share of independent pairs of draws of π* that is accepted, and the chains then.
 
     Starts chosen by weight would not be better ones: the few largest weights are where π* is too small, and a chain
     stays there for as long as the weight is large.
@@ -288,7 +288,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(x: np.ndarray) -> Agreement:
-    """How well draws (C, K, D) of C chains agree."""
+    """The agreement of draws (C, K, D) of C chains."""
     arviz = _arviz()
     if x.shape[1] < _FEWEST_TO_TELL:
         return Agreement(*np.full((2, x.shape[2]), np.nan))

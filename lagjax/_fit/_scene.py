@@ -1,4 +1,4 @@
-"""What a fit asks of a scene: a `System`, or a `Hybrid`, whose motion goes through several."""
+"""The scene of a fit: a `System`, or a `Hybrid`, whose motion goes through several."""
 
 from typing import Any
 

@@ -73,7 +73,7 @@ def _likelihood(done: Descent) -> float:
 
 
 def reader_of(record: Record, observe, about: Question, numbers: np.ndarray, probes: int = 256) -> Reader | None:
-    """What reads states off a record; None where its signals are no positions, or go round too fast to tell."""
+    """A reader of states off a record; None where its signals are no positions, or go round too fast to tell."""
     if not looks_like_positions(observe, record, about.layout):
         return None
     periods = about.signals.periods
@@ -175,7 +175,7 @@ def by_gradient(
 
 
 def _followed(question: AbstractQuestion, done: Descent | Failure) -> Descent:
-    """What a search came to. Raises `Unfollowed` where its motions could not be followed."""
+    """The result of a search. Raises `Unfollowed` where its motions could not be followed."""
     if isinstance(done, Failure):
         raise Unfollowed(question.where(done) + " Begin nearer: other params0, or starts that are known.")
     return done
@@ -207,7 +207,7 @@ def _grown(
 
 
 class _Begun(NamedTuple):
-    """Where growing segments begin: u, the cuts, the states at the first samples, how far off that is, and the search
+    """The beginning of growing segments: u, the cuts, the states at the first samples, their error, and the search
     on the shortest segments where it came to an end."""
 
     u: np.ndarray
@@ -310,7 +310,7 @@ def _over_segments(question: AbstractQuestion, systems, u, noise, readers: list[
 
 
 def _time_scales(question: AbstractQuestion, readers: list[Reader | None], u) -> list[float]:
-    """How long the motion of each record looks like a straight line: of all records of a system the same.
+    """The duration for which the motion of each record looks like a straight line: of all records of a system the same.
 
     It is infinite for a system of which no state can be read off.
     """

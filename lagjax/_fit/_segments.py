@@ -1,4 +1,4 @@
-"""Where a search begins: states read off the data, and records cut into segments that grow together.
+"""The beginning of a search: states read off the data, and records cut into segments that grow together.
 
 Over a long record the sum of squares has many minima: a wrong frequency is out of phase, a chaotic motion forgets its
 start. Over a segment shorter than the motion's own time scale there is one. So the records are first cut into short
@@ -146,7 +146,7 @@ def glimpses(readers: list[Reader], length: float) -> tuple[list[Record], np.nda
 
 
 class TimeScales(NamedTuple):
-    """How long a motion looks like a straight line, by what the data say and by what the scene says of their states."""
+    """The duration for which a motion looks like a straight line, by the data and by the scene at their states."""
 
     data: float
     scene: float

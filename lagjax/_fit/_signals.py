@@ -168,5 +168,5 @@ def _is_complex(leaf) -> bool:
 
 
 def looks_like_positions(observe: Callable | Delayed | None, record: Record, layout: Layout) -> bool:
-    """Whether the signals are positions, or something of their structure (with a gain, a bias): a start for q."""
+    """True if the signals are positions, or something of their structure (with a gain, a bias): a start for q."""
     return sensors(observe)[0] is None or record.structure == (layout.tree, layout.shapes)

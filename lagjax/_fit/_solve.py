@@ -42,7 +42,7 @@ _KINK = (
 
 
 class Descent(NamedTuple):
-    """Where a search ended: the last trial, its noise, whether it converged, how many trials, a sentence, and the
+    """The end of a search: the last trial, its noise, whether it converged, how many trials, a sentence, and the
     question about which it was."""
 
     point: Point

@@ -136,7 +136,7 @@ def _trial(chart: Chart, zeta: np.ndarray) -> Point | Failure:
 
 
 def _jacobians(chart: Chart, trial: Point, zeta: np.ndarray, states: int) -> list[np.ndarray]:
-    """How the weighted residuals of every batch move with ζ, (N, T, S, d)."""
+    """The slopes of the weighted residuals of every batch by ζ, (N, T, S, d)."""
     density = chart.density
     question, free, places = density.question, len(density.point.u), _places(density, states)
     padded = np.pad(chart.columns(zeta), (0, 1))

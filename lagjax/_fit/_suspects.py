@@ -1,4 +1,4 @@
-"""What may be wrong with the data of a fit that explains nothing: each mistake is undone, and the fit tried again.
+"""Mistakes in the data of a fit that explains nothing: each one is undone, and the fit tried again.
 
 Degrees for radians, milliseconds for seconds, two signals in each other's place, a sign, an angle from the upright:
 each leaves data that a scene cannot follow, and each can be undone. If the fit then follows them, that is the mistake,

@@ -20,7 +20,7 @@ from lagjax._fit._residuals import AbstractQuestion, Failure, Part, Point, Quest
 
 
 class Several(AbstractQuestion):
-    """What is asked of several systems at once, by their names; `u` moves the parameters that they share.
+    """The problem of several systems at once, by their names; `u` moves the parameters that they share.
 
     `systems` holds the questions about whole records. A piece has the number of its record among all, those of the
     first system first. Without `pieces` (N,) and `fitted` (N,) it is about whole records itself.
@@ -80,7 +80,7 @@ class Several(AbstractQuestion):
 
     @property
     def unknowns(self) -> int:
-        """How many numbers of all starts are free."""
+        """The number of free numbers of all starts."""
         return sum(part.question.unknowns for part, _ in self.apart)
 
     def of(self, pieces: list[Piece], fitted: np.ndarray) -> "Several":
@@ -106,7 +106,7 @@ class Several(AbstractQuestion):
         return slice(part.signals.start + own.start, part.signals.start + own.stop)
 
     def called(self, record: int) -> str:
-        """How the user reaches a record."""
+        """The name by which the user reaches a record."""
         name = next(name for name, first in reversed(self.first.items()) if first <= record)
         return f"records[{name!r}][{record - self.first[name]}]"
 
@@ -141,7 +141,7 @@ def asked(systems: dict[str | None, Question]) -> AbstractQuestion:
 
 
 class Given(NamedTuple):
-    """What the user gives of one system, with its name, which is None where it is the only one."""
+    """The arguments for one system, with its name, which is None where it is the only one."""
 
     name: str | None
     system: Any

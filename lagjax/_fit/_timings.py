@@ -117,7 +117,7 @@ class Timings(Measured):
 
     @property
     def ts(self) -> np.ndarray:
-        """Where the motion begins, and the last measured time."""
+        """The time at which the motion begins, and the last measured time."""
         return np.array([float(self.t0), np.nanmax(self.flat.times)])
 
     @property
@@ -387,7 +387,7 @@ class Clock(AbstractClock):
         return Crossed(np.where(ok[:, None], t, np.nan), order, by_y, by_numbers, ok, ts, y0, numbers, steps)
 
     def _moved(self, t: np.ndarray, y: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How the times t (N, M) of crossings move with the states y (N, M, 2n) there, and with the parameters."""
+        """The slopes of the times t (N, M) of crossings by the states y (N, M, 2n) there, and by the parameters."""
         (count, crossings, states), n = y.shape, self.layout.size
         each = np.repeat(numbers, crossings, axis=0)
         columns = *y.reshape(-1, states).T, t.ravel(), *each.T
@@ -433,7 +433,7 @@ class Clock(AbstractClock):
         return crossed.t[0], self.forward(crossed, y0_dot[None], numbers_dot[None])[0]
 
     def forward(self, crossed: Crossed, y0_dot: np.ndarray, numbers_dot: np.ndarray) -> np.ndarray:
-        """How the times move along D directions (N, M, D): of the starts (N, D, 2n), of the parameters (N, D, P)."""
+        """Tangents of the times along D directions (N, M, D): of the starts (N, D, 2n), of the parameters (N, D, P)."""
         tangents, _ = _derivatives.jvp(
             self.flow, crossed.ts, crossed.y0, crossed.numbers, crossed.steps, y0_dot, numbers_dot, self.of_tangents
         )  # fmt: skip

@@ -41,7 +41,7 @@ class AbstractTransform(abc.ABC):
 
     @abc.abstractmethod
     def refuses(self, x: np.ndarray) -> str | None:
-        """What the values must be, as the end of a sentence, where `x` is outside the set; None where it is not."""
+        """The condition on the values, as the end of a sentence, where `x` is outside the set; None where it is not."""
 
     @abc.abstractmethod
     def value(self, u, xp: Any = np) -> Any:
@@ -72,12 +72,12 @@ class AbstractTransform(abc.ABC):
         return np.full(len(u), -self.reach), np.full(len(u), self.reach)
 
     def stepped(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Where a step (m,) leads from u (m,)."""
+        """The end of a step (m,) from u (m,)."""
         return u + step
 
     @property
     def separable(self) -> bool:
-        """Whether every number moves by itself, so that one can be kept and the others moved."""
+        """True if every number moves by itself, so that one can be kept and the others moved."""
         return False
 
     @property
@@ -177,7 +177,7 @@ class Positive(AbstractSeparable):
         return np.log(x)
 
     def limits(self, u):
-        """What lowers or raises x by the factor e to the power of `reach`."""
+        """The steps that lower or raise x by the factor e to the power of `reach`."""
         return np.full(len(u), np.expm1(-self.reach)), np.full(len(u), np.expm1(self.reach))
 
     def stepped(self, u, step):

@@ -1,4 +1,4 @@
-"""How well the parameters are known: their covariance where residuals are correlated, and what is not seen at all.
+"""The uncertainty of the parameters: their covariance where residuals are correlated, and what is not seen at all.
 
 With the starts eliminated, a small change of the measurements by ε moves the free parameters by H⁻¹ Gᵀ ε: G has the
 rows of the parameters, made orthogonal to those of the starts, in units of the noise, and H = GᵀG. So
@@ -40,7 +40,7 @@ _NOTHING = 1e-140
 
 
 class Information(NamedTuple):
-    """What the data say about F free parameters.
+    """The information of the data about F free parameters.
 
     - `covariance` (F, F) of u; infinite variance and NaN beside it where a parameter is not seen.
     - `null` (F, K): the K directions of u that nothing depends on, as far as rounding lets one tell; `confirmed` are
@@ -61,7 +61,7 @@ class Information(NamedTuple):
 
 
 def information(question: AbstractQuestion, point: Point, widths: Widths) -> Information:
-    """What the data say about the parameters, at the end of a search."""
+    """The information of the data about the parameters, at the end of a search."""
     factors = [np.sqrt(b.weights) / widths.sigma for b in question.batches]
     triangles = question.triangles(point, factors)
     null, basis = seen(triangles, question.states)
@@ -111,7 +111,7 @@ def seen(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_lost(question: AbstractQuestion, point: Point) -> bool:
-    """Whether the last digit of a parameter moves a signal by its size, because motions grow apart.
+    """True if the last digit of a parameter moves a signal by its size, because motions grow apart.
 
     Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
     """

@@ -1,4 +1,4 @@
-"""What the data cannot see, in words: null directions of the information as sentences with the parameters' names.
+"""Unseen numbers, in words: null directions of the information as sentences with the parameters' names.
 
 A null direction v of the parameters says that measurements do not change along v, at one point. In logarithms, with
 the relative changes dxᵢ/xᵢ as coordinates, what is seen is orthogonal to it: if that has small whole exponents, here

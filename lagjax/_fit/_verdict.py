@@ -1,4 +1,4 @@
-"""What a search came to, in words: how it ended, what it leaves, parameters at the end of their sets, records that
+"""The result of a search in words: its end, signals that it leaves, parameters at the end of their sets, records that
 disagree.
 
 A search may converge where it explains nothing. So the residuals of every signal are compared with the signal itself,
@@ -39,7 +39,7 @@ _CORRELATED = 0.5
 
 
 class Verdict(NamedTuple):
-    """Whether a fit can be relied upon, and the sentences that say why; and what it leaves."""
+    """A flag that a fit can be relied upon, the sentences that say why, and what it leaves."""
 
     ok: bool
     message: str
@@ -47,7 +47,7 @@ class Verdict(NamedTuple):
 
 
 def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, question: AbstractQuestion) -> Verdict:
-    """What a search came to that ended there."""
+    """The verdict on a search that ended there."""
     parts = [descent.message]
     if known.confirmed.shape[1]:
         parts.append("Not everything that is free is seen: fix it, or measure more.")
@@ -73,8 +73,8 @@ def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, quest
 
 
 class Unexplained(NamedTuple):
-    """What a trial leaves: sentences for the signals of which motion is left, and for those whose noise is as large as
-    they are; the largest share of a signal that is left, whether it holds motion at all, and the records, the worst
+    """Sentences on the residuals of a trial: for signals of which motion is left, and for those whose noise is as large
+    as they are; the largest share of a signal that is left, whether it holds motion at all, and the records, the worst
     first."""
 
     motion: list[str]
@@ -85,7 +85,7 @@ class Unexplained(NamedTuple):
 
 
 def unexplained(question: AbstractQuestion, point: Point, widths: Widths) -> Unexplained:
-    """What a trial leaves of the signals, where that is much."""
+    """The share of the signals that a trial leaves, where that is much."""
     left, noisy, shares, doubted, many = [], [], [0.0], False, len(question.records) > 1
     of_records = np.zeros(len(question.records))
     for signal, name in enumerate(question.names):

@@ -64,7 +64,7 @@ def wrapped(period: PyTree, observe: Any = None) -> "Wrapped":
 
 @dataclass(frozen=True)
 class Wrapped:
-    """What `wrapped` returns: `observe`, as the user gave it, with the `period` of its signals."""
+    """The result of `wrapped`: `observe`, as the user gave it, with the `period` of its signals."""
 
     period: PyTree
     observe: Any = None

@@ -151,7 +151,7 @@ def _motion(plan: Plan, problem: Problem) -> tuple[Ending, Record]:
 
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: Record) -> Trajectory:
-    """What became of the motion, in the pytree of the user."""
+    """The motion in the pytree of the user."""
     restore, (accepted, rejected) = problem.layout.restore, ending.steps
     (q, qdot), (q_end, qdot_end), (q_before, qdot_before) = map(halves, (ending.path, ending.y, record.y))
     transitions = Transitions(

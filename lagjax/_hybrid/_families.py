@@ -51,7 +51,7 @@ class _Traced(NamedTuple):
 
 
 class _Site(NamedTuple):
-    """Where a number stands in a trace: among its constants, the operands of equations (i, j), or the results."""
+    """The place of a number in a trace: among its constants, the operands of equations (i, j), or the results."""
 
     kind: str
     place: tuple[int, ...]
@@ -168,7 +168,7 @@ def _traced(function: Function, roles: int, layout: Layout, params) -> _Traced:
 
 
 def _same_outline(one: System, of_one, other: System, of_other) -> bool:
-    """Whether two modes have the same functions and transitions, but for what the functions give."""
+    """True if two modes have the same functions and transitions, but for what the functions give."""
 
     def outline(system, leaving):
         roles = [getattr(system, role) is None for role in ROLES]
@@ -178,7 +178,7 @@ def _same_outline(one: System, of_one, other: System, of_other) -> bool:
 
 
 def _few(traces: Sequence[list]) -> bool:
-    """Whether few numbers differ between the modes of these traces."""
+    """True if few numbers differ between the modes of these traces."""
     columns = [column for column in zip(*traces, strict=True) if column[0] is not None]
     return sum(np.size(sites[0].value) for column in columns for sites in _different(column)) <= MOST_NUMBERS
 
@@ -218,7 +218,7 @@ def _is_float(x) -> bool:
 
 
 def _differ_by_numbers(one: _Traced | None, other: _Traced | None) -> bool:
-    """Whether two functions are the same but for numbers that may differ."""
+    """True if two functions are the same but for numbers that may differ."""
     if one is None or other is None:
         return one is other
     if one.function == other.function:
@@ -230,7 +230,7 @@ def _differ_by_numbers(one: _Traced | None, other: _Traced | None) -> bool:
 
 
 def _same_jaxpr(one: core.Jaxpr, other: core.Jaxpr, numbers: Callable = lambda a, b: True) -> bool:
-    """Whether two jaxprs are the same operations on the same variables; literals as `numbers` compares them."""
+    """True if two jaxprs are the same operations on the same variables; literals as `numbers` compares them."""
     names: dict = {}
 
     def same(a, b) -> bool:
@@ -259,7 +259,7 @@ def _same_jaxpr(one: core.Jaxpr, other: core.Jaxpr, numbers: Callable = lambda a
 
 
 def _same_parameter(a, b) -> bool:
-    """Whether two parameters of an operation are known to be the same."""
+    """True if two parameters of an operation are known to be the same."""
     if a is b:
         return True
     if isinstance(a, core.ClosedJaxpr) and isinstance(b, core.ClosedJaxpr):
@@ -275,7 +275,7 @@ def _same_parameter(a, b) -> bool:
 
 
 def _equal(a, b) -> bool:
-    """Whether two constants are the same, down to the sign of zero."""
+    """True if two constants are the same, down to the sign of zero."""
     if a is b:
         return True
     a, b = np.asarray(a), np.asarray(b)

@@ -171,7 +171,7 @@ class Mode(NamedTuple):
         return lambda taken, t, y, numbers: differentiated_as(moved, (t, y), taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):
-        """Whether a state is off the constraints of this mode."""
+        """True if a state is off the constraints of this mode."""
         system = self.problem.system
         if system.constraints is None and system.velocity_constraints is None:
             return jnp.asarray(False)

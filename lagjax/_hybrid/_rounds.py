@@ -35,7 +35,7 @@ _LEAST = 1e-300  # a side of a guard that is exactly zero still has a sign
 
 
 class Plan(eqx.Module):
-    """What does not change from round to round: the modes by name, their transitions, and what a run may cost."""
+    """The constants of all rounds: the modes by name, their transitions, and what a run may cost."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     systems: tuple[System, ...]
@@ -87,7 +87,7 @@ class Group(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """How far a motion has come: after the last round, how it ended."""
+    """The state of a motion between rounds: after the last round, how it ended."""
 
     t: jax.Array
     y: jax.Array  # (2n,)
@@ -102,7 +102,7 @@ class Ending(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What is known of every guard just before the last reset, (K,): its value, and the side of its surface.
+    """The sides of every guard just before the last reset, (K,): its value, and the side of its surface.
 
     Of a guard of another mode the value is NaN. `rounding` is that of the largest terms that a guard has had.
     """
@@ -180,7 +180,7 @@ class _Rounds(NamedTuple):
         return after, record
 
     def is_inconsistent(self, mode, t, y, among: Sequence[int]) -> jax.Array:
-        """Whether a state is off the constraints of a mode, which is one `among` these."""
+        """True if a state is off the constraints of a mode, which is one `among` these."""
         (place, row), off = jnp.asarray(self.places)[mode], jnp.asarray(False)
         for index in np.unique(self.places[list(among), 0]).tolist():
             this = place == index
@@ -258,7 +258,7 @@ class _Rounds(NamedTuple):
         return Memory(jnp.full(count, jnp.nan), jnp.zeros(count), jnp.broadcast_to(rounding, (count,)))
 
     def _memory(self, mode: Mode, guarded: Guarded, kinds, before: Memory, sides, stays) -> Memory:
-        """What is known before a reset of the guards of this mode, which began on these `sides`.
+        """The sides before a reset of the guards of this mode, which began on these `sides`.
 
         A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where it
         began, if it `stays` there since or has no rate, and else from where its rate does.
@@ -311,7 +311,7 @@ def _constant_unless(varies, tree: PyTree) -> PyTree:
 
 
 def _pile_up(times, end) -> jax.Array:
-    """Whether the times of a spent budget of transitions run geometrically to a limit before `end`.
+    """True if the times of a spent budget of transitions run geometrically to a limit before `end`.
 
     Aitken's extrapolation of the last times, taken far enough apart that a pattern of two, three or six transitions (a
     flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one. Or the

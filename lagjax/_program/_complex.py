@@ -38,7 +38,7 @@ class Pair(NamedTuple):
 
     @property
     def is_real(self) -> bool:
-        """Whether the imaginary part is zero whatever the numbers."""
+        """True if the imaginary part is zero whatever the numbers."""
         graph = self.im.expansion.graph
         return all(graph.value(i) == 0 for i in self.im.ids.ravel().tolist())
 

@@ -92,7 +92,7 @@ class Expansion:
 
     @staticmethod
     def has_pairs(array: np.ndarray) -> bool:
-        """Whether any of these numbers is complex."""
+        """True if any of these numbers is complex."""
         return bool(array.size) and array.max() >= PAIRS
 
     def map(self, op: str, *arrays: np.ndarray, attribute=None) -> np.ndarray:
@@ -159,7 +159,7 @@ class Expansion:
 
 
 def is_complex(dtype) -> bool:
-    """Whether numbers of this type are complex."""
+    """True if numbers of this type are complex."""
     return jnp.issubdtype(dtype, jnp.complexfloating)
 
 
@@ -210,7 +210,7 @@ def live_equations(jaxpr) -> list:
 
 
 def read_by(equation) -> list:
-    """What the lowered equation reads: of a linear system the matrix and the right-hand side, not JAX's own factors."""
+    """The operands of a lowered equation: of a linear system the matrix and the right-hand side, not JAX's factors."""
     if equation.primitive.name != "custom_linear_solve":
         return equation.invars
     lengths = equation.params["const_lengths"]
@@ -495,7 +495,7 @@ LOWER.update({name: _cumulation(op) for name, op in CUMULATIONS.items()})
 
 
 def _first_extreme(better):
-    """Where the largest or smallest element along an axis is, the first of equal ones."""
+    """The index of the largest or smallest element along an axis, the first of equal ones."""
 
     def rule(expansion, params, x):
         (axis,), kind = params["axes"], kind_of(params["index_dtype"])
@@ -556,7 +556,7 @@ def _dynamic_update_slice(expansion, params, x, update, *starts):
 
 
 def _places(indices, shape, offset_dims, collapsed, index_map, operand_batch, indices_batch, sizes, clip):
-    """Where each element of a gather's result lies in the flattened operand; -1 for a window that sticks out.
+    """The place of each element of a gather's result in the flattened operand; -1 for a window that sticks out.
 
     The same for a scatter, with the updates in place of the result.
     """
@@ -670,7 +670,7 @@ def written_out(primitive) -> core.ClosedJaxpr:
 
 
 def _searches_from_the_right(body, arguments) -> bool:
-    """Whether a function that is named so is `jnp.searchsorted(knots, x, side="right")`, for which `jnp.interp` asks.
+    """True if a function that is named so is `jnp.searchsorted(knots, x, side="right")`, for which `jnp.interp` asks.
 
     It is tried with numbers: knots 0, 1, …, and a number below them, between two of them, at one, and beyond them.
     """
@@ -707,7 +707,7 @@ def _scan(expansion, params, *arguments):
 
 
 def _parts_of_scan(params) -> tuple[int, int]:
-    """How many arguments of a scan are constants, and how many are the state that it carries."""
+    """The numbers of a scan's constants, and of the arrays that it carries."""
     if "num_carry" in params:
         return params["num_consts"], params["num_carry"]
     consts, carry, _ = params["ft_in"].unpack()  # since JAX 0.11

@@ -42,7 +42,7 @@ def _polynomial(coefficients: Sequence[float], x: Any) -> Any:
 
 
 def _reflected(x: Scalars) -> tuple[Any, Any, Any]:
-    """Whether x is negative, what is positive of x and 1 − x, and x where it is negative, else ½."""
+    """A flag that x is negative, the positive one of x and 1 − x, and x where it is negative, else ½."""
     negative = x.map("lt", x, 0.0)
     return negative, xp.where(negative, 1.0 - x, x), xp.where(negative, x, 0.5)
 

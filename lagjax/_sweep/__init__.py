@@ -93,11 +93,11 @@ class Sweep:
         return data.assign({RESULT.name: result})
 
     def status(self) -> Status:
-        """How far it has come, how members ended, which failed, and the worst change of energy."""
+        """The progress: units that are done, the ends of members, those that failed, and the worst change of energy."""
         return status(Store(self.store))
 
     def statistics(self) -> dict[str, Summary]:
-        """What `reduce` asked for, of all units that are done, by the names of the quantities."""
+        """The statistics that `reduce` asked for, of all units that are done, by the names of the quantities."""
         store = Store(self.store)
         spec, totals = store.spec(), {}
         for unit in sorted(store.done()) if spec["reduce"] else ():
@@ -107,7 +107,7 @@ class Sweep:
         return {name: summary(Statistics(**spec["reduce"][name]), x, shapes[name]) for name, x in totals.items()}
 
     def damaged(self) -> dict[int, str]:
-        """What is wrong with chunks of finished units, in words, by units; all of them are read."""
+        """The damage of chunks of finished units, in words, by units; all of them are read."""
         store = Store(self.store)
         return store.damaged(store.spec(), store.done(), whole=True)
 

@@ -36,7 +36,7 @@ def label(code: int) -> str:
 
 
 class Kept(NamedTuple):
-    """What remains of the members of a batch: values (B, …) by name, results (B,), |h − h₀| (B,), and complaints."""
+    """The results of the members of a batch: values (B, …) by name, results (B,), |h − h₀| (B,), and complaints."""
 
     values: dict[str, np.ndarray]
     result: np.ndarray
@@ -46,7 +46,7 @@ class Kept(NamedTuple):
 
 
 def batches_of(motions: Motions, conserves: bool) -> "Batches":
-    """What computes batches of these motions; the last ones are remembered, with what was compiled for them."""
+    """The function that computes batches of these motions; the last ones are kept, with what was compiled for them."""
     fixed = (motions.system, motions.q0, motions.qdot0, motions.params, motions.keep, *motions.settings.values())
     sections = motions.sections and motions.sections._replace(functions=tuple(map(id, motions.sections.functions)))
     key = (
@@ -88,7 +88,7 @@ class Batches:
         self._keep_all, self._tolerances = jax.jit(self._keep_of_all), None
 
     def __call__(self, points: dict[str, np.ndarray]) -> Kept:
-        """What is kept of the members at these points (B,)."""
+        """The kept values of the members at these points (B,)."""
         motions, no_start = self._motions_of(points)
         kept, drift, complaints = self._kept_of(motions)
         result = np.asarray(motions.run.result._value).astype(RESULT.dtype)
@@ -119,7 +119,7 @@ class Batches:
         return _Motions(run, crossings, (_arrays(run), crossings), of_members), complaints
 
     def _kept_of(self, motions: "_Motions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
-        """What `keep` returns of each member, the change of its energy, and for which members `keep` raised."""
+        """The result of `keep` for each member, the change of its energy, and the members for which `keep` raised."""
         if "keep" not in self.slow:
             try:
                 return self._compiled(motions)
@@ -146,7 +146,7 @@ class Batches:
         return start
 
     def _compiled(self, motions: "_Motions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
-        """What is kept of all members at once; members for which `keep` raises while it runs are blank, and told."""
+        """The kept values of all members at once; members for which `keep` raises while it runs are blank, and told."""
         everyone = np.arange(len(motions.run.result._value))
         try:
             return *self._of_some(motions, None), {}
@@ -164,7 +164,7 @@ class Batches:
         return kept, None if drift is None else np.where(bad, np.nan, drift), complaints
 
     def _of_some(self, motions: "_Motions", which: np.ndarray | None) -> tuple[dict[str, np.ndarray], Any]:
-        """What is kept of these members (B,), by default of all in their order, and the change of their energy."""
+        """The kept values of these members (B,), by default of all in their order, and the change of their energy."""
         arrays = motions.arrays, motions.params
         if which is not None:
             arrays = jax.tree.map(lambda x: np.asarray(x)[which], arrays)
@@ -187,7 +187,7 @@ class Batches:
         return found if len(found) <= _MOST_RAISE else {}
 
     def _keep_of_all(self, arrays: tuple, params: PyTree) -> tuple:
-        """What `keep` returns of every member, and the change of the energy."""
+        """The result of `keep` for every member, and the change of the energy."""
 
         def of_member(arrays, params):
             run, crossings = arrays
@@ -203,7 +203,7 @@ class Batches:
         return jax.jit(jax.vmap(of_member, in_axes=(0, self._axes[2])))(arrays, params)
 
     def _kept(self, trajectory: Trajectory, crossings: Any) -> dict:
-        """What `keep` returns of one member."""
+        """The result of `keep` for one member."""
         keep, asked = self.motions.keep, {} if self.motions.sections is None else {"crossings": crossings}
         kept = keep(trajectory, **asked)
         _require_dict(kept)
@@ -229,7 +229,7 @@ class Batches:
     # ---- member by member ----
 
     def _one_by_one(self, motions: "_Motions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
-        """What `keep` returns of each member, called with numbers; and what is wrong with what it returned."""
+        """The result of `keep` for each member, called with numbers; and the complaints about these results."""
         rows, errors = self._rows(motions)
         if not self.quantities and not any(rows):
             raise errors[0]  # at the first look, of all members
@@ -241,7 +241,7 @@ class Batches:
         return {q.name: _stacked(q, rows) for q in expected}, complaints
 
     def _rows(self, motions: "_Motions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
-        """What `keep` returns of each member by name, None of those for which it raised; and what it raised."""
+        """The result of `keep` for each member by name, None where it raised; and the exceptions."""
         arrays = jax.tree.map(np.asarray, motions.arrays)
         params, rows, errors = jax.tree.map(np.asarray, motions.params), [], {}
         for k in range(len(motions.run.result._value)):
@@ -309,7 +309,7 @@ def _arrays(run: Trajectory) -> tuple:
 
 
 def _misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
-    """How what `keep` returned differs from what it returned of others."""
+    """The difference of a result of `keep` from those for other members."""
     names = [q.name for q in expected]
     if names != list(row):
         return f"keep returned {list(row)}, of other members {names}"
@@ -349,14 +349,14 @@ def _by_name(kept: dict) -> dict[str, Any]:
 
 
 def names_of(kept: dict) -> dict:
-    """What `keep` returns with the name of every leaf in its place."""
+    """The result of `keep` with the name of every leaf in its place."""
     return jax.tree_util.tree_map_with_path(
         lambda path, _: ".".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path), kept
     )
 
 
 def _raised(error: BaseException) -> str:
-    """What a callback raised, of all that XLA says about it."""
+    """The exception of a callback, out of all that XLA says about it."""
     lines = [line.strip() for line in str(error).split("\n")]
     return next((line for line in reversed(lines) if _RAISED.match(line)), lines[0])[:200]
 

@@ -26,7 +26,7 @@ _PROBED = 4096  # members by which the time of a member is estimated
 
 
 def first_look(motions: Motions, points: dict[str, np.ndarray]) -> tuple[Kept, float, bool]:
-    """What is kept of a few members, the seconds that one of them takes, and whether the energy is constant."""
+    """The kept values of a few members, the seconds that one of them takes, and whether the energy is constant."""
     conserves = _conserves(motions, points)
     batches = batches_of(motions, conserves)
     points = _some(points, UNIT_BYTES // max(1, batches.bytes_of_one(points)))
@@ -96,7 +96,7 @@ def _few(axes: tuple[Axis, ...], motions: Motions) -> dict[str, np.ndarray]:
 
 
 def _conserves(motions: Motions, points: dict[str, np.ndarray]) -> bool:
-    """Whether the energy of this scene is known to be constant."""
+    """True if the energy of this scene is known to be constant."""
     q, qdot, params = motions.start({name: x[0] for name, x in points.items()})
     return bool(motions.system.explain(q, qdot, params=params).energy_conserved)
 

@@ -90,7 +90,7 @@ class Worker:
         return sorted(int(name.split(".")[1]) for name in os.listdir(self.claims) if name.split(".")[0] == str(unit))
 
     def _is_dead(self, unit: int, generation: int) -> bool:
-        """Whether the owner of a claim works no more."""
+        """True if the owner of a claim works no more."""
         try:
             owner = (self.claims / f"{unit}.{generation}").read_text()
         except FileNotFoundError:
@@ -124,7 +124,7 @@ def claimed(store: Store) -> dict[int, str]:
 
 
 def _place() -> str | None:
-    """What two processes have in common that can see each other's numbers; None where that is not known."""
+    """The identity that two processes share if they can see each other's numbers; None where it is not known."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
         return f"{socket.gethostname()} {boot} {os.readlink('/proc/self/ns/pid')}"

@@ -36,7 +36,7 @@ class Design:
         return Design(self.kind, self.count, self.seed, *bounds)
 
     def described(self) -> dict:
-        """What the rule is, without the count."""
+        """The rule without the count."""
         return {"rule": self.kind, "seed": self.seed, "low": list(self.low), "high": list(self.high)}
 
     @classmethod

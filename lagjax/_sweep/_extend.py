@@ -104,7 +104,7 @@ def _places(old: Store, new: Store, of_old: dict, of_new: dict) -> _Places:
 
 
 def _read(old: Store, spec: dict, places: list[np.ndarray]) -> dict[str, np.ndarray]:
-    """What is stored of a product of members, (members, …) by name."""
+    """The stored values of a product of members, (members, …) by name."""
     runs = [slice(int(x[0]), int(x[-1]) + 1) if np.all(np.diff(x) == 1) else x for x in places]  # read as they lie
     found = {}
     for q in old.quantities(spec):

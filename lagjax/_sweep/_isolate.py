@@ -108,7 +108,7 @@ class Child:
         return _compute_alone(self, job, unit)
 
     def look(self, motions: Motions, points: dict[str, np.ndarray]) -> tuple[Kept, float, bool]:
-        """What is kept of a few members (`first_look`), of those at least that do not end the child."""
+        """The kept values of a few members (`first_look`), of those at least that do not end the child."""
         request = packed(motions), users_path(), in_doubles()
         waiting = [points]
         while waiting:

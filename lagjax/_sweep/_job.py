@@ -56,7 +56,7 @@ class Job:
 
 
 def in_doubles() -> bool:
-    """Whether JAX computes in double precision here."""
+    """True if JAX computes in double precision here."""
     return jax.dtypes.canonicalize_dtype(np.float64) == np.float64
 
 
@@ -88,7 +88,7 @@ _before: list[bool] = []  # that of the process before the first one came, while
 
 
 def _of_process() -> bool:
-    """Whether this process computes in doubles, whatever this thread has chosen: as a thread sees it that has not."""
+    """True if this process computes in doubles, whatever this thread has chosen: as a thread sees it that has not."""
     seen: list[bool] = []
     thread = threading.Thread(target=lambda: seen.append(in_doubles()))
     thread.start()
@@ -102,7 +102,7 @@ def _set_of_process(doubles: bool) -> None:
 
 
 def goes_on_from(motions: Motions, store: Store) -> str | None:
-    """Where the motions of a store were left, as a path from its folder: both may be moved, or seen, elsewhere."""
+    """The store of the ends of motions, as a path from this one's folder: both may be moved, or seen, elsewhere."""
     return None if motions.left is None else os.path.relpath(motions.left.path, store.path.parent)
 
 

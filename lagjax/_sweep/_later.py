@@ -21,12 +21,12 @@ from lagjax._trajectory import State
 
 
 def goes_on(other: Store, motions: Motions) -> bool:
-    """Whether the output times of these motions begin at the last one of a store."""
+    """True if the output times of these motions begin at the last one of a store."""
     return float(motions.ts[0]) == other.spec()["ts"]["ends"][1]
 
 
 def left_in(other: Store, axes: tuple[Axis, ...], motions: Motions) -> Left:
-    """Where the motions were left. Raises `ValueError` for other ones, and where not all ends are there."""
+    """The ends of the motions. Raises `ValueError` for other ones, and where not all ends are there."""
     spec = other.spec()
     require_versions(other, spec)
     now = json.loads(json.dumps([axis.described() for axis in axes]))

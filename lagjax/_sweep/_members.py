@@ -133,21 +133,21 @@ class Grid:
 
     @property
     def members(self) -> int:
-        """How many members there are."""
+        """The number of members."""
         return math.prod(self.shape)
 
     @property
     def tiles(self) -> tuple[int, ...]:
-        """How many units there are along each axis."""
+        """The number of units along each axis."""
         return tuple(math.ceil(size / part) for size, part in zip(self.shape, self.chunk, strict=True))
 
     @property
     def units(self) -> int:
-        """How many units there are."""
+        """The number of units."""
         return math.prod(self.tiles)
 
     def place(self, unit: int) -> tuple[int, ...]:
-        """Where a unit is among the units; the name of its chunk."""
+        """The place of a unit among the units; the name of its chunk."""
         return tuple(int(i) for i in np.unravel_index(unit, self.tiles))
 
     def box(self, unit: int) -> tuple[slice, ...]:
@@ -156,11 +156,11 @@ class Grid:
         return tuple(slice(i * part, min((i + 1) * part, size)) for i, part, size in parts)
 
     def box_shape(self, unit: int) -> tuple[int, ...]:
-        """How many members a unit has along each axis."""
+        """The number of members of a unit along each axis."""
         return tuple(s.stop - s.start for s in self.box(unit))
 
     def size(self, unit: int) -> int:
-        """How many members a unit has."""
+        """The number of members of a unit."""
         return math.prod(self.box_shape(unit))
 
     def numbers(self, unit: int, which: np.ndarray) -> np.ndarray:

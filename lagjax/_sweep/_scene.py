@@ -33,7 +33,7 @@ _SHOWN = 40  # lines of a difference
 
 
 class Left(NamedTuple):
-    """Where motions were left that go on: the path of the store, and its names of the leaves of q and q̇ at the end."""
+    """The store of motions that go on: the path of the store, and its names of the leaves of q and q̇ at the end."""
 
     path: str
     q: PyTree
@@ -50,7 +50,7 @@ class Left(NamedTuple):
 
 @dataclass(frozen=True)
 class Motions:
-    """What is done with each member: the scene, its start as values or functions of a point, and what is kept."""
+    """The work for each member: the scene, its start as values or functions of a point, and what is kept."""
 
     system: System
     ts: np.ndarray
@@ -155,7 +155,7 @@ def _value_text(value: PyTree) -> str:
 
 
 def difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]) -> str | None:
-    """What differs between the texts in a store and those of a call, line by line; None where nothing does."""
+    """The differences between the texts in a store and those of a call, line by line; None where there are none."""
     parts = []
     for role in dict.fromkeys([*before, *now]):
         old, new = (x.get(role, {"text": "", "program": ""}) for x in (before, now))

@@ -66,7 +66,7 @@ class Sections(NamedTuple):
         return cls(names, functions, directions, int(crossings.get("count", 64)))
 
     def described(self) -> dict:
-        """What is not a function of them, for the store."""
+        """The part that is no function of them, for the store."""
         names = None if self.names is None else list(self.names)
         return {"names": names, "directions": list(self.directions), "count": self.count}
 
@@ -75,7 +75,7 @@ class Sections(NamedTuple):
         return dict(zip(self.names or ("section",), self.functions, strict=True))
 
     def bytes_of(self, states: int) -> int:
-        """What is noted of a member whose state has so many numbers."""
+        """The notes on a member whose state has this many numbers."""
         return 8 * len(self.functions) * (self.count + 1) * (states + 1)
 
 

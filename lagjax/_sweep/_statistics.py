@@ -21,7 +21,7 @@ _OFFSET = 2**20  # more than |log x| / log γ of any double
 
 
 class Statistics:
-    """What `reduce` collects of a quantity: always count, mean, variance, and the extremes with their members.
+    """The statistics of a quantity that `reduce` collects: count, mean, variance, and the extremes with their members.
 
     - `edges` (B + 1,): a histogram between these edges, in increasing order; the last bin includes its upper edge.
     - `quantiles`: levels between 0 and 1, such as (0.05, 0.5, 0.95); resolved to a thousandth of the value.
@@ -166,7 +166,7 @@ def merged(one: Partial | None, two: Partial) -> Partial:
 
 
 def summary(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
-    """What is told of a quantity of this shape."""
+    """The statistics of a quantity of this shape."""
     empty = total.count == 0
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.where(total.count > 1, total.square / (total.count - 1), np.nan)
@@ -209,7 +209,7 @@ def to_bytes(partials: dict[str, Partial]) -> bytes:
 
 
 def from_bytes(data: bytes) -> dict[str, Partial]:
-    """What `to_bytes` was given."""
+    """The value that `to_bytes` was given."""
     with np.load(io.BytesIO(data)) as file:
         names = dict.fromkeys(key.rsplit("/", 1)[0] for key in file)
         return {name: Partial(*(file[f"{name}/{field}"] for field in Partial._fields)) for name in names}

@@ -27,7 +27,7 @@ class Failure(NamedTuple):
 
 
 class Status(NamedTuple):
-    """How far a sweep has come; print it, or read its fields.
+    """The progress of a sweep; print it, or read its fields.
 
     - `done`, `members`: how many members are done, of how many; `units_done`, `units`, `claimed` alike.
     - `rate`: recent members per second, None before it is known; `left`: seconds until the end at that rate.
@@ -88,7 +88,7 @@ class Status(NamedTuple):
 
 
 def status(store: Store) -> Status:
-    """How far a store has come."""
+    """The progress of a store."""
     spec = store.spec()
     grid, finished = store.grid(spec), store.done()
     damaged = store.damaged(spec, finished)

@@ -58,7 +58,7 @@ class Quantity:
 
     @property
     def nothing(self) -> Any:
-        """What stands where there is no value: NaN; of whole numbers the least, or greatest, of their type."""
+        """The filling where there is no value: NaN; of whole numbers the least, or greatest, of their type."""
         kind = self.dtype.kind
         if kind in "fc":
             return self.dtype.type(np.nan)
@@ -115,12 +115,12 @@ class Store:
         return Grid(tuple(spec["shape"]), tuple(spec["chunk"]))
 
     def quantities(self, spec: dict) -> list[Quantity]:
-        """What is stored of each member, `result` last."""
+        """The quantities that are stored of each member, `result` last."""
         kept = [Quantity(x["name"], tuple(x["shape"]), np.dtype(x["dtype"])) for x in spec["kept"]]
         return [*(q for q in kept if q.name not in spec["reduce"]), RESULT]
 
     def is_there(self) -> bool:
-        """Whether there is something by this name; an empty folder is nothing."""
+        """True if there is something by this name; an empty folder is nothing."""
         return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
     @contextmanager
@@ -204,7 +204,7 @@ class Store:
         return {int(name.split(".")[0]) for name in os.listdir(self.job / "done") if name.endswith(".json")}
 
     def record(self, unit: int) -> dict:
-        """What was noted when a unit was finished."""
+        """The notes on a finished unit."""
         return json.loads((self.job / "done" / f"{unit}.json").read_text())
 
     def statistics(self, unit: int) -> bytes:
@@ -245,7 +245,7 @@ class Store:
         return np.ascontiguousarray(little).reshape(-1).view(np.uint8)
 
     def chunk_file(self, grid: Grid, unit: int, name: str, inner: tuple[int, ...]) -> Path:
-        """Where zarr looks for the chunk of a unit."""
+        """The path at which zarr looks for the chunk of a unit."""
         return self.path / name / "c" / "/".join(map(str, grid.place(unit) + (0,) * len(inner)))
 
     def undo(self, spec: dict, unit: int) -> None:
@@ -254,7 +254,7 @@ class Store:
         self.chunk_file(self.grid(spec), unit, RESULT.name, RESULT.shape).unlink(missing_ok=True)
 
     def damaged(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
-        """What is wrong with finished units, in words: chunks that lack or have another size or, `whole`, hash."""
+        """The damage of finished units, in words: chunks that lack or have another size or, `whole`, hash."""
         grid, found, tail = self.grid(spec), {}, _CHECKSUM if spec["format"] >= 3 else 0
         for unit in sorted(units):
             try:
@@ -354,7 +354,7 @@ def write_through(file: Path, data) -> None:
 
 
 def _is_drawn_late(rule: str, size: int) -> bool:
-    """Whether the coordinates of an axis are written by those who compute its members: so that 10⁸ cost no time."""
+    """True if the coordinates of an axis are written by those who compute its members: so that 10⁸ cost no time."""
     return rule != "values" and size > _designs.SLICE
 
 

@@ -44,7 +44,7 @@ def parts(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
 
 
 def starts(job: Job, unit: int) -> tuple[Callable[[np.ndarray], dict[str, np.ndarray]], np.ndarray]:
-    """What gives the points of some members of a unit; and how all of them ended before, where they go on."""
+    """The points of some members of a unit, as a function; and the ends of all of them before, where they go on."""
     box, shape = job.grid.box(unit), job.grid.box_shape(unit)
     axes, more, before = job.store.coordinates(job.spec["axes"], box), {}, np.full(job.grid.size(unit), SUCCESSFUL)
     if job.motions.left is not None:
@@ -101,7 +101,7 @@ def _blank(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, which, r
 
 
 def _record(job: Job, unit: int, result: np.ndarray, drifts: np.ndarray, complaints: dict[int, str]) -> dict:
-    """What is noted of a unit: how members ended, the largest change of energy, and what failed."""
+    """The notes on a unit: how members ended, the largest change of energy, and what failed."""
     counts = np.bincount(result)
     record = {
         "unit": unit,
