@@ -57,9 +57,18 @@ def draw(part: str, record: Record, folder: Path) -> list[Path]:
         for name, size, fill in _figures_of(part, record[part]["rows"]):
             figure = Figure(figsize=size, layout="constrained")
             fill(figure)
-            paths.append(folder / f"{name}.png")
-            figure.savefig(paths[-1], dpi=150)
+            paths.append(save(figure, folder / f"{name}.png"))
     return paths
+
+
+def save(figure, path: Path, dpi: int = 150) -> Path:
+    """The figure as a small file, of 256 colours, and its path."""
+    from PIL import Image
+
+    figure.savefig(path, dpi=dpi)
+    exact = Image.open(path).convert("RGB")
+    exact.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+    return path
 
 
 def _figures_of(part: str, rows: list[dict]) -> Iterable[tuple[str, tuple[float, float], Callable]]:

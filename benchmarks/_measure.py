@@ -51,7 +51,8 @@ class Row:
         return self.times[k % len(self.times)] / self.members
 
     def as_dict(self) -> dict[str, Any]:
-        return asdict(self) | {"seconds": self.seconds, "least_seconds": self.least_seconds}
+        kept = {name: value for name, value in asdict(self).items() if name != "times"}
+        return kept | {"seconds": self.seconds, "least_seconds": self.least_seconds}
 
 
 @dataclass

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 import lagjax
+from benchmarks._figures import save
 from lagjax import scenes
 
 DURATION = 100.0
@@ -53,7 +54,7 @@ def figure(angles, value, path: Path) -> None:
     ax = lagjax.plot.state_map(angles, angles, value, label="λ₁, T = 100", cmap="inferno")
     ax.set(xlabel="θ1", ylabel="θ2", aspect="equal")
     path.parent.mkdir(exist_ok=True)
-    ax.figure.savefig(path, dpi=150, bbox_inches="tight")
+    save(ax.figure, path)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 import lagjax
+from benchmarks._figures import save
 from lagjax import scenes
 
 
@@ -78,7 +79,7 @@ def _figure(families: dict[str, lagjax.Family], path: Path) -> None:
     ax.legend(frameon=False)
     ax.grid(color="0.9", linewidth=0.8)
     path.parent.mkdir(exist_ok=True)
-    ax.figure.savefig(path, dpi=150)
+    save(ax.figure, path)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 import lagjax
+from benchmarks._figures import save
 from lagjax import scenes
 
 CHUNK, RTOL = 2000, 1e-9
@@ -132,7 +133,7 @@ def _figure(name: str, crossings, path: Path) -> None:
     matplotlib.use("Agg")
     ax = lagjax.plot.poincare(crossings, lambda q, qdot: (q[1], qdot[1]), size=0.4)
     ax.set(xlabel="y" if name == "henon_heiles" else "θ2", ylabel="ẏ" if name == "henon_heiles" else "θ̇2")
-    ax.figure.savefig(path, dpi=150)
+    save(ax.figure, path)
 
 
 if __name__ == "__main__":

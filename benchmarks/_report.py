@@ -165,15 +165,17 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def write_json(path: Path, record: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(_finite(record), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    path.write_text(json.dumps(_finite(record), indent=0, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def _finite(value: Any) -> Any:
-    """JSON knows neither NaN nor infinity, nor NumPy's numbers: None, and Python's."""
+    """JSON knows neither NaN nor infinity, nor NumPy's numbers: None, and Python's, to six digits."""
     if isinstance(value, dict):
         return {str(key): _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.6g}") if np.isfinite(value) else None

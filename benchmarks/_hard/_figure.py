@@ -5,7 +5,7 @@ from pathlib import Path as File
 
 import numpy as np
 
-from benchmarks._figures import COLOURS, GREY, STYLE
+from benchmarks._figures import COLOURS, GREY, STYLE, save
 from benchmarks._hard import _borders, _chaos, _fields, _gravity, _rotation
 from benchmarks._hard._case import Path, follow
 from lagjax import scenes
@@ -85,8 +85,7 @@ def draw(rows: list[dict], folder: File) -> File | None:
         else:
             bottom = figure
         _errors(bottom.add_subplot(), rows)
-        figure.savefig(folder / "hard_cases.png", dpi=150)
-    return folder / "hard_cases.png"
+        return save(figure, folder / "hard_cases.png", dpi=100)
 
 
 def _portrait(axes, name: str, scene: Callable, time: float, lines: Callable) -> None:
