@@ -11,7 +11,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 - `samples`: an input that was measured, as a function of time
 - `crossings`: where a motion crosses a section, as `Crossings`
 - `simulate_hybrid`: a motion through modes, by `Transition`s; those that happened are `Transitions`; `Hybrid`: all of
-  it as one object, for `fit`
+  it as one object, for `fit` and `sweep`
 - `MachineCode`, `FineOutput`: what integrates
 - `SimulationError`, `RESULTS`: how a motion ends
 

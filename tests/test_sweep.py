@@ -870,3 +870,62 @@ def test_a_store_opens_without_its_script_and_without_a_writable_disk(tmp_path):
         assert again() == swept and not writes
     with pytest.raises(FileNotFoundError, match="is no store of a sweep"):
         lagjax.Sweep(tmp_path / "other.zarr")
+
+
+# ---- hybrid motion ---------------------------------------------------------------------------------------------------
+
+
+def bouncing(restitution=0.8, **how):
+    """A ball on a floor, one law and one transition; its functions read `restitution`."""
+    ball = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q)
+
+    def bounce(q, v):
+        return q, -restitution * v
+
+    floor = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=bounce)
+    return lagjax.Hybrid({"flight": ball}, [floor], "flight", **how)
+
+
+BOUNCES = dict(
+    over={"height": np.linspace(0.3, 1.0, 9)}, ts=np.linspace(0.0, 1.5, 4), q0=lambda point: point["height"],
+    qdot0=0.0, params={"g": 9.81}, progress=False,
+    keep=lambda run: {"q": run.q[-1], "bounces": run.transitions.count, "first": run.transitions.t[0]},
+)  # fmt: skip
+
+
+def test_a_hybrid_scene(tmp_path):  # compiles the motion of a ball for one shape, and for one member
+    scene = bouncing()
+    kept = lagjax.sweep(scene, **BOUNCES, store=tmp_path / "store").open()
+    heights, g = BOUNCES["over"]["height"], 9.81
+    np.testing.assert_allclose(kept["first"], np.sqrt(2 * heights / g), rtol=1e-12)  # the fall from rest
+    falls = np.sqrt(2 * heights / g)[:, None] * np.cumsum([1.0, *(2 * 0.8**k for k in range(1, 12))])
+    np.testing.assert_array_equal(kept.bounces, (falls < 1.5).sum(axis=1))
+    one = lagjax.simulate_hybrid(
+        scene.modes, scene.transitions, "flight", heights[4], 0.0, BOUNCES["ts"], BOUNCES["params"]
+    )
+    assert float(kept.q[4]) == float(one.q[-1])
+    for other, words in ((bouncing(0.7), "reset of transition 0"), (bouncing(max_transitions=5), "transitions")):
+        with pytest.raises(ValueError, match=f"What differs:\n{words}"):
+            lagjax.sweep(other, **BOUNCES, store=tmp_path / "store")
+    for name, value in (("event", lambda q, v: q), ("crossings", {"section": lambda q, v: v}), ("solver", "Tsit5")):
+        with pytest.raises(ValueError, match=f"{name} of sweep: for the motion of one System"):
+            lagjax.sweep(scene, **BOUNCES, store=tmp_path / "other", **{name: value})
+    with pytest.raises(ValueError, match="A hybrid motion does not go on from a store"):
+        later = BOUNCES | {"ts": np.linspace(1.5, 2.0, 3)}
+        lagjax.sweep(scene, **later, store=tmp_path / "later", extend=tmp_path / "store")
+
+
+@pytest.mark.slow
+def test_hybrid_motion_in_units_workers_and_children(tmp_path, monkeypatch):
+    short = bouncing(max_transitions=3)
+    whole = lagjax.sweep(short, **BOUNCES, store=tmp_path / "whole")
+    spent = lagjax.RESULTS.max_transitions_reached._value
+    assert set(whole.open().result.values.tolist()) == {int(spent), int(lagjax.RESULTS.successful._value)}
+    assert "max_transitions_reached, at height = 0.3" in str(whole)
+    lagjax.sweep(short, **BOUNCES, store=tmp_path / "children", isolate=True, unit=4)
+    monkeypatch.setattr("lagjax._sweep.work", lambda *_: None)
+    begun = lagjax.sweep(short, **BOUNCES, store=tmp_path / "shell", unit=2)
+    assert worker(Store(begun.store)).wait() == 0
+    for name in ("children", "shell"):
+        for quantity, values in whole.open().items():
+            np.testing.assert_array_equal(lagjax.Sweep(tmp_path / name).open()[quantity], values)

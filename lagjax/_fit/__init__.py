@@ -47,7 +47,6 @@ from lagjax._fit._records import (
 )
 from lagjax._fit._residuals import AbstractQuestion, Failure, Question
 from lagjax._fit._result import Covariance, Fit, SignalNoise
-from lagjax._fit._scene import Scene, first_law, require_scene
 from lagjax._fit._search import Unfollowed, by_gradient, reader_of, roomy, search_records, searches, weakly
 from lagjax._fit._segments import Reader, TimeScales, time_scales, whole
 from lagjax._fit._signals import Signals, looks_like_positions
@@ -61,7 +60,7 @@ from lagjax._fit._uncertainty import Information, information
 from lagjax._fit._unseen import sentences
 from lagjax._fit._verdict import Unexplained, Verdict, verdict
 from lagjax._fit._wrapped import UNCLEAR, require_no_jumps, sensors, wrapped
-from lagjax._hybrid import Hybrid
+from lagjax._hybrid import Hybrid, Scene, first_law, require_scene
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL
 from lagjax._samples import HOLDS

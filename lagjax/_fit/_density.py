@@ -23,9 +23,9 @@ from lagjax._fit._inputs import Driven, asks
 from lagjax._fit._noise import AbstractNoise, StudentT, Widths
 from lagjax._fit._records import Samples, started
 from lagjax._fit._residuals import AbstractQuestion, Part, Point
-from lagjax._fit._scene import Scene
-from lagjax._fit._scene import follow as follow_scene
 from lagjax._fit._wrapped import on_circle
+from lagjax._hybrid import Scene
+from lagjax._hybrid import follow as follow_scene
 from lagjax._layout import halves
 from lagjax._system import System
 

@@ -18,8 +18,8 @@ import numpy as np
 from lagjax._fit._density import Density
 from lagjax._fit._noise import AbstractNoise, Widths
 from lagjax._fit._residuals import AbstractQuestion, Failure, Point
-from lagjax._fit._scene import Scene
 from lagjax._fit._solve import Descent
+from lagjax._hybrid import Scene
 
 _RATE, _WARM = 1e-2, 0.05  # the largest step, in units of each number; the share of steps over which it rises
 _PORTION = 100  # steps in one call: of them the best is kept

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function
-from lagjax._fit._scene import Scene, laws
+from lagjax._hybrid import Scene, laws
 from lagjax._reads import Edition
 from lagjax._samples import MARGINS, continued, samples
 from lagjax._system import System

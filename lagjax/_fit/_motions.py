@@ -20,8 +20,7 @@ from lagjax._engine import choose
 from lagjax._failures import sentence
 from lagjax._fit._inputs import Driven, Form, Table, asks
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._scene import Scene, first_law, follow
-from lagjax._hybrid import Hybrid
+from lagjax._hybrid import Hybrid, Scene, first_law, follow
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import Flow, MachineCode, _derivatives, _tolerances, flow_of
 from lagjax._machine_code._steps import KEPT

@@ -25,12 +25,12 @@ from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start
 from lagjax._fit._report import Drawn, page, pictures_of
 from lagjax._fit._residuals import AbstractQuestion, Failure, Part, Point, Question
 from lagjax._fit._sample import draw, inference_data
-from lagjax._fit._scene import follow
 from lagjax._fit._search import reader_of
 from lagjax._fit._signals import looks_like_positions
 from lagjax._fit._solve import minimise
 from lagjax._fit._uncertainty import Information
 from lagjax._fit._wrapped import UNCLEAR, on_circle
+from lagjax._hybrid import follow
 from lagjax._notebook import cell
 from lagjax._tables import intervals
 from lagjax._trajectory import Trajectory

@@ -16,7 +16,6 @@ from lagjax._fit._many import Waterfall, distinct, drawn, misfit, short_search
 from lagjax._fit._noise import Widths, log_likelihood
 from lagjax._fit._records import Piece, Record
 from lagjax._fit._residuals import AbstractQuestion, Failure, Question
-from lagjax._fit._scene import Scene
 from lagjax._fit._segments import Reader, complete, glimpses, levels, time_scales, whole
 from lagjax._fit._signals import looks_like_positions
 from lagjax._fit._solve import Anchor, Descent, minimise
@@ -24,7 +23,7 @@ from lagjax._fit._systems import asked
 from lagjax._fit._verdict import unexplained
 from lagjax._fit._weak import balanced
 from lagjax._fit._wrapped import continued
-from lagjax._hybrid import Hybrid
+from lagjax._hybrid import Hybrid, Scene
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
 # independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.

@@ -23,8 +23,7 @@ from lagjax._crossings import directions_of, sections_of
 from lagjax._failures import sentence
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Guess, Measured, real_numbers, require_start
-from lagjax._fit._scene import Scene, follow
-from lagjax._hybrid import Hybrid, Transition
+from lagjax._hybrid import Hybrid, Scene, Transition, follow
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode, Noted, Surfaces, _derivatives, _tolerances, flow_of, surfaces_of
 from lagjax._machine_code._steps import KEPT

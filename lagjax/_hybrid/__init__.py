@@ -9,6 +9,7 @@ Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & 
 """
 
 import dataclasses
+import operator
 from typing import Any
 
 import jax
@@ -23,19 +24,19 @@ from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode
 from lagjax._problem import Problem
 from lagjax._results import SimulationError, result_from
-from lagjax._simulate import raise_unless_ok
-from lagjax._system import System, present_system
+from lagjax._simulate import raise_unless_ok, simulate
+from lagjax._system import System, present_system, require_system
 from lagjax._trajectory import State, Trajectory, Transitions
 from lagjax._validate import as_arrays, is_concrete, require_budget, require_flag
 
-__all__ = ["Hybrid", "Transition", "simulate_hybrid"]
+__all__ = ["Hybrid", "Scene", "Transition", "first_law", "follow", "laws", "require_scene", "simulate_hybrid"]
 
 PyTree = Any
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hybrid:
-    """A scene whose motion changes its laws, as one object: what `fit` takes in the place of a `System`.
+    """A scene whose motion changes its laws, as one object: `fit` and `sweep` take it in the place of a `System`.
 
     - `modes`, `transitions`, `start`, `max_transitions`: those of `simulate_hybrid`; every motion begins in the mode
       `start`.
@@ -57,8 +58,11 @@ class Hybrid:
     max_transitions: int = 32
 
     def now(self) -> "Hybrid":
-        """The scene with its functions as they are now."""
-        return Hybrid(*_present(self.modes, self.transitions), self.start, self.max_transitions)
+        """The scene with its functions as they are now: this one, where nothing that they read has changed."""
+        modes, transitions = _present(self.modes, self.transitions)
+        before, now = [*self.modes.values(), *self.transitions], [*modes.values(), *transitions]
+        same = all(map(operator.is_, before, now))
+        return self if same else Hybrid(modes, transitions, self.start, self.max_transitions)
 
     def __post_init__(self):
         _require_modes(self.modes, self.transitions, self.start, self.max_transitions)
@@ -223,3 +227,36 @@ def _require_modes(modes, transitions, start, max_transitions) -> None:
             "each of these modes, or leave them out."
         )
     require_budget(max_transitions, "max_transitions")
+
+
+# ---- a scene of one law or of several --------------------------------------------------------------------------------
+
+Scene = System | Hybrid
+
+
+def require_scene(scene: Any) -> Scene:
+    """The scene with its functions as they are now.
+
+    Raises `TypeError` for what is neither a `System` nor a `Hybrid`.
+    """
+    return scene.now() if isinstance(scene, Hybrid) else require_system(scene)
+
+
+def first_law(scene: Scene) -> System:
+    """The system that a motion begins in."""
+    return scene.modes[scene.start] if isinstance(scene, Hybrid) else scene
+
+
+def laws(scene: Scene) -> tuple[System, ...]:
+    """The systems that a motion may be in."""
+    return tuple(scene.modes.values()) if isinstance(scene, Hybrid) else (scene,)
+
+
+def follow(scene: Scene, q0: PyTree, qdot0: PyTree, ts, params: PyTree, **options) -> Trajectory:
+    """The motion of a scene, with the `options` that `simulate` and `simulate_hybrid` share."""
+    if not isinstance(scene, Hybrid):
+        return simulate(scene, q0, qdot0, ts, params, **options)
+    modes, transitions, start = scene.modes, scene.transitions, scene.start
+    return simulate_hybrid(
+        modes, transitions, start, q0, qdot0, ts, params, max_transitions=scene.max_transitions, **options
+    )

@@ -25,6 +25,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from lagjax._hybrid import Hybrid, Scene, require_scene
 from lagjax._sweep._begin import begin, first_look, repair, require_same
 from lagjax._sweep._designs import Design, latin_hypercube, random, sobol
 from lagjax._sweep._isolate import Child
@@ -38,7 +39,6 @@ from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merged, s
 from lagjax._sweep._status import Failure, Progress, Status, status
 from lagjax._sweep._store import NOT_DONE, RESULT, Store
 from lagjax._sweep._unit import compute
-from lagjax._system import System, require_system
 from lagjax._validate import require_flag
 
 __all__ = [
@@ -113,7 +113,7 @@ class Sweep:
 
 
 def sweep(
-    system: System,
+    system: Scene,
     over: dict,
     ts: jax.Array,
     *,
@@ -143,6 +143,8 @@ def sweep(
 
     **Everyday arguments**
 
+    - `system`: a `System`, or a `Hybrid`, of which `keep` gets the trajectory that `simulate_hybrid` returns. Its
+      transitions watch the motion in machine code: `event`, `crossings` and `solver` are not for it, nor a later end.
     - `over`: a dict of axes, of which the product is swept. A 1-D array is an axis by its name; a design
       (`lagjax.random`, `lagjax.sobol`, `lagjax.latin_hypercube`) draws its values by a rule; a tuple of names with a
       tuple of arrays, or with a design, varies several together. There may be 10⁸ members: they are never listed.
@@ -212,9 +214,11 @@ def sweep(
     assert swept.open().fastest.dims == ("length", "angle")
     ```
     """
-    system = require_system(system)
+    system = require_scene(system)
     require_flag(progress, "progress")
     settings = dict(rtol=rtol, atol=atol, max_steps=max_steps, event=event, solver=solver)
+    if isinstance(system, Hybrid):
+        _require_none(event=event, crossings=crossings, solver=solver)
     sections = Sections.of(crossings, _callable(keep), settings)
     motions = Motions(system, np.asarray(ts, float), q0, qdot0, params, keep, _reduce(reduce), settings, sections)
     if executor is not None and isolate:
@@ -226,6 +230,11 @@ def sweep(
         if place.is_there() and other is not None and not place.spec()["goes_on_from"]:
             other = None  # of which the members were taken: it may be gone
         if other is not None and goes_on(other, motions):
+            if isinstance(system, Hybrid):
+                raise ValueError(
+                    "A hybrid motion does not go on from a store, which has no mode at the end of it: begin again at "
+                    f"ts[0], with another store than {str(extend)!r}."
+                )
             motions = replace(motions, left=left_in(other, axes, motions))
         if not place.is_there():
             begin(place, axes, motions, unit, child.look if child else first_look, other)
@@ -252,6 +261,15 @@ def _callable(keep: Any) -> Callable:
     if not callable(keep):
         raise TypeError(f"keep must be a function of a trajectory that returns a dict; got {keep!r}.")
     return keep
+
+
+def _require_none(**arguments: Any) -> None:
+    """Raise `ValueError` for arguments that a hybrid motion does not have."""
+    if given := [name for name, value in arguments.items() if value is not None]:
+        raise ValueError(
+            f"{' and '.join(given)} of sweep: for the motion of one System. Transitions watch a hybrid motion, in "
+            "machine code; one without a reset notes where it is crossed, and `trajectory.transitions` tells when."
+        )
 
 
 def _reduce(reduce: Any) -> dict[str, Statistics]:

@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._hybrid import Hybrid
 from lagjax._results import name_of, result_from
 from lagjax._sweep._scene import NOT_TRACEABLE, Motions
 from lagjax._sweep._sections import run_batch
 from lagjax._sweep._store import RESULT, Quantity
-from lagjax._trajectory import State, Trajectory
+from lagjax._trajectory import State, Trajectory, Transitions
 
 PyTree = Any
 CRASHED, KEEP_FAILED = 1000, 1001  # result codes of the sweep's own, far from those of `lagjax.RESULTS`
@@ -114,7 +115,7 @@ class Batches:
             role: start(points, complaints) if start else getattr(motions, role) for role, start in self._starts.items()
         }
         run, crossings = run_batch(motions.system, values, ts, self._axes, motions.settings, motions.sections)
-        self._tolerances = run.tolerances
+        self._tolerances = None if isinstance(motions.system, Hybrid) else run.tolerances
         of_members = values["params"] if self._axes[2] == 0 else None
         return _Motions(run, crossings, (_arrays(run), crossings), of_members), complaints
 
@@ -211,19 +212,23 @@ class Batches:
 
     def _trajectory(self, arrays: tuple, params: PyTree) -> Trajectory:
         """The trajectory of one member."""
-        q, qdot, code, end, stats = arrays
+        q, qdot, code, end, stats, mode, transitions = arrays
+        scene, hybrid = self.motions.system, {"mode": None, "transitions": None, "mode_names": ()}
+        if isinstance(scene, Hybrid):
+            hybrid = {"mode": mode, "transitions": Transitions(*transitions), "mode_names": tuple(scene.modes)}
         return Trajectory.of(
             ts=jnp.asarray(self.motions.ts), q=q, qdot=qdot, result=result_from(code), end=State(*end), stats=stats,
-            system=self.motions.system, params=self.motions.params if self._axes[2] is None else params,
-            params_axes=None, mode=None, transitions=None, mode_names=(), tolerances=self._tolerances, engine="",
+            system=dict(scene.modes) if isinstance(scene, Hybrid) else scene, params_axes=None, engine="",
+            params=self.motions.params if self._axes[2] is None else params, tolerances=self._tolerances, **hybrid,
         )  # fmt: skip
 
     def _drift(self, run: Trajectory):
         """|h − h₀| from the first output to the end."""
-        if not self.conserves:
+        scene = self.motions.system
+        if not self.conserves or isinstance(scene, Hybrid):
             return None
         q, qdot = jax.tree.map(lambda x: x[0], (run.q, run.qdot))
-        energy, end = self.motions.system.energy, run.end
+        energy, end = scene.energy, run.end
         return jnp.abs(energy(end.q, end.qdot, end.t, run.params) - energy(q, qdot, run.ts[0], run.params))
 
     # ---- member by member ----
@@ -305,7 +310,8 @@ def _common(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
 
 def _arrays(run: Trajectory) -> tuple:
     stats = {name: count for name, count in run.stats.items() if jnp.ndim(count)}  # what is of each member
-    return run.q, run.qdot, run.result._value, tuple(run.end), stats
+    transitions = None if run.transitions is None else tuple(run.transitions)
+    return run.q, run.qdot, run.result._value, tuple(run.end), stats, run.mode, transitions
 
 
 def _misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:

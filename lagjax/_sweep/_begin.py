@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from lagjax._hybrid import Hybrid
 from lagjax._layout import Layout
 from lagjax._results import RESULTS, code_of
 from lagjax._sweep import _batch
@@ -97,6 +98,8 @@ def _few(axes: tuple[Axis, ...], motions: Motions) -> dict[str, np.ndarray]:
 
 def _conserves(motions: Motions, points: dict[str, np.ndarray]) -> bool:
     """True if the energy of this scene is known to be constant."""
+    if isinstance(motions.system, Hybrid):
+        return False  # resets may do work
     q, qdot, params = motions.start({name: x[0] for name, x in points.items()})
     return bool(motions.system.explain(q, qdot, params=params).energy_conserved)
 

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import accept
+from lagjax._hybrid import Hybrid, Scene
 from lagjax._reads import array_text, hash_of, identity, source, without_addresses
 from lagjax._sweep._sections import Sections
 from lagjax._sweep._statistics import Statistics
-from lagjax._system import System
 
 PyTree = Any
 ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
@@ -52,7 +52,7 @@ class Left(NamedTuple):
 class Motions:
     """The work for each member: the scene, its start as values or functions of a point, and what is kept."""
 
-    system: System
+    system: Scene
     ts: np.ndarray
     q0: Any
     qdot0: Any
@@ -99,11 +99,11 @@ def texts(motions: Motions, names: list[str]) -> dict[str, dict[str, str]]:
     point = {name: jnp.zeros(()) for name in names}
     q, qdot, params = motions.shapes(names)
     found = {}
-    for role in ROLES:
-        function = getattr(motions.system, role)
-        if function is not None:
-            arguments = (q,) if role == "constraints" else (q, qdot)
-            found[role] = _entry(function.code.function, _traced(function, arguments, params), function.arrays)
+    for name, function in _functions(motions.system).items():
+        arguments = (q,) if name.split()[0] == "constraints" else (q, qdot)
+        found[name] = _entry(function.code.function, _traced(function, arguments, params), function.arrays)
+    if isinstance(motions.system, Hybrid):
+        found["transitions"] = _entry(_plan(motions.system), None)
     event = motions.settings.get("event")
     if event is not None:
         condition = getattr(event, "cond_fn", event)
@@ -118,6 +118,23 @@ def texts(motions: Motions, names: list[str]) -> dict[str, dict[str, str]]:
         found[role] = _entry(value, (lambda f=value: jax.make_jaxpr(f)(point)) if callable(value) else None)
     found["keep"] = _entry(motions.keep, None)
     return found
+
+
+def _functions(scene: Scene) -> dict[str, Any]:
+    """The functions of a scene by their roles; of a hybrid one by role and mode, or by role and transition."""
+    if not isinstance(scene, Hybrid):
+        named = {role: getattr(scene, role) for role in ROLES}
+    else:
+        named = {f"{role} of {mode}": getattr(law, role) for mode, law in scene.modes.items() for role in ROLES}
+        for k, transition in enumerate(scene.transitions):
+            named |= {f"{role} of transition {k}": getattr(transition, role) for role in ("guard", "reset")}
+    return {name: function for name, function in named.items() if function is not None}
+
+
+def _plan(scene: Hybrid) -> list:
+    """The modes and transitions of a hybrid scene without their functions."""
+    arrows = [(t.source, t.target, t.direction) for t in scene.transitions]
+    return [list(scene.modes), scene.start, scene.max_transitions, arrows]
 
 
 def _traced(function, arguments: tuple, params) -> Callable:

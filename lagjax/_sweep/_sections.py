@@ -5,19 +5,21 @@ on. States at times between come from another run of the same motion.
 """
 
 import dataclasses
+import functools
 import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from lagjax._consistent import has_constraints
 from lagjax._crossings import _dressed, _surfaces, directions_of, sections_of
+from lagjax._hybrid import Hybrid, Scene, follow
 from lagjax._machine_code import MachineCode, Noted, _tolerances, flow_of
 from lagjax._problem import Batch, Solution, axes_per_leaf
 from lagjax._results import RESULTS, SUCCESSFUL, code_of
 from lagjax._simulate import _trajectory, simulate_batch
-from lagjax._system import System
 from lagjax._trajectory import Trajectory
 from lagjax._validate import as_arrays, require_budget
 
@@ -86,8 +88,19 @@ def _parameters(keep: Callable) -> list[str]:
         return []
 
 
+@functools.lru_cache(maxsize=8)
+def _hybrid_batch(scene: Hybrid, axes: tuple, **tolerances) -> Callable:
+    """`follow` for all members at once, compiled."""
+
+    def of_member(q0, qdot0, ts, params):
+        return follow(scene, q0, qdot0, ts, params, throw=False, **tolerances)
+
+    of_q0, of_qdot0, of_params = axes
+    return jax.jit(jax.vmap(of_member, in_axes=(of_q0, of_qdot0, None, of_params)))
+
+
 def run_batch(
-    system: System, values: dict[str, PyTree], ts, axes: tuple, settings: dict[str, Any], sections: Sections | None
+    system: Scene, values: dict[str, PyTree], ts, axes: tuple, settings: dict[str, Any], sections: Sections | None
 ) -> tuple[Trajectory, Any]:
     """The motions of B members, and what was noted on the way: `Crossings`, or a dict of them, None without sections.
 
@@ -95,6 +108,9 @@ def run_batch(
     crossings has the members in front.
     """
     q0, qdot0, params = values.values()
+    if isinstance(system, Hybrid):
+        tolerances = {name: settings[name] for name in ("rtol", "atol", "max_steps")}
+        return _hybrid_batch(system, axes, **tolerances)(q0, qdot0, ts, params), None
     if sections is None:
         return simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings), None
     of_leaves, size = axes_per_leaf(values, axes)
