@@ -139,6 +139,15 @@ def test_a_record_of_another_machine_is_not_ok():
     values = [motion(1.0, 0.0), motion(-0.5, 2.0, seed=1), motion(0.8, 1.0, TRUTH | {"w2": 9.5}, seed=2)]
     found = fit(values)
     assert not found.ok and "records[2] disagrees with the others" in found.message
+    assert "without it params['w2'] would move down" in found.message
+
+
+def test_two_records_that_contradict_each_other():
+    values = [motion(1.0, 0.0), motion(-0.5, 2.0, seed=1)]
+    assert fit(values).ok
+    values[1] = motion(-0.5, 2.0, TRUTH | {"w2": 9.5}, seed=1)
+    found = fit(values)
+    assert not found.ok and "contradicts the other record: without it params['w2'] would move" in found.message
 
 
 # ---- mistakes that can be undone -------------------------------------------------------------------------------------

@@ -28,9 +28,7 @@ from lagjax._fit._transforms import Between, Positive
 from lagjax._fit._uncertainty import Information, orthogonal
 
 _BEYOND = 2.0  # standard errors that a step must lead beyond a bound: of sound fits at a bound one in forty does
-_DISAGREE = (
-    5.0  # standard deviations of a shift: twenty records of ten parameters that agree show it in one of 1e4 fits
-)
+_DISAGREE = 5.0  # standard deviations of a shift: twenty records of ten parameters show it in one of 1e4 fits
 _MOST_NAMED = 3
 _UNEXPLAINED = 0.3  # of a signal's size, left as motion: sound fits leave 1e-3 to 0.1, a false minimum 0.4 to 1
 _DOUBTED = 0.05  # of a signal's size, left as motion, from which a fit of other records is tried
@@ -212,7 +210,8 @@ def _disagreements(
     Only of parameters `inside` (F,) of their sets: at a bound the sum of squares has a slope.
     """
     records = np.array([piece.record for piece in question.pieces])
-    if known.null.shape[1] or len(np.unique(records)) < 3 or not inside.any():
+    count = len(np.unique(records))
+    if known.null.shape[1] or count < 2 or not inside.any():
         return []
     columns = np.concatenate([np.ones(question.states, bool), inside, [True]])
     variances = np.diag(known.covariance)[inside], np.diag(known.white)[inside]
@@ -220,11 +219,21 @@ def _disagreements(
     labels = [label for label, keep in zip(question.parameters.labels, inside, strict=True) if keep]
     worst = [(k, int(np.argmax(np.abs(z)))) for k, z in shifts.items()]
     worst = sorted((-abs(shifts[k][i]), k, i) for k, i in worst if abs(shifts[k][i]) > _DISAGREE)
+    if count == 2:  # each moves as far without the other
+        return [
+            f"{question.called(k)} contradicts the other record: without it {_moved(labels[i], shifts[k][i])}."
+            for _, k, i in worst[:1]
+        ]
     return [
-        f"{question.called(k)} disagrees with the others: without it {labels[i]} would move by "
-        f"{-size:.1f} of the standard deviations that chance gives it."
-        for size, k, i in worst[:_MOST_NAMED]
+        f"{question.called(k)} disagrees with the others: without it {_moved(labels[i], shifts[k][i])}."
+        for _, k, i in worst[:_MOST_NAMED]
     ]
+
+
+def _moved(label: str, shift: float) -> str:
+    """The clause on a shift in standard deviations; parameters move up with their unknowns."""
+    way = "up" if shift > 0 else "down"
+    return f"{label} would move {way} by {abs(shift):.1f} of the standard deviations that chance gives it"
 
 
 def shifts_without(states: int, triangles, records: np.ndarray, variances, white) -> dict[int, np.ndarray]:
