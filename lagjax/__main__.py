@@ -56,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
         action.add_argument("store", type=Path, metavar="STORE", help="the folder")
         action.set_defaults(command=command)
         if name == "run":
-            action.add_argument("--units", type=int, help="end after so many units (default: when all are done)")
+            action.add_argument("--units", type=int, help="end after this many units (default: when all are done)")
             action.add_argument("--quiet", action="store_true", help="print no progress")
     return parser
 

@@ -93,5 +93,5 @@ def plain(ax) -> None:
 
 
 def _some(count: int, most: int) -> np.ndarray:
-    """At most so many of the places 0 … count − 1, evenly chosen."""
+    """At most this many of the places 0 … count − 1, evenly chosen."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))

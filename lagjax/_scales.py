@@ -104,7 +104,7 @@ def _line(force: Callable, steps: np.ndarray) -> tuple[float, float]:
     return slope, high
 
 
-# Rounds of so many steps, which leave 1e-11 of a reach that is known by a factor of four.
+# Rounds of this many steps, which leave 1e-11 of a reach that is known by a factor of four.
 _ROUNDS, _BETWEEN = 8, 25
 
 

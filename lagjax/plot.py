@@ -197,7 +197,7 @@ def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: A
 
     - `points`, `q`, `params`: as in `Trajectory.animate`, and the equilibrium: the points there, in grey, and at the
       two ends of the swing, of which the largest deviation of a coordinate is `largest`. In the plane.
-    - `count`: draw so many modes, the slowest first.
+    - `count`: draw this many modes, the slowest first.
 
     Draws into `figure`, or a new one, and returns the Axes (M,). A complex shape, where something turns or damps, is
     drawn at the instant of its largest deviation.
@@ -549,7 +549,7 @@ def _positive(count, name: str) -> int:
 
 
 def _states(trajectory: Trajectory, members: int) -> tuple[Any, Any]:
-    """q and qdot of at most so many members, on a first axis that is there for a single trajectory too."""
+    """q and qdot of at most this many members, on a first axis that is there for a single trajectory too."""
     _require_numbers(trajectory, "trajectory")
     count = _positive(members, "members")
     states = trajectory.q, trajectory.qdot

@@ -14,7 +14,7 @@ import numpy as np
 
 from lagjax._layout import Layout
 
-# Up to so many coordinates every linear map is tried, 144 of them.
+# Up to this many coordinates every linear map is tried, 144 of them.
 _ALL_MAPS = 12
 
 # Leaves whose last axis is so long are vectors, which can be rotated.

@@ -33,7 +33,7 @@ PyTree = Any
 Vector = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
 
-# Eigenvalues below so many units of round-off of the largest, times n, are zero: ten times what LAPACK is off.
+# Eigenvalues below this many units of round-off of the largest, times n, are zero: ten times what LAPACK is off.
 _UNITS = 16
 
 
@@ -202,7 +202,7 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
 
 
 def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
-    """True if so many of the constraints are independent."""
+    """True if this many of the constraints are independent."""
     if not len(jacobian):
         return jnp.asarray(True)
     lengths = jnp.sqrt(jnp.sum(jacobian**2, axis=1, keepdims=True))

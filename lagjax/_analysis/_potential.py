@@ -36,7 +36,7 @@ def along_line(slope: Callable, start: Array, end: Array) -> Array:
 
 
 def _integral(rate: Callable, parts: int, dtype) -> Array:
-    """∫ rate(s) ds from 0 to 1 by Gauss's rule on so many parts."""
+    """∫ rate(s) ds from 0 to 1 by Gauss's rule on this many parts."""
     nodes, shares = np.polynomial.legendre.leggauss(_NODES)
     places = (np.arange(parts)[:, None] + 0.5 * (nodes + 1)).ravel() / parts
     values = jax.vmap(rate)(jnp.asarray(places, dtype))

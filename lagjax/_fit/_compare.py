@@ -25,7 +25,7 @@ _ENOUGH, _TRIALS = 1e-2, 40  # a record left out is then told to a hundredth of 
 class Comparison(NamedTuple):
     """Fits of the same records, in the order of `names`. Print it for a table.
 
-    - `free`: how many free numbers are seen; `log_likelihood`, `aic`, `bic`: of so many samples as are effective.
+    - `free`: how many free numbers are seen; `log_likelihood`, `aic`, `bic`: of as many samples as are effective.
     - `left_out`: the root mean square residuals of records that were left out, by signal; None without folds.
     - `best`: without folds the fit of the smallest BIC. With folds the fit of the fewest free numbers among those that
       follow records left out as well as any does, within the standard error of the difference over the groups.

@@ -58,7 +58,7 @@ def lag_products(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
 
 
 _LAGS = 20  # of residuals that hold motion some are correlated over the first lags, unless a period has two samples
-_CHANCE = 4.0  # standard errors of a correlation: white residuals show it at one of so many lags in 1 of 800 fits
+_CHANCE = 4.0  # standard errors of a correlation: white residuals show it at one of this many lags in 1 of 800 fits
 
 
 def structure(rows: np.ndarray, counted: np.ndarray) -> float:

@@ -208,7 +208,7 @@ class Density:
         return total
 
     def _of_noise(self, samples: np.ndarray) -> np.ndarray:
-        """The covariance of log σ, and of the numbers that move ν, from Fisher's information of so many samples (S,).
+        """The covariance of log σ, and of the numbers that move ν, from Fisher's information of this many samples (S,).
 
         Per sample of Student's t it is 2ν/(ν+3) for log σ, [ψ′(ν/2) − ψ′((ν+1)/2)]/4 − (ν+5)/(2ν(ν+1)(ν+3)) for ν and
         −2/((ν+1)(ν+3)) between them. Source: Lange, Little & Taylor (1989), appendix B.

@@ -30,7 +30,7 @@ def descend(
     question: AbstractQuestion, systems: dict[str | None, Scene], u: np.ndarray, starts: np.ndarray,
     noise: AbstractNoise, steps: int, told: Callable[[str], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, bool] | Failure:  # fmt: skip
-    """u (F,), the starts (N, 2n) after so many steps, and whether log L has come to rest.
+    """u (F,), the starts (N, 2n) after this many steps, and whether log L has come to rest.
 
     A `Failure` where the motion from the first trial cannot be followed; later ones are passed over.
     """

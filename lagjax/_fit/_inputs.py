@@ -94,7 +94,7 @@ class Form(NamedTuple):
         return self.driven(system), Driven(params, table.knots[0], table.values[0])
 
     def params(self, params: PyTree, room: int) -> Driven:
-        """Parameters of the driven scene, with a table of zeros of so many instants: a structure."""
+        """Parameters of the driven scene, with a table of zeros of this many instants: a structure."""
         return Driven(params, np.arange(float(room)), np.zeros((room, self.size)))
 
 

@@ -99,7 +99,7 @@ def motions_of(
 
 class _ByMachineCode(AbstractMotions):
     def __init__(self, problem: Callable[[int], Problem], is_driven: bool):
-        """`problem(room)` is about the scene with tables of inputs of so many instants."""
+        """`problem(room)` is about the scene with tables of inputs of this many instants."""
         self.problem, self.tolerances, self.is_driven = problem, _tolerances(problem(2)), is_driven
         self.projection = None if is_driven else flow_of(problem(2)).projection
 

@@ -43,7 +43,7 @@ from lagjax._fit._surrogate import Surrogate, expanded
 _ACCEPTED = 0.85  # the mean acceptance that steps are tuned for
 _ROUNDS = (400, 800, 3200)  # draws of all chains from π*: each round has the metric of the one before
 _ROUNDS_OF_MOTIONS = (200, 400, 800)  # of π, where each costs as many motions as draws do later
-_FEWEST = 50  # of them of one chain: its step needs so many
+_FEWEST = 50  # of them of one chain: its step needs this many
 _MOST_INNER = 64  # steps of the sampler along π* for one draw: a motion is waited for no longer than that
 _PILOT = 64  # draws of π* that are weighed with π before the first draw
 _LEAST = 0.2  # of them are accepted, or π* is given up: fewer, and a chain may stay where π* is too small

@@ -70,7 +70,7 @@ class Reader(NamedTuple):
 
 
 def some_of(record: Record, count: int) -> np.ndarray:
-    """At most so many places of samples, from the first to the last."""
+    """At most this many places of samples, from the first to the last."""
     return np.unique(np.linspace(0, len(record) - 1, count).astype(int))
 
 

@@ -76,7 +76,7 @@ def find_mistake(
     """A sentence for the first mistake without which a fit follows the records; none where there is no such.
 
     `share(records)` is what a fit of other records leaves of the signals, None where it fails as well; `left` is what
-    the fit of these left. No try begins after so many seconds of processor time.
+    the fit of these left. No try begins after this many seconds of processor time.
     """
     until = time.process_time() + seconds
     for suspect in possible:

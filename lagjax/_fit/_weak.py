@@ -111,7 +111,7 @@ def imbalance(question: Question, system: System, readers: list[Reader | None], 
 
 
 def _read(readers: list[Reader], half: float) -> list[tuple]:
-    """States (T, 2n), times, inputs and windows of every record, thinned to so many samples in all."""
+    """States (T, 2n), times, inputs and windows of every record, thinned to this many samples in all."""
     found = []
     for reader in readers:
         count = max(_FEWEST + 1, _SAMPLES // len(readers))

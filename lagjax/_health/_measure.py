@@ -169,7 +169,7 @@ class Members:
         return np.concatenate(parts, axis=-1)
 
     def shared(self, x, dimensions: int) -> np.ndarray:
-        """Times or tolerances, arrays of so many dimensions, for every member: (N, …), also where all share them."""
+        """Times or tolerances, arrays of this many dimensions, for every member: (N, …), also where all share them."""
         x = np.asarray(x)
         if x.ndim < len(self.batch) + dimensions:
             x = np.expand_dims(x, x.ndim - dimensions)

@@ -44,13 +44,13 @@ def on_host(host: Callable, shapes, *arrays) -> tuple:
 
 
 def has_handler(flow: Flow, members: int) -> bool:
-    """True if a run of so many members begins in the handler."""
+    """True if a run of this many members begins in the handler."""
     notes = flow.guards is not None and flow.guards.notes
     return NO_HANDLER is None and not notes and flow.kernel.to_run(members).threads(members) == 1
 
 
 def has_sweep(flow: Flow, members: int) -> bool:
-    """True if derivatives of so many members begin in a handler, with their motion run once more."""
+    """True if derivatives of this many members begin in a handler, with their motion run once more."""
     return has_handler(flow, members) and flow.projection is None and flow.kernel.rounds_of_sweep > 0
 
 
@@ -59,7 +59,7 @@ def run_by_handler(
 ) -> tuple:
     """The run of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), N not too many for one thread.
 
-    The handler goes so many `rounds`, by default those of a slice of time.
+    The handler goes this many `rounds`, by default those of a slice of time.
     `host(ts, y0, params, *begun)` goes on with what the handler leaves undone (`_native.Begun`); its results, of these
     `shapes`, are those of the whole.
     """

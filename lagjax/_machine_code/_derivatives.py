@@ -332,7 +332,7 @@ def _over_divided(flow: Flow, steps: Steps, member: int, params, tolerances, exc
 
 
 def _divided(flow: Flow, steps: Steps, member: int, params, tolerances: Tolerances, parts: int) -> Steps:
-    """The steps of one member, each in so many parts: the states between are outputs of the motion."""
+    """The steps of one member, each in this many parts: the states between are outputs of the motion."""
     first = steps.first[member]
     rows = steps.table[first : first + steps.counts[member]]
     t, h, first_state = rows[:, 0], rows[:, 1], rows[:1, 4:]

@@ -147,7 +147,7 @@ class Flow:
         return 2 * self.size
 
     def path_shape(self, times: int, notes: int) -> tuple[int, ...]:
-        """The shape of the `path` of a member: of states at so many output times, or of what is noted."""
+        """The shape of the `path` of a member: of states at this many output times, or of what is noted."""
         if self.guards is None or not self.guards.notes:
             return times, self.states
         return len(self.guards.directions) * (notes + 1), self.states + 1
@@ -250,7 +250,7 @@ class Flow:
         return stuck & (tolerances.tries > 1), self, tolerances.perturbed
 
     def _tangent(self, directions: int) -> "Flow":
-        """The flow of q and of its derivatives along so many directions, whose δparams are numbers of it.
+        """The flow of q and of its derivatives along this many directions, whose δparams are numbers of it.
 
         It has (1 + D) n coordinates and (1 + D) P parameters. A tangent that is zero by symmetry is as exact as the
         other coordinates in its direction, not exact relative to itself: each direction is one group.

@@ -124,7 +124,7 @@ class Adjoint:
         frame.finish()
 
     def _run(self, steps: list[Code]) -> None:
-        """`run(job, memory, lanes, rounds)`: so many rounds, or until the batch is done; one step back in every lane.
+        """`run(job, memory, lanes, rounds)`: this many rounds, or until the batch is done; one step back in every lane.
 
         Returns 1 if there is more to do.
         """

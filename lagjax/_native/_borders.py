@@ -47,7 +47,7 @@ from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
 from lagjax._program._saltation import Jump, looks_up
 
 NOWHERE = 1e300  # a level that no switching number comes to
-SLIDING = 4.0  # a guard that stays zero; of others that touch the border so many rates are zero, and one less
+SLIDING = 4.0  # a guard that stays zero; for others that touch the border the number of zero rates, plus one
 
 
 class Borders:

@@ -78,13 +78,13 @@ class Layout:
         return -(-self._doubles[0] // self.width) * self.width
 
     def extend(self, name: str, rows: int, columns: int = 1) -> None:
-        """One field more, of so many vectors, behind all others."""
+        """One field more, of this many vectors, behind all others."""
         begin = self.end
         self._offsets[name], self._columns[name] = begin, columns
         self._doubles[0] = begin + rows * columns * self.width
 
     def extend_by(self, fields: dict[str, int]) -> None:
-        """More fields, by name, of so many vectors each, behind all others."""
+        """More fields, by name, of this many vectors each, behind all others."""
         for name, rows in fields.items():
             self.extend(name, rows)
 
@@ -228,7 +228,7 @@ class Frame:
     # ---- functions ----
 
     def at(self, offset: Value) -> Value:
-        """The address that lies so many doubles behind the beginning of the memory."""
+        """The address that lies this many doubles behind the beginning of the memory."""
         return self.code.element(self._memory, offset)
 
     def call(self, function: Code, *arguments: Value) -> None:

@@ -42,7 +42,7 @@ _lock = threading.Lock()
 
 
 def grid(members: int) -> tuple[int, int]:
-    """The blocks, and the threads of each, for so many members."""
+    """The blocks, and the threads of each, for this many members."""
     return min(MOST_BLOCKS, max(1, -(-members // THREADS))), THREADS
 
 
@@ -67,7 +67,7 @@ def program_for_gpus(integrator: Integrator) -> str:
 
 
 def _assembly(text: str, size: int) -> str:
-    """PTX from the text of a module whose threads remember so many doubles."""
+    """PTX from the text of a module whose threads remember this many doubles."""
     machine = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3)
     text = text.replace('target triple = ""', f'target triple = "{machine.triple}"')
     text = text.replace('target datalayout = ""', f'target datalayout = "{machine.target_data}"')

@@ -209,7 +209,7 @@ def _tell_version(code: Code, extension: Value) -> None:
 
 
 def _address(base: Value, offset: int) -> Value:
-    """A place so many bytes behind another."""
+    """A place this many bytes behind another."""
     return base.code.element(base, offset, ir.IntType(8))
 
 

@@ -1,4 +1,4 @@
-"""The integration of a batch by Taylor series, as two functions of LLVM: one begins, one runs so many rounds.
+"""The integration of a batch by Taylor series, as two functions of LLVM: one begins, one runs this many rounds.
 
 Every lane of a vector carries one member. A round takes one step in each lane:
 
@@ -167,7 +167,7 @@ class Integrator:
     # ---- rounds ----
 
     def _run(self) -> None:
-        """`run(job, memory, lanes, idle, rounds)`: so many rounds, or until the batch is done.
+        """`run(job, memory, lanes, idle, rounds)`: this many rounds, or until the batch is done.
 
         Returns 1 if there is more to do. `idle` counts the lanes without a member.
         """

@@ -297,7 +297,7 @@ class Code:
         return Value(self, self.builder.mul(self.builder.zext(loaded, whole), eight))
 
     def gather(self, base: Value, offsets: Value) -> Value:
-        """The doubles that lie so many bytes behind `base`, one for each lane."""
+        """The doubles that lie this many bytes behind `base`, one for each lane."""
         function, _, options = self._constants_of_a_gather
         first = self.as_value(Value(self, self.builder.ptrtoint(base.it, INTEGER)), offsets.it.type)
         pointers = ir.VectorType(POINTER, self.lanes)

@@ -152,11 +152,11 @@ class Kernel:
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
     def of_members(self, members: int) -> "Kernel":
-        """The kernel for so many members: for one alone without lanes, which would be computed and read for nobody."""
+        """The kernel for this many members: for one alone without lanes, which would be computed for nobody."""
         return self._alone if members == 1 < self.width else self
 
     def to_run(self, members: int) -> "Kernel":
-        """The kernel that integrates so many members: one after the other where lanes would not fit in a cache."""
+        """The kernel that integrates this many members: one after the other where lanes would not fit in a cache."""
         return self.of_members(1 if self._one_by_one else members)
 
     @functools.cached_property
@@ -215,7 +215,7 @@ class Kernel:
 
         `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. So many
         steps as there is `room` for are written down, for derivatives. What a handler has `begun` is gone on with.
-        Where guards are noted, with room for so many notes of each, `path` holds these for one guard after the other: a
+        Where guards are noted, with this much room for each, `path` holds the notes for one guard after the other: a
         time, and the state then, (N, guards (room + 1), 1 + 2n); behind them how many there would have been.
         """
         ts, y0, params = _contiguous(ts, y0, params)
@@ -288,7 +288,7 @@ class Kernel:
         return y_ct, params_ct, excess
 
     def _back_over(self, members: int) -> "tuple[_Compiled, int]":
-        """The transpose for so many members, and on how many threads."""
+        """The transpose for this many members, and on how many threads."""
         kernel = self.of_members(1 if members < self.width / 2 else members)  # few are as fast one after the other
         # A vector of members is as much work as the motions of several, and worth a thread the sooner.
         return kernel._backward, min(kernel.threads(members * MOTIONS_PER_ADJOINT), -(-members // kernel.width))
@@ -322,7 +322,7 @@ class Kernel:
         return path_dot, y_dot, excess
 
     def _forward_along(self, members: int, directions: int) -> "tuple[_Compiled, int]":
-        """The tangents of so many members along so many directions, and on how many threads."""
+        """The tangents of this many members along this many directions, and on how many threads."""
         if directions > 1 and members < self.width / 2:
             return self._tangents(True), min(cores(), members)
         kernel = self.of_members(members)
@@ -395,7 +395,7 @@ class Kernel:
         )  # fmt: skip
 
     def threads(self, members: int) -> int:
-        """On how many threads so many members are worked on."""
+        """On how many threads this many members are worked on."""
         return min(cores(), max(1, members // (VECTORS_PER_THREAD * self.width)))
 
 

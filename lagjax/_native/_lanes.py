@@ -56,11 +56,11 @@ class Lines:
             yield some, {k: i - n for k, i in enumerate(some) if i >= n}
 
     def room(self, frame: Frame, count: int) -> Numbers:
-        """Room for so many vectors."""
+        """Room for this many vectors."""
         return [None] * count
 
     def largest(self, code: Code, numbers: Callable[[int], Value], count: int) -> Value:
-        """The largest of so many numbers, which are not negative; NaN where the last one is."""
+        """The largest of this many numbers, which are not negative; NaN where the last one is."""
         return functools.reduce(code.maximum, map(numbers, range(count)))
 
     def largest_by_group(self, frame: Frame, numbers: Callable[[int], Value], groups: Sequence[int]) -> Numbers:

@@ -37,7 +37,7 @@ _COPY, _STORE = (Kind(op, None, ("float",), "float", (None,)) for op in ("copy",
 
 
 class _Program(NamedTuple):
-    """A program with the kinds of its operations, in stages; its last outputs, so many, are stored somewhere else."""
+    """A program with the kinds of its operations, in stages; its last outputs, this many, are stored somewhere else."""
 
     line: StraightLine
     kinds: list[Kind]
@@ -46,7 +46,7 @@ class _Program(NamedTuple):
 
 
 class Packed(Tables):
-    """The form of large kernels of one member; vectors have so many `lanes`.
+    """The form of large kernels of one member; vectors have this many `lanes`.
 
     `function(name, *kinds)` makes a function of the kernel, with its frame; `wide` one whose vectors have these lanes.
     """
@@ -154,7 +154,7 @@ class Packed(Tables):
     # ---- the code ----
 
     def _write_execute(self) -> None:
-        """`(table, shift)`: run a program; what is stored lies so many doubles behind where the table says."""
+        """`(table, shift)`: run a program; what is stored lies this many doubles behind where the table says."""
         frame, code = self._execute, self._execute.code
         table, _ = frame.arguments
         at = code.variable(table)

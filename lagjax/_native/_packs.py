@@ -50,7 +50,7 @@ class Run(NamedTuple):
 
 
 def stages(operations: Sequence[Operation], nodes: int, kept: Sequence[int]) -> list[Stage]:
-    """The stages of a program of so many nodes, in an order in which they can run; nodes that are `kept` live on."""
+    """The stages of a program of this many nodes, in an order in which they can run; nodes that are `kept` live on."""
     level = [0] * nodes
     groups: dict[tuple[int, int], list[Operation]] = {}
     for operation in operations:
@@ -85,7 +85,7 @@ def forget_stages() -> None:
 
 
 def fills(line: StraightLine, width: int) -> bool:
-    """True if most lanes of so many have something to do where alike operations of a program stand in them."""
+    """True if most lanes of this many have something to do where alike operations of a program stand in them."""
     _, program = staged(Same(line))
     counts = np.array([stage.results.shape[1] for stage in program])
     return bool(counts.sum() >= LEAST_FILLED * width * (-(-counts // width)).sum())
@@ -100,7 +100,7 @@ class Arranged(NamedTuple):
 
 
 def arranged(program: list[Stage], places: np.ndarray, first: int, width: int) -> Arranged:
-    """The program in runs of vectors of so many lanes.
+    """The program in runs of vectors of this many lanes.
 
     `places` has where the inputs and the numbers lie; results get places from `first` on. Behind the results of a stage
     `width` numbers are free, for a vector that is not full is written as a whole.

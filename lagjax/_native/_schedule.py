@@ -72,7 +72,7 @@ class Schedule(NamedTuple):
 def schedule(line: StraightLine, stored: int) -> Schedule:
     """The order of the operations that the outputs of a program need, and the slots of their results.
 
-    The last outputs, so many, are `stored` somewhere else as soon as they are there.
+    The last outputs, this many, are `stored` somewhere else as soon as they are there.
     """
     nodes, uses = line.nodes, count_uses(line.nodes, line.outputs)
     kinds, operations = _joined_of(Same(line))

@@ -24,7 +24,7 @@ from lagjax._program._series import Recurrent, Series, StraightLine
 
 
 class Chosen(NamedTuple):
-    """Which of the numbers of a member are parameters of a motion: those at `positions`, `of` so many.
+    """Which of the numbers of a member are parameters of a motion: those at `positions`, `of` this many.
 
     The others are only looked up (`_look_ups`).
     """
@@ -39,7 +39,7 @@ class Motion:
     The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n. `fields`
     names what else a thread remembers (see `Layout`), `job` the structure that all threads share. `large` kernels are
     written as tables (see `is_large`). Vectors have `width` lanes. The last of the numbers of the program are its
-    `pieces`, the others the `chosen` ones of a member, or all. Of its outputs so many are `kept`, behind the first
+    `pieces`, the others the `chosen` ones of a member, or all. Of its outputs this many are `kept`, behind the first
     ones. With `keep_sums` the sums of every order stay in
     memory, not only those of the last.
     """
@@ -285,7 +285,7 @@ class Motion:
 
 
 def is_large(program: Recurrent, projection=None, guards=None, times: int = 1, more: Sequence = ()) -> bool:
-    """True if a kernel that has the operations of these programs so many times, and of `more` lines, is in tables."""
+    """True if a kernel that has the operations of these programs this many times, and of `more` lines, is in tables."""
     lines = [program.line]
     if projection is not None:
         lines += [projection.state.line, projection.velocity_scale.line]

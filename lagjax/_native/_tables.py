@@ -87,11 +87,11 @@ class Tables:
             yield [i, i + n], {1: i}
 
     def room(self, frame: Frame, count: int) -> Numbers:
-        """Room for so many vectors."""
+        """Room for this many vectors."""
         return frame.vectors(self._field(count), count)
 
     def largest(self, code: Code, numbers: Callable[[Value], Value], count: int) -> Value:
-        """The largest of so many numbers, which are not negative; NaN where the last one is."""
+        """The largest of this many numbers, which are not negative; NaN where the last one is."""
         largest = code.variable(code.lanes_of(0.0))
         for i in self.each(code, count):
             code.store(code.maximum(code.load(largest, code.vector), numbers(i)), largest)
@@ -128,7 +128,7 @@ class Tables:
     # ---- where numbers lie ----
 
     def _field(self, count: int) -> str:
-        """A new field of the memory, of so many vectors."""
+        """A new field of the memory, of this many vectors."""
         name = f"field{len(self._fields)}"
         self._fields.append(name)
         self._layout.extend(name, count)
@@ -156,7 +156,7 @@ class Tables:
     # ---- the table of a program ----
 
     def _words(self, kind: Kind, group: list[Operation], places: dict[int, int]) -> list[int]:
-        """The operations of a group, all of one kind, so many at a time as there is code for."""
+        """The operations of a group, all of one kind, this many at a time as there is code for."""
         start, words = 0, []
         while start < len(group):
             times = next(times for times in TIMES if times <= len(group) - start)
@@ -170,7 +170,7 @@ class Tables:
     # ---- the code ----
 
     def _write_execute(self) -> None:
-        """`(table, shift)`: run a program; what is stored lies so many doubles behind where the table says."""
+        """`(table, shift)`: run a program; what is stored lies this many doubles behind where the table says."""
         frame, code = self._execute, self._execute.code
         table, shift = frame.arguments
         at = code.variable(table)

@@ -57,7 +57,7 @@ class Units(NamedTuple):
     length: np.ndarray
 
     def repeated(self, count: int) -> "Units":
-        """Each so many times, (R count, 2n)."""
+        """Each this many times, (R count, 2n)."""
         return Units(*(np.repeat(x, count, axis=0) for x in self))
 
     def growth(self, growth: np.ndarray) -> np.ndarray:

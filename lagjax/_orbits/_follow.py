@@ -163,7 +163,7 @@ class Follower:
         return self.begun(point.chain.states(), point.chain.periods(), count * more, point.numbers)
 
     def begun(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> Point:
-        """The orbit from a state (1, 2n) in so many arcs, both in the units of the user."""
+        """The orbit from a state (1, 2n) in this many arcs, both in the units of the user."""
         parts, y = _shooting.guesses(self.closing(numbers), y0, period, count)
         return self.point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
 

@@ -104,7 +104,7 @@ def _pieces(arcs: Arcs, y0, duration, throw: bool) -> int:
 
 
 def _spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: int) -> np.ndarray:
-    """The exponents (N, 2n) of some motions, each from so many arcs."""
+    """The exponents (N, 2n) of some motions, each from this many arcs."""
     members, states = y0.shape
     times = duration[:, None] * np.arange(pieces + 1) / pieces
     path = arcs.ends(times, y0).path

@@ -247,7 +247,7 @@ class Symmetries(NamedTuple):
 
 
 def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
-    """The rank decision about closed chains: which directions are symmetries, at most so many.
+    """The rank decision about closed chains: which directions are symmetries, at most this many.
 
     At a branch point monodromy − 1 sends more to zero, by chance: those of the smallest singular values are chosen.
     """

@@ -350,7 +350,7 @@ class Program:
         return Scalars(first.expansion, np.array(self.origin.outputs, dtype=np.int64)) if same else None
 
     def with_inputs(self, count: int) -> "Program":
-        """The program with so many more floats behind its own inputs, none of which it reads."""
+        """The program with this many more floats behind its own inputs, none of which it reads."""
         more, other = jax.ShapeDtypeStruct((count,), jnp.result_type(float)), self.otherwise
         return replace(
             self,

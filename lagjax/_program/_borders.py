@@ -493,7 +493,7 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
     """The guards of all pieces; piece number `slides[k].piece` slides where the k-th of the last ones is 1.
 
     Those of one piece stand side by side: of several that are violated where no time passes the first one counts, and
-    so many borders that push onto each other come to rest (Murty, Linear Algebra Appl. 9 (1974) 65).
+    this many borders that push onto each other come to rest (Murty, Linear Algebra Appl. 9 (1974) 65).
     """
     guards: list[Guard] = []
     sliding = [slide.piece for slide in slides]

@@ -94,7 +94,7 @@ def looks_up(program: Recurrent) -> bool:
 
 
 def with_levels(borders: Borders, size: int, directions: int) -> Borders:
-    """The borders of a motion together with its tangents along so many directions; along a piece these are smooth.
+    """The borders of a motion together with its tangents along this many directions; along a piece these are smooth.
 
     The inputs q, q̇ and the parameters have 1 + D rows, those of the motion and then one for each direction, and so have
     the accelerations.
@@ -140,7 +140,7 @@ def _renumbered(line: StraightLine, places: dict[int, int]) -> StraightLine:
 
 
 def over_border(borders: Borders, size: int, directions: tuple[int, ...]) -> Jump:
-    """The jump of the tangents of a motion, of tangents of these and so on, along so many `directions` each.
+    """The jump of the tangents of a motion, of tangents of these and so on, along this many `directions` each.
 
     `borders` are those of the motion alone. Raises `Unlowerable` where directions are of too many kinds.
     """

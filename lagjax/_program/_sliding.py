@@ -22,7 +22,7 @@ from lagjax._program._transpose import copied, gradient_in
 MOST_SLIDING = 64  # pieces that are unknowns of the linear system: their own elimination takes a third of the cube
 MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for each of which a program is copied, and its operations
 # Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
-# mended so many times. The share of what no border holds alone is as exact as rounding, divided by it.
+# mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
 SOFT, MENDED = 1e-9, 2
 FAR = 1e200  # of a rate: a share that is beyond 0 and 1, and finite
 _LARGEST = 10_000_000  # operations: a bound for errors

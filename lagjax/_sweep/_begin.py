@@ -38,7 +38,7 @@ def first_look(motions: Motions, points: dict[str, np.ndarray]) -> tuple[Kept, f
 
 
 def _some(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
-    """At most so many of these points, one at least."""
+    """At most this many of these points, one at least."""
     count = len(next(iter(points.values())))
     return {name: x[:: -(-count // max(1, most))] for name, x in points.items()}
 

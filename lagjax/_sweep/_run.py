@@ -17,7 +17,7 @@ from lagjax._sweep._job import Job, opened, precision
 from lagjax._sweep._store import Store
 from lagjax._sweep._unit import Unit, compute
 
-_WINDOW = 64  # units that an executor is given at a time: a scheduler holds so many tasks, not a million
+_WINDOW = 64  # units that an executor is given at a time: a scheduler holds this many tasks, not a million
 _POLL = 0.2  # seconds between two looks at what others do
 
 Compute = Callable[[Job, int], Unit]
