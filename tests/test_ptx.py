@@ -59,17 +59,17 @@ def on_the_ptx(monkeypatch):
             _transforms.vjp_p: (_transforms._vjp_for_gpus, _transforms._vjp_compiled),
         }
 
-        def register(which):
-            for primitive, forms in places.items():
-                rule = mlir.lower_fun(forms[which], multiple_results=True)
+        def register(for_gpus):
+            for primitive, (on_gpus, on_cpus) in places.items():
+                rule = mlir.lower_fun(on_gpus, multiple_results=True) if for_gpus else _transforms._for_cpus(on_cpus)
                 mlir.register_lowering(primitive, rule, platform="cpu")
             transforms_are_new()
 
-        register(0)
+        register(for_gpus=True)
         try:
             return jax.tree.map(np.asarray, jax.jit(function)(*args))
         finally:
-            register(1)
+            register(for_gpus=False)
 
     monkeypatch.setattr(_gpu, "launch", launch)
     run.launches = launches
