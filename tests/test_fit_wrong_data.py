@@ -150,6 +150,14 @@ def test_two_records_that_contradict_each_other():
     assert not found.ok and "contradicts the other record: without it params['w2'] would move" in found.message
 
 
+def test_what_the_scene_lacks_is_told_and_is_no_other_machine():
+    # A vibration of six σ, and a difference of 0.6 %: that is beyond chance, and little of what is left.
+    shaken = [6 * SIGMA * np.sin(25.0 * TS + phase) for phase in (0.3, 2.0)]
+    values = [motion(1.0, 0.0) + shaken[0], motion(-0.5, 2.0, TRUTH | {"w2": 9.055}, seed=1) + shaken[1]]
+    found = fit(values)
+    assert found.ok and "the scene lacks something that differs from record to record" in found.message
+
+
 # ---- mistakes that can be undone -------------------------------------------------------------------------------------
 
 

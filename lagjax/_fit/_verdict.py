@@ -12,6 +12,10 @@ Whether records agree is told without another search. With Hₖ and gₖ what re
 of the parameters, starts eliminated, the fit without record k is near u + (H − Hₖ)⁻¹ gₖ, since all gradients together
 are zero. If the records agree, that shift has the covariance (H − Hₖ)⁻¹ − H⁻¹. Source: Cook & Weisberg, *Residuals and
 Influence in Regression* (1982), §3.4, for one observation.
+
+With enough samples every model is wrong beyond chance, and records show it in different ways. So a record contradicts
+the others only if parameters of its own would explain a fair share of the motion that the fit leaves in it: for another
+machine that is nearly all, for what the scene lacks a few per cent.
 """
 
 from typing import NamedTuple
@@ -29,6 +33,7 @@ from lagjax._fit._uncertainty import Information, orthogonal
 
 _BEYOND = 2.0  # standard errors that a step must lead beyond a bound: of sound fits at a bound one in forty does
 _DISAGREE = 5.0  # standard deviations of a shift: twenty records of ten parameters show it in one of 1e4 fits
+_OWN = 0.2  # of the motion left in a record, explained by parameters of its own: 0.9 and more for another machine
 _MOST_NAMED = 3
 _UNEXPLAINED = 0.3  # of a signal's size, left as motion: sound fits leave 1e-3 to 0.1, a false minimum 0.4 to 1
 _DOUBTED = 0.05  # of a signal's size, left as motion, from which a fit of other records is tried
@@ -59,8 +64,8 @@ def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, quest
     labels = dict.fromkeys(question.parameters.labels[i] for i in np.flatnonzero(wide & ~named))
     if labels:
         parts.append(f"Hardly seen, or at the end of what its transform allows: {', '.join(labels)}.")
-    apart = _disagreements(question, triangles, known, ~named)
-    parts += apart
+    apart, pulls = _disagreements(question, triangles, known, ~named, _motion(question, descent.point, descent.widths))
+    parts += apart + pulls
     if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
     ok = descent.converged and not (unseen or left.motion or apart)
@@ -203,31 +208,49 @@ def _at_end(name: str, transform: Positive | Between, x: float, step: float, err
 
 
 def _disagreements(
-    question: AbstractQuestion, triangles: np.ndarray, known: Information, inside: np.ndarray
-) -> list[str]:
-    """Sentences for the records without which a parameter would move by more than they can have by chance.
+    question: AbstractQuestion, triangles: np.ndarray, known: Information, inside: np.ndarray, motion: dict[int, float]
+) -> tuple[list[str], list[str]]:
+    """Sentences for the records without which a parameter would move by more than they can have by chance: for those of
+    another motion, and for those that show, each in its way, what the scene lacks.
 
-    Only of parameters `inside` (F,) of their sets: at a bound the sum of squares has a slope.
+    Only of parameters `inside` (F,) of their sets: at a bound the sum of squares has a slope. `motion` is the sum of
+    squares of what the fit leaves in a record beyond white noise.
     """
     records = np.array([piece.record for piece in question.pieces])
     count = len(np.unique(records))
     if known.null.shape[1] or count < 2 or not inside.any():
-        return []
+        return [], []
     columns = np.concatenate([np.ones(question.states, bool), inside, [True]])
     variances = np.diag(known.covariance)[inside], np.diag(known.white)[inside]
     shifts = shifts_without(question.states, triangles[..., columns], records, *variances)
     labels = [label for label, keep in zip(question.parameters.labels, inside, strict=True) if keep]
-    worst = [(k, int(np.argmax(np.abs(z)))) for k, z in shifts.items()]
-    worst = sorted((-abs(shifts[k][i]), k, i) for k, i in worst if abs(shifts[k][i]) > _DISAGREE)
+    worst = [(k, int(np.argmax(np.abs(shift.sizes)))) for k, shift in shifts.items()]
+    worst = sorted((-abs(shifts[k].sizes[i]), k, i) for k, i in worst if abs(shifts[k].sizes[i]) > _DISAGREE)
+    apart = [(k, i) for _, k, i in worst if shifts[k].explained > _OWN * motion.get(k, 0.0)]
+    pulls = [(k, i) for _, k, i in worst if (k, i) not in apart]
     if count == 2:  # each moves as far without the other
-        return [
-            f"{question.called(k)} contradicts the other record: without it {_moved(labels[i], shifts[k][i])}."
-            for _, k, i in worst[:1]
-        ]
-    return [
-        f"{question.called(k)} disagrees with the others: without it {_moved(labels[i], shifts[k][i])}."
-        for _, k, i in worst[:_MOST_NAMED]
-    ]
+        apart, pulls, how = apart[:1], [] if apart else pulls[:1], "contradicts the other record"
+    else:
+        apart, pulls, how = apart[:_MOST_NAMED], pulls[:1], "disagrees with the others"
+    return (
+        [f"{question.called(k)} {how}: without it {_moved(labels[i], shifts[k].sizes[i])}." for k, i in apart],
+        [
+            f"Without {question.called(k)} {_moved(labels[i], shifts[k].sizes[i])}, more than its interval allows for. "
+            f"Parameters of its own would explain {100 * shifts[k].explained / motion[k]:.2g} % of the motion that is "
+            "left in it: the scene lacks something that differs from record to record."
+            for k, i in pulls
+        ],
+    )
+
+
+def _motion(question: AbstractQuestion, point: Point, widths: Widths) -> dict[int, float]:
+    """Of every record the sum of squares that a trial leaves beyond white noise, in those of the noise."""
+    found: dict[int, float] = {}
+    for signal in range(len(question.names)):
+        for k, rows in _rows_of_signal(question, point, widths, signal).items():
+            part = _parts(*rows)
+            found[k] = found.get(k, 0.0) + part.samples * part.motion / widths.sigma[signal] ** 2
+    return found
 
 
 def _moved(label: str, shift: float) -> str:
@@ -236,8 +259,16 @@ def _moved(label: str, shift: float) -> str:
     return f"{label} would move {way} by {abs(shift):.1f} of the standard deviations that chance gives it"
 
 
-def shifts_without(states: int, triangles, records: np.ndarray, variances, white) -> dict[int, np.ndarray]:
-    """By how much each u (F,) moves without one record, in the standard deviations of that for records that agree.
+class Shift(NamedTuple):
+    """A fit without a record: how far each u moves (F,), in standard deviations of that for records that agree, and by
+    how much parameters of its own would lower the record's sum of squares."""
+
+    sizes: np.ndarray
+    explained: float
+
+
+def shifts_without(states: int, triangles, records: np.ndarray, variances, white) -> dict[int, Shift]:
+    """The fit without one record, for each of them.
 
     `triangles` (N, …, 2n + F + 1) are those of the pieces, `records` (N,) says whose they are; `variances` (F,) are
     those of u, and `white` (F,) what they were if residuals were white. A record without which something is not
@@ -254,8 +285,11 @@ def shifts_without(states: int, triangles, records: np.ndarray, variances, white
         if values[-1] < 1e-5 * values[0]:
             continue
         mine = own[records == k].reshape(-1, own.shape[-1])
+        slopes, residuals = mine[:, :-1] / size, mine[:, -1]
         without, beside = np.linalg.inv(rest.T @ rest), np.linalg.inv(whole.T @ whole)
-        shift = without @ (mine[:, :-1] / size).T @ mine[:, -1]
+        shift = without @ slopes.T @ residuals
         chance = np.sqrt(np.maximum(np.diag(without) - np.diag(beside), 1e-12 * np.diag(without)))
-        found[int(k)] = shift / (chance * growth)
+        axes, values, _ = np.linalg.svd(slopes, full_matrices=False)
+        along = axes[:, values > 1e-5 * values[0]].T @ residuals
+        found[int(k)] = Shift(shift / (chance * growth), float(along @ along))
     return found
