@@ -1,5 +1,7 @@
 """Lagrangians with small matrices and complex numbers: closed forms, and the same scene written with real numbers."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
@@ -175,6 +177,77 @@ def test_weights_jump_without_a_border():
         assert OPERATIONS["binade"].value(np.float64(x)) == in_jax("binade", x) == expected
 
 
+# ---- eigenvalues ----------------------------------------------------------------------------------------------------
+
+
+def matrices(n, seed):
+    """Symmetric matrices of all scales, every third with two eigenvalues that are equal to some digits, or to all."""
+    rng = np.random.default_rng(seed)
+    for trial in range(60):
+        values = rng.normal(size=n) * 10.0 ** rng.integers(-8, 9, size=n if trial % 2 else 1)
+        if n > 1 and trial % 3 == 0:
+            values[1] = values[0] * (1 + 10.0 ** -rng.integers(1, 17))
+        axes = np.linalg.qr(rng.normal(size=(n, n)))[0]
+        yield (axes * values) @ axes.T
+    yield from (np.zeros((n, n)), np.eye(n), np.diag(np.arange(n, 0.0, -1.0)))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_eigenvalues_are_as_exact_as_those_of_lapack(n):
+    program = lower(jnp.linalg.eigvalsh, np.eye(n))
+    for a in matrices(n, seed=n):
+        expected = np.linalg.eigvalsh(a, UPLO="L")
+        found = np.array(program.evaluate(*a.ravel()))
+        assert np.abs(found - expected).max() <= 20 * np.finfo(float).eps * np.abs(expected).max(initial=0.0)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_eigenvectors_are_orthogonal_and_diagonalise(n):
+    program, eps = lower(lambda a: jnp.linalg.eigh(a), np.eye(n)), np.finfo(float).eps
+    for a in matrices(n, seed=10 + n):
+        found = np.array(program.evaluate(*a.ravel()))
+        values, vectors = found[:n], found[n:].reshape(n, n)
+        if np.isnan(vectors).any():  # of equal eigenvalues there are none
+            assert np.diff(values).min() <= 4 * eps * np.abs(values).max()
+            continue
+        np.testing.assert_allclose(vectors.T @ vectors, np.eye(n), atol=50 * eps)
+        assert np.abs(a @ vectors - vectors * values).max() <= 50 * eps * np.abs(values).max()
+
+
+def test_a_strained_cube_by_its_principal_stretches():
+    # tr f(C) by the eigenvalues of C, and by its powers; through states where one principal stretch overtakes another.
+    mass = jnp.array([1.0, 1.2, 0.8, 1.0, 0.9, 1.1])
+    by_stretches = lambda q, v: 0.5 * mass @ v**2 - jnp.sum(jnp.linalg.eigvalsh(symmetric(q)) ** 4)
+    by_powers = lambda q, v: 0.5 * mass @ v**2 - jnp.trace(jnp.linalg.matrix_power(symmetric(q), 4))
+    one, other = lagjax.System(by_stretches), lagjax.System(by_powers)
+    assert in_machine_code(one, Q, V) and one.explain(Q, V).borders == ()
+    ts = jnp.linspace(0.0, 3.0, 7)
+    paths = [lagjax.simulate(system, Q, V, ts, rtol=1e-12) for system in (one, other)]
+    np.testing.assert_allclose(paths[0].q, paths[1].q, rtol=1e-9, atol=1e-9)
+    slopes = [
+        jax.jacfwd(lambda v, of=of: lagjax.simulate(of, Q, v, ts[:3], rtol=1e-12).q[-1])(V) for of in (one, other)
+    ]
+    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-8, atol=1e-8)
+
+
+def test_eigenvalues_of_parts_that_cross_change_their_order_at_a_border():
+    # diag(q, −q) has the eigenvalues ±|q|.
+    system = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.linalg.eigvalsh(jnp.diag(jnp.stack([q, -q])))[1])
+    path = lagjax.simulate(system, 0.5, 0.0, jnp.array([0.0, 1.0, 2.0]), rtol=1e-12)
+    np.testing.assert_allclose(path.q, [0.5, 0.0, -0.5], atol=1e-12)
+
+
+def test_eigenvalues_without_a_formula_are_left_to_diffrax():
+    def lagrangian(q, v, size):
+        return 0.5 * v @ v - jnp.linalg.eigvalsh(jnp.eye(size) + 0.1 * jnp.outer(q, q))[-1]
+
+    facts = lagjax.System(lambda q, v: lagrangian(q, v, 4)).explain(jnp.ones(4), jnp.zeros(4))
+    assert "eigenvalues of a symmetric matrix of 4 rows have no formula" in facts.solver
+    hermitian = lambda q, v: 0.5 * v**2 - jnp.linalg.eigvalsh(jnp.array([[1.0, 1j * q], [-1j * q, 1.0]]))[1]
+    facts = lagjax.System(hermitian).explain(0.3, 0.0)
+    assert not facts.solver.startswith("Taylor series in machine code")
+
+
 # ---- complex numbers ------------------------------------------------------------------------------------------------
 
 
@@ -270,6 +343,49 @@ def test_series_hold_everywhere(name):
             exact = float(SERIES[name](mpmath.mpf(x)))
         # Functions of Γ have zeros, next to which rounding is that of terms of order one.
         assert abs(float(program.evaluate(x)[0]) - exact) <= 1e-14 * max(abs(exact), float(of_gamma)), x
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 5, 20])
+def test_exponential_integrals(n):
+    program = lower(lambda x: jax.scipy.special.expn(n, x), 0.5)
+    force = lagjax.System(lambda q, v: 0.5 * v**2 + jax.scipy.special.expn(n, q)).acceleration
+    for x in (1e-8, 1e-3, 0.3, 1.0, 1.999, 2.001, 7.7, 30.0, 200.0):
+        assert float(program.evaluate(x)[0]) == pytest.approx(float(mpmath.expint(n, mpmath.mpf(x))), rel=1e-14)
+        assert float(force(x, 0.0)) == pytest.approx(-float(mpmath.expint(n - 1, mpmath.mpf(x))), rel=1e-13)
+    assert np.isnan(program.evaluate(-1.0)[0])
+    assert program.evaluate(0.0)[0] == pytest.approx(1 / (n - 1) if n > 1 else np.inf)
+
+
+@pytest.mark.parametrize("a", [0.1, 1.0, 2.5, 33.3, 100.0])
+def test_incomplete_functions_of_gamma(a):
+    special = jax.scipy.special
+    program = lower(lambda x: (special.gammainc(a, x), special.gammaincc(a, x)), 0.5)
+    forces = [lagjax.System(lambda q, v, of=of: 0.5 * v**2 + of(a, q)).acceleration
+              for of in (special.gammainc, special.gammaincc)]  # fmt: skip
+    for x in (0.0, 1e-3, 0.3, 1.0, 1.999, 2.001, a + 0.99, a + 1.01, 2 * a, 300.0):
+        with mpmath.workdps(40):
+            below = mpmath.gammainc(mpmath.mpf(a), 0, mpmath.mpf(x), regularized=True)
+        # xᵃ e⁻ˣ / Γ(a) by the logarithm of it, whose terms are of order a log a.
+        tolerance = 1e-15 * (2 + a)
+        np.testing.assert_allclose(program.evaluate(x), [float(below), float(1 - below)], rtol=0, atol=tolerance)
+        slope = math.exp((a - 1) * math.log(x) - x - math.lgamma(a)) if x else float(a == 1)
+        if x or a >= 1:
+            np.testing.assert_allclose([of(x, 0.0) for of in forces], [slope, -slope], rtol=20 * tolerance, atol=1e-15)
+    assert np.isnan(program.evaluate(-1.0)).all()
+
+
+def test_a_motion_between_exponential_and_gamma_integrals():
+    special = jax.scipy.special
+    system = lagjax.System(lambda q, v: 0.5 * v**2 - 0.3 * special.exp1(q) - special.gammainc(2.5, q))
+    facts = system.explain(1.5, -0.5)
+    assert facts.solver.startswith("Taylor series in machine code") and facts.borders == ()
+    path = lagjax.simulate(system, 4.0, -0.5, jnp.linspace(0.0, 8.0, 9), rtol=1e-12)
+    assert path.q.max() > 3.5 > 2.0 > path.q.min()  # past where both change their form
+    potential = lambda q: float(0.3 * mpmath.e1(q) + mpmath.gammainc(2.5, 0, q, regularized=True))
+    energy = [0.5 * v**2 + potential(float(q)) for q, v in zip(path.q, path.qdot, strict=True)]
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-10)
+    unknown = lagjax.System(lambda q, v, params: 0.5 * v**2 - special.gammainc(params, q)).explain(1.0, 0.0, params=2.5)
+    assert "written out for one known a" in unknown.solver
 
 
 @pytest.mark.parametrize("order", [1, 2, 6])

@@ -37,7 +37,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 
-from lagjax._program import _complex, _matrices, _special  # noqa: F401  (they register what they lower)
+from lagjax._program import _complex, _eigenvalues, _matrices, _special  # noqa: F401  (they register what they lower)
 from lagjax._program._differentiate import Derivatives, has_own_rules
 from lagjax._program._emit import Rows, emit, emit_rows, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp

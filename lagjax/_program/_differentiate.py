@@ -17,7 +17,7 @@ from jax.extend import core
 
 from lagjax._program._graph import Graph, Node, Tape
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._rules import determinant_of, live_equations
+from lagjax._program._rules import is_formula, live_equations
 
 _Rule = Callable[[int], int]
 Tangents = dict[int, int]  # by the number of the direction; a direction that is not there has none
@@ -28,7 +28,7 @@ _OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "
 def has_own_rules(jaxpr) -> bool:
     """True if a jaxpr, or one that it calls, asks for other derivatives than those of its operations."""
     return any(
-        determinant_of(equation) is None
+        not is_formula(equation)
         and (equation.primitive.name in _OWN_RULES or any(has_own_rules(inner) for inner in _inner(equation)))
         for equation in live_equations(jaxpr)
     )

@@ -348,6 +348,10 @@ _ROWS = (
     _comparison("le", np.less_equal, "<="),
     _comparison("gt", np.greater, ">"),
     _comparison("ge", np.greater_equal, ">="),
+    # u > v, where it chooses between two ways to the same number: it has no side, and no step ends where it jumps.
+    Operation(
+        "prefers", 2, np.greater, lambda code, a, b: code.compare(">", a, b), lax="gt", is_logical=True, is_step=True
+    ),
     _bitwise("and", np.bitwise_and, lambda code, a, b: a & b),
     _bitwise("or", np.bitwise_or, lambda code, a, b: a | b),
     _bitwise("xor", np.bitwise_xor, lambda code, a, b: (a | b) & ~(a & b), simplify=None),

@@ -128,7 +128,7 @@ class Expansion:
             )
 
     def _equation(self, equation, arguments) -> list[np.ndarray]:
-        name = determinant_of(equation) or equation.primitive.name
+        name = formula_of(equation) or equation.primitive.name
         for variable in equation.outvars:
             self.work(variable.aval.size)
         if name == "mul" and equation.invars[0] is equation.invars[1]:
@@ -217,19 +217,29 @@ def read_by(equation) -> list:
     return equation.invars[: lengths.matvec] + equation.invars[sum(lengths) :]
 
 
-def determinant_of(equation) -> str | None:
-    """Which of JAX's determinants a call is, "det" or "slogdet", or None.
+def formula_of(equation) -> str | None:
+    """Which of the functions of JAX that have a formula here a call is: "det", "slogdet", "expn", or None.
 
     JAX has rules of its own for their derivatives, which agree with those of any formula for them.
     """
-    if equation.primitive.name != "custom_jvp_call" or len(equation.invars) != 1:
+    name, operands = equation.primitive.name, [variable.aval for variable in equation.invars]
+    if name in ("jit", "pjit"):
+        is_integral = equation.params["name"] == "expn" and len(operands) == 2
+        return "expn" if is_integral and jnp.issubdtype(operands[0].dtype, jnp.integer) else None
+    if name != "custom_jvp_call" or len(operands) != 1:
         return None
-    (variable,), body = equation.invars, equation.params["call_jaxpr"]
-    shape, dtype = variable.aval.shape, variable.aval.dtype
+    shape, dtype = operands[0].shape, operands[0].dtype
     if len(shape) < 2 or shape[-2] != shape[-1] or not jnp.issubdtype(dtype, jnp.floating):
         return None
-    text = str(body)
+    text = str(equation.params["call_jaxpr"])
     return next((name for name in ("det", "slogdet") if text in _determinant(name, shape, dtype)), None)
+
+
+def is_formula(equation) -> bool:
+    """True for a call of such a function, and for one that does nothing but call it."""
+    body = equation.params.get("call_jaxpr")
+    inner = body.eqns if equation.primitive.name == "custom_jvp_call" else ()
+    return formula_of(equation) is not None or (len(inner) == 1 and formula_of(inner[0]) is not None)
 
 
 @functools.cache

@@ -33,7 +33,9 @@ class Scalars:
         return Scalars(self.expansion, self.expansion.map(op, *map(self._ids, operands)))
 
     def _ids(self, x) -> np.ndarray:
-        return x.ids if isinstance(x, Scalars) else self.expansion.constants(x)
+        if isinstance(x, Scalars):
+            return x.ids
+        return self.expansion.constants(float(x) if type(x) is int else x)  # an int would make what it meets an int
 
     def __getitem__(self, index) -> "Scalars":
         return Scalars(self.expansion, self.ids[index])
@@ -91,6 +93,7 @@ def _function(op: str, in_jax: Callable) -> Callable:
 
 
 binade = _function("binade", lambda x: in_jax("binade", x))
+prefers, equal = _function("prefers", jnp.greater), _function("eq", jnp.equal)
 exponential, logarithm, root = _function("exp", jnp.exp), _function("log", jnp.log), _function("sqrt", jnp.sqrt)
 minimum, maximum, absolute = _function("min", jnp.minimum), _function("max", jnp.maximum), _function("abs", jnp.abs)
 
