@@ -15,6 +15,8 @@ import lagjax
 from lagjax._derivation import derivation_of
 from lagjax._layout import Layout
 from lagjax._program import Unlowerable, lower
+from lagjax._program._evaluate import evaluate, vjp
+from lagjax._program._groups import groups_of
 
 TOLERANCE = 4e-15
 
@@ -621,3 +623,31 @@ def test_lanes_broadcast():
     program = lower(lambda x, y: (x * y, x + 1, 3.0), 0.3, 0.4)
     outputs = program(jnp.ones((2, 1)), jnp.ones(3))
     assert [output.shape for output in outputs] == [(2, 3)] * 3
+
+
+# ---- groups of alike operations --------------------------------------------------------------------------------------
+
+
+def test_groups_have_the_values_and_derivatives_of_single_nodes():
+    # Pairs of bodies, of which some are beyond a border where the branch not taken has no derivative.
+    i, j = np.triu_indices(50, 1)
+
+    def forces(x, k):
+        d = x[i] - x[j]
+        near = jnp.where(d > 0, jnp.sqrt(jnp.where(d > 0, d, 1.0)), jnp.abs(d) ** 3) * (k + i % 3)
+        far = jnp.exp(-jnp.abs(d)) / (1 + d**2)
+        sums = [jnp.zeros(50).at[i].add(near), jnp.zeros(50).at[j].add(far)]
+        return [sums[0][0], sums[1][-1], *(a @ sums[0] for a in jnp.eye(50)[:40]), jnp.floor(3 * x[1]), x[0]]
+
+    x = np.random.default_rng(0).normal(size=(50, 7))
+    program = lower(forces, x[:, 0], jnp.asarray(2))
+    groups = groups_of(program.line)
+    assert groups is not None and 50 * len(groups.groups) < len(program.nodes)
+    columns = [*x, np.asarray(2)]
+    np.testing.assert_allclose(program.evaluate_many(columns), evaluate(program.line, columns), rtol=1e-13)
+    for cotangents in ([1.0, -2.0] * 22, [None, x[0], *[None] * 42]):
+        found, expected = program.vjp_many(columns, cotangents), vjp(program.line, columns, cotangents)
+        assert [part is None for part in found] == [part is None for part in expected]
+        for part, other in zip(found, expected, strict=True):
+            if part is not None:
+                np.testing.assert_allclose(part, np.broadcast_to(other, 7), rtol=1e-11, atol=1e-12)

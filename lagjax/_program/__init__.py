@@ -42,6 +42,7 @@ from lagjax._program._differentiate import Derivatives, has_own_rules
 from lagjax._program._emit import Rows, emit, emit_rows, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
+from lagjax._program._groups import Groups, groups_of
 from lagjax._program._look_ups import look_up, table_of
 from lagjax._program._memory import machine_memory, operations_that_fit, without_collections
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
@@ -323,11 +324,15 @@ class Program:
         `columns` holds one entry for each input: a number, or S of them, shape (S,). Floats have the precision of the
         columns.
         """
-        return evaluate(self.line, columns, self._steps)
+        return evaluate(self.line, columns, self._steps, self._groups)
 
     @functools.cached_property
     def _steps(self) -> Callable:
         return functools.cache(functools.partial(steps_of, self.line))
+
+    @functools.cached_property
+    def _groups(self) -> Groups | None:
+        return groups_of(self.line)
 
     def round_off_many(self, columns) -> np.ndarray:
         """The rounding error of every output at S states, shape (outputs, S), to first order."""
@@ -339,7 +344,7 @@ class Program:
         Of the operations as they stand here, without the user's own rules for derivatives. All of the values are kept
         in between: some hundred states at once are enough.
         """
-        return vjp(self.line, columns, cotangents)
+        return vjp(self.line, columns, cotangents, self._groups)
 
     def own_outputs(self, *scalars) -> Scalars | None:
         """The outputs in the graph that the program was cut out of, where the scalars are its inputs there."""

@@ -4,10 +4,11 @@ Every node becomes one NumPy operation on a vector of states. That costs a micro
 node and state: less than XLA or LLVM take to compile a program, as long as it is not evaluated millions of times.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
+from lagjax._program._groups import MOST_HELD, MOST_STATES, Groups
 from lagjax._program._look_ups import cotangents as of_entries
 from lagjax._program._look_ups import look_up, table_of
 from lagjax._program._operations import LOOK_UPS, OPERATIONS, in_numpy
@@ -17,17 +18,22 @@ from lagjax._program._operations import LOOK_UPS, OPERATIONS, in_numpy
 CHUNK = 2048
 
 
-def evaluate(line, columns: Sequence, steps: Callable | None = None) -> np.ndarray:
+def evaluate(line, columns: Sequence, steps: Callable | None = None, groups: Groups | None = None) -> np.ndarray:
     """The outputs of a straight line at many states, shape (outputs, S); nothing raises or warns.
 
-    `steps` gives those of `steps_of` for a precision, where they are kept.
+    `steps` gives those of `steps_of` for a precision, where they are kept; of large lines `groups` are evaluated.
 
     `columns` holds one entry for each input: a number, or one number for each of S states, shape (S,). Floats have the
     precision of the float columns. Values are dropped as soon as nothing needs them.
     """
-    columns, precision, count = _prepared(line, columns)
-    sequence = steps_of(line, precision) if steps is None else steps(precision)
+    columns, precision, count = _prepared(line, columns, groups)
     results = np.empty((len(line.outputs), count), precision)
+    if groups is not None and count <= MOST_STATES:
+        for part, values in _of_groups(groups, columns, precision, count):
+            for kind, (rows, positions) in groups.outputs.items():
+                results[positions, part] = values[kind][rows]
+        return results
+    sequence = steps_of(line, precision) if steps is None else steps(precision)
     with np.errstate(all="ignore"):
         for start in range(0, count, CHUNK):
             part = columns if count <= CHUNK else [x if np.ndim(x) == 0 else x[start : start + CHUNK] for x in columns]
@@ -37,14 +43,24 @@ def evaluate(line, columns: Sequence, steps: Callable | None = None) -> np.ndarr
     return results
 
 
-def _prepared(line, columns) -> tuple[list[np.ndarray], np.dtype, int]:
+def _of_groups(groups: Groups, columns, precision, count: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+    """The values of all nodes, for some states after the other."""
+    size = max(1, MOST_HELD // sum(groups.counts.values()))
+    for start in range(0, count, size):
+        part = slice(start, min(start + size, count))
+        here = columns if size >= count else [_cut(x, part) for x in columns]
+        with np.errstate(all="ignore"):
+            yield part, groups.values(here, precision, part.stop - start)
+
+
+def _cut(x, part: slice):
+    """Those of the numbers of some states; one that is that of all states stays."""
+    return x if np.size(x) == 1 else x[part]
+
+
+def _prepared(line, columns, groups: Groups | None = None) -> tuple[list[np.ndarray], np.dtype, int]:
     """The columns as arrays of their kinds, the precision of floats, and the number of states."""
-    of_input = {
-        attribute: kind for (op, _, attribute), kind in zip(line.nodes, line.kinds, strict=True) if op == "input"
-    }
-    for op, _, attribute in line.nodes:
-        if op in LOOK_UPS:
-            of_input |= dict.fromkeys(table_of(attribute).positions, "float")
+    of_input = _kinds_of_inputs(line) if groups is None else groups.kinds_of_inputs()
     read = {i: np.asarray(columns[i]) for i in of_input}  # what nobody reads is passed on as it is
     floats = [read[i].dtype for i, kind in of_input.items() if kind == "float"]
     precision = np.result_type(*floats) if floats else np.dtype(float)
@@ -52,6 +68,16 @@ def _prepared(line, columns) -> tuple[list[np.ndarray], np.dtype, int]:
     for i, x in read.items():
         typed[i] = x.astype(_dtype(of_input[i], precision), copy=False)
     return typed, precision, max(sizes, default=1)
+
+
+def _kinds_of_inputs(line) -> dict[int, str]:
+    of_input = {
+        attribute: kind for (op, _, attribute), kind in zip(line.nodes, line.kinds, strict=True) if op == "input"
+    }
+    for op, _, attribute in line.nodes:
+        if op in LOOK_UPS:
+            of_input |= dict.fromkeys(table_of(attribute).positions, "float")
+    return of_input
 
 
 def _dtype(kind: str, precision: np.dtype) -> np.dtype:
@@ -140,14 +166,17 @@ def round_off(line, columns: Sequence) -> np.ndarray:
 # ---- the transposed derivative ---------------------------------------------------------------------------------------
 
 
-def vjp(line, columns: Sequence, cotangents: Sequence) -> list:
+def vjp(line, columns: Sequence, cotangents: Sequence, groups: Groups | None = None) -> list:
     """Σ cotangentₖ ∂outputₖ/∂input for every input, each a number or of shape (S,); None where nothing flows there.
 
     It is the derivative of this straight line of operations, in reverse as JAX would take it: NaN where a branch that
     `select` does not take has no derivative. Rules of the user's for the derivatives of a function are not in the
-    straight line. A cotangent is a number, an array that broadcasts with the columns, or None.
+    straight line. A cotangent is a number, an array that broadcasts with the columns, or None. Of large lines the
+    `groups` are evaluated.
     """
-    (nodes, kinds, outputs), (columns, precision, _) = line, _prepared(line, columns)
+    (nodes, kinds, outputs), (columns, precision, count) = line, _prepared(line, columns, groups)
+    if groups is not None:
+        return _vjp_of_groups(groups, columns, precision, count, cotangents)
     with np.errstate(all="ignore"):
         values = _values(steps_of((nodes, kinds, range(len(nodes))), precision), columns)
         of_nodes: list = [None] * len(nodes)
@@ -172,6 +201,18 @@ def vjp(line, columns: Sequence, cotangents: Sequence) -> list:
                         partial(in_numpy, float, of_nodes[k], values[k], *(values[j] for j in operands)),
                     )
             of_nodes[k] = None
+    return inputs
+
+
+def _vjp_of_groups(groups: Groups, columns, precision, count: int, cotangents) -> list:
+    inputs: list = [None] * len(columns)
+    for part, values in _of_groups(groups, columns, precision, count):
+        here = cotangents if part == slice(0, count) else [x if x is None else _cut(x, part) for x in cotangents]
+        with np.errstate(all="ignore"):
+            for i, flow in groups.transposed(values, here):
+                if inputs[i] is None:
+                    inputs[i] = np.zeros(count, precision)
+                inputs[i][part] += flow
     return inputs
 
 
