@@ -24,7 +24,7 @@ from lagjax._check._findings import listed
 from lagjax._crossings import Crossings
 from lagjax._display import is_known, times_of_members
 from lagjax._fit import Fit, Record
-from lagjax._fit._figures import draw_record
+from lagjax._fit._report import draw_record
 from lagjax._fit._result import record_matrix
 from lagjax._layout import Layout
 from lagjax._precision import WorkPrecision

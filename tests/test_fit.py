@@ -16,10 +16,10 @@ import pytest
 from scipy.optimize import least_squares
 
 import lagjax
-from lagjax._fit import _correlation, _residuals, _signals, _solve, _transforms
+from lagjax._fit import _descent, _parameters, _residuals, _sensors, _uncertainty
 from lagjax._fit._motions import _ByJAX, motions_of
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._segments import Reader
+from lagjax._fit._search import Reader
 from lagjax._fit._verdict import shifts_without
 from lagjax._layout import Layout
 
@@ -435,7 +435,7 @@ def test_the_real_axis_with_dry_friction(capsys):
 def test_derivatives_of_motions_and_sensors_are_those_of_differences():
     parameters = Parameters.of(TRUTH, FREE, lagjax.positive)
     observe = lambda q, v, t, params: jnp.stack([jnp.sin(q) * params["l"], v * t])
-    signals = _signals.Signals(
+    signals = _sensors.Signals(
         observe, Layout.of(0.0, 0.0), parameters, lagjax.Record(TS, np.zeros((len(TS), 2)), start=(0.0, 0.0))
     )
     motions = motions_of(SCENE, Layout.of(0.0, 0.0), parameters, 1e-12, None)
@@ -476,9 +476,9 @@ def test_elimination_is_the_solution_of_the_whole_problem():
     pieces, states, free, damping = 5, 4, 3, 0.3
     rows = rng.normal(size=(pieces, 30, states + free + 1))
     triangles = _residuals.compressed(rows)
-    scale = _solve._scales(triangles, states)
+    scale = _descent._scales(triangles, states)
     pull = np.array([0.5, 0.0, 2.0]), np.array([0.1, 0.0, -0.3])
-    step = _solve.eliminate(triangles, states, scale, damping, pull)
+    step = _descent.eliminate(triangles, states, scale, damping, pull)
     whole = np.zeros((pieces * 30 + pieces * states + 2 * free, pieces * states + free))
     right = np.zeros(len(whole))
     for k in range(pieces):
@@ -490,13 +490,13 @@ def test_elimination_is_the_solution_of_the_whole_problem():
     whole[-free:, -free:], right[-free:] = np.diag(pull[0]), -pull[1]
     expected, *_ = np.linalg.lstsq(whole, right, rcond=None)
     np.testing.assert_allclose(np.concatenate([step.starts.ravel(), step.u]), expected, atol=1e-12)
-    bounded = _solve.eliminate(triangles, states, scale, damping, pull, (np.full(free, -1e-3), np.full(free, 1e-3)))
+    bounded = _descent.eliminate(triangles, states, scale, damping, pull, (np.full(free, -1e-3), np.full(free, 1e-3)))
     assert (np.abs(bounded.u) <= 1e-3).all()
 
 
 def test_transforms_are_inverses_with_the_slopes_of_differences():
     u = np.array([-3.0, 0.2, 2.0])
-    for transform in (lagjax.positive, lagjax.between(-1.0, 4.0), _transforms.Unbounded()):
+    for transform in (lagjax.positive, lagjax.between(-1.0, 4.0), _parameters.Unbounded()):
         x = transform.value(u)
         np.testing.assert_allclose(transform.inverse(x), u, rtol=1e-12)
         slope = (transform.value(u + 1e-6) - transform.value(u - 1e-6)) / 2e-6
@@ -518,7 +518,7 @@ def test_a_correlated_square_is_that_of_the_whole_matrix():
     law[:3] = lags
     matrix = law[np.abs(np.subtract.outer(np.arange(20), np.arange(20)))]
     expected = np.einsum("ntf,ts,nsg->fg", rows, matrix, rows)
-    np.testing.assert_allclose(_correlation.correlated_square(rows, lags), expected, atol=1e-12)
+    np.testing.assert_allclose(_uncertainty.correlated_square(rows, lags), expected, atol=1e-12)
 
 
 # ---- what is wrong, in a sentence ------------------------------------------------------------------------------------

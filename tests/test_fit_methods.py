@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._fit import _search, _transforms, _weak
-from lagjax._fit._parameters import Parameters
-from lagjax._fit._segments import Reader, time_scales
-from lagjax._fit._transforms import Unbounded
+from lagjax._fit import _parameters, _search
+from lagjax._fit._parameters import Parameters, Unbounded
+from lagjax._fit._search import Reader, time_scales
 
 TS = np.linspace(0.0, 4.0, 101)
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -166,7 +165,7 @@ def test_a_leaf_that_starts_outside_of_its_set_is_refused(start, transform, mess
 
 
 def test_the_sum_of_a_simplex_is_that_of_its_start():
-    own = _transforms.simplex.of(np.array([1.0, 2.0, 4.0]), (3,))
+    own = _parameters.simplex.of(np.array([1.0, 2.0, 4.0]), (3,))
     assert np.sum(own.value(np.array([0.3, -2.0]))) == pytest.approx(7.0)
 
 
@@ -358,7 +357,7 @@ def test_a_report_is_one_file_with_everything(tmp_path):
 def weak(fit, u):
     readers = [Reader.of(record) for record in fit.records]
     scale = min(time_scales(readers, fit.question.motions, fit.parameters.numbers(fit.u)))
-    return _weak.imbalance(fit.question, SPRING, readers, scale), _weak.weak_start(
+    return _search.imbalance(fit.question, SPRING, readers, scale), _search.weak_start(
         fit.question, SPRING, u, readers, scale
     )
 
@@ -426,5 +425,5 @@ def test_inputs_drive_the_density_the_weak_form_and_many_starts():
     np.testing.assert_allclose(jax.jit(jax.grad(density))(x), central, rtol=1e-5, atol=1e-4)
     readers = [Reader.of(one)]
     scale = min(time_scales(readers, fit.question.motions, fit.parameters.numbers(fit.u)))
-    u = _weak.weak_start(fit.question, scene, fit.u + 2.0, readers, scale)
+    u = _search.weak_start(fit.question, scene, fit.u + 2.0, readers, scale)
     np.testing.assert_allclose(fit.parameters.values(u), [0.3, 4.0], rtol=0.1)

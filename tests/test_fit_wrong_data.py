@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._fit._correlation import structure
-from lagjax._fit._wrapped import on_circle
+from lagjax._fit._sensors import on_circle
+from lagjax._fit._uncertainty import structure
 
 SIGMA = 3e-3
 TS = np.linspace(0.0, 8.0, 401)

@@ -5,12 +5,24 @@
     checked   batch       search      squares     null           pytree, in words
                           begins                  directions
 
-Files: `_records`, `_parameters` and `_transforms` take what the user gives; `_motions` and `_signals` follow motions
-and sensors with their derivatives, `_wrapped` sensors that show angles less whole turns; `_residuals` and `_noise` say
-how far off a trial is, and `_systems` how far one of several systems; `_segments` says where to begin, and `_weak`
-where that is far off; `_solve` goes down from there, or `_gradient`, from many starts by `_many`, one after the other
-by `_search`; `_correlation`, `_uncertainty`, `_joint`, `_unseen`, `_verdict`, `_suspects`, `_profile`, `_density`,
-`_chart`, `_surrogate`, `_sample`, `_next`, `_report` and `_result` say what that means.
+Files, from the lowest floor up:
+
+    _noise         Gaussian and Student-t residuals: noise scale, degrees of freedom, likelihood
+    _parameters    the free numbers, their names, and the transforms that keep them in a set
+    _records       Record, its sampled inputs, and rows of records in batches
+    _timings       Timings, the instants at which a motion crosses sections, with derivatives
+    _motions       motions of many starts with their derivatives; starts on constraints
+    _sensors       signals of a motion with their derivatives; delays, wrapped angles
+    _residuals     the residuals of one trial with their derivatives, for one system or several
+    _density       the posterior density, coordinates in which it is round, its expansion
+    _uncertainty   autocorrelation of residuals, covariance, identifiability, experiment design
+    _descent       Gauss–Newton with eliminated starts; Adam for networks
+    _sample        draws from the posterior
+    _profile       profile likelihood, and comparison of fits by AIC, BIC, cross-validation
+    _verdict       the end of a search in words, influence of records, mistakes in the data
+    _search        multiple shooting over growing segments, weak form, multistart
+    _report        figures and pages of HTML
+    _result        Fit
 """
 
 import functools
@@ -27,17 +39,16 @@ import numpy as np
 
 from lagjax._consistent import has_constraints
 from lagjax._doubles import DOUBLE, with_doubles
-from lagjax._fit._blame import reading_params
-from lagjax._fit._delays import Delayed
-from lagjax._fit._inputs import Form, asks
-from lagjax._fit._many import Waterfall
-from lagjax._fit._motions import motions_of
+from lagjax._fit._descent import Descent
+from lagjax._fit._motions import Manifold, motions_of
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
-from lagjax._fit._parameters import Parameters
+from lagjax._fit._parameters import Parameters, angle, between, inertia, positive, reading_params, simplex
 from lagjax._fit._records import (
+    Form,
     Guess,
     Measured,
     Record,
+    asks,
     in_structure,
     known_start,
     require_alike,
@@ -45,21 +56,26 @@ from lagjax._fit._records import (
     require_untraced,
     started,
 )
-from lagjax._fit._residuals import AbstractQuestion, Failure, Question
+from lagjax._fit._residuals import AbstractQuestion, Failure, Question, asked, by_name, naming
 from lagjax._fit._result import Covariance, Fit, SignalNoise
-from lagjax._fit._search import Unfollowed, by_gradient, reader_of, roomy, search_records, searches, weakly
-from lagjax._fit._segments import Reader, TimeScales, time_scales, whole
-from lagjax._fit._signals import Signals, looks_like_positions
-from lagjax._fit._solve import Descent
-from lagjax._fit._starts import Manifold
-from lagjax._fit._suspects import SECONDS, find_mistake, hanging, suspects
-from lagjax._fit._systems import asked, by_name, naming
+from lagjax._fit._search import (
+    Reader,
+    TimeScales,
+    Unfollowed,
+    Waterfall,
+    by_gradient,
+    reader_of,
+    roomy,
+    search_records,
+    searches,
+    time_scales,
+    weakly,
+    whole,
+)
+from lagjax._fit._sensors import UNCLEAR, Delayed, Signals, looks_like_positions, require_no_jumps, sensors, wrapped
 from lagjax._fit._timings import Timings, clock_of
-from lagjax._fit._transforms import angle, between, inertia, positive, simplex
-from lagjax._fit._uncertainty import Information, information
-from lagjax._fit._unseen import sentences
-from lagjax._fit._verdict import Unexplained, Verdict, verdict
-from lagjax._fit._wrapped import UNCLEAR, require_no_jumps, sensors, wrapped
+from lagjax._fit._uncertainty import Information, information, sentences
+from lagjax._fit._verdict import SECONDS, Unexplained, Verdict, find_mistake, hanging, suspects, verdict
 from lagjax._hybrid import Hybrid, Scene, first_law, require_scene
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL

@@ -1,22 +1,547 @@
-"""`Parameters`: which numbers among the user's parameters are fitted, what they are called, and how they may move.
+"""Parameters: the numbers that are fitted, their names, and the transforms that keep them in a set.
 
-The scene's parameters are a pytree of any structure. Its P numbers end to end are one vector; F of them are free, and
-the search moves these through their transforms.
+It holds `reading_params` (errors of functions that read a parameter which is not there), the transforms and
+`Parameters`.
+
+**Transforms.** The search moves numbers u that may be any real, the scene gets x = x(u):
+
+    positive        x = eᵘ                               0 < x
+    between(a, b)   x = a + (b − a) / (1 + e⁻ᵘ)          a < x < b
+    angle           x = u, less whole turns              −π < x ≤ π
+    simplex         x = c softmax(H u)                   0 < xᵢ, Σ xᵢ = c
+    inertia         J = U(u) U(u)ᵀ                       what a rigid body of positive density can have
+
+so that no step leaves the set and no bound is ever active: a parameter that the data push onto a bound comes near it,
+with an interval that says so. The first three move every number by itself. The others move all numbers of one leaf
+together, and there may be fewer u than x. Intervals end inside the set, or at its bound where that is not excluded.
+
+**Parameters.** The scene's parameters are a pytree of any structure. Its P numbers end to end are one vector; F of them
+are free, and the search moves these through their transforms.
 """
 
+import abc
 import functools
+import linecache
+import traceback
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from lagjax._fit._transforms import AbstractTransform, Unbounded
 from lagjax._layout import taken_apart
 from lagjax._validate import as_arrays, require_finite
 
 PyTree = Any
+
+
+_OURS = str(Path(__file__).parents[1]), str(Path(jax.__file__).parent)
+
+
+def reading_params(reason: Exception) -> str | None:
+    """The expression that read `params` where a function of the user failed; None where something else failed."""
+    if reason.__traceback__ is None:
+        return None
+    frames = traceback.extract_tb(reason.__traceback__)
+    theirs = [frame for frame in frames if not frame.filename.startswith(_OURS)]
+    if not theirs or theirs[-1].lineno is None:
+        return None
+    last = theirs[-1]
+    text = linecache.getline(last.filename, last.lineno or 0).encode()[last.colno : last.end_colno].decode()
+    return text if text.startswith(("params", "(params")) else None
+
+
+class AbstractTransform(abc.ABC):
+    """A smooth map x(u) from real numbers (m,) onto the values (n,) that the numbers of one leaf may have.
+
+    `reach` is how far a step of the search may change u: beyond it x(u) is nothing like its tangent. `room` is how far
+    from one u another can be told from a bound of the set, or from itself. Functions that take `xp` compute with NumPy,
+    or with `jax.numpy` inside of a program of JAX.
+    """
+
+    reach: ClassVar[float] = 2.0
+    room: ClassVar[float] = 40.0
+
+    def of(self, x: np.ndarray, shape: tuple[int, ...]) -> "AbstractTransform":
+        """The map for a leaf of this shape that starts at `x` (n,), where the map depends on that."""
+        return self
+
+    def unknowns(self, count: int) -> int:
+        """m, how many u move a leaf of n = `count` numbers."""
+        return count
+
+    @abc.abstractmethod
+    def refuses(self, x: np.ndarray) -> str | None:
+        """The condition on the values, as the end of a sentence, where `x` is outside the set; None where it is not."""
+
+    @abc.abstractmethod
+    def value(self, u, xp: Any = np) -> Any:
+        """x(u), (m,) → (n,)."""
+
+    @abc.abstractmethod
+    def jacobian(self, u: np.ndarray) -> np.ndarray:
+        """∂x/∂u, (n, m)."""
+
+    @abc.abstractmethod
+    def inverse(self, x: np.ndarray) -> np.ndarray:
+        """u(x) of values inside the set, (n,) → (m,)."""
+
+    @abc.abstractmethod
+    def ends(self, x: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The ends of intervals about `x` (n,) whose half width is `spread` where the set does not bend them."""
+
+    @abc.abstractmethod
+    def drawn(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Another u (m,) to begin a search from, anywhere in the set if that is bounded, else about `u`."""
+
+    @abc.abstractmethod
+    def log_volume(self, u, xp: Any = np) -> Any:
+        """log of the volume of x per volume of u, up to a constant: what makes a density of x one of u."""
+
+    def limits(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(low, high) between which one step of the search may lie, (m,) each."""
+        return np.full(len(u), -self.reach), np.full(len(u), self.reach)
+
+    def stepped(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """The end of a step (m,) from u (m,)."""
+        return u + step
+
+    @property
+    def separable(self) -> bool:
+        """True if every number moves by itself, so that one can be kept and the others moved."""
+        return False
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Between which two numbers each number moves by itself; ∓∞ where there is no such bound."""
+        return -np.inf, np.inf
+
+
+class AbstractSeparable(AbstractTransform):
+    """A map that moves every number by itself, x_i = x(u_i), and increases."""
+
+    @abc.abstractmethod
+    def slope(self, u, xp: Any = np) -> Any:
+        """dx/du."""
+
+    @property
+    def separable(self) -> bool:
+        """True."""
+        return True
+
+    def jacobian(self, u):
+        """A diagonal of slopes."""
+        return np.diag(self.slope(u))
+
+    def ends(self, x, spread):
+        """x(u ± spread / slope): relative for logarithms, and inside of the bounds.
+
+        Where x ± spread does not exclude a bound, its logarithm says nothing: the ends are those of x ± spread then,
+        cut off at the bounds.
+        """
+        low, high = np.maximum(x - spread, self.bounds[0]), np.minimum(x + spread, self.bounds[1])
+        excluded = (low > self.bounds[0]) & (high < self.bounds[1])
+        u = self.inverse(x)
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            wide = spread / self.slope(u)
+            return np.where(excluded, self.value(u - wide), low), np.where(excluded, self.value(u + wide), high)
+
+    def log_volume(self, u, xp: Any = np):
+        """Σ log dx/du."""
+        return xp.sum(xp.log(self.slope(u, xp)))
+
+
+@dataclass(frozen=True)
+class Unbounded(AbstractSeparable):
+    """x = u: any real number."""
+
+    reach: ClassVar[float] = np.inf
+    room: ClassVar[float] = np.inf
+
+    def value(self, u, xp: Any = np):
+        """x(u)."""
+        return u
+
+    def slope(self, u, xp: Any = np):
+        """dx/du."""
+        return xp.ones_like(u)
+
+    def inverse(self, x):
+        """u(x)."""
+        return x
+
+    def drawn(self, u, rng):
+        """Normal about u, as wide as it is large; as wide as one about zero."""
+        return u + np.where(u != 0, np.abs(u), 1.0) * rng.normal(size=len(u))
+
+    def refuses(self, x):
+        """None: every number is allowed."""
+        return None
+
+
+@dataclass(frozen=True)
+class Positive(AbstractSeparable):
+    """x = eᵘ: a number above zero. `lagjax.positive` is its instance.
+
+    ```python
+    import lagjax
+
+    transforms = {"mass": lagjax.positive, "friction": lagjax.positive}  # lagjax.fit(..., transforms=transforms)
+    ```
+    """
+
+    @property
+    def bounds(self):
+        """Zero and infinity."""
+        return 0.0, np.inf
+
+    def value(self, u, xp: Any = np):
+        """x(u)."""
+        return xp.exp(u)
+
+    def slope(self, u, xp: Any = np):
+        """dx/du."""
+        return xp.exp(u)
+
+    def inverse(self, x):
+        """u(x), of positive x."""
+        return np.log(x)
+
+    def limits(self, u):
+        """The steps that lower or raise x by the factor e to the power of `reach`."""
+        return np.full(len(u), np.expm1(-self.reach)), np.full(len(u), np.expm1(self.reach))
+
+    def stepped(self, u, step):
+        """u of x + dx/du · step: signals are more nearly linear in a coefficient than in its logarithm."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return u + np.log1p(step)
+
+    def drawn(self, u, rng):
+        """Normal in the logarithm, with the standard deviation of a decade."""
+        return u + np.log(10.0) * rng.normal(size=len(u))
+
+    def refuses(self, x):
+        """That values must be positive, where one is not."""
+        return None if np.all(x > 0) else "must start above zero, because its transform is lagjax.positive"
+
+    def __repr__(self) -> str:
+        return "lagjax.positive"
+
+
+@dataclass(frozen=True)
+class Between(AbstractSeparable):
+    """x = a + (b − a)/(1 + e⁻ᵘ): numbers between a and b. `lagjax.between(a, b)` makes one."""
+
+    lower: float
+    upper: float
+
+    @property
+    def bounds(self):
+        """Both."""
+        return self.lower, self.upper
+
+    def value(self, u, xp: Any = np):
+        """x(u)."""
+        return self.lower + (self.upper - self.lower) * _logistic(u, xp)
+
+    def slope(self, u, xp: Any = np):
+        """dx/du."""
+        return (self.upper - self.lower) * _logistic(u, xp) * _logistic(-u, xp)
+
+    def inverse(self, x):
+        """u(x), of x between the bounds."""
+        return np.log((x - self.lower) / (self.upper - x))
+
+    def limits(self, u):
+        """The steps to where u is `reach` less or more."""
+        each = _logistic(u) * _logistic(-u)
+        with np.errstate(invalid="ignore", divide="ignore"):  # NaN, no limit, where x is rounded to its bound
+            low, high = (
+                np.where(u < 0, _logistic(u + by) - _logistic(u), _logistic(-u) - _logistic(-u - by)) / each
+                for by in (-self.reach, self.reach)
+            )
+        return low, high
+
+    def stepped(self, u, step):
+        """u of x + dx/du · step, as for `Positive`."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return u + np.log1p(_logistic(-u) * step) - np.log1p(-_logistic(u) * step)
+
+    def drawn(self, u, rng):
+        """Uniform between the bounds."""
+        share = rng.uniform(size=len(u))
+        return np.log(share / (1.0 - share))
+
+    def refuses(self, x):
+        """That values must lie between the bounds, where one does not."""
+        if np.all((x > self.lower) & (x < self.upper)):
+            return None
+        return f"must start between {self.lower:g} and {self.upper:g}, because its transform is {self!r}"
+
+    def __repr__(self) -> str:
+        return f"lagjax.between({self.lower:g}, {self.upper:g})"
+
+
+@dataclass(frozen=True)
+class Angle(AbstractSeparable):
+    """x = u less whole turns, in (−π, π]: an angle. `lagjax.angle` is its instance.
+
+    The search may go round; the scene must have the period 2π in x. An interval may end beyond ±π; one that is wider
+    than a turn is (x − π, x + π), which means that the data do not determine x.
+
+    ```python
+    import lagjax
+
+    transforms = {"phase": lagjax.angle}  # lagjax.fit(..., transforms=transforms)
+    ```
+    """
+
+    reach: ClassVar[float] = 0.5 * np.pi
+    room: ClassVar[float] = np.pi
+
+    def value(self, u, xp: Any = np):
+        """x(u)."""
+        return u - 2 * np.pi * xp.ceil((u - np.pi) / (2 * np.pi))
+
+    def slope(self, u, xp: Any = np):
+        """dx/du."""
+        return xp.ones_like(u)
+
+    def inverse(self, x):
+        """u(x)."""
+        return x
+
+    def drawn(self, u, rng):
+        """Uniform on the circle."""
+        return rng.uniform(-np.pi, np.pi, len(u))
+
+    def ends(self, x, spread):
+        """x ± spread, at most a turn in all."""
+        half = np.minimum(spread, np.pi)
+        return x - half, x + half
+
+    def refuses(self, x):
+        """None: every number is an angle."""
+        return None
+
+    def __repr__(self) -> str:
+        return "lagjax.angle"
+
+
+@dataclass(frozen=True)
+class Simplex(AbstractTransform):
+    """x = c softmax(H u): an array of n numbers above zero with a constant sum c. `lagjax.simplex` is its instance.
+
+    The sum is that of the array in `params0`. H (n, n − 1) has orthonormal columns of sum zero (Helmert's), so that all
+    numbers are treated alike.
+
+    ```python
+    import lagjax
+
+    transforms = {"shares": lagjax.simplex}  # lagjax.fit(..., transforms=transforms)
+    ```
+
+    Source: Egozcue et al., *Isometric logratio transformations for compositional data*, Math. Geology 35 (2003) 279.
+    """
+
+    total: float = 1.0
+
+    def of(self, x, shape):
+        """The simplex with the sum of `x`."""
+        return Simplex(float(np.sum(x)))
+
+    def unknowns(self, count):
+        """n − 1."""
+        return count - 1
+
+    def refuses(self, x):
+        """That there must be several numbers, all positive."""
+        if len(x) < 2 or not np.all(x > 0):
+            return "must start as several numbers above zero in one array, because its transform is lagjax.simplex"
+        return None
+
+    def value(self, u, xp: Any = np):
+        """x(u)."""
+        logs = _helmert(u.shape[0] + 1) @ u
+        shares = xp.exp(logs - xp.max(logs))
+        return self.total * shares / xp.sum(shares)
+
+    def jacobian(self, u):
+        """c (diag p − p pᵀ) H with the shares p."""
+        shares = self.value(u) / self.total
+        return self.total * (np.diag(shares) - np.outer(shares, shares)) @ _helmert(len(u) + 1)
+
+    def inverse(self, x):
+        """u(x) = Hᵀ log x."""
+        return _helmert(len(x)).T @ np.log(x)
+
+    def drawn(self, u, rng):
+        """Uniform on the simplex."""
+        return self.inverse(rng.dirichlet(np.ones(len(u) + 1)))
+
+    def ends(self, x, spread):
+        """Intervals of every share, made in its logit."""
+        return Between(0.0, self.total).ends(x, spread)
+
+    def log_volume(self, u, xp: Any = np):
+        """Σ log x, up to a constant."""
+        return xp.sum(xp.log(self.value(u, xp)))
+
+    def __repr__(self) -> str:
+        return "lagjax.simplex"
+
+
+@dataclass(frozen=True)
+class Inertia(AbstractTransform):
+    """The inertia of a rigid body of positive density, by its log-Cholesky form. `lagjax.inertia` is its instance.
+
+    With the mass m, its first moments h = ∫ r dm and second ones Σ = ∫ r rᵀ dm = ½ tr(I) 1 − I, about any point,
+
+        J = [[Σ, h], [hᵀ, m]] = U Uᵀ,
+        U = e^α [[e^d₁, s₁₂, s₁₃, t₁], [0, e^d₂, s₂₃, t₂], [0, 0, e^d₃, t₃], [0, 0, 0, 1]]
+
+    is positive definite for every u = (α, d₁, d₂, d₃, s₁₂, s₂₃, s₁₃, t₁, t₂, t₃). The leaf is J itself, (4, 4), or
+    (m, h_x, h_y, h_z, I_xx, I_yy, I_zz, I_xy, I_xz, I_yz), where I_xy is the element of the matrix, −∫ x y dm.
+
+    ```python
+    import lagjax
+
+    transforms = {"forearm": lagjax.inertia}  # lagjax.fit(..., transforms=transforms)
+    ```
+
+    Source: Rucker & Wensing, *Smooth parameterization of rigid-body inertia*, IEEE RA-L 7 (2022) 2771.
+    """
+
+    vector: bool = True
+
+    def of(self, x, shape):
+        """The form for ten numbers, or for a matrix."""
+        return Inertia(vector=shape != (4, 4))
+
+    def unknowns(self, count):
+        """Ten."""
+        return 10
+
+    def refuses(self, x):
+        """That the numbers must be those of a body."""
+        if len(x) not in (10, 16):
+            return "must have the shape (10,) or (4, 4), because its transform is lagjax.inertia"
+        matrix = self._pseudo(x) if len(x) == 10 else x.reshape(4, 4)
+        if not np.allclose(matrix, matrix.T, rtol=1e-9) or np.linalg.eigvalsh(matrix).min() <= 0:
+            return (
+                "must start as the inertia of a body whose density is positive everywhere, because its transform is "
+                "lagjax.inertia: its pseudo-inertia must be symmetric and positive definite"
+            )
+        return None
+
+    @staticmethod
+    def _pseudo(x) -> np.ndarray:
+        m, hx, hy, hz, xx, yy, zz, xy, xz, yz = x
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        moments = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+        return np.block([[moments, np.array([[hx], [hy], [hz]])], [np.array([[hx, hy, hz, m]])]])
+
+    def _numbers(self, pseudo, xp):
+        """The leaf of pseudo-inertias (..., 4, 4), (..., n)."""
+        if not self.vector:
+            return pseudo.reshape(*pseudo.shape[:-2], 16)
+        at = lambda i, j: pseudo[..., i, j]  # noqa: E731
+        return xp.stack(
+            [
+                at(3, 3), at(0, 3), at(1, 3), at(2, 3),
+                at(1, 1) + at(2, 2), at(0, 0) + at(2, 2), at(0, 0) + at(1, 1), -at(0, 1), -at(0, 2), -at(1, 2),
+            ],
+            axis=-1,
+        )  # fmt: skip
+
+    def _factor(self, u, xp):
+        """U, (4, 4)."""
+        alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = u
+        zero, one = xp.zeros_like(alpha), xp.ones_like(alpha)
+        rows = [[xp.exp(d1), s12, s13, t1], [zero, xp.exp(d2), s23, t2], [zero, zero, xp.exp(d3), t3],
+                [zero, zero, zero, one]]  # fmt: skip
+        return xp.exp(alpha) * xp.stack([xp.stack(row) for row in rows])
+
+    def value(self, u, xp: Any = np):
+        """x(u)."""
+        factor = self._factor(u, xp)
+        return self._numbers(factor @ factor.T, xp)
+
+    def jacobian(self, u):
+        """The derivatives of U Uᵀ, one for each u."""
+        factor, size = self._factor(u, np), np.exp(u[0])
+        moves = np.zeros((10, 4, 4))
+        moves[0] = factor
+        for k in range(3):
+            moves[1 + k, k, k] = factor[k, k]
+        for k, place in enumerate(((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))):
+            moves[(4 + k, *place)] = size
+        products = moves @ factor.T
+        return self._numbers(products + products.swapaxes(1, 2), np).T
+
+    def inverse(self, x):
+        """u(x), of the inertia of a body."""
+        pseudo = self._pseudo(x) if self.vector else x.reshape(4, 4)
+        flipped = np.linalg.cholesky(pseudo[::-1, ::-1])
+        factor = flipped[::-1, ::-1] / flipped[0, 0]
+        off = [factor[place] for place in ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))]
+        return np.array([np.log(flipped[0, 0]), *np.log(np.diag(factor)[:3]), *off])
+
+    def drawn(self, u, rng):
+        """Normal about u with the standard deviation of a factor 1.65 in masses and lengths."""
+        return u + 0.5 * rng.normal(size=len(u))
+
+    def ends(self, x, spread):
+        """Relative intervals for what is positive, the mass and the diagonal; others are x ± spread."""
+        diagonal = [0, 4, 5, 6] if self.vector else [0, 5, 10, 15]
+        low, high = x - spread, x + spread
+        low[diagonal], high[diagonal] = positive.ends(x[diagonal], spread[diagonal])
+        return low, high
+
+    def log_volume(self, u, xp: Any = np):
+        """log |∂J/∂u| = 20 α + 2 d₁ + 3 d₂ + 4 d₃, up to a constant."""
+        return 20 * u[0] + 2 * u[1] + 3 * u[2] + 4 * u[3]
+
+    def __repr__(self) -> str:
+        return "lagjax.inertia"
+
+
+def _logistic(u, xp: Any = np):
+    """1 / (1 + e⁻ᵘ), without overflow, and right to rounding where it is small."""
+    return xp.exp(-xp.logaddexp(0.0, -u))
+
+
+def _helmert(n: int) -> np.ndarray:
+    """Orthonormal columns (n, n − 1) of sum zero."""
+    matrix = np.zeros((n, n - 1))
+    for k in range(1, n):
+        matrix[:k, k - 1], matrix[k, k - 1] = 1.0 / k, -1.0
+        matrix[:, k - 1] *= np.sqrt(k / (k + 1))
+    return matrix
+
+
+positive = Positive()
+angle = Angle()
+simplex = Simplex()
+inertia = Inertia()
+
+
+def between(lower: float, upper: float) -> Between:
+    """A parameter that stays between two numbers: x = lower + (upper − lower)/(1 + e⁻ᵘ).
+
+    Raises `ValueError` where the two are not finite numbers in order.
+
+    ```python
+    import lagjax
+
+    transforms = {"friction": lagjax.between(0.0, 2.0), "mass": lagjax.positive}
+    ```
+    """
+    if not (np.ndim(lower) == np.ndim(upper) == 0 and np.isfinite(lower) and np.isfinite(upper) and lower < upper):
+        raise ValueError(f"between(a, b) needs two finite numbers with a < b; got a = {lower!r} and b = {upper!r}.")
+    return Between(float(lower), float(upper))
 
 
 class Part(NamedTuple):

@@ -12,24 +12,18 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from lagjax._doubles import with_doubles
-from lagjax._fit._compare import Comparison, comparison, effective_share
 from lagjax._fit._density import Density
-from lagjax._fit._figures import draw_record
-from lagjax._fit._joint import deviations, of_starts, start_alone
-from lagjax._fit._many import Waterfall
-from lagjax._fit._next import Experiments, ranked
+from lagjax._fit._descent import minimise
 from lagjax._fit._noise import AbstractNoise, Known, Widths
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._profile import Profile, profile
+from lagjax._fit._profile import Comparison, Profile, comparison, effective_share, profile
 from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike, require_held
-from lagjax._fit._report import Drawn, page, pictures_of
+from lagjax._fit._report import Drawn, draw_record, page, pictures_of
 from lagjax._fit._residuals import AbstractQuestion, Failure, Part, Point, Question
 from lagjax._fit._sample import draw, inference_data
-from lagjax._fit._search import reader_of
-from lagjax._fit._signals import looks_like_positions
-from lagjax._fit._solve import minimise
-from lagjax._fit._uncertainty import Information
-from lagjax._fit._wrapped import UNCLEAR, on_circle
+from lagjax._fit._search import Waterfall, reader_of
+from lagjax._fit._sensors import UNCLEAR, looks_like_positions, on_circle
+from lagjax._fit._uncertainty import Experiments, Information, deviations, of_starts, ranked, start_alone
 from lagjax._hybrid import follow
 from lagjax._notebook import cell
 from lagjax._tables import intervals

@@ -1,9 +1,9 @@
 """`sample`: draws from the posterior of a fit, by the No-U-Turn sampler in the fit's own metric.
 
-`_chart` has coordinates z in which the posterior π is nearly round, beside a bound too.
+`Chart` has coordinates z in which the posterior π is nearly round, beside a bound too.
 
 By rule, where that can be had: the sampler moves along π*, the density whose residuals are expanded to second order
-(`_surrogate`), which costs no motions, so many of its steps that y is nearly independent of the x where it began; then
+(`Surrogate`), which costs no motions, so many of its steps that y is nearly independent of the x where it began; then
 one exact density decides. The chain goes to y with the probability
 
     min(1, π(y) π*(x) / [π(x) π*(y)])
@@ -36,9 +36,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit._chart import Chart
-from lagjax._fit._density import Density
-from lagjax._fit._surrogate import Surrogate, expanded
+from lagjax._fit._density import Chart, Density, Surrogate, expanded
 
 _ACCEPTED = 0.85  # the mean acceptance that steps are tuned for
 _ROUNDS = (400, 800, 3200)  # draws of all chains from π*: each round has the metric of the one before

@@ -1,29 +1,576 @@
-"""`search_records`: where a fit begins and how it goes on, from segments that grow together to whole records.
+"""Search: where a fit begins, multiple shooting over segments that grow, the weak form, and multistart.
 
-`searches` does that from many starts, `by_gradient` with gradients in reverse mode. `weakly` is the first value of the
-parameters by the weak form, where the user's is too far off.
+It holds `Reader`, `weak_start`, `Waterfall`, `searches` and `search_records`.
+
+**Multiple shooting.** Over a long record the sum of squares has many minima: a wrong frequency is out of phase, a
+chaotic motion forgets its start. Over a segment shorter than the motion's own time scale there is one. So the records
+are first cut into short segments, each with a start of its own (multiple shooting), from states that local polynomials
+read off the data. When the parameters fit those, neighbours are joined and the joined segment goes on from the start of
+its first part: its end then misses the data by as much as the states of two neighbours disagreed, which the next search
+closes. So the weight of continuity goes from none to all, in as many doublings as it takes to reach whole records. A
+level needs a rough answer only: the parameters must be good enough to predict a segment twice as long.
+
+Others impose continuity by penalties or constraints on all levels at once (Bock's multiple shooting, coupling to the
+data); the growing of segments needs no weights, and every level is the same least squares with starts eliminated.
+Source: Bock, *Recent advances in parameter identification for ODE* (1983); Pisarenko & Sornette, Phys. Rev. E 69
+(2004) 036122, for segments of chaotic signals.
+
+**Weak form** of Lagrange's equations, for states that were read off the data. With a bump φ that vanishes at both ends
+of a window, integration by parts takes the time derivative off the momentum:
+
+    ∫ (φ̇ p + φ F) dt = 0,      p = ∂L/∂q̇,   F = ∂L/∂q + Q
+
+which asks for q and q̇ of the data and for no second derivative of them. It is linear where the parameters are, and has
+one minimum where long motions have many. It is not scaled like the noise, and biased by that of q̇: a start, from which
+the search then goes on. Each coordinate is divided by the size of its own ∫ φ̇ p, or else all masses would shrink to
+nothing together.
+Source: Messenger & Bortz, *Weak SINDy*, J. Comput. Phys. 443 (2021) 110525; Bortz, Messenger & Dukic, Bull. Math.
+Biol. 85 (2023) 110, for parameters.
+
+**Multistart.** The first start is the user's `params0`, the others are drawn from what the transforms say: a decade
+about a positive number, all of an interval, of a circle or of a simplex, and about any other number as far as it is
+large. All of them take a few damped steps of Gauss and Newton at once: the members of one batch are starts × records,
+over a sample of the times of each record. A start whose motion fails costs the others nothing. The best few then go
+through the whole search.
+
+The waterfall is what all of them came to, in order: many that are equally good, then a cliff, are a minimum that can be
+trusted; a slope without a step is not.
+Source: Raue et al., PLoS ONE 8 (2013) e74335, for many starts and waterfalls.
+
+**The search of whole records.** `search_records` goes from segments to whole records; `searches` does that from many
+starts, `by_gradient` with gradients in reverse mode. `weakly` is the first value of the parameters by the weak form,
+where the user's is too far off.
 """
 
 import functools
+import itertools
 import sys
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import block_diag
+from scipy.optimize import least_squares
 
-from lagjax._fit._gradient import descend, ended
-from lagjax._fit._many import Waterfall, distinct, drawn, misfit, short_search
+from lagjax._consistent import has_constraints
+from lagjax._fit._descent import Anchor, Descent, descend, eliminate, ended, minimise
+from lagjax._fit._motions import AbstractMotions
 from lagjax._fit._noise import Widths, log_likelihood
-from lagjax._fit._records import Piece, Record
-from lagjax._fit._residuals import AbstractQuestion, Failure, Question
-from lagjax._fit._segments import Reader, complete, glimpses, levels, time_scales, whole
-from lagjax._fit._signals import looks_like_positions
-from lagjax._fit._solve import Anchor, Descent, minimise
-from lagjax._fit._systems import asked
+from lagjax._fit._parameters import Parameters
+from lagjax._fit._records import Driven, Piece, Record, asks, at_instants, in_structure, inputs_between
+from lagjax._fit._residuals import AbstractQuestion, Failure, Question, asked, compressed
+from lagjax._fit._sensors import continued, looks_like_positions, on_circle
 from lagjax._fit._verdict import unexplained
-from lagjax._fit._weak import balanced
-from lagjax._fit._wrapped import continued
 from lagjax._hybrid import Hybrid, Scene
+from lagjax._layout import halves
+from lagjax._system import System
+
+_DEGREE = 3  # of local polynomials: velocities without the bias that curvature gives to lines
+_WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them
+_PROBES = 32  # places of a record where its time scale is looked at
+_WORSE_WINDOW = 1.3  # what a window may leave, in units of what the shortest leaves
+_PER_SCALE = 24  # samples per time scale that early levels look at: more cost time and find the same
+_GLIMPSES = 256  # places of all records where curvature is looked at
+_FEWEST_IN_SEGMENT = 8  # samples
+_QUARTER = (
+    0.25  # of a period, by which the motion over a segment may be wrong: beyond a half residuals have false minima
+)
+
+
+class Reader(NamedTuple):
+    """Positions and velocities of one record from local cubics: each signal is a coordinate.
+
+    `windows` (S,) are the samples in one cubic, `scatter` (S,) what the shortest leave, `periods` (S,) those of signals
+    that are known less whole periods, else infinite.
+    """
+
+    record: Record
+    windows: tuple[int, ...]
+    scatter: tuple[float, ...]
+    periods: tuple[float, ...]
+
+    @classmethod
+    def of(cls, record: Record, probes: int = 256, periods: np.ndarray | None = None) -> "Reader":
+        """A reader with the longest windows whose cubics leave at most `_WORSE_WINDOW` times what the shortest leave.
+
+        Beyond these they no longer follow the motion. They are tried at `probes` places.
+        """
+        places = some_of(record, probes)
+        windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
+        each = np.full(len(windows), np.inf) if periods is None else periods
+        return cls(record, windows, scatter, tuple(each.tolist()))
+
+    def states(self, places) -> np.ndarray:
+        """(q, q̇) at the samples `places` (M,) of the record, (M, 2n)."""
+        read = self.read(places)
+        return np.stack([one[k] for k in (0, 1) for one in read], axis=-1)
+
+    def read(self, places) -> list[tuple]:
+        """Of every signal what `_read_states` gives at the samples `places`."""
+        ts = self.record.ts[places]
+        return [
+            _read_states(ts, *signal, window)
+            for signal, window in zip(_signals(self.record), self.windows, strict=True)
+        ]
+
+
+def some_of(record: Record, count: int) -> np.ndarray:
+    """At most this many places of samples, from the first to the last."""
+    return np.unique(np.linspace(0, len(record) - 1, count).astype(int))
+
+
+def _signals(record: Record) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Times and values of every signal, where it is not missing."""
+    columns = record.matrix.T
+    return [(record.ts[np.isfinite(column)], column[np.isfinite(column)]) for column in columns]
+
+
+def _read_states(ts: np.ndarray, t: np.ndarray, y: np.ndarray, window: int):
+    """The values of a signal (t, y) and its rates at the times `ts`, what is left, and the local cubics there.
+
+    Where hardly anything was measured the signal is taken to be at rest.
+    """
+    if len(t) <= _DEGREE + 1:
+        level = np.full(len(ts), np.mean(y) if len(y) else 0.0)
+        return level, np.zeros(len(ts)), 0.0, level[:, None]
+    return _local_cubics(ts, t, y, min(window, len(t)))
+
+
+def _window(ts: np.ndarray, t: np.ndarray, y: np.ndarray) -> tuple[int, float]:
+    """The number of samples in the window for one signal, and the scatter about the shortest."""
+    scatter = _read_states(ts, t, y, _WINDOWS[0])[2]
+    best, most = _WINDOWS[0], _WORSE_WINDOW * scatter
+    for window in _WINDOWS[1:]:
+        if window > len(t) or _read_states(ts, t, y, window)[2] > most:
+            break
+        best = window
+    return best, scatter
+
+
+def _local_cubics(ts, t, y, window: int):
+    """Cubics through the `window` samples of (t, y) about each of the times `ts`: values, rates, what is left, and
+    the coefficients (M, 4) of the powers of the time since."""
+    after = np.searchsorted(t, ts)
+    first = np.clip(after - window // 2, 0, len(t) - window)
+    places = first[:, None] + np.arange(window)
+    offsets = t[places] - ts[:, None]
+    length = np.abs(offsets).max(axis=1, keepdims=True)
+    powers = (offsets / length)[..., None] ** np.arange(min(_DEGREE, window - 1) + 1)
+    # On [-1, 1] the normal equations of a cubic have a condition below 1e3.
+    transposed = powers.swapaxes(1, 2)
+    coefficients = np.linalg.solve(transposed @ powers, transposed @ y[places][..., None])
+    left = (powers @ coefficients)[..., 0] - y[places]
+    coefficients = coefficients[..., 0]
+    dof = max(window - powers.shape[-1], 1)
+    cubics = coefficients / length ** np.arange(powers.shape[-1])
+    return cubics[:, 0], cubics[:, 1], float(np.sqrt(np.mean(left**2) * window / dof)), cubics
+
+
+def glimpses(readers: list[Reader], length: float) -> tuple[list[Record], np.ndarray]:
+    """Short records, each `length` long, of the local cubics at some places of all records, and the states there.
+
+    Motions that are shorter than the time between samples see the curvature of the cubics: what a scene says about
+    accelerations, without a second derivative of the data.
+    """
+    found, states = [], []
+    for reader in readers:
+        places = some_of(reader.record, max(4, _GLIMPSES // len(readers)))
+        offsets = np.linspace(0.0, length, 4)
+        cubics = [
+            _read_states(reader.record.ts[places], *s, w)[3]
+            for s, w in zip(_signals(reader.record), reader.windows, strict=True)
+        ]
+        values = np.stack([np.polynomial.polynomial.polyval(offsets, c.T) for c in cubics], axis=-1)
+        structured = [in_structure(v, reader.record) for v in values]
+        found += [
+            Record(t + offsets, v, inputs_between(reader.record, t + offsets))
+            for t, v in zip(reader.record.ts[places], structured, strict=True)
+        ]
+        states.append(reader.states(places))
+    return found, np.concatenate(states)
+
+
+class TimeScales(NamedTuple):
+    """The duration for which a motion looks like a straight line, by the data and by the scene at their states."""
+
+    data: float
+    scene: float
+
+
+def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.ndarray) -> TimeScales:
+    """The shortest times over which a motion looks like a straight line, with the parameters `numbers` (P,).
+
+    That of the data is the ratio of the spread of a coordinate to its rate, about 1/ω; that of the scene the root of
+    the spread of the coordinates, in units of each, over the accelerations there. Where nothing moves, they are
+    infinite.
+    """
+    places = [some_of(reader.record, _PROBES) for reader in readers]
+    states = [reader.states(some) for reader, some in zip(readers, places, strict=True)]
+    t = np.concatenate([reader.record.ts[some] for reader, some in zip(readers, places, strict=True)])
+    y, n = np.concatenate(states), states[0].shape[1] // 2
+    within = np.concatenate([state[:, :n] - state[:, :n].mean(axis=0) for state in states])
+    inputs = np.concatenate([reader.record.input_matrix[some] for reader, some in zip(readers, places, strict=True)])
+    pulled = motions.rate(t, y, numbers, at_instants(t, inputs))
+    pulled = np.where(np.isfinite(pulled), pulled, 0.0)
+    spread, rate, pulled = (np.sqrt(np.mean(x**2, axis=0)) for x in (within, y[:, n:], pulled))
+    spread = np.minimum(spread, _QUARTER * np.array(readers[0].periods))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        both = spread / rate, np.sqrt(spread / pulled)
+    return TimeScales(*(float(one[np.isfinite(one) & (one > 0)].min(initial=np.inf)) for one in both))
+
+
+def levels(records: list[Record | None], scales: list[float]) -> list[list[Piece]]:
+    """Cuts of the records, from segments of two time scales to whole records, each twice as long as the one before.
+
+    Each record has its time scale. Without any where records are hardly longer than that; None in the place of a record
+    is left out.
+    """
+    edges = [(k, record, _edges(record, 2.0 * scales[k])) for k, record in enumerate(records) if record is not None]
+    most, found, stride = max(len(e) - 1 for *_, e in edges), [], 1
+    while stride < most:
+        pieces = []
+        for k, record, e in edges:
+            cut = [*e[:-1:stride].tolist(), len(record)]
+            if len(cut) > 2 and 2 * (e[-1] - cut[-2]) < e[min(stride, len(e) - 1)] - e[0]:
+                del cut[-2]  # a rest shorter than half a segment joins the one before
+            pieces += [_thinned(record, k, a, b, scales[k]) for a, b in itertools.pairwise(cut)]
+        found.append(pieces)
+        stride *= 2
+    return found
+
+
+def _edges(record: Record, length: float) -> np.ndarray:
+    """The first samples of the shortest segments of one record, and its length."""
+    ts = record.ts
+    count = max(1, int((ts[-1] - ts[0]) / length)) if np.isfinite(length) else 1
+    count = max(1, min(count, len(ts) // _FEWEST_IN_SEGMENT))
+    return np.unique(np.append(np.searchsorted(ts, np.linspace(ts[0], ts[-1], count + 1)[:-1]), len(ts)))
+
+
+def _thinned(record: Record, which: int, begin: int, end: int, scale: float) -> Piece:
+    """The samples from `begin` to `end`, of which only so many as the motion needs to be seen."""
+    spacing = (record.ts[end - 1] - record.ts[begin]) / max(end - 1 - begin, 1)
+    step = int(scale / (_PER_SCALE * spacing)) if np.isfinite(scale) and spacing > 0 else 1
+    step = max(1, min(step, (end - begin) // _FEWEST_IN_SEGMENT))
+    return Piece(which, np.arange(begin, end, step))
+
+
+def complete(pieces: list[Piece], records: list[Record]) -> list[Piece]:
+    """The same pieces of records with all of their samples, up to the first of the next piece."""
+    firsts = {(piece.record, int(piece.places[0])) for piece in pieces}
+    ends = [
+        min((place for k, place in firsts if k == piece.record and place > piece.places[0]), default=None)
+        for piece in pieces
+    ]
+    return [
+        Piece(piece.record, np.arange(piece.places[0], len(records[piece.record]) if end is None else end))
+        for piece, end in zip(pieces, ends, strict=True)
+    ]
+
+
+def whole(records: list[Record]) -> list[Piece]:
+    """Every record in one piece."""
+    return [Piece(k, np.arange(len(record))) for k, record in enumerate(records)]
+
+
+_SAMPLES_OF_WEAK_FORM = 2000  # of all records, at most
+_FEWEST_IN_WINDOW = 9  # samples in a window
+_POWER = 4  # of the bump (1 − s²)ᵖ, whose first derivatives vanish at its ends
+_TRIALS_OF_WEAK_FORM = 100
+_WIDE = 3.0  # time scales in half a window: a bump sees what turns over within it
+
+
+class _Windows:
+    """Bumps on the samples of one record: `inside` and `rate` (W, T), which integrate with φ and φ̇ by trapezia."""
+
+    def __init__(self, ts: np.ndarray, half: float):
+        spans = np.gradient(ts)
+        spans[0], spans[-1] = 0.5 * (ts[1] - ts[0]), 0.5 * (ts[-1] - ts[-2])
+        half = min(max(half, 0.5 * _FEWEST_IN_WINDOW * np.max(np.diff(ts))), 0.5 * (ts[-1] - ts[0]))
+        count = max(1, int(np.ceil(2 * (ts[-1] - ts[0]) / half)) - 3)  # each begins a quarter behind the one before
+        centres = np.linspace(ts[0] + half, ts[-1] - half, count)
+        s = np.clip((ts - centres[:, None]) / half, -1.0, 1.0)
+        self.inside = spans * (1 - s**2) ** _POWER
+        self.rate = -2 * _POWER / half * spans * s * (1 - s**2) ** (_POWER - 1)
+
+
+def weak_start(question: Question, system: System, u: np.ndarray, readers: list[Reader | None], scale: float):
+    """The u (F,) that balances the weak form best, in a search from `u`; None where there is nothing to balance.
+
+    `scale` is the motion's time scale, `system` the scene as its author wrote it.
+    """
+    return balanced([(question, system, readers, scale)], u)
+
+
+def balanced(systems: list[tuple[Question, System, list[Reader | None], float]], u: np.ndarray):
+    """The u (F,) that balances the weak forms of several systems best: each with what `weak_start` takes.
+
+    A system with constraints, or where nothing moves, says nothing.
+    """
+    telling = [one for one in systems if not has_constraints(one[1]) and np.isfinite(one[3])]
+    if not telling:
+        return None
+    each, dtype = [imbalance(*one) for one in telling], telling[0][0].layout.dtype
+
+    def residuals(u):
+        return jnp.concatenate([one(u) for one in each])
+
+    value, slope = jax.jit(residuals), jax.jit(jax.jacfwd(residuals))
+    if jax.eval_shape(residuals, u.astype(dtype)).size < 2 * len(u):
+        return None  # a network would follow the noise of so few windows
+    to_host: Any = lambda f: lambda u: np.asarray(f(u.astype(dtype)), float)  # noqa: E731
+    if not (np.isfinite(to_host(value)(u)).all() and np.isfinite(to_host(slope)(u)).all()):
+        return None
+    try:
+        done = least_squares(to_host(value), u, to_host(slope), x_scale="jac", max_nfev=_TRIALS_OF_WEAK_FORM)
+    except (ValueError, np.linalg.LinAlgError):  # a trial that is not finite
+        return None
+    return done.x if np.isfinite(done.x).all() else None
+
+
+def imbalance(question: Question, system: System, readers: list[Reader | None], scale: float):
+    """∫ (φ̇ p + φ F) dt of all windows and coordinates, over the size of ∫ φ̇ p: a function of u (F,) for JAX."""
+    layout, parameters, form = question.layout, question.parameters, question.signals.form
+    form = form if form is not None and asks(system) else None
+    scene = system if form is None else form.driven(system)
+    pieces = _states_and_inputs([reader for reader in readers if reader is not None], _WIDE * scale)
+
+    def both(y, t, table, numbers):
+        params = parameters.restore(numbers)
+        params = params if form is None else Driven(params, *table)
+        motion = scene.motion(layout, params)
+        state = (*halves(y), t, params)
+        return jnp.stack([motion.momentum(*state), motion.generalized_force(*state)])
+
+    at_all = jax.vmap(both, in_axes=(0, 0, 0 if form is not None else None, None))
+
+    y, t, inputs = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
+    table = tuple(at_instants(t, inputs)) if form is not None else None
+    rate, inside = (block_diag(*[getattr(piece[3], name) for piece in pieces]) for name in ("rate", "inside"))
+
+    def residuals(u):
+        p, force = jnp.moveaxis(at_all(y, t, table, parameters.numbers(u, jnp)), 1, 0)
+        moved, forced = rate @ p, inside @ force
+        return ((moved + forced) / jnp.sqrt(jnp.sum(moved**2, axis=0))).ravel()
+
+    return residuals
+
+
+def _states_and_inputs(readers: list[Reader], half: float) -> list[tuple]:
+    """States (T, 2n), times, inputs and windows of every record, thinned to this many samples in all."""
+    found = []
+    for reader in readers:
+        count = max(_FEWEST_IN_WINDOW + 1, _SAMPLES_OF_WEAK_FORM // len(readers))
+        places = np.unique(np.linspace(0, len(reader.record) - 1, min(count, len(reader.record))).astype(int))
+        ts = reader.record.ts[places]
+        if len(ts) > 2:
+            found.append((reader.states(places), ts, reader.record.input_matrix[places], _Windows(ts, half)))
+    return found
+
+
+_SHORT_STEPS = 8  # of the short search
+_SHORT_SAMPLES = 200  # of each record, in it
+_ROOM = 2**24  # numbers of tangents at once
+_FIRST_DAMPING = 1e-2  # damping, relative to the squared norms of columns
+_ALIKE = 0.02  # in the logarithm of the misfit: two starts in one minimum
+
+
+class Waterfall(NamedTuple):
+    """The results of many starts: `misfits` (K,), in order.
+
+    A misfit is the noise that is left, over the size of the signals: its geometric mean over them, of those that went
+    through the whole search after that, of the others after the short one. It is infinite where a motion failed.
+    """
+
+    misfits: np.ndarray
+
+    def __repr__(self) -> str:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            above = np.log(self.misfits / self.misfits[0])
+        alike = int((above <= _ALIKE).sum())
+        failed = int(np.isinf(self.misfits).sum())
+        rest = self.misfits[alike : len(self.misfits) - failed]
+        text = f"{len(self.misfits)}, of which {alike} came to the least misfit, {self.misfits[0]:.3g} of the signals"
+        text += f"; the next to {rest[0]:.3g}, the last to {rest[-1]:.3g}" if len(rest) else ""
+        return text + (f"; {failed} could not be followed." if failed else ".")
+
+
+class Trials(NamedTuple):
+    """K starts of the search: u (K, F), the starts of their records (K, N, 2n), and their misfits (K,)."""
+
+    u: np.ndarray
+    starts: np.ndarray
+    misfits: np.ndarray
+
+
+def drawn(parameters: Parameters, u: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """u itself and `count` − 1 random ones, (K, F)."""
+    rng = np.random.default_rng(seed)
+    return np.stack([u, *(parameters.drawn(u, rng) for _ in range(count - 1))])
+
+
+def short_search(question: AbstractQuestion, u: np.ndarray, starts: np.ndarray) -> Trials:
+    """The results of the starts u (K, F) after a few steps, from the records' starts (N, 2n); in order."""
+    part = _sampled(question)
+    at = _tried(part, u, np.repeat(starts[None], len(u), axis=0))
+    damping = np.full(len(u), _FIRST_DAMPING)
+    for _ in range(_SHORT_STEPS):
+        going = np.flatnonzero(np.isfinite(at.misfits))
+        if not len(going):
+            break
+        moved = [_step(part, at, int(k), damping[k]) for k in going]
+        trial = _tried(part, *(np.stack(parts) for parts in zip(*moved, strict=True)))
+        better = trial.misfits < at.misfits[going]
+        damping[going] = np.where(better, 0.2 * damping[going], 10.0 * damping[going])
+        for mine, new in zip(at, trial, strict=True):
+            mine[going[better]] = new[better]
+    order = np.argsort(at.misfits, kind="stable")
+    return Trials(at.u[order], at.starts[order], at.misfits[order])
+
+
+def misfit(widths: Widths, question: AbstractQuestion) -> float:
+    """The noise that is left, over the size of the signals."""
+    return float(np.exp(np.mean(np.log(widths.sigma / question.size))))
+
+
+def distinct(trials: Trials, count: int) -> list[int]:
+    """The places of the best starts that came to different misfits, at most `count`."""
+    chosen: list[int] = []
+    for k in np.flatnonzero(np.isfinite(trials.misfits)).tolist():
+        if all(abs(np.log(trials.misfits[k] / trials.misfits[j])) > 1e-3 for j in chosen):
+            chosen.append(k)
+    return chosen[:count]
+
+
+class _Tried(NamedTuple):
+    """Like `Trials`, with the weighted triangles (K, N, D + 1, D + 1) of all pieces."""
+
+    u: np.ndarray
+    starts: np.ndarray
+    misfits: np.ndarray
+    triangles: np.ndarray
+
+
+def _sampled(question: AbstractQuestion) -> AbstractQuestion:
+    """The question with at most `_SHORT_SAMPLES` samples of each record."""
+    timed = {part.records.start + k for part in question.parts for k in part.question.clocks}
+    pieces = [
+        piece
+        if piece.record in timed
+        else Piece(
+            piece.record, piece.places[np.unique(np.linspace(0, len(piece.places) - 1, _SHORT_SAMPLES).astype(int))]
+        )
+        for piece in question.pieces
+    ]
+    return question.of(pieces, question.fitted)
+
+
+def _tried(question: AbstractQuestion, u: np.ndarray, starts: np.ndarray) -> _Tried:
+    columns = question.states + u.shape[1] + 1
+    found = _Tried(
+        u.copy(), starts.copy(), np.full(len(u), np.inf), np.zeros((*starts.shape[:2], columns, columns))
+    )  # fmt: skip
+    largest = max(batch.ts.size for batch in question.batches) * question.states * columns
+    portion = max(1, _ROOM // largest)
+    for begin in range(0, len(u), portion):
+        _fill(question, found, slice(begin, min(begin + portion, len(u))))
+    return found
+
+
+def _fill(question: AbstractQuestion, found: _Tried, some: slice) -> None:
+    """The misfits and triangles of some starts, whose motions are one run for each batch of records."""
+    parameters, count = question.parameters, some.stop - some.start
+    numbers = np.stack([parameters.numbers(u) for u in found.u[some]])
+    directions = np.stack([parameters.directions(u) for u in found.u[some]])
+    squares, samples = np.zeros((count, len(question.size))), np.zeros(len(question.size))
+    ok = np.isfinite(numbers).all(axis=1) & np.isfinite(directions).all(axis=(1, 2))
+    followed = []
+    for part, places in question.apart:
+        own, states = part.question, part.question.states
+        begun = found.starts[some][:, places, :states]
+        moves = [own.origins.move(y, *of) for y, *of in zip(begun, numbers, directions, strict=True)]
+        begun = np.stack([y for y, _ in moves])
+        found.starts[some, places, :states] = begun
+        for batch in own.batches:
+            each = _residuals(own, batch, begun, numbers, directions, [m for _, m in moves])
+            ok &= np.isfinite(each).all(axis=(1, 2, 3, 4))
+            each = np.where(np.isfinite(each), each, 0.0)
+            squares[:, part.signals] += (batch.weights * each[..., -1] ** 2).sum(axis=(1, 2))
+            samples[part.signals] += (batch.weights > 0).sum(axis=(0, 1))
+            followed.append((part, places[batch.rows], batch.weights, each))
+    sigma = np.maximum(np.sqrt(squares / samples), question.least)
+    found.misfits[some] = np.where(ok, np.exp(np.mean(np.log(sigma / question.size), axis=1)), np.inf)
+    for part, places, weights, each in followed:
+        each *= (np.sqrt(weights) / sigma[:, None, None, part.signals])[..., None]
+        small, states = compressed(each.reshape(count * len(places), -1, each.shape[-1])), part.question.states
+        _place(found.triangles[some], places, states, question.states - states, small)
+
+
+def _place(triangles: np.ndarray, places: np.ndarray, states: int, more: int, of_system: np.ndarray) -> None:
+    """Put the triangles of M pieces of one system, (K·M, D, D), at their `places` among those of all, (K, N, …).
+
+    Behind the columns of its `states` these have `more` columns, for a system with more coordinates.
+    """
+    rows = np.insert(of_system, [states] * more, 0.0, axis=-1)
+    triangles[:, places, : rows.shape[-2]] = rows.reshape(len(triangles), len(places), *rows.shape[1:])
+
+
+def _residuals(question: Question, batch, starts, numbers, directions, moved) -> np.ndarray:
+    """The derivatives of signals and, last, residuals of one batch for K starts: (K, N, T, S, D + 1).
+
+    NaN where a motion failed, zero where nothing was measured.
+    """
+    along = [question._along(batch, m, d) for m, d in zip(moved, directions, strict=True)]
+    record = question.pieces[batch.rows[0]].record
+    shown = _timed if record in question.clocks else _sensed
+    columns, free = question.columns(record), directions.shape[1]
+    missing = question.states + free - along[0][1].shape[0]
+    found = np.zeros((len(starts), *batch.values.shape, question.states + free + 1))
+    for k, both in enumerate(shown(question, batch, starts[:, batch.rows], numbers, along)):
+        if both is None:
+            found[k] = np.nan
+            continue
+        values, slopes = both
+        slopes = np.pad(slopes, ((0, 0), (0, 0), (0, 0), (missing, 0)))
+        slopes[~question.fitted[batch.rows], ..., : question.states] = 0.0
+        left = on_circle(values - batch.values[..., columns], question.periods[columns])
+        found[k, ..., columns, :-1], found[k, ..., columns, -1] = slopes, left
+    return np.where((batch.weights > 0)[..., None] | np.isnan(found), found, 0.0)
+
+
+def _timed(question: Question, batch, starts, numbers, along):
+    """Of each start the crossing times and their derivatives, or None."""
+    clock = question.clocks[question.pieces[batch.rows[0]].record]
+    for y0, some, directions in zip(starts, numbers, along, strict=True):
+        shown = question._time(clock, batch, y0, some, *directions)
+        yield None if isinstance(shown, Failure) else shown
+
+
+def _sensed(question: Question, batch, starts, numbers, along):
+    """Of each start the signals and their derivatives, or None where a motion failed; all in one run."""
+    count, members = len(starts), len(batch.rows)
+    tile = lambda x: np.tile(x, (count, *[1] * (x.ndim - 1)))  # noqa: E731
+    table = None if batch.table is None else type(batch.table)(*map(tile, batch.table))
+    motion = question.motions.follow(
+        tile(batch.ts), starts.reshape(count * members, -1), np.repeat(numbers, members, axis=0),
+        np.concatenate([y0_dot for y0_dot, _ in along]), np.repeat([d for _, d in along], members, axis=0), table,
+    )  # fmt: skip
+    for k in range(count):
+        part = type(motion)(*(x[k * members : (k + 1) * members] for x in motion))
+        yield question.signals.of(part, batch.ts, batch.inputs, numbers[k], along[k][1]) if part.ok else None
+
+
+def _step(question: AbstractQuestion, at: _Tried, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """The end of the damped step of one start."""
+    triangles, states, none = at.triangles[k], question.states, np.zeros(at.u.shape[1])
+    limits = question.parameters.limits(at.u[k])
+    norms = np.linalg.norm(triangles[..., :states], axis=1), np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
+    scale = tuple(np.where(norm > 0, norm, 1.0) for norm in norms)
+    step = eliminate(triangles, states, scale, damping, (none, none), limits)
+    return question.parameters.stepped(at.u[k], step.u), at.starts[k] + step.starts
+
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
 # independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.
@@ -37,7 +584,7 @@ _WORSE = (
 )
 _LOST = 2  # levels that may be lost: after one the next may find the motion again, with better parameters
 _LYAPUNOV = 5.0  # times 1/λ that a record is long: shorter ones are followed whole
-_STEPS = 3000  # of a descent by gradients
+_GRADIENT_STEPS = 3000  # of a descent by gradients
 _BEST = 4  # of many starts go through the whole search
 
 
@@ -162,14 +709,14 @@ def by_gradient(
     """The descent by gradients: over segments of the records that grow, where they can be read, then over all."""
     told, question.watch = question.watch, None
     tell = None if told is None else lambda text: print(text, file=sys.stderr, flush=True)
-    steps = _STEPS
+    steps = _GRADIENT_STEPS
     if readers is not None:
         u = weakly(question, list(systems.values()), u, readers)
         u = _over_segments(question, systems, u, noise, readers, tell)
-        steps = _STEPS // 3
+        steps = _GRADIENT_STEPS // 3
     done = descend(question, systems, u, y0, noise, steps, tell)
     if not isinstance(done, Failure):
-        done = ended(question, done[0], done[1], noise, _STEPS, done[2])
+        done = ended(question, done[0], done[1], noise, _GRADIENT_STEPS, done[2])
     return _followed(question, done)
 
 
@@ -302,7 +849,7 @@ def _over_segments(question: AbstractQuestion, systems, u, noise, readers: list[
         reading = ((recorder, piece.places[:1]) for piece in pieces if (recorder := readers[piece.record]))
         states = np.stack([roomy(one.states(place)[0], question.states) for one, place in reading])
         part = question.of(pieces, np.ones(len(pieces), bool))
-        done = descend(part, systems, u, states, noise, 2 * _STEPS // (3 * len(cuts)), tell)
+        done = descend(part, systems, u, states, noise, 2 * _GRADIENT_STEPS // (3 * len(cuts)), tell)
         if not isinstance(done, Failure):
             u = done[0]
     return u

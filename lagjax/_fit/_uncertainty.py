@@ -1,7 +1,15 @@
-"""The uncertainty of the parameters: their covariance where residuals are correlated, and what is not seen at all.
+"""Uncertainty: autocorrelation of residuals, covariance of parameters and starts, identifiability, experiment design.
 
-With the starts eliminated, a small change of the measurements by ε moves the free parameters by H⁻¹ Gᵀ ε: G has the
-rows of the parameters, made orthogonal to those of the starts, in units of the noise, and H = GᵀG. So
+It holds `Correlation`, `Information`, `OfStarts`, `sentences` (parameters that are not identifiable) and `Experiments`.
+
+**Autocorrelation of residuals.** At 1 kHz residuals hold what the scene lacks, and neighbours agree: n samples are
+worth n/τ independent ones, with τ the sum of the correlations over all lags. Source: Geyer, *Practical Markov chain
+Monte Carlo*, Stat. Sci. 7 (1992) 473, for where correlations end; Newey & West, Econometrica 55 (1987) 703, for tapers
+whose spectrum has no negative parts.
+
+**Covariance of the parameters.** With the starts eliminated, a small change of the measurements by ε moves the free
+parameters by H⁻¹ Gᵀ ε: G has the rows of the parameters, made orthogonal to those of the starts, in units of the noise,
+and H = GᵀG. So
 
     covariance = H⁻¹ (Gᵀ C G) H⁻¹,      C the correlation of the residuals, from the residuals themselves
 
@@ -16,15 +24,138 @@ grows fastest, and rounding hides the rest: G seems to have null directions wher
 same whatever the rows are multiplied by, so they are looked for a second time where every row has length one
 (`confirmed`): what is null there is not seen, and what is not was drowned. Where rows grow by more than there are
 digits, all are.
+
+**Covariance of the starts**, which were eliminated. A piece with rows A of its start and B of the parameters, in units
+of the noise ε, has the start
+
+    δs = A⁺ (ε − B δu),        δu = H⁻¹ Gᵀ ε,        G = B − A A⁺B over all pieces
+
+so its covariance is that of its own rows, that of the parameters through A⁺B, and what both share where residuals are
+correlated. Where A does not see a component of the start its variance is infinite.
+
+**Identifiability.** A null direction v of the parameters says that measurements do not change along v, at one point. In
+logarithms, with the relative changes dxᵢ/xᵢ as coordinates, what is seen is orthogonal to it: if that has small whole
+exponents, here and at another point, then only a product of powers enters, such as m·l. The same with the changes dxᵢ
+themselves finds sums. Everything else is told as the direction that it is.
+
+**Experiment design.** With M the information that the fit has, and G the rows of a planned record in units of the
+noise, made orthogonal to those of its start where that has to be fitted too,
+
+    gain = log det(M + GᵀG) − log det M
+
+is twice the logarithm by which the volume of the confidence ellipsoid shrinks (D-optimality), expected at the fitted
+parameters. A record that sees a combination which was not seen so far comes first, whatever its gain in the others.
+Source: Atkinson, Donev & Tobias, *Optimum Experimental Designs* (2007), ch. 11.
 """
 
+import math
+import re
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._fit._correlation import correlated_square, correlation, together
 from lagjax._fit._noise import Widths
-from lagjax._fit._residuals import AbstractQuestion, Point, compressed
+from lagjax._fit._parameters import Parameters
+from lagjax._fit._residuals import AbstractQuestion, Failure, Point, compressed
+
+
+class Correlation(NamedTuple):
+    """Of one signal: correlations at lags 0, 1, …, tapered to zero; their sum over all lags; how many samples."""
+
+    lags: np.ndarray
+    time: float
+    count: int
+    neighbour: float
+
+
+def correlation(question: AbstractQuestion, point: Point, widths: Widths, signal: int) -> Correlation:
+    """The correlation of the residuals of one signal, over all pieces.
+
+    It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
+    length: then its spectrum is nowhere negative.
+    """
+    dof = widths.dof[signal]
+    sums, count = np.zeros(1), 0
+    for batch, residuals in zip(question.batches, point.residuals, strict=True):
+        z = np.sqrt(batch.weights[..., signal]) * residuals[..., signal] / widths.sigma[signal]
+        if not np.isinf(dof):
+            z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
+        counted = batch.weights[..., signal] > 0
+        own, count = lag_products(z, counted), count + int(counted.sum())
+        longer = np.zeros(max(len(sums), len(own)))
+        longer[: len(sums)] += sums
+        longer[: len(own)] += own
+        sums = longer
+    law = sums / sums[0] if sums[0] > 0 else np.eye(1, len(sums))[0]
+    insignificant = np.flatnonzero(law <= 2.0 / np.sqrt(count))
+    cut = int(insignificant[0]) if len(insignificant) else len(law)
+    if cut <= 1:
+        return Correlation(np.ones(1), 1.0, count, float(law[1]) if len(law) > 1 else 0.0)
+    lags = law[: 3 * cut] * _parzen(np.arange(min(3 * cut, len(law))) / (3 * cut))
+    return Correlation(lags, float(max(1.0, lags[0] + 2 * lags[1:].sum())), count, float(law[1]))
+
+
+def lag_products(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """Σ zᵢ zᵢ₊ₖ over rows (N, T) for the lags k = 0 … T − 1, of samples that count."""
+    rows = together(rows, counted)
+    spectrum = np.abs(np.fft.rfft(rows, 2 * rows.shape[1])) ** 2
+    return np.fft.irfft(spectrum.sum(axis=0), 2 * rows.shape[1])[: rows.shape[1]]
+
+
+_LAGS = 20  # of residuals that hold motion some are correlated over the first lags, unless a period has two samples
+_CHANCE = 4.0  # standard errors of a correlation: white residuals show it at one of this many lags in 1 of 800 fits
+
+
+def structure(rows: np.ndarray, counted: np.ndarray) -> float:
+    """The mean square of what is no white noise in residuals (N, T), zero where no correlation is beyond chance.
+
+    Motion that changes little from one sample to the next has its whole mean square in the product of neighbours, to
+    which white noise adds nothing.
+    """
+    count = int(counted.sum())
+    sums = lag_products(np.where(counted, rows, 0.0), counted)[: _LAGS + 1]
+    if count < 2 or not sums[0] > 0:
+        return 0.0
+    highest = np.abs(sums[1:]).max(initial=0.0)
+    return float(highest / count) if highest > _CHANCE / np.sqrt(count) * sums[0] else 0.0
+
+
+def together(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """The rows (N, T, ...) with what `counted` (N, T) in front, so that lags count samples that are there.
+
+    Where every tenth sample is measured, or some are missing, the neighbour of one is the next that was measured.
+    """
+    if counted.all():
+        return rows
+    order = np.argsort(~counted, axis=1, kind="stable")
+    return np.take_along_axis(rows, order.reshape(*order.shape, *[1] * (rows.ndim - 2)), axis=1)
+
+
+def _parzen(x: np.ndarray) -> np.ndarray:
+    return np.where(x < 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3)
+
+
+def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """Σ Gᵀ C G over N pieces `rows` (N, T, F), where C has the correlations `lags`."""
+    if len(lags) == 1:
+        flat = rows.reshape(math.prod(rows.shape[:-1]), rows.shape[-1])
+        return flat.T @ flat
+    lags = lags[: rows.shape[1]]
+    size = rows.shape[1] + len(lags)
+    kernel = np.zeros(size)
+    kernel[: len(lags)] += lags
+    kernel[-np.arange(1, len(lags))] += lags[1:]
+    spectrum = np.fft.rfft(kernel).real
+    smooth = np.fft.irfft(np.fft.rfft(rows, size, axis=1) * spectrum[:, None], size, axis=1)[:, : rows.shape[1]]
+    return np.einsum("ntf,ntg->fg", rows, smooth)
+
+
+def share(question: AbstractQuestion, point: Point, widths: Widths) -> float:
+    """The number of independent samples that one sample is worth, over all signals: at most 1."""
+    laws = [correlation(question, point, widths, signal) for signal in range(len(widths.sigma))]
+    return sum(law.count / law.time for law in laws) / max(sum(law.count for law in laws), 1)
+
 
 # Singular values below this fraction of the largest, of columns of length one, are null: derivatives are as accurate
 # as the motion, to 1e-9, and a direction that is really seen so little would need a million times the data.
@@ -183,3 +314,337 @@ def orthogonal(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.nda
     instead = np.matmul(v.swapaxes(1, 2) * inverse[:, None], np.matmul(u.swapaxes(1, 2), of_u))
     shape = (len(slopes), *[1] * (slopes.ndim - 3), *instead.shape[1:])
     return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))
+
+
+class OfStarts(NamedTuple):
+    """The uncertainty of N starts: `covariance` (N, 2n, 2n), and A⁺B (N, 2n, F), how they follow the parameters."""
+
+    covariance: np.ndarray
+    follows: np.ndarray
+
+
+def of_starts(question: AbstractQuestion, point: Point, widths: Widths, known: Information) -> OfStarts:
+    """The uncertainty of the starts of all pieces at the end of a search; zero for those that are not fitted."""
+    states, free, pieces = question.states, len(point.u), len(question.pieces)
+    lags = [correlation(question, point, widths, s).lags for s in range(len(widths.sigma))]
+    found = OfStarts(np.zeros((pieces, states, states)), np.zeros((pieces, states, free)))
+    for batch, slopes in zip(question.batches, point.slopes, strict=True):
+        rows = np.sqrt(batch.weights)[..., None] / widths.sigma[:, None] * slopes
+        for row, piece in zip(batch.rows.tolist(), rows, strict=True):
+            if question.fitted[row]:
+                across = np.zeros((states, states)) if point.across is None else point.across[row]
+                found.covariance[row], found.follows[row] = _of_start(piece, states, lags, known, across)
+    return found
+
+
+def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Information, across: np.ndarray):
+    """The covariance (2n, 2n) of one start, and A⁺B, from its weighted rows (T, S, 2n + F).
+
+    What is `across` (2n, 2n) the constraints is not free, and no less known for not being seen.
+    """
+    a, b = rows[..., :states], rows[..., states:]
+    u, values, v = np.linalg.svd(a.reshape(-1, states), full_matrices=False)
+    sees = values > 1e-10 * values.max()
+    into = (u[:, sees] / values[sees]) @ v[sees]  # (A⁺)ᵀ, (T S, 2n)
+    follows = into.T @ b.reshape(-1, b.shape[-1])
+    own = np.concatenate([into.reshape(a.shape), b - a @ follows], axis=-1)
+    square = np.sum([correlated_square(own[None, :, s], lags[s]) for s in range(len(lags))], axis=0)
+    covariance = _of_seen(known)
+    shared = square[:states, states:] @ known.white @ follows.T
+    found = known.lost * (square[:states, :states] - shared - shared.T) + follows @ covariance @ follows.T
+    not_seen = v[~sees] - v[~sees] @ across.T
+    lost = (np.abs(not_seen) > 1e-6).any(axis=0) | _moves(follows, known)
+    found[lost], found[:, lost] = np.nan, np.nan
+    found[lost, lost] = np.inf
+    return found, follows
+
+
+def start_alone(rows: np.ndarray, states: int, known: Information, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """The uncertainty of a start by weighted rows (T, S, 2n + F): covariance (2n, 2n) for fixed parameters, and A⁺B.
+
+    Every sample is worth the `share` of an independent one.
+    """
+    flat = rows.reshape(-1, rows.shape[-1])
+    u, values, v = np.linalg.svd(flat[:, :states], full_matrices=False)
+    sees = values > 1e-10 * values.max()
+    into = (u[:, sees] / values[sees]) @ v[sees]
+    return known.lost / share * into.T @ into, into.T @ flat[:, states:]
+
+
+def deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.ndarray, known: Information):
+    """The standard deviations (T, S) of signals whose derivatives are `slopes` (T, S, 2n + F).
+
+    They come from the parameters as far as these are seen, and from a start of covariance `start` (2n, 2n) of its own
+    that `follows` (2n, F) the parameters.
+    """
+    a = slopes[..., :states]
+    along = slopes[..., states:] - a @ follows
+    covariance = _of_seen(known)
+    variance = np.einsum("tsf,fg,tsg->ts", along, covariance, along) + np.einsum("tsi,ij,tsj->ts", a, start, a)
+    return np.where(_moves(along, known), np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _of_seen(known: Information) -> np.ndarray:
+    """The covariance (F, F) of what is seen, zero along what is not; with white residuals where some is not."""
+    return known.covariance if not known.null.size else known.lost * known.white
+
+
+def _moves(rows: np.ndarray, known: Information) -> np.ndarray:
+    """True if rows (..., F) of derivatives depend on a direction that is not seen."""
+    if not known.null.size:
+        return np.zeros(rows.shape[:-1], bool)
+    return (np.abs(rows @ known.null) > 1e-6 * np.abs(rows).max(initial=0.0)).any(axis=-1)
+
+
+_MOST_NAMES = 12  # in one sentence
+_LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
+
+
+def sentences(question: AbstractQuestion, point: Point, widths: Widths, known: Information) -> tuple[str, ...]:
+    """A sentence for every set of parameters of which something is not seen, and one for those that rounding hides."""
+    hidden = _hidden(question, point, known)
+    null, parameters = known.confirmed, question.parameters
+    if not null.shape[1]:
+        return hidden
+    elsewhere = _null_elsewhere(question, point, widths)
+    spaces = [(parameters.jacobian(point.u) @ null, parameters.values(point.u))]
+    if elsewhere is not None:
+        u, other = elsewhere
+        spaces.append((parameters.jacobian(u) @ other, parameters.values(u)))
+    found = [_sentence(parameters, block, spaces) for block in _blocks(spaces[0][0])]
+    if not found:
+        ended = dict.fromkeys(parameters.labels[i] for i in np.flatnonzero(np.abs(null).max(axis=1) > 1e-6))
+        found = [f"At the end of its set, where nothing that was measured depends on it: {', '.join(ended)}."]
+    return (*found, *hidden)
+
+
+def _hidden(question: AbstractQuestion, point: Point, known: Information) -> tuple[str, ...]:
+    """The sentence for parameters whose columns are drowned where sensitivities grow."""
+    if known.confirmed.shape[1] == known.null.shape[1]:
+        return ()
+    basis = np.linalg.qr(known.confirmed)[0]
+    left = known.null / np.linalg.norm(known.null, axis=0)
+    left = left - basis @ (basis.T @ left)
+    labels = question.parameters.labels
+    names = list(dict.fromkeys(labels[k] for k in np.flatnonzero(np.linalg.norm(left, axis=1) > 1e-5)))
+    sizes = row_sizes(question, point)
+    grown, record = max(
+        (growth([row[None]]), question.pieces[batch.rows[k]].record)
+        for batch, size in zip(question.batches, sizes, strict=True)
+        for k, row in enumerate(size)
+    )
+    return (
+        f"{question.called(record)} is chaotic: motions grow apart within it by a factor of {grown:.0e}, and rounding "
+        f"hides what it says about {_listed(names)}. There are no intervals from records that long: cut it into "
+        "several shorter ones.",
+    )
+
+
+def _null_elsewhere(question: AbstractQuestion, point: Point, widths: Widths):
+    """Other values u of the free parameters, a few per cent away, and the null directions there."""
+    u = point.u
+    near = u + question.parameters.sizes(u) * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
+    other = question.at(near, point.starts)
+    if isinstance(other, Failure):
+        return None
+    factors = [np.sqrt(batch.weights) / widths.sigma for batch in question.batches]
+    null = seen(question.triangles(other, factors), question.states)[0]
+    return near, confirmed_null(question, other, null)
+
+
+def _blocks(null: np.ndarray) -> list[np.ndarray]:
+    """The parameters of the null directions in sets, of which each is free by itself: rows that are not zero."""
+    reduced = _reduced(null.T)
+    sets: list[set[int]] = []
+    for row in reduced:
+        own = set(np.flatnonzero(np.abs(row) > 1e-5 * np.abs(row).max()).tolist())
+        for other in [s for s in sets if s & own]:
+            sets.remove(other)
+            own |= other
+        sets.append(own)
+    return [np.array(sorted(s)) for s in sets]
+
+
+def _reduced(rows: np.ndarray) -> np.ndarray:
+    """The reduced row echelon form of independent rows, with the largest pivots."""
+    rows = np.array(rows, float)
+    for i in range(len(rows)):
+        rest = np.abs(rows[i:])
+        k, column = np.unravel_index(np.argmax(rest), rest.shape)
+        if not rest[k, column] > 0:  # a direction along which numbers at the end of their sets no longer change
+            rows = rows[:i]
+            break
+        rows[[i, i + k]] = rows[[i + k, i]]
+        rows[i] /= rows[i, column]
+        others = np.arange(len(rows)) != i
+        rows[others] -= np.outer(rows[others, column], rows[i])
+    return np.where(np.abs(rows) > 1e-9, rows, 0.0)
+
+
+def _sentence(parameters: Parameters, block: np.ndarray, spaces) -> str:
+    """The sentence for one set of parameters, from the null directions of x and the values x at one or two points."""
+    names = [parameters.names[i] for i in block]
+    if len(block) == 1:
+        return f"Nothing that was measured depends on {names[0]}."
+    relative = [_within(direction / np.where(x != 0, x, 1.0)[:, None], block) for direction, x in spaces]
+    absolute = [_within(direction, block) for direction, _ in spaces]
+    if all(np.all(x[block] != 0) for _, x in spaces) and (rows := _whole_numbers(relative)) is not None:
+        if relative[0].shape[1] == 1 and np.ptp(relative[0]) < _EXACT * np.abs(relative[0]).max():
+            return f"A common factor of {_listed(names)} is not seen, only their ratios: keep one of them fixed."
+        return f"Of {_listed(names)} only {_listed([_product(row, names) for row in rows])} {_is(rows)} seen."
+    if (rows := _whole_numbers(absolute)) is not None:
+        return f"Of {_listed(names)} only {_listed([_sum(row, names) for row in rows])} {_is(rows)} seen."
+    if (count := absolute[0].shape[1]) > 1:
+        return f"{count} combinations of {_listed(names)} are not seen: keep {count} of them fixed."
+    changes = absolute[0][:, 0] / np.abs(absolute[0][:, 0]).max()
+    together = ", ".join(f"{name} by {change:+.3g}" for name, change in zip(names, changes, strict=True))
+    return (
+        f"A combination of {_listed(names)} is not seen: to change {together}, in proportion, changes nothing measured."
+    )
+
+
+def _within(directions: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """The directions that move only the parameters of one set, (len(block), K)."""
+    outside = np.delete(directions, block, axis=0)
+    if not outside.size:
+        return directions[block]
+    size = np.linalg.norm(directions, axis=0)
+    _, values, right = np.linalg.svd(outside / size)
+    values = np.append(values, np.zeros(directions.shape[1] - len(values)))
+    inside = right[values < 1e-5].T
+    return (directions / size @ inside)[block]
+
+
+def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
+    """The rows orthogonal to a space of directions as small whole numbers, the same at all points; None if not so."""
+    first = spaces[0]
+    if len(spaces) < 2 or any(space.shape != first.shape or not space.size for space in spaces):
+        return None
+    _, values, right = np.linalg.svd(first.T)
+    rank = int((values > 1e-6 * values.max()).sum())
+    if rank == len(first):
+        return None
+    rows = []
+    for row in _reduced(right[rank:]):
+        fractions = [Fraction(float(x)).limit_denominator(_LARGEST_EXPONENT) for x in row]
+        common = np.lcm.reduce([f.denominator for f in fractions])
+        whole = [int(f * int(common)) for f in fractions]
+        if max(map(abs, whole)) > _LARGEST_EXPONENT or np.abs(np.array(whole) / common - row).max() > _EXACT:
+            return None
+        rows.append(whole)
+    rows = _plain(rows)
+    for space in spaces[1:]:
+        left = np.array(rows, float) @ space
+        if np.abs(left).max() > _EXACT * np.abs(space).max():
+            return None
+    return rows
+
+
+def _plain(rows: list[list[int]]) -> list[list[int]]:
+    """Whole rows of the same span with fewer minus signs, and then smaller numbers: a·m and b·m, not a/b and a·m."""
+
+    def weight(row):
+        return sum(x < 0 for x in row), sum(map(abs, row)), [-x for x in row]  # the last so that a/b is not b/a
+
+    def upright(row):
+        return min(row, [-x for x in row], key=weight)
+
+    rows = [upright(row) for row in rows]
+    while True:  # the weights fall at every turn, and are whole
+        better = []
+        for i, row in enumerate(rows):
+            for other in rows[:i] + rows[i + 1 :]:
+                sums = [upright([a + sign * b for a, b in zip(row, other, strict=True)]) for sign in (1, -1)]
+                better += [(weight(new), i, new) for new in sums if weight(new)[:2] < weight(row)[:2]]
+        if not better:
+            return sorted(rows, reverse=True)
+        _, i, new = min(better)
+        rows[i] = new
+
+
+def _product(row: list[int], names: list[str]) -> str:
+    above = [_power(name, x) for name, x in zip(names, row, strict=True) if x > 0]
+    below = [_power(name, -x) for name, x in zip(names, row, strict=True) if x < 0]
+    return "·".join(above) + (f"/({'·'.join(below)})" if len(below) > 1 else f"/{below[0]}" if below else "")
+
+
+def _power(name: str, exponent: int) -> str:
+    return name if exponent == 1 else f"{name}^{exponent}"
+
+
+def _sum(row: list[int], names: list[str]) -> str:
+    parts = [(x, name if abs(x) == 1 else f"{abs(x)} {name}") for x, name in zip(row, names, strict=True) if x]
+    text = "".join(f" {'+' if x > 0 else '−'} {part}" for x, part in parts)
+    return text.removeprefix(" + ")
+
+
+def _listed(names: list[str]) -> str:
+    if len(names) > _MOST_NAMES:  # weights of a network: whole arrays instead of their numbers
+        names = list(dict.fromkeys(re.sub(r"\[[\d, ]+\]$", "", name) for name in names))
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _is(rows: list) -> str:
+    return "is" if len(rows) == 1 else "are"
+
+
+class Experiments(NamedTuple):
+    """Planned records in the order of what they would tell. Print it for a table.
+
+    - `names` (E,); `gain` (E,): log det(M + GᵀG) − log det M of what is seen already.
+    - `newly_seen` (E,): how many combinations a record would see that were not seen.
+    - `parameters` (F,), `deviations` (E, F): the standard deviation of each unknown afterwards, over that of now.
+    """
+
+    names: tuple[str, ...]
+    gain: np.ndarray
+    newly_seen: np.ndarray
+    parameters: tuple[str, ...]
+    deviations: np.ndarray
+
+    def __repr__(self) -> str:
+        width = max(len(name) for name in (*self.names, "experiment"))
+        rows = [f"{'experiment':<{width}}  {'gain':>8}  {'volume':>8}  {'newly seen':>10}  most for"]
+        for name, gain, new, after in zip(self.names, self.gain, self.newly_seen, self.deviations, strict=True):
+            rows.append(f"{name:<{width}}  {gain:>8.3g}  {np.exp(-gain / 2):>8.3g}  {new:>10}  {self._most(after)}")
+        return "\n".join(rows)
+
+    def _most(self, after: np.ndarray) -> str:
+        known = np.where(np.isfinite(after), after, 1.0)
+        place = int(np.argmin(known))
+        return f"{self.parameters[place]}, whose interval becomes {known[place]:.2g} of now" if known[place] < 1 else ""
+
+
+def ranked(names: list[str], rows: list[np.ndarray], labels: tuple[str, ...], known: Information) -> Experiments:
+    """The information of planned records; their rows (M, F) have starts eliminated and are in units of the noise."""
+    unseen = known.null
+    basis = np.linalg.svd(unseen, full_matrices=True)[0][:, unseen.shape[1] :] if unseen.size else np.eye(len(labels))
+    have = _information(known, basis)
+    told = [_told(g, basis, unseen, have) for g in rows]
+    order = sorted(range(len(rows)), key=lambda k: (-told[k][1], -told[k][0]))
+    gain, new, deviations = (np.array([told[k][i] for k in order]) for i in range(3))
+    return Experiments(tuple(names[k] for k in order), gain, new, labels, deviations)
+
+
+def _information(known: Information, basis: np.ndarray) -> np.ndarray:
+    """M in the coordinates of what is seen: the inverse of the reported covariance where that is finite."""
+    finite = np.isfinite(np.diag(known.covariance))
+    if finite.all():
+        return np.linalg.inv(basis.T @ known.covariance @ basis)
+    # Beside unseen combinations the covariance of white residuals is there in the seen directions.
+    return np.linalg.inv(basis.T @ (known.lost * known.white) @ basis)
+
+
+def _told(g: np.ndarray, basis: np.ndarray, unseen: np.ndarray, have: np.ndarray) -> tuple[float, int, np.ndarray]:
+    """The gain of one record, how many unseen combinations it sees, and deviations afterwards over those of now."""
+    seen = g @ basis
+    gain = np.linalg.slogdet(have + seen.T @ seen)[1] - np.linalg.slogdet(have)[1]
+    new = 0
+    if unseen.size:
+        size = np.linalg.norm(g) or 1.0
+        values = np.linalg.svd(g @ unseen, compute_uv=False)
+        new = int((values > 1e-6 * size * np.linalg.norm(unseen, 2)).sum())
+    before, after = (np.diag(basis @ np.linalg.inv(m) @ basis.T) for m in (have, have + seen.T @ seen))
+    lost = np.linalg.norm(unseen, axis=1) > 1e-6 if unseen.size else np.zeros(len(before), bool)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return float(gain), new, np.where(lost, np.nan, np.sqrt(after / before))
