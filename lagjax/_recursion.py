@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._linear import singular_threshold
-from lagjax._program import Derivatives, Expansion, Graph, Scalars
+from lagjax._program import Derivatives, Expansion, Graph, Scalars, copied
 
 Form = dict[int, int]  # a linear combination of unknowns: the node of the factor of each
 
@@ -140,7 +140,7 @@ def _hessian(derivatives: Derivatives, value: int, curved: Iterable[int], fronti
     second, one = Derivatives(apart), apart.constant(1.0, "float")
     slopes = second.slopes(nodes[value], second.below([nodes[value]]), varied)
     rows = second.along(slopes, [{i: one} for i in varied])
-    places = derivatives.copied(apart, inputs)
+    places = copied(derivatives.graph, apart, inputs)
     return {(frontier[a], frontier[b]): places[node] for a, row in enumerate(rows) for b, node in row.items() if b <= a}
 
 

@@ -29,9 +29,9 @@ from lagjax._native._output import RECORDED, recall_pieces
 from lagjax._native._saltation import GuardTable, Saltation, jump_along
 from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._program._borders import Borders
+from lagjax._program._derivatives import pullback, pullback_and_entries
 from lagjax._program._look_ups import Table
 from lagjax._program._series import Recurrent, Series
-from lagjax._program._transpose import pullback, pullback_and_entries
 
 # `y_ct` is the cotangent of the end, and becomes that of the start.
 JOB = job(

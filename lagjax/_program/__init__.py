@@ -38,7 +38,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 
 from lagjax._program import _complex, _eigenvalues, _matrices, _special  # noqa: F401  (they register what they lower)
-from lagjax._program._differentiate import Derivatives, has_own_rules
+from lagjax._program._derivatives import Derivatives, copied, pullback, pushforward, with_tangents
 from lagjax._program._emit import Rows, emit, emit_rows, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
@@ -47,11 +47,9 @@ from lagjax._program._look_ups import look_up, table_of
 from lagjax._program._memory import machine_memory, operations_that_fit, without_collections
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
-from lagjax._program._pushforward import pushforward, with_tangents
-from lagjax._program._rules import LARGEST_UNFOLDED, Expansion, inputs_of, written_out
+from lagjax._program._rules import LARGEST_UNFOLDED, Expansion, has_own_rules, inputs_of, written_out
 from lagjax._program._scalars import Scalars, stacked
 from lagjax._program._series import LinearSystem, Series, StraightLine, series
-from lagjax._program._transpose import copied, pullback
 
 __all__ = [
     "OPERATIONS",
@@ -64,6 +62,7 @@ __all__ = [
     "StraightLine",
     "Tape",
     "Unlowerable",
+    "copied",
     "emit",
     "evaluate",
     "has_own_rules",

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lagjax._program._derivatives import copied, gradient_in, pullback_and_entries
 from lagjax._program._graph import Graph
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS
@@ -30,7 +31,6 @@ from lagjax._program._passes import eliminate_dead_code, live
 from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._sliding import MOST_SLIDING, Slide, dot, with_sliding
-from lagjax._program._transpose import copied, gradient_in, pullback_and_entries
 
 # The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders nobody has to look for.
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK = range(6)

@@ -26,13 +26,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._program import _scalars as xp
-from lagjax._program._differentiate import Derivatives
+from lagjax._program._derivatives import Derivatives, copied
 from lagjax._program._graph import Graph, Unlowerable
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._rules import Expansion, inputs_of, lowers
 from lagjax._program._scalars import Scalars
 from lagjax._program._series import StraightLine
-from lagjax._program._transpose import copied
 
 # The rows of the largest matrix that is written out.
 LARGEST_MATRIX = 8

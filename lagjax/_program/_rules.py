@@ -242,6 +242,27 @@ def is_formula(equation) -> bool:
     return formula_of(equation) is not None or (len(inner) == 1 and formula_of(inner[0]) is not None)
 
 
+_OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"))
+
+
+def has_own_rules(jaxpr) -> bool:
+    """True if a jaxpr, or one that it calls, asks for other derivatives than those of its operations."""
+    return any(
+        not is_formula(equation)
+        and (equation.primitive.name in _OWN_RULES or any(has_own_rules(inner) for inner in _inner(equation)))
+        for equation in live_equations(jaxpr)
+    )
+
+
+def _inner(equation) -> list:
+    params = equation.params
+    if equation.primitive.name == "custom_linear_solve":  # how JAX solves it is not what is lowered
+        params = {"matvec": params["jaxprs"].matvec}
+    leaves = jax.tree.leaves(list(params.values()), is_leaf=lambda x: isinstance(x, core.Jaxpr | core.ClosedJaxpr))
+    closed = (x.jaxpr if isinstance(x, core.ClosedJaxpr) else x for x in leaves)
+    return [x for x in closed if isinstance(x, core.Jaxpr)]
+
+
 @functools.cache
 def _determinant(name: str, shape: tuple[int, ...], dtype) -> tuple[str, ...]:
     """The calls with rules of their own in one of JAX's determinants, also under `vmap`, as texts of their bodies."""

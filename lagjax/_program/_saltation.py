@@ -24,11 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._program._borders import Borders, Pieced
+from lagjax._program._derivatives import copied, pullback, tangents_in, with_tangents
 from lagjax._program._graph import Graph, Unlowerable
 from lagjax._program._passes import eliminate_dead_code, live
-from lagjax._program._pushforward import along, with_tangents
 from lagjax._program._series import Recurrent, StraightLine
-from lagjax._program._transpose import copied, pullback
 
 # Explicit Runge–Kutta methods of order s with s stages: what of the stages before goes into each, and into the step.
 # Source: Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.1.
@@ -276,7 +275,7 @@ class _OverBorder:
         a_behind = [jet[0] for jet in self._rates(place, behind)[n : 2 * n]]
         nodes = copied(graph, self.switch, [*base, *before, *hit])
         rates = [*base[n : 2 * n], *a_before, graph.constant(1.0, "float")]
-        rate = along(graph, self.switch, nodes, dict(enumerate(rates)), {}).get(self.switch.outputs[0], zero)
+        rate = tangents_in(graph, self.switch, nodes, dict(enumerate(rates)), {}).get(self.switch.outputs[0], zero)
         delay = self._delay(place, before, hit, rate)
         there = self._flow(place, before, delay)
         back = self._flow(there, behind, [None if x is None else graph.apply("neg", x) for x in delay])

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lagjax._program._derivatives import copied, gradient_in
 from lagjax._program._graph import Graph
 from lagjax._program._series import LinearSystem, StraightLine
-from lagjax._program._transpose import copied, gradient_in
 
 MOST_SLIDING = 64  # pieces that are unknowns of the linear system: their own elimination takes a third of the cube
 MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for each of which a program is copied, and its operations

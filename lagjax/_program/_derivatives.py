@@ -1,0 +1,412 @@
+"""Derivatives of scalar programs: in forward and in reverse mode, of the nodes of a graph and of straight lines.
+
+A derivative of scalars is more scalars of the same graph. What it costs is then what it consists of: only operations
+that carry a derivative are looked at, where an array derivative goes through every zero of its unit vectors. The rules
+are those of `_operations`: a scalar operation is its own transpose, so that one formula, linear in g, takes a cotangent
+from the result to an operand and a tangent from an operand to the result.
+
+    Derivatives        of nodes of a graph: gradients of a function that was taped, tangents along directions
+    pushforward        of a straight line along one direction, as a straight line
+    with_tangents      a straight line and its tangents along several directions, in one
+    pullback           the transpose of `pushforward`, as a straight line
+    gradient_in        the gradient of a node of a straight line, in the graph in which the line is
+
+These are derivatives of the operations as they stand: `has_own_rules` in `_rules` finds functions with other ones.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from lagjax._program._graph import INPUTS, Graph, Node, Tape
+from lagjax._program._look_ups import Table, moved
+from lagjax._program._operations import LOOK_UPS, OPERATIONS
+from lagjax._program._passes import eliminate_dead_code, factor, replace_by_inputs, sink_negations
+from lagjax._program._series import StraightLine
+
+_Rule = Callable[[int], int]
+Tangents = dict[int, int]  # by the number of the direction; a direction that is not there has none
+
+_LARGEST = 100  # operations of a derivative for one of a line: a bound for errors, three are usual
+
+
+def copied(graph: Graph, line, inputs: Sequence[int], places: Sequence[int] | None = None) -> list[int]:
+    """The nodes of a line, of a tape or of another graph in a graph, where `inputs` are its inputs.
+
+    Tables begin at other inputs where `places` says what input i has become.
+    """
+    nodes: list[int] = []
+    for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
+        if op == "input":
+            nodes.append(graph.real(inputs[attribute]))
+        elif op == "constant":
+            nodes.append(graph.constant(attribute, kind))
+        elif op == "integer_pow":
+            nodes.append(graph.power(nodes[operands[0]], attribute))
+        else:
+            here = moved(attribute, places) if op in LOOK_UPS and places is not None else attribute
+            nodes.append(graph.apply(op, *[nodes[i] for i in operands], attribute=here))
+    return nodes
+
+
+# ---- nodes of a graph -----------------------------------------------------------------------------------------------
+
+
+class Derivatives:
+    """Derivatives of nodes of a graph; `operations` counts what they consist of before anything is simplified."""
+
+    def __init__(self, graph: Graph):
+        self.graph, self.operations = graph, 0
+
+    # ---- reverse mode ----
+
+    def gradient(
+        self, tape: Tape, nodes: list[int], output: int, by: Sequence[int], together: bool, again: Sequence[int] = ()
+    ) -> list[int]:
+        """The derivatives of one scalar of a tape by the inputs at the positions `by`.
+
+        What depends on the inputs `again` will be differentiated once more by these.
+
+        `nodes` holds what the tape is in the graph. The cotangents of scalars that are equal are added up at once where
+        they are to be taken `together`, else each is followed on its own as far as it is written apart.
+        """
+        first: dict[int, int] = {}
+        same = [first.setdefault(i, k) if together else k for k, i in enumerate(nodes)]
+        varied, once_more = (self._varied(tape, nodes, frozenset(inputs)) for inputs in (by, again))
+        cotangents, results = {same[output]: self._number(1.0)}, {}
+        for k in range(output, -1, -1):
+            if not varied[k] or (g := cotangents.pop(k, None)) is None:
+                continue
+            op, operands, attribute = tape.nodes[k]
+            if op == "input":
+                results[attribute] = g
+            rules_of = self._rules if once_more[k] else self._rules_once
+            rules = rules_of(nodes[k], op, [nodes[x] for x in operands], attribute)
+            for x, rule in zip(operands, rules, strict=False):
+                if rule is not None and varied[x]:
+                    self._add(cotangents, same[x], rule(g))
+        return [results.get(i, self._number(0.0)) for i in by]
+
+    def slopes(self, output: int, through: Iterable[int], by: Sequence[int]) -> list[int]:
+        """The derivatives of a node by others, as if these were independent.
+
+        `through` holds the nodes that depend on the others, in order, `output` the last of them.
+        """
+        cotangents, ends = {output: self._number(1.0)}, set(by)
+        for i in reversed(list(through)):
+            if i in ends or (g := cotangents.pop(i, None)) is None:
+                continue
+            op, operands, attribute = self.as_derived(i)
+            for x, rule in zip(operands, self._rules(i, op, operands, attribute), strict=False):
+                if rule is not None and self.graph.value(x) is None:
+                    self._add(cotangents, x, rule(g))
+        return [cotangents.get(i, self._number(0.0)) for i in by]
+
+    def _varied(self, tape: Tape, nodes: list[int], by: frozenset[int]) -> list[bool]:
+        """Which scalars of a tape depend on the inputs `by`, and have a derivative."""
+        varied: list[bool] = []
+        for k, (op, operands, attribute) in enumerate(tape.nodes):
+            depends = attribute in by if op == "input" else any(varied[x] for x in operands)
+            varied.append(depends and tape.kinds[k] == "float" and self.graph.value(nodes[k]) is None)
+        return varied
+
+    # ---- forward mode ----
+
+    def along(self, outputs: Sequence[int], directions: Sequence[Tangents]) -> list[Tangents]:
+        """The derivatives of some nodes along directions, each the tangents of some inputs."""
+        tangents: dict[int, Tangents] = {}
+        for k, direction in enumerate(directions):
+            for i, tangent in direction.items():
+                if self.graph.value(tangent) != 0:
+                    tangents.setdefault(i, {})[k] = tangent
+        for i in self.below(outputs) if tangents else ():
+            if self.graph.kinds[i] == "float" and i not in tangents:
+                moved = not tangents.keys().isdisjoint(self.as_derived(i)[1])
+                if moved and (of_node := self._tangents(i, tangents)):
+                    tangents[i] = of_node
+        return [tangents.get(i, {}) for i in outputs]
+
+    def along_one(self, outputs: Sequence[int], direction: Tangents) -> list[int]:
+        """The derivatives of some nodes along one direction, the tangents of some inputs."""
+        return [t.get(0, self._number(0.0)) for t in self.along(outputs, [direction])]
+
+    def _tangents(self, i: int, tangents: dict[int, Tangents]) -> Tangents:
+        """The tangents of a node, from those of its operands."""
+        (op, operands, attribute), result = self.as_derived(i), {}
+        if op == "div" and all(x in tangents for x in operands):
+            (u, v), found = operands, tangents
+            directions = [*found[v], *(k for k in found[u] if k not in found[v])]
+            return {k: self.of_quotient(i, v, found[u].get(k), found[v].get(k)) for k in directions}
+        for operand, rule in zip(operands, self._rules(i, op, operands, attribute), strict=False):
+            if rule is not None:
+                for k, tangent in tangents.get(operand, {}).items():
+                    self._add(result, k, rule(tangent))
+        return {k: tangent for k, tangent in result.items() if self.graph.value(tangent) != 0}
+
+    def of_quotient(self, w: int, v: int, of_u: int | None, of_v: int | None) -> int:
+        """(u′ − w v′)/v, the tangent of w = u / v: one division, where the two rules have two."""
+        if of_v is None:
+            assert of_u is not None
+            return self._apply("div", of_u, v)
+        part = self._apply("mul", w, of_v)
+        return self._apply("div", self._apply("neg", part) if of_u is None else self._apply("sub", of_u, part), v)
+
+    # ---- rules ----
+
+    def rules(self, w: int, op: str, operands: Sequence[int]) -> list[_Rule | None]:
+        """For every operand what takes a cotangent, or a tangent, past w = op(operands); None: there is none."""
+
+        def passed(rule):
+            return None if rule is None else lambda g: rule(self._apply, self._number, g, w, *operands)
+
+        return [passed(rule) for rule in OPERATIONS[op].transpose()] if operands else []
+
+    def _rules(self, w: int, op: str, operands: Sequence[int], attribute: Any = None) -> Sequence[_Rule | None]:
+        """`rules`, where a power is one operation."""
+        if op == "integer_pow":
+            return [lambda g: self._of_power(operands[0], attribute, g)]
+        return self.rules(w, op, operands)
+
+    def _rules_once(self, w: int, op: str, operands: Sequence[int], attribute: Any) -> Sequence[_Rule | None]:
+        """`_rules` for the only cotangent of w: factors 2 and ½ are next to others, with which they cancel."""
+        if op == "sqrt":
+            return [lambda g: self._apply("mul", self._number(0.5), self._apply("div", g, w))]
+        if op == "mul" and operands[0] == operands[1]:
+            return [lambda g: self._of_power(operands[0], 2, g)]
+        return self._rules(w, op, operands, attribute)
+
+    def _of_power(self, base: int, exponent: float, g: int) -> int:
+        """p uᵖ⁻¹ g, which is finite at u = 0 where the products and roots that make up uᵖ have no derivative."""
+        lower = base if exponent == 2 else self._apply("pow", base, self._number(exponent - 1))
+        return self._apply("mul", g, self._apply("mul", self._number(exponent), lower))
+
+    # ---- the graph ----
+
+    def as_derived(self, i: int) -> Node:
+        """A node as it is differentiated: a power is one operation, not the products that it consists of."""
+        if i in self.graph.powers:
+            base, exponent = self.graph.powers[i]
+            return "integer_pow", (base,), exponent
+        return self.graph.nodes[i]
+
+    def below(self, outputs: Sequence[int]) -> list[int]:
+        """The nodes that some nodes are derived from, and these, in order."""
+        return self.graph.below(outputs, as_derived=True)
+
+    def size(self, outputs: Sequence[int]) -> int:
+        """The number of operations of some nodes together."""
+        return sum(bool(self.graph.nodes[i][1]) for i in self.graph.below(outputs))
+
+    def _apply(self, op: str, *operands: int, attribute=None) -> int:
+        self.operations += 1
+        return self.graph.apply(op, *operands, attribute=attribute)
+
+    def _number(self, x: float) -> int:
+        return self.graph.constant(x, "float")
+
+    def _add(self, parts: dict[int, int], i: int, part: int) -> None:
+        parts[i] = self._apply("add", parts[i], part) if i in parts else part
+
+
+# ---- straight lines -------------------------------------------------------------------------------------------------
+
+
+def pushforward(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=()) -> StraightLine:
+    """From the inputs and the tangents of the inputs `by` to the tangents of the outputs `of`.
+
+    `dtypes` has the type of every input of `line`. Its inputs come first, the tangents after them, and after those the
+    values of the outputs `known`, which are not computed once more.
+    """
+    places = {i: len(dtypes) + k for k, i in enumerate(by)}
+    placed = _PlacedLine.in_new_graph(line, dtypes, len(by))
+    with np.errstate(all="ignore"):
+        tangents = {i: placed.graph.input(place, "float") for i, place in places.items()}
+        moved = placed.tangents(tangents, places, beside=True)
+        zero = placed.graph.constant(0.0, "float")
+        return placed.finished([moved.get(line.outputs[i], zero) for i in of], known, len(dtypes) + len(by))
+
+
+def pullback(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=()) -> StraightLine:
+    """The transpose of `pushforward`: from the inputs and the cotangents of the outputs `of` to those of the inputs
+    `by`.
+
+    `dtypes` has the type of every input of `line`. Its inputs come first, the cotangents after them, and after those
+    the values of the outputs `known`, which are not computed once more.
+    """
+    return pullback_and_entries(line, dtypes, by, of, known)[0]
+
+
+def pullback_and_entries(
+    line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=()
+) -> tuple[StraightLine, tuple[Table, ...]]:
+    """`pullback`, and the cotangents of the entries of tables that are not among the inputs `by`.
+
+    For each of the tables two outputs come behind those of the inputs: the index of an entry, and its cotangent.
+    """
+    placed, tables = _PlacedLine.in_new_graph(line, dtypes), []
+    with np.errstate(all="ignore"):
+        cotangents: dict[int, int] = {}
+        for k, output in enumerate(of):
+            placed._add(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
+        results = placed.cotangents(cotangents, by, tables)
+        results += [i for _, *entry in tables for i in entry]
+        done = placed.finished(results, known, len(dtypes) + len(of))
+    return done, tuple(table for table, *_ in tables)
+
+
+def with_tangents(
+    line: StraightLine, dtypes: Sequence, places: Sequence[int], directions: Sequence[dict[int, int]], of: Sequence
+) -> StraightLine:
+    """A straight line and its tangents along some directions, in one.
+
+    Input i of `line` is input `places[i]` of the result, its tangent along a direction d input `directions[d][i]`; an
+    input that is not there does not move. The outputs are `of`, pairs of an output and a direction, or None for the
+    output itself.
+    """
+    graph, kinds = Graph(_LARGEST * len(line.nodes) * (1 + len(directions)) + 1000), [*map(_kind, dtypes)]
+    with np.errstate(all="ignore"):
+        ids = [
+            place + INPUTS if kind == "float" else graph.input(place, kind)
+            for place, kind in zip(places, kinds, strict=True)
+        ]
+        placed = _PlacedLine(graph, line, copied(graph, line, ids, places))
+        moved = []
+        for direction in directions:
+            tangents = {i: place + INPUTS for i, place in direction.items() if kinds[i] == "float"}
+            moved.append(placed.tangents(tangents, direction))
+        zero = graph.constant(0.0, "float")
+        results = []
+        for output, direction in of:
+            node = line.outputs[output]
+            results.append(placed.nodes[node] if direction is None else moved[direction].get(node, zero))
+        return StraightLine(*eliminate_dead_code(*sink_negations(*factor(graph, results))))
+
+
+def gradient_in(graph: Graph, line: StraightLine, nodes: list[int], node: int, by: Sequence[int]) -> list[int]:
+    """The derivatives of one node of a line by the inputs `by`, as nodes of the graph in which the line is `nodes`."""
+    return _PlacedLine(graph, line, nodes).cotangents({node: graph.constant(1.0, "float")}, by)
+
+
+def tangents_in(
+    graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[int, int], places: dict[int, int]
+) -> dict[int, int]:
+    """The tangents of the nodes of a line that have some, from those of its inputs, in the graph in which it is
+    `nodes`; the tangent of input i is input `places[i]`."""
+    return _PlacedLine(graph, line, nodes).tangents(of_inputs, places)
+
+
+def _kind(dtype) -> str:
+    return "float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name
+
+
+class _PlacedLine(Derivatives):
+    """A straight line that is `nodes` in a graph, of which its derivatives become part."""
+
+    def __init__(self, graph: Graph, line: StraightLine, nodes: list[int]):
+        super().__init__(graph)
+        self.line, self.nodes = line, nodes
+
+    @classmethod
+    def in_new_graph(cls, line: StraightLine, dtypes: Sequence, more: int = 0) -> "_PlacedLine":
+        """The line in a graph of its own, with inputs of these types and this many more floats."""
+        graph = Graph(_LARGEST * len(line.nodes) + 1000)
+        inputs = [graph.input(i, kind) for i, kind in enumerate([*map(_kind, dtypes), *["float"] * more])]
+        with np.errstate(all="ignore"):
+            return cls(graph, line, copied(graph, line, inputs))
+
+    def finished(self, results: list[int], known: Sequence[int], first: int) -> StraightLine:
+        """The line of some results, which reads the outputs `known` of the line as inputs from `first` on."""
+        results, count = results + [self.nodes[self.line.outputs[i]] for i in known], len(results)
+        done = StraightLine(*eliminate_dead_code(*sink_negations(*factor(self.graph, results))))
+        values = done.outputs[count:]
+        positions = {node: first + k for k, node in enumerate(values) if done.nodes[node][1]}
+        return StraightLine(*replace_by_inputs(done.nodes, done.kinds, done.outputs[:count], positions))
+
+    def tangents(self, of_inputs: dict[int, int], places: dict[int, int], beside: bool = False) -> dict[int, int]:
+        """The tangents of the nodes that have some, from those of the inputs.
+
+        The tangent of input i is input `places[i]`. Tables that are not among these have theirs `beside` the inputs.
+        """
+        graph, line, nodes, tangents = self.graph, self.line, self.nodes, {}
+        for k, (op, operands, attribute) in enumerate(line.nodes):
+            if op == "input" and attribute in of_inputs:
+                tangents[k] = graph.real(of_inputs[attribute])
+            if op == "take" and (table := _tangents_of(attribute, places, beside)) is not None:
+                tangents[k] = graph.apply("take", nodes[operands[0]], attribute=table)
+                continue
+            if line.kinds[k] != "float" or not any(i in tangents for i in operands):
+                continue
+            here, parts = [nodes[i] for i in operands], {}
+            if op == "div" and operands[1] in tangents:
+                u, v = operands
+                parts[k] = self.of_quotient(nodes[k], nodes[v], tangents.get(u), tangents[v])
+            else:
+                for i, rule in zip(operands, self.rules(nodes[k], op, here), strict=False):
+                    if rule is not None and i in tangents:
+                        self._add(parts, k, self._zero_where_zero(k, tangents[i], rule(tangents[i])))
+            if k in parts and graph.value(parts[k]) != 0:
+                tangents[k] = parts[k]
+        return tangents
+
+    def cotangents(self, cotangents: dict[int, int], by: Sequence[int], tables: list | None = None) -> list[int]:
+        """The cotangents of the inputs `by`, from those of some nodes.
+
+        Those of entries of a table are added to `tables`: the table, the index, and the cotangent; or, where the table
+        consists of inputs `by`, to each of these.
+        """
+        line, nodes, inputs, results = self.line, self.nodes, frozenset(by), {}
+        varied = self._varied_by(inputs, tables is not None)
+        for k in range(len(line.nodes) - 1, -1, -1):
+            (op, operands, attribute), g = line.nodes[k], cotangents.get(k)
+            if g is None or not varied[k]:
+                continue
+            if op == "input":
+                self._add(results, attribute, g)
+            elif op == "take" and attribute.first not in inputs:
+                assert tables is not None  # else the entry does not vary
+                tables.append((attribute, nodes[operands[0]], g))
+            elif op == "take":
+                for i, position in enumerate(attribute.positions):
+                    at = self.graph.apply("eq", nodes[operands[0]], self._number(float(i)))
+                    self._add(results, position, self.graph.apply("select", at, self._number(0.0), g))
+            else:
+                rules = self.rules(nodes[k], op, [nodes[j] for j in operands])
+                for i, rule in zip(operands, rules, strict=False):  # a step has no derivative at all
+                    if rule is not None and varied[i]:
+                        self._add(cotangents, i, self._zero_where_zero(k, g, rule(g)))
+        return [results[i] if i in results else self._number(0.0) for i in by]
+
+    def _varied_by(self, inputs: frozenset[int], tables: bool) -> list[bool]:
+        """Which nodes depend on some inputs, or on entries of tables."""
+        varied: list[bool] = []
+        for (op, operands, attribute), kind in zip(self.line.nodes, self.line.kinds, strict=True):
+            if op == "take":
+                varied.append(attribute.numbers is None and (tables or attribute.first in inputs))
+            else:
+                depends = attribute in inputs if op == "input" else any(varied[i] for i in operands)
+                varied.append(kind == "float" and depends)
+        return varied
+
+    def _zero_where_zero(self, k: int, g: int, part: int) -> int:
+        """The part of `g` that node k passes on: 0 of 0, also where its slope is infinite, as that of u**0.5 at 0.
+
+        There a program has a number in the place of the slope (`_recurrences.finite`), so that g is 0.
+        """
+        nodes, (op, operands, _) = self.line.nodes, self.line.nodes[k]
+        by_root = op == "div" and (of := nodes[operands[1]][0]) not in ("input", "constant") and OPERATIONS[of].steep
+        if not (OPERATIONS[op].steep or by_root):
+            return part
+        zero = self._number(0.0)
+        return self.graph.apply("select", self.graph.apply("eq", g, zero), part, zero)
+
+
+def _tangents_of(table: Table, places: dict[int, int], beside: bool) -> Table | None:
+    """The table of the tangents of the entries of another one; None where they have none."""
+    if table.numbers is not None:
+        return None
+    if table.first not in places:
+        return table._replace(tangents=True) if beside else None
+    first = places[table.first]
+    stride = places[table.first + table.stride] - first if table.count > 1 else 1
+    return table._replace(first=first, stride=stride)
