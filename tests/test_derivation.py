@@ -280,8 +280,8 @@ SCENES = {
     "many coordinates": (lagjax.System(free), np.ones(80), "machine code", ""),
     "many operations": (lagjax.System(pairs(10)), np.ones(10), "diffrax", "operations, more than"),
     "too many for XLA": (lagjax.System(pairs(5)), np.ones(5), "machine code", ""),
-    "no scalar form": (lagjax.System(lambda q, v: free(q, v) - jnp.sum(jax.scipy.special.gammainc(2.0, q))), np.ones(2),
-                       "diffrax", "igamma"),
+    "no scalar form": (lagjax.System(lambda q, v: free(q, v) - jax.scipy.special.betainc(2.0, 3.0, q[0])), np.ones(2),
+                       "diffrax", "regularized_incomplete_beta"),
     "pivoting": (
         lagjax.System(lambda q, v: v[:-1] @ v[1:] + 0.5 * v[2] ** 2 - q @ q), np.ones(17), "diffrax", "pivoting",
     ),
