@@ -84,7 +84,7 @@ if TYPE_CHECKING:  # each is imported where it is first asked for: all of them t
     from lagjax._animation import Animation
     from lagjax._check import Finding, Findings, check
     from lagjax._crossings import Crossings, crossings
-    from lagjax._diffrax._solvers import FineOutput
+    from lagjax._diffrax import FineOutput
     from lagjax._explain import Explanation
     from lagjax._fit import (
         Delayed,

@@ -4,8 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from lagjax._sweep import Store, run_store, status
-from lagjax._sweep._status import Progress
+from lagjax._sweep import Progress, Store, run_store, status
 
 
 def main(arguments: list[str] | None = None) -> int:

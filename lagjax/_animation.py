@@ -21,7 +21,7 @@ import numpy as np
 from lagjax._arguments import Function, accept
 from lagjax._diagnosis import with_numbers
 from lagjax._display import is_known, numbers_at, times_of_members
-from lagjax._health._measure import Members
+from lagjax._health import Members
 from lagjax._layout import Layout
 
 PyTree = Any

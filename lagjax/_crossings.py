@@ -112,13 +112,13 @@ def crossings(
     if has_constraints(system):
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
         require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
-    surfaces = _surfaces(problem, functions, directions, names)
+    surfaces = surfaces_in(problem, functions, directions, names)
     solution, noted = MachineCode().crossings(problem, surfaces, count)
     how = _how_it_ended if isinstance(solution.y_end, np.ndarray) else _how_it_ended_traced
     result, end, ok = how(noted, solution, count)
     if throw:
         noted = _raise_unless_ok(problem, end, noted, result)
-    return _dressed(problem.layout, names, noted, ok)
+    return as_crossings(problem.layout, names, noted, ok)
 
 
 def _how_it_ended(noted: Noted, solution: Solution, count: int, library: Any = np) -> tuple:
@@ -149,7 +149,7 @@ def _raise_unless_ok(problem: Problem, end: tuple, noted: Noted, result) -> Note
     return noted
 
 
-def _dressed(layout: Layout, names: tuple[str, ...] | None, noted: Noted, ok) -> Crossings | dict[str, Crossings]:
+def as_crossings(layout: Layout, names: tuple[str, ...] | None, noted: Noted, ok) -> Crossings | dict[str, Crossings]:
     """The crossings in the pytree of the user, and by the names of the sections."""
 
     def of_section(k: int) -> Crossings:
@@ -190,11 +190,11 @@ def directions_of(direction, names) -> tuple[int, ...]:
     return tuple(map(int, ways))
 
 
-def _surfaces(problem: Problem, functions, directions, names) -> Surfaces:
+def surfaces_in(problem: Problem, functions, directions, names) -> Surfaces:
     """The sections as programs. Raises `ValueError` where there is no machine code, or a section never changes."""
     if problem.is_single:
         with jax.enable_x64(True):
-            return _surfaces(problem.in_doubles, functions, directions, names)
+            return surfaces_in(problem.in_doubles, functions, directions, names)
     refusal = MachineCode().refuses(problem)
     surfaces = refusal or surfaces_of(problem, functions, directions, "A section")
     if not isinstance(surfaces, str):

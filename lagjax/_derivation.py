@@ -27,18 +27,22 @@ from lagjax._linear import solve_many
 from lagjax._motion import Motion
 from lagjax._native import Projection
 from lagjax._program import (
+    Borders,
     Graph,
     Program,
     Unlowerable,
+    applied,
+    borders,
+    joined,
     lower,
     lower_formula,
     lower_scalars,
     lower_solution,
     operations_that_fit,
+    spread,
+    stacked,
     without_collections,
 )
-from lagjax._program._borders import Borders, borders
-from lagjax._program._scalars import applied, joined, spread, stacked
 from lagjax._quantities import OwnRules, quantities
 from lagjax._recursion import Recursion, RecursiveElimination
 from lagjax._saddle import LARGEST_INDEFINITE, IndefiniteElimination, SaddleElimination, TwoCoordinates

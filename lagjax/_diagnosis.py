@@ -19,8 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._blame import Offender, offenders, pieces_of, poles
-from lagjax._check import check
-from lagjax._check._findings import listed
+from lagjax._check import check, listed
 from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._display import numbers_at
 from lagjax._layout import Layout, halves

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._diffrax import LEAST_RTOL as LEAST_RTOL_OF_DIFFRAX
-from lagjax._diffrax._solvers import FineOutput
+from lagjax._diffrax import FineOutput
 from lagjax._display import as_printed
 from lagjax._engine import choose
 from lagjax._layout import Layout

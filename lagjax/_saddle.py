@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._linear import rank_tolerance, singular_threshold
-from lagjax._program import _scalars as xp
-from lagjax._program._matrices import orthogonalized, row_weights, solve_orthogonalized
+from lagjax._program import orthogonalized, row_weights, solve_orthogonalized
+from lagjax._program import scalars as xp
 
 # The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
 # digits of an acceleration may be lost, and twelve remain. Twice as large, a few more states take the general variant,

@@ -141,7 +141,7 @@ def simulate(
         require_consistent(problem.system, layout, problem.ts, q0, qdot0, problem.params)
     engine = choose(problem, asked).engine
     solution = engine.solve(problem)
-    trajectory = _trajectory(given, engine, solution, given.y0, given.params)
+    trajectory = trajectory_of(given, engine, solution, given.y0, given.params)
     if not throw or (isinstance(solution.result, np.integer) and solution.result in ENDED_WELL):
         return trajectory
     return raise_unless_ok(trajectory, layout)
@@ -192,11 +192,11 @@ def simulate_batch(
     inconsistent = inconsistent_members(system, batch.member.ts, values, axes)
     engine = choose(batch.member, asked).engine
     solution = engine.solve_batch(batch)
-    trajectory = _trajectory(given.member, engine, solution, given.y0, values["params"], batch_axes[2])
+    trajectory = trajectory_of(given.member, engine, solution, given.y0, values["params"], batch_axes[2])
     return trajectory if inconsistent is None else _refused(trajectory, inconsistent)
 
 
-def _trajectory(problem: Problem, engine: AbstractEngine, solution: Solution, y0, params: PyTree, params_axes=None):
+def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, y0, params: PyTree, params_axes=None):
     """The solution in the pytree of the user, of one problem or of a batch; `y0` and `params` are those of all members.
 
     Where nothing is traced, the few numbers stay in NumPy: each one sent to JAX costs as much as ten steps.

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from lagjax._arguments import Function, accept, present
 from lagjax._constraints import Constraints
 from lagjax._derivation import columns_of, derivation_of, numbers_of
-from lagjax._diffrax._equations import form_of
+from lagjax._diffrax import form_of
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
 from lagjax._linear import saddle_many, schur_complements

@@ -20,12 +20,10 @@ import numpy as np
 from lagjax._analysis import Modes
 from lagjax._animation import as_points, course_of, courses_of
 from lagjax._arguments import Function, accept
-from lagjax._check._findings import listed
+from lagjax._check import listed
 from lagjax._crossings import Crossings
 from lagjax._display import is_known, times_of_members
-from lagjax._fit import Fit, Record
-from lagjax._fit._report import draw_record
-from lagjax._fit._result import record_matrix
+from lagjax._fit import Fit, Record, draw_record, record_matrix
 from lagjax._layout import Layout
 from lagjax._precision import WorkPrecision
 from lagjax._trajectory import Trajectory

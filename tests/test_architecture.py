@@ -50,6 +50,22 @@ def test_imports_point_up_the_street():
             assert STREET.index(there) < STREET.index(here), f"{path} imports {there} from below"
 
 
+def test_packages_have_doors():
+    # What another package uses stands in `__init__`, and an underscore name does not cross. `_native` reads the files
+    # of `_program` one by one, since it runs without JAX.
+    packages = {path.parent.name for path in PACKAGE.glob("_*/__init__.py")}
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("lagjax."):
+                continue
+            there, *inside = node.module.split(".")[1:]
+            if there == place(path) or (place(path), there) == ("_native", "_program"):
+                continue
+            private = [alias.name for alias in node.names if alias.name.startswith("_")]
+            assert not (there in packages and inside), f"{path} imports {node.module} past its door"
+            assert not private, f"{path} imports {private} from {node.module}"
+
+
 JAX = {"jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax"}
 ALONE = """
 import importlib.abc, sys, types

@@ -26,7 +26,7 @@ from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
 from lagjax._validate import is_concrete, not_finite
 
-__all__ = ["Finding", "Findings", "check"]
+__all__ = ["Finding", "Findings", "check", "listed"]
 
 PyTree = Any
 

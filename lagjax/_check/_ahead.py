@@ -15,9 +15,7 @@ from lagjax._check._borders import OF_FORCE
 from lagjax._check._findings import Finding, listed
 from lagjax._check._measure import Scene
 from lagjax._derivation import numbers_of
-from lagjax._program import StraightLine, Unlowerable, evaluate
-from lagjax._program._borders import BELOW, Borders
-from lagjax._program._passes import live
+from lagjax._program import BELOW, Borders, StraightLine, Unlowerable, evaluate, live
 
 _PLACES = np.concatenate([s * np.geomspace(1e-3, 1e3, 61) for s in (-1, 1)])  # to start from, in sizes of the number
 _NEWTON = 30  # iterations: a linear number takes two, and what has not come to rest by then is left out

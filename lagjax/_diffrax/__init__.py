@@ -14,6 +14,7 @@ import numpy as np
 import optimistix as optx
 
 from lagjax._constraints import rank_lost
+from lagjax._diffrax._equations import ArrayEquations as ArrayEquations
 from lagjax._diffrax._equations import Equations, form_of
 from lagjax._diffrax._integrate import Jumps, Method, WithJumps, integrate
 from lagjax._diffrax._solvers import FineOutput, Projected
@@ -21,9 +22,7 @@ from lagjax._doubles import DOUBLE, SINGLE
 from lagjax._failures import differentiable_where, lost_unless
 from lagjax._layout import Layout, halves
 from lagjax._problem import AbstractEngine, Batch, Problem, PyTree, Solution, too_tight
-from lagjax._program import Unlowerable
-from lagjax._program._borders import CLOCK
-from lagjax._program._look_ups import table_of
+from lagjax._program import CLOCK, Unlowerable, table_of
 from lagjax._results import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, result_from
 from lagjax._stopped import End, what_stopped
 from lagjax._validate import is_concrete, require_number

@@ -56,8 +56,9 @@ from lagjax._fit._records import (
     require_untraced,
     started,
 )
+from lagjax._fit._report import draw_record
 from lagjax._fit._residuals import AbstractQuestion, Failure, Question, asked, by_name, naming
-from lagjax._fit._result import Covariance, Fit, SignalNoise
+from lagjax._fit._result import Covariance, Fit, SignalNoise, record_matrix
 from lagjax._fit._search import (
     Reader,
     TimeScales,
@@ -91,9 +92,11 @@ __all__ = [
     "Timings",
     "angle",
     "between",
+    "draw_record",
     "fit",
     "inertia",
     "positive",
+    "record_matrix",
     "simplex",
     "wrapped",
 ]  # fmt: skip

@@ -30,9 +30,7 @@ from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Form, Table, asks, started
 from lagjax._hybrid import Hybrid, Scene, first_law, follow
 from lagjax._layout import Layout, halves
-from lagjax._machine_code import Flow, MachineCode, _derivatives, _tolerances, flow_of
-from lagjax._machine_code._derivatives import _projected_start
-from lagjax._machine_code._steps import KEPT
+from lagjax._machine_code import KEPT, Flow, MachineCode, flow_of, jvp, projected_start, tolerances_of
 from lagjax._native import Projection
 from lagjax._problem import Problem
 from lagjax._program import evaluate
@@ -111,7 +109,7 @@ def motions_of(
 class _ByMachineCode(AbstractMotions):
     def __init__(self, problem: Callable[[int], Problem], is_driven: bool):
         """`problem(room)` is about the scene with tables of inputs of this many instants."""
-        self.problem, self.tolerances, self.is_driven = problem, _tolerances(problem(2)), is_driven
+        self.problem, self.tolerances, self.is_driven = problem, tolerances_of(problem(2)), is_driven
         self.projection = None if is_driven else flow_of(problem(2)).projection
 
     def _flow(self, numbers: np.ndarray, table: Table | None) -> tuple[Flow, np.ndarray]:
@@ -128,7 +126,7 @@ class _ByMachineCode(AbstractMotions):
         params_dot = np.zeros((*y0_dot.shape[:2], params.shape[1]))
         params_dot[..., : numbers.shape[-1]] = numbers_dot
         steps = run.path, run.result, run.accepted, run.ticket
-        tangents, _ = _derivatives.jvp(flow, ts, y0, params, steps, y0_dot, params_dot, self.tolerances)
+        tangents, _ = jvp(flow, ts, y0, params, steps, y0_dot, params_dot, self.tolerances)
         return Motion(run.path, tangents, run.result, run.t_end, run.y_end)
 
     def rate(self, t, y, numbers, table=None):
@@ -271,7 +269,7 @@ def _by_steps(projection: Projection, y: np.ndarray, t: np.ndarray, numbers: np.
     y = np.where(still[:, None], y, np.nan)
     along = np.zeros((count, states + len(directions), states)), np.zeros((states + len(directions), len(numbers)))
     along[0][:, :states], along[1][states:] = np.eye(states), directions
-    moved = _projected_start(
+    moved = projected_start(
         projection, t[:, None], y, rows, along[0], np.broadcast_to(along[1], (count, *along[1].shape))
     )
     return Placed(y, moved[:, :states].swapaxes(1, 2), moved[:, states:])

@@ -25,8 +25,7 @@ from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Guess, Measured, real_numbers, require_start
 from lagjax._hybrid import Hybrid, Scene, Transition, follow
 from lagjax._layout import Layout, halves
-from lagjax._machine_code import MachineCode, Noted, Surfaces, _derivatives, _tolerances, flow_of, surfaces_of
-from lagjax._machine_code._steps import KEPT
+from lagjax._machine_code import KEPT, MachineCode, Noted, Surfaces, flow_of, jvp, surfaces_of, tolerances_of, vjp
 from lagjax._problem import Problem
 from lagjax._program import Program, lower
 from lagjax._results import ENDED_WELL
@@ -351,7 +350,7 @@ class Clock(AbstractClock):
             )
         self.noting = flow_of(dataclasses.replace(problem, guards=surfaces.guards(notes=True)))
         self.flow, self.room = flow_of(problem), int(self.flat.numbers.max()) + 1
-        self.tolerances = _tolerances(problem)
+        self.tolerances = tolerances_of(problem)
         self.of_tangents = self.tolerances._replace(rtol=rtol, atol=self.tolerances.atol / _SHARPER)
         self.sections, self._slopes = len(functions), _slopes_of(surfaces, layout.size, len(parameters.first))
         self._last: tuple[bytes, tuple[np.ndarray, np.ndarray]] | None = None
@@ -433,7 +432,7 @@ class Clock(AbstractClock):
 
     def forward(self, crossed: Crossed, y0_dot: np.ndarray, numbers_dot: np.ndarray) -> np.ndarray:
         """Tangents of the times along D directions (N, M, D): of the starts (N, D, 2n), of the parameters (N, D, P)."""
-        tangents, _ = _derivatives.jvp(
+        tangents, _ = jvp(
             self.flow, crossed.ts, crossed.y0, crossed.numbers, crossed.steps, y0_dot, numbers_dot, self.of_tangents
         )  # fmt: skip
         y_dot = np.empty((*crossed.t.shape, *y0_dot.shape[1:]))
@@ -445,7 +444,7 @@ class Clock(AbstractClock):
         """The transpose of `forward`, from cotangents (N, M) of the times: of the starts (N, 2n), and (N, P)."""
         path_ct = np.zeros((len(t_ct), 1, *crossed.steps[0].shape[1:]))
         path_ct[:, 0, 1:] = np.take_along_axis(t_ct[..., None] * crossed.by_y, crossed.order[..., None], axis=1)
-        of_y0, of_numbers = _derivatives.vjp(
+        of_y0, of_numbers = vjp(
             self.flow, crossed.ts, crossed.y0, crossed.numbers, crossed.steps, path_ct,
             np.zeros((len(t_ct), 1, crossed.y0.shape[1])), self.of_tangents,
         )  # fmt: skip

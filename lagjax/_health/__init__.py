@@ -43,7 +43,7 @@ from lagjax._results import RESULTS, advice
 from lagjax._system import System
 from lagjax._validate import is_concrete
 
-__all__ = ["Extreme", "Health", "examine"]
+__all__ = ["Extreme", "Health", "Members", "examine"]
 
 # The part of steps rejected beyond which the motion meets something that the step control does not get over.
 UNSTEADY = 0.5

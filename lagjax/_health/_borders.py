@@ -12,9 +12,7 @@ import numpy as np
 from lagjax._blame import pieces_of
 from lagjax._derivation import derivation_of
 from lagjax._layout import Layout
-from lagjax._machine_code import flow_of
-from lagjax._machine_code._flow import Flow, Tolerances
-from lagjax._machine_code._steps import StepStore
+from lagjax._machine_code import Flow, StepStore, Tolerances, flow_of
 from lagjax._problem import Problem
 from lagjax._program import Unlowerable
 from lagjax._system import System

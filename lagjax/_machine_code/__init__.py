@@ -16,8 +16,10 @@ import numpy as np
 from lagjax._derivation import Derivation
 from lagjax._doubles import in_doubles
 from lagjax._machine_code import _transforms
+from lagjax._machine_code._derivatives import jvp, projected_start, vjp
 from lagjax._machine_code._events import MOST_GUARDS, Noted, along_crossings, surfaces_of, surfaces_of_event, to_event
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
+from lagjax._machine_code._steps import KEPT, StepStore
 from lagjax._machine_code._surfaces import Guarded, Surfaces, moved_with, require_one_number, vector_of
 from lagjax._native import Guards, watched
 from lagjax._platform import default_platform
@@ -26,18 +28,25 @@ from lagjax._program import Program, Unlowerable
 from lagjax._validate import is_concrete
 
 __all__ = [
+    "KEPT",
     "MOST_GUARDS",
     "Flow",
     "Guarded",
     "Guards",
     "MachineCode",
     "Noted",
+    "StepStore",
     "Surfaces",
+    "Tolerances",
     "flow_of",
+    "jvp",
     "moved_with",
+    "projected_start",
     "require_one_number",
     "surfaces_of",
+    "tolerances_of",
     "vector_of",
+    "vjp",
 ]  # fmt: skip
 
 
@@ -111,7 +120,7 @@ class MachineCode(AbstractEngine):
         """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
         if problem.is_single:
             return _in_doubles(self.solve, problem)
-        flow, tolerances = flow_of(problem), _tolerances(problem)
+        flow, tolerances = flow_of(problem), tolerances_of(problem)
         if problem.is_known and default_platform() == "cpu":
             _require_increasing(flow.program, problem.vector)
             ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
@@ -128,7 +137,7 @@ class MachineCode(AbstractEngine):
         """
         ts, y0, numbers = map(jax.lax.stop_gradient, (problem.ts, problem.y0, problem.vector))
         numbers = jnp.concatenate([numbers, jnp.asarray(sides, float)])
-        return _transforms.run(flow_of(problem), _tolerances(problem), ts, y0, numbers)
+        return _transforms.run(flow_of(problem), tolerances_of(problem), ts, y0, numbers)
 
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
         """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""
@@ -139,7 +148,7 @@ class MachineCode(AbstractEngine):
         if problem.is_single:
             return _in_doubles(lambda problem: self.crossings(problem, surfaces, room), problem)
         noting = dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True))
-        flow, tolerances = flow_of(noting), _tolerances(problem)._replace(notes=room)
+        flow, tolerances = flow_of(noting), tolerances_of(problem)._replace(notes=room)
         if problem.is_known:
             ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
             solution = flow.run(ts, y0, params, tolerances)
@@ -161,7 +170,7 @@ class MachineCode(AbstractEngine):
 
 def _run(problem: Problem, given: tuple) -> Solution:
     ts, y0, params = given
-    return flow_of(problem).run(ts, y0, params, _tolerances(problem))
+    return flow_of(problem).run(ts, y0, params, tolerances_of(problem))
 
 
 def _in_doubles(solve: Callable, problem: Problem):
@@ -238,6 +247,7 @@ def _require_increasing(program: Program, vector) -> None:
                 )
 
 
-def _tolerances(problem: Problem) -> Tolerances:
+def tolerances_of(problem: Problem) -> Tolerances:
+    """The numbers that say how exactly, and how long, a problem is integrated."""
     atol = problem.tolerances[1]
     return Tolerances(float(MachineCode().rtol(problem)), 0.0 if atol is None else float(atol), problem.max_steps)

@@ -36,7 +36,7 @@ def jvp(flow: Flow, ts, y0, params, solution, dy0, dparams, tolerances: Toleranc
     path, result, accepted, ticket = solution
     members, m = dy0.shape[:2]
     if flow.projection is not None:
-        dy0 = _projected_start(flow.projection, ts[:, :1], y0, params, dy0, dparams)
+        dy0 = projected_start(flow.projection, ts[:, :1], y0, params, dy0, dparams)
     groups = _groups_of_directions(members, m)
     directions = math.ceil(m / groups)
     padding = ((0, 0), (0, groups * directions - m), (0, 0))
@@ -213,14 +213,14 @@ def _vjp_by_jacobian(
 # differentiated as if it began at the projection of its start, which is that start.
 
 
-def _projected_start(projection: Projection, t, y0, params, dy0, dparams) -> np.ndarray:
+def projected_start(projection: Projection, t, y0, params, dy0, dparams) -> np.ndarray:
     """The tangents (N, m, 2n) of the projection of the starts."""
     inputs = _at_start(t, y0, params, dy0, dparams)
     return evaluate(_moved(projection.state, y0.shape[1]), inputs).T.reshape(dy0.shape)
 
 
 def _through_projected_start(projection: Projection, t, y0, params, y_ct) -> tuple[np.ndarray, np.ndarray]:
-    """The transpose of `_projected_start`: cotangents (N, m, 2n) of the starts, and (N, m, P) of the parameters."""
+    """The transpose of `projected_start`: cotangents (N, m, 2n) of the starts, and (N, m, P) of the parameters."""
     back = evaluate(_transposed(projection.state, y0.shape[1]), _at_start(t, y0, params, y_ct)).T
     back = back.reshape(*y_ct.shape[:2], -1)
     return back[..., : y0.shape[1]], back[..., y0.shape[1] :]

@@ -11,7 +11,7 @@ import numpy as np
 
 from lagjax import _native
 from lagjax._machine_code._flow import NOT_FINITE_RESULT, RESULT_OF_CODE, Flow, Tolerances
-from lagjax._native import _gpu
+from lagjax._native import gpu
 from lagjax._program import Unlowerable
 
 _TARGET = "__gpu$xla.gpu.ptx"
@@ -28,7 +28,7 @@ def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
         raise ValueError(f"solver=lagjax.MachineCode() cannot integrate this scene on a GPU: {reason}.") from None
     members, times = len(y0), ts.shape[1]
     rtol, atol, max_steps, _, notes = tolerances
-    numbers = _gpu.words(
+    numbers = gpu.words(
         members=members, times=times, ts_stride=times if len(ts) > 1 else 0,
         params_stride=flow.numbers if len(params) > 1 else 0, order=_native.order_for(rtol), max_steps=max_steps,
         room_of_notes=notes, rtol=rtol, atol=atol,
@@ -45,11 +45,11 @@ def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
 
 def launch(program: str, operands, results) -> list:
     """Launch a program on its operands: `_native._gpu.RESULTS`, of these shapes."""
-    blocks, threads = _gpu.grid(results[2].shape[0])
+    blocks, threads = gpu.grid(results[2].shape[0])
     sizes = dict(grid_x=blocks, grid_y=1, grid_z=1, block_x=threads, block_y=1, block_z=1, shared_mem_bytes=0)
     attributes = {name: np.int32(size) for name, size in sizes.items()}
     # Nothing clears what a kernel writes to: the counter and the path are given, and written to where they are.
-    aliased = {_gpu.ARGUMENTS.index(name): _gpu.RESULTS.index(name) for name in ("next_member", "path")}
+    aliased = {gpu.ARGUMENTS.index(name): gpu.RESULTS.index(name) for name in ("next_member", "path")}
     call = jax.ffi.ffi_call(_TARGET, results, input_output_aliases=aliased)
     return list(call(*operands, name="integrate", kernel_type="ptx", kernel_data=program, **attributes))
 

@@ -27,6 +27,7 @@ one Taylor series, of the order that the tolerance asks for.
 Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).
 """
 
+from lagjax._native import _gpu as gpu
 from lagjax._native._constants import (
     ATOL_OVER_MOTION,
     ATOL_OVER_RTOL,
@@ -65,6 +66,6 @@ __all__ = [
     "ATOL_OVER_MOTION", "ATOL_OVER_RTOL", "DISCONTINUOUS", "DONE", "EVENT", "GUARD_NOISE", "INSTANT", "NOT_FINITE",
     "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "SMALLEST_STEP", "STEP_TOO_SMALL",
     "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "SweepPlan", "cores", "each_of", "floor_of",
-    "handler", "is_large", "lanes", "order_for", "pieces_of", "recurrences", "require_recurrences",
+    "gpu", "handler", "is_large", "lanes", "order_for", "pieces_of", "recurrences", "require_recurrences",
     "sweep_handler", "unavailable", "watched",
 ]  # fmt: skip

@@ -29,7 +29,7 @@ from lagjax._native._output import RECORDED, recall_pieces
 from lagjax._native._saltation import GuardTable, Saltation, jump_along
 from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._program._borders import Borders
-from lagjax._program._derivatives import pullback, pullback_and_entries
+from lagjax._program._differentiation import pullback, pullback_and_entries
 from lagjax._program._look_ups import Table
 from lagjax._program._series import Recurrent, Series
 

@@ -31,7 +31,7 @@ from lagjax._native._saltation import GuardTable, Saltation, jump_along
 from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._native._tables import Tables
 from lagjax._program._borders import Borders
-from lagjax._program._derivatives import pushforward
+from lagjax._program._differentiation import pushforward
 from lagjax._program._saltation import Jump
 from lagjax._program._series import Recurrent, Series
 

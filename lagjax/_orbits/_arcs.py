@@ -14,8 +14,7 @@ from lagjax._consistent import has_constraints
 from lagjax._derivation import columns_of
 from lagjax._failures import sentence
 from lagjax._layout import Layout, halves
-from lagjax._machine_code import MachineCode, _derivatives, _tolerances, flow_of
-from lagjax._machine_code._steps import KEPT
+from lagjax._machine_code import KEPT, MachineCode, flow_of, jvp, tolerances_of
 from lagjax._orbits._starts import require_untraced
 from lagjax._problem import Problem
 from lagjax._results import SUCCESSFUL
@@ -75,7 +74,7 @@ class Arcs:
 
     def __init__(self, problem: Problem, numbers: np.ndarray):
         self.problem, self.numbers = problem, numbers
-        self.flow, self.tolerances = flow_of(problem), _tolerances(problem)
+        self.flow, self.tolerances = flow_of(problem), tolerances_of(problem)
         self.derivation, self.layout = problem.derivation, problem.layout
         self.size = problem.layout.size
         named = {i for name in ("lagrangian", "mass_matrix", "force") for i in self.derivation.reads(name)}
@@ -149,7 +148,7 @@ class Arcs:
             times, start, dy0, dparams, *steps = (
                 x[well] for x in (times, y0, dy0, dparams, run.path, run.result, run.accepted, run.ticket)
             )
-            moved[well] = _derivatives.jvp(self.flow, times, start, params, steps, dy0, dparams, self.tolerances)[1]
+            moved[well] = jvp(self.flow, times, start, params, steps, dy0, dparams, self.tolerances)[1]
         end = np.where(well[:, None], run.y_end, np.nan)
         moved = np.swapaxes(moved, 1, 2)
         return Arc(end, moved[..., :states], moved[..., states:], run.result, run.t_end, run.accepted)

@@ -37,53 +37,31 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 
-from lagjax._program import _complex, _eigenvalues, _matrices, _special  # noqa: F401  (they register what they lower)
-from lagjax._program._derivatives import Derivatives, copied, pullback, pushforward, with_tangents
+from lagjax._program import _complex, _eigenvalues, _special  # noqa: F401  (they register what they lower)
+from lagjax._program import _scalars as scalars
+from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders
+from lagjax._program._differentiation import Derivatives, copied, pullback, pushforward, with_tangents
 from lagjax._program._emit import Rows, emit, emit_rows, in_jax, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
 from lagjax._program._groups import Groups, groups_of
 from lagjax._program._look_ups import look_up, table_of
+from lagjax._program._matrices import orthogonalized, row_weights, solve_orthogonalized
 from lagjax._program._memory import machine_memory, operations_that_fit, without_collections
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
 from lagjax._program._rules import LARGEST_UNFOLDED, Expansion, has_own_rules, inputs_of, written_out
-from lagjax._program._scalars import Scalars, stacked
+from lagjax._program._scalars import Scalars, applied, joined, spread, stacked
 from lagjax._program._series import LinearSystem, Series, StraightLine, series
 
 __all__ = [
-    "OPERATIONS",
-    "Derivatives",
-    "Expansion",
-    "Graph",
-    "Program",
-    "Scalars",
-    "Series",
-    "StraightLine",
-    "Tape",
-    "Unlowerable",
-    "copied",
-    "emit",
-    "evaluate",
-    "has_own_rules",
-    "in_jax",
-    "inputs_of",
-    "lower",
-    "lower_formula",
-    "lower_scalars",
-    "lower_solution",
-    "machine_memory",
-    "operations_that_fit",
-    "plain_elementary",
-    "pullback",
-    "pushforward",
-    "series",
-    "steps_of",
-    "traced",
-    "with_tangents",
-    "without_collections",
-    "written_out",
-]
+    "BELOW", "CLOCK", "FLOOR", "OPERATIONS", "SIGN", "TABLE", "TRUNC", "Borders", "Derivatives", "Expansion", "Graph",
+    "Program", "Scalars", "Series", "StraightLine", "Tape", "Unlowerable", "applied", "borders", "copied", "emit",
+    "evaluate", "has_own_rules", "in_jax", "inputs_of", "joined", "live", "lower", "lower_formula", "lower_scalars",
+    "lower_solution", "machine_memory", "operations_that_fit", "orthogonalized", "plain_elementary", "pullback",
+    "pushforward", "row_weights", "scalars", "series", "solve_orthogonalized", "spread", "stacked", "steps_of",
+    "table_of", "traced", "with_tangents", "without_collections", "written_out",
+]  # fmt: skip
 
 
 def lower(function: Callable, *examples, budget: int = 20_000) -> "Program":

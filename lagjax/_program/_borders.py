@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._program._derivatives import copied, gradient_in, pullback_and_entries
+from lagjax._program._differentiation import copied, gradient_in, pullback_and_entries
 from lagjax._program._graph import Graph
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS

@@ -6,7 +6,7 @@ An array of 25 000 samples is one `Table`, not 25 000 inputs. Two operations rea
     locate   how many entries of an increasing table are at most x, less one: the piece of it that x is on
 
 An entry is an input of the program, or a number of the program itself. Derivatives by the entries are sparse: `take`
-passes its tangent on from the same place of a table of tangents, and its cotangent to one place (`_derivatives`).
+passes its tangent on from the same place of a table of tangents, and its cotangent to one place (`_differentiation`).
 """
 
 from collections.abc import Sequence

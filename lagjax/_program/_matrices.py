@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._program import _scalars as xp
-from lagjax._program._derivatives import Derivatives, copied
+from lagjax._program._differentiation import Derivatives, copied
 from lagjax._program._graph import Graph, Unlowerable
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._rules import Expansion, inputs_of, lowers

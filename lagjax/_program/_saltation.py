@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._program._borders import Borders, Pieced
-from lagjax._program._derivatives import copied, pullback, tangents_in, with_tangents
+from lagjax._program._differentiation import copied, pullback, tangents_in, with_tangents
 from lagjax._program._graph import Graph, Unlowerable
 from lagjax._program._passes import eliminate_dead_code, live
 from lagjax._program._series import Recurrent, StraightLine

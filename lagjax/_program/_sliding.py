@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._program._derivatives import copied, gradient_in
+from lagjax._program._differentiation import copied, gradient_in
 from lagjax._program._graph import Graph
 from lagjax._program._series import LinearSystem, StraightLine
 

@@ -42,8 +42,8 @@ from lagjax._sweep._unit import compute
 from lagjax._validate import require_flag
 
 __all__ = [
-    "Design", "Failure", "Statistics", "Status", "Store", "Summary", "Sweep", "latin_hypercube", "random", "run_store",
-    "sobol", "status", "sweep",
+    "Design", "Failure", "Progress", "Statistics", "Status", "Store", "Summary", "Sweep", "latin_hypercube", "random",
+    "run_store", "sobol", "status", "sweep",
 ]  # fmt: skip
 
 PyTree = Any

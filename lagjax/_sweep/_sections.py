@@ -14,12 +14,12 @@ import jax
 import numpy as np
 
 from lagjax._consistent import has_constraints
-from lagjax._crossings import _dressed, _surfaces, directions_of, sections_of
+from lagjax._crossings import as_crossings, directions_of, sections_of, surfaces_in
 from lagjax._hybrid import Hybrid, Scene, follow
-from lagjax._machine_code import MachineCode, Noted, _tolerances, flow_of
+from lagjax._machine_code import MachineCode, Noted, flow_of, tolerances_of
 from lagjax._problem import Batch, Solution, axes_per_leaf
 from lagjax._results import RESULTS, SUCCESSFUL, code_of
-from lagjax._simulate import _trajectory, simulate_batch
+from lagjax._simulate import simulate_batch, trajectory_of
 from lagjax._trajectory import Trajectory
 from lagjax._validate import as_arrays, require_budget
 
@@ -118,20 +118,20 @@ def run_batch(
     solution, noted = _along(batch, sections)
     if len(ts) == 2 and not has_constraints(system):
         params = as_arrays(params, batch.member.layout.dtype)
-        run = _trajectory(batch.member, MachineCode(), _with_ends(solution, batch), batch.y0, params, axes[2])
+        run = trajectory_of(batch.member, MachineCode(), _with_ends(solution, batch), batch.y0, params, axes[2])
     else:
         run = simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings)
         noted = _of_those_that_start(noted, np.asarray(run.result._value) != _INCONSISTENT)
     ok = (solution.result == SUCCESSFUL) & (noted.count <= sections.count)
-    return run, _dressed(batch.member.layout, sections.names, noted, ok)
+    return run, as_crossings(batch.member.layout, sections.names, noted, ok)
 
 
 def _along(batch: Batch, sections: Sections) -> tuple[Solution, Noted]:
     """The motions from the first to the last time, and the crossings of G sections, each with that axis in front."""
     section = dict(sections.by_name()) if sections.names else sections.functions[0]
-    surfaces = _surfaces(batch.member, sections_of(section)[1], sections.directions, sections.names)
+    surfaces = surfaces_in(batch.member, sections_of(section)[1], sections.directions, sections.names)
     problem = dataclasses.replace(batch.member, guards=surfaces.guards(notes=True))
-    tolerances = _tolerances(problem)._replace(notes=sections.count)
+    tolerances = tolerances_of(problem)._replace(notes=sections.count)
     ts, y0, params = (np.asarray(x) for x in (problem.ts, batch.y0, batch.vectors))
     solution = flow_of(problem).run(ts[None], y0, params, tolerances)
     path = solution.path.reshape(len(y0), len(sections.functions), sections.count + 1, -1)
