@@ -476,7 +476,7 @@ def test_elimination_is_the_solution_of_the_whole_problem():
     pieces, states, free, damping = 5, 4, 3, 0.3
     rows = rng.normal(size=(pieces, 30, states + free + 1))
     triangles = _residuals.compressed(rows)
-    scale = _descent._scales(triangles, states)
+    scale = _descent.column_norms(triangles, states)
     pull = np.array([0.5, 0.0, 2.0]), np.array([0.1, 0.0, -0.3])
     step = _descent.eliminate(triangles, states, scale, damping, pull)
     whole = np.zeros((pieces * 30 + pieces * states + 2 * free, pieces * states + free))

@@ -109,7 +109,7 @@ def test_slopes_and_the_density_of_hybrid_motion_are_those_of_differences(stuck)
                 u[k] += sign
             else:
                 starts[0, k - 3] += sign
-            moved.append(question.follow(u, starts))
+            moved.append(question.evaluate(u, starts))
         column = k + 2 if k < 3 else k - 3
         for residuals, slopes in zip(zip(*(one.residuals for one in moved), strict=True), point.slopes, strict=True):
             change = (residuals[1] - residuals[0]) / (2 * h)

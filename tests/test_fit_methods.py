@@ -356,9 +356,9 @@ def test_a_report_is_one_file_with_everything(tmp_path):
 
 def weak(fit, u):
     readers = [Reader.of(record) for record in fit.records]
-    scale = min(time_scales(readers, fit.question.motions, fit.parameters.numbers(fit.u)))
-    return _search.imbalance(fit.question, SPRING, readers, scale), _search.weak_start(
-        fit.question, SPRING, u, readers, scale
+    scale = min(time_scales(readers, fit.question.systems[0].motions, fit.parameters.numbers(fit.u)))
+    return _search.imbalance(fit.question.systems[0], readers, scale), _search.balanced(
+        [(fit.question.systems[0], readers, scale)], u
     )
 
 
@@ -424,6 +424,6 @@ def test_inputs_drive_the_density_the_weak_form_and_many_starts():
     central = [(value(x + step) - value(x - step)) / 2e-5 for step in 1e-5 * np.eye(len(x))]
     np.testing.assert_allclose(jax.jit(jax.grad(density))(x), central, rtol=1e-5, atol=1e-4)
     readers = [Reader.of(one)]
-    scale = min(time_scales(readers, fit.question.motions, fit.parameters.numbers(fit.u)))
-    u = _search.weak_start(fit.question, scene, fit.u + 2.0, readers, scale)
+    scale = min(time_scales(readers, fit.question.systems[0].motions, fit.parameters.numbers(fit.u)))
+    u = _search.balanced([(fit.question.systems[0], readers, scale)], fit.u + 2.0)
     np.testing.assert_allclose(fit.parameters.values(u), [0.3, 4.0], rtol=0.1)

@@ -64,11 +64,11 @@ def test_parameters_and_start_come_out_of_crossing_times(exact):
 def test_times_have_the_derivatives_of_differences_forward_and_in_reverse(exact):
     fit = lagjax.fit(SCENE, timings(exact, lagjax.Guess(*START)), TRUTH)
     question, starts = fit.question, np.array([START])
-    point, h = question.at(fit.u, starts), 1e-5
+    point, h = question.evaluate(fit.u, starts), 1e-5
     for k, step in enumerate(h * np.eye(4)):
-        ends = [question.at(fit.u + way * step[2:], starts + way * step[:2]).residuals[0] for way in (1, -1)]
+        ends = [question.evaluate(fit.u + way * step[2:], starts + way * step[:2]).residuals[0] for way in (1, -1)]
         np.testing.assert_allclose(point.slopes[0][..., k], (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-8)
-    [clock] = question.clocks.values()
+    [clock] = question.systems[0].clocks.values()
     crossed = clock.crossed(starts, fit.parameters.numbers(fit.u)[None])
     weights = np.linspace(-1.0, 2.0, crossed.t.shape[1])
     of_start, of_numbers = (x[0] for x in clock.reverse(crossed, weights[None]))
@@ -91,6 +91,12 @@ def test_records_and_timings_of_one_motion_are_fitted_together(exact):
     assert (np.abs([both.params["c"] - 0.05, both.params["g"] - 9.81]) < 4 * deviation).all()
     assert abs(both.params["g"] - alone.params["g"]) < 3 * deviation[1]
     assert both.predict(both.records[1]).residuals.std() == pytest.approx(both.rms["q"], rel=0.1)
+
+
+def test_a_record_that_is_not_of_the_scene_beside_timings_ends_in_a_verdict(exact):
+    ts = np.linspace(0.0, 4.0, 81)
+    fit = lagjax.fit(SCENE, [timings(exact), lagjax.Record(ts, np.sin(7 * ts))], FIRST, method="whole")
+    assert not fit.ok and "of q: its motion is not that of the scene" in fit.message
 
 
 @pytest.mark.slow

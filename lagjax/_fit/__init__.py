@@ -1,6 +1,6 @@
 """`fit`: the parameters of a scene, and of its forces, from recordings of its motion.
 
-    Record ─► Question ─► segments ─► Descent ─► Information ─► Fit
+    Record ─► Residuals ─► segments ─► Descent ─► Information ─► Fit
     measured  flat, one   where the   the least   covariance,    in the user's
     checked   batch       search      squares     null           pytree, in words
                           begins                  directions
@@ -49,15 +49,18 @@ from lagjax._fit._records import (
     Measured,
     Record,
     asks,
+    errors_of_system,
     in_structure,
     known_start,
     require_alike,
     require_held,
     require_untraced,
     started,
+    systems_by_name,
+    whole,
 )
 from lagjax._fit._report import draw_record
-from lagjax._fit._residuals import AbstractQuestion, Failure, Question, asked, by_name, naming
+from lagjax._fit._residuals import Failure, Residuals, SystemResiduals
 from lagjax._fit._result import Covariance, Fit, SignalNoise, record_matrix
 from lagjax._fit._search import (
     Reader,
@@ -71,7 +74,6 @@ from lagjax._fit._search import (
     searches,
     time_scales,
     weakly,
-    whole,
 )
 from lagjax._fit._sensors import UNCLEAR, Delayed, Signals, looks_like_positions, require_no_jumps, sensors, wrapped
 from lagjax._fit._timings import Timings, clock_of
@@ -224,8 +226,8 @@ def _mistakes(
     if len(scenes) > 1 or how.method == "gradient":
         return []
     [scene] = scenes
-    once, about = how._replace(starts=1, progress=False), _question(scene, parameters)
-    reading = [reader for reader in _readers(scenes, about) or [] if reader is not None]
+    once, about = how._replace(starts=1, progress=False), _residuals_of(scene, parameters)
+    reading = [reader for reader in _readers(scenes, Residuals([about])) or [] if reader is not None]
     if not about.signals.names:
         return []
 
@@ -256,7 +258,7 @@ class _How(NamedTuple):
 
 def _answer(how: _How, scenes: list["_Scene"], params0: PyTree, parameters: Parameters) -> tuple[Fit, Verdict]:
     """The fit of records that were checked. Raises `Unfollowed` where the first trial cannot be followed."""
-    question = asked({scene.name: _question(scene, parameters) for scene in scenes})
+    question = Residuals([_residuals_of(scene, parameters) for scene in scenes])
     _require_one_beginning(question, how.starts, how.method)
     readers = _readers(scenes, question)
     if how.progress:
@@ -264,10 +266,9 @@ def _answer(how: _How, scenes: list["_Scene"], params0: PyTree, parameters: Para
     y0 = _starts(scenes, readers, question.states, params0)
     readers = _to_cut(scenes, readers, how.method)
     first, noise = parameters.moved(parameters.first), how.noise
-    systems = {scene.name: scene.system for scene in scenes}
     if how.method == "gradient":
-        return _told(how, by_gradient(question, systems, first, y0, noise, readers), None)
-    weak = functools.partial(weakly, question, list(systems.values()), readers=readers or [])
+        return _told(how, by_gradient(question, first, y0, noise, readers), None)
+    weak = functools.partial(weakly, question, readers=readers or [])
     search = functools.partial(search_records, question, noise=noise, method=how.method, readers=readers, weak=weak)
     return _told(how, *searches(question, search, first, y0, how.starts, how.seed))
 
@@ -287,8 +288,8 @@ class _Scene(NamedTuple):
 def _scenes(system, records, params0, observe, hold: str) -> list[_Scene]:
     """The systems with their records, checked."""
     scenes = []
-    for name, one, own, shown in by_name(system, records, observe):
-        with naming(name):
+    for name, one, own, shown in systems_by_name(system, records, observe):
+        with errors_of_system(name):
             one = require_scene(one)
             own = require_alike(own)
             form = _form(one, own, hold)
@@ -296,7 +297,7 @@ def _scenes(system, records, params0, observe, hold: str) -> list[_Scene]:
     return scenes
 
 
-def _require_one_beginning(question: AbstractQuestion, starts: int, method: str) -> None:
+def _require_one_beginning(question: Residuals, starts: int, method: str) -> None:
     """Raise `ValueError` where many starts, or a descent by gradients, are asked for and cannot be."""
     if not len(question.parameters) and (method == "gradient" or starts > 1):
         raise ValueError(
@@ -305,7 +306,7 @@ def _require_one_beginning(question: AbstractQuestion, starts: int, method: str)
         )
     if method == "gradient" and starts > 1:
         raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
-    for one in [part.question for part in question.parts] if starts > 1 else []:
+    for one in [part.system for part in question.parts] if starts > 1 else []:
         if one.signals.delays is not None:
             raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")
         if one.manifold is not None and one.fitted.any():
@@ -365,13 +366,13 @@ def _layout(system: Scene, records: list[Record], params0, form: Form | None) ->
     return replace(Layout.of(q, qdot), dtype=DOUBLE)
 
 
-def _question(scene: _Scene, parameters: Parameters) -> Question:
-    """The question about whole records of one system."""
-    with naming(scene.name):
-        return _about(*scene[1:], parameters)
+def _residuals_of(scene: _Scene, parameters: Parameters) -> SystemResiduals:
+    """The residuals of whole records of one system."""
+    with errors_of_system(scene.name):
+        return _about(*scene, parameters)
 
 
-def _about(system, records, observe, form, layout, parameters) -> Question:
+def _about(name, system, records, observe, form, layout, parameters) -> SystemResiduals:
     rtol = DEFAULT_RTOL
     motions = motions_of(system, layout, parameters, rtol, None, form)
     recordings = [record for record in records if isinstance(record, Record)]
@@ -393,9 +394,9 @@ def _about(system, records, observe, form, layout, parameters) -> Question:
         manifold = Manifold(system, layout, parameters, motions.projection)
     elif has_constraints(system) and fitted.any():
         raise ValueError("A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0).")
-    return Question(
-        records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0), rtol, clocks,
-        manifold,
+    return SystemResiduals(
+        name, system, records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0),
+        rtol, clocks, manifold,
     )  # fmt: skip
 
 
@@ -440,7 +441,7 @@ def _sizes(recordings: list[Record]) -> np.ndarray:
     return np.sqrt(np.nanmean(np.concatenate([record.matrix for record in recordings]) ** 2, axis=0))
 
 
-def _readers(scenes: list[_Scene], question: AbstractQuestion) -> list[Reader | None] | None:
+def _readers(scenes: list[_Scene], question: Residuals) -> list[Reader | None] | None:
     """Readers of states off the data, for each record whose signals are positions; None where there is no such record.
 
     All records of a system together try windows at a few hundred places.
@@ -449,7 +450,7 @@ def _readers(scenes: list[_Scene], question: AbstractQuestion) -> list[Reader | 
     for scene, part in zip(scenes, question.parts, strict=True):
         probes = max(8, 256 // len(scene.records))
         readers += [
-            reader_of(record, scene.observe, part.question, numbers, probes) if isinstance(record, Record) else None
+            reader_of(record, scene.observe, part.system, numbers, probes) if isinstance(record, Record) else None
             for record in scene.records
         ]
     return readers if any(reader is not None for reader in readers) else None
@@ -474,7 +475,7 @@ def _starts(scenes: list[_Scene], readers: list[Reader | None] | None, states: i
     found, first = [], 0
     for scene in scenes:
         own = None if readers is None else readers[first : first + len(scene.records)]
-        with naming(scene.name):
+        with errors_of_system(scene.name):
             found += [_start(record, own, scene, k, params0) for k, record in enumerate(scene.records)]
         first += len(scene.records)
     return np.stack([roomy(state, states) for state in found])
@@ -548,7 +549,7 @@ def _told(how: _How, descent: Descent, waterfall: Waterfall | None) -> tuple[Fit
     return done, found
 
 
-def _noise_by_name(question: AbstractQuestion, widths, known: Information) -> dict[str, SignalNoise]:
+def _noise_by_name(question: Residuals, widths, known: Information) -> dict[str, SignalNoise]:
     samples = (question.weights > 0).sum(axis=0)
     columns = zip(widths.sigma, widths.dof, samples, known.effective, 2 * (1 - known.correlation), strict=True)
     return {
@@ -557,7 +558,7 @@ def _noise_by_name(question: AbstractQuestion, widths, known: Information) -> di
     }
 
 
-def _by_record(question: AbstractQuestion, point) -> list[PyTree]:
+def _by_record(question: Residuals, point) -> list[PyTree]:
     """The residuals of every record in its structure, NaN where nothing was measured."""
     columns = [question.columns(k) for k in range(len(question.records))]
     found = [

@@ -61,13 +61,7 @@ from scipy.special import polygamma
 from lagjax._doubles import accepts_singles
 from lagjax._fit._noise import AbstractNoise, StudentT, Widths
 from lagjax._fit._parameters import AbstractSeparable
-from lagjax._fit._records import Driven, Samples, asks, started
-from lagjax._fit._residuals import AbstractQuestion, Failure, Part, Point, compressed
-from lagjax._fit._sensors import on_circle
-from lagjax._hybrid import Scene
-from lagjax._hybrid import follow as follow_scene
-from lagjax._layout import halves
-from lagjax._system import System
+from lagjax._fit._residuals import Failure, Point, Residuals, compressed
 
 _LEAST_DOF, _MOST_DOF = 1.0, 200.0  # ν is between these, with a flat density of its logarithm
 
@@ -81,85 +75,30 @@ class Unknowns(NamedTuple):
     dof: Any
 
 
-class OfSystem:
-    """The residuals of the records of one system, for JAX: gradients come back over the steps of their motions.
-
-    `rows` (N,) says which of all records these are.
-    """
-
-    def __init__(self, part: Part, rows: np.ndarray, system: Scene):
-        question = part.question
-        if question.manifold is not None and question.fitted.any():
-            raise ValueError("There is no density for starts on constraints that are fitted: give start=(q0, qdot0).")
-        if question.signals.delays is not None:
-            raise ValueError("There is no density for lagjax.Delayed sensors: keep the delay, and shift the times.")
-        self.question, self.rows, self.signals = question, rows, part.signals
-        form = question.signals.form
-        self._form = form if form is not None and asks(system) else None
-        self._scene = system
-        if self._form is not None and isinstance(system, System):
-            self._scene = self._form.driven(system)
-
-    def begun(self, starts, params):
-        """The starts of all records (N, 2n), of which some of this system are functions of the parameters."""
-        layout, states = self.question.layout, self.question.states
-        for row, piece in zip(self.rows, self.question.pieces, strict=True):
-            start = self.question.records[piece.record].start
-            if callable(start) and piece.places[0] == 0:
-                pair = started(start, params)
-                starts = starts.at[row, :states].set(jnp.concatenate([layout.flatten(half) for half in pair]))
-        return starts
-
-    def residuals(self, batch: Samples, at: Unknowns):
-        """The outputs of the sensors less the measurements, (N, T, S of this system), of the records of one batch."""
-        layout, signals = self.question.layout, self.question.signals
-        numbers = self.question.parameters.numbers(at.u, jnp)
-        params = self.question.parameters.restore(numbers)
-        starts = at.starts[self.rows[batch.rows], : self.question.states]
-        record = self.question.pieces[batch.rows[0]].record
-        if record in self.question.clocks:
-            times = self.question.clocks[record].times(starts[0], numbers)
-            shown = jnp.zeros(batch.values.shape).at[0, :, -1].set(times)
-            return jnp.where(batch.weights > 0, shown - batch.values, 0.0)
-
-        def follow(ts, y0, inputs, table):
-            q, qdot = map(layout.restore, halves(y0))
-            own = params if self._form is None else Driven(params, *table)
-            motion = follow_scene(self._scene, q, qdot, ts, own, rtol=self.question.rtol, throw=False)
-            rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))(motion.q, motion.qdot)
-            return jax.vmap(lambda y, t, i: signals.at_one_time(y, t, numbers, i))(rows, ts, inputs)
-
-        ts, values, inputs = (jnp.asarray(x, at.u.dtype) for x in (batch.ts, batch.values, batch.inputs))
-        table = None if batch.table is None else tuple(jnp.asarray(x, at.u.dtype) for x in batch.table)
-        shown = jax.vmap(follow)(ts, starts, inputs, table)
-        shown = jnp.zeros(values.shape, values.dtype).at[..., : shown.shape[-1]].set(shown)
-        return jnp.where(batch.weights > 0, on_circle(shown - values, self.question.periods, jnp), 0.0)
-
-
 class Density:
     """log p(x), called with x (D,), for records whose residuals are those of `question` at `point`.
 
-    - `systems`: the scenes by the names that they have in the question, None for the only one.
     - `first` (D,): the fit; `names` (D,): what the numbers are called.
     - `of_starts` (N, 2n): which numbers of x the starts are; D for one that is known, or that a system does not have.
     - `shares` (S,): how many independent samples one sample of each signal is worth.
     """
 
     def __init__(
-        self, question: AbstractQuestion, systems: dict[str | None, Scene], noise: AbstractNoise, point: Point,
-        widths: Widths, shares: np.ndarray, prior: Callable | None = None,
+        self, question: Residuals, noise: AbstractNoise, point: Point, widths: Widths, shares: np.ndarray,
+        prior: Callable | None = None,
     ):  # fmt: skip
         self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths
-        self.systems = [OfSystem(part, rows, systems[part.name]) for part, rows in question.apart]
-        self.dtype = np.result_type(*(one.question.layout.dtype for one in self.systems))
+        for part in question.parts:
+            part.system.require_traced()
+        self.dtype = np.result_type(*(part.system.layout.dtype for part in question.parts))
         self._tails = np.isfinite(widths.dof)
         self.moves_dof = isinstance(noise, StudentT) and noise.dof is None
         share = np.log(np.clip(widths.dof, 1.01 * _LEAST_DOF, 0.99 * _MOST_DOF) / _LEAST_DOF)
         share = share / math.log(_MOST_DOF / _LEAST_DOF)
         dof = np.log(share / (1 - share)) if self.moves_dof else np.zeros(0)
         moves = np.zeros((len(question.pieces), question.states), bool)
-        for one in self.systems:
-            moves[one.rows, : one.question.states] = question.fitted[one.rows, None]
+        for part in question.parts:
+            moves[part.rows, : part.system.states] = question.fitted[part.rows, None]
         free, starts = len(point.u), point.starts[moves]
         self.first = np.concatenate([point.u, starts, np.log(widths.sigma), dof])
         self.of_starts = np.full(moves.shape, len(self.first))
@@ -169,7 +108,7 @@ class Density:
 
     def _names_of_starts(self) -> list[str]:
         question = self.question
-        layouts = {row: one.question.layout for one in self.systems for row in one.rows.tolist()}
+        layouts = {row: part.system.layout for part in question.parts for row in part.rows.tolist()}
         return [
             f"starts{question.called(question.pieces[row].record).removeprefix('records')}.{half}{name[1:]}"
             for row in np.flatnonzero(question.fitted).tolist()
@@ -188,8 +127,8 @@ class Density:
         """A vector (D,) taken apart."""
         u, starts = x[: len(self.question.parameters)], jnp.asarray(self.point.starts, x.dtype)
         starts = jnp.where(self.of_starts < len(self), jnp.append(x, 0.0)[self.of_starts], starts)
-        for one in self.systems:
-            starts = one.begun(starts, self.params(u))
+        for part in self.question.parts:
+            starts = part.system.traced_starts(starts, part.rows, self.params(u))
         dof = self._dof(x[self.of_noise.stop :]) if self.moves_dof else jnp.asarray(self.widths.dof, x.dtype)
         return Unknowns(u, starts, jnp.exp(x[self.of_noise]), dof)
 
@@ -227,10 +166,10 @@ class Density:
     def residuals(self, at: Unknowns) -> list:
         """The outputs of the sensors less the measurements, (N, T, S), of every batch of the question."""
         found, signals = [], len(self.question.names)
-        for one in self.systems:
-            for batch in one.question.batches:
-                own = one.residuals(batch, at)
-                found.append(jnp.zeros((*own.shape[:2], signals), own.dtype).at[..., one.signals].set(own))
+        for part in self.question.parts:
+            for batch in part.system.batches:
+                own = part.system.traced(batch, at.u, at.starts[part.rows[batch.rows], : part.system.states])
+                found.append(jnp.zeros((*own.shape[:2], signals), own.dtype).at[..., part.signals].set(own))
         return found
 
     def of_weighted(self, weighted: list, counted: list, at: Unknowns):
@@ -506,7 +445,7 @@ def _trial(chart: Chart, zeta: np.ndarray) -> Point | Failure:
     """The residuals and their derivatives at ζ (D,)."""
     density, x = chart.density, chart.at(zeta)
     starts = np.where(density.of_starts < len(x), np.append(x, 0.0)[density.of_starts], density.point.starts)
-    return density.question.follow(x[: len(density.point.u)], starts)
+    return density.question.evaluate(x[: len(density.point.u)], starts, notify=False)
 
 
 def _jacobians(chart: Chart, trial: Point, zeta: np.ndarray, states: int) -> list[np.ndarray]:

@@ -34,9 +34,8 @@ import numpy as np
 
 from lagjax._fit._density import Density
 from lagjax._fit._noise import AbstractNoise, Widths
-from lagjax._fit._residuals import AbstractQuestion, Failure, Point, compressed, triangle_of
+from lagjax._fit._residuals import Failure, Point, Residuals, compressed, triangle_of
 from lagjax._fit._uncertainty import share
-from lagjax._hybrid import Scene
 
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
 # least one, damping is below the round-off of derivatives and only keeps columns that nothing depends on from moving.
@@ -66,7 +65,7 @@ class Descent(NamedTuple):
     converged: bool
     trials: int
     message: str
-    question: AbstractQuestion
+    question: Residuals
 
 
 class Step(NamedTuple):
@@ -98,7 +97,7 @@ class Anchor(NamedTuple):
 
 
 def minimise(
-    question: AbstractQuestion,
+    question: Residuals,
     u: np.ndarray,
     starts: np.ndarray,
     noise: AbstractNoise,
@@ -113,7 +112,7 @@ def minimise(
     parameter is further than √(2 enough) standard deviations from the minimum.
     A `Failure` is returned where the motion from the first trial cannot be followed.
     """
-    point = question.at(u, starts)
+    point = question.evaluate(u, starts)
     if isinstance(point, Failure):
         return point
     anchor = Anchor.none(u) if anchor is None else anchor
@@ -153,11 +152,11 @@ class _Model(NamedTuple):
 
     def step(self, damping: float) -> Step:
         """The damped step from the trial."""
-        scale = _scales(self.triangles, self.states)
+        scale = column_norms(self.triangles, self.states)
         return eliminate(self.triangles, self.states, scale, damping, self.pull, self.limits)
 
 
-def _model(question: AbstractQuestion, point: Point, noise: AbstractNoise, anchor: Anchor) -> _Model:
+def _model(question: Residuals, point: Point, noise: AbstractNoise, anchor: Anchor) -> _Model:
     widths = question.widths(point, noise)
     factors = question.factors(point, widths)
     triangles, cost = question.triangles(point, factors), question.cost(point, factors) + anchor.cost(point.u)
@@ -166,7 +165,7 @@ def _model(question: AbstractQuestion, point: Point, noise: AbstractNoise, ancho
 
 
 def _descended(
-    question: AbstractQuestion, point: Point, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
+    question: Residuals, point: Point, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
 ) -> tuple[Point | None, float, int]:
     """The first trial that is better, the damping to go on with, and the count of trials.
 
@@ -177,7 +176,7 @@ def _descended(
         step = model.step(damping)
         if step.gain <= _FLAT * model.cost or damping > _MOST:
             break
-        trial = question.at(question.parameters.stepped(point.u, step.u), point.starts + step.starts)
+        trial = question.evaluate(question.parameters.stepped(point.u, step.u), point.starts + step.starts)
         trials += 1
         if not isinstance(trial, Failure):
             fall = model.cost - question.cost(trial, model.factors) - anchor.cost(trial.u)
@@ -190,8 +189,8 @@ def _descended(
 def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, limits=(-np.inf, np.inf)) -> Step:
     """The damped step for the triangles (N, D + 1, D + 1) of all pieces, whose first `states` columns are starts.
 
-    `scale` holds the norms of the columns (`_scales`), and `pull` is (weight, residuals), (F,) each, of an anchor of
-    the parameters. A parameter that would step beyond its `limits`, (low, high), is damped more than the others.
+    `scale` holds the norms of the columns (`column_norms`), and `pull` is (weight, residuals), (F,) each, of an anchor
+    of the parameters. A parameter that would step beyond its `limits`, (low, high), is damped more than the others.
     """
     of_starts, of_u = scale
     (pieces, columns, _), free = triangles.shape, len(of_u)
@@ -222,7 +221,7 @@ def _within_limits(rest: np.ndarray, of_u: np.ndarray, damping: float, limits) -
         each[beyond] *= 10.0
 
 
-def _scales(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
+def column_norms(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     """The norms of the columns of starts (N, 2n) and of parameters (F,); one where nothing depends on a column."""
     of_starts = np.linalg.norm(triangles[..., :states], axis=1)
     of_u = np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
@@ -235,8 +234,8 @@ _STILL = 1.0  # what log L may gain over the last tenth of the steps where the d
 
 
 def descend(
-    question: AbstractQuestion, systems: dict[str | None, Scene], u: np.ndarray, starts: np.ndarray,
-    noise: AbstractNoise, steps: int, told: Callable[[str], None] | None = None,
+    question: Residuals, u: np.ndarray, starts: np.ndarray, noise: AbstractNoise, steps: int,
+    told: Callable[[str], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, bool] | Failure:  # fmt: skip
     """u (F,), the starts (N, 2n) after this many steps, and whether log L has come to rest.
 
@@ -244,7 +243,7 @@ def descend(
     """
     optax = _optax()
     whole = Widths(question.size, np.full(len(question.size), np.inf))
-    density = Density(question, systems, noise, Point(u, starts, [], []), whole, np.ones(len(question.size)))
+    density = Density(question, noise, Point(u, starts, [], []), whole, np.ones(len(question.size)))
     first = _with_noise(density, question, noise)
     if isinstance(first, Failure):
         return first
@@ -276,7 +275,7 @@ def descend(
     return x[: len(u)], np.asarray(at.starts, float), bool((rest - costs[-1]) * question.measured < _STILL)
 
 
-def _with_noise(density: Density, question: AbstractQuestion, noise: AbstractNoise) -> np.ndarray | Failure:
+def _with_noise(density: Density, question: Residuals, noise: AbstractNoise) -> np.ndarray | Failure:
     """The first x (D,), with the noise that its residuals have."""
     at = density.unknowns(jnp.asarray(density.first, density.dtype))
     left = [np.asarray(residuals, float) for residuals in density.residuals(at)]
@@ -299,20 +298,18 @@ def _units(density: Density, x: np.ndarray) -> np.ndarray:
     scale = np.ones(len(x))
     unbounded = np.isinf(question.parameters.reach)
     scale[:free] = np.where(unbounded, np.maximum(1.0, np.abs(x[:free])), 1.0)
-    for one in density.systems:
-        fitted = one.rows[one.question.fitted]
+    for part in question.parts:
+        fitted = part.rows[part.system.fitted]
         if len(fitted):
-            places = density.of_starts[fitted, : one.question.states]
+            places = density.of_starts[fitted, : part.system.states]
             size = np.sqrt(np.mean(x[places] ** 2, axis=0))
             scale[places] = np.where(size > 0, size, 1.0)
     return scale
 
 
-def ended(
-    question: AbstractQuestion, u: np.ndarray, starts: np.ndarray, noise, steps: int, rest: bool
-) -> Descent | Failure:
+def ended(question: Residuals, u: np.ndarray, starts: np.ndarray, noise, steps: int, rest: bool) -> Descent | Failure:
     """The result of the descent, with the derivatives that intervals need."""
-    point = question.at(u, starts)
+    point = question.evaluate(u, starts)
     if isinstance(point, Failure):
         return point
     text = f"The descent by gradients came to rest within {steps} steps."

@@ -34,7 +34,7 @@ from scipy.special import stdtrit
 
 from lagjax._fit._descent import minimise
 from lagjax._fit._noise import Known, Widths, log_likelihood
-from lagjax._fit._residuals import AbstractQuestion, Failure
+from lagjax._fit._residuals import Failure, Residuals
 from lagjax._fit._uncertainty import Information
 
 _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT = 1e-2, 40  # a record left out is then told to a hundredth of its noise
@@ -118,7 +118,7 @@ def _table(names, free, logs, aic, bic, left) -> list[str]:
     return rows
 
 
-def left_out(question: AbstractQuestion, u: np.ndarray, states: np.ndarray, law, widths: Widths, folds: int):
+def left_out(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths: Widths, folds: int):
     """The root mean square residuals by signal of records that were left out, and for each group their mean logarithm.
 
     Infinite where one cannot be followed. A signal that only the records left out have is as noisy as `widths` (S,) of
@@ -153,7 +153,7 @@ def _of_signals(names: tuple[str, ...], *known: tuple[tuple[str, ...], Widths]) 
     return Widths(*(np.array(numbers) for numbers in zip(*(found[name] for name in names), strict=True)))
 
 
-def _part(question: AbstractQuestion, keep: np.ndarray) -> AbstractQuestion:
+def _part(question: Residuals, keep: np.ndarray) -> Residuals:
     """The question about some of its pieces."""
     part = question.of([p for p, k in zip(question.pieces, keep, strict=True) if k], question.fitted[keep])
     part.watch = None
@@ -217,7 +217,7 @@ class _Place(NamedTuple):
 class _Line:
     """The values of one unknown, of which every one asked for begins from its neighbours."""
 
-    def __init__(self, question: AbstractQuestion, u, starts, widths: Widths, known: Information, which: int):
+    def __init__(self, question: Residuals, u, starts, widths: Widths, known: Information, which: int):
         self.question, self.widths, self.which = question, widths, which
         reported, white = known.covariance[which, which], known.white[which, which]
         self.scale = white / reported if np.isfinite(reported) and reported > 0 else 1.0 / known.lost
@@ -266,9 +266,7 @@ class _Line:
         return float(done.point.u[self.which]), 2.0 * self.scale * lost
 
 
-def profile(
-    question: AbstractQuestion, u, starts, widths: Widths, known: Information, name: str, level: float
-) -> Profile:
+def profile(question: Residuals, u, starts, widths: Widths, known: Information, name: str, level: float) -> Profile:
     """The profile of the free number called `name`."""
     parameters = question.parameters
     line = _Line(question, u, starts, widths, known, parameters.unknown(name))

@@ -17,9 +17,9 @@ from lagjax._fit._descent import minimise
 from lagjax._fit._noise import AbstractNoise, Known, Widths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._profile import Comparison, Profile, comparison, effective_share, profile
-from lagjax._fit._records import Guess, Piece, Record, in_structure, known_start, require_alike, require_held
+from lagjax._fit._records import Guess, Record, in_structure, known_start, require_alike, require_held
 from lagjax._fit._report import Drawn, draw_record, page, pictures_of
-from lagjax._fit._residuals import AbstractQuestion, Failure, Part, Point, Question
+from lagjax._fit._residuals import Failure, Point, Residuals, SystemPart, SystemResiduals
 from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._search import Waterfall, reader_of
 from lagjax._fit._sensors import UNCLEAR, looks_like_positions, on_circle
@@ -123,7 +123,7 @@ class Fit:
     law: AbstractNoise = field(repr=False)
     information: Information = field(repr=False)
     widths: Widths = field(repr=False)
-    question: AbstractQuestion = field(repr=False)
+    question: Residuals = field(repr=False)
     system: Any = field(repr=False)
     observe: Any = field(repr=False)
 
@@ -220,8 +220,7 @@ class Fit:
         least squares, and `params(u)` turns the first numbers into the user's pytree.
         """
         shares = np.array([noise.effective / noise.samples for noise in self.noise.values()])
-        systems: dict = self.system if isinstance(self.system, dict) else {None: self.system}
-        return Density(self.question, systems, self.law, self._point, self.widths, shares, prior)
+        return Density(self.question, self.law, self._point, self.widths, shares, prior)
 
     @with_doubles
     def sample(self, draws: int = 1000, seed: int = 0, *, chains: int = 4, prior: Callable | None = None) -> Any:
@@ -256,11 +255,11 @@ class Fit:
     @functools.cached_property
     def _point(self) -> Point:
         """The trial that the search ended at, computed anew."""
-        point = self.question.at(self.u, self.states)
+        point = self.question.evaluate(self.u, self.states)
         assert isinstance(point, Point)  # it was computed before
         return point
 
-    def _part(self, system: str | None) -> Part:
+    def _part(self, system: str | None) -> SystemPart:
         """One of the systems by its name, or the only one. Raises `ValueError` for a name that there is not."""
         parts = {part.name: part for part in self.question.parts}
         if system not in parts:
@@ -269,9 +268,9 @@ class Fit:
             raise ValueError(f"This is a fit of several systems: give system=, one of {', '.join(map(repr, parts))}.")
         return parts[system]
 
-    def _of_sensors(self, part: Part) -> Widths:
+    def _of_sensors(self, part: SystemPart) -> Widths:
         """The noise of the signals of a system's records, without that of crossing times."""
-        sensors = slice(part.signals.start, part.signals.start + len(part.question.signals.names))
+        sensors = slice(part.signals.start, part.signals.start + len(part.system.signals.names))
         return Widths(self.widths.sigma[sensors], self.widths.dof[sensors])
 
     def _quantile(self, level: float) -> float:
@@ -296,7 +295,7 @@ class Fit:
         Raises `ValueError` where the record has other signals than those of the fit, or its motion fails.
         """
         [record], part = require_alike([record]), self._part(system)
-        about = part.question
+        about = part.system
         first = next((one for one in about.records if isinstance(one, Record)), None)
         if not isinstance(record, Record) or first is None:
             raise TypeError("Only a lagjax.Record is predicted, after a fit of some: for times ask lagjax.crossings.")
@@ -311,13 +310,9 @@ class Fit:
         is_known = state is not None and not isinstance(record.start, Guess)
         if state is None:
             state = _start_read_off(record, self._by_name(self.observe, part), about, self.parameters.numbers(self.u))
-        piece = [Piece(0, np.arange(len(record)))]
-        question = Question(
-            [record], piece, np.array([not is_known]), about.motions, about.signals, fixed, about.size, about.rtol,
-            None, about.manifold,
-        )  # fmt: skip
+        question = Residuals([about.of_records([record], np.array([not is_known]), fixed, about.manifold)])
         if is_known:
-            point = question.at(np.zeros(0), state[None])
+            point = question.evaluate(np.zeros(0), state[None])
         else:
             done = minimise(question, np.zeros(0), state[None], Known(self._of_sensors(part)), enough=1e-3)
             point = done if isinstance(done, Failure) else done.point
@@ -328,8 +323,7 @@ class Fit:
         ts = np.asarray(record.ts, layout.dtype)
         q0, qdot0 = (jax.tree.map(lambda x: np.asarray(x, layout.dtype), half) for half in start)
         form, driven = about.signals.form, (record.sampled_at, record.input_samples)
-        scene, params = self.system, self.params
-        scene = self._by_name(scene, part)
+        scene, params = about.scene, self.params
         scene, params = (scene, params) if form is None else form.along(scene, params, *driven)
         trajectory = follow(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
         values, deviation = self._shown(part, record, question, point)
@@ -340,9 +334,9 @@ class Fit:
         shown, missed, uncertain = (in_structure(matrix, record) for matrix in (values, left, deviation))
         return Prediction(trajectory, shown, missed, start, uncertain, noise)
 
-    def _shown(self, part: Part, record: Record, question: Question, point: Point) -> tuple[np.ndarray, np.ndarray]:
+    def _shown(self, part: SystemPart, record: Record, question: Residuals, point: Point):
         """The signals (T, S) of a record that was followed, at all its times, and their standard deviations."""
-        planned, slopes = self._followed(part.question, record, point.starts[0])
+        planned, slopes = self._followed(part.system, record, point.starts[0])
         known, states = self.information, question.states
         own, follows = np.zeros((states, states)), np.zeros((states, len(self.u)))
         if question.fitted[0]:
@@ -350,14 +344,11 @@ class Fit:
             own, follows = start_alone(rows, states, known, effective_share(self))
         return planned.matrix, deviations(slopes, states, own, follows, known)
 
-    def _followed(self, of: Question, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
+    def _followed(self, of: SystemResiduals, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
         """A record with what sensors would show for its values, from a state (2n,), and their derivatives (T, S, D)."""
         everywhere = replace(record, values=in_structure(np.zeros_like(record.matrix), record), weights=None)
-        about = Question(
-            [everywhere], [Piece(0, np.arange(len(record)))], np.array([True]), of.motions, of.signals,
-            self.parameters, of.size, of.rtol,
-        )  # fmt: skip
-        full = about.at(self.u, state[None])
+        about = Residuals([of.of_records([everywhere], np.array([True]), self.parameters)])
+        full = about.evaluate(self.u, state[None])
         if isinstance(full, Failure):
             raise ValueError(about.where(full))
         shown = np.where(about.batches[0].weights[0] > 0, full.residuals[0][0], np.nan)  # NaN before a delay is over
@@ -384,19 +375,19 @@ class Fit:
         rows = [self._rows_of(self._part(system), name, record) for name, record in named.items()]
         return ranked(list(named), rows, self.parameters.labels, self.information)
 
-    def _rows_of(self, part: Part, name: str, record: Record) -> np.ndarray:
+    def _rows_of(self, part: SystemPart, name: str, record: Record) -> np.ndarray:
         """The rows (M, F) of a planned record in units of the noise, its start eliminated where it is not known."""
         if not isinstance(record, Record) or record.start is None:
             raise ValueError(
                 f"The planned record {name} needs a start: (q0, qdot0), or lagjax.Guess(q0, qdot0) if that is to be "
                 "fitted."
             )
-        state = known_start(record, part.question.layout, 0, self.params)
+        state = known_start(record, part.system.layout, 0, self.params)
         assert state is not None
-        planned, slopes = self._followed(part.question, record, state)
+        planned, slopes = self._followed(part.system, record, state)
         sigma = self._of_sensors(part).sigma[:, None]
         weights = planned.weight_matrix[..., None] * (effective_share(self) / sigma**2)
-        rows, states = np.sqrt(weights) * slopes, part.question.states
+        rows, states = np.sqrt(weights) * slopes, part.system.states
         own = rows[..., states:]
         if isinstance(record.start, Guess):
             own = own - rows[..., :states] @ start_alone(rows, states, self.information, 1.0)[1]
@@ -416,15 +407,15 @@ class Fit:
         with open(path, "w", encoding="utf-8") as file:
             file.write(text)
 
-    def _drawn(self, part: Part) -> Drawn:
+    def _drawn(self, part: SystemPart) -> Drawn:
         """The records of one system with their residuals."""
         residuals = self.question.end_to_end(self.residuals)[part.records]
-        pairs = [pair for pair in zip(residuals, part.question.records, strict=True) if isinstance(pair[1], Record)]
+        pairs = [pair for pair in zip(residuals, part.system.records, strict=True) if isinstance(pair[1], Record)]
         records, matrices = [record for _, record in pairs], [record_matrix(r, record) for r, record in pairs]
-        return Drawn(part.name, records, matrices, part.question.signals.names, self._of_sensors(part).sigma)
+        return Drawn(part.name, records, matrices, part.system.signals.names, self._of_sensors(part).sigma)
 
     @staticmethod
-    def _by_name(of_all, part: Part) -> Any:
+    def _by_name(of_all, part: SystemPart) -> Any:
         """The part for one system: by its name, or for all."""
         return of_all[part.name] if isinstance(of_all, dict) else of_all
 
@@ -457,7 +448,7 @@ def _half_widths(deviation: np.ndarray, widths: Widths, level: float, columns) -
     return np.sqrt((ndtri(0.5 + 0.5 * level) * flat) ** 2 + noise**2).reshape(deviation.shape)
 
 
-def _start_read_off(record: Record, observe, about: Question, numbers: np.ndarray) -> np.ndarray:
+def _start_read_off(record: Record, observe, about: SystemResiduals, numbers: np.ndarray) -> np.ndarray:
     """The first state of a record from local polynomials. Raises where its signals are no positions."""
     reader = reader_of(record, observe, about, numbers)
     if reader is not None:

@@ -327,11 +327,11 @@ def inference_data(density: Density, drawn: Draws) -> Any:
         else:  # numbers of the array that are kept have no draws: the others go by their own names
             names = dict(zip(parameters.places.tolist(), parameters.names, strict=True))
             posterior |= {names[place]: values[..., place] for place in part.places.tolist()}
-    for one, (part, _) in zip(density.systems, question.apart, strict=True):
-        fitted, layout = one.question.fitted, one.question.layout
+    for part in question.parts:
+        fitted, layout = part.system.fitted, part.system.layout
         of = "" if part.name is None else f"{part.name}: "
         if fitted.any():
-            own, axes = starts[..., one.rows[fitted], : one.question.states], [f"{of}record", f"{of}coordinate"]
+            own, axes = starts[..., part.rows[fitted], : part.system.states], [f"{of}record", f"{of}coordinate"]
             coords |= dict(zip(axes, (np.flatnonzero(fitted), list(layout.names)), strict=True))
             posterior |= {f"{of}q0": own[..., : layout.size], f"{of}qdot0": own[..., layout.size :]}
             dims |= {f"{of}q0": axes, f"{of}qdot0": axes}

@@ -1,6 +1,6 @@
 """Search: where a fit begins, multiple shooting over segments that grow, the weak form, and multistart.
 
-It holds `Reader`, `weak_start`, `Waterfall`, `searches` and `search_records`.
+It holds `Reader`, `balanced`, `Waterfall`, `searches` and `search_records`.
 
 **Multiple shooting.** Over a long record the sum of squares has many minima: a wrong frequency is out of phase, a
 chaotic motion forgets its start. Over a segment shorter than the motion's own time scale there is one. So the records
@@ -55,15 +55,15 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from lagjax._consistent import has_constraints
-from lagjax._fit._descent import Anchor, Descent, descend, eliminate, ended, minimise
+from lagjax._fit._descent import Anchor, Descent, column_norms, descend, eliminate, ended, minimise
 from lagjax._fit._motions import AbstractMotions
-from lagjax._fit._noise import Widths, log_likelihood
+from lagjax._fit._noise import Gaussian, Widths, log_likelihood
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Piece, Record, asks, at_instants, in_structure, inputs_between
-from lagjax._fit._residuals import AbstractQuestion, Failure, Question, asked, compressed
-from lagjax._fit._sensors import continued, looks_like_positions, on_circle
+from lagjax._fit._residuals import Failure, Residuals, SystemResiduals
+from lagjax._fit._sensors import continued, looks_like_positions
 from lagjax._fit._verdict import unexplained
-from lagjax._hybrid import Hybrid, Scene
+from lagjax._hybrid import Hybrid
 from lagjax._layout import halves
 from lagjax._system import System
 
@@ -270,11 +270,6 @@ def complete(pieces: list[Piece], records: list[Record]) -> list[Piece]:
     ]
 
 
-def whole(records: list[Record]) -> list[Piece]:
-    """Every record in one piece."""
-    return [Piece(k, np.arange(len(record))) for k, record in enumerate(records)]
-
-
 _SAMPLES_OF_WEAK_FORM = 2000  # of all records, at most
 _FEWEST_IN_WINDOW = 9  # samples in a window
 _POWER = 4  # of the bump (1 − s²)ᵖ, whose first derivatives vanish at its ends
@@ -296,20 +291,19 @@ class _Windows:
         self.rate = -2 * _POWER / half * spans * s * (1 - s**2) ** (_POWER - 1)
 
 
-def weak_start(question: Question, system: System, u: np.ndarray, readers: list[Reader | None], scale: float):
-    """The u (F,) that balances the weak form best, in a search from `u`; None where there is nothing to balance.
+def balanced(
+    systems: Sequence[tuple[SystemResiduals, Sequence[Reader | None], float]], u: np.ndarray
+) -> np.ndarray | None:
+    """The u (F,) that balances the weak forms of systems best, in a search from `u`; None where nothing is to balance.
 
-    `scale` is the motion's time scale, `system` the scene as its author wrote it.
+    Each system comes with readers of its records and the motion's time scale. One with constraints, or where nothing
+    moves, says nothing, and so does hybrid motion, whose velocities jump.
     """
-    return balanced([(question, system, readers, scale)], u)
-
-
-def balanced(systems: list[tuple[Question, System, list[Reader | None], float]], u: np.ndarray):
-    """The u (F,) that balances the weak forms of several systems best: each with what `weak_start` takes.
-
-    A system with constraints, or where nothing moves, says nothing.
-    """
-    telling = [one for one in systems if not has_constraints(one[1]) and np.isfinite(one[3])]
+    telling = [
+        one
+        for one in systems
+        if not (isinstance(one[0].scene, Hybrid) or has_constraints(one[0].scene)) and np.isfinite(one[2])
+    ]
     if not telling:
         return None
     each, dtype = [imbalance(*one) for one in telling], telling[0][0].layout.dtype
@@ -330,11 +324,12 @@ def balanced(systems: list[tuple[Question, System, list[Reader | None], float]],
     return done.x if np.isfinite(done.x).all() else None
 
 
-def imbalance(question: Question, system: System, readers: list[Reader | None], scale: float):
+def imbalance(system: SystemResiduals, readers: Sequence[Reader | None], scale: float):
     """∫ (φ̇ p + φ F) dt of all windows and coordinates, over the size of ∫ φ̇ p: a function of u (F,) for JAX."""
-    layout, parameters, form = question.layout, question.parameters, question.signals.form
-    form = form if form is not None and asks(system) else None
-    scene = system if form is None else form.driven(system)
+    layout, parameters, form, scene = system.layout, system.parameters, system.signals.form, system.scene
+    assert isinstance(scene, System)
+    form = form if form is not None and asks(scene) else None
+    scene = scene if form is None else form.driven(scene)
     pieces = _states_and_inputs([reader for reader in readers if reader is not None], _WIDE * scale)
 
     def both(y, t, table, numbers):
@@ -411,7 +406,7 @@ def drawn(parameters: Parameters, u: np.ndarray, count: int, seed: int) -> np.nd
     return np.stack([u, *(parameters.drawn(u, rng) for _ in range(count - 1))])
 
 
-def short_search(question: AbstractQuestion, u: np.ndarray, starts: np.ndarray) -> Trials:
+def short_search(question: Residuals, u: np.ndarray, starts: np.ndarray) -> Trials:
     """The results of the starts u (K, F) after a few steps, from the records' starts (N, 2n); in order."""
     part = _sampled(question)
     at = _tried(part, u, np.repeat(starts[None], len(u), axis=0))
@@ -430,7 +425,7 @@ def short_search(question: AbstractQuestion, u: np.ndarray, starts: np.ndarray) 
     return Trials(at.u[order], at.starts[order], at.misfits[order])
 
 
-def misfit(widths: Widths, question: AbstractQuestion) -> float:
+def misfit(widths: Widths, question: Residuals) -> float:
     """The noise that is left, over the size of the signals."""
     return float(np.exp(np.mean(np.log(widths.sigma / question.size))))
 
@@ -453,21 +448,15 @@ class _Tried(NamedTuple):
     triangles: np.ndarray
 
 
-def _sampled(question: AbstractQuestion) -> AbstractQuestion:
-    """The question with at most `_SHORT_SAMPLES` samples of each record."""
-    timed = {part.records.start + k for part in question.parts for k in part.question.clocks}
-    pieces = [
-        piece
-        if piece.record in timed
-        else Piece(
-            piece.record, piece.places[np.unique(np.linspace(0, len(piece.places) - 1, _SHORT_SAMPLES).astype(int))]
-        )
-        for piece in question.pieces
-    ]
+def _sampled(question: Residuals) -> Residuals:
+    """The residuals of at most `_SHORT_SAMPLES` samples of each record."""
+    chosen = lambda count: np.unique(np.linspace(0, count - 1, _SHORT_SAMPLES).astype(int))  # noqa: E731
+    pieces = [Piece(piece.record, piece.places[chosen(len(piece.places))]) for piece in question.pieces]
     return question.of(pieces, question.fitted)
 
 
-def _tried(question: AbstractQuestion, u: np.ndarray, starts: np.ndarray) -> _Tried:
+def _tried(question: Residuals, u: np.ndarray, starts: np.ndarray) -> _Tried:
+    """The misfits and triangles of trials u (K, F) and starts (K, N, 2n), a portion of them at once."""
     columns = question.states + u.shape[1] + 1
     found = _Tried(
         u.copy(), starts.copy(), np.full(len(u), np.inf), np.zeros((*starts.shape[:2], columns, columns))
@@ -475,100 +464,20 @@ def _tried(question: AbstractQuestion, u: np.ndarray, starts: np.ndarray) -> _Tr
     largest = max(batch.ts.size for batch in question.batches) * question.states * columns
     portion = max(1, _ROOM // largest)
     for begin in range(0, len(u), portion):
-        _fill(question, found, slice(begin, min(begin + portion, len(u))))
+        some = slice(begin, begin + portion)
+        for k, trial in enumerate(question.evaluate_trials(u[some], starts[some]), begin):
+            if not isinstance(trial, Failure):
+                noise = question.widths(trial, Gaussian())
+                found.starts[k], found.misfits[k] = trial.starts, misfit(noise, question)
+                found.triangles[k] = question.triangles(trial, question.factors(trial, noise))
     return found
 
 
-def _fill(question: AbstractQuestion, found: _Tried, some: slice) -> None:
-    """The misfits and triangles of some starts, whose motions are one run for each batch of records."""
-    parameters, count = question.parameters, some.stop - some.start
-    numbers = np.stack([parameters.numbers(u) for u in found.u[some]])
-    directions = np.stack([parameters.directions(u) for u in found.u[some]])
-    squares, samples = np.zeros((count, len(question.size))), np.zeros(len(question.size))
-    ok = np.isfinite(numbers).all(axis=1) & np.isfinite(directions).all(axis=(1, 2))
-    followed = []
-    for part, places in question.apart:
-        own, states = part.question, part.question.states
-        begun = found.starts[some][:, places, :states]
-        moves = [own.origins.move(y, *of) for y, *of in zip(begun, numbers, directions, strict=True)]
-        begun = np.stack([y for y, _ in moves])
-        found.starts[some, places, :states] = begun
-        for batch in own.batches:
-            each = _residuals(own, batch, begun, numbers, directions, [m for _, m in moves])
-            ok &= np.isfinite(each).all(axis=(1, 2, 3, 4))
-            each = np.where(np.isfinite(each), each, 0.0)
-            squares[:, part.signals] += (batch.weights * each[..., -1] ** 2).sum(axis=(1, 2))
-            samples[part.signals] += (batch.weights > 0).sum(axis=(0, 1))
-            followed.append((part, places[batch.rows], batch.weights, each))
-    sigma = np.maximum(np.sqrt(squares / samples), question.least)
-    found.misfits[some] = np.where(ok, np.exp(np.mean(np.log(sigma / question.size), axis=1)), np.inf)
-    for part, places, weights, each in followed:
-        each *= (np.sqrt(weights) / sigma[:, None, None, part.signals])[..., None]
-        small, states = compressed(each.reshape(count * len(places), -1, each.shape[-1])), part.question.states
-        _place(found.triangles[some], places, states, question.states - states, small)
-
-
-def _place(triangles: np.ndarray, places: np.ndarray, states: int, more: int, of_system: np.ndarray) -> None:
-    """Put the triangles of M pieces of one system, (K·M, D, D), at their `places` among those of all, (K, N, …).
-
-    Behind the columns of its `states` these have `more` columns, for a system with more coordinates.
-    """
-    rows = np.insert(of_system, [states] * more, 0.0, axis=-1)
-    triangles[:, places, : rows.shape[-2]] = rows.reshape(len(triangles), len(places), *rows.shape[1:])
-
-
-def _residuals(question: Question, batch, starts, numbers, directions, moved) -> np.ndarray:
-    """The derivatives of signals and, last, residuals of one batch for K starts: (K, N, T, S, D + 1).
-
-    NaN where a motion failed, zero where nothing was measured.
-    """
-    along = [question._along(batch, m, d) for m, d in zip(moved, directions, strict=True)]
-    record = question.pieces[batch.rows[0]].record
-    shown = _timed if record in question.clocks else _sensed
-    columns, free = question.columns(record), directions.shape[1]
-    missing = question.states + free - along[0][1].shape[0]
-    found = np.zeros((len(starts), *batch.values.shape, question.states + free + 1))
-    for k, both in enumerate(shown(question, batch, starts[:, batch.rows], numbers, along)):
-        if both is None:
-            found[k] = np.nan
-            continue
-        values, slopes = both
-        slopes = np.pad(slopes, ((0, 0), (0, 0), (0, 0), (missing, 0)))
-        slopes[~question.fitted[batch.rows], ..., : question.states] = 0.0
-        left = on_circle(values - batch.values[..., columns], question.periods[columns])
-        found[k, ..., columns, :-1], found[k, ..., columns, -1] = slopes, left
-    return np.where((batch.weights > 0)[..., None] | np.isnan(found), found, 0.0)
-
-
-def _timed(question: Question, batch, starts, numbers, along):
-    """Of each start the crossing times and their derivatives, or None."""
-    clock = question.clocks[question.pieces[batch.rows[0]].record]
-    for y0, some, directions in zip(starts, numbers, along, strict=True):
-        shown = question._time(clock, batch, y0, some, *directions)
-        yield None if isinstance(shown, Failure) else shown
-
-
-def _sensed(question: Question, batch, starts, numbers, along):
-    """Of each start the signals and their derivatives, or None where a motion failed; all in one run."""
-    count, members = len(starts), len(batch.rows)
-    tile = lambda x: np.tile(x, (count, *[1] * (x.ndim - 1)))  # noqa: E731
-    table = None if batch.table is None else type(batch.table)(*map(tile, batch.table))
-    motion = question.motions.follow(
-        tile(batch.ts), starts.reshape(count * members, -1), np.repeat(numbers, members, axis=0),
-        np.concatenate([y0_dot for y0_dot, _ in along]), np.repeat([d for _, d in along], members, axis=0), table,
-    )  # fmt: skip
-    for k in range(count):
-        part = type(motion)(*(x[k * members : (k + 1) * members] for x in motion))
-        yield question.signals.of(part, batch.ts, batch.inputs, numbers[k], along[k][1]) if part.ok else None
-
-
-def _step(question: AbstractQuestion, at: _Tried, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def _step(question: Residuals, at: _Tried, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """The end of the damped step of one start."""
     triangles, states, none = at.triangles[k], question.states, np.zeros(at.u.shape[1])
     limits = question.parameters.limits(at.u[k])
-    norms = np.linalg.norm(triangles[..., :states], axis=1), np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
-    scale = tuple(np.where(norm > 0, norm, 1.0) for norm in norms)
-    step = eliminate(triangles, states, scale, damping, (none, none), limits)
+    step = eliminate(triangles, states, column_norms(triangles, states), damping, (none, none), limits)
     return question.parameters.stepped(at.u[k], step.u), at.starts[k] + step.starts
 
 
@@ -592,7 +501,7 @@ class Unfollowed(ValueError):
     """Records whose motion cannot be followed from the first trial."""
 
 
-def searches(question: AbstractQuestion, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
+def searches(question: Residuals, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
     """The best of the searches from u and from `starts` − 1 random values, and what all of them came to."""
     if starts == 1:
         return search(u, y0), None
@@ -618,7 +527,7 @@ def _likelihood(done: Descent) -> float:
     return log_likelihood(done.widths, done.point.flat(), done.question.weights)
 
 
-def reader_of(record: Record, observe, about: Question, numbers: np.ndarray, probes: int = 256) -> Reader | None:
+def reader_of(record: Record, observe, about: SystemResiduals, numbers: np.ndarray, probes: int = 256) -> Reader | None:
     """A reader of states off a record; None where its signals are no positions, or go round too fast to tell."""
     if not looks_like_positions(observe, record, about.layout):
         return None
@@ -633,7 +542,7 @@ def reader_of(record: Record, observe, about: Question, numbers: np.ndarray, pro
     return Reader.of(read, probes, periods)
 
 
-def search_records(question: AbstractQuestion, u, starts, noise, method: str, readers, weak) -> Descent:
+def search_records(question: Residuals, u, starts, noise, method: str, readers, weak) -> Descent:
     """The search of whole records, after that of growing segments where the method asks for it."""
     if method == "segments" and readers is None:
         raise ValueError('method="segments" reads starts off the data: for that values must have the structure of q.')
@@ -684,7 +593,7 @@ def _parting(done: Descent) -> float:
     return float(np.median(rates) * longest) if rates else 0.0
 
 
-def _in_pieces(question: AbstractQuestion, level: Descent, joined: Widths | None, noise) -> Descent:
+def _in_pieces(question: Residuals, level: Descent, joined: Widths | None, noise) -> Descent:
     """The search on the pieces of a level, with all samples of these and a start for each."""
     pieces = complete(level.question.pieces, question.records)
     part = question.of(pieces, level.question.fitted)
@@ -703,24 +612,22 @@ def _in_pieces(question: AbstractQuestion, level: Descent, joined: Widths | None
     return done._replace(message=f"{done.message} {text}", converged=False)
 
 
-def by_gradient(
-    question: AbstractQuestion, systems: dict[str | None, Scene], u, y0, noise, readers: list[Reader | None] | None
-) -> Descent:
+def by_gradient(question: Residuals, u, y0, noise, readers: list[Reader | None] | None) -> Descent:
     """The descent by gradients: over segments of the records that grow, where they can be read, then over all."""
     told, question.watch = question.watch, None
     tell = None if told is None else lambda text: print(text, file=sys.stderr, flush=True)
     steps = _GRADIENT_STEPS
     if readers is not None:
-        u = weakly(question, list(systems.values()), u, readers)
-        u = _over_segments(question, systems, u, noise, readers, tell)
+        u = weakly(question, u, readers)
+        u = _over_segments(question, u, noise, readers, tell)
         steps = _GRADIENT_STEPS // 3
-    done = descend(question, systems, u, y0, noise, steps, tell)
+    done = descend(question, u, y0, noise, steps, tell)
     if not isinstance(done, Failure):
         done = ended(question, done[0], done[1], noise, _GRADIENT_STEPS, done[2])
     return _followed(question, done)
 
 
-def _followed(question: AbstractQuestion, done: Descent | Failure) -> Descent:
+def _followed(question: Residuals, done: Descent | Failure) -> Descent:
     """The result of a search. Raises `Unfollowed` where its motions could not be followed."""
     if isinstance(done, Failure):
         raise Unfollowed(question.where(done) + " Begin nearer: other params0, or starts that are known.")
@@ -728,7 +635,7 @@ def _followed(question: AbstractQuestion, done: Descent | Failure) -> Descent:
 
 
 def _grown(
-    question: AbstractQuestion, u, starts, noise, readers: list[Reader | None], weak: Callable
+    question: Residuals, u, starts, noise, readers: list[Reader | None], weak: Callable
 ) -> tuple[np.ndarray, np.ndarray, list[Descent]]:
     """Better first values of u and of the starts, from segments that grow together to whole records; and the levels.
 
@@ -763,7 +670,7 @@ class _Begun(NamedTuple):
     first: Descent | None = None
 
 
-def _begun(question: AbstractQuestion, u, starts, readers: list[Reader | None], search) -> _Begun:
+def _begun(question: Residuals, u, starts, readers: list[Reader | None], search) -> _Begun:
     """The search on the shortest segments, from u, whose misfit is positive where they were not fitted.
 
     It is the mean logarithm of the noise σ of the signals, over `_POOR` times the scatter of the data or a share
@@ -781,12 +688,12 @@ def _begun(question: AbstractQuestion, u, starts, readers: list[Reader | None], 
     for part in question.parts:
         if reading := [reader for reader in readers[part.records] if reader is not None]:
             scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in reading], axis=0))
-            near.append(np.maximum(_POOR * scatter, _COARSE * part.question.size[: len(scatter)]))
+            near.append(np.maximum(_POOR * scatter, _COARSE * part.system.size[: len(scatter)]))
     ratio = done.widths.sigma / np.concatenate(near)
     return _Begun(done.point.u, cuts, best, float(np.mean(np.log(ratio))), done)
 
 
-def _level(question: AbstractQuestion, pieces: list[Piece], u, best, noise, readers, anchor) -> Descent | Failure:
+def _level(question: Residuals, pieces: list[Piece], u, best, noise, readers, anchor) -> Descent | Failure:
     """The search on one cut of the records. The states in `best`, by record and sample, begin it and take its end."""
     firsts = [(piece.record, int(piece.places[0])) for piece in pieces]
     for k, reader in enumerate(readers):
@@ -802,60 +709,48 @@ def _level(question: AbstractQuestion, pieces: list[Piece], u, best, noise, read
     return done
 
 
-def _glimpsed(question: AbstractQuestion, u, noise, readers: list[Reader | None], anchor: Anchor) -> np.ndarray:
+def _glimpsed(question: Residuals, u, noise, readers: list[Reader | None], anchor: Anchor) -> np.ndarray:
     """The u that suits the accelerations of local cubics: these have one minimum where segments are too long for u."""
-    scales, short, states = _time_scales(question, readers, u), {}, []
+    scales, short, states = _time_scales(question, readers, u), [], []
     for part in question.parts:
         reading = [reader for reader in readers[part.records] if reader is not None]
-        scale, about = scales[part.records.start], part.question
+        scale = scales[part.records.start]
         if not (reading and np.isfinite(scale)):
             continue
         records, begun = glimpses(reading, 0.25 * scale)
         states.append(roomy(begun, question.states))
-        short[part.name] = Question(
-            records, whole(records), np.ones(len(records), bool), about.motions, about.signals, about.parameters,
-            about.size, about.rtol,
-        )  # fmt: skip
+        short.append(part.system.of_records(records, np.ones(len(records), bool)))
     if not short:
         return u
-    part = asked(short)
+    part = Residuals(short)
     y0 = np.concatenate(states)[:, : part.states]
     done = minimise(part, u, y0, noise, _ENOUGH_OF_GLIMPSES, _TRIALS_OF_LEVEL, anchor)
     return u if isinstance(done, Failure) else done.point.u
 
 
-def weakly(question: AbstractQuestion, systems: Sequence[Scene], u, readers: list[Reader | None]) -> np.ndarray:
-    """The u that balances the weak form of Lagrange's equations, u itself where there is none.
-
-    Hybrid motion, whose velocities jump, has none.
-    """
+def weakly(question: Residuals, u: np.ndarray, readers: list[Reader | None]) -> np.ndarray:
+    """The u that balances the weak form of Lagrange's equations, u itself where there is none."""
     scales = _time_scales(question, readers, u)
-    found = balanced(
-        [
-            (part.question, system, readers[part.records], scales[part.records.start])
-            for part, system in zip(question.parts, systems, strict=True)
-            if not isinstance(system, Hybrid)
-        ],
-        u,
-    )
+    parts = question.parts
+    found = balanced([(part.system, readers[part.records], scales[part.records.start]) for part in parts], u)
     return u if found is None else found
 
 
-def _over_segments(question: AbstractQuestion, systems, u, noise, readers: list[Reader | None], tell) -> np.ndarray:
+def _over_segments(question: Residuals, u, noise, readers: list[Reader | None], tell) -> np.ndarray:
     """The u that two thirds of the steps come to over segments that grow, each with a start of its own."""
     recordings = [None if reader is None else reader.record for reader in readers]
     cuts = levels(recordings, _time_scales(question, readers, u))
-    for pieces in [] if any(part.question.clocks for part in question.parts) else cuts:
+    for pieces in [] if any(part.system.clocks for part in question.parts) else cuts:
         reading = ((recorder, piece.places[:1]) for piece in pieces if (recorder := readers[piece.record]))
         states = np.stack([roomy(one.states(place)[0], question.states) for one, place in reading])
         part = question.of(pieces, np.ones(len(pieces), bool))
-        done = descend(part, systems, u, states, noise, 2 * _GRADIENT_STEPS // (3 * len(cuts)), tell)
+        done = descend(part, u, states, noise, 2 * _GRADIENT_STEPS // (3 * len(cuts)), tell)
         if not isinstance(done, Failure):
             u = done[0]
     return u
 
 
-def _time_scales(question: AbstractQuestion, readers: list[Reader | None], u) -> list[float]:
+def _time_scales(question: Residuals, readers: list[Reader | None], u) -> list[float]:
     """The duration for which the motion of each record looks like a straight line: of all records of a system the same.
 
     It is infinite for a system of which no state can be read off.
@@ -863,8 +758,8 @@ def _time_scales(question: AbstractQuestion, readers: list[Reader | None], u) ->
     scales, numbers = [], question.parameters.numbers(u)
     for part in question.parts:
         reading = [reader for reader in readers[part.records] if reader is not None]
-        scale = min(time_scales(reading, part.question.motions, numbers)) if reading else np.inf
-        scales += [scale] * len(part.question.records)
+        scale = min(time_scales(reading, part.system.motions, numbers)) if reading else np.inf
+        scales += [scale] * len(part.system.records)
     return scales
 
 

@@ -57,7 +57,7 @@ import numpy as np
 
 from lagjax._fit._noise import Widths
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._residuals import AbstractQuestion, Failure, Point, compressed
+from lagjax._fit._residuals import Failure, Point, Residuals, compressed
 
 
 class Correlation(NamedTuple):
@@ -69,7 +69,7 @@ class Correlation(NamedTuple):
     neighbour: float
 
 
-def correlation(question: AbstractQuestion, point: Point, widths: Widths, signal: int) -> Correlation:
+def correlation(question: Residuals, point: Point, widths: Widths, signal: int) -> Correlation:
     """The correlation of the residuals of one signal, over all pieces.
 
     It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
@@ -151,7 +151,7 @@ def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
     return np.einsum("ntf,ntg->fg", rows, smooth)
 
 
-def share(question: AbstractQuestion, point: Point, widths: Widths) -> float:
+def share(question: Residuals, point: Point, widths: Widths) -> float:
     """The number of independent samples that one sample is worth, over all signals: at most 1."""
     laws = [correlation(question, point, widths, signal) for signal in range(len(widths.sigma))]
     return sum(law.count / law.time for law in laws) / max(sum(law.count for law in laws), 1)
@@ -191,7 +191,7 @@ class Information(NamedTuple):
     lost: float
 
 
-def information(question: AbstractQuestion, point: Point, widths: Widths) -> Information:
+def information(question: Residuals, point: Point, widths: Widths) -> Information:
     """The information of the data about the parameters, at the end of a search."""
     factors = [np.sqrt(b.weights) / widths.sigma for b in question.batches]
     triangles = question.triangles(point, factors)
@@ -241,7 +241,7 @@ def seen(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     return null, directions[~small].T / unit[:, None]
 
 
-def _is_lost(question: AbstractQuestion, point: Point) -> bool:
+def _is_lost(question: Residuals, point: Point) -> bool:
     """True if the last digit of a parameter moves a signal by its size, because motions grow apart.
 
     Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
@@ -253,7 +253,7 @@ def _is_lost(question: AbstractQuestion, point: Point) -> bool:
     return moved > _LOST and growth(row_sizes(question, point)) > _LOST
 
 
-def confirmed_null(question: AbstractQuestion, point: Point, null: np.ndarray) -> np.ndarray:
+def confirmed_null(question: Residuals, point: Point, null: np.ndarray) -> np.ndarray:
     """Those of the null directions (F, K) that are no work of rounding, (F, K′)."""
     sizes = row_sizes(question, point)
     if growth(sizes) < _GROWTH:
@@ -263,7 +263,7 @@ def confirmed_null(question: AbstractQuestion, point: Point, null: np.ndarray) -
     return seen(question.triangles(point, level), question.states)[0]
 
 
-def row_sizes(question: AbstractQuestion, point: Point) -> list[np.ndarray]:
+def row_sizes(question: Residuals, point: Point) -> list[np.ndarray]:
     """The length of the row of each sample (N, T, S) of every batch, its columns as fractions of their largest."""
     largest = np.max([np.abs(slopes).max(axis=(0, 1, 2)) for slopes in point.slopes], axis=0)
     columns = np.where(largest > 0, largest, 1.0)
@@ -323,7 +323,7 @@ class OfStarts(NamedTuple):
     follows: np.ndarray
 
 
-def of_starts(question: AbstractQuestion, point: Point, widths: Widths, known: Information) -> OfStarts:
+def of_starts(question: Residuals, point: Point, widths: Widths, known: Information) -> OfStarts:
     """The uncertainty of the starts of all pieces at the end of a search; zero for those that are not fitted."""
     states, free, pieces = question.states, len(point.u), len(question.pieces)
     lags = [correlation(question, point, widths, s).lags for s in range(len(widths.sigma))]
@@ -400,7 +400,7 @@ _MOST_NAMES = 12  # in one sentence
 _LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
 
 
-def sentences(question: AbstractQuestion, point: Point, widths: Widths, known: Information) -> tuple[str, ...]:
+def sentences(question: Residuals, point: Point, widths: Widths, known: Information) -> tuple[str, ...]:
     """A sentence for every set of parameters of which something is not seen, and one for those that rounding hides."""
     hidden = _hidden(question, point, known)
     null, parameters = known.confirmed, question.parameters
@@ -418,7 +418,7 @@ def sentences(question: AbstractQuestion, point: Point, widths: Widths, known: I
     return (*found, *hidden)
 
 
-def _hidden(question: AbstractQuestion, point: Point, known: Information) -> tuple[str, ...]:
+def _hidden(question: Residuals, point: Point, known: Information) -> tuple[str, ...]:
     """The sentence for parameters whose columns are drowned where sensitivities grow."""
     if known.confirmed.shape[1] == known.null.shape[1]:
         return ()
@@ -440,11 +440,11 @@ def _hidden(question: AbstractQuestion, point: Point, known: Information) -> tup
     )
 
 
-def _null_elsewhere(question: AbstractQuestion, point: Point, widths: Widths):
+def _null_elsewhere(question: Residuals, point: Point, widths: Widths):
     """Other values u of the free parameters, a few per cent away, and the null directions there."""
     u = point.u
     near = u + question.parameters.sizes(u) * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
-    other = question.at(near, point.starts)
+    other = question.evaluate(near, point.starts)
     if isinstance(other, Failure):
         return None
     factors = [np.sqrt(batch.weights) / widths.sigma for batch in question.batches]

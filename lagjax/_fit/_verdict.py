@@ -34,11 +34,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._fit._descent import Descent, eliminate
+from lagjax._fit._descent import Descent, column_norms, eliminate
 from lagjax._fit._noise import Widths
 from lagjax._fit._parameters import Between, Parameters, Positive
 from lagjax._fit._records import Record, in_structure
-from lagjax._fit._residuals import AbstractQuestion, Point, compressed
+from lagjax._fit._residuals import Point, Residuals, compressed
 from lagjax._fit._uncertainty import Information, orthogonal, structure
 
 _WIDE = 3.0  # rad: a signal of a smaller range is not tried as degrees, which would leave it 0.05
@@ -182,7 +182,7 @@ class Verdict(NamedTuple):
     left: "Unexplained"
 
 
-def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, question: AbstractQuestion) -> Verdict:
+def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, question: Residuals) -> Verdict:
     """The verdict on a search that ended there."""
     parts = [descent.message]
     if known.confirmed.shape[1]:
@@ -203,7 +203,7 @@ def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, quest
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
     ok = descent.converged and not (unseen or left.motion or apart)
     if not ok or at_ends or labels:
-        still = [text for part in question.parts for text in hanging(part.question.records, part.question.names)]
+        still = [text for part in question.parts for text in hanging(part.system.records, part.system.signals.names)]
         parts, ok = parts + still, ok and not still
     return Verdict(ok, " ".join(parts), left)
 
@@ -220,7 +220,7 @@ class Unexplained(NamedTuple):
     worst: list[int]
 
 
-def unexplained(question: AbstractQuestion, point: Point, widths: Widths) -> Unexplained:
+def unexplained(question: Residuals, point: Point, widths: Widths) -> Unexplained:
     """The share of the signals that a trial leaves, where that is much."""
     left, noisy, shares, doubted, many = [], [], [0.0], False, len(question.records) > 1
     of_records = np.zeros(len(question.records))
@@ -276,7 +276,7 @@ def _parts(rows: np.ndarray, values: np.ndarray, counts: np.ndarray) -> _Parts:
     return _Parts(samples, np.sum(counts * rows**2) / samples, motion, np.sum(counts * (values - mean) ** 2) / samples)
 
 
-def _rows_of_signal(question: AbstractQuestion, point: Point, widths: Widths, signal: int) -> dict[int, tuple]:
+def _rows_of_signal(question: Residuals, point: Point, widths: Widths, signal: int) -> dict[int, tuple]:
     """Of every record that has a signal: residuals, values and how much each counts, (M, T) for its M pieces."""
     found: dict[int, list] = {}
     columns = zip(question.batches, point.residuals, question.factors(point, widths), strict=True)
@@ -305,10 +305,8 @@ def _at_ends(parameters: Parameters, point: Point, triangles, states: int, known
     found, named = [], np.zeros(len(parameters), bool)
     if known.null.shape[1] or not len(parameters):
         return found, named
-    norms = np.linalg.norm(triangles[..., :states], axis=1), np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
-    scale = tuple(np.where(norm > 0, norm, 1.0) for norm in norms)
     none = np.zeros(len(parameters))
-    step = eliminate(triangles, states, scale, 1e-14, (none, none)).u
+    step = eliminate(triangles, states, column_norms(triangles, states), 1e-14, (none, none)).u
     deviations = _deviations(known)
     for unknown, (label, transform) in enumerate(zip(parameters.labels, parameters.maps, strict=True)):
         if not isinstance(transform, Positive | Between):
@@ -341,7 +339,7 @@ def _at_end(name: str, transform: Positive | Between, x: float, step: float, err
 
 
 def _disagreements(
-    question: AbstractQuestion, triangles: np.ndarray, known: Information, inside: np.ndarray, motion: dict[int, float]
+    question: Residuals, triangles: np.ndarray, known: Information, inside: np.ndarray, motion: dict[int, float]
 ) -> tuple[list[str], list[str]]:
     """Sentences for the records without which a parameter would move by more than they can have by chance: for those of
     another motion, and for those that show, each in its way, what the scene lacks.
@@ -376,7 +374,7 @@ def _disagreements(
     )
 
 
-def _motion(question: AbstractQuestion, point: Point, widths: Widths) -> dict[int, float]:
+def _motion(question: Residuals, point: Point, widths: Widths) -> dict[int, float]:
     """Of every record the sum of squares that a trial leaves beyond white noise, in those of the noise."""
     found: dict[int, float] = {}
     for signal in range(len(question.names)):
