@@ -353,31 +353,32 @@ class Clock(AbstractClock):
         self.tolerances = tolerances_of(problem)
         self.of_tangents = self.tolerances._replace(rtol=rtol, atol=self.tolerances.atol / _SHARPER)
         self.sections, self._slopes = len(functions), _slopes_of(surfaces, layout.size, len(parameters.first))
-        self._last: tuple[bytes, tuple[np.ndarray, np.ndarray]] | None = None
         self.times = self._as_function()
 
     # ---- the crossings of N motions ----
 
-    def noted(self, y0: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """When the motions from y0 (N, 2n) with the parameters `numbers` (N, P) cross, (N, M), and which have all of
-        the crossings, (N,). The times of one that has not are spread over the span."""
+    def noted(self, y0: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """The times (N, M) at which motions from y0 (N, 2n) with the parameters `numbers` (N, P) cross, in one run.
+
+        NaN for a motion that has not all of the crossings.
+        """
         noted = self.noting.run(self.span[None], y0, numbers, self.tolerances._replace(notes=self.room))
         rows = noted.path.reshape(len(y0), self.sections, self.room + 1, -1)
         t = rows[:, self.flat.which, self.flat.numbers, 0]
-        ok = np.isfinite(t).all(axis=1)
-        return np.where(ok[:, None], t, np.linspace(self.span[0], self.span[1], t.shape[1] + 1)[1:]), ok
+        return np.where(np.isfinite(t).all(axis=1, keepdims=True), t, np.nan)
 
-    def crossed(self, y0: np.ndarray, numbers: np.ndarray, noted: tuple[np.ndarray, np.ndarray] | None = None):
-        """The crossings of the motions from y0 (N, 2n) with the parameters `numbers` (N, P), as `Crossed`.
+    def crossed(self, y0: np.ndarray, numbers: np.ndarray, t: np.ndarray) -> Crossed:
+        """The crossings at the times t (N, M) that `noted` found for y0 (N, 2n) and `numbers` (N, P), by a second run.
 
-        `noted` is what the method of that name returned for the same motions, where it was asked before.
+        A motion that has not all of them is followed at times spread over the span, so that the others have one run.
         """
-        t, ok = self.noted(y0, numbers) if noted is None else noted
+        has_all = np.isfinite(t).all(axis=1, keepdims=True)
+        t = np.where(has_all, t, np.linspace(self.span[0], self.span[1], t.shape[1] + 1)[1:])
         count, begin = len(y0), self.span[:1]
         order = np.argsort(t, axis=1, kind="stable")
         ts = np.concatenate([np.broadcast_to(begin, (count, 1)), np.take_along_axis(t, order, axis=1)], axis=1)
         run = self.flow.run(ts, y0, numbers, self.tolerances, KEPT)
-        ok = ok & np.isin(run.result, ENDED_WELL)
+        ok = has_all[:, 0] & np.isin(run.result, ENDED_WELL)
         y = np.empty((*t.shape, y0.shape[1]))
         np.put_along_axis(y, order[..., None], run.path[:, 1:], axis=1)
         by_y, by_numbers = self._moved(t, y, numbers)
@@ -425,7 +426,8 @@ class Clock(AbstractClock):
 
     def along(self, y0, numbers, y0_dot, numbers_dot):
         """The times (M,) and how they move (M, D); see `AbstractClock`."""
-        crossed = self.crossed(y0[None], numbers[None])
+        y0, numbers = y0[None], numbers[None]
+        crossed = self.crossed(y0, numbers, self.noted(y0, numbers))
         if not crossed.ok.all():
             return None
         return crossed.t[0], self.forward(crossed, y0_dot[None], numbers_dot[None])[0]
@@ -455,41 +457,37 @@ class Clock(AbstractClock):
     def _as_function(self):
         """`(y0, numbers)` → the times (M,), a function for `jax.jit`, `jax.vmap` and `jax.grad`; NaN where it failed.
 
-        Members of a batch are one run. Its derivatives are those of first order, in reverse.
+        Members of a batch are one run. Its derivatives are those of first order, in reverse: the times that were noted
+        on the way forward are an argument of the way back, which runs to the states there.
         """
-        count = len(self.flat.which)
 
-        def call(host, shapes, *arguments):
-            of = jax.tree.map(lambda size: jax.ShapeDtypeStruct((size,), np.float64), shapes)
+        def call(host, sizes, *arguments):
+            of = jax.tree.map(lambda size: jax.ShapeDtypeStruct((size,), np.float64), sizes)
             return jax.pure_callback(host, of, *arguments, vmap_method="broadcast_all")
 
         @jax.custom_vjp
         def times(y0, numbers):
-            return call(self._times, count, y0, numbers)
+            return call(self._times, len(self.flat.which), y0, numbers)
 
         def forward(y0, numbers):
-            return times(y0, numbers), (y0, numbers)
+            t = times(y0, numbers)
+            return t, (y0, numbers, t)
 
-        def backward(inputs, t_ct):
-            return call(self._cotangents, tuple(x.shape[-1] for x in inputs), *inputs, t_ct)
+        def backward(kept, t_ct):
+            return call(self._cotangents, tuple(x.shape[-1] for x in kept[:2]), *kept, t_ct)
 
         times.defvjp(forward, backward)
         return times
 
     def _times(self, y0, numbers):
-        """The times alone, which need no second run: what is noted is kept for a cotangent that follows."""
         y0, numbers = (np.asarray(x, np.float64) for x in (y0, numbers))
-        rows = tuple(x.reshape(-1, x.shape[-1]) for x in (y0, numbers))
-        t, ok = noted = self.noted(*rows)
-        self._last = y0.tobytes() + numbers.tobytes(), noted
-        return np.where(ok[:, None], t, np.nan).reshape(*y0.shape[:-1], -1)
+        t = self.noted(*(x.reshape(-1, x.shape[-1]) for x in (y0, numbers)))
+        return t.reshape(*y0.shape[:-1], -1)
 
     def _cotangents(self, *arrays):
         arrays = [np.asarray(x, np.float64) for x in arrays]
-        y0, numbers, t_ct = (x.reshape(-1, x.shape[-1]) for x in arrays)
-        key, last = y0.tobytes() + numbers.tobytes(), self._last
-        noted = last[1] if last is not None and last[0] == key else None
-        found = self.reverse(self.crossed(y0, numbers, noted), t_ct)
+        y0, numbers, t, t_ct = (x.reshape(-1, x.shape[-1]) for x in arrays)
+        found = self.reverse(self.crossed(y0, numbers, t), t_ct)
         return tuple(x.reshape(like.shape) for x, like in zip(found, arrays[:2], strict=True))
 
 
