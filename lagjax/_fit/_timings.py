@@ -378,7 +378,7 @@ class Clock(AbstractClock):
         order = np.argsort(t, axis=1, kind="stable")
         ts = np.concatenate([np.broadcast_to(begin, (count, 1)), np.take_along_axis(t, order, axis=1)], axis=1)
         run = self.flow.run(ts, y0, numbers, self.tolerances, KEPT)
-        ok = has_all[:, 0] & np.isin(run.result, ENDED_WELL)
+        ok = np.ravel(has_all) & np.isin(run.result, ENDED_WELL)
         y = np.empty((*t.shape, y0.shape[1]))
         np.put_along_axis(y, order[..., None], run.path[:, 1:], axis=1)
         by_y, by_numbers = self._moved(t, y, numbers)
