@@ -5,6 +5,7 @@ here, translated from the PTX (`ptx.PtxOnCpu`), so that all of `simulate` around
 """
 
 import functools
+import importlib
 import re
 import subprocess
 import sys
@@ -16,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.interpreters import mlir
-from ptx import PtxOnCpu
 
 import lagjax
+from benchmarks._ptx import PtxOnCpu
 from lagjax import scenes
 from lagjax._machine_code import _gpu, _transforms
 from lagjax._machine_code._call import on_host
@@ -270,6 +271,19 @@ def test_a_scene_that_cannot_go_to_a_gpu_says_why():
 
     with pytest.raises(ValueError, match="on a GPU: its tables of numbers"):
         jax.jit(function).trace(1.0).lower(lowering_platforms=("cuda",))
+
+
+@pytest.mark.slow
+def test_instructions_are_counted():
+    # Of a pendulum's step at order 13: every product of two series of 13 terms alone has 91 products.
+    gpu_estimate = importlib.import_module("benchmarks.gpu_estimate")
+    program, a_step, steps = gpu_estimate.counted(scenes.pendulum())
+    assert program.count(".entry") == 1 and 10 < steps < 200
+    assert 300 < a_step["float64"] < 3000 and 0 < a_step["local stores"] < a_step["local loads"] < 3000
+    thread = {"registers": 128, "stack": 4096, "spills": 0}
+    twice = gpu_estimate.bounds({name: 2 * count for name, count in a_step.items()}, steps, thread)
+    for name, bound in gpu_estimate.bounds(a_step, steps, thread).items():
+        assert twice[name] == pytest.approx(2 * bound) and bound > 0
 
 
 # ---- assembled -------------------------------------------------------------------------------------------------------

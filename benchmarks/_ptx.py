@@ -1,4 +1,4 @@
-"""PTX on the CPU: the assembly language of NVIDIA's GPUs, translated back into LLVM, so that tests can run it.
+"""PTX on the CPU: the assembly language of NVIDIA's GPUs, translated back into LLVM, so that it can be run and counted.
 
 It knows the some eighty instructions that lagjax's kernels have: no calls, no barriers.
 """
@@ -37,6 +37,8 @@ _NUMBERS = {
     "u32": I32,
     "pred": I1,
 }
+COUNTED = "float64", "local loads", "local stores"
+_ARITHMETIC = frozenset(("add", "sub", "mul", "div", "fma", "max", "min", "sqrt", "rcp", "setp"))
 _SPECIAL = ("%tid.x", "%ntid.x", "%ctaid.x", "%nctaid.x")
 
 
@@ -44,15 +46,21 @@ class PtxOnCpu:
     """One kernel of a PTX text as a function `(tid, ntid, ctaid, nctaid, *arguments)`, one thread a call.
 
     A register is a variable of its bits; all spaces of addresses are one, that of the host. No calls, no barriers.
+    Where it is `counting`, `counts` has how many instructions of the kinds in `COUNTED` it has executed so far: those
+    of the arithmetic of float64, and doubles read from and written to local memory.
     """
 
-    def __init__(self, ptx):
+    def __init__(self, ptx, counting=False):
         text = re.sub(r"//[^\n]*", "", ptx)
         header, body = re.search(r"\.entry\s+(\w+\(.*?\))[^{]*\{(.*?)\n\}", text, re.DOTALL).groups()
         self.parameters = re.findall(r"(\w+_param_\d+)", header)
         self.module = ir.Module("ptx")
         self.module.triple = llvm.get_default_triple()
-        self.names = {}
+        self.names, self._counters = {}, None
+        if counting:
+            kind = ir.ArrayType(I64, len(COUNTED))
+            self._counters = ir.GlobalVariable(self.module, kind, "counters")
+            self._counters.initializer = ir.Constant(kind, [0] * len(COUNTED))
         for name, size, data in re.findall(
             r"\.(?:global|const)[^;{]*?.b8\s+([\w$]+)\[(\d+)\](?:\s*=\s*\{([^}]*)\})?", text
         ):
@@ -101,9 +109,27 @@ class PtxOnCpu:
         passes.run(module, builder)
         self.engine, address = jitted(module, "thread")
         self.address = address
+        if counting:
+            place = self.engine.get_global_value_address("counters")
+            self._totals = (ctypes.c_int64 * len(COUNTED)).from_address(place)
         self.thread = ctypes.CFUNCTYPE(None, *[ctypes.c_uint32] * count, *[ctypes.c_void_p] * len(self.parameters))(
             address
         )
+
+    @property
+    def counts(self):
+        return dict(zip(COUNTED, self._totals, strict=True))
+
+    def _count(self, name, parts, registers):
+        """Count an instruction; local memory is that of `.local` and of the thread's own pointers."""
+        kind = None
+        if name in ("ld", "st") and parts[1] == "local":
+            kind = "local loads" if name == "ld" else "local stores"
+        elif name in _ARITHMETIC and parts[-1] == "f64":
+            kind = "float64"
+        if self._counters is not None and kind is not None:
+            place = self.b.gep(self._counters, [I32(0), I32(COUNTED.index(kind))], inbounds=True)
+            self.b.store(self.b.add(self.b.load(place), I64(registers)), place)
 
     def _line(self, line, labels, function):
         b = self.b
@@ -190,6 +216,7 @@ class PtxOnCpu:
                 else [operands[0 if name == "ld" else 1]]
             )
             place, argument = self._address(operands[1 if name == "ld" else 0])
+            self._count(name, parts, len(registers))
             for i, register in enumerate(registers):
                 t = _NUMBERS[kind]
                 if argument:
@@ -201,8 +228,12 @@ class PtxOnCpu:
                 else:
                     b.store(self._read(register, kind), at, align=1)
             return
+        self._count(name, parts, 1)
         to, *others = operands
-        read = lambda i, k=kind: self._read(others[i], k)
+
+        def read(i, k=kind):
+            return self._read(others[i], k)
+
         floating, signed = kind.startswith("f"), kind.startswith("s")
         if name == "high":
             value = b.trunc(b.lshr(self._read(others[0], "b64"), I64(32)), I32)
@@ -271,8 +302,8 @@ class PtxOnCpu:
         elif name == "mul" and "lo" in parts:
             value = b.mul(read(0), read(1))
         elif name in ("mul", "mad") and "wide" in parts:
-            wide = lambda x: (b.sext if signed else b.zext)(x, I64)
-            value = b.mul(wide(read(0)), wide(read(1)))
+            extend = b.sext if signed else b.zext
+            value = b.mul(extend(read(0), I64), extend(read(1), I64))
             value = b.add(value, self._read(others[2], "b64")) if name == "mad" else value
         elif name == "mad" and "lo" in parts:
             value = b.add(b.mul(read(0), read(1)), read(2))

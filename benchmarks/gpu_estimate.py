@@ -1,0 +1,153 @@
+"""An estimate of what motions take on an H100, from the code that would run there. Nothing is measured on a GPU.
+
+    python -m benchmarks.gpu_estimate
+
+The PTX of every scene is run on the CPU, instruction by instruction, for a few members; its float64 arithmetic and its
+reads and writes of local memory are counted. `ptxas` (`pip install nvidia-cuda-nvcc-cu12`), where it is, says how many
+registers, bytes of stack and spills a thread has. Each of these takes a member some time, if all threads are at work:
+
+    arithmetic    132 multiprocessors × 64 instructions a cycle × 1.98 GHz
+    L1            132 × 16 doubles a cycle × 1.98 GHz
+    HBM           3.35 TB/s, for the part of local memory that the caches (256 KB a multiprocessor, 50 MB for all) do
+                  not hold, as if every access to that part missed them
+
+The longest of them is the estimate. Spills, latencies, divergence and instruction caches come on top. The last column
+is measured: the same members in machine code on this machine's cores.
+"""
+
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.interpreters import mlir
+
+import lagjax
+from benchmarks import _report
+from benchmarks._ptx import PtxOnCpu
+from lagjax import scenes
+from lagjax._machine_code import _gpu, _transforms
+from lagjax._native import gpu
+
+STORE = Path(__file__).parent / "results" / "gpu_estimate.json"
+CLOCK, MULTIPROCESSORS, ARITHMETIC, L1, HBM = 1.98e9, 132, 64, 16, 3.35e12
+REGISTERS, L1_BYTES, L2_BYTES = 65536, 256 * 1024, 50e6  # of a multiprocessor; L2 of all of them
+MEMBERS, BATCH, DURATION, RTOL = 4, 4096, 5.0, 1e-9
+SCENES = {
+    "pendulum": scenes.pendulum,
+    "Kepler": scenes.kepler,
+    "double pendulum": scenes.double_pendulum,
+    "double pendulum, constrained": scenes.cartesian_double_pendulum,
+    "spherical pendulum": scenes.spherical_pendulum,
+    "chain of 4": lambda: scenes.chain(4),
+    "chain of 8": lambda: scenes.chain(8),
+}
+
+
+def starts(scene, members: int) -> tuple:
+    """The scene's own start, with velocities that differ by up to a tenth."""
+    scales = jnp.linspace(0.9, 1.1, members)
+    q0 = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *jnp.shape(x))), scene.q0)
+    return q0, jax.tree.map(lambda x: jnp.multiply.outer(scales, x), scene.qdot0)
+
+
+def counted(scene) -> tuple[str, dict, float]:
+    """The PTX of a scene's motion, its instructions a step, and the steps of a member."""
+    programs, counts = [], {}
+
+    def launch(program, operands, results):
+        def host(*arrays):
+            translated = PtxOnCpu(program, counting=True)
+            arrays = [np.array(x) for x in arrays]
+            outputs = [arrays[4], arrays[5], *(np.full(x.shape, np.nan) for x in results[2:])]
+            translated.thread(0, 1, 0, 1, *(x.ctypes.data for x in (*arrays, *outputs)))
+            counts.update(translated.counts)
+            return tuple(outputs)
+
+        programs.append(program)
+        return list(jax.pure_callback(host, tuple(results), *operands))
+
+    def lower_by(rule):
+        mlir.register_lowering(_transforms.run_p, rule, platform="cpu")
+
+    kept, _gpu.launch = _gpu.launch, launch
+    try:  # the rule of GPUs on the CPU
+        lower_by(mlir.lower_fun(_transforms._run_for_gpus, multiple_results=True))
+        run = jax.jit(lambda q0, v0: motions(scene, q0, v0, solver=lagjax.MachineCode()).stats)
+        stats = jax.tree.map(np.asarray, run(*starts(scene, MEMBERS)))
+    finally:
+        lower_by(_transforms._for_cpus(_transforms._run_compiled))
+        _gpu.launch = kept
+        jax.clear_caches()
+    steps = stats["num_steps"].sum()
+    return programs[0], {name: count / steps for name, count in counts.items()}, float(steps) / MEMBERS
+
+
+def motions(scene, q0, v0, solver=None):
+    ts = jnp.array([0.0, DURATION])
+    return lagjax.simulate_batch(scene.system, q0, v0, ts, scene.params, rtol=RTOL, solver=solver)
+
+
+def assembled(program: str) -> dict | None:
+    """What a thread takes of an H100, by `ptxas`; None where that is missing."""
+    places = (file for folder in sys.path for file in Path(folder or ".").glob("nvidia/*/bin/ptxas"))
+    if (ptxas := next(places, None)) is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "k.ptx"
+        source.write_text(program)
+        command = [ptxas, "-v", "-arch", "sm_90", source, "-o", Path(folder) / "k.cubin"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    report = done.stdout + done.stderr
+    stack, *spills = (int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", report))
+    (registers,) = map(int, re.findall(r"Used (\d+) registers", report))
+    return {"registers": registers, "stack": stack, "spills": sum(spills)}
+
+
+def bounds(a_step: dict, steps: float, thread: dict) -> dict:
+    """The least times of a member in nanoseconds."""
+    moved = steps * (a_step["local loads"] + a_step["local stores"])
+    resident = min(gpu.MOST_BLOCKS * gpu.THREADS // MULTIPROCESSORS, REGISTERS // thread["registers"])
+    held = max(L1_BYTES, L2_BYTES / MULTIPROCESSORS)
+    beyond = max(0.0, 1.0 - held / (resident * thread["stack"]))
+    peak = MULTIPROCESSORS * CLOCK
+    return {
+        "arithmetic_ns": 1e9 * steps * a_step["float64"] / (peak * ARITHMETIC),
+        "L1_ns": 1e9 * moved / (peak * L1),
+        "HBM_ns": 1e9 * 8 * moved * beyond / HBM,
+    }
+
+
+def on_this_machine(scene) -> float:
+    """Nanoseconds of a member in machine code on these cores, the median of five batches."""
+    q0, v0 = starts(scene, BATCH)
+    times = []
+    for _ in range(6):
+        begun = time.perf_counter()
+        jax.block_until_ready(motions(scene, q0, v0))
+        times.append(time.perf_counter() - begun)
+    return 1e9 * float(np.median(times[1:])) / BATCH
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    rows = []
+    for name, make in SCENES.items():
+        scene = make()
+        program, a_step, steps = counted(scene)
+        thread = assembled(program)
+        row = {"scene": name, "steps": steps, **{f"{kind} a step": count for kind, count in a_step.items()}}
+        row |= {**thread, **bounds(a_step, steps, thread)} if thread is not None else {}
+        rows.append(row | {"cpu_ns": on_this_machine(scene)})
+    print(_report.table(rows))
+    note = "an estimate from counted instructions; not run on a GPU"
+    _report.write_json(STORE, {**_report.circumstances(), "note": note, "duration": DURATION, "scenes": rows})
+
+
+if __name__ == "__main__":
+    main()
