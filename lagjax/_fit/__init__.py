@@ -21,7 +21,8 @@ Files, from the lowest floor up:
     _profile       profile likelihood, and comparison of fits by AIC, BIC, cross-validation
     _verdict       the end of a search in words, influence of records, mistakes in the data
     _search        multiple shooting over growing segments, weak form, multistart
-    _report        figures and pages of HTML
+    _prediction    records that were not fitted, or are planned
+    _report        a fit in words, figures, pages of HTML
     _result        Fit
 """
 
@@ -46,7 +47,6 @@ from lagjax._fit._parameters import Parameters, angle, between, inertia, positiv
 from lagjax._fit._records import (
     Form,
     Guess,
-    Measured,
     Record,
     asks,
     errors_of_system,
@@ -59,9 +59,9 @@ from lagjax._fit._records import (
     systems_by_name,
     whole,
 )
-from lagjax._fit._report import draw_record
+from lagjax._fit._report import draw_record, record_matrix
 from lagjax._fit._residuals import Failure, Residuals, SystemResiduals
-from lagjax._fit._result import Covariance, Fit, SignalNoise, record_matrix
+from lagjax._fit._result import Covariance, Fit, SignalNoise
 from lagjax._fit._search import (
     Reader,
     TimeScales,
@@ -75,7 +75,7 @@ from lagjax._fit._search import (
     time_scales,
     weakly,
 )
-from lagjax._fit._sensors import UNCLEAR, Delayed, Signals, looks_like_positions, require_no_jumps, sensors, wrapped
+from lagjax._fit._sensors import UNCLEAR, Delayed, Signals, require_no_jumps, sensors, wrapped
 from lagjax._fit._timings import Timings, clock_of
 from lagjax._fit._uncertainty import Information, information, sentences
 from lagjax._fit._verdict import SECONDS, Unexplained, Verdict, find_mistake, hanging, suspects, verdict
@@ -263,7 +263,7 @@ def _answer(how: _How, scenes: list["_Scene"], params0: PyTree, parameters: Para
     readers = _readers(scenes, question)
     if how.progress:
         question.watch = _Printer(question.size)
-    y0 = _starts(scenes, readers, question.states, params0)
+    y0 = _starts(question, readers, params0)
     readers = _to_cut(scenes, readers, how.method)
     first, noise = parameters.moved(parameters.first), how.noise
     if how.method == "gradient":
@@ -450,7 +450,7 @@ def _readers(scenes: list[_Scene], question: Residuals) -> list[Reader | None] |
     for scene, part in zip(scenes, question.parts, strict=True):
         probes = max(8, 256 // len(scene.records))
         readers += [
-            reader_of(record, scene.observe, part.system, numbers, probes) if isinstance(record, Record) else None
+            reader_of(record, part.system, numbers, probes) if isinstance(record, Record) else None
             for record in scene.records
         ]
     return readers if any(reader is not None for reader in readers) else None
@@ -470,24 +470,24 @@ def _to_cut(scenes: list[_Scene], readers: list[Reader | None] | None, method: s
     return left if any(reader is not None for reader in left) else None
 
 
-def _starts(scenes: list[_Scene], readers: list[Reader | None] | None, states: int, params0) -> np.ndarray:
+def _starts(question: Residuals, readers: list[Reader | None] | None, params0: PyTree) -> np.ndarray:
     """The first guess of the starts of all records, (N, 2n) of the system with the most coordinates."""
-    found, first = [], 0
-    for scene in scenes:
-        own = None if readers is None else readers[first : first + len(scene.records)]
-        with errors_of_system(scene.name):
-            found += [_start(record, own, scene, k, params0) for k, record in enumerate(scene.records)]
-        first += len(scene.records)
-    return np.stack([roomy(state, states) for state in found])
+    found = []
+    for part in question.parts:
+        own = None if readers is None else readers[part.records]
+        with errors_of_system(part.name):
+            found += [_start(part.system, own, k, params0) for k in range(len(part.system.records))]
+    return np.stack([roomy(state, question.states) for state in found])
 
 
-def _start(record: Measured, readers: list[Reader | None] | None, scene: _Scene, place: int, params0) -> np.ndarray:
+def _start(system: SystemResiduals, readers: list[Reader | None] | None, place: int, params0: PyTree) -> np.ndarray:
     """The first guess of the start of one record, (2n,)."""
-    state = known_start(record, scene.layout, place, params0)
+    record = system.records[place]
+    state = known_start(record, system.layout, place, params0)
     if state is not None:
         return state
     reader = None if readers is None else readers[place]
-    if reader is None and isinstance(record, Record) and looks_like_positions(scene.observe, record, scene.layout):
+    if reader is None and isinstance(record, Record) and system.signals.look_like_positions(record):
         raise ValueError(UNCLEAR.format(f"records[{place}]"))
     if reader is None:
         raise ValueError(

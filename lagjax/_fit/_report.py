@@ -1,6 +1,6 @@
-"""Report: figures of a fit with matplotlib, and a page of HTML with them inside.
+"""Report: a fit in words, in figures drawn with matplotlib, and as a page of HTML with these inside.
 
-It holds the functions that draw, `Drawn` and `page`.
+It holds `lab_book` (what `print(fit)` shows), the functions that draw, `Drawn` and `page`.
 
 The figures do without the state machine of matplotlib, and `lagjax.plot` draws them too.
 """
@@ -8,9 +8,11 @@ The figures do without the state machine of matplotlib, and `lagjax.plot` draws 
 import base64
 import html
 import io
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from lagjax._fit._records import Record
@@ -188,3 +190,92 @@ def _of_records(records, residuals: list[np.ndarray], names, sigma) -> dict[str,
             _picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))
         ]
     return figures
+
+
+# ---- in words --------------------------------------------------------------------------------------------------------
+
+_LISTED = 8  # numbers of one array that a table lists; of more it says how many there are
+
+
+def lab_book(fit) -> str:
+    """The table of parameters, the noise of the signals, what is not seen, and the verdict."""
+    lines = [
+        title_of(fit),
+        "",
+        *_table_of_parameters(fit),
+        "",
+        *_table_of_noise(fit),
+        "",
+    ]
+    lines += [f"not seen    {sentence}" for sentence in fit.unseen]
+    if fit.waterfall is not None:
+        lines.append(f"starts      {fit.waterfall}")
+    lines.append(f"verdict     {fit.message}")
+    return "\n".join(lines)
+
+
+def title_of(fit) -> str:
+    samples = sum(noise.samples for noise in fit.noise.values())
+    spans = [record.ts[-1] - record.ts[0] for record in fit.records]
+    plural = "s" if len(fit.records) > 1 else ""
+    of_records = f"{len(fit.records)} record{plural}, {sum(spans):g} long, {samples} values"
+    return f"Fit of {len(fit.u)} parameter{'s' * (len(fit.u) != 1)} to {of_records}"
+
+
+def cells_of_parameters(fit) -> list[list[str]]:
+    low, high = fit._ends(0.95)
+    rows = [["parameter", "value", "from", "to (95 %)", "± relative"]]
+    for name, x, a, b in zip(fit.parameters.names, fit.parameters.values(fit.u), low, high, strict=True):
+        half = 50 * (b - a) / abs(x) if x else np.inf
+        rows.append([name, f"{x:.6g}", f"{a:.6g}", f"{b:.6g}", f"{half:.2g} %" if np.isfinite(half) else "not seen"])
+    return rows
+
+
+def cells_of_noise(fit) -> list[list[str]]:
+    rows = [["signal", "RMS", "σ", "ν", "samples", "effective", "Durbin–Watson"]]
+    for (name, noise), rms in zip(fit.noise.items(), fit.rms.values(), strict=True):
+        numbers = f"{rms:.3g}", f"{noise.sigma:.3g}", f"{noise.dof:.3g}", f"{noise.samples}", f"{noise.effective:.0f}"
+        rows.append([name, *numbers, f"{noise.durbin_watson:.2f}"])
+    return rows
+
+
+def _table_of_parameters(fit) -> list[str]:
+    if not fit.parameters.names:
+        return ["All parameters are kept: starts and noise were fitted."]
+    low, high = fit._ends(0.95)
+    values = fit.parameters.values(fit.u)
+    width = max(len(name) for name in (*fit.parameters.names, "parameter"))
+    rows = [f"{'parameter':<{width}}  {'value':>12}  {'95 % interval':>27}  relative"]
+    owners = [part.label for part in fit.parameters.parts for _ in part.places]
+    many = {label: count for label, count in Counter(owners).items() if count > _LISTED}
+    for label, count in many.items():
+        rows.append(f"{label:<{width}}  {f'{count} numbers':>12}")
+    for owner, name, x, a, b in zip(owners, fit.parameters.names, values, low, high, strict=True):
+        if owner in many:
+            continue
+        relative = 100 * (b - a) / 2 / abs(x) if x else np.inf
+        shown = f"± {relative:.2g} %" if np.isfinite(relative) else "not seen"
+        rows.append(f"{name:<{width}}  {x:>12.6g}  {a:>12.6g} … {b:>12.6g}  {shown}")
+    return rows
+
+
+def _table_of_noise(fit) -> list[str]:
+    width = max(len(name) for name in (*fit.noise, "signal"))
+    has_tails = any(np.isfinite(noise.dof) for noise in fit.noise.values())
+    tails = "         ν" if has_tails else ""
+    head = f"{'signal':<{width}}  {'RMS':>10}  {'noise σ':>10}{tails}"
+    rows = [f"{head}  {'samples':>8}  {'effective':>9}  Durbin–Watson"]
+    for (name, noise), rms in zip(fit.noise.items(), fit.rms.values(), strict=True):
+        tail = f"{noise.dof:>10.3g}" if has_tails else ""
+        rows.append(
+            f"{name:<{width}}  {rms:>10.3g}  {noise.sigma:>10.3g}{tail}  {noise.samples:>8}  {noise.effective:>9.0f}  "
+            f"{noise.durbin_watson:.2f}"
+        )
+    return rows
+
+
+def record_matrix(values: Any, record) -> np.ndarray:
+    """Signals in the structure of a record's values, side by side (T, S); times end to end (M, 1)."""
+    if not isinstance(record, Record):
+        return record.columns(values)
+    return np.concatenate([np.reshape(leaf, (len(record), -1)) for leaf in jax.tree.leaves(values)], axis=1)

@@ -402,6 +402,11 @@ class SystemPart(NamedTuple):
         """The name of the system, None where there is no other."""
         return self.system.name
 
+    def of_sensors(self, widths: Widths) -> Widths:
+        """The noise of the signals of records among that of all signals, without that of crossing times."""
+        own = slice(self.signals.start, self.signals.start + len(self.system.signals.names))
+        return Widths(widths.sigma[own], widths.dof[own])
+
 
 class Residuals:
     """The residuals of pieces of the records of one system or several; `u` moves the parameters that they share.
@@ -572,6 +577,15 @@ class Residuals:
         place = next(k for k, own in enumerate(self._records) if record < own.stop)
         name = self.systems[place].name
         return f"records{'' if name is None else f'[{name!r}]'}[{record - self._records[place].start}]"
+
+    def part_called(self, name: str | None) -> SystemPart:
+        """One of the systems by its name, or the only one. Raises `ValueError` for a name that there is not."""
+        parts = {part.name: part for part in self.parts}
+        if name not in parts:
+            if None in parts:
+                raise ValueError(f"This is a fit of one system without a name: leave system={name!r} out.")
+            raise ValueError(f"This is a fit of several systems: give system=, one of {', '.join(map(repr, parts))}.")
+        return parts[name]
 
     def _part_of(self, record: int) -> SystemPart:
         return next(part for part in self.parts if part.records.start <= record < part.records.stop)

@@ -2,32 +2,37 @@
 
 import functools
 import os
-from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, cast
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
-import jax
 import numpy as np
-from scipy.special import ndtri, stdtrit
+from scipy.special import stdtrit
 
 from lagjax._doubles import with_doubles
 from lagjax._fit._density import Density
-from lagjax._fit._descent import minimise
-from lagjax._fit._noise import AbstractNoise, Known, Widths
+from lagjax._fit._noise import AbstractNoise, Widths
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._profile import Comparison, Profile, comparison, effective_share, profile
-from lagjax._fit._records import Guess, Record, in_structure, known_start, require_alike, require_held
-from lagjax._fit._report import Drawn, draw_record, page, pictures_of
-from lagjax._fit._residuals import Failure, Point, Residuals, SystemPart, SystemResiduals
+from lagjax._fit._prediction import Prediction, planned_rows, predicted, require_level
+from lagjax._fit._profile import Comparison, Profile, comparison, profile
+from lagjax._fit._records import Record
+from lagjax._fit._report import (
+    Drawn,
+    cells_of_noise,
+    cells_of_parameters,
+    draw_record,
+    lab_book,
+    page,
+    pictures_of,
+    record_matrix,
+    title_of,
+)
+from lagjax._fit._residuals import Point, Residuals, SystemPart
 from lagjax._fit._sample import draw, inference_data
-from lagjax._fit._search import Waterfall, reader_of
-from lagjax._fit._sensors import UNCLEAR, looks_like_positions, on_circle
-from lagjax._fit._uncertainty import Experiments, Information, deviations, of_starts, ranked, start_alone
-from lagjax._hybrid import follow
+from lagjax._fit._search import Waterfall
+from lagjax._fit._uncertainty import Experiments, Information, of_starts, ranked
 from lagjax._notebook import cell
 from lagjax._tables import intervals
-from lagjax._trajectory import Trajectory
 
 PyTree = Any
 
@@ -59,33 +64,6 @@ class SignalNoise(NamedTuple):
     samples: int
     effective: float
     durbin_watson: float
-
-
-class Prediction(NamedTuple):
-    """A record as the fitted scene follows it.
-
-    - `trajectory`: the motion from `start`, (q0, qdot0), at the record's times.
-    - `values`: the signals that the sensors would show; `residuals`: those less the measured ones, NaN where missing.
-    - `deviation`: the standard deviation of `values`, because the parameters, and a start that was fitted, are known
-      only so well. It is infinite where the values depend on what is not seen. `widths`: the noise of a new sample.
-    """
-
-    trajectory: Trajectory
-    values: PyTree
-    residuals: PyTree
-    start: tuple[PyTree, PyTree]
-    deviation: PyTree
-    widths: Widths
-
-    def bands(self, level: float = 0.95) -> tuple[PyTree, PyTree]:
-        """(low, high) between which a new sample of weight one falls with probability `level`, noise included.
-
-        Raises `ValueError` for a level that is not between 0 and 1.
-        """
-        _require_level(level)
-        columns = iter(range(len(self.widths.sigma)))
-        half = jax.tree.map(lambda leaf: _half_widths(leaf, self.widths, level, columns), self.deviation)
-        return jax.tree.map(np.subtract, self.values, half), jax.tree.map(np.add, self.values, half)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -128,7 +106,7 @@ class Fit:
     observe: Any = field(repr=False)
 
     def __repr__(self) -> str:
-        return _lab_book(self)
+        return lab_book(self)
 
     @with_doubles
     def _repr_html_(self) -> str | None:
@@ -208,7 +186,7 @@ class Fit:
 
         Source: Venzon & Moolgavkar, Applied Statistics 37 (1988) 87; Raue et al., Bioinformatics 25 (2009) 1923.
         """
-        _require_level(level)
+        require_level(level)
         return profile(self.question, self.u, self.states, self.widths, self.information, name, level)
 
     def log_density(self, prior: Callable | None = None) -> Density:
@@ -259,23 +237,9 @@ class Fit:
         assert isinstance(point, Point)  # it was computed before
         return point
 
-    def _part(self, system: str | None) -> SystemPart:
-        """One of the systems by its name, or the only one. Raises `ValueError` for a name that there is not."""
-        parts = {part.name: part for part in self.question.parts}
-        if system not in parts:
-            if None in parts:
-                raise ValueError(f"This is a fit of one system without a name: leave system={system!r} out.")
-            raise ValueError(f"This is a fit of several systems: give system=, one of {', '.join(map(repr, parts))}.")
-        return parts[system]
-
-    def _of_sensors(self, part: SystemPart) -> Widths:
-        """The noise of the signals of a system's records, without that of crossing times."""
-        sensors = slice(part.signals.start, part.signals.start + len(part.system.signals.names))
-        return Widths(self.widths.sigma[sensors], self.widths.dof[sensors])
-
     def _quantile(self, level: float) -> float:
         """Student's t of a level, for the effective number of samples less that of parameters."""
-        _require_level(level)
+        require_level(level)
         dof = max(float(np.sum(self.information.effective)) - len(self.u), 1.0)
         return float(stdtrit(dof, 0.5 + 0.5 * level))
 
@@ -294,65 +258,7 @@ class Fit:
 
         Raises `ValueError` where the record has other signals than those of the fit, or its motion fails.
         """
-        [record], part = require_alike([record]), self._part(system)
-        about = part.system
-        first = next((one for one in about.records if isinstance(one, Record)), None)
-        if not isinstance(record, Record) or first is None:
-            raise TypeError("Only a lagjax.Record is predicted, after a fit of some: for times ask lagjax.crossings.")
-        if record.structure != first.structure:
-            raise ValueError("The record has other signals than those of the fit.")
-        if record.input_structure != first.input_structure:
-            raise ValueError("The record has other inputs than those of the fit.")
-        if about.signals.form is not None:
-            require_held(record, about.signals.form.hold, "the record")
-        layout, fixed = about.layout, self.parameters.kept(self.u)
-        state = known_start(record, layout, 0, self.params)
-        is_known = state is not None and not isinstance(record.start, Guess)
-        if state is None:
-            state = _start_read_off(record, self._by_name(self.observe, part), about, self.parameters.numbers(self.u))
-        question = Residuals([about.of_records([record], np.array([not is_known]), fixed, about.manifold)])
-        if is_known:
-            point = question.evaluate(np.zeros(0), state[None])
-        else:
-            done = minimise(question, np.zeros(0), state[None], Known(self._of_sensors(part)), enough=1e-3)
-            point = done if isinstance(done, Failure) else done.point
-        if isinstance(point, Failure):
-            raise ValueError(question.where(point))
-        n = layout.size
-        start = layout.restore(point.starts[0, :n]), layout.restore(point.starts[0, n:])
-        ts = np.asarray(record.ts, layout.dtype)
-        q0, qdot0 = (jax.tree.map(lambda x: np.asarray(x, layout.dtype), half) for half in start)
-        form, driven = about.signals.form, (record.sampled_at, record.input_samples)
-        scene, params = about.scene, self.params
-        scene, params = (scene, params) if form is None else form.along(scene, params, *driven)
-        trajectory = follow(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
-        values, deviation = self._shown(part, record, question, point)
-        left = on_circle(values - record.matrix, about.signals.periods)
-        left = np.where(record.weight_matrix > 0, left, np.nan)
-        noise = self._of_sensors(part)
-        noise = noise._replace(sigma=noise.sigma * np.sqrt(self.information.lost))
-        shown, missed, uncertain = (in_structure(matrix, record) for matrix in (values, left, deviation))
-        return Prediction(trajectory, shown, missed, start, uncertain, noise)
-
-    def _shown(self, part: SystemPart, record: Record, question: Residuals, point: Point):
-        """The signals (T, S) of a record that was followed, at all its times, and their standard deviations."""
-        planned, slopes = self._followed(part.system, record, point.starts[0])
-        known, states = self.information, question.states
-        own, follows = np.zeros((states, states)), np.zeros((states, len(self.u)))
-        if question.fitted[0]:
-            rows = np.sqrt(record.weight_matrix)[..., None] / self._of_sensors(part).sigma[:, None] * slopes
-            own, follows = start_alone(rows, states, known, effective_share(self))
-        return planned.matrix, deviations(slopes, states, own, follows, known)
-
-    def _followed(self, of: SystemResiduals, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
-        """A record with what sensors would show for its values, from a state (2n,), and their derivatives (T, S, D)."""
-        everywhere = replace(record, values=in_structure(np.zeros_like(record.matrix), record), weights=None)
-        about = Residuals([of.of_records([everywhere], np.array([True]), self.parameters)])
-        full = about.evaluate(self.u, state[None])
-        if isinstance(full, Failure):
-            raise ValueError(about.where(full))
-        shown = np.where(about.batches[0].weights[0] > 0, full.residuals[0][0], np.nan)  # NaN before a delay is over
-        return replace(record, values=in_structure(shown, record)), full.slopes[0][0]
+        return predicted(self, record, system)
 
     @with_doubles
     def next_experiment(
@@ -372,26 +278,9 @@ class Fit:
         named = candidates if isinstance(candidates, dict) else {f"[{k}]": one for k, one in enumerate(candidates)}
         if not named:
             raise ValueError("candidates is empty: give at least one lagjax.Record.")
-        rows = [self._rows_of(self._part(system), name, record) for name, record in named.items()]
+        part = self.question.part_called(system)
+        rows = [planned_rows(self, part, name, record) for name, record in named.items()]
         return ranked(list(named), rows, self.parameters.labels, self.information)
-
-    def _rows_of(self, part: SystemPart, name: str, record: Record) -> np.ndarray:
-        """The rows (M, F) of a planned record in units of the noise, its start eliminated where it is not known."""
-        if not isinstance(record, Record) or record.start is None:
-            raise ValueError(
-                f"The planned record {name} needs a start: (q0, qdot0), or lagjax.Guess(q0, qdot0) if that is to be "
-                "fitted."
-            )
-        state = known_start(record, part.system.layout, 0, self.params)
-        assert state is not None
-        planned, slopes = self._followed(part.system, record, state)
-        sigma = self._of_sensors(part).sigma[:, None]
-        weights = planned.weight_matrix[..., None] * (effective_share(self) / sigma**2)
-        rows, states = np.sqrt(weights) * slopes, part.system.states
-        own = rows[..., states:]
-        if isinstance(record.start, Guess):
-            own = own - rows[..., :states] @ start_alone(rows, states, self.information, 1.0)[1]
-        return own.reshape(-1, own.shape[-1])
 
     @with_doubles
     def report(self, path: str | os.PathLike, experiments: Sequence[Record] | dict[str, Record] = ()) -> None:
@@ -400,10 +289,10 @@ class Fit:
         With `experiments`, a set of planned records, it also says what to measure next (`next_experiment`). It needs
         matplotlib.
         """
-        tables = {"Parameters": _cells_of_parameters(self), "Noise": _cells_of_noise(self)}
+        tables = {"Parameters": cells_of_parameters(self), "Noise": cells_of_noise(self)}
         texts = {"What to measure next": str(self.next_experiment(experiments))} if experiments else {}
         pictures = pictures_of([self._drawn(part) for part in self.question.parts], self.covariance, self.waterfall)
-        text = page(_title(self), self.message, self.ok, self.unseen, tables, pictures, texts)
+        text = page(title_of(self), self.message, self.ok, self.unseen, tables, pictures, texts)
         with open(path, "w", encoding="utf-8") as file:
             file.write(text)
 
@@ -412,12 +301,7 @@ class Fit:
         residuals = self.question.end_to_end(self.residuals)[part.records]
         pairs = [pair for pair in zip(residuals, part.system.records, strict=True) if isinstance(pair[1], Record)]
         records, matrices = [record for _, record in pairs], [record_matrix(r, record) for r, record in pairs]
-        return Drawn(part.name, records, matrices, part.system.signals.names, self._of_sensors(part).sigma)
-
-    @staticmethod
-    def _by_name(of_all, part: SystemPart) -> Any:
-        """The part for one system: by its name, or for all."""
-        return of_all[part.name] if isinstance(of_all, dict) else of_all
+        return Drawn(part.name, records, matrices, part.system.signals.names, part.of_sensors(self.widths).sigma)
 
     @with_doubles
     def compare(self, other: "Fit | dict[str, Fit]", *, folds: int = 0) -> Comparison:
@@ -433,115 +317,3 @@ class Fit:
         """
         others = other if isinstance(other, dict) else {"the other": other}
         return comparison({"this": self, **others}, folds)
-
-
-def _require_level(level) -> None:
-    if not (np.ndim(level) == 0 and 0 < level < 1):
-        raise ValueError(f"level must be between 0 and 1, as 0.95 is; got {level!r}.")
-
-
-def _half_widths(deviation: np.ndarray, widths: Widths, level: float, columns) -> np.ndarray:
-    """Half of the band of one leaf of signals, whose places among all signals are the next of `columns`."""
-    flat = deviation.reshape(len(deviation), -1)
-    own = [next(columns) for _ in range(flat.shape[1])]
-    noise = widths.sigma[own] * stdtrit(np.minimum(widths.dof[own], 1e9), 0.5 + 0.5 * level)
-    return np.sqrt((ndtri(0.5 + 0.5 * level) * flat) ** 2 + noise**2).reshape(deviation.shape)
-
-
-def _start_read_off(record: Record, observe, about: SystemResiduals, numbers: np.ndarray) -> np.ndarray:
-    """The first state of a record from local polynomials. Raises where its signals are no positions."""
-    reader = reader_of(record, observe, about, numbers)
-    if reader is not None:
-        return reader.states(np.array([0]))[0]
-    if looks_like_positions(observe, record, about.layout):
-        raise ValueError(UNCLEAR.format("This record"))
-    raise ValueError("This record needs a start: give start=(q0, qdot0), or lagjax.Guess(q0, qdot0) to fit it.")
-
-
-def record_matrix(values: PyTree, record) -> np.ndarray:
-    """Signals in the structure of a record's values, side by side (T, S); times end to end (M, 1)."""
-    if not isinstance(record, Record):
-        return record.columns(values)
-    return np.concatenate([np.reshape(leaf, (len(record), -1)) for leaf in jax.tree.leaves(values)], axis=1)
-
-
-_LISTED = 8  # numbers of one array that a table lists; of more it says how many there are
-
-# ---- in words --------------------------------------------------------------------------------------------------------
-
-
-def _lab_book(fit: Fit) -> str:
-    """The table of parameters, the noise of the signals, what is not seen, and the verdict."""
-    lines = [
-        _title(fit),
-        "",
-        *_table_of_parameters(fit),
-        "",
-        *_table_of_noise(fit),
-        "",
-    ]
-    lines += [f"not seen    {sentence}" for sentence in fit.unseen]
-    if fit.waterfall is not None:
-        lines.append(f"starts      {fit.waterfall}")
-    lines.append(f"verdict     {fit.message}")
-    return "\n".join(lines)
-
-
-def _title(fit: Fit) -> str:
-    samples = sum(noise.samples for noise in fit.noise.values())
-    spans = [record.ts[-1] - record.ts[0] for record in fit.records]
-    plural = "s" if len(fit.records) > 1 else ""
-    of_records = f"{len(fit.records)} record{plural}, {sum(spans):g} long, {samples} values"
-    return f"Fit of {len(fit.u)} parameter{'s' * (len(fit.u) != 1)} to {of_records}"
-
-
-def _cells_of_parameters(fit: Fit) -> list[list[str]]:
-    low, high = fit._ends(0.95)
-    rows = [["parameter", "value", "from", "to (95 %)", "± relative"]]
-    for name, x, a, b in zip(fit.parameters.names, fit.parameters.values(fit.u), low, high, strict=True):
-        half = 50 * (b - a) / abs(x) if x else np.inf
-        rows.append([name, f"{x:.6g}", f"{a:.6g}", f"{b:.6g}", f"{half:.2g} %" if np.isfinite(half) else "not seen"])
-    return rows
-
-
-def _cells_of_noise(fit: Fit) -> list[list[str]]:
-    rows = [["signal", "RMS", "σ", "ν", "samples", "effective", "Durbin–Watson"]]
-    for (name, noise), rms in zip(fit.noise.items(), fit.rms.values(), strict=True):
-        numbers = f"{rms:.3g}", f"{noise.sigma:.3g}", f"{noise.dof:.3g}", f"{noise.samples}", f"{noise.effective:.0f}"
-        rows.append([name, *numbers, f"{noise.durbin_watson:.2f}"])
-    return rows
-
-
-def _table_of_parameters(fit: Fit) -> list[str]:
-    if not fit.parameters.names:
-        return ["All parameters are kept: starts and noise were fitted."]
-    low, high = fit._ends(0.95)
-    values = fit.parameters.values(fit.u)
-    width = max(len(name) for name in (*fit.parameters.names, "parameter"))
-    rows = [f"{'parameter':<{width}}  {'value':>12}  {'95 % interval':>27}  relative"]
-    owners = [part.label for part in fit.parameters.parts for _ in part.places]
-    many = {label: count for label, count in Counter(owners).items() if count > _LISTED}
-    for label, count in many.items():
-        rows.append(f"{label:<{width}}  {f'{count} numbers':>12}")
-    for owner, name, x, a, b in zip(owners, fit.parameters.names, values, low, high, strict=True):
-        if owner in many:
-            continue
-        relative = 100 * (b - a) / 2 / abs(x) if x else np.inf
-        shown = f"± {relative:.2g} %" if np.isfinite(relative) else "not seen"
-        rows.append(f"{name:<{width}}  {x:>12.6g}  {a:>12.6g} … {b:>12.6g}  {shown}")
-    return rows
-
-
-def _table_of_noise(fit: Fit) -> list[str]:
-    width = max(len(name) for name in (*fit.noise, "signal"))
-    has_tails = any(np.isfinite(noise.dof) for noise in fit.noise.values())
-    tails = "         ν" if has_tails else ""
-    head = f"{'signal':<{width}}  {'RMS':>10}  {'noise σ':>10}{tails}"
-    rows = [f"{head}  {'samples':>8}  {'effective':>9}  Durbin–Watson"]
-    for (name, noise), rms in zip(fit.noise.items(), fit.rms.values(), strict=True):
-        tail = f"{noise.dof:>10.3g}" if has_tails else ""
-        rows.append(
-            f"{name:<{width}}  {rms:>10.3g}  {noise.sigma:>10.3g}{tail}  {noise.samples:>8}  {noise.effective:>9.0f}  "
-            f"{noise.durbin_watson:.2f}"
-        )
-    return rows

@@ -61,7 +61,7 @@ from lagjax._fit._noise import Gaussian, Widths, log_likelihood
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Piece, Record, asks, at_instants, in_structure, inputs_between
 from lagjax._fit._residuals import Failure, Residuals, SystemResiduals
-from lagjax._fit._sensors import continued, looks_like_positions
+from lagjax._fit._sensors import continued
 from lagjax._fit._verdict import unexplained
 from lagjax._hybrid import Hybrid
 from lagjax._layout import halves
@@ -527,9 +527,9 @@ def _likelihood(done: Descent) -> float:
     return log_likelihood(done.widths, done.point.flat(), done.question.weights)
 
 
-def reader_of(record: Record, observe, about: SystemResiduals, numbers: np.ndarray, probes: int = 256) -> Reader | None:
+def reader_of(record: Record, about: SystemResiduals, numbers: np.ndarray, probes: int = 256) -> Reader | None:
     """A reader of states off a record; None where its signals are no positions, or go round too fast to tell."""
-    if not looks_like_positions(observe, record, about.layout):
+    if not about.signals.look_like_positions(record):
         return None
     periods = about.signals.periods
     smooth = continued(record, periods)

@@ -303,6 +303,7 @@ class Signals:
         form: Form | None = None,
     ):
         self.layout, self.parameters, self.form = layout, parameters, form
+        self.observe = observe
         self.delays: Delays | None = None
         if record is None:
             self.names, self._at, self.periods = (), None, np.zeros(0)
@@ -363,6 +364,10 @@ class Signals:
             rate = by_t + np.einsum("msi,mi->ms", by_inputs, rates.reshape(len(by_t), -1))
             slopes += rate.reshape(shape)[..., None] * ts_dot
         return values.reshape(shape), slopes
+
+    def look_like_positions(self, record: Record) -> bool:
+        """True if the signals are positions, or something of their structure (with a gain, a bias): a start for q."""
+        return sensors(self.observe)[0] is None or record.structure == (self.layout.tree, self.layout.shapes)
 
     def positions(self, record: Record, numbers: np.ndarray) -> Record:
         """The record with the coordinates that make sensors of the structure of q show its values, by Newton's method.
@@ -425,8 +430,3 @@ def _require_signals(observed, layout: Layout, parameters: Parameters, record: R
 
 def _is_complex(leaf) -> bool:
     return np.issubdtype(np.result_type(leaf), np.complexfloating)
-
-
-def looks_like_positions(observe: Callable | Delayed | None, record: Record, layout: Layout) -> bool:
-    """True if the signals are positions, or something of their structure (with a gain, a bias): a start for q."""
-    return sensors(observe)[0] is None or record.structure == (layout.tree, layout.shapes)
