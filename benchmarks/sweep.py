@@ -37,9 +37,9 @@ import numpy as np
 
 import lagjax
 from benchmarks import _report
-from lagjax._sweep import Store, run_store, status
-from lagjax._sweep._sections import Sections, run_batch
-from lagjax._sweep._status import Progress
+from lagjax._sweep import Progress, Store, run_store, status
+from lagjax._sweep._batch import run_batch
+from lagjax._sweep._description import Sections
 
 SCENE = lagjax.scenes.double_pendulum()
 DURATION, RTOL = 5.0, 5e-9  # of which the median error is 1e-8
@@ -365,7 +365,7 @@ def _abort(kinds):
 def plan(options: argparse.Namespace) -> dict[str, Any]:
     """10⁸ members described, and their store made: seconds, and memory beside that of Python and JAX."""
     found = {}
-    over = {"a grid": grid(10**8), "random": {("theta1", "theta2"): lagjax.random(10**8, 1, -math.pi, math.pi)}}
+    over = {"a grid": grid(10**8), "random": {("theta1", "theta2"): lagjax.designs.random(10**8, 1, -math.pi, math.pi)}}
     for name, axes in over.items():
         with tempfile.TemporaryDirectory(dir=options.folder) as folder, _Memory() as memory:
             began = time.perf_counter()

@@ -122,8 +122,9 @@ if TYPE_CHECKING:  # each is imported where it is first asked for: all of them t
     from lagjax._results import RESULTS, SimulationError
     from lagjax._samples import samples
     from lagjax._simulate import simulate, simulate_batch
-    from lagjax._sweep import Statistics, Status, Sweep, latin_hypercube, random, sobol, sweep
+    from lagjax._sweep import Statistics, Status, Sweep, sweep
     from lagjax._trajectory import State, Trajectory, Transitions
+    from lagjax.designs import latin_hypercube, random, sobol
 
 __version__ = "0.1.0"
 __all__ = [

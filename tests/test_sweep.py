@@ -22,7 +22,8 @@ import pytest
 
 import lagjax
 from lagjax import __main__ as command_line
-from lagjax._sweep import _claims, _designs, _job, _run, _statistics, _store, _unit
+from lagjax import designs
+from lagjax._sweep import _job, _statistics, _store, _workers
 from lagjax._sweep._members import Grid, axes_of
 from lagjax._sweep._store import Store
 
@@ -97,7 +98,7 @@ def test_status_tells_results_and_the_worst_energy(tmp_path):
 
 @pytest.mark.slow
 def test_designs_and_names_that_vary_together(tmp_path):
-    over = {("length", "mass"): ([0.5, 1.0], [1.0, 3.0]), "angle": lagjax.random(5, seed=1, low=0.0, high=2.0)}
+    over = {("length", "mass"): ([0.5, 1.0], [1.0, 3.0]), "angle": designs.random(5, seed=1, low=0.0, high=2.0)}
     data = swept(tmp_path, over, unit=None).open()
     assert data.end.dims == ("length_mass", "angle") and data.end.shape == (2, 5)
     np.testing.assert_array_equal(data.mass, [1.0, 3.0])
@@ -142,7 +143,7 @@ def test_crossings_do_not_depend_on_neighbours_and_workers(tmp_path, how, monkey
     ts, rule = jnp.array([0.0, 2.0]), {**RULE, **WITH_CROSSINGS}
     whole = lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": tmp_path / "whole"}).open().load()
     store = tmp_path / "store"
-    monkeypatch.setattr("lagjax._sweep.work", lambda *_: _run.work(*_, 2))  # stopped after two units
+    monkeypatch.setattr("lagjax._sweep.work", lambda *_: _workers.work(*_, 2))  # stopped after two units
     lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how})
     monkeypatch.undo()
     data = lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how}).open()
@@ -216,16 +217,16 @@ def test_units_tile_the_members_in_order(shape, size):
 
 
 def test_a_hundred_million_members_are_no_list(monkeypatch):
-    monkeypatch.setattr(_designs, "SLICE", 1000)
-    over = {"a": np.linspace(0, 1, 10_000), "b": lagjax.random(10_000)}
+    monkeypatch.setattr(designs, "SLICE", 1000)
+    over = {"a": np.linspace(0, 1, 10_000), "b": designs.random(10_000)}
     grid = Grid.of(tuple(axis.size for axis in axes_of(over)), 10**6)
     assert grid.members == 10**8 and grid.units == 100 and grid.box(99)[0] == slice(9900, 10_000)
-    (axis,) = axes_of({("x", "y"): lagjax.random(10**8, seed=3)})
+    (axis,) = axes_of({("x", "y"): designs.random(10**8, seed=3)})
     start, first = next(axis.pieces())
     assert start == 0 and len(first) == 1000
 
 
-@pytest.mark.parametrize("design", [lagjax.random, pytest.param(lagjax.sobol, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("design", [designs.random, pytest.param(designs.sobol, marks=pytest.mark.slow)])
 def test_more_members_begin_with_the_same_ones(design, monkeypatch):
     def all_of(count, seed=4):
         (axis,) = axes_of({("x", "y", "z"): design(count, seed, low=(0, 1, 2), high=(1, 3, 9))})
@@ -234,13 +235,13 @@ def test_more_members_begin_with_the_same_ones(design, monkeypatch):
     few, many, others = all_of(100), all_of(1000), all_of(100, seed=5)
     np.testing.assert_array_equal(few, many[:100])
     assert ((many >= [0, 1, 2]) & (many < [1, 3, 9])).all() and not np.isin(few, others).any()
-    monkeypatch.setattr(_designs, "SLICE", 32)  # member k is a function of (seed, k)
+    monkeypatch.setattr(designs, "SLICE", 32)  # member k is a function of (seed, k)
     np.testing.assert_array_equal(all_of(1000), many)
 
 
 @pytest.mark.slow
 def test_latin_hypercube_has_one_point_in_each_part():
-    (axis,) = axes_of({("x", "y"): lagjax.latin_hypercube(50, seed=1)})
+    (axis,) = axes_of({("x", "y"): designs.latin_hypercube(50, seed=1)})
     ((_, values),) = axis.pieces()
     np.testing.assert_array_equal(np.sort(np.floor(50 * values), axis=0).T, [np.arange(50)] * 2)
 
@@ -251,7 +252,7 @@ def test_latin_hypercube_has_one_point_in_each_part():
 def begun(folder, units=0, **changes):
     """A store of which so many units are done."""
     with pytest.MonkeyPatch.context() as patch:
-        run = _run.work
+        run = _workers.work
         patch.setattr("lagjax._sweep.work", lambda job, tell, how: run(job, tell, how, units) if units else None)
         swept(folder, **changes)
     return Store(folder / "store")
@@ -372,7 +373,7 @@ def test_disks_that_refuse(tmp_path, undisturbed, monkeypatch, number, words):
         swept(tmp_path)
     assert error.value.errno == number and "unit" in str(error.value)
     store = Store(tmp_path / "store")
-    with pytest.raises(OSError, match=f"nothing was computed: .*{words}"), _claims.Worker(store):
+    with pytest.raises(OSError, match=f"nothing was computed: .*{words}"), _workers.Worker(store):
         pass
     done = store.done()
     assert 0 < len(done) < 6 and not store.damaged(store.spec(), done, whole=True)
@@ -451,8 +452,7 @@ def test_stores_of_another_version_are_left_alone(tmp_path, undisturbed):
 def test_another_kind_of_cpu_goes_on_and_is_told(tmp_path, undisturbed, monkeypatch):
     begun(tmp_path, 2)
     here = _job.cpu()
-    for module in (_job, _unit):
-        monkeypatch.setattr(module, "cpu", lambda: "an abacus")
+    monkeypatch.setattr(_job, "cpu", lambda: "an abacus")
     with pytest.warns(UserWarning, match=r"begun on a CPU of the kind .*, and goes on here on an abacus"):
         told = swept(tmp_path).status()
     assert told.cpus == (here, "an abacus") and "an abacus: their members" in str(told)
@@ -513,7 +513,7 @@ def store(tmp_path):
 
 
 def test_one_of_many_gets_a_claim(store):
-    with _claims.Worker(store) as one, _claims.Worker(store) as two:
+    with _workers.Worker(store) as one, _workers.Worker(store) as two:
         for unit in range(20):
             with ThreadPoolExecutor(8) as pool:
                 assert sum(pool.map(lambda k, u=unit: (one, two)[k % 2].claim(u), range(8))) == 1
@@ -523,13 +523,13 @@ def test_one_of_many_gets_a_claim(store):
 
 @pytest.mark.slow
 def test_claims_of_the_dead_are_taken_whatever_the_clocks(store, monkeypatch):
-    monkeypatch.setattr(_claims, "STALE", 0.2)
-    dead = _claims.Worker(store)
+    monkeypatch.setattr(_workers, "STALE", 0.2)
+    dead = _workers.Worker(store)
     dead._identity["place"] = "another machine"
     dead._beat()
     os.utime(dead._file, (2**33, 2**33))  # its clock is of another century
     assert dead.claim(0)
-    with _claims.Worker(store) as other:
+    with _workers.Worker(store) as other:
         assert not other.claim(0)  # seen for the first time
         dead._beat()
         time.sleep(0.3)
@@ -543,11 +543,11 @@ def test_claims_of_the_dead_are_taken_whatever_the_clocks(store, monkeypatch):
 
 
 def test_a_process_that_has_ended_is_dead_at_once(store):
-    gone = _claims.Worker(store)
+    gone = _workers.Worker(store)
     gone._identity["began"] = "0"  # as of a process whose number another one has by now
     gone._beat()
     assert gone.claim(0)
-    with _claims.Worker(store) as other:
+    with _workers.Worker(store) as other:
         assert other.claim(0)
 
 
@@ -576,8 +576,8 @@ def test_a_finer_grid_takes_what_is_known(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("slice", [16, 2**20])
 def test_more_members_of_a_design(tmp_path, slice, monkeypatch):
-    monkeypatch.setattr(_designs, "SLICE", slice)  # coordinates of more are written by those who compute the members
-    over = lambda count: {("length", "angle"): lagjax.random(count, seed=2, low=(0.5, 0.0), high=(1.5, 3.0))}
+    monkeypatch.setattr(designs, "SLICE", slice)  # coordinates of more are written by those who compute the members
+    over = lambda count: {("length", "angle"): designs.random(count, seed=2, low=(0.5, 0.0), high=(1.5, 3.0))}
     few = begun(tmp_path, 3, over=over(45)).path  # of which 30 are done
     swept(tmp_path, over(75), store=tmp_path / "whole")
     many = swept(tmp_path, over(75), store=tmp_path / "many", extend=few)
@@ -744,7 +744,7 @@ class Broken(Jobs):
 
 @pytest.mark.slow
 def test_tasks_that_are_no_futures(tmp_path, undisturbed, monkeypatch):
-    monkeypatch.setattr(_run, "_POLL", 0.001)
+    monkeypatch.setattr(_workers, "_POLL", 0.001)
     with pytest.raises(ZeroDivisionError):
         swept(tmp_path, executor=Broken())
     swept(tmp_path, executor=Jobs())

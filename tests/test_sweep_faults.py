@@ -139,7 +139,7 @@ def test_the_first_look_stays_within_the_memory(tmp_path, monkeypatch):
 
 def test_the_first_look_at_many_axes_is_as_small():
     over = {f"x{k}": [0.0, 1.0] for k in range(40)}
-    points = _begin._few(axes_of(over), lagjax._sweep._scene.Motions(*[None] * 8))
+    points = _begin._few(axes_of(over), lagjax._sweep._description.Description(*[None] * 8))
     assert 2048 < len(points["x0"]) <= 4096
 
 
@@ -199,7 +199,7 @@ def test_commands_that_begin_a_store_at_the_same_moment(tmp_path):
 # ---- stores that grow ------------------------------------------------------------------------------------------------
 
 
-def drawn(count, seed=3, kind=lagjax.random):
+def drawn(count, seed=3, kind=lagjax.designs.random):
     return {("length", "angle"): kind(count, seed=seed, low=(0.5, 0.0), high=(1.5, 3.0))}
 
 

@@ -1,17 +1,16 @@
 """`sweep`: one scene for many starts and parameters, a few numbers kept of each motion, in a store that is the job.
 
-over, q0, keep, … ──► Motions, Grid ──► Store ──► units, claimed and computed by any number of workers ──► xarray
+over, q0, keep, … ──► Description, Grid ──► Store ──► units, claimed and computed by any number of workers ──► xarray
 
-_designs, _members   what is swept: axes and rules, the grid of members, its units
-_statistics          what is said of all members without a list
-_sections            motions of a batch with their crossings
-_scene               the user's functions: what they are, in words; their way to another process
-_store, _claims      the files; who has which unit
-_batch, _job, _unit  what computes a unit
-_begin, _extend      stores that are begun; those that take members of another one
-_later               motions that go on where those of another store were left
-_run, _isolate       workers: here, in children, by executors
-_status              how far it is
+_members       the points of a sweep: axes, the grid of members, its units (`lagjax.designs` has the rules for axes)
+_statistics    statistics of all members, unit by unit, without a list of their values
+_description   the scene and the user's functions; their text, by which stores are compared; their way to a worker
+_store         the files of a store
+_batch         a batch of members: their motions, the crossings on the way, what is kept of each
+_job           a store with its functions in a process; the computation of a unit
+_begin         stores that are begun: new ones, those with members of another, those that continue its motions
+_workers       claims of units; units in this process, by executors, in a child process
+_status        the progress of a store
 """
 
 import os
@@ -26,24 +25,18 @@ import jax
 import numpy as np
 
 from lagjax._hybrid import Hybrid, Scene, require_scene
-from lagjax._sweep._begin import begin, first_look, repair, require_same
-from lagjax._sweep._designs import Design, latin_hypercube, random, sobol
-from lagjax._sweep._isolate import Child
-from lagjax._sweep._job import Job, in_doubles, precision
-from lagjax._sweep._later import goes_on, left_in
+from lagjax._sweep._begin import begin, first_look, goes_on, left_in, repair, require_same
+from lagjax._sweep._description import Description, Sections
+from lagjax._sweep._job import Job, compute, in_doubles, precision
 from lagjax._sweep._members import axes_of
-from lagjax._sweep._run import run_store, submit, work
-from lagjax._sweep._scene import Motions
-from lagjax._sweep._sections import Sections
 from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merged, summary
 from lagjax._sweep._status import Failure, Progress, Status, status
 from lagjax._sweep._store import NOT_DONE, RESULT, Store
-from lagjax._sweep._unit import compute
+from lagjax._sweep._workers import Child, run_store, submit, work
 from lagjax._validate import require_flag
 
 __all__ = [
-    "Design", "Failure", "Progress", "Statistics", "Status", "Store", "Summary", "Sweep", "latin_hypercube", "random",
-    "run_store", "sobol", "status", "sweep",
+    "Failure", "Progress", "Statistics", "Status", "Store", "Summary", "Sweep", "run_store", "status", "sweep",
 ]  # fmt: skip
 
 PyTree = Any
@@ -220,7 +213,9 @@ def sweep(
     if isinstance(system, Hybrid):
         _require_none(event=event, crossings=crossings, solver=solver)
     sections = Sections.of(crossings, _callable(keep), settings)
-    motions = Motions(system, np.asarray(ts, float), q0, qdot0, params, keep, _reduce(reduce), settings, sections)
+    description = Description(
+        system, np.asarray(ts, float), q0, qdot0, params, keep, _reduce(reduce), settings, sections
+    )
     if executor is not None and isolate:
         raise ValueError("isolate is for sweeps of this process: give it, or an executor, whose processes may die too.")
     axes, place = axes_of(over), _place(store, "store")
@@ -229,18 +224,18 @@ def sweep(
     with precision(in_doubles()), child or nullcontext():
         if place.is_there() and other is not None and not place.spec()["goes_on_from"]:
             other = None  # of which the members were taken: it may be gone
-        if other is not None and goes_on(other, motions):
+        if other is not None and goes_on(other, description):
             if isinstance(system, Hybrid):
                 raise ValueError(
                     "A hybrid motion does not go on from a store, which has no mode at the end of it: begin again at "
                     f"ts[0], with another store than {str(extend)!r}."
                 )
-            motions = replace(motions, left=left_in(other, axes, motions))
+            description = replace(description, left=left_in(other, axes, description))
         if not place.is_there():
-            begin(place, axes, motions, unit, child.look if child else first_look, other)
+            begin(place, axes, description, unit, child.look if child else first_look, other)
         spec = place.spec()
-        require_same(place, spec, axes, motions)
-        job = Job.of(place, spec, motions)
+        require_same(place, spec, axes, description)
+        job = Job.of(place, spec, description)
         repair(job)
         show = Progress(place, spec, progress)
         if executor is not None:

@@ -1,11 +1,13 @@
 """`Batches`: from the points of a batch of members to what is kept of each.
 
-    points ──start──► (q0, qdot0, params) ──simulate_batch──► Trajectory ──keep──► values, and the change of energy
+    points ──start──► (q0, qdot0, params) ──run_batch──► Trajectory, Crossings ──keep──► values, change of energy
 
 The user's functions are for one member. Where they are written in jax.numpy they are compiled for all members of a
 batch at once; else they are called member by member, which `slow` tells.
 """
 
+import dataclasses
+import functools
 import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,12 +16,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._hybrid import Hybrid
-from lagjax._results import name_of, result_from
-from lagjax._sweep._scene import NOT_TRACEABLE, Motions
-from lagjax._sweep._sections import run_batch
+from lagjax._consistent import has_constraints
+from lagjax._crossings import as_crossings, sections_of, surfaces_in
+from lagjax._hybrid import Hybrid, Scene, follow
+from lagjax._machine_code import MachineCode, Noted, flow_of, tolerances_of
+from lagjax._problem import Batch, Solution, axes_per_leaf
+from lagjax._results import RESULTS, SUCCESSFUL, code_of, name_of, result_from
+from lagjax._simulate import simulate_batch, trajectory_of
+from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
 from lagjax._sweep._store import RESULT, Quantity
 from lagjax._trajectory import State, Trajectory, Transitions
+from lagjax._validate import as_arrays
 
 PyTree = Any
 CRASHED, KEEP_FAILED = 1000, 1001  # result codes of the sweep's own, far from those of `lagjax.RESULTS`
@@ -46,22 +53,31 @@ class Kept(NamedTuple):
     engine: str
 
 
-def batches_of(motions: Motions, conserves: bool) -> "Batches":
-    """The function that computes batches of these motions; the last ones are kept, with what was compiled for them."""
-    fixed = (motions.system, motions.q0, motions.qdot0, motions.params, motions.keep, *motions.settings.values())
-    sections = motions.sections and motions.sections._replace(functions=tuple(map(id, motions.sections.functions)))
+def batches_of(description: Description, conserves: bool) -> "Batches":
+    """The function that computes batches of a sweep; the last eight stay, with what was compiled for them."""
+    fixed = (
+        description.system,
+        description.q0,
+        description.qdot0,
+        description.params,
+        description.keep,
+        *description.settings.values(),
+    )
+    sections = description.sections and description.sections._replace(
+        functions=tuple(map(id, description.sections.functions))
+    )
     key = (
-        *map(id, fixed),
+        *map(id, (*fixed, *description.settings.values())),
         sections,
-        motions.left and motions.left.path,
-        motions.ts.tobytes(),
+        description.left and description.left.path,
+        description.ts.tobytes(),
         bool(conserves),
         jax.dtypes.canonicalize_dtype(float),
     )
     if key not in _remembered:
         while len(_remembered) >= _REMEMBERED:
             _remembered.pop(next(iter(_remembered)))
-        _remembered[key] = Batches(motions, conserves)  # holds what the key names, so that no number is used twice
+        _remembered[key] = Batches(description, conserves)  # holds what the key names, so that no number is used twice
     return _remembered[key]
 
 
@@ -72,12 +88,12 @@ _remembered: "dict[tuple, Batches]" = {}
 class Batches:
     """Computes batches of one sweep; what it compiles it keeps."""
 
-    def __init__(self, motions: Motions, conserves: bool):
-        self.motions, self.conserves = motions, conserves
+    def __init__(self, description: Description, conserves: bool):
+        self.description, self.conserves = description, conserves
         self.quantities: list[Quantity] = []  # what is kept of each member, once that is known
         self.slow: dict[str, str] = {}  # which functions are called member by member, and why
-        begin = motions.left or motions
-        roles = {"q0": begin.q0, "qdot0": begin.qdot0, "params": motions.params}
+        begin = description.left or description
+        roles = {"q0": begin.q0, "qdot0": begin.qdot0, "params": description.params}
         if not any(map(callable, roles.values())):
             raise ValueError(
                 "None of q0, qdot0 and params is a function: all members would be the same. Write q0=lambda point: "
@@ -108,18 +124,21 @@ class Batches:
             (row,), _ = self._rows(motions)
             return sum(x.nbytes for x in (row or {}).values())
 
-    def _motions_of(self, points: dict[str, np.ndarray]) -> tuple["_Motions", dict[int, str]]:
+    def _motions_of(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str]]:
         """The motions of these members; and of members for which q0, q̇0 or params raised, why."""
-        motions, ts, complaints = self.motions, jnp.asarray(self.motions.ts), {}
+        description, ts, complaints = self.description, jnp.asarray(self.description.ts), {}
         values = {
-            role: start(points, complaints) if start else getattr(motions, role) for role, start in self._starts.items()
+            role: start(points, complaints) if start else getattr(description, role)
+            for role, start in self._starts.items()
         }
-        run, crossings = run_batch(motions.system, values, ts, self._axes, motions.settings, motions.sections)
-        self._tolerances = None if isinstance(motions.system, Hybrid) else run.tolerances
+        run, crossings = run_batch(
+            description.system, values, ts, self._axes, description.settings, description.sections
+        )
+        self._tolerances = None if isinstance(description.system, Hybrid) else run.tolerances
         of_members = values["params"] if self._axes[2] == 0 else None
-        return _Motions(run, crossings, (_arrays(run), crossings), of_members), complaints
+        return _BatchMotions(run, crossings, (_arrays(run), crossings), of_members), complaints
 
-    def _kept_of(self, motions: "_Motions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
+    def _kept_of(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
         """The result of `keep` for each member, the change of its energy, and the members for which `keep` raised."""
         if "keep" not in self.slow:
             try:
@@ -146,7 +165,7 @@ class Batches:
 
         return start
 
-    def _compiled(self, motions: "_Motions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
+    def _compiled(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
         """The kept values of all members at once; members for which `keep` raises while it runs are blank, and told."""
         everyone = np.arange(len(motions.run.result._value))
         try:
@@ -164,7 +183,7 @@ class Batches:
             ).astype(x.dtype)
         return kept, None if drift is None else np.where(bad, np.nan, drift), complaints
 
-    def _of_some(self, motions: "_Motions", which: np.ndarray | None) -> tuple[dict[str, np.ndarray], Any]:
+    def _of_some(self, motions: "_BatchMotions", which: np.ndarray | None) -> tuple[dict[str, np.ndarray], Any]:
         """The kept values of these members (B,), by default of all in their order, and the change of their energy."""
         arrays = motions.arrays, motions.params
         if which is not None:
@@ -172,7 +191,7 @@ class Batches:
         kept, drift = self._keep_all(*arrays)
         return {name: np.asarray(x) for name, x in _by_name(kept).items()}, None if drift is None else np.asarray(drift)
 
-    def _raising(self, motions: "_Motions", everyone: np.ndarray) -> dict[int, str]:
+    def _raising(self, motions: "_BatchMotions", everyone: np.ndarray) -> dict[int, str]:
         """The members for which `keep` raises, as from a callback, and what: by halves, in batches of the same size."""
         found, waiting = {}, [everyone]
         while waiting and len(found) <= _MOST_RAISE:
@@ -205,7 +224,7 @@ class Batches:
 
     def _kept(self, trajectory: Trajectory, crossings: Any) -> dict:
         """The result of `keep` for one member."""
-        keep, asked = self.motions.keep, {} if self.motions.sections is None else {"crossings": crossings}
+        keep, asked = self.description.keep, {} if self.description.sections is None else {"crossings": crossings}
         kept = keep(trajectory, **asked)
         _require_dict(kept)
         return kept
@@ -213,18 +232,18 @@ class Batches:
     def _trajectory(self, arrays: tuple, params: PyTree) -> Trajectory:
         """The trajectory of one member."""
         q, qdot, code, end, stats, mode, transitions = arrays
-        scene, hybrid = self.motions.system, {"mode": None, "transitions": None, "mode_names": ()}
+        scene, hybrid = self.description.system, {"mode": None, "transitions": None, "mode_names": ()}
         if isinstance(scene, Hybrid):
             hybrid = {"mode": mode, "transitions": Transitions(*transitions), "mode_names": tuple(scene.modes)}
         return Trajectory.of(
-            ts=jnp.asarray(self.motions.ts), q=q, qdot=qdot, result=result_from(code), end=State(*end), stats=stats,
+            ts=jnp.asarray(self.description.ts), q=q, qdot=qdot, result=result_from(code), end=State(*end), stats=stats,
             system=dict(scene.modes) if isinstance(scene, Hybrid) else scene, params_axes=None, engine="",
-            params=self.motions.params if self._axes[2] is None else params, tolerances=self._tolerances, **hybrid,
+            params=self.description.params if self._axes[2] is None else params, tolerances=self._tolerances, **hybrid,
         )  # fmt: skip
 
     def _drift(self, run: Trajectory):
         """|h − h₀| from the first output to the end."""
-        scene = self.motions.system
+        scene = self.description.system
         if not self.conserves or isinstance(scene, Hybrid):
             return None
         q, qdot = jax.tree.map(lambda x: x[0], (run.q, run.qdot))
@@ -233,7 +252,7 @@ class Batches:
 
     # ---- member by member ----
 
-    def _one_by_one(self, motions: "_Motions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
+    def _one_by_one(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
         """The result of `keep` for each member, called with numbers; and the complaints about these results."""
         rows, errors = self._rows(motions)
         if not self.quantities and not any(rows):
@@ -245,7 +264,7 @@ class Batches:
                 rows[k], complaints[k] = None, wrong
         return {q.name: _stacked(q, rows) for q in expected}, complaints
 
-    def _rows(self, motions: "_Motions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
+    def _rows(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
         """The result of `keep` for each member by name, None where it raised; and the exceptions."""
         arrays = jax.tree.map(np.asarray, motions.arrays)
         params, rows, errors = jax.tree.map(np.asarray, motions.params), [], {}
@@ -260,7 +279,7 @@ class Batches:
         return rows, errors
 
 
-class _Motions(NamedTuple):
+class _BatchMotions(NamedTuple):
     """Motions of a batch and their crossings, the same as arrays of B members, and their params where these differ."""
 
     run: Trajectory
@@ -369,3 +388,72 @@ def _raised(error: BaseException) -> str:
 
 def _first_line(error: BaseException) -> str:
     return str(error).strip().split("\n")[0][:200]
+
+
+# ---- motions of all members, with their crossings of sections on the way ---------------------------------------------
+
+_INCONSISTENT = code_of(RESULTS.inconsistent_start)
+
+
+@functools.lru_cache(maxsize=8)
+def _hybrid_batch(scene: Hybrid, axes: tuple, **tolerances) -> Callable:
+    """`follow` for all members at once, compiled."""
+
+    def of_member(q0, qdot0, ts, params):
+        return follow(scene, q0, qdot0, ts, params, throw=False, **tolerances)
+
+    of_q0, of_qdot0, of_params = axes
+    return jax.jit(jax.vmap(of_member, in_axes=(of_q0, of_qdot0, None, of_params)))
+
+
+def run_batch(
+    system: Scene, values: dict[str, PyTree], ts, axes: tuple, settings: dict[str, Any], sections: Sections | None
+) -> tuple[Trajectory, Any]:
+    """The motions of B members, and what was noted on the way: `Crossings`, or a dict of them, None without sections.
+
+    `values` are q0, qdot0 and params by name, and `axes` their `batch_axes` of `simulate_batch`. Every leaf of the
+    crossings has the members in front.
+    """
+    q0, qdot0, params = values.values()
+    if isinstance(system, Hybrid):
+        tolerances = {name: settings[name] for name in ("rtol", "atol", "max_steps")}
+        return _hybrid_batch(system, axes, **tolerances)(q0, qdot0, ts, params), None
+    if sections is None:
+        return simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings), None
+    of_leaves, size = axes_per_leaf(values, axes)
+    batch = Batch.of(system, values, of_leaves, size, ts, settings["rtol"], settings["atol"], settings["max_steps"])
+    solution, noted = _along(batch, sections)
+    if len(ts) == 2 and not has_constraints(system):
+        params = as_arrays(params, batch.member.layout.dtype)
+        run = trajectory_of(batch.member, MachineCode(), _with_ends(solution, batch), batch.y0, params, axes[2])
+    else:
+        run = simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings)
+        noted = _of_those_that_start(noted, np.asarray(run.result._value) != _INCONSISTENT)
+    ok = (solution.result == SUCCESSFUL) & (noted.count <= sections.count)
+    return run, as_crossings(batch.member.layout, sections.names, noted, ok)
+
+
+def _along(batch: Batch, sections: Sections) -> tuple[Solution, Noted]:
+    """The motions from the first to the last time, and the crossings of G sections, each with that axis in front."""
+    section = dict(sections.by_name()) if sections.names else sections.functions[0]
+    surfaces = surfaces_in(batch.member, sections_of(section)[1], sections.directions, sections.names)
+    problem = dataclasses.replace(batch.member, guards=surfaces.guards(notes=True))
+    tolerances = tolerances_of(problem)._replace(notes=sections.count)
+    ts, y0, params = (np.asarray(x) for x in (problem.ts, batch.y0, batch.vectors))
+    solution = flow_of(problem).run(ts[None], y0, params, tolerances)
+    path = solution.path.reshape(len(y0), len(sections.functions), sections.count + 1, -1)
+    rows = np.moveaxis(path, 1, 0)
+    return solution, Noted(rows[:, :, :-1, 0], rows[:, :, :-1, 1:], rows[:, :, -1, 0])
+
+
+def _with_ends(solution: Solution, batch: Batch) -> Solution:
+    """The solution with the states at the first and the last time, NaN where that was not reached, as its path."""
+    reached = (solution.result == SUCCESSFUL)[:, None]
+    path = np.stack([np.asarray(batch.y0), np.where(reached, solution.y_end, np.nan)], axis=1)
+    return solution._replace(path=path)
+
+
+def _of_those_that_start(noted: Noted, starts: np.ndarray) -> Noted:
+    """The same without the crossings of members that are not on their constraints, and were not to be followed."""
+    t, y = np.where(starts[:, None], noted.t, np.nan), np.where(starts[:, None, None], noted.y, np.nan)
+    return Noted(t, y, np.where(starts, noted.count, 0))

@@ -1,35 +1,50 @@
-"""Stores that are begun, and stores that are there: what both have to be."""
+"""Stores that are begun: new ones, those with members of another store, those that continue its motions.
+
+Of a store that is there already, `require_same` checks the description and `repair` the files.
+
+**Members of another store** (`extend`): a member is known where all of its coordinates, bit for bit, are those of a
+member of the other store that is done. In a unit of the new store the known members are those of a product of places
+along each axis. Units of which all are known are written at once; of the others the known members stand aside, until
+their unit is computed.
+
+**A later end**: what is kept of a motion does not tell how it continues; its last state does, where `keep` returns
+`trajectory.end` by some name. The new store has the same members, and output times that begin at the last one of the
+other.
+"""
 
 import json
 import math
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lagjax._hybrid import Hybrid
 from lagjax._layout import Layout
-from lagjax._results import RESULTS, code_of
+from lagjax._results import ENDED_WELL, RESULTS, code_of
 from lagjax._sweep import _batch
-from lagjax._sweep._batch import Kept, batches_of, label, quantities_of
-from lagjax._sweep._designs import Design
-from lagjax._sweep._extend import carry, require_extensible
-from lagjax._sweep._job import Job, cpu, goes_on_from, in_doubles, require_versions, versions
-from lagjax._sweep._later import states
+from lagjax._sweep._batch import Kept, batches_of, label, names_of, quantities_of
+from lagjax._sweep._description import MOTION, Description, Left, difference, packed, texts, users_path
+from lagjax._sweep._job import Job, cpu, goes_on_from, in_doubles, require_versions, states, versions
 from lagjax._sweep._members import RESERVED, Axis, Grid, in_words, points_of
-from lagjax._sweep._scene import Motions, difference, packed, texts, users_path
-from lagjax._sweep._store import FORMAT, NOT_DONE, RESULT, Quantity, Store
+from lagjax._sweep._store import FORMAT, KNOWN, NOT_DONE, RESULT, Quantity, Store, arrays_as_bytes
+from lagjax._trajectory import State
+from lagjax.designs import GROWING, Design
 
 SECONDS = 20.0  # of a unit, by default: what a worker that dies loses
 UNIT_BYTES = 64 * 2**20  # of what is kept of a unit, by default; two of them are in memory, one being written
 _PROBED = 4096  # members by which the time of a member is estimated
 
 
-def first_look(motions: Motions, points: dict[str, np.ndarray]) -> tuple[Kept, float, bool]:
+def first_look(description: Description, points: dict[str, np.ndarray]) -> tuple[Kept, float, bool]:
     """The kept values of a few members, the seconds that one of them takes, and whether the energy is constant."""
-    conserves = _conserves(motions, points)
-    batches = batches_of(motions, conserves)
+    conserves = _conserves(description, points)
+    batches = batches_of(description, conserves)
     points = _some(points, UNIT_BYTES // max(1, batches.bytes_of_one(points)))
     batches(points)  # which compiles
     began = time.perf_counter()
@@ -43,36 +58,37 @@ def _some(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
     return {name: x[:: -(-count // max(1, most))] for name, x in points.items()}
 
 
-Look = Callable[[Motions, dict[str, np.ndarray]], tuple[Kept, float, bool]]
+Look = Callable[[Description, dict[str, np.ndarray]], tuple[Kept, float, bool]]
 
 
 def begin(
     store: Store,
     axes: tuple[Axis, ...],
-    motions: Motions,
+    description: Description,
     unit: int | None,
     look: Look = first_look,
     extend: Store | None = None,
 ) -> None:
     """Make the store, after a look at what a few members take and keep, with the members that `extend` knows."""
-    scene = packed(motions)
-    points, shape = _few(axes, motions), tuple(axis.size for axis in axes)
-    points = _some(points, _room(motions, points))
-    kept, seconds, conserves = look(motions, points)
+    scene = packed(description)
+    points, shape = _few(axes, description), tuple(axis.size for axis in axes)
+    points = _some(points, _room(description, points))
+    kept, seconds, conserves = look(description, points)
     quantities = quantities_of(kept)
-    _require_names(quantities, axes, motions.reduce)
+    _require_names(quantities, axes, description.reduce)
     members = _unit_size(unit, shape, seconds, quantities)
     names = [name for axis in axes for name in axis.names]
     spec = {
         "format": FORMAT, "versions": versions(), "cpu": cpu(), "x64": in_doubles(), "engine": kept.engine,
         "axes": [axis.described() for axis in axes], "shape": shape, "chunk": Grid.of(shape, members).chunk,
-        "batch": _batch_size(motions, points, kept), "seconds_per_member": seconds, "conserves": conserves,
-        "kept": [{"name": q.name, "shape": q.shape, "dtype": q.dtype.str} for q in quantities], **motions.described(),
-        "goes_on_from": goes_on_from(motions, store), "scene": texts(motions, names), "path": users_path(),
+        "batch": _batch_size(description, points, kept), "seconds_per_member": seconds, "conserves": conserves,
+        "kept": [{"name": q.name, "shape": q.shape, "dtype": q.dtype.str} for q in quantities],
+        **description.described(),
+        "goes_on_from": goes_on_from(description, store), "scene": texts(description, names), "path": users_path(),
     }  # fmt: skip
     codes = sorted({code_of(item) for item in RESULTS._name_to_item.values()} | set(_batch.NAMES))
     title = f"lagjax sweep over {', '.join(names)}"
-    extend = None if motions.left else extend  # of which no member is taken as it is
+    extend = None if description.left else extend  # of which no member is taken as it is
     if extend is not None:
         require_extensible(extend, extend.spec(), spec)
     with store.made_aside() as new:
@@ -81,27 +97,27 @@ def begin(
             carry(extend, new)
 
 
-def _few(axes: tuple[Axis, ...], motions: Motions) -> dict[str, np.ndarray]:
+def _few(axes: tuple[Axis, ...], description: Description) -> dict[str, np.ndarray]:
     """Points of some thousand members, evenly spread over the grid; of designs, and of what goes on, the first ones."""
     sides, shape = [], []
     for axis in axes:
         _, values = next(axis.pieces())
         count = min(axis.size, max(2, round(_PROBED ** (1 / len(axes)))), len(values))
         count = count if math.prod(shape) * count <= _PROBED else 1  # of a dozen axes and more
-        first = isinstance(axis.source, Design) or motions.left is not None
+        first = isinstance(axis.source, Design) or description.left is not None
         which = np.arange(count) if first else np.linspace(0, len(values) - 1, count).astype(int)
         sides.append({name: values[which, c] for c, name in enumerate(axis.names)})
         shape.append(count)
     points = points_of(sides, tuple(shape), np.arange(int(np.prod(shape))))
-    return points | (states(motions.left, tuple(map(slice, shape)))[0] if motions.left else {})
+    return points | (states(description.left, tuple(map(slice, shape)))[0] if description.left else {})
 
 
-def _conserves(motions: Motions, points: dict[str, np.ndarray]) -> bool:
+def _conserves(description: Description, points: dict[str, np.ndarray]) -> bool:
     """True if the energy of this scene is known to be constant."""
-    if isinstance(motions.system, Hybrid):
+    if isinstance(description.system, Hybrid):
         return False  # resets may do work
-    q, qdot, params = motions.start({name: x[0] for name, x in points.items()})
-    return bool(motions.system.explain(q, qdot, params=params).energy_conserved)
+    q, qdot, params = description.start({name: x[0] for name, x in points.items()})
+    return bool(description.system.explain(q, qdot, params=params).energy_conserved)
 
 
 def _unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantities: list[Quantity]) -> int:
@@ -116,18 +132,18 @@ def _unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantit
     return max(1, min(int(SECONDS / seconds), UNIT_BYTES // each, several))
 
 
-def _batch_size(motions: Motions, points: dict[str, np.ndarray], kept: Kept) -> int:
+def _batch_size(description: Description, points: dict[str, np.ndarray], kept: Kept) -> int:
     """The most members of a batch: their paths take at most `PATH_BYTES`."""
     most = _batch.MOST if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
-    return max(1, min(most, _room(motions, points)))
+    return max(1, min(most, _room(description, points)))
 
 
-def _room(motions: Motions, points: dict[str, np.ndarray]) -> int:
+def _room(description: Description, points: dict[str, np.ndarray]) -> int:
     """The members whose paths, and what is noted on the way, take `PATH_BYTES`; none where one takes more."""
-    q, qdot, _ = motions.start({name: x[0] for name, x in points.items()})
+    q, qdot, _ = description.start({name: x[0] for name, x in points.items()})
     states = 2 * Layout.of(q, qdot).size
-    noted = motions.sections.bytes_of(states) if motions.sections else 0
-    return _batch.PATH_BYTES // (8 * states * len(motions.ts) + noted)
+    noted = description.sections.bytes_of(states) if description.sections else 0
+    return _batch.PATH_BYTES // (8 * states * len(description.ts) + noted)
 
 
 def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: dict) -> None:
@@ -157,12 +173,12 @@ def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: d
 # ---- a store that is there -------------------------------------------------------------------------------------------
 
 
-def require_same(store: Store, spec: dict, axes: tuple[Axis, ...], motions: Motions) -> None:
+def require_same(store: Store, spec: dict, axes: tuple[Axis, ...], description: Description) -> None:
     """Raise `ValueError`, with the difference, where the store was begun with another description."""
     require_versions(store, spec)
     names = [name for axis in axes for name in axis.names]
-    now = {"axes": [axis.described() for axis in axes], "x64": in_doubles(), **motions.described()}
-    now["goes_on_from"] = goes_on_from(motions, store)
+    now = {"axes": [axis.described() for axis in axes], "x64": in_doubles(), **description.described()}
+    now["goes_on_from"] = goes_on_from(description, store)
     now = json.loads(json.dumps(now))
     words = {"axes": in_words}
     lines = [
@@ -170,7 +186,7 @@ def require_same(store: Store, spec: dict, axes: tuple[Axis, ...], motions: Moti
         for name, x in now.items()
         if spec[name] != x
     ]
-    if change := difference(spec["scene"], texts(motions, names)):
+    if change := difference(spec["scene"], texts(description, names)):
         lines.append(change)
     if lines:
         raise ValueError(
@@ -184,3 +200,150 @@ def repair(job: Job) -> None:
     for unit, text in job.store.damaged(job.spec, job.store.done()).items():
         warnings.warn(f"{job.store.path}: {text}. It is computed again.", stacklevel=3)
         job.store.undo(job.spec, unit)
+
+
+# ---- a store that begins with members of another one -----------------------------------------------------------------
+
+_SAME = ("x64", "engine", "ts", "rtol", "atol", "max_steps", "solver", "crossings", "kept", "reduce")
+
+
+def require_extensible(old: Store, spec: dict, now: dict) -> None:
+    """Raise `ValueError`, with the difference, where the members of `old` are not those of the new store."""
+    require_versions(old, spec)
+    now = json.loads(json.dumps(now))
+    lines = [f"{name}: {spec.get(name)} in the store, now {now[name]}" for name in _SAME if spec.get(name) != now[name]]
+    names = [[axis["names"] for axis in x["axes"]] for x in (spec, now)]
+    if names[0] != names[1]:
+        lines.append(f"names of over: {names[0]} in the store, now {names[1]}")
+    if change := difference(spec["scene"], now["scene"]):
+        lines.append(change)
+    if spec["reduce"]:
+        lines.append("reduce: statistics do not tell of single members, so that none of them is known")
+    if lines:
+        later = ""
+        if spec["ts"] != now["ts"]:
+            later = (
+                "\nWhat is kept of a motion does not tell how it goes on. For a later end give ts that begin at "
+                f"{spec['ts']['ends'][1]:g}, where the motions of that store end; else leave extend= away."
+            )
+        raise ValueError(f"{old.path} has members of another description. What differs:\n" + "\n".join(lines) + later)
+
+
+def carry(old: Store, new: Store) -> int:
+    """Take what is known from `old` into `new`, of which nothing is done yet; how many members that is."""
+    before, spec, total = old.spec(), new.spec(), 0
+    (new.job / KNOWN).mkdir(exist_ok=True)
+    grid, places = new.grid(spec), list(map(partial(_places, old, new), before["axes"], spec["axes"]))
+    if not all(place.common for place in places):
+        warnings.warn(
+            f"{old.path} has no member that is also in `over`, so that all are computed: compare the values of its "
+            "axes, and the seeds and bounds of its designs. A latin hypercube cannot be extended.",
+            stacklevel=4,
+        )
+        return 0
+    for unit in range(grid.units):
+        box = [place(part) for place, part in zip(places, grid.box(unit), strict=True)]
+        inside = [np.flatnonzero(x >= 0) for x in box]
+        if not all(len(x) for x in inside):
+            continue
+        found = _read(old, before, [x[i] for x, i in zip(box, inside, strict=True)])
+        which = np.ravel_multi_index(np.ix_(*inside), grid.box_shape(unit)).ravel()
+        done = found[RESULT.name] >= 0
+        which, found = which[done], {name: x[done] for name, x in found.items()}
+        total += len(which)
+        if len(which) == grid.size(unit):
+            new.coordinates(spec["axes"], grid.box(unit))  # which nobody else would write
+            new.write_unit(spec, unit, found, _record(grid, unit, found[RESULT.name], spec), b"")
+        elif len(which):
+            data = arrays_as_bytes({"which": which, **{f"of {name}": x for name, x in found.items()}})
+            new.write(new.job / KNOWN / f"{unit}.npz", data, f"{unit}-known")
+    return total
+
+
+class _Places(NamedTuple):
+    """For places along an axis of the new store those in the old one with the same values; −1 where there is none.
+
+    `known` (size,) lists them; None where both have one rule, by which the first `common` ones are the same.
+    """
+
+    common: int
+    known: np.ndarray | None
+
+    def __call__(self, part: slice) -> np.ndarray:
+        if self.known is not None:
+            return self.known[part]
+        numbers = np.arange(part.start, part.stop)
+        return np.where(numbers < self.common, numbers, -1)
+
+
+def _places(old: Store, new: Store, of_old: dict, of_new: dict) -> _Places:
+    rules = [{name: x for name, x in axis.items() if name != "size"} for axis in (of_old, of_new)]
+    if rules[0] == rules[1] and of_old["rule"] in GROWING:
+        return _Places(min(of_old["size"], of_new["size"]), None)
+    sides = [s.coordinates([axis], (slice(0, axis["size"]),))[0] for s, axis in ((old, of_old), (new, of_new))]
+    before, now = (np.stack([side[name] for name in of_new["names"]], axis=1) for side in sides)
+    known = {row.tobytes(): k for k, row in enumerate(before)}
+    found = np.array([known.get(row.tobytes(), -1) for row in now])
+    return _Places(int(np.sum(found >= 0)), found)
+
+
+def _read(old: Store, spec: dict, places: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """The stored values of a product of members, (members, …) by name."""
+    runs = [slice(int(x[0]), int(x[-1]) + 1) if np.all(np.diff(x) == 1) else x for x in places]  # read as they lie
+    found = {}
+    for q in old.quantities(spec):
+        values = np.asarray(old.array(q.name).oindex[(*runs, *(slice(None) for _ in q.shape))])
+        found[q.name] = values.reshape(-1, *q.shape)
+    return found
+
+
+def _record(grid: Grid, unit: int, result: np.ndarray, spec: dict) -> dict:
+    codes, counts = np.unique(result, return_counts=True)
+    failed = np.flatnonzero(~np.isin(result, ENDED_WELL))[:100]
+    numbers = grid.numbers(unit, failed)
+    return {
+        "unit": unit, "members": len(result), "engine": spec["engine"], "slow": {}, "seconds": 0.0, "cpu_seconds": 0.0,
+        "results": {label(int(code)): int(count) for code, count in zip(codes, counts, strict=True)},
+        "failed": [[int(k), label(int(result[j])), ""] for j, k in zip(failed, numbers, strict=True)],
+    }  # fmt: skip
+
+
+# ---- a later end -----------------------------------------------------------------------------------------------------
+
+
+def goes_on(other: Store, description: Description) -> bool:
+    """True if the output times of these motions begin at the last one of a store."""
+    return float(description.ts[0]) == other.spec()["ts"]["ends"][1]
+
+
+def left_in(other: Store, axes: tuple[Axis, ...], description: Description) -> Left:
+    """The ends of the motions. Raises `ValueError` for other ones, and where not all ends are there."""
+    spec = other.spec()
+    require_versions(other, spec)
+    now = json.loads(json.dumps([axis.described() for axis in axes]))
+    lines = [f"axes: {in_words(spec['axes'])} in the store, now {in_words(now)}"] if now != spec["axes"] else []
+    if spec["x64"] != in_doubles():
+        lines.append(f"x64: {spec['x64']} in the store, now {in_doubles()}")
+    names = [name for axis in axes for name in axis.names]
+    scenes = (
+        {role: x for role, x in of.items() if role in MOTION} for of in (spec["scene"], texts(description, names))
+    )
+    if change := difference(*scenes):
+        lines.append(change)
+    if lines:
+        raise ValueError(
+            f"{other.path} has motions of another description, which cannot go on. What differs:\n" + "\n".join(lines)
+        )
+    if left := other.grid(spec).units - len(other.done()):
+        raise ValueError(f"{other.path}: {left} units are not done; motions can go on when they are.")
+    q, qdot, _ = description.shapes(names)
+    shapes = {x.name: x.shape for x in other.quantities(spec)}
+    for prefix in (name.removesuffix(".t") for name in shapes if name.endswith(".t")):
+        end = names_of({prefix: State(jnp.zeros(()), q, qdot)})[prefix]
+        wanted = zip(jax.tree.leaves((end.q, end.qdot)), jax.tree.leaves((q, qdot)), strict=True)
+        if all(shapes.get(name) == jnp.shape(x) for name, x in wanted):
+            return Left(str(other.path), end.q, end.qdot)
+    raise ValueError(
+        f"{other.path} does not have the states in which its motions ended, from which they could go on: let keep "
+        "return them, as in {'end': trajectory.end, …}."
+    )

@@ -1,25 +1,35 @@
-"""`Job`: a store with the functions that belong to it, in a process that is to compute."""
+"""`Job`: a store with the functions that belong to it, in a process that is to compute; `compute`: one of its units.
+
+The batches of a unit follow from its size alone, all of one size; the last is filled up with copies of its last
+member, which are thrown away. So a member stands at the same place of the same batch whoever computes it.
+"""
 
 import hashlib
 import json
+import math
 import os
 import platform
 import threading
+import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from llvmlite import binding as llvm
 
-from lagjax._sweep._batch import Batches, Kept, batches_of
-from lagjax._sweep._members import Grid
-from lagjax._sweep._scene import Motions, difference, texts, unpacked
+from lagjax._results import ENDED_WELL, SUCCESSFUL
+from lagjax._sweep._batch import CRASHED, KEEP_FAILED, Batches, Kept, batches_of, label
+from lagjax._sweep._description import Description, Left, difference, texts, unpacked
+from lagjax._sweep._members import Grid, points_of
+from lagjax._sweep._statistics import partial_of, to_bytes
 from lagjax._sweep._store import RESULT, Store
 
 
@@ -30,11 +40,11 @@ class Job:
     store: Store
     spec: dict
     grid: Grid
-    motions: Motions
+    description: Description
     batches: Batches
 
     @classmethod
-    def of(cls, store: Store, spec: dict, motions: Motions) -> "Job":
+    def of(cls, store: Store, spec: dict, description: Description) -> "Job":
         """The job of a store whose functions are at hand."""
         if spec.get("cpu", cpu()) != cpu():
             warnings.warn(
@@ -42,9 +52,9 @@ class Job:
                 "are computed here may differ from what that one would give, as by a change of rounding.",
                 stacklevel=4,
             )
-        batches = batches_of(motions, spec["conserves"])
+        batches = batches_of(description, spec["conserves"])
         batches.quantities = [q for q in store.quantities({**spec, "reduce": {}}) if q != RESULT]
-        return cls(store, spec, store.grid(spec), motions, batches)
+        return cls(store, spec, store.grid(spec), description, batches)
 
     def require_engine(self, kept: Kept) -> None:
         """Raise `ValueError` where another engine integrates here than where the store was begun."""
@@ -101,18 +111,18 @@ def _set_of_process(doubles: bool) -> None:
         jax.config.update("jax_enable_x64", doubles)
 
 
-def goes_on_from(motions: Motions, store: Store) -> str | None:
+def goes_on_from(description: Description, store: Store) -> str | None:
     """The store of the ends of motions, as a path from this one's folder: both may be moved, or seen, elsewhere."""
-    return None if motions.left is None else os.path.relpath(motions.left.path, store.path.parent)
+    return None if description.left is None else os.path.relpath(description.left.path, store.path.parent)
 
 
-def _left_here(motions: Motions, store: Store, path: str | None) -> Motions:
+def _left_here(description: Description, store: Store, path: str | None) -> Description:
     """The motions of a store, left where `path` leads from its folder. Raises `FileNotFoundError` if that is gone."""
-    if motions.left is None or path is None:
-        return motions
+    if description.left is None or path is None:
+        return description
     other = Store((store.path.parent / path).resolve())
     other.spec()
-    return replace(motions, left=motions.left._replace(path=str(other.path)))
+    return replace(description, left=description.left._replace(path=str(other.path)))
 
 
 def opened(path: str) -> Job:
@@ -130,11 +140,11 @@ def _opened(path: str, content: str) -> Job:
     spec = store.spec()
     require_versions(store, spec)
     with precision(bool(spec["x64"])):
-        motions = _left_here(unpacked(store.scene(), spec["path"]), store, spec["goes_on_from"])
+        description = _left_here(unpacked(store.scene(), spec["path"]), store, spec["goes_on_from"])
         names = [name for axis in spec["axes"] for name in axis["names"]]
-        if change := difference(spec["scene"], texts(motions, names)):
+        if change := difference(spec["scene"], texts(description, names)):
             raise ValueError(f"{store.path}: the scene is not here what it was when the store was begun.\n{change}")
-        return Job.of(store, spec, motions)
+        return Job.of(store, spec, description)
 
 
 @lru_cache(maxsize=1)
@@ -165,3 +175,134 @@ def require_versions(store: Store, spec: dict) -> None:
             f"{store.path} was begun with {'; '.join(other)}: its numbers would not be of one program. Install that "
             "version to go on, or begin another store. What is there can be read."
         )
+
+
+# ---- a unit ----------------------------------------------------------------------------------------------------------
+
+_NAMED = 100  # failures of a unit that are named in its record; the array `result` has them all
+
+
+class Unit(NamedTuple):
+    """A unit that was computed: values (m, …) by name, what is noted of it, and its statistics as bytes."""
+
+    values: dict[str, np.ndarray]
+    record: dict
+    statistics: bytes
+
+
+def parts(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
+    """The batches of a unit: its members in each, all of one length, and how many of them are not copies."""
+    known, _ = job.store.known(unit)
+    left = np.arange(job.grid.size(unit))
+    left = np.setdiff1d(left, known) if known.size else left
+    if not left.size:
+        return []
+    batch = math.ceil(len(left) / math.ceil(len(left) / job.spec["batch"]))
+    starts = range(0, len(left), batch)
+    return [(left[np.minimum(np.arange(k, k + batch), len(left) - 1)], min(batch, len(left) - k)) for k in starts]
+
+
+def starts(job: Job, unit: int) -> tuple[Callable[[np.ndarray], dict[str, np.ndarray]], np.ndarray]:
+    """The points of some members of a unit, as a function; and the ends of all of them before, where they go on."""
+    box, shape = job.grid.box(unit), job.grid.box_shape(unit)
+    axes, more, before = job.store.coordinates(job.spec["axes"], box), {}, np.full(job.grid.size(unit), SUCCESSFUL)
+    if job.description.left is not None:
+        more, before = states(job.description.left, box)
+    return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in more.items()}, before
+
+
+def _nobody(batch: int) -> None:
+    pass
+
+
+def compute(
+    job: Job, unit: int, crashed: Mapping[int, str] = MappingProxyType({}), tell: Callable[[int], None] = _nobody
+) -> Unit:
+    """Compute a unit without members that are known to end their process, and how; `tell(k)` before the k-th batch."""
+    began, spent = time.monotonic(), time.process_time()
+    size, (points, before) = job.grid.size(unit), starts(job, unit)
+    drifts, complaints = np.full(size, np.nan), {}
+    known, of_known = job.store.known(unit)
+    values = {q.name: np.empty((size, *q.shape), q.dtype) for q in (*job.batches.quantities, RESULT)}
+    for name, x in of_known.items():
+        values[name][known] = x
+    for k, (which, count) in enumerate(parts(job, unit)):
+        tell(k)
+        kept, own = job.batches(points(_without(which, crashed))), which[:count]
+        job.require_engine(kept)
+        for name, x in {**kept.values, RESULT.name: kept.result}.items():
+            values[name][own] = x[:count]
+        if kept.drift is not None:
+            drifts[own] = kept.drift[:count]
+        complaints |= {int(own[j]): text for j, text in kept.complaints.items() if j < count}
+    ended = np.flatnonzero(before != SUCCESSFUL)  # before these motions began
+    _blank(job, values, drifts, ended, before[ended])
+    _blank(job, values, drifts, list(crashed), CRASHED)
+    complaints |= crashed
+    record = _record(job, unit, values[RESULT.name], drifts, complaints)
+    record |= {"seconds": time.monotonic() - began, "cpu_seconds": time.process_time() - spent}
+    return Unit(values, record, _statistics(job, unit, values))
+
+
+def _without(which: np.ndarray, crashed: Mapping[int, str]) -> np.ndarray:
+    """Members of a batch with another one of them in the place of those that `crashed`."""
+    bad = np.isin(which, list(crashed))
+    if bad.all():
+        raise ValueError("All members of a batch end their process: look at one of them alone, with `simulate`.")
+    return np.where(bad, which[~bad][0], which)
+
+
+def _blank(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, which, result) -> None:
+    """Members of which nothing is known but their results."""
+    for q in job.batches.quantities:
+        values[q.name][which] = q.nothing
+    values[RESULT.name][which], drifts[which] = result, np.nan
+
+
+def _record(job: Job, unit: int, result: np.ndarray, drifts: np.ndarray, complaints: dict[int, str]) -> dict:
+    """The notes on a unit: how members ended, the largest change of energy, and what failed."""
+    counts = np.bincount(result)
+    record = {
+        "unit": unit,
+        "members": len(result),
+        "engine": job.spec["engine"],
+        "cpu": cpu(),
+        "slow": job.batches.slow,
+    }
+    record["results"] = {label(int(code)): int(counts[code]) for code in np.flatnonzero(counts)}
+    failed = np.flatnonzero(~np.isin(result, ENDED_WELL))[:_NAMED]
+    record["failed"] = [
+        [int(number), label(int(result[j])), complaints.get(int(j), "")]
+        for j, number in zip(failed, job.grid.numbers(unit, failed), strict=True)
+    ]
+    drifts = np.where(np.isin(result, (*ENDED_WELL, KEEP_FAILED)), drifts, np.nan)
+    if np.isfinite(drifts).any():
+        worst = int(np.nanargmax(drifts))
+        record["drift"] = [float(drifts[worst]), int(job.grid.numbers(unit, np.array([worst]))[0])]
+    return record
+
+
+def _statistics(job: Job, unit: int, values: dict[str, np.ndarray]) -> bytes:
+    if not job.description.reduce:
+        return b""
+    ok = np.isin(values[RESULT.name], ENDED_WELL)
+    numbers = job.grid.numbers(unit, np.arange(len(ok)))
+    return to_bytes({name: partial_of(how, values[name], ok, numbers) for name, how in job.description.reduce.items()})
+
+
+def states(left: Left, box: tuple[slice, ...]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Of the members of a box, (m, …) by name, the states to go on from, and how they ended (m,).
+
+    The states of members that came to no end, or to one of their own by an event, are NaN: they do not go on.
+    """
+    store = Store(Path(left.path))
+
+    def read(name: str) -> np.ndarray:
+        values = np.asarray(store.array(name)[box])
+        return values.reshape(-1, *values.shape[len(box) :])
+
+    result = read(RESULT.name)
+    found = {name: read(name) for name in jax.tree.leaves((left.q, left.qdot))}
+    for values in found.values():
+        values[result != SUCCESSFUL] = np.nan
+    return found, result

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from lagjax._sweep import _designs
-from lagjax._sweep._designs import Design
+from lagjax import designs
+from lagjax.designs import Design
 
 RESERVED = ("result",)
 
@@ -36,7 +36,7 @@ class Axis:
     def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
         """(start, values (m, names)), one after the other."""
         if isinstance(self.source, Design):
-            for start in range(0, self.size, _designs.SLICE):
+            for start in range(0, self.size, designs.SLICE):
                 yield start, self.source.piece(self.names, start)
         else:
             yield 0, np.stack(self.source, axis=1)

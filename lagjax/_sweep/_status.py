@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._display import as_printed
-from lagjax._sweep._claims import claimed
 from lagjax._sweep._members import text_of
 from lagjax._sweep._store import Store
+from lagjax._sweep._workers import claimed
 
 WELL = ("successful", "event_occurred")
 _RECENT = 32  # units from which the rate is told

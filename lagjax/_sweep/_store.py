@@ -28,9 +28,9 @@ from typing import Any
 
 import numpy as np
 
-from lagjax._sweep import _designs
-from lagjax._sweep._designs import Design
+from lagjax import designs
 from lagjax._sweep._members import Axis, Grid
+from lagjax.designs import Design
 
 FORMAT = 3
 _FORMATS = (2, 3)  # that can be gone on with; chunks of format 2 have no checksum
@@ -177,7 +177,7 @@ class Store:
         sides = []
         for axis, part in zip(axes, box, strict=True):
             if _is_drawn_late(axis["rule"], axis["size"]):
-                for k in range(part.start // _designs.SLICE, (part.stop - 1) // _designs.SLICE + 1):
+                for k in range(part.start // designs.SLICE, (part.stop - 1) // designs.SLICE + 1):
                     self._draw(axis, k)
             sides.append({name: np.asarray(self.array(name)[part]) for name in axis["names"]})
         return sides
@@ -187,9 +187,9 @@ class Store:
         files = [self.path / name / "c" / str(k) for name in axis["names"]]
         if all(file.exists() for file in files):
             return
-        values = Design.of(axis).piece(tuple(axis["names"]), k * _designs.SLICE)
+        values = Design.of(axis).piece(tuple(axis["names"]), k * designs.SLICE)
         for file, column in zip(files, values.T, strict=True):
-            chunk = np.full(_designs.SLICE, np.nan)
+            chunk = np.full(designs.SLICE, np.nan)
             chunk[: len(column)] = column
             self.write(file, chunk.astype("<f8", copy=False).data, f"{file.parent.parent.name}-{k}")
 
@@ -355,12 +355,12 @@ def write_through(file: Path, data) -> None:
 
 def _is_drawn_late(rule: str, size: int) -> bool:
     """True if the coordinates of an axis are written by those who compute its members: so that 10⁸ cost no time."""
-    return rule != "values" and size > _designs.SLICE
+    return rule != "values" and size > designs.SLICE
 
 
 def _write_axis(group, axis: Axis) -> None:
     """The values along an axis as coordinates, some at a time."""
-    chunk = min(axis.size, _designs.SLICE)
+    chunk = min(axis.size, designs.SLICE)
     arrays = [
         group.create_array(
             name, shape=(axis.size,), chunks=(chunk,), dtype="float64", compressors=None, filters=None,
@@ -372,8 +372,8 @@ def _write_axis(group, axis: Axis) -> None:
         return
     for start, values in axis.pieces():
         for column, array in zip(values.T, arrays, strict=True):
-            for begin in range(0, len(column), _designs.SLICE):
-                array[start + begin : start + begin + _designs.SLICE] = column[begin : begin + _designs.SLICE]
+            for begin in range(0, len(column), designs.SLICE):
+                array[start + begin : start + begin + designs.SLICE] = column[begin : begin + designs.SLICE]
 
 
 def require_zarr():

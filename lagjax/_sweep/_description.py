@@ -1,12 +1,15 @@
-"""`Motions`: what is done with each member; what tells it from another; its functions' way to other processes.
+"""`Description`: what a sweep computes for each member; its text, by which stores are compared; its way to workers.
 
 A worker in another shell gets the functions by cloudpickle: those of the user's script by value, those of modules by
-name, found along the same `sys.path`. Whether they still are what the store was begun with is told by their programs,
-as JAX traces them, with every constant: a change of a global number changes those, though not the text of a function.
-Of what JAX does not trace here, `keep` above all, `_reads.identity` tells it: the code, and all that it uses.
+name, found along the same `sys.path`. Their programs decide whether they still are what the store was begun with, as
+JAX traces them, with every constant: a change of a global number changes those, though not the text of a function. Of
+what JAX does not trace here, `keep` above all, `_reads.identity` decides it: the code, and all that it uses.
 """
 
 import difflib
+import inspect
+import io
+import pickle
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,10 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import accept
+from lagjax._crossings import directions_of, sections_of
 from lagjax._hybrid import Hybrid, Scene
+from lagjax._machine_code import MachineCode
 from lagjax._reads import array_text, hash_of, identity, source, without_addresses
-from lagjax._sweep._sections import Sections
 from lagjax._sweep._statistics import Statistics
+from lagjax._validate import require_budget
 
 PyTree = Any
 ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
@@ -29,7 +34,68 @@ MOTION = (*ROLES, "q0", "qdot0", "params")  # what a motion depends on, besides 
 NOT_TRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
 _NUMBERS = ("rtol", "atol", "max_steps")
 _OF_EVENTS = ("direction", "root_finder")  # what a diffrax.Event has besides its condition
+_ARGUMENTS = ("section", "direction", "count")
 _SHOWN = 40  # lines of a difference
+
+
+class Sections(NamedTuple):
+    """The sections to watch: functions of (q, qdot) and, by name, `t` and `params`; how they change; room for each.
+
+    `names` are those of a dict of sections, None for one function.
+    """
+
+    names: tuple[str, ...] | None
+    functions: tuple[Callable, ...]
+    directions: tuple[int, ...]
+    count: int
+
+    @classmethod
+    def of(cls, crossings: Any, keep: Callable, settings: dict[str, Any]) -> "Sections | None":
+        """From the arguments of `sweep`. Raises `TypeError` or `ValueError` where they cannot be right."""
+        asked = "crossings" in _parameters(keep)
+        if crossings is None:
+            if asked:
+                raise ValueError("keep asks for `crossings`: say which, by crossings={'section': a function}.")
+            return None
+        if not isinstance(crossings, dict) or "section" not in crossings or not set(crossings) <= set(_ARGUMENTS):
+            raise TypeError(
+                "crossings must be a dict with arguments of lagjax.crossings: section, perhaps direction and count; "
+                f"got {list(crossings) if isinstance(crossings, dict) else crossings!r}."
+            )
+        if not asked:
+            raise ValueError(
+                "crossings are found for keep, which does not ask for them: write keep(trajectory, crossings)."
+            )
+        if settings["event"] is not None:
+            raise ValueError("An event ends the motion, and crossings do not: give one of the two.")
+        if not isinstance(settings["solver"], MachineCode | None):
+            raise ValueError("crossings are found in machine code: leave solver at None.")
+        section = crossings["section"]
+        names, _ = sections_of(section)
+        require_budget(crossings.get("count", 64), "count")
+        directions = directions_of(crossings.get("direction", 0), names)
+        functions = (section,) if names is None else tuple(section.values())
+        return cls(names, functions, directions, int(crossings.get("count", 64)))
+
+    def described(self) -> dict:
+        """The part that is no function of them, for the store."""
+        names = None if self.names is None else list(self.names)
+        return {"names": names, "directions": list(self.directions), "count": self.count}
+
+    def by_name(self) -> dict[str, Callable]:
+        """The functions, by what a store calls them."""
+        return dict(zip(self.names or ("section",), self.functions, strict=True))
+
+    def bytes_of(self, states: int) -> int:
+        """The notes on a member whose state has this many numbers."""
+        return 8 * len(self.functions) * (self.count + 1) * (states + 1)
+
+
+def _parameters(keep: Callable) -> list[str]:
+    try:
+        return list(inspect.signature(keep).parameters)
+    except (TypeError, ValueError):  # of what is written in C
+        return []
 
 
 class Left(NamedTuple):
@@ -49,7 +115,7 @@ class Left(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Motions:
+class Description:
     """The work for each member: the scene, its start as values or functions of a point, and what is kept."""
 
     system: Scene
@@ -94,29 +160,29 @@ class Motions:
 # ---- text and hash ---------------------------------------------------------------------------------------------------
 
 
-def texts(motions: Motions, names: list[str]) -> dict[str, dict[str, str]]:
+def texts(description: Description, names: list[str]) -> dict[str, dict[str, str]]:
     """For every function and value: its text, and its program as JAX traces it (the text where it cannot)."""
     point = {name: jnp.zeros(()) for name in names}
-    q, qdot, params = motions.shapes(names)
+    q, qdot, params = description.shapes(names)
     found = {}
-    for name, function in _functions(motions.system).items():
+    for name, function in _functions(description.system).items():
         arguments = (q,) if name.split()[0] == "constraints" else (q, qdot)
         found[name] = _entry(function.code.function, _traced(function, arguments, params), function.arrays)
-    if isinstance(motions.system, Hybrid):
-        found["transitions"] = _entry(_plan(motions.system), None)
-    event = motions.settings.get("event")
+    if isinstance(description.system, Hybrid):
+        found["transitions"] = _entry(_plan(description.system), None)
+    event = description.settings.get("event")
     if event is not None:
         condition = getattr(event, "cond_fn", event)
         of_event = _traced(accept(condition, "event"), (q, qdot), params) if callable(condition) else None
         found["event"] = _entry(condition, of_event)
         found["event"]["program"] += "\n" + identity([getattr(event, name, None) for name in _OF_EVENTS])
-    for name, section in motions.sections.by_name().items() if motions.sections else ():
+    for name, section in description.sections.by_name().items() if description.sections else ():
         of_section = _traced(accept(section, "section"), (q, qdot), params)
         found[f"crossings of {name}"] = _entry(section, of_section)
     for role in ("q0", "qdot0", "params"):
-        value = getattr(motions, role)
+        value = getattr(description, role)
         found[role] = _entry(value, (lambda f=value: jax.make_jaxpr(f)(point)) if callable(value) else None)
-    found["keep"] = _entry(motions.keep, None)
+    found["keep"] = _entry(description.keep, None)
     return found
 
 
@@ -188,25 +254,38 @@ def difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]
 # ---- to another process ----------------------------------------------------------------------------------------------
 
 
-def packed(motions: Motions) -> bytes:
+def packed(description: Description) -> bytes:
     """The motions as bytes. Raises `ImportError` without cloudpickle, `TypeError` where a function cannot be packed."""
     try:
         import cloudpickle
     except ImportError:
         raise ImportError("sweep() needs the package cloudpickle: pip install cloudpickle.") from None
     try:
-        return cloudpickle.dumps(motions)
+        return cloudpickle.dumps(description)
     except Exception as why:
         raise TypeError(f"A function of this sweep cannot be sent to another process: {why}") from why
 
 
-def unpacked(data: bytes, path: list[str]) -> Motions:
-    """The motions again, modules of the user found along his `path`. Raises `ImportError` where one is not."""
-    import pickle
+class _Unpickler(pickle.Unpickler):
+    """Finds the classes of this package under the names that they had when the bytes were written."""
 
+    def find_class(self, module: str, name: str) -> Any:
+        """The class or function of this name."""
+        return super().find_class(*_MOVED.get((module, name), (module, name)))
+
+
+_MOVED = {
+    ("lagjax._sweep._scene", "Motions"): (__name__, "Description"),
+    ("lagjax._sweep._scene", "Left"): (__name__, "Left"),
+    ("lagjax._sweep._sections", "Sections"): (__name__, "Sections"),
+}
+
+
+def unpacked(data: bytes, path: list[str]) -> Description:
+    """The description again, modules of the user found along his `path`. Raises `ImportError` where one is not."""
     sys.path += [place for place in path if place not in sys.path]
     try:
-        return pickle.loads(data)
+        return _Unpickler(io.BytesIO(data)).load()
     except (ImportError, AttributeError) as why:
         raise ImportError(
             f"The functions of this sweep cannot be rebuilt here: {why}. They were defined in a module that this "
