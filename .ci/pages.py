@@ -24,13 +24,15 @@ sys.path.insert(0, str(ROOT))
 
 import lagjax  # noqa: E402
 
+PUBLIC = (*lagjax.__all__, *lagjax.results.__all__)
+
 # ---- what there is -----------------------------------------------------------------------------------------------
 
 
 def groups() -> dict[str, list[str]]:
     """The public names by the headings of the package's docstring; those that it forgets come last, under "Others"."""
     _, *parts = re.split(r"^\*\*(.+)\*\*$", inspect.getdoc(lagjax), flags=re.MULTILINE)
-    public, result = set(lagjax.__all__), {}
+    public, result = set(PUBLIC), {}
     for title, text in zip(parts[::2], parts[1::2], strict=True):
         names = [name for name in re.findall(r"`(\w+)`", text) if name in public]
         result[title] = list(dict.fromkeys(names))
@@ -40,10 +42,10 @@ def groups() -> dict[str, list[str]]:
 
 def makers(name: str) -> list[str]:
     """The public functions, and methods of public classes, that return the class `name`, by their annotations."""
-    owners = {"": lagjax} | {f"{n}.": getattr(lagjax, n) for n in lagjax.__all__ if inspect.isclass(getattr(lagjax, n))}
+    owners = {"": lagjax} | {f"{n}.": getattr(lagjax, n) for n in PUBLIC if inspect.isclass(getattr(lagjax, n))}
     found = []
     for prefix, owner in owners.items():
-        for member in lagjax.__all__ if owner is lagjax else vars(owner):
+        for member in PUBLIC if owner is lagjax else vars(owner):
             thing = inspect.getattr_static(owner, member)
             returned = getattr(thing, "__annotations__", {}).get("return", "")
             text = returned if isinstance(returned, str) else getattr(returned, "__name__", "") + str(returned)
@@ -134,7 +136,7 @@ def on_files(files, config):
     readme = (ROOT / "README.md").read_text()
     texts = {"index.md": readme, "reference.md": f"# By purpose\n\n{inspect.getdoc(lagjax)}\n"}
     texts |= {name: (ROOT / name).read_text() for name in ("CONTRIBUTING.md", "CHANGELOG.md")}
-    texts |= {f"reference/{name}.md": page_of_name(name) for name in lagjax.__all__}
+    texts |= {f"reference/{name}.md": page_of_name(name) for name in PUBLIC}
     texts |= {f"{path.stem}.md": page_of_example(path) for path in examples()}
     for name, text in texts.items():
         files.append(File.generated(config, name, content=_from_the_top(text)))
@@ -151,7 +153,7 @@ def _from_the_top(text: str) -> str:
 
 def on_page_content(html, page, config, files):
     """Turns names in code, as `simulate` or `lagjax.simulate`, into links to their pages."""
-    here, names = Path(page.file.dest_uri), "|".join(lagjax.__all__)
+    here, names = Path(page.file.dest_uri), "|".join(PUBLIC)
 
     def link(match):
         name = match["name"]

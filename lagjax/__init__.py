@@ -42,34 +42,28 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 **Many members, few numbers of each**
 
 - `sweep`: up to 10⁸ members in a store, as a `Sweep`, with its `Statistics` and `Status`
-- `sobol`, `latin_hypercube`, `random`: points to sweep over
+- `designs`: points to sweep over: random, Sobol's, Latin hypercubes
 
 **More**
 
 - `scenes`: ready Lagrangians with exact solutions
 - `plot`: figures
+- `results`: the classes of what functions return
 - `Animation`: a motion as a film, made by `Trajectory.animate`
 """
 
 import ast
+import functools
 import importlib
+import importlib.util
+import warnings
 from typing import TYPE_CHECKING, Any
 
 from lagjax._system import System
 
 if TYPE_CHECKING:  # each is imported where it is first asked for: all of them take as long as JAX itself
-    from lagjax import plot, scenes
+    from lagjax import designs, plot, results, scenes
     from lagjax._analysis import (
-        CanonicalTrajectory,
-        ChangedCoordinates,
-        Conserved,
-        ConservedQuantities,
-        Equilibrium,
-        Hamiltonian,
-        Linearization,
-        Modes,
-        Routhian,
-        SameMotion,
         change_coordinates,
         conserved_quantities,
         cyclic_coordinates,
@@ -81,14 +75,11 @@ if TYPE_CHECKING:  # each is imported where it is first asked for: all of them t
         routhian,
         same_motion,
     )
-    from lagjax._animation import Animation
-    from lagjax._check import Finding, Findings, check
-    from lagjax._crossings import Crossings, crossings
+    from lagjax._check import check
+    from lagjax._crossings import crossings
     from lagjax._diffrax import FineOutput
-    from lagjax._explain import Explanation
     from lagjax._fit import (
         Delayed,
-        Fit,
         Gaussian,
         Guess,
         Record,
@@ -102,14 +93,9 @@ if TYPE_CHECKING:  # each is imported where it is first asked for: all of them t
         simplex,
         wrapped,
     )
-    from lagjax._health import Health
     from lagjax._hybrid import Hybrid, Transition, simulate_hybrid
     from lagjax._machine_code import MachineCode
     from lagjax._orbits import (
-        Family,
-        LyapunovExponent,
-        Orbit,
-        Path,
         action,
         branch_off,
         family,
@@ -118,58 +104,30 @@ if TYPE_CHECKING:  # each is imported where it is first asked for: all of them t
         lyapunov_spectrum,
         periodic_orbit,
     )
-    from lagjax._precision import WorkPrecision, WorkPrecisionRow, work_precision
+    from lagjax._precision import work_precision
     from lagjax._results import RESULTS, SimulationError
     from lagjax._samples import samples
     from lagjax._simulate import simulate, simulate_batch
-    from lagjax._sweep import Statistics, Status, Sweep, sweep
-    from lagjax._trajectory import State, Trajectory, Transitions
-    from lagjax.designs import latin_hypercube, random, sobol
+    from lagjax._sweep import Statistics, Sweep, sweep
+    from lagjax.results import *  # noqa: F403
 
 __version__ = "0.1.0"
 __all__ = [
     "RESULTS",
-    "Animation",
-    "CanonicalTrajectory",
-    "ChangedCoordinates",
-    "Conserved",
-    "ConservedQuantities",
-    "Crossings",
     "Delayed",
-    "Equilibrium",
-    "Explanation",
-    "Family",
-    "Finding",
-    "Findings",
     "FineOutput",
-    "Fit",
     "Gaussian",
     "Guess",
-    "Hamiltonian",
-    "Health",
     "Hybrid",
-    "Linearization",
-    "LyapunovExponent",
     "MachineCode",
-    "Modes",
-    "Orbit",
-    "Path",
     "Record",
-    "Routhian",
-    "SameMotion",
     "SimulationError",
-    "State",
     "Statistics",
-    "Status",
     "StudentT",
     "Sweep",
     "System",
     "Timings",
-    "Trajectory",
     "Transition",
-    "Transitions",
-    "WorkPrecision",
-    "WorkPrecisionRow",
     "action",
     "angle",
     "between",
@@ -179,13 +137,13 @@ __all__ = [
     "conserved_quantities",
     "crossings",
     "cyclic_coordinates",
+    "designs",
     "equilibrium",
     "family",
     "find_path",
     "fit",
     "hamiltonian",
     "inertia",
-    "latin_hypercube",
     "linearize",
     "lyapunov_exponent",
     "lyapunov_spectrum",
@@ -194,7 +152,7 @@ __all__ = [
     "periodic_orbit",
     "plot",
     "positive",
-    "random",
+    "results",
     "routhian",
     "same_motion",
     "samples",
@@ -203,18 +161,26 @@ __all__ = [
     "simulate",
     "simulate_batch",
     "simulate_hybrid",
-    "sobol",
     "sweep",
     "work_precision",
     "wrapped",
 ]
 
 
+_MOVED = {name: f"lagjax.designs.{name}" for name in ("latin_hypercube", "random", "sobol")}
+
+
 def __getattr__(name: str) -> Any:
-    """A public name, imported from where the block above says."""
-    if name not in __all__:
+    """A public name or a class of `lagjax.results`, imported from its module; an old name, with a warning."""
+    if name in _MOVED:
+        warnings.warn(
+            f"lagjax.{name} is {_MOVED[name]} now; the old name goes with the next version.",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return getattr(importlib.import_module("lagjax.designs"), name)
+    if (path := _places().get(name)) is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    path = _places()[name]
     value = (
         importlib.import_module(f"{path}.{name}") if path == __name__ else getattr(importlib.import_module(path), name)
     )
@@ -225,10 +191,16 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
+@functools.cache
 def _places() -> dict[str, str]:
-    """The module of every public name: what a type checker reads, so that it is said once."""
-    assert __spec__ is not None and __spec__.loader is not None
-    tree = ast.parse(__spec__.loader.get_source(__name__))  # type: ignore[attr-defined]
-    (block,) = (node for node in tree.body if isinstance(node, ast.If))
-    imports = (node for node in block.body if isinstance(node, ast.ImportFrom))
-    return {alias.name: str(node.module) for node in imports for alias in node.names}
+    """The module of every public name and result: what a type checker reads, so that it is said once."""
+    (block,) = (node for node in _parsed(__name__).body if isinstance(node, ast.If))
+    imports = [*block.body, *_parsed(f"{__name__}.results").body]
+    imports = [node for node in imports if isinstance(node, ast.ImportFrom)]
+    return {alias.name: str(node.module) for node in imports for alias in node.names if alias.name != "*"}
+
+
+def _parsed(module: str) -> ast.Module:
+    """The syntax of a module of this package, which is not imported for it."""
+    loader = __spec__.loader if module == __name__ else importlib.util.find_spec(module).loader  # type: ignore
+    return ast.parse(loader.get_source(module))  # type: ignore[attr-defined]

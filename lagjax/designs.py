@@ -1,6 +1,11 @@
-"""Designs: points that are chosen by a rule instead of listed.
+"""Designs: points that are chosen by a rule instead of listed, for `over` of `lagjax.sweep`.
 
-A design knows its values by their numbers, from the rule alone: no worker needs what another one drew.
+A design computes its values from their numbers and the rule alone: no worker needs the values of another one.
+
+- `random`: independent uniform numbers
+- `sobol`: Sobol's sequence, scrambled, whose means have small errors
+- `latin_hypercube`: one point in each of equal parts of every interval
+- `Design`: what they return
 """
 
 import hashlib
@@ -8,6 +13,8 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
+
+__all__ = ["Design", "latin_hypercube", "random", "sobol"]
 
 GROWING = ("random", "sobol")  # more members begin with the same ones
 SLICE = 2**20  # values that are in memory together: 8 MiB of one name
@@ -94,7 +101,7 @@ def random(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
     ```python
     import lagjax
 
-    over = {"length": [0.5, 1.0], ("angle", "speed"): lagjax.random(10_000, seed=1, low=-3.0, high=3.0)}
+    over = {"length": [0.5, 1.0], ("angle", "speed"): lagjax.designs.random(10_000, seed=1, low=-3.0, high=3.0)}
     ```
     """
     return _made("random", count, seed, low, high, None)
@@ -111,7 +118,7 @@ def sobol(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
     ```python
     import lagjax
 
-    over = {("angle", "speed"): lagjax.sobol(1024, seed=1, low=(-3.0, 0.0), high=(3.0, 1.0))}
+    over = {("angle", "speed"): lagjax.designs.sobol(1024, seed=1, low=(-3.0, 0.0), high=(3.0, 1.0))}
     ```
     """
     return _made("sobol", count, seed, low, high, _LONGEST_SOBOL)
@@ -128,7 +135,7 @@ def latin_hypercube(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
     ```python
     import lagjax
 
-    over = {("angle", "speed"): lagjax.latin_hypercube(1000, seed=1, low=(-3.0, 0.0), high=(3.0, 1.0))}
+    over = {("angle", "speed"): lagjax.designs.latin_hypercube(1000, seed=1, low=(-3.0, 0.0), high=(3.0, 1.0))}
     ```
     """
     return _made("latin_hypercube", count, seed, low, high, _LONGEST_HYPERCUBE)
@@ -140,7 +147,7 @@ def _made(kind: str, count, seed, low, high, most: int | None) -> Design:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:
         raise ValueError(f"The seed of a {kind} design must be a whole number from 0 to 2^63 - 1; got {seed!r}.")
     if most is not None and count > most:
-        raise ValueError(f"A {kind} design has at most {most} points; {count} were asked for: take lagjax.random.")
+        raise ValueError(f"A {kind} design has at most {most} points, not {count}: take lagjax.designs.random.")
     low, high = (tuple(float(x) for x in np.atleast_1d(np.asarray(bound))) for bound in (low, high))
     names = max(len(low), len(high))
     pairs = zip(*(x * names if len(x) == 1 else x for x in (low, high)), strict=len(low) == len(high))

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import lagjax
 
 PACKAGE = Path(lagjax.__file__).parent
@@ -13,7 +15,7 @@ PACKAGE = Path(lagjax.__file__).parent
 README = (Path(__file__).parent.parent / "README.md").read_text()
 # From the top of the street to its end, as the README's table lists it. A new module must take a place there.
 STREET = re.findall(r"^\| `(\w+)(?:\.py|/)` \|", README.split("## The street")[1].split("\n## ")[0], flags=re.MULTILINE)
-LEAVES = {"scenes", "plot"}  # for users, tests, benchmarks and examples; imported by nothing on the street
+LEAVES = {"scenes", "plot", "results"}  # for users, tests, benchmarks and examples; imported by nothing on the street
 
 
 def place(path: Path) -> str:
@@ -138,13 +140,27 @@ def test_importing_changes_nothing():
 def test_a_name_is_imported_when_it_is_used():
     code = (
         "import lagjax, sys; assert 'lagjax._simulate' not in sys.modules, 'it has not been used';"
-        "assert set(lagjax.__all__) <= set(dir(lagjax)) and {*lagjax._places(), 'System'} == set(lagjax.__all__);"
+        "assert set(lagjax.__all__) <= set(dir(lagjax)) and not {'Orbit', 'sobol'} & set(dir(lagjax));"
         "assert not hasattr(lagjax, 'System2') and lagjax.simulate is lagjax.simulate;"
         "assert not {'scipy.optimize', 'scipy.special', 'lagjax._fit', 'lagjax._sweep'} & set(sys.modules);"
-        "from lagjax import *; assert sweep is lagjax.sweep and plot.__name__ == 'lagjax.plot'"
+        "from lagjax import *; assert sweep is lagjax.sweep and plot.__name__ == 'lagjax.plot';"
+        "assert {*lagjax._places(), 'System'} == {*lagjax.__all__, *results.__all__}"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_results_have_one_module_and_keep_their_old_names():
+    for name in lagjax.results.__all__:
+        assert getattr(lagjax, name) is getattr(lagjax.results, name)
+    assert not set(lagjax.__all__) & set(lagjax.results.__all__)
+
+
+@pytest.mark.parametrize("name", ["random", "sobol", "latin_hypercube"])
+def test_old_names_say_the_new_one(name):
+    with pytest.warns(DeprecationWarning, match=f"lagjax.{name} is lagjax.designs.{name} now") as told:
+        assert getattr(lagjax, name) is getattr(lagjax.designs, name)
+    assert told[0].filename == __file__
 
 
 VAGUE = ("What ", "How ", "Whether ", "Where ")

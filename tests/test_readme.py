@@ -52,7 +52,9 @@ def methods(kind: type) -> dict[str, object]:
     return {name: value for name, value in own.items() if "```python" in (inspect.getdoc(value) or "")}
 
 
-PUBLIC = {name: getattr(lagjax, name) for name in lagjax.__all__ if callable(getattr(lagjax, name))}
+PUBLIC = {name: getattr(lagjax, name) for name in (*lagjax.__all__, *lagjax.results.__all__)}
+PUBLIC |= {f"designs.{name}": getattr(lagjax.designs, name) for name in lagjax.designs.__all__}
+PUBLIC = {name: thing for name, thing in PUBLIC.items() if callable(thing)}
 METHODS = {f"{name}.{own}": of for name, it in PUBLIC.items() if inspect.isclass(it) for own, of in methods(it).items()}
 COSTLY = ("work_precision", "System.project", "Trajectory.animate", "Trajectory.to_pandas", "Trajectory.health")
 

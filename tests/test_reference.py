@@ -12,7 +12,7 @@ import pytest
 import lagjax
 
 ROOT = Path(__file__).parent.parent
-PUBLIC = {name: getattr(lagjax, name) for name in lagjax.__all__}
+PUBLIC = {name: getattr(lagjax, name) for name in (*lagjax.__all__, *lagjax.results.__all__)}
 
 
 def returned_by_public_functions() -> str:

@@ -134,42 +134,45 @@ def sweep(
     failure of the machine at any moment. `python -m lagjax sweep run STORE` in another shell, on another machine that
     shares the disk, or in an array of batch jobs works on the same units; such workers may join or die at any time.
 
-    **Everyday arguments**
+    **What runs**
 
     - `system`: a `System`, or a `Hybrid`, of which `keep` gets the trajectory that `simulate_hybrid` returns. Its
       transitions watch the motion in machine code: `event`, `crossings` and `solver` are not for it, nor a later end.
-    - `over`: a dict of axes, of which the product is swept. A 1-D array is an axis by its name; a design
-      (`lagjax.random`, `lagjax.sobol`, `lagjax.latin_hypercube`) draws its values by a rule; a tuple of names with a
-      tuple of arrays, or with a design, varies several together. There may be 10⁸ members: they are never listed.
+    - `over`: a dict of axes, of which the product is swept. A 1-D array is an axis by its name; a design of
+      `lagjax.designs` (`random`, `sobol`, `latin_hypercube`) draws its values by a rule; a tuple of names with a tuple
+      of arrays, or with a design, varies several together. There may be 10⁸ members: they are never listed.
     - `ts`: output times, shape (T,), of every member.
     - `q0`, `qdot0`, `params`: values for all, or functions of one member's point, which is a dict of numbers by the
       names in `over`.
-    - `keep(trajectory)`: a dict of what remains of a member, numbers or arrays by names, from its `Trajectory`.
+    - `rtol`, `atol`, `max_steps`, `event`, `solver`: as in `simulate_batch`.
     - `crossings`: arguments of `lagjax.crossings`, {"section": …, "direction": …, "count": …}. Then `keep(trajectory,
       crossings)` also gets the `Crossings` of that motion, which does not end at them: the time of the first event and
       the final state come from one run, if `ts` are two times.
-    - `store`: a folder. `xarray.open_zarr(store)` reads it, with the names of `over` as dimensions and coordinates, the
-      kept quantities as variables, and `result`: how each member ended, −1 for those still to do. Missing values are
-      NaN, or the least integer of an integer type.
 
-    **Rarer ones**
+    **What is kept**
 
+    - `keep(trajectory)`: a dict of what remains of a member, numbers or arrays by names, from its `Trajectory`.
     - `reduce`: for quantities that are too many to keep, a dict of `lagjax.Statistics` by their names: count, mean,
       variance, extremes with their members, histogram, quantiles. These are merged in the order of the units and stored
       instead of the members' values; `Sweep.statistics()` reads them.
-    - `unit`: the number of members in a unit of work. A unit is a chunk of the store, and all that is lost with a
-      worker that dies. By default as many as take 20 s here, with at most 64 MiB of kept quantities.
+    - `store`: a folder. `xarray.open_zarr(store)` reads it, with the names of `over` as dimensions and coordinates, the
+      kept quantities as variables, and `result`: how each member ended, −1 for those still to do. Missing values are
+      NaN, or the least integer of an integer type.
     - `extend`: a store of the same scene, from which the members that are also in `over` are copied, for more members
       of a design or a finer grid. It is not changed. For a later end let `keep` return {"end": trajectory.end, …}, and
-      give `ts` that begin at the last time of that store: its motions go on from there, and `keep` sees the rest of
+      give `ts` that begin at the last time of that store: its motions continue from there, and `keep` sees the rest of
       them. Members that ended before that time keep their `result`.
+
+    **Where it runs**
+
+    - `unit`: the number of members in a unit of work. A unit is a chunk of the store, and all that is lost with a
+      worker that dies. By default as many as take 20 s here, with at most 64 MiB of kept quantities.
     - `executor`: any `concurrent.futures.Executor`, such as dask's `client.get_executor()`; a task is a unit. By
       default this process works, with the machine code's threads on all cores, and writes a unit while it computes the
       next.
     - `isolate`: compute in a child process. A unit whose child dies, or takes longer than `isolate` seconds over a
       batch (True: 600), is halved until the members that end it are known; these are labelled `crashed`.
     - `progress`: a line on stderr.
-    - `rtol`, `atol`, `max_steps`, `event`, `solver`: as in `simulate_batch`.
 
     A store knows the scene and `keep` by their code and by all that this reads: helpers, globals, closures, classes
     with all their attributes, modules imported inside. What it cannot know is what a function reads from files, from

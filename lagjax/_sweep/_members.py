@@ -68,7 +68,7 @@ def axes_of(over: Any) -> tuple[Axis, ...]:
     if not isinstance(over, dict) or not over:
         raise TypeError(
             "over must be a dict that is not empty: names with 1-D arrays or designs, as in {'l': np.linspace(1, 2, "
-            f"50), ('a', 'b'): lagjax.random(1000, seed=1)}}; got {type(over).__name__}."
+            f"50), ('a', 'b'): lagjax.designs.random(1000, seed=1)}}; got {type(over).__name__}."
         )
     axes = tuple(_axis(key, value) for key, value in over.items())
     names = [name for axis in axes for name in axis.names]
@@ -104,7 +104,7 @@ def _column(name: str, value: Any) -> np.ndarray:
     if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "fiu":
         raise ValueError(
             f"over[{name!r}] must be a 1-D array of real numbers that is not empty, or a design such as "
-            f"lagjax.random(1000, seed=1); got an array of shape {array.shape} and type {array.dtype}."
+            f"lagjax.designs.random(1000, seed=1); got an array of shape {array.shape} and type {array.dtype}."
         )
     array = array.astype(np.float64)
     if not np.isfinite(array).all():

@@ -1,0 +1,100 @@
+"""The classes of what lagjax returns, for annotations and `isinstance`; nobody has to construct them.
+
+Each of them is also found as `lagjax.Trajectory`, `lagjax.Orbit`, ….
+
+**Motion**
+
+- `Trajectory`, with its `State` at the end and the `Transitions` of a hybrid motion: from `simulate`, `simulate_batch`,
+  `simulate_hybrid`
+- `Crossings`: from `crossings`
+- `Animation`: from `Trajectory.animate`
+
+**Trust**
+
+- `Findings`, each a `Finding`: from `check`
+- `Explanation`: from `System.explain`
+- `Health`: from `Trajectory.health`
+- `WorkPrecision`, of `WorkPrecisionRow`s: from `work_precision`
+
+**Analysis**
+
+- `Equilibrium`, `Linearization`, `Modes`: from `equilibrium`, `linearize`, `normal_modes`
+- `ConservedQuantities`, each a `Conserved`: from `conserved_quantities`
+- `SameMotion`: from `same_motion`
+- `ChangedCoordinates`, `Hamiltonian` with its `CanonicalTrajectory`, `Routhian`: from `change_coordinates`,
+  `hamiltonian`, `routhian`
+- `Orbit`, `Family`: from `periodic_orbit`, `family`, `branch_off`
+- `LyapunovExponent`: from `lyapunov_exponent`
+- `Path`: from `find_path`
+
+**Parameters and sweeps**
+
+- `Fit`: from `fit`
+- `Status`: from `Sweep.status`
+
+```python
+import jax.numpy as jnp, lagjax
+from lagjax.results import Trajectory
+
+
+def last(trajectory: Trajectory):
+    return trajectory.q[-1]
+
+
+scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+last(lagjax.simulate(scene, 1.0, 0.0, jnp.linspace(0.0, 1.0, 11)))
+```
+"""
+
+from lagjax._analysis import (
+    CanonicalTrajectory,
+    ChangedCoordinates,
+    Conserved,
+    ConservedQuantities,
+    Equilibrium,
+    Hamiltonian,
+    Linearization,
+    Modes,
+    Routhian,
+    SameMotion,
+)
+from lagjax._animation import Animation
+from lagjax._check import Finding, Findings
+from lagjax._crossings import Crossings
+from lagjax._explain import Explanation
+from lagjax._fit import Fit
+from lagjax._health import Health
+from lagjax._orbits import Family, LyapunovExponent, Orbit, Path
+from lagjax._precision import WorkPrecision, WorkPrecisionRow
+from lagjax._sweep import Status
+from lagjax._trajectory import State, Trajectory, Transitions
+
+__all__ = [
+    "Animation",
+    "CanonicalTrajectory",
+    "ChangedCoordinates",
+    "Conserved",
+    "ConservedQuantities",
+    "Crossings",
+    "Equilibrium",
+    "Explanation",
+    "Family",
+    "Finding",
+    "Findings",
+    "Fit",
+    "Hamiltonian",
+    "Health",
+    "Linearization",
+    "LyapunovExponent",
+    "Modes",
+    "Orbit",
+    "Path",
+    "Routhian",
+    "SameMotion",
+    "State",
+    "Status",
+    "Trajectory",
+    "Transitions",
+    "WorkPrecision",
+    "WorkPrecisionRow",
+]
