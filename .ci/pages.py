@@ -1,12 +1,13 @@
 """Makes the pages of the reference at build time: the hook that `mkdocs.yml` names.
 
-The README is the front page. Every public name has a page, in the groups of the package's own docstring; every example
+The README is the front page, and the files of `docs/` come after it. Every public name has a page, in the groups of the package's own docstring; every example
 has one, whose Markdown cells are text, whose code is code, and whose picture stands on top where `examples/gallery`
 holds it. Names in code are links to their pages. Nothing of this is a file in the repository.
 """
 
 import ast
 import inspect
+import os
 import re
 import sys
 from pathlib import Path
@@ -120,6 +121,8 @@ def on_config(config):
     config.markdown_extensions.append(Prompts())
     config.nav = [
         {"lagjax": "index.md"},
+        {"Guide": [{page.stem: _on_the_site(page).as_posix()} for page in guide()]},
+        {"Method and figures": [f"{name}.md" for name in ("method", "benchmarks", "problems", "development")]},
         {"Reference": [{"By purpose": "reference.md"}, *_reference()]},
         {"Examples": [{path.stem.replace("_", " "): f"{path.stem}.md"} for path in examples()]},
         {"Project": [{"Contributing": "CONTRIBUTING.md"}, {"Changes": "CHANGELOG.md"}]},
@@ -132,23 +135,53 @@ def _reference() -> list[dict]:
 
 
 def on_files(files, config):
-    """Adds all pages, and the pictures that the README shows."""
-    readme = (ROOT / "README.md").read_text()
-    texts = {"index.md": readme, "reference.md": f"# By purpose\n\n{inspect.getdoc(lagjax)}\n"}
-    texts |= {name: (ROOT / name).read_text() for name in ("CONTRIBUTING.md", "CHANGELOG.md")}
+    """Adds all pages, and the files that they show or link to."""
+    texts = {"reference.md": f"# By purpose\n\n{inspect.getdoc(lagjax)}\n"}
     texts |= {f"reference/{name}.md": page_of_name(name) for name in PUBLIC}
     texts |= {f"{path.stem}.md": page_of_example(path) for path in examples()}
+    linked = set()
+    for written in (Path("README.md"), Path("CONTRIBUTING.md"), Path("CHANGELOG.md"), *_pages()):
+        texts[_on_the_site(written).as_posix()] = _moved(written, linked)
     for name, text in texts.items():
-        files.append(File.generated(config, name, content=_from_the_top(text)))
-    for linked in set(re.findall(r"\]\(([^):#]+)\)", readme)):
-        if (ROOT / linked).is_file() and linked not in texts and not linked.startswith("examples/"):
-            files.append(File.generated(config, linked, abs_src_path=str(ROOT / linked)))
+        files.append(File.generated(config, name, content=text))
+    for path in linked:
+        name = _on_the_site(path).as_posix()
+        if (ROOT / path).is_file() and name not in texts and path.parts[0] != "examples":
+            files.append(File.generated(config, name, abs_src_path=str(ROOT / path)))
     return files
 
 
-def _from_the_top(text: str) -> str:
-    """Links and pictures of the README in `examples/`, which is the top of the site."""
-    return text.replace("](examples/", "](").replace('src="examples/', 'src="')
+def _pages() -> list[Path]:
+    """The files of `docs/`, from the root of the repository."""
+    return sorted(path.relative_to(ROOT) for path in (ROOT / "docs").rglob("*.md"))
+
+
+def guide() -> list[Path]:
+    """The pages of the guide, in the order in which the README names them."""
+    return [Path(name) for name in dict.fromkeys(re.findall(r"docs/guide/\w+\.md", (ROOT / "README.md").read_text()))]
+
+
+def _on_the_site(path: Path) -> Path:
+    """The place of a file of the repository on the site, whose top has what `docs/` and `examples/` hold."""
+    if path == Path("README.md"):
+        return Path("index.md")
+    return Path(*path.parts[1:]) if path.parts[0] in ("docs", "examples") else path
+
+
+def _moved(written: Path, linked: set[Path]) -> str:
+    """The text of a file of the repository with its links as they are on the site; they are added to `linked`."""
+    here = _on_the_site(written).parent
+
+    def link(match):
+        address, *heading = match["address"].split("#")
+        if not address or ":" in address:
+            return match[0]
+        path = Path(os.path.normpath(written.parent / address))
+        linked.add(path)
+        return match["before"] + "#".join([os.path.relpath(_on_the_site(path), here), *heading]) + match["after"]
+
+    text = (ROOT / written).read_text()
+    return re.sub(r'(?P<before>\]\(|src=")(?P<address>[^)"\s]+)(?P<after>\)|")', link, text)
 
 
 def on_page_content(html, page, config, files):

@@ -1,4 +1,4 @@
-"""What the README and the docstrings show is executed as it stands."""
+"""What the README, the pages of `docs/` and the docstrings show is executed as it stands."""
 
 import inspect
 import re
@@ -11,6 +11,9 @@ import lagjax
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
+# The guide goes on from the README, page after page in the order in which that names them.
+GUIDE = [ROOT / name for name in dict.fromkeys(re.findall(r"docs/guide/\w+\.md", README))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def blocks(text: str, language: str = "python") -> list[str]:
@@ -24,26 +27,42 @@ def shape_of(printed: str) -> str:
 
 def test_readme_code(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    # One session, as a reader would type it; what a block prints is what the README shows right after it.
-    shown = re.findall(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", README, flags=re.DOTALL)
-    assert len(shown) == len(blocks(README)) and sum(bool(printed) for _, printed in shown) > 5
-    session = {}
-    for code, printed in shown:
-        exec(compile(code, "README.md", "exec"), session)
-        assert shape_of(capsys.readouterr().out) == shape_of(printed)
+    # One session, as a reader would type it; what a block prints is what the page shows right after it.
+    session, prints = {}, 0
+    for page in (ROOT / "README.md", *GUIDE):
+        text = page.read_text()
+        shown = re.findall(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", text, flags=re.DOTALL)
+        assert len(shown) == len(blocks(text))
+        for code, printed in shown:
+            exec(compile(code, page.name, "exec"), session)
+            assert shape_of(capsys.readouterr().out) == shape_of(printed)
+            prints += bool(printed)
+    assert prints > 5
+
+
+def test_the_readme_is_a_front_page():
+    assert len(README.splitlines()) <= 150
+    assert {page for page in PAGES if page.parent.name == "guide"} == set(GUIDE)
 
 
 def test_readme_commands_and_links():
     commands = "\n".join(blocks(README, "sh"))
     assert 'pip install -e ".[test]" && python -m pytest' in commands
     assert (ROOT / re.search(r"python (examples/\S+)", commands)[1]).exists()
-    titles = re.findall(r"^#+ (.*)$", README, flags=re.MULTILINE)
-    headings = {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
-    for linked in re.findall(r"\]\(([^)]+)\)", README):
-        if linked.startswith("#"):
-            assert linked[1:] in headings, f"the README links to the section {linked}"
-            continue
-        assert linked.startswith("https://") or (ROOT / linked).exists(), f"the README links to {linked}"
+    for page in PAGES:
+        text = page.read_text()
+        titles = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+        headings = {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
+        for linked in re.findall(r"\]\(([^)]+)\)", text):
+            if linked.startswith("#"):
+                assert linked[1:] in headings, f"{page} links to the section {linked}"
+                continue
+            assert linked.startswith("https://") or (page.parent / linked).exists(), f"{page} links to {linked}"
+        # Programs that a page names are there.
+        for name in re.findall(r"`python ((?:examples|benchmarks)/\w+\.py)", text):
+            assert (ROOT / name).exists(), f"{page} names {name}"
+        for name in re.findall(r"`python -m (benchmarks\.\w+)", text):
+            assert (ROOT / (name.replace(".", "/") + ".py")).exists(), f"{page} names {name}"
 
 
 def methods(kind: type) -> dict[str, object]:

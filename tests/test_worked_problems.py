@@ -130,13 +130,16 @@ def test_the_restricted_problem_of_three_bodies(tmp_path, monkeypatch):
 
 
 def test_every_worked_problem_has_its_picture():
-    gallery, readme = runpy.run_path(str(EXAMPLES / "gallery.py")), (EXAMPLES.parent / "README.md").read_text()
+    gallery, problems = (
+        runpy.run_path(str(EXAMPLES / "gallery.py")),
+        (EXAMPLES.parent / "docs" / "problems.md").read_text(),
+    )
     assert sorted(path.stem for path in (EXAMPLES / "gallery").glob("*.png")) == sorted(gallery["NAMES"])
     for name in gallery["NAMES"]:
         picture = (EXAMPLES / "gallery" / f"{name}.png").read_bytes()
         assert picture.startswith(b"\x89PNG") and 10_000 < len(picture) <= 120_000
         assert f'savefig("out/{name}.png")' in (EXAMPLES / f"{name}.py").read_text()
-        assert f"`python examples/{name}.py`" in readme and f"examples/gallery/{name}.png" in readme
+        assert f"`python examples/{name}.py`" in problems and f"examples/gallery/{name}.png" in problems
 
 
 @pytest.mark.slow
