@@ -357,7 +357,7 @@ def test_a_report_is_one_file_with_everything(tmp_path):
 def weak(fit, u):
     readers = [Reader.of(record) for record in fit.records]
     scale = min(time_scales(readers, fit.question.systems[0].motions, fit.parameters.numbers(fit.u)))
-    return _search.imbalance(fit.question.systems[0], readers, scale), _search.balanced(
+    return _search.weak_form_residuals(fit.question.systems[0], readers, scale), _search.fit_weak_form(
         [(fit.question.systems[0], readers, scale)], u
     )
 
@@ -425,5 +425,5 @@ def test_inputs_drive_the_density_the_weak_form_and_many_starts():
     np.testing.assert_allclose(jax.jit(jax.grad(density))(x), central, rtol=1e-5, atol=1e-4)
     readers = [Reader.of(one)]
     scale = min(time_scales(readers, fit.question.systems[0].motions, fit.parameters.numbers(fit.u)))
-    u = _search.balanced([(fit.question.systems[0], readers, scale)], fit.u + 2.0)
+    u = _search.fit_weak_form([(fit.question.systems[0], readers, scale)], fit.u + 2.0)
     np.testing.assert_allclose(fit.parameters.values(u), [0.3, 4.0], rtol=0.1)

@@ -11,7 +11,7 @@ import pytest
 
 import lagjax
 from lagjax._fit._sensors import on_circle
-from lagjax._fit._uncertainty import structure
+from lagjax._fit._uncertainty import correlated_power
 
 SIGMA = 3e-3
 TS = np.linspace(0.0, 8.0, 401)
@@ -124,8 +124,8 @@ def test_noise_as_large_as_the_signal_is_honest():
 def test_structure_is_what_white_noise_is_not():
     rng, counted = np.random.default_rng(0), np.ones((2, 2000), bool)
     white, slow = rng.normal(size=(2, 2000)), np.sin(np.arange(2000) / 20.0)
-    assert structure(white, counted) == 0.0
-    assert structure(white + slow, counted) == pytest.approx(0.5, rel=0.1)  # the mean square of a sine
+    assert correlated_power(white, counted) == 0.0
+    assert correlated_power(white + slow, counted) == pytest.approx(0.5, rel=0.1)  # the mean square of a sine
 
 
 def test_an_outlier_is_no_bound():

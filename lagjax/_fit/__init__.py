@@ -68,17 +68,25 @@ from lagjax._fit._search import (
     Unfollowed,
     Waterfall,
     by_gradient,
+    pad_states,
     reader_of,
-    roomy,
     search_records,
     searches,
+    start_by_weak_form,
     time_scales,
-    weakly,
 )
 from lagjax._fit._sensors import UNCLEAR, Delayed, Signals, require_no_jumps, sensors, wrapped
 from lagjax._fit._timings import Timings, clock_of
-from lagjax._fit._uncertainty import Information, information, sentences
-from lagjax._fit._verdict import SECONDS, Unexplained, Verdict, find_mistake, hanging, suspects, verdict
+from lagjax._fit._uncertainty import Information, information, unseen_sentences
+from lagjax._fit._verdict import (
+    SECONDS,
+    Unexplained,
+    Verdict,
+    constant_signals,
+    find_mistake,
+    possible_mistakes,
+    verdict,
+)
 from lagjax._hybrid import Hybrid, Scene, first_law, require_scene
 from lagjax._layout import Layout
 from lagjax._problem import DEFAULT_RTOL
@@ -197,7 +205,7 @@ def fit(
         raise TypeError(f"noise must be lagjax.Gaussian() or lagjax.StudentT(); got {noise!r}.")
     scenes = _scenes(system, records, params0, observe, hold)
     parameters = Parameters.of(params0, free, transforms)
-    how = _How(system, observe, noise, int(starts), method, int(seed), progress)
+    settings = _Settings(system, observe, noise, int(starts), method, int(seed), progress)
     if len(parameters) > _MANY and method != "gradient":
         warnings.warn(
             f"{len(parameters)} numbers are free, and with method={method!r} every trial follows that many derivatives "
@@ -207,44 +215,49 @@ def fit(
         )
     begun = time.process_time()
     try:
-        done, came_to = _answer(how, scenes, params0, parameters)
+        done, judged = _fit_checked(settings, scenes, params0, parameters)
     except Unfollowed as reason:
         nothing = Unexplained([str(reason)], [], np.inf, True, list(range(len(scenes[0].records))))
-        more = _mistakes(how, scenes, params0, parameters, nothing, time.process_time() - begun)
+        more = _mistakes(settings, scenes, params0, parameters, nothing, time.process_time() - begun)
         raise Unfollowed(" ".join([str(reason), *more])) from reason.__cause__
-    if not came_to.left.doubted:
+    if not judged.left.doubted:
         return done
-    more = _mistakes(how, scenes, params0, parameters, came_to.left, time.process_time() - begun)
+    more = _mistakes(settings, scenes, params0, parameters, judged.left, time.process_time() - begun)
     return replace(done, ok=done.ok and not more, message=" ".join([done.message, *more]))
 
 
 def _mistakes(
-    how: "_How", scenes: list["_Scene"], params0: PyTree, parameters: Parameters, left: Unexplained, spent: float
+    settings: "_Settings",
+    scenes: list["_GivenSystem"],
+    params0: PyTree,
+    parameters: Parameters,
+    left: Unexplained,
+    spent: float,
 ) -> list[str]:
     """The mistakes in records of which a fit leaves much, as far as fits of other records tell; `spent` is the
     processor time that it took, and the tries may take, or more where it explains nothing."""
-    if len(scenes) > 1 or how.method == "gradient":
+    if len(scenes) > 1 or settings.method == "gradient":
         return []
     [scene] = scenes
-    once, about = how._replace(starts=1, progress=False), _residuals_of(scene, parameters)
+    once, about = settings._replace(starts=1, progress=False), _residuals_of(scene, parameters)
     reading = [reader for reader in _readers(scenes, Residuals([about])) or [] if reader is not None]
     if not about.signals.names:
         return []
 
     def share(records: list[Any]) -> float | None:
         try:
-            _, came_to = _answer(once, [scene._replace(records=records)], params0, parameters)
+            _, judged = _fit_checked(once, [scene._replace(records=records)], params0, parameters)
         except ValueError:
             return None
-        return None if came_to.left.motion else came_to.left.share
+        return None if judged.left.motion else judged.left.share
 
     scales = time_scales(reading, about.motions, parameters.first) if reading else TimeScales(1.0, 1.0)
     slower = scales.data / scales.scene if np.isfinite(scales.data) else 1.0
-    possible = suspects(scene.records, about.signals.names, left.worst, slower)
+    possible = possible_mistakes(scene.records, about.signals.names, left.worst, slower)
     return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent)
 
 
-class _How(NamedTuple):
+class _Settings(NamedTuple):
     """The settings of a search."""
 
     system: Any
@@ -256,24 +269,28 @@ class _How(NamedTuple):
     progress: bool
 
 
-def _answer(how: _How, scenes: list["_Scene"], params0: PyTree, parameters: Parameters) -> tuple[Fit, Verdict]:
+def _fit_checked(
+    settings: _Settings, scenes: list["_GivenSystem"], params0: PyTree, parameters: Parameters
+) -> tuple[Fit, Verdict]:
     """The fit of records that were checked. Raises `Unfollowed` where the first trial cannot be followed."""
     question = Residuals([_residuals_of(scene, parameters) for scene in scenes])
-    _require_one_beginning(question, how.starts, how.method)
+    _require_one_beginning(question, settings.starts, settings.method)
     readers = _readers(scenes, question)
-    if how.progress:
+    if settings.progress:
         question.watch = _Printer(question.size)
     y0 = _starts(question, readers, params0)
-    readers = _to_cut(scenes, readers, how.method)
-    first, noise = parameters.moved(parameters.first), how.noise
-    if how.method == "gradient":
-        return _told(how, by_gradient(question, first, y0, noise, readers), None)
-    weak = functools.partial(weakly, question, readers=readers or [])
-    search = functools.partial(search_records, question, noise=noise, method=how.method, readers=readers, weak=weak)
-    return _told(how, *searches(question, search, first, y0, how.starts, how.seed))
+    readers = _to_cut(scenes, readers, settings.method)
+    first, noise = parameters.moved(parameters.first), settings.noise
+    if settings.method == "gradient":
+        return _result_of(settings, by_gradient(question, first, y0, noise, readers), None)
+    weak = functools.partial(start_by_weak_form, question, readers=readers or [])
+    search = functools.partial(
+        search_records, question, noise=noise, method=settings.method, readers=readers, weak=weak
+    )
+    return _result_of(settings, *searches(question, search, first, y0, settings.starts, settings.seed))
 
 
-class _Scene(NamedTuple):
+class _GivenSystem(NamedTuple):
     """One system of a fit: its name, None for the only one, its records and sensors, and the structure of its inputs
     and coordinates."""
 
@@ -285,7 +302,7 @@ class _Scene(NamedTuple):
     layout: Layout
 
 
-def _scenes(system, records, params0, observe, hold: str) -> list[_Scene]:
+def _scenes(system, records, params0, observe, hold: str) -> list[_GivenSystem]:
     """The systems with their records, checked."""
     scenes = []
     for name, one, own, shown in systems_by_name(system, records, observe):
@@ -293,7 +310,7 @@ def _scenes(system, records, params0, observe, hold: str) -> list[_Scene]:
             one = require_scene(one)
             own = require_alike(own)
             form = _form(one, own, hold)
-            scenes.append(_Scene(name, one, own, shown, form, _layout(one, own, params0, form)))
+            scenes.append(_GivenSystem(name, one, own, shown, form, _layout(one, own, params0, form)))
     return scenes
 
 
@@ -366,7 +383,7 @@ def _layout(system: Scene, records: list[Record], params0, form: Form | None) ->
     return replace(Layout.of(q, qdot), dtype=DOUBLE)
 
 
-def _residuals_of(scene: _Scene, parameters: Parameters) -> SystemResiduals:
+def _residuals_of(scene: _GivenSystem, parameters: Parameters) -> SystemResiduals:
     """The residuals of whole records of one system."""
     with errors_of_system(scene.name):
         return _about(*scene, parameters)
@@ -411,7 +428,7 @@ def _require_no_jumps(scene: Scene, records: list[Any], observe, signals: Signal
 
 def _require_motion(recordings: list[Record], names: tuple[str, ...], records: list[Any]) -> None:
     """Raise `ValueError` where starts are fitted, and no signal of any record ever changes."""
-    still = hanging(recordings, names)
+    still = constant_signals(recordings, names)
     if still and len(still) == len(names) * len(records) and all(record.start is None for record in records):
         raise ValueError(f"{still[0]} So it is with all signals of all records: nothing moves that could be fitted.")
 
@@ -441,7 +458,7 @@ def _sizes(recordings: list[Record]) -> np.ndarray:
     return np.sqrt(np.nanmean(np.concatenate([record.matrix for record in recordings]) ** 2, axis=0))
 
 
-def _readers(scenes: list[_Scene], question: Residuals) -> list[Reader | None] | None:
+def _readers(scenes: list[_GivenSystem], question: Residuals) -> list[Reader | None] | None:
     """Readers of states off the data, for each record whose signals are positions; None where there is no such record.
 
     All records of a system together try windows at a few hundred places.
@@ -456,7 +473,7 @@ def _readers(scenes: list[_Scene], question: Residuals) -> list[Reader | None] |
     return readers if any(reader is not None for reader in readers) else None
 
 
-def _to_cut(scenes: list[_Scene], readers: list[Reader | None] | None, method: str) -> list[Reader | None] | None:
+def _to_cut(scenes: list[_GivenSystem], readers: list[Reader | None] | None, method: str) -> list[Reader | None] | None:
     """The readers of records that may be cut into segments: not of hybrid motion, whose mode is known at first only.
 
     Raises `ValueError` where the method needs some, and there are none for that reason.
@@ -477,7 +494,7 @@ def _starts(question: Residuals, readers: list[Reader | None] | None, params0: P
         own = None if readers is None else readers[part.records]
         with errors_of_system(part.name):
             found += [_start(part.system, own, k, params0) for k in range(len(part.system.records))]
-    return np.stack([roomy(state, question.states) for state in found])
+    return np.stack([pad_states(state, question.states) for state in found])
 
 
 def _start(system: SystemResiduals, readers: list[Reader | None] | None, place: int, params0: PyTree) -> np.ndarray:
@@ -516,12 +533,12 @@ class _Printer:
 # ---- what came out ---------------------------------------------------------------------------------------------------
 
 
-def _told(how: _How, descent: Descent, waterfall: Waterfall | None) -> tuple[Fit, Verdict]:
+def _result_of(settings: _Settings, descent: Descent, waterfall: Waterfall | None) -> tuple[Fit, Verdict]:
     """The result in the user's structures and in words."""
     point, widths, question = descent.point, descent.widths, descent.question
     parameters, question.watch = question.parameters, None
     known = information(question, point, widths)
-    unseen = sentences(question, point, widths, known)
+    unseen = unseen_sentences(question, point, widths, known)
     found = verdict(descent, unseen, known, question)
     done = Fit(
         params=parameters.restore(parameters.numbers(point.u)),
@@ -539,12 +556,12 @@ def _told(how: _How, descent: Descent, waterfall: Waterfall | None) -> tuple[Fit
         parameters=parameters,
         u=point.u,
         states=point.starts,
-        law=how.noise,
+        law=settings.noise,
         information=known,
         widths=widths,
         question=question,
-        system=how.system,
-        observe=how.observe,
+        system=settings.system,
+        observe=settings.observe,
     )
     return done, found
 

@@ -59,7 +59,7 @@ from jax.scipy.special import gammaln
 from scipy.special import polygamma
 
 from lagjax._doubles import accepts_singles
-from lagjax._fit._noise import AbstractNoise, StudentT, Widths
+from lagjax._fit._noise import AbstractNoise, NoiseScale, StudentT
 from lagjax._fit._parameters import AbstractSeparable
 from lagjax._fit._residuals import Failure, Point, Residuals, compressed
 
@@ -84,7 +84,7 @@ class Density:
     """
 
     def __init__(
-        self, question: Residuals, noise: AbstractNoise, point: Point, widths: Widths, shares: np.ndarray,
+        self, question: Residuals, noise: AbstractNoise, point: Point, widths: NoiseScale, shares: np.ndarray,
         prior: Callable | None = None,
     ):  # fmt: skip
         self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths

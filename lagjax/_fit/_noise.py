@@ -21,7 +21,7 @@ _WIDEST, _NARROWEST = 200.0, 1.0  # ν: beyond 200 it is a Gaussian to a percent
 _ROUNDS = 30  # of the fixed point for σ, which gains a factor of three or more in each
 
 
-class Widths(NamedTuple):
+class NoiseScale(NamedTuple):
     """The noise of S signals: `sigma` (S,), and `dof` ν (S,), infinite for a Gaussian."""
 
     sigma: np.ndarray
@@ -32,7 +32,7 @@ class AbstractNoise(abc.ABC):
     """A law for the scatter of measurements."""
 
     @abc.abstractmethod
-    def widths(self, residuals: np.ndarray, weights: np.ndarray, least: np.ndarray) -> Widths:
+    def widths(self, residuals: np.ndarray, weights: np.ndarray, least: np.ndarray) -> NoiseScale:
         """The noise of S signals that makes these residuals (M, S) likeliest; no σ is smaller than `least` (S,)."""
 
 
@@ -51,7 +51,7 @@ class Gaussian(AbstractNoise):
         """σ² = mean of w e² over the samples that count."""
         count = np.maximum((weights > 0).sum(axis=0), 1)
         sigma = np.sqrt((weights * residuals**2).sum(axis=0) / count)
-        return Widths(np.maximum(sigma, least), np.full(len(least), np.inf))
+        return NoiseScale(np.maximum(sigma, least), np.full(len(least), np.inf))
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class StudentT(AbstractNoise):
             for s in range(residuals.shape[1])
             for keep in [weights[:, s] > 0]
         ]
-        return Widths(np.array([sigma for sigma, _ in found]), np.array([dof for _, dof in found]))
+        return NoiseScale(np.array([sigma for sigma, _ in found]), np.array([dof for _, dof in found]))
 
     def _of_one(self, scaled: np.ndarray, least: float) -> tuple[float, float]:
         if self.dof is not None:
@@ -108,7 +108,7 @@ class StudentT(AbstractNoise):
 class Known(AbstractNoise):
     """Noise that is known already, for one more record."""
 
-    known: Widths
+    known: NoiseScale
 
     def widths(self, residuals, weights, least):
         """The noise that is known."""
@@ -133,7 +133,7 @@ def _cost(scaled: np.ndarray, sigma: float, dof: float) -> float:
     return np.log(sigma) - constant + 0.5 * (dof + 1) * float(np.mean(np.log1p((scaled / sigma) ** 2 / dof)))
 
 
-def counts(widths: Widths, residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def counts(widths: NoiseScale, residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The weight of each sample in the next sum of squares of e/σ, in the shape of the residuals."""
     z = weights * (residuals / widths.sigma) ** 2
     with np.errstate(invalid="ignore"):  # ∞/∞ where the noise is Gaussian
@@ -141,7 +141,7 @@ def counts(widths: Widths, residuals: np.ndarray, weights: np.ndarray) -> np.nda
     return weights * robust
 
 
-def log_likelihood(widths: Widths, residuals: np.ndarray, weights: np.ndarray) -> float:
+def log_likelihood(widths: NoiseScale, residuals: np.ndarray, weights: np.ndarray) -> float:
     """The logarithm of the likelihood of residuals (M, S) whose samples are independent."""
     total = 0.0
     for s, (sigma, dof) in enumerate(zip(*widths, strict=True)):

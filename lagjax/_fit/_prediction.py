@@ -14,13 +14,13 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from lagjax._fit._descent import minimise
-from lagjax._fit._noise import Known, Widths
+from lagjax._fit._noise import Known, NoiseScale
 from lagjax._fit._profile import effective_share
 from lagjax._fit._records import Guess, Record, in_structure, known_start, require_alike, require_held
 from lagjax._fit._residuals import Failure, Point, Residuals, SystemPart, SystemResiduals
 from lagjax._fit._search import reader_of
 from lagjax._fit._sensors import UNCLEAR, on_circle
-from lagjax._fit._uncertainty import deviations, start_alone
+from lagjax._fit._uncertainty import covariance_of_one_start, signal_deviations
 from lagjax._hybrid import follow
 from lagjax._trajectory import Trajectory
 
@@ -41,7 +41,7 @@ class Prediction(NamedTuple):
     residuals: PyTree
     start: tuple[PyTree, PyTree]
     deviation: PyTree
-    widths: Widths
+    widths: NoiseScale
 
     def bands(self, level: float = 0.95) -> tuple[PyTree, PyTree]:
         """(low, high) between which a new sample of weight one falls with probability `level`, noise included.
@@ -59,7 +59,7 @@ def require_level(level) -> None:
         raise ValueError(f"level must be between 0 and 1, as 0.95 is; got {level!r}.")
 
 
-def _half_widths(deviation: np.ndarray, widths: Widths, level: float, columns) -> np.ndarray:
+def _half_widths(deviation: np.ndarray, widths: NoiseScale, level: float, columns) -> np.ndarray:
     """Half of the band of one leaf of signals, whose places among all signals are the next of `columns`."""
     flat = deviation.reshape(len(deviation), -1)
     own = [next(columns) for _ in range(flat.shape[1])]
@@ -111,14 +111,14 @@ def predicted(fit, record: Record, system: str | None) -> Prediction:
 
 
 def _shown(fit, part: SystemPart, record: Record, question: Residuals, point: Point):
-    """The signals (T, S) of a record that was followed, at all its times, and their standard deviations."""
+    """The signals (T, S) of a record that was followed, at all its times, and their standard signal_deviations."""
     planned, slopes = _followed(fit, part.system, record, point.starts[0])
     known, states = fit.information, question.states
     own, follows = np.zeros((states, states)), np.zeros((states, len(fit.u)))
     if question.fitted[0]:
         rows = np.sqrt(record.weight_matrix)[..., None] / part.of_sensors(fit.widths).sigma[:, None] * slopes
-        own, follows = start_alone(rows, states, known, effective_share(fit))
-    return planned.matrix, deviations(slopes, states, own, follows, known)
+        own, follows = covariance_of_one_start(rows, states, known, effective_share(fit))
+    return planned.matrix, signal_deviations(slopes, states, own, follows, known)
 
 
 def _followed(fit, of: SystemResiduals, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
@@ -156,5 +156,5 @@ def planned_rows(fit, part: SystemPart, name: str, record: Record) -> np.ndarray
     rows, states = np.sqrt(weights) * slopes, part.system.states
     own = rows[..., states:]
     if isinstance(record.start, Guess):
-        own = own - rows[..., :states] @ start_alone(rows, states, fit.information, 1.0)[1]
+        own = own - rows[..., :states] @ covariance_of_one_start(rows, states, fit.information, 1.0)[1]
     return own.reshape(-1, own.shape[-1])

@@ -33,7 +33,7 @@ from scipy.optimize import brentq
 from scipy.special import stdtrit
 
 from lagjax._fit._descent import minimise
-from lagjax._fit._noise import Known, Widths, log_likelihood
+from lagjax._fit._noise import Known, NoiseScale, log_likelihood
 from lagjax._fit._residuals import Failure, Residuals
 from lagjax._fit._uncertainty import Information
 
@@ -118,7 +118,7 @@ def _table(names, free, logs, aic, bic, left) -> list[str]:
     return rows
 
 
-def left_out(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths: Widths, folds: int):
+def left_out(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths: NoiseScale, folds: int):
     """The root mean square residuals by signal of records that were left out, and for each group their mean logarithm.
 
     Infinite where one cannot be followed. A signal that only the records left out have is as noisy as `widths` (S,) of
@@ -147,10 +147,10 @@ def left_out(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths
     return rms, scores
 
 
-def _of_signals(names: tuple[str, ...], *known: tuple[tuple[str, ...], Widths]) -> Widths:
+def _of_signals(names: tuple[str, ...], *known: tuple[tuple[str, ...], NoiseScale]) -> NoiseScale:
     """The noise of signals by their names, from the last of several that knows it."""
     found = {name: one for own, widths in known for name, one in zip(own, zip(*widths, strict=True), strict=True)}
-    return Widths(*(np.array(numbers) for numbers in zip(*(found[name] for name in names), strict=True)))
+    return NoiseScale(*(np.array(numbers) for numbers in zip(*(found[name] for name in names), strict=True)))
 
 
 def _part(question: Residuals, keep: np.ndarray) -> Residuals:
@@ -217,7 +217,7 @@ class _Place(NamedTuple):
 class _Line:
     """The values of one unknown, of which every one asked for begins from its neighbours."""
 
-    def __init__(self, question: Residuals, u, starts, widths: Widths, known: Information, which: int):
+    def __init__(self, question: Residuals, u, starts, widths: NoiseScale, known: Information, which: int):
         self.question, self.widths, self.which = question, widths, which
         reported, white = known.covariance[which, which], known.white[which, which]
         self.scale = white / reported if np.isfinite(reported) and reported > 0 else 1.0 / known.lost
@@ -266,7 +266,7 @@ class _Line:
         return float(done.point.u[self.which]), 2.0 * self.scale * lost
 
 
-def profile(question: Residuals, u, starts, widths: Widths, known: Information, name: str, level: float) -> Profile:
+def profile(question: Residuals, u, starts, widths: NoiseScale, known: Information, name: str, level: float) -> Profile:
     """The profile of the free number called `name`."""
     parameters = question.parameters
     line = _Line(question, u, starts, widths, known, parameters.unknown(name))

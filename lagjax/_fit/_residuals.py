@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._fit._motions import AbstractMotions, Manifold, Motion, Origins, Placed
-from lagjax._fit._noise import AbstractNoise, Widths, counts
+from lagjax._fit._noise import AbstractNoise, NoiseScale, counts
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Piece, Samples, asks, at_instants, batches, inputs_at, started, whole
 from lagjax._fit._sensors import Signals, on_circle
@@ -402,10 +402,10 @@ class SystemPart(NamedTuple):
         """The name of the system, None where there is no other."""
         return self.system.name
 
-    def of_sensors(self, widths: Widths) -> Widths:
+    def of_sensors(self, widths: NoiseScale) -> NoiseScale:
         """The noise of the signals of records among that of all signals, without that of crossing times."""
         own = slice(self.signals.start, self.signals.start + len(self.system.signals.names))
-        return Widths(widths.sigma[own], widths.dof[own])
+        return NoiseScale(widths.sigma[own], widths.dof[own])
 
 
 class Residuals:
@@ -529,11 +529,11 @@ class Residuals:
                 slopes.append(by_unknowns)
         return Point(u, placed, residuals, slopes, across if across.any() else None)
 
-    def widths(self, point: Point, noise: AbstractNoise) -> Widths:
+    def widths(self, point: Point, noise: AbstractNoise) -> NoiseScale:
         """The noise of the signals that makes the residuals of a trial likeliest."""
         return noise.widths(point.flat(), self.weights, self.least)
 
-    def factors(self, point: Point, widths: Widths) -> list[np.ndarray]:
+    def factors(self, point: Point, widths: NoiseScale) -> list[np.ndarray]:
         """√count/σ of every sample, by which its residual enters the sum of squares."""
         return [
             np.sqrt(counts(widths, r, batch.weights)) / widths.sigma

@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 
 from lagjax._doubles import with_doubles
 from lagjax._fit._density import Density
-from lagjax._fit._noise import AbstractNoise, Widths
+from lagjax._fit._noise import AbstractNoise, NoiseScale
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._prediction import Prediction, planned_rows, predicted, require_level
 from lagjax._fit._profile import Comparison, Profile, comparison, profile
@@ -30,7 +30,7 @@ from lagjax._fit._report import (
 from lagjax._fit._residuals import Point, Residuals, SystemPart
 from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._search import Waterfall
-from lagjax._fit._uncertainty import Experiments, Information, of_starts, ranked
+from lagjax._fit._uncertainty import Experiments, Information, rank_experiments, start_covariances
 from lagjax._notebook import cell
 from lagjax._tables import intervals
 
@@ -100,7 +100,7 @@ class Fit:
     states: np.ndarray = field(repr=False)
     law: AbstractNoise = field(repr=False)
     information: Information = field(repr=False)
-    widths: Widths = field(repr=False)
+    widths: NoiseScale = field(repr=False)
     question: Residuals = field(repr=False)
     system: Any = field(repr=False)
     observe: Any = field(repr=False)
@@ -167,7 +167,9 @@ class Fit:
         """
         wide = self._quantile(level) * np.sqrt(
             np.diagonal(
-                of_starts(self.question, self._point, self.widths, self.information).covariance, axis1=1, axis2=2
+                start_covariances(self.question, self._point, self.widths, self.information).covariance,
+                axis1=1,
+                axis2=2,
             )
         )
         ends = (enumerate((self.states + s * wide)[self.question.firsts]) for s in (-1, 1))
@@ -280,7 +282,7 @@ class Fit:
             raise ValueError("candidates is empty: give at least one lagjax.Record.")
         part = self.question.part_called(system)
         rows = [planned_rows(self, part, name, record) for name, record in named.items()]
-        return ranked(list(named), rows, self.parameters.labels, self.information)
+        return rank_experiments(list(named), rows, self.parameters.labels, self.information)
 
     @with_doubles
     def report(self, path: str | os.PathLike, experiments: Sequence[Record] | dict[str, Record] = ()) -> None:

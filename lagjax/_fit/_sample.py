@@ -19,7 +19,13 @@ is little.
 
 Which library: blackjax, whose kernels are plain functions of a log density, so that chains, the loop and what is kept
 are a few lines here; arviz for what draws are worth. numpyro does the same behind a language for models, of which
-nothing is needed.
+nothing is needed. The warming (`_tuned`) is not `blackjax.window_adaptation`: its chains share one step and one metric,
+where a window adaptation has one of each for every chain and does not say how many draws are worth an independent one.
+Measured along the expansions of two posteriors of 7 and 11 unknowns, four chains, two seeds, with compilation: the
+rounds here take 12 to 16 s of a core, and then 4.5 to 5.5 steps of trajectories make an independent draw; windows of
+500 steps a chain take 7 to 8 s, and 4.9 to 5.9; of 150 steps, 7 to 9 s, and 14 to 32. So along the expansion windows
+would warm in half the time; along the exact density, where a step is a batch of motions and 350 of a chain are what is
+spent, they were not measured.
 
 Source: Hoffman & Gelman, *The No-U-Turn sampler*, JMLR 15 (2014) 1593; Christen & Fox, *MCMC using an approximation*,
 J. Comput. Graph. Stat. 14 (2005) 795; Vehtari et al., Bayesian Analysis 16 (2021) 667, for dispersed chains, r-hat and
@@ -317,7 +323,7 @@ def inference_data(density: Density, drawn: Draws) -> Any:
     arviz = _arviz()
     question, parameters = density.question, density.question.parameters
     chains, draws, size = drawn.x.shape
-    at = jax.jit(jax.vmap(lambda x: _told(density, x)))(jnp.asarray(drawn.x.reshape(-1, size)))
+    at = jax.jit(jax.vmap(lambda x: _named_unknowns(density, x)))(jnp.asarray(drawn.x.reshape(-1, size)))
     values, starts, sigma, dof = (np.asarray(x).reshape(chains, draws, *x.shape[1:]) for x in at)
     posterior, dims, coords = {}, {}, {}
     for part in parameters.parts:
@@ -347,7 +353,7 @@ def inference_data(density: Density, drawn: Draws) -> Any:
     return arviz.from_dict(posterior=posterior, sample_stats=stats, dims=dims, coords=coords, attrs=attributes)
 
 
-def _told(density: Density, x):
+def _named_unknowns(density: Density, x):
     at = density.unknowns(x)
     numbers = density.question.parameters.numbers(at.u, jnp)
     return numbers, at.starts, at.sigma, jnp.broadcast_to(at.dof, at.sigma.shape)

@@ -1,6 +1,6 @@
 """Search: where a fit begins, multiple shooting over segments that grow, the weak form, and multistart.
 
-It holds `Reader`, `balanced`, `Waterfall`, `searches` and `search_records`.
+It holds `Reader`, `fit_weak_form`, `Waterfall`, `searches` and `search_records`.
 
 **Multiple shooting.** Over a long record the sum of squares has many minima: a wrong frequency is out of phase, a
 chaotic motion forgets its start. Over a segment shorter than the motion's own time scale there is one. So the records
@@ -38,8 +38,8 @@ trusted; a slope without a step is not.
 Source: Raue et al., PLoS ONE 8 (2013) e74335, for many starts and waterfalls.
 
 **The search of whole records.** `search_records` goes from segments to whole records; `searches` does that from many
-starts, `by_gradient` with gradients in reverse mode. `weakly` is the first value of the parameters by the weak form,
-where the user's is too far off.
+starts, `by_gradient` with gradients in reverse mode. `start_by_weak_form` is the first value of the parameters by the
+weak form, where the user's is too far off.
 """
 
 import functools
@@ -55,9 +55,9 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from lagjax._consistent import has_constraints
-from lagjax._fit._descent import Anchor, Descent, column_norms, descend, eliminate, ended, minimise
+from lagjax._fit._descent import Anchor, Descent, as_descent, column_norms, descend_gradient, eliminate, minimise
 from lagjax._fit._motions import AbstractMotions
-from lagjax._fit._noise import Gaussian, Widths, log_likelihood
+from lagjax._fit._noise import Gaussian, NoiseScale, log_likelihood
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Piece, Record, asks, at_instants, in_structure, inputs_between
 from lagjax._fit._residuals import Failure, Residuals, SystemResiduals
@@ -72,7 +72,7 @@ _WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them
 _PROBES = 32  # places of a record where its time scale is looked at
 _WORSE_WINDOW = 1.3  # what a window may leave, in units of what the shortest leaves
 _PER_SCALE = 24  # samples per time scale that early levels look at: more cost time and find the same
-_GLIMPSES = 256  # places of all records where curvature is looked at
+_WINDOWS_IN_ALL = 256  # places of all records where curvature is looked at
 _FEWEST_IN_SEGMENT = 8  # samples
 _QUARTER = (
     0.25  # of a period, by which the motion over a segment may be wrong: beyond a half residuals have false minima
@@ -168,7 +168,7 @@ def _local_cubics(ts, t, y, window: int):
     return cubics[:, 0], cubics[:, 1], float(np.sqrt(np.mean(left**2) * window / dof)), cubics
 
 
-def glimpses(readers: list[Reader], length: float) -> tuple[list[Record], np.ndarray]:
+def short_windows(readers: list[Reader], length: float) -> tuple[list[Record], np.ndarray]:
     """Short records, each `length` long, of the local cubics at some places of all records, and the states there.
 
     Motions that are shorter than the time between samples see the curvature of the cubics: what a scene says about
@@ -176,7 +176,7 @@ def glimpses(readers: list[Reader], length: float) -> tuple[list[Record], np.nda
     """
     found, states = [], []
     for reader in readers:
-        places = some_of(reader.record, max(4, _GLIMPSES // len(readers)))
+        places = some_of(reader.record, max(4, _WINDOWS_IN_ALL // len(readers)))
         offsets = np.linspace(0.0, length, 4)
         cubics = [
             _read_states(reader.record.ts[places], *s, w)[3]
@@ -291,7 +291,7 @@ class _Windows:
         self.rate = -2 * _POWER / half * spans * s * (1 - s**2) ** (_POWER - 1)
 
 
-def balanced(
+def fit_weak_form(
     systems: Sequence[tuple[SystemResiduals, Sequence[Reader | None], float]], u: np.ndarray
 ) -> np.ndarray | None:
     """The u (F,) that balances the weak forms of systems best, in a search from `u`; None where nothing is to balance.
@@ -306,7 +306,7 @@ def balanced(
     ]
     if not telling:
         return None
-    each, dtype = [imbalance(*one) for one in telling], telling[0][0].layout.dtype
+    each, dtype = [weak_form_residuals(*one) for one in telling], telling[0][0].layout.dtype
 
     def residuals(u):
         return jnp.concatenate([one(u) for one in each])
@@ -324,7 +324,7 @@ def balanced(
     return done.x if np.isfinite(done.x).all() else None
 
 
-def imbalance(system: SystemResiduals, readers: Sequence[Reader | None], scale: float):
+def weak_form_residuals(system: SystemResiduals, readers: Sequence[Reader | None], scale: float):
     """∫ (φ̇ p + φ F) dt of all windows and coordinates, over the size of ∫ φ̇ p: a function of u (F,) for JAX."""
     layout, parameters, form, scene = system.layout, system.parameters, system.signals.form, system.scene
     assert isinstance(scene, System)
@@ -400,7 +400,7 @@ class Trials(NamedTuple):
     misfits: np.ndarray
 
 
-def drawn(parameters: Parameters, u: np.ndarray, count: int, seed: int) -> np.ndarray:
+def random_starts(parameters: Parameters, u: np.ndarray, count: int, seed: int) -> np.ndarray:
     """u itself and `count` − 1 random ones, (K, F)."""
     rng = np.random.default_rng(seed)
     return np.stack([u, *(parameters.drawn(u, rng) for _ in range(count - 1))])
@@ -409,14 +409,14 @@ def drawn(parameters: Parameters, u: np.ndarray, count: int, seed: int) -> np.nd
 def short_search(question: Residuals, u: np.ndarray, starts: np.ndarray) -> Trials:
     """The results of the starts u (K, F) after a few steps, from the records' starts (N, 2n); in order."""
     part = _sampled(question)
-    at = _tried(part, u, np.repeat(starts[None], len(u), axis=0))
+    at = _evaluate_starts(part, u, np.repeat(starts[None], len(u), axis=0))
     damping = np.full(len(u), _FIRST_DAMPING)
     for _ in range(_SHORT_STEPS):
         going = np.flatnonzero(np.isfinite(at.misfits))
         if not len(going):
             break
         moved = [_step(part, at, int(k), damping[k]) for k in going]
-        trial = _tried(part, *(np.stack(parts) for parts in zip(*moved, strict=True)))
+        trial = _evaluate_starts(part, *(np.stack(parts) for parts in zip(*moved, strict=True)))
         better = trial.misfits < at.misfits[going]
         damping[going] = np.where(better, 0.2 * damping[going], 10.0 * damping[going])
         for mine, new in zip(at, trial, strict=True):
@@ -425,12 +425,12 @@ def short_search(question: Residuals, u: np.ndarray, starts: np.ndarray) -> Tria
     return Trials(at.u[order], at.starts[order], at.misfits[order])
 
 
-def misfit(widths: Widths, question: Residuals) -> float:
+def misfit(widths: NoiseScale, question: Residuals) -> float:
     """The noise that is left, over the size of the signals."""
     return float(np.exp(np.mean(np.log(widths.sigma / question.size))))
 
 
-def distinct(trials: Trials, count: int) -> list[int]:
+def distinct_minima(trials: Trials, count: int) -> list[int]:
     """The places of the best starts that came to different misfits, at most `count`."""
     chosen: list[int] = []
     for k in np.flatnonzero(np.isfinite(trials.misfits)).tolist():
@@ -439,7 +439,7 @@ def distinct(trials: Trials, count: int) -> list[int]:
     return chosen[:count]
 
 
-class _Tried(NamedTuple):
+class _EvaluatedStarts(NamedTuple):
     """Like `Trials`, with the weighted triangles (K, N, D + 1, D + 1) of all pieces."""
 
     u: np.ndarray
@@ -455,10 +455,10 @@ def _sampled(question: Residuals) -> Residuals:
     return question.of(pieces, question.fitted)
 
 
-def _tried(question: Residuals, u: np.ndarray, starts: np.ndarray) -> _Tried:
+def _evaluate_starts(question: Residuals, u: np.ndarray, starts: np.ndarray) -> _EvaluatedStarts:
     """The misfits and triangles of trials u (K, F) and starts (K, N, 2n), a portion of them at once."""
     columns = question.states + u.shape[1] + 1
-    found = _Tried(
+    found = _EvaluatedStarts(
         u.copy(), starts.copy(), np.full(len(u), np.inf), np.zeros((*starts.shape[:2], columns, columns))
     )  # fmt: skip
     largest = max(batch.ts.size for batch in question.batches) * question.states * columns
@@ -473,7 +473,7 @@ def _tried(question: Residuals, u: np.ndarray, starts: np.ndarray) -> _Tried:
     return found
 
 
-def _step(question: Residuals, at: _Tried, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def _step(question: Residuals, at: _EvaluatedStarts, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """The end of the damped step of one start."""
     triangles, states, none = at.triangles[k], question.states, np.zeros(at.u.shape[1])
     limits = question.parameters.limits(at.u[k])
@@ -484,7 +484,7 @@ def _step(question: Residuals, at: _Tried, k: int, damping: float) -> tuple[np.n
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
 # independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.
 _ENOUGH, _ENOUGH_OF_LEVEL = 1e-3, 1e-2
-_ENOUGH_OF_GLIMPSES = 0.1
+_ENOUGH_OF_WINDOWS = 0.1
 _POOR, _COARSE = 2.0, 0.02  # times scatter or size of signals: beyond, the shortest segments were not fitted
 _LOOSE = 3.0  # standard deviations of u about its first value on these levels, where u is a logarithm or the like
 _TRIALS, _TRIALS_OF_LEVEL = 60, 20
@@ -505,9 +505,9 @@ def searches(question: Residuals, search, u, y0, starts: int, seed: int) -> tupl
     """The best of the searches from u and from `starts` − 1 random values, and what all of them came to."""
     if starts == 1:
         return search(u, y0), None
-    trials = short_search(question, drawn(question.parameters, u, starts, seed), y0)
+    trials = short_search(question, random_starts(question.parameters, u, starts, seed), y0)
     misfits, done = trials.misfits.copy(), []
-    chosen = distinct(trials, _BEST)
+    chosen = distinct_minima(trials, _BEST)
     for place, at in [*((k, (trials.u[k], trials.starts[k])) for k in chosen), (None, (u, y0))]:
         try:
             done.append(search(*at))
@@ -547,22 +547,22 @@ def search_records(question: Residuals, u, starts, noise, method: str, readers, 
     if method == "segments" and readers is None:
         raise ValueError('method="segments" reads starts off the data: for that values must have the structure of q.')
     if method == "whole" or readers is None:
-        return _followed(question, minimise(question, u, starts, noise, _ENOUGH, _TRIALS))
-    u, starts, levels_done = _grown(question, u, starts, noise, readers, weak)
-    good = _last_good(levels_done)
+        return _require_followed(question, minimise(question, u, starts, noise, _ENOUGH, _TRIALS))
+    u, starts, levels_done = _fit_growing_segments(question, u, starts, noise, readers, weak)
+    good = _last_followed_level(levels_done)
     if len(levels_done) - good > _LOST:
         return _in_pieces(question, levels_done[good], levels_done[-1].widths, noise)
     done = minimise(question, u, starts, noise, _ENOUGH, _TRIALS)
     if levels_done and (
         isinstance(done, Failure) or not done.converged or unexplained(question, done.point, done.widths).motion
     ):
-        good = _last_good([*levels_done, *([] if isinstance(done, Failure) else [done])])
+        good = _last_followed_level([*levels_done, *([] if isinstance(done, Failure) else [done])])
         if good < len(levels_done) and misfit(levels_done[good].widths, question) < _COARSE:
             return _in_pieces(question, levels_done[good], None if isinstance(done, Failure) else done.widths, noise)
-    return _followed(question, done)
+    return _require_followed(question, done)
 
 
-def _last_good(levels_done: list[Descent]) -> int:
+def _last_followed_level(levels_done: list[Descent]) -> int:
     """The place of the last level from which on joining did not lose the motion.
 
     A scene that lacks something leaves up to three times more at each join, and motion that is lost some ten times.
@@ -575,7 +575,7 @@ def _last_good(levels_done: list[Descent]) -> int:
     return good
 
 
-def _parting(done: Descent) -> float:
+def _separation(done: Descent) -> float:
     """The logarithm of how far motions part that begin side by side, over the longest record: λ times its length.
 
     λ is the median over the pieces, from the mean square of the derivatives by the start over the first and the last
@@ -593,18 +593,18 @@ def _parting(done: Descent) -> float:
     return float(np.median(rates) * longest) if rates else 0.0
 
 
-def _in_pieces(question: Residuals, level: Descent, joined: Widths | None, noise) -> Descent:
+def _in_pieces(question: Residuals, level: Descent, joined: NoiseScale | None, noise) -> Descent:
     """The search on the pieces of a level, with all samples of these and a start for each."""
     pieces = complete(level.question.pieces, question.records)
     part = question.of(pieces, level.question.fitted)
     done = minimise(part, level.point.u, level.point.starts, noise, _ENOUGH, _TRIALS)
     if isinstance(done, Failure):
-        return _followed(part, done)
+        return _require_followed(part, done)
     worse = (
         "fails" if joined is None else f"leaves {misfit(joined, question) / misfit(done.widths, part):.2g} times more"
     )
     text = f"The records are followed in {len(pieces)} pieces, each with a start of its own: to join them {worse}"
-    growth = _parting(done)
+    growth = _separation(done)
     if growth > _LYAPUNOV:
         text += f", because motions that begin side by side part e^{growth:.0f}-fold over a record."
         return done._replace(message=f"{done.message} {text}")
@@ -618,23 +618,23 @@ def by_gradient(question: Residuals, u, y0, noise, readers: list[Reader | None] 
     tell = None if told is None else lambda text: print(text, file=sys.stderr, flush=True)
     steps = _GRADIENT_STEPS
     if readers is not None:
-        u = weakly(question, u, readers)
+        u = start_by_weak_form(question, u, readers)
         u = _over_segments(question, u, noise, readers, tell)
         steps = _GRADIENT_STEPS // 3
-    done = descend(question, u, y0, noise, steps, tell)
+    done = descend_gradient(question, u, y0, noise, steps, tell)
     if not isinstance(done, Failure):
-        done = ended(question, done[0], done[1], noise, _GRADIENT_STEPS, done[2])
-    return _followed(question, done)
+        done = as_descent(question, done[0], done[1], noise, _GRADIENT_STEPS, done[2])
+    return _require_followed(question, done)
 
 
-def _followed(question: Residuals, done: Descent | Failure) -> Descent:
+def _require_followed(question: Residuals, done: Descent | Failure) -> Descent:
     """The result of a search. Raises `Unfollowed` where its motions could not be followed."""
     if isinstance(done, Failure):
         raise Unfollowed(question.where(done) + " Begin nearer: other params0, or starts that are known.")
     return done
 
 
-def _grown(
+def _fit_growing_segments(
     question: Residuals, u, starts, noise, readers: list[Reader | None], weak: Callable
 ) -> tuple[np.ndarray, np.ndarray, list[Descent]]:
     """Better first values of u and of the starts, from segments that grow together to whole records; and the levels.
@@ -642,11 +642,13 @@ def _grown(
     Where joining loses the motion twice in a row, no longer segment is tried.
     """
     anchor = Anchor(u, np.where(np.isfinite(question.parameters.reach), 1.0 / _LOOSE, 0.0))
-    search = functools.partial(_level, question, noise=noise, readers=readers, anchor=anchor)
-    begun = _begun(question, u, starts, readers, search)
-    for other in (lambda: weak(u), lambda: _glimpsed(question, u, noise, readers, anchor)):
+    search = functools.partial(_fit_level, question, noise=noise, readers=readers, anchor=anchor)
+    begun = _fit_shortest_segments(question, u, starts, readers, search)
+    for other in (lambda: weak(u), lambda: _fit_short_windows(question, u, noise, readers, anchor)):
         if begun.misfit > 0.0:  # the shortest segments were not fitted from here
-            begun = min(begun, _begun(question, other(), starts, readers, search), key=lambda one: one.misfit)
+            begun = min(
+                begun, _fit_shortest_segments(question, other(), starts, readers, search), key=lambda one: one.misfit
+            )
     u, best, levels_done = begun.u, begun.best, [] if begun.first is None else [begun.first]
     for pieces in begun.cuts[1:]:
         done = search(pieces, u, best)
@@ -654,12 +656,12 @@ def _grown(
             break  # whole records then begin from the best so far, and say so if they fail as well
         u = done.point.u
         levels_done.append(done)
-        if len(levels_done) - _last_good(levels_done) > _LOST:
+        if len(levels_done) - _last_followed_level(levels_done) > _LOST:
             break
     return u, np.stack([best[k, 0] for k in range(len(question.records))]), levels_done
 
 
-class _Begun(NamedTuple):
+class _ShortestSegments(NamedTuple):
     """The beginning of growing segments: u, the cuts, the states at the first samples, their error, and the search
     on the shortest segments where it came to an end."""
 
@@ -670,7 +672,7 @@ class _Begun(NamedTuple):
     first: Descent | None = None
 
 
-def _begun(question: Residuals, u, starts, readers: list[Reader | None], search) -> _Begun:
+def _fit_shortest_segments(question: Residuals, u, starts, readers: list[Reader | None], search) -> _ShortestSegments:
     """The search on the shortest segments, from u, whose misfit is positive where they were not fitted.
 
     It is the mean logarithm of the noise σ of the signals, over `_POOR` times the scatter of the data or a share
@@ -680,26 +682,26 @@ def _begun(question: Residuals, u, starts, readers: list[Reader | None], search)
     cuts = levels(recordings, _time_scales(question, readers, u))
     best = {(k, 0): start for k, start in enumerate(starts)}
     if not cuts:
-        return _Begun(u, cuts, best, -np.inf)
+        return _ShortestSegments(u, cuts, best, -np.inf)
     done = search(cuts[0], u, best)
     if isinstance(done, Failure):
-        return _Begun(u, cuts, best, np.inf)
+        return _ShortestSegments(u, cuts, best, np.inf)
     near = []
     for part in question.parts:
         if reading := [reader for reader in readers[part.records] if reader is not None]:
             scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in reading], axis=0))
             near.append(np.maximum(_POOR * scatter, _COARSE * part.system.size[: len(scatter)]))
     ratio = done.widths.sigma / np.concatenate(near)
-    return _Begun(done.point.u, cuts, best, float(np.mean(np.log(ratio))), done)
+    return _ShortestSegments(done.point.u, cuts, best, float(np.mean(np.log(ratio))), done)
 
 
-def _level(question: Residuals, pieces: list[Piece], u, best, noise, readers, anchor) -> Descent | Failure:
+def _fit_level(question: Residuals, pieces: list[Piece], u, best, noise, readers, anchor) -> Descent | Failure:
     """The search on one cut of the records. The states in `best`, by record and sample, begin it and take its end."""
     firsts = [(piece.record, int(piece.places[0])) for piece in pieces]
     for k, reader in enumerate(readers):
         new = [place for record, place in firsts if record == k and (k, place) not in best]
         if new and reader is not None:
-            read = roomy(reader.states(np.array(new)), question.states)
+            read = pad_states(reader.states(np.array(new)), question.states)
             best |= {(k, place): y for place, y in zip(new, read, strict=True)}
     part = question.of(pieces, np.array([question.fitted[k] or place > 0 for k, place in firsts]))
     y0 = np.stack([best[first] for first in firsts])
@@ -709,7 +711,7 @@ def _level(question: Residuals, pieces: list[Piece], u, best, noise, readers, an
     return done
 
 
-def _glimpsed(question: Residuals, u, noise, readers: list[Reader | None], anchor: Anchor) -> np.ndarray:
+def _fit_short_windows(question: Residuals, u, noise, readers: list[Reader | None], anchor: Anchor) -> np.ndarray:
     """The u that suits the accelerations of local cubics: these have one minimum where segments are too long for u."""
     scales, short, states = _time_scales(question, readers, u), [], []
     for part in question.parts:
@@ -717,22 +719,22 @@ def _glimpsed(question: Residuals, u, noise, readers: list[Reader | None], ancho
         scale = scales[part.records.start]
         if not (reading and np.isfinite(scale)):
             continue
-        records, begun = glimpses(reading, 0.25 * scale)
-        states.append(roomy(begun, question.states))
+        records, begun = short_windows(reading, 0.25 * scale)
+        states.append(pad_states(begun, question.states))
         short.append(part.system.of_records(records, np.ones(len(records), bool)))
     if not short:
         return u
     part = Residuals(short)
     y0 = np.concatenate(states)[:, : part.states]
-    done = minimise(part, u, y0, noise, _ENOUGH_OF_GLIMPSES, _TRIALS_OF_LEVEL, anchor)
+    done = minimise(part, u, y0, noise, _ENOUGH_OF_WINDOWS, _TRIALS_OF_LEVEL, anchor)
     return u if isinstance(done, Failure) else done.point.u
 
 
-def weakly(question: Residuals, u: np.ndarray, readers: list[Reader | None]) -> np.ndarray:
+def start_by_weak_form(question: Residuals, u: np.ndarray, readers: list[Reader | None]) -> np.ndarray:
     """The u that balances the weak form of Lagrange's equations, u itself where there is none."""
     scales = _time_scales(question, readers, u)
     parts = question.parts
-    found = balanced([(part.system, readers[part.records], scales[part.records.start]) for part in parts], u)
+    found = fit_weak_form([(part.system, readers[part.records], scales[part.records.start]) for part in parts], u)
     return u if found is None else found
 
 
@@ -742,9 +744,9 @@ def _over_segments(question: Residuals, u, noise, readers: list[Reader | None], 
     cuts = levels(recordings, _time_scales(question, readers, u))
     for pieces in [] if any(part.system.clocks for part in question.parts) else cuts:
         reading = ((recorder, piece.places[:1]) for piece in pieces if (recorder := readers[piece.record]))
-        states = np.stack([roomy(one.states(place)[0], question.states) for one, place in reading])
+        states = np.stack([pad_states(one.states(place)[0], question.states) for one, place in reading])
         part = question.of(pieces, np.ones(len(pieces), bool))
-        done = descend(part, u, states, noise, 2 * _GRADIENT_STEPS // (3 * len(cuts)), tell)
+        done = descend_gradient(part, u, states, noise, 2 * _GRADIENT_STEPS // (3 * len(cuts)), tell)
         if not isinstance(done, Failure):
             u = done[0]
     return u
@@ -763,6 +765,6 @@ def _time_scales(question: Residuals, readers: list[Reader | None], u) -> list[f
     return scales
 
 
-def roomy(state: np.ndarray, states: int) -> np.ndarray:
+def pad_states(state: np.ndarray, states: int) -> np.ndarray:
     """States (..., 2n) of a system, with zeros up to those of the one with the most coordinates."""
     return np.concatenate([state, np.zeros((*state.shape[:-1], states - state.shape[-1]))], axis=-1)

@@ -1,6 +1,7 @@
 """Uncertainty: autocorrelation of residuals, covariance of parameters and starts, identifiability, experiment design.
 
-It holds `Correlation`, `Information`, `OfStarts`, `sentences` (parameters that are not identifiable) and `Experiments`.
+It holds `Correlation`, `Information`, `StartCovariance`, `unseen_sentences` (parameters that are not identifiable) and
+`Experiments`.
 
 **Autocorrelation of residuals.** At 1 kHz residuals hold what the scene lacks, and neighbours agree: n samples are
 worth n/τ independent ones, with τ the sum of the correlations over all lags. Source: Geyer, *Practical Markov chain
@@ -16,8 +17,8 @@ and H = GᵀG. So
 For white noise C = 1. At 1 kHz residuals are not white: they hold what the model lacks, and H⁻¹ alone would give
 intervals many times too small. Source: Newey & West, Econometrica 55 (1987) 703.
 
-Directions that nothing depends on have no variance: they are found as null directions of G (`seen`), their parameters
-have infinite variance, and nothing is inverted there.
+Directions that nothing depends on have no variance: they are found as null directions of G (`null_space`), their
+parameters have infinite variance, and nothing is inverted there.
 
 Over a chaotic record sensitivities grow by so many powers of ten that all columns point along the one direction that
 grows fastest, and rounding hides the rest: G seems to have null directions where it has none. Null directions are the
@@ -55,7 +56,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._fit._noise import Widths
+from lagjax._fit._noise import NoiseScale
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._residuals import Failure, Point, Residuals, compressed
 
@@ -69,7 +70,7 @@ class Correlation(NamedTuple):
     neighbour: float
 
 
-def correlation(question: Residuals, point: Point, widths: Widths, signal: int) -> Correlation:
+def correlation(question: Residuals, point: Point, widths: NoiseScale, signal: int) -> Correlation:
     """The correlation of the residuals of one signal, over all pieces.
 
     It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
@@ -98,7 +99,7 @@ def correlation(question: Residuals, point: Point, widths: Widths, signal: int) 
 
 def lag_products(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """Σ zᵢ zᵢ₊ₖ over rows (N, T) for the lags k = 0 … T − 1, of samples that count."""
-    rows = together(rows, counted)
+    rows = without_gaps(rows, counted)
     spectrum = np.abs(np.fft.rfft(rows, 2 * rows.shape[1])) ** 2
     return np.fft.irfft(spectrum.sum(axis=0), 2 * rows.shape[1])[: rows.shape[1]]
 
@@ -107,7 +108,7 @@ _LAGS = 20  # of residuals that hold motion some are correlated over the first l
 _CHANCE = 4.0  # standard errors of a correlation: white residuals show it at one of this many lags in 1 of 800 fits
 
 
-def structure(rows: np.ndarray, counted: np.ndarray) -> float:
+def correlated_power(rows: np.ndarray, counted: np.ndarray) -> float:
     """The mean square of what is no white noise in residuals (N, T), zero where no correlation is beyond chance.
 
     Motion that changes little from one sample to the next has its whole mean square in the product of neighbours, to
@@ -121,7 +122,7 @@ def structure(rows: np.ndarray, counted: np.ndarray) -> float:
     return float(highest / count) if highest > _CHANCE / np.sqrt(count) * sums[0] else 0.0
 
 
-def together(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
+def without_gaps(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """The rows (N, T, ...) with what `counted` (N, T) in front, so that lags count samples that are there.
 
     Where every tenth sample is measured, or some are missing, the neighbour of one is the next that was measured.
@@ -151,7 +152,7 @@ def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
     return np.einsum("ntf,ntg->fg", rows, smooth)
 
 
-def share(question: Residuals, point: Point, widths: Widths) -> float:
+def independent_share(question: Residuals, point: Point, widths: NoiseScale) -> float:
     """The number of independent samples that one sample is worth, over all signals: at most 1."""
     laws = [correlation(question, point, widths, signal) for signal in range(len(widths.sigma))]
     return sum(law.count / law.time for law in laws) / max(sum(law.count for law in laws), 1)
@@ -191,11 +192,11 @@ class Information(NamedTuple):
     lost: float
 
 
-def information(question: Residuals, point: Point, widths: Widths) -> Information:
+def information(question: Residuals, point: Point, widths: NoiseScale) -> Information:
     """The information of the data about the parameters, at the end of a search."""
     factors = [np.sqrt(b.weights) / widths.sigma for b in question.batches]
     triangles = question.triangles(point, factors)
-    null, basis = seen(triangles, question.states)
+    null, basis = null_space(triangles, question.states)
     if _is_lost(question, point):
         null, basis = np.eye(len(point.u)), np.zeros((len(point.u), 0))
     laws = [correlation(question, point, widths, s) for s in range(len(widths.sigma))]
@@ -206,7 +207,7 @@ def information(question: Residuals, point: Point, widths: Widths) -> Informatio
     for batch, factor, slopes in zip(question.batches, factors, point.slopes, strict=True):
         own = orthogonal(triangles[batch.rows], factor[..., None] * slopes, question.states) / unit
         for s, law in enumerate(lags):
-            middle += correlated_square(together(own[:, :, s], batch.weights[..., s] > 0), law)
+            middle += correlated_square(without_gaps(own[:, :, s], batch.weights[..., s] > 0), law)
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + question.unknowns
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
@@ -225,7 +226,7 @@ def information(question: Residuals, point: Point, widths: Widths) -> Informatio
     )
 
 
-def seen(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
+def null_space(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
     rows = _eliminated(triangles, states)
     unit = _lengths(triangles, states)
@@ -260,7 +261,7 @@ def confirmed_null(question: Residuals, point: Point, null: np.ndarray) -> np.nd
         return null
     with np.errstate(divide="ignore"):
         level = [np.where(size > 0, 1.0 / size, 0.0) for size in sizes]
-    return seen(question.triangles(point, level), question.states)[0]
+    return null_space(question.triangles(point, level), question.states)[0]
 
 
 def row_sizes(question: Residuals, point: Point) -> list[np.ndarray]:
@@ -316,18 +317,18 @@ def orthogonal(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.nda
     return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))
 
 
-class OfStarts(NamedTuple):
+class StartCovariance(NamedTuple):
     """The uncertainty of N starts: `covariance` (N, 2n, 2n), and A⁺B (N, 2n, F), how they follow the parameters."""
 
     covariance: np.ndarray
     follows: np.ndarray
 
 
-def of_starts(question: Residuals, point: Point, widths: Widths, known: Information) -> OfStarts:
+def start_covariances(question: Residuals, point: Point, widths: NoiseScale, known: Information) -> StartCovariance:
     """The uncertainty of the starts of all pieces at the end of a search; zero for those that are not fitted."""
     states, free, pieces = question.states, len(point.u), len(question.pieces)
     lags = [correlation(question, point, widths, s).lags for s in range(len(widths.sigma))]
-    found = OfStarts(np.zeros((pieces, states, states)), np.zeros((pieces, states, free)))
+    found = StartCovariance(np.zeros((pieces, states, states)), np.zeros((pieces, states, free)))
     for batch, slopes in zip(question.batches, point.slopes, strict=True):
         rows = np.sqrt(batch.weights)[..., None] / widths.sigma[:, None] * slopes
         for row, piece in zip(batch.rows.tolist(), rows, strict=True):
@@ -349,7 +350,7 @@ def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Info
     follows = into.T @ b.reshape(-1, b.shape[-1])
     own = np.concatenate([into.reshape(a.shape), b - a @ follows], axis=-1)
     square = np.sum([correlated_square(own[None, :, s], lags[s]) for s in range(len(lags))], axis=0)
-    covariance = _of_seen(known)
+    covariance = _covariance_of_seen(known)
     shared = square[:states, states:] @ known.white @ follows.T
     found = known.lost * (square[:states, :states] - shared - shared.T) + follows @ covariance @ follows.T
     not_seen = v[~sees] - v[~sees] @ across.T
@@ -359,7 +360,9 @@ def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Info
     return found, follows
 
 
-def start_alone(rows: np.ndarray, states: int, known: Information, share: float) -> tuple[np.ndarray, np.ndarray]:
+def covariance_of_one_start(
+    rows: np.ndarray, states: int, known: Information, share: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The uncertainty of a start by weighted rows (T, S, 2n + F): covariance (2n, 2n) for fixed parameters, and A⁺B.
 
     Every sample is worth the `share` of an independent one.
@@ -371,7 +374,7 @@ def start_alone(rows: np.ndarray, states: int, known: Information, share: float)
     return known.lost / share * into.T @ into, into.T @ flat[:, states:]
 
 
-def deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.ndarray, known: Information):
+def signal_deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.ndarray, known: Information):
     """The standard deviations (T, S) of signals whose derivatives are `slopes` (T, S, 2n + F).
 
     They come from the parameters as far as these are seen, and from a start of covariance `start` (2n, 2n) of its own
@@ -379,12 +382,12 @@ def deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.n
     """
     a = slopes[..., :states]
     along = slopes[..., states:] - a @ follows
-    covariance = _of_seen(known)
+    covariance = _covariance_of_seen(known)
     variance = np.einsum("tsf,fg,tsg->ts", along, covariance, along) + np.einsum("tsi,ij,tsj->ts", a, start, a)
     return np.where(_moves(along, known), np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _of_seen(known: Information) -> np.ndarray:
+def _covariance_of_seen(known: Information) -> np.ndarray:
     """The covariance (F, F) of what is seen, zero along what is not; with white residuals where some is not."""
     return known.covariance if not known.null.size else known.lost * known.white
 
@@ -400,9 +403,9 @@ _MOST_NAMES = 12  # in one sentence
 _LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
 
 
-def sentences(question: Residuals, point: Point, widths: Widths, known: Information) -> tuple[str, ...]:
+def unseen_sentences(question: Residuals, point: Point, widths: NoiseScale, known: Information) -> tuple[str, ...]:
     """A sentence for every set of parameters of which something is not seen, and one for those that rounding hides."""
-    hidden = _hidden(question, point, known)
+    hidden = _sentence_on_rounding(question, point, known)
     null, parameters = known.confirmed, question.parameters
     if not null.shape[1]:
         return hidden
@@ -418,7 +421,7 @@ def sentences(question: Residuals, point: Point, widths: Widths, known: Informat
     return (*found, *hidden)
 
 
-def _hidden(question: Residuals, point: Point, known: Information) -> tuple[str, ...]:
+def _sentence_on_rounding(question: Residuals, point: Point, known: Information) -> tuple[str, ...]:
     """The sentence for parameters whose columns are drowned where sensitivities grow."""
     if known.confirmed.shape[1] == known.null.shape[1]:
         return ()
@@ -440,7 +443,7 @@ def _hidden(question: Residuals, point: Point, known: Information) -> tuple[str,
     )
 
 
-def _null_elsewhere(question: Residuals, point: Point, widths: Widths):
+def _null_elsewhere(question: Residuals, point: Point, widths: NoiseScale):
     """Other values u of the free parameters, a few per cent away, and the null directions there."""
     u = point.u
     near = u + question.parameters.sizes(u) * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
@@ -448,7 +451,7 @@ def _null_elsewhere(question: Residuals, point: Point, widths: Widths):
     if isinstance(other, Failure):
         return None
     factors = [np.sqrt(batch.weights) / widths.sigma for batch in question.batches]
-    null = seen(question.triangles(other, factors), question.states)[0]
+    null = null_space(question.triangles(other, factors), question.states)[0]
     return near, confirmed_null(question, other, null)
 
 
@@ -615,12 +618,14 @@ class Experiments(NamedTuple):
         return f"{self.parameters[place]}, whose interval becomes {known[place]:.2g} of now" if known[place] < 1 else ""
 
 
-def ranked(names: list[str], rows: list[np.ndarray], labels: tuple[str, ...], known: Information) -> Experiments:
+def rank_experiments(
+    names: list[str], rows: list[np.ndarray], labels: tuple[str, ...], known: Information
+) -> Experiments:
     """The information of planned records; their rows (M, F) have starts eliminated and are in units of the noise."""
     unseen = known.null
     basis = np.linalg.svd(unseen, full_matrices=True)[0][:, unseen.shape[1] :] if unseen.size else np.eye(len(labels))
     have = _information(known, basis)
-    told = [_told(g, basis, unseen, have) for g in rows]
+    told = [_gain(g, basis, unseen, have) for g in rows]
     order = sorted(range(len(rows)), key=lambda k: (-told[k][1], -told[k][0]))
     gain, new, deviations = (np.array([told[k][i] for k in order]) for i in range(3))
     return Experiments(tuple(names[k] for k in order), gain, new, labels, deviations)
@@ -635,7 +640,7 @@ def _information(known: Information, basis: np.ndarray) -> np.ndarray:
     return np.linalg.inv(basis.T @ (known.lost * known.white) @ basis)
 
 
-def _told(g: np.ndarray, basis: np.ndarray, unseen: np.ndarray, have: np.ndarray) -> tuple[float, int, np.ndarray]:
+def _gain(g: np.ndarray, basis: np.ndarray, unseen: np.ndarray, have: np.ndarray) -> tuple[float, int, np.ndarray]:
     """The gain of one record, how many unseen combinations it sees, and deviations afterwards over those of now."""
     seen = g @ basis
     gain = np.linalg.slogdet(have + seen.T @ seen)[1] - np.linalg.slogdet(have)[1]

@@ -35,11 +35,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._fit._descent import Descent, column_norms, eliminate
-from lagjax._fit._noise import Widths
+from lagjax._fit._noise import NoiseScale
 from lagjax._fit._parameters import Between, Parameters, Positive
 from lagjax._fit._records import Record, in_structure
 from lagjax._fit._residuals import Point, Residuals, compressed
-from lagjax._fit._uncertainty import Information, orthogonal, structure
+from lagjax._fit._uncertainty import Information, correlated_power, orthogonal
 
 _WIDE = 3.0  # rad: a signal of a smaller range is not tried as degrees, which would leave it 0.05
 _WIDEST = 20.0  # rad, three turns: of a larger range degrees are tried first
@@ -50,23 +50,25 @@ _SLOW = 30.0  # times slower than the scene moves, from which milliseconds are t
 SECONDS = 10.0  # of processor time that tries may take where a fit explains nothing: some ten fits that fail
 
 
-class Suspect(NamedTuple):
+class PossibleMistake(NamedTuple):
     """A mistake in words, and the records without it."""
 
     text: str
     records: list[Any]
 
 
-def suspects(records: list[Any], names: tuple[str, ...], worst: list[int], slower: float) -> Iterator[Suspect]:
+def possible_mistakes(
+    records: list[Any], names: tuple[str, ...], worst: list[int], slower: float
+) -> Iterator[PossibleMistake]:
     """The mistakes that may be in the records, the likeliest first, where the data move so many times slower than the
     scene does, and `worst` has the places of the records in the order of what is left of them."""
     count, some = len(names), range(min(len(names), _MOST))
     by_time = [_in_milliseconds(r) if isinstance(r, Record) else r for r in records]
-    milliseconds = [Suspect("with the times in milliseconds", by_time)]
+    milliseconds = [PossibleMistake("with the times in milliseconds", by_time)]
     ranges = [max(np.ptp(_there(r, k)) for r in records if isinstance(r, Record)) for k in range(count)]
     wide = [k for k in range(count) if ranges[k] > _WIDE]
     degrees = [
-        Suspect(f"with {_listed(names, turned)} in degrees", _scaled(records, turned, np.pi / 180))
+        PossibleMistake(f"with {_listed(names, turned)} in degrees", _scaled(records, turned, np.pi / 180))
         for turned in ([wide] if wide else []) + [[k] for k in wide[:_MOST] if len(wide) > 1]
     ]
     yield from milliseconds if slower > _SLOW else []
@@ -75,16 +77,16 @@ def suspects(records: list[Any], names: tuple[str, ...], worst: list[int], slowe
     for i, j in itertools.combinations(some, 2):
         order = np.arange(count)
         order[[i, j]] = j, i
-        swaps.append(Suspect(f"with {names[i]} and {names[j]} swapped", _reordered(records, order)))
+        swaps.append(PossibleMistake(f"with {names[i]} and {names[j]} swapped", _reordered(records, order)))
     yield from swaps if len(swaps) == 1 else []  # one try tells
     for place in worst[:_MOST] if len(records) > 2 else []:
-        yield Suspect(f"without records[{place}]", [*records[:place], *records[place + 1 :]])
+        yield PossibleMistake(f"without records[{place}]", [*records[:place], *records[place + 1 :]])
     yield from swaps if len(swaps) > 1 else []
     for k in some:
-        yield Suspect(f"with the other sign of {names[k]}", _scaled(records, [k], -1.0))
+        yield PossibleMistake(f"with the other sign of {names[k]}", _scaled(records, [k], -1.0))
     for turned in [list(some)] + [[k] for k in some if count > 1]:
         text = f"with {_listed(names, turned)} counted from the opposite direction, π further"
-        yield Suspect(text, _changed(records, turned, lambda x: x + np.pi))
+        yield PossibleMistake(text, _changed(records, turned, lambda x: x + np.pi))
     yield from degrees if max(ranges) <= _WIDEST else []
     yield from milliseconds if slower <= _SLOW else []
 
@@ -95,7 +97,7 @@ def _in_milliseconds(record: Record) -> Record:
 
 
 def find_mistake(
-    share: Callable[[list[Any]], float | None], possible: Iterable[Suspect], left: float, seconds: float
+    share: Callable[[list[Any]], float | None], possible: Iterable[PossibleMistake], left: float, seconds: float
 ) -> list[str]:
     """A sentence for the first mistake without which a fit follows the records; none where there is no such.
 
@@ -115,7 +117,7 @@ def find_mistake(
     return []
 
 
-def hanging(records: list[Any], names: tuple[str, ...]) -> list[str]:
+def constant_signals(records: list[Any], names: tuple[str, ...]) -> list[str]:
     """A sentence for every signal, of these names, that is the same at all samples of a record of one system."""
     return [
         f"{name} is {there[0]:.6g} at all {len(there)} samples of records[{place}]: it does not move, or its "
@@ -203,7 +205,9 @@ def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, quest
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
     ok = descent.converged and not (unseen or left.motion or apart)
     if not ok or at_ends or labels:
-        still = [text for part in question.parts for text in hanging(part.system.records, part.system.signals.names)]
+        still = [
+            text for part in question.parts for text in constant_signals(part.system.records, part.system.signals.names)
+        ]
         parts, ok = parts + still, ok and not still
     return Verdict(ok, " ".join(parts), left)
 
@@ -220,7 +224,7 @@ class Unexplained(NamedTuple):
     worst: list[int]
 
 
-def unexplained(question: Residuals, point: Point, widths: Widths) -> Unexplained:
+def unexplained(question: Residuals, point: Point, widths: NoiseScale) -> Unexplained:
     """The share of the signals that a trial leaves, where that is much."""
     left, noisy, shares, doubted, many = [], [], [0.0], False, len(question.records) > 1
     of_records = np.zeros(len(question.records))
@@ -272,11 +276,11 @@ class _Parts(NamedTuple):
 def _parts(rows: np.ndarray, values: np.ndarray, counts: np.ndarray) -> _Parts:
     samples, root = counts.sum(), np.sqrt(counts)
     mean = np.sum(counts * values) / samples
-    motion = structure(root * rows, counts > 0) * (counts > 0).sum() / samples
+    motion = correlated_power(root * rows, counts > 0) * (counts > 0).sum() / samples
     return _Parts(samples, np.sum(counts * rows**2) / samples, motion, np.sum(counts * (values - mean) ** 2) / samples)
 
 
-def _rows_of_signal(question: Residuals, point: Point, widths: Widths, signal: int) -> dict[int, tuple]:
+def _rows_of_signal(question: Residuals, point: Point, widths: NoiseScale, signal: int) -> dict[int, tuple]:
     """Of every record that has a signal: residuals, values and how much each counts, (M, T) for its M pieces."""
     found: dict[int, list] = {}
     columns = zip(question.batches, point.residuals, question.factors(point, widths), strict=True)
@@ -374,7 +378,7 @@ def _disagreements(
     )
 
 
-def _motion(question: Residuals, point: Point, widths: Widths) -> dict[int, float]:
+def _motion(question: Residuals, point: Point, widths: NoiseScale) -> dict[int, float]:
     """Of every record the sum of squares that a trial leaves beyond white noise, in those of the noise."""
     found: dict[int, float] = {}
     for signal in range(len(question.names)):
