@@ -418,7 +418,7 @@ def _about(name, system, records, observe, form, layout, parameters) -> SystemRe
 
 
 def _require_no_jumps(scene: Scene, records: list[Any], observe, signals: Signals) -> None:
-    """Raise `ValueError` where a signal jumps by a period that nobody spoke of; motion through modes may jump."""
+    """Raise `ValueError` where a signal jumps by a period without `lagjax.wrapped`; hybrid motion may jump."""
     if isinstance(scene, Hybrid) or sensors(observe)[1] is not None:
         return
     for place, record in enumerate(records):

@@ -164,7 +164,7 @@ class Density:
         return self.of_weighted(weighted, [batch.weights > 0 for batch in self.question.batches], at)
 
     def residuals(self, at: Unknowns) -> list:
-        """The outputs of the sensors less the measurements, (N, T, S), of every batch of the question."""
+        """The outputs of the sensors less the measurements, (N, T, S), of every batch."""
         found, signals = [], len(self.question.names)
         for part in self.question.parts:
             for batch in part.system.batches:

@@ -62,7 +62,7 @@ _KINK = (
 
 class Descent(NamedTuple):
     """The end of a search: the last trial, its noise, whether it converged, how many trials, a sentence, and the
-    question about which it was."""
+    residuals that it minimised, `question`."""
 
     point: Point
     widths: NoiseScale
@@ -239,7 +239,7 @@ _STILL = 1.0  # what log L may gain over the last tenth of the steps where the d
 
 def descend_gradient(
     question: Residuals, u: np.ndarray, starts: np.ndarray, noise: AbstractNoise, steps: int,
-    told: Callable[[str], None] | None = None,
+    notify: Callable[[str], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, bool] | Failure:  # fmt: skip
     """u (F,), the starts (N, 2n) after this many steps, and whether log L has come to rest.
 
@@ -269,8 +269,8 @@ def descend_gradient(
     for k in range(max(1, -(-steps // _PORTION))):
         carry = go(carry)
         costs.append(float(carry[2][0]))
-        if told is not None:
-            told(f"step {(k + 1) * _PORTION}: log likelihood {-costs[-1] * question.measured:.6g}")
+        if notify is not None:
+            notify(f"step {(k + 1) * _PORTION}: log likelihood {-costs[-1] * question.measured:.6g}")
     if not np.isfinite(costs[-1]):
         return Failure(0, "The gradient is not finite at any trial.")
     x = np.asarray(first + scale * carry[2][1], float)

@@ -714,7 +714,7 @@ class Parameters:
 
     @property
     def room(self) -> np.ndarray:
-        """The distance from one value of each u (F,) at which others are told apart."""
+        """The distance from one value of each u (F,) at which others are distinct."""
         return self._of_each("room")
 
     def _of_each(self, name: str) -> np.ndarray:

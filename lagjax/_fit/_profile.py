@@ -37,7 +37,7 @@ from lagjax._fit._noise import Known, NoiseScale, log_likelihood
 from lagjax._fit._residuals import Failure, Residuals
 from lagjax._fit._uncertainty import Information
 
-_ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT = 1e-2, 40  # a record left out is then told to a hundredth of its noise
+_ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT = 1e-2, 40  # a record left out is then known to a hundredth of its noise
 
 
 class Comparison(NamedTuple):
@@ -154,7 +154,7 @@ def _of_signals(names: tuple[str, ...], *known: tuple[tuple[str, ...], NoiseScal
 
 
 def _part(question: Residuals, keep: np.ndarray) -> Residuals:
-    """The question about some of its pieces."""
+    """The residuals of some of the pieces, without a watch."""
     part = question.of([p for p, k in zip(question.pieces, keep, strict=True) if k], question.fitted[keep])
     part.watch = None
     return part

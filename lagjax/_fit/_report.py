@@ -112,19 +112,19 @@ def page(
     figures: dict[str, list[str]], texts: dict[str, str],
 ) -> str:  # fmt: skip
     """The file: a verdict, what is not seen, tables by their headings, pictures, and texts as they are printed."""
-    told = html.escape
-    parts = [f"<h1>{told(title)}</h1>", f"<p{'' if ok else ' class=no'}>{told(message)}</p>"]
-    parts += [f'<p class="no">Not seen: {told(sentence)}</p>' for sentence in unseen]
+    escaped = html.escape
+    parts = [f"<h1>{escaped(title)}</h1>", f"<p{'' if ok else ' class=no'}>{escaped(message)}</p>"]
+    parts += [f'<p class="no">Not seen: {escaped(sentence)}</p>' for sentence in unseen]
     for heading, (head, *rows) in tables.items():
-        cells = "".join(f"<th>{told(cell)}</th>" for cell in head)
-        body = "".join("<tr>" + "".join(f"<td>{told(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        parts.append(f"<h2>{told(heading)}</h2><table><tr>{cells}</tr>{body}</table>")
+        cells = "".join(f"<th>{escaped(cell)}</th>" for cell in head)
+        body = "".join("<tr>" + "".join(f"<td>{escaped(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        parts.append(f"<h2>{escaped(heading)}</h2><table><tr>{cells}</tr>{body}</table>")
     for heading, text in texts.items():
-        parts.append(f"<h2>{told(heading)}</h2><pre>{told(text)}</pre>")
+        parts.append(f"<h2>{escaped(heading)}</h2><pre>{escaped(text)}</pre>")
     for heading, pictures in figures.items():
-        images = "".join(f'<p><img alt="{told(heading)}" src="data:image/png;base64,{one}"></p>' for one in pictures)
-        parts.append(f"<h2>{told(heading)}</h2>{images}")
-    head = f'<meta charset="utf-8"><title>{told(title)}</title><style>{_STYLE}</style>'
+        images = "".join(f'<p><img alt="{escaped(heading)}" src="data:image/png;base64,{one}"></p>' for one in pictures)
+        parts.append(f"<h2>{escaped(heading)}</h2>{images}")
+    head = f'<meta charset="utf-8"><title>{escaped(title)}</title><style>{_STYLE}</style>'
     return f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(parts)}</body></html>\n"
 
 

@@ -80,8 +80,8 @@ class SystemResiduals:
     """The residuals of pieces of the records of one system, called `name`, None where there is no other.
 
     `fitted` (N,) says of each piece whether its start is free; `size` (S,) is the root mean square of the signals, and
-    that times `rtol`, the tolerance of the motion, the smallest noise that can be told; `periods` (S,) are those of
-    wrapped signals, up to which residuals are known. Where some pieces are `Timings`, with `clocks` by the number of
+    that times `rtol`, the tolerance of the motion, the smallest noise that can be estimated; `periods` (S,) are those
+    of wrapped signals, up to which residuals are known. Where some pieces are `Timings`, with `clocks` by the number of
     the record, crossing times are one more signal, the last.
     """
 
@@ -415,7 +415,7 @@ class Residuals:
       first system first. Without `pieces` (N,) and `fitted` (N,), whether the start of a piece is free, the pieces are
       whole records.
     - `parts`: the systems that have pieces. `records`; `states`: the numbers of a start.
-    - `names`, `size`, `least` (S,): signals, their root mean square, and the smallest noise that can be told of them.
+    - `names`, `size`, `least` (S,): signals, their root mean square, and the smallest noise that can be estimated.
     - `batches`: the samples, with a column for every signal; `weights` (M, S): all of theirs; `measured`: how many.
     - `watch` is called with every trial of `evaluate`.
     """

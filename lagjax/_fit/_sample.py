@@ -3,8 +3,8 @@
 `Chart` has coordinates z in which the posterior π is nearly round, beside a bound too.
 
 By rule, where that can be had: the sampler moves along π*, the density whose residuals are expanded to second order
-(`Surrogate`), which costs no motions, so many of its steps that y is nearly independent of the x where it began; then
-one exact density decides. The chain goes to y with the probability
+(`Surrogate`), which costs no motions, with enough of its steps that y is nearly independent of the x where it began;
+then one exact density decides. The chain goes to y with the probability
 
     min(1, π(y) π*(x) / [π(x) π*(y)])
 
@@ -14,8 +14,8 @@ measured before, on independent pairs of its draws, and after: where less than `
 the weights π/π* have no variance because π* is too narrow, and where chains are worth few independent draws, the
 sampler follows π itself, with gradients through the motions at every step.
 
-All chains go side by side in one batch of motions. What the draws are worth is told with them, and warned of where it
-is little.
+All chains go side by side in one batch of motions. The effective number of draws comes with them, and a warning where
+it is small.
 
 Which library: blackjax, whose kernels are plain functions of a log density, so that chains, the loop and what is kept
 are a few lines here; arviz for what draws are worth. numpyro does the same behind a language for models, of which

@@ -250,7 +250,7 @@ def _edges(record: Record, length: float) -> np.ndarray:
 
 
 def _thinned(record: Record, which: int, begin: int, end: int, scale: float) -> Piece:
-    """The samples from `begin` to `end`, of which only so many as the motion needs to be seen."""
+    """The samples from `begin` to `end`, thinned to what the time scale of the motion needs."""
     spacing = (record.ts[end - 1] - record.ts[begin]) / max(end - 1 - begin, 1)
     step = int(scale / (_PER_SCALE * spacing)) if np.isfinite(scale) and spacing > 0 else 1
     step = max(1, min(step, (end - begin) // _FEWEST_IN_SEGMENT))
@@ -614,8 +614,8 @@ def _in_pieces(question: Residuals, level: Descent, joined: NoiseScale | None, n
 
 def by_gradient(question: Residuals, u, y0, noise, readers: list[Reader | None] | None) -> Descent:
     """The descent by gradients: over segments of the records that grow, where they can be read, then over all."""
-    told, question.watch = question.watch, None
-    tell = None if told is None else lambda text: print(text, file=sys.stderr, flush=True)
+    watch, question.watch = question.watch, None
+    tell = None if watch is None else lambda text: print(text, file=sys.stderr, flush=True)
     steps = _GRADIENT_STEPS
     if readers is not None:
         u = start_by_weak_form(question, u, readers)

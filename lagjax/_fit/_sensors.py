@@ -15,8 +15,8 @@ of such a signal is known up to a period P as well, and the likeliest is the sma
 samples are close enough to tell which way an angle went, neighbours less than `_CLEAR` of a period apart, the data are
 made continuous once, and states are read off that.
 
-A jump that was not announced would count as motion of a huge speed, and no fit follows it. It is told by three things
-together: it is larger than the steps beside it; it stays; and less a period it is no larger than these steps.
+A jump that was not announced would count as motion of a huge speed, and no fit follows it. Three things together
+identify it: it is larger than the steps beside it; it stays; and less a period it is no larger than these steps.
 
 **Signals.** `observe(q, qdot)` makes signals of a state, by default q itself. It may ask for `t` and `params`, so that
 a gain, a bias or a mounting position can be fitted, too, and for the sampled `inputs` of the record.
@@ -123,7 +123,7 @@ class Delays:
         return None
 
 
-_CLEAR = 0.35  # of a period between neighbours: at a half the way round cannot be told; noise takes the rest
+_CLEAR = 0.35  # of a period between neighbours: at a half the way round is ambiguous; noise takes the rest
 _UNCLEAR = 0.05  # share of steps that may be longer, over gaps and glitches: states are read well where most are not
 _SHARP = 3.0  # times the steps beside it that a jump is large: a tent of noise is 2, and a period of 6 samples is 5
 _NEAR = (
@@ -266,7 +266,7 @@ def _jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
         within = any(a - edge <= low and high <= a + period + edge for a in (0.0, -period / 2))
         if (within and fits.sum() > 1 - once) or (period in _TURNS and fits.sum() > 1):
             return int(np.argmax(fits)), text
-    # A count, of which nobody knows how many make a turn: it goes from one end of its range to the other, twice.
+    # A count whose number in a turn is unknown: it goes from one end of its range to the other, twice.
     ends = sharp & (np.abs(steps - (high - low)) <= _NEAR * beside)
     if positions and ends.sum() > 1:
         return int(np.argmax(ends)), f"about {high - low:.4g}"

@@ -37,7 +37,7 @@ correlated. Where A does not see a component of the start its variance is infini
 **Identifiability.** A null direction v of the parameters says that measurements do not change along v, at one point. In
 logarithms, with the relative changes dxᵢ/xᵢ as coordinates, what is seen is orthogonal to it: if that has small whole
 exponents, here and at another point, then only a product of powers enters, such as m·l. The same with the changes dxᵢ
-themselves finds sums. Everything else is told as the direction that it is.
+themselves finds sums. Every other direction is given in numbers.
 
 **Experiment design.** With M the information that the fit has, and G the rows of a planned record in units of the
 noise, made orthogonal to those of its start where that has to be fitted too,
@@ -162,7 +162,7 @@ def independent_share(question: Residuals, point: Point, widths: NoiseScale) -> 
 # as the motion, to 1e-9, and a direction that is really seen so little would need a million times the data.
 NULL = 1e-7
 # By how much the rows of a record grow before they can drown each other: a hundredth of what `NULL` tells from nothing,
-# so that two columns which grow like this are still told apart by their early rows where this says nothing.
+# so that two columns which grow like this still differ in their early rows where this says nothing.
 _GROWTH = 1e-2 / NULL
 # By how much they grow before the last digit of a number moves signals by their size: what was computed then is one
 # motion of many, and no derivative of it says how well anything is known.
@@ -625,9 +625,9 @@ def rank_experiments(
     unseen = known.null
     basis = np.linalg.svd(unseen, full_matrices=True)[0][:, unseen.shape[1] :] if unseen.size else np.eye(len(labels))
     have = _information(known, basis)
-    told = [_gain(g, basis, unseen, have) for g in rows]
-    order = sorted(range(len(rows)), key=lambda k: (-told[k][1], -told[k][0]))
-    gain, new, deviations = (np.array([told[k][i] for k in order]) for i in range(3))
+    gains = [_gain(g, basis, unseen, have) for g in rows]
+    order = sorted(range(len(rows)), key=lambda k: (-gains[k][1], -gains[k][0]))
+    gain, new, deviations = (np.array([gains[k][i] for k in order]) for i in range(3))
     return Experiments(tuple(names[k] for k in order), gain, new, labels, deviations)
 
 

@@ -5,8 +5,8 @@ It holds `verdict`, `unexplained`, `shifts_without` (influence of a record) and 
 **Mistakes.** Degrees for radians, milliseconds for seconds, two signals in each other's place, a sign, an angle from
 the upright: each leaves data that a scene cannot follow, and each can be undone. If the fit then follows them, that is
 the mistake, with evidence: how much was left before and after. How the numbers look says only what is tried first. All
-tries together take no more time than the fit itself, or some seconds, and what one cannot tell in that time is not
-told. A signal that never changes cannot be undone, and is named as it is.
+tries together take no more time than the fit itself, or some seconds, and what is not found in that time is not
+reported. A signal that never changes cannot be undone, and is named as it is.
 
 **Verdict.** A search may converge where it explains nothing. So the residuals of every signal are compared with the
 signal itself, about its mean: what they hold beyond white noise must be a small share of that. Noise alone may be as
@@ -16,7 +16,7 @@ At the end of a search every number is asked where it would go on a straight lin
 Newton without bounds. A positive number that is smaller than its standard error is one that the data do not need; one
 whose step leads beyond a bound by more than two standard errors is held there by the bound alone.
 
-Whether records agree is told without another search. With Hₖ and gₖ what record k adds to the matrix H and the gradient
+The agreement of records needs no other search. With Hₖ and gₖ what record k adds to the matrix H and the gradient
 of the parameters, starts eliminated, the fit without record k is near u + (H − Hₖ)⁻¹ gₖ, since all gradients together
 are zero. If the records agree, that shift has the covariance (H − Hₖ)⁻¹ − H⁻¹. Source: Cook & Weisberg, *Residuals and
 Influence in Regression* (1982), §3.4, for one observation.
@@ -300,7 +300,7 @@ def _padded(rows: list[np.ndarray]) -> np.ndarray:
 
 
 def _deviations(known: Information) -> np.ndarray:
-    """The standard deviations of u (F,), zero where something is not seen: that is told elsewhere."""
+    """The standard deviations of u (F,), zero where something is not identifiable: `unseen_sentences` says that."""
     return np.sqrt(np.nan_to_num(np.diag(known.covariance), posinf=0.0))
 
 
