@@ -46,6 +46,24 @@ def joint():
     return lagjax.fit({"one": SPRING, "two": PLANE}, records(), {"k": 3.8, "c": 1.4}, method="whole")
 
 
+def test_trials_of_one_batch_are_those_one_by_one_also_where_one_fails(joint):
+    question = joint.question
+    u = joint.u + np.array([[0.0], [0.05], [np.nan], [-0.05]])
+    starts = joint.states + 0.01 * np.arange(4)[:, None, None]
+    trials = question.evaluate_trials(u, starts)
+    assert [hasattr(trial, "text") for trial in trials] == [False, False, True, False]
+    for k in (0, 1, 3):
+        alone = question.evaluate(u[k], starts[k], notify=False)
+        for kind in ("residuals", "slopes"):
+            for mine, own in zip(getattr(trials[k], kind), getattr(alone, kind), strict=True):
+                np.testing.assert_allclose(mine, own, rtol=1e-12, atol=1e-12)
+    # And these are those of the closed form: of the spring, less the measurements, by its start and by k.
+    q, slope = (f(starts[1, 0, :2], u[1, 1]) for f in (swing, jax.jacfwd(swing, argnums=(0, 1))))
+    np.testing.assert_allclose(trials[1].residuals[0][0, :, 0], q - records()["one"].values, atol=1e-7)
+    np.testing.assert_allclose(trials[1].slopes[0][0, :, 0, :2], slope[0], atol=1e-7)
+    np.testing.assert_allclose(trials[1].slopes[0][0, :, 0, 5], slope[1], atol=1e-7)
+
+
 def by_hand(x, shares):
     """log p of x = (c, k, start of one, start of two[0], log σ of three signals) in closed form."""
     c, k, (q, v), plane = x[0], x[1], x[2:4], x[4:8]

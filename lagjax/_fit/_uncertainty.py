@@ -70,7 +70,12 @@ class Correlation(NamedTuple):
     neighbour: float
 
 
-def correlation(question: Residuals, point: Point, widths: NoiseScale, signal: int) -> Correlation:
+def autocorrelations(question: Residuals, point: Point, widths: NoiseScale) -> list[Correlation]:
+    """The autocorrelation of the residuals of every signal (S,)."""
+    return [_autocorrelation(question, point, widths, signal) for signal in range(len(widths.sigma))]
+
+
+def _autocorrelation(question: Residuals, point: Point, widths: NoiseScale, signal: int) -> Correlation:
     """The correlation of the residuals of one signal, over all pieces.
 
     It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
@@ -154,7 +159,7 @@ def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
 
 def independent_share(question: Residuals, point: Point, widths: NoiseScale) -> float:
     """The number of independent samples that one sample is worth, over all signals: at most 1."""
-    laws = [correlation(question, point, widths, signal) for signal in range(len(widths.sigma))]
+    laws = autocorrelations(question, point, widths)
     return sum(law.count / law.time for law in laws) / max(sum(law.count for law in laws), 1)
 
 
@@ -199,7 +204,7 @@ def information(question: Residuals, point: Point, widths: NoiseScale) -> Inform
     null, basis = null_space(triangles, question.states)
     if _is_lost(question, point):
         null, basis = np.eye(len(point.u)), np.zeros((len(point.u), 0))
-    laws = [correlation(question, point, widths, s) for s in range(len(widths.sigma))]
+    laws = autocorrelations(question, point, widths)
     lags = [law.lags for law in laws]
     effective = np.array([law.count / law.time for law in laws])
     free, unit = len(point.u), _lengths(triangles, question.states)  # of columns: their squares may be no numbers
@@ -327,7 +332,7 @@ class StartCovariance(NamedTuple):
 def start_covariances(question: Residuals, point: Point, widths: NoiseScale, known: Information) -> StartCovariance:
     """The uncertainty of the starts of all pieces at the end of a search; zero for those that are not fitted."""
     states, free, pieces = question.states, len(point.u), len(question.pieces)
-    lags = [correlation(question, point, widths, s).lags for s in range(len(widths.sigma))]
+    lags = [law.lags for law in autocorrelations(question, point, widths)]
     found = StartCovariance(np.zeros((pieces, states, states)), np.zeros((pieces, states, free)))
     for batch, slopes in zip(question.batches, point.slopes, strict=True):
         rows = np.sqrt(batch.weights)[..., None] / widths.sigma[:, None] * slopes
