@@ -1,9 +1,9 @@
 """`fit`: the parameters of a scene, and of its forces, from recordings of its motion.
 
     Record ─► Residuals ─► segments ─► Descent ─► Information ─► Fit
-    measured  flat, one   where the   the least   covariance,    in the user's
-    checked   batch       search      squares     null           pytree, in words
-                          begins                  directions
+    measured  flat, one    where the   the least  covariance,    in the user's
+    checked   batch        search      squares    null           pytree, in words
+                           begins                 directions
 
 Files, from the lowest floor up:
 

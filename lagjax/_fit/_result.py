@@ -1,4 +1,7 @@
-"""`Fit`: what came out of a search, with intervals and in words."""
+"""`Fit`: the result of a search, with intervals, profiles, draws, predictions, comparison and a report.
+
+It holds the nouns `Covariance` and `SignalNoise`; every method hands over to the file of its subject.
+"""
 
 import functools
 import os
