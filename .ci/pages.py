@@ -1,8 +1,9 @@
 """Makes the pages of the reference at build time: the hook that `mkdocs.yml` names.
 
-The README is the front page, and the files of `docs/` come after it. Every public name has a page, in the groups of the package's own docstring; every example
-has one, whose Markdown cells are text, whose code is code, and whose picture stands on top where `examples/gallery`
-holds it. Names in code are links to their pages. Nothing of this is a file in the repository.
+The README is the front page, and the files of `docs/` come after it. Every public name has a page, in the groups of the
+package's own docstring; every example has one, whose Markdown cells are text, whose code is code, and whose picture
+stands on top where `examples/gallery` holds it. Names in code are links to their pages. Nothing of this is a file in
+the repository.
 """
 
 import ast

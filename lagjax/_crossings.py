@@ -13,12 +13,12 @@ import numpy as np
 
 from lagjax._arguments import accept
 from lagjax._consistent import has_constraints, require_consistent
-from lagjax._display import as_printed, is_known
 from lagjax._failures import raise_where_failed, sentence
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import MOST_GUARDS, MachineCode, Noted, Surfaces, surfaces_of
+from lagjax._platform import is_known
 from lagjax._problem import Problem, Solution
-from lagjax._results import RESULTS, SUCCESSFUL, SimulationError, code_of
+from lagjax._results import RESULTS, SUCCESSFUL, SimulationError, as_printed, code_of
 from lagjax._system import System, require_system
 from lagjax._validate import as_arrays, is_concrete, require_budget, require_flag
 

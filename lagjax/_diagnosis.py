@@ -21,9 +21,9 @@ import numpy as np
 from lagjax._blame import Offender, offenders, pieces_of, poles
 from lagjax._check import check, listed
 from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
-from lagjax._display import numbers_at
 from lagjax._layout import Layout, halves
 from lagjax._linear import eigen
+from lagjax._platform import numbers_at
 from lagjax._program import Unlowerable
 from lagjax._results import RESULTS, code_of
 from lagjax._stopped import AHEAD

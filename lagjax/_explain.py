@@ -12,12 +12,12 @@ import numpy as np
 
 from lagjax._blame import pieces_of as pieces_in
 from lagjax._diffrax import ArrayEquations, form_of
-from lagjax._display import as_printed
 from lagjax._engine import choose
 from lagjax._linear import dependent_rows
 from lagjax._native import is_large, pieces_of
 from lagjax._problem import Problem
 from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Program, Unlowerable
+from lagjax._results import as_printed
 
 _PIECES = {
     SIGN: "the sign of", FLOOR: "the whole part of", TRUNC: "the whole part of", CLOCK: "samples by",

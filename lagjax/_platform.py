@@ -1,6 +1,10 @@
-"""Which kind of device JAX computes on, as far as a program that is being traced can know."""
+"""The device: its kind, as far as a traced program can know it, and the numbers of the arrays that it holds."""
+
+from typing import Any
 
 import jax
+import numpy as np
+from jax.core import Tracer
 
 
 def default_platform() -> str:
@@ -9,3 +13,18 @@ def default_platform() -> str:
     if device is None:
         return jax.default_backend()
     return device if isinstance(device, str) else device.platform
+
+
+def is_known(x: Any) -> bool:
+    """True if the values of an array can be read here: it is neither traced, nor a shape alone, nor deleted."""
+    if isinstance(x, Tracer):
+        return False
+    if isinstance(x, jax.Array):
+        return x.is_fully_addressable and not x.is_deleted()
+    return isinstance(x, np.ndarray | np.generic)
+
+
+def numbers_at(array, place: tuple) -> np.ndarray:
+    """`array[place]` in NumPy; of an array on another device only that much is copied from there."""
+    elsewhere = isinstance(array, jax.Array) and any(device.platform != "cpu" for device in array.devices())
+    return np.asarray(array[place] if elsewhere else np.asarray(array)[place])

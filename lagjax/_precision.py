@@ -18,11 +18,11 @@ import numpy as np
 
 from lagjax._diffrax import LEAST_RTOL as LEAST_RTOL_OF_DIFFRAX
 from lagjax._diffrax import FineOutput
-from lagjax._display import as_printed
 from lagjax._engine import choose
 from lagjax._layout import Layout
 from lagjax._machine_code import MachineCode
 from lagjax._problem import LEAST_RTOL, Batch, Problem, axes_per_leaf
+from lagjax._results import as_printed
 from lagjax._simulate import simulate, simulate_batch
 from lagjax._system import System, require_system
 from lagjax._trajectory import Trajectory

@@ -107,3 +107,15 @@ class SimulationError(RuntimeError):
     def __init__(self, message, trajectory):
         super().__init__(message)
         self.trajectory = trajectory
+
+
+def as_printed(result, printer, cycle: bool) -> None:
+    """Let IPython show the `str` of a result, which is meant for reading, and not its fields.
+
+    A class takes it as its `_repr_pretty_`. Where `str` has no values to show, inside `jax.jit`, it is the fields.
+    """
+    try:
+        text = str(result)
+    except Exception:  # a display must not fail
+        text = repr(result)
+    printer.text(text)

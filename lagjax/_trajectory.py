@@ -13,14 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._animation import Animation, animated
-from lagjax._display import summary
+from lagjax._display import Animation, animated, dataset, frame, of_trajectory, summary
 from lagjax._health import Health, examine
 from lagjax._layout import Layout
-from lagjax._notebook import of_trajectory
 from lagjax._results import RESULTS
 from lagjax._system import System
-from lagjax._tables import dataset, frame
 
 PyTree = Any
 Number = jax.Array | np.ndarray

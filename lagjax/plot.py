@@ -18,17 +18,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._analysis import Modes
-from lagjax._animation import as_points, course_of, courses_of
 from lagjax._arguments import Function, accept
 from lagjax._check import listed
 from lagjax._crossings import Crossings
-from lagjax._display import is_known, times_of_members
+from lagjax._display import COLORS, as_points, course_of, courses_of, times_of_members
 from lagjax._fit import Fit, Record, draw_record, record_matrix
 from lagjax._layout import Layout
+from lagjax._platform import is_known
 from lagjax._precision import WorkPrecision
 from lagjax._trajectory import Trajectory
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 GREY = "0.55"
 CURVE = 600  # points of a curve, at least: about as many as dots of a figure that is printed

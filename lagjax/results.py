@@ -58,9 +58,9 @@ from lagjax._analysis import (
     Routhian,
     SameMotion,
 )
-from lagjax._animation import Animation
 from lagjax._check import Finding, Findings
 from lagjax._crossings import Crossings
+from lagjax._display import Animation
 from lagjax._explain import Explanation
 from lagjax._fit import Fit
 from lagjax._health import Health

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax import _animation
+from lagjax._display import _animation
 
 SPRING = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params * q["x"] ** 2)
 TS = jnp.linspace(0.0, 6.0, 31)

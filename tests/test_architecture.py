@@ -14,9 +14,8 @@ PACKAGE = Path(lagjax.__file__).parent
 
 DEVELOPMENT = (Path(__file__).parent.parent / "docs" / "development.md").read_text()
 # From the top of the street to its end, as the table there lists it. A new module must take a place in it.
-STREET = re.findall(
-    r"^\| `(\w+)(?:\.py|/)` \|", DEVELOPMENT.split("## The street")[1].split("\n## ")[0], flags=re.MULTILINE
-)
+TABLE = DEVELOPMENT.split("## The street")[1].split("\n## ")[0]
+STREET = re.findall(r"^\| `(\w+)(?:\.py|/)` \|", TABLE, flags=re.MULTILINE)
 LEAVES = {"scenes", "plot", "results"}  # for users, tests, benchmarks and examples; imported by nothing on the street
 
 

@@ -111,7 +111,7 @@ def test_names_that_are_html_are_shown_as_they_are():
 
 
 def test_a_picture_of_a_large_batch_is_of_a_few_members(fallen, monkeypatch):
-    from lagjax import _notebook
+    from lagjax._display import _notebook
 
     places = []
     monkeypatch.setattr(

@@ -21,11 +21,11 @@ from lagjax._analysis._linearize import steady_matrices
 from lagjax._analysis._scene import Scene
 from lagjax._analysis._smooth import is_smooth, require_smooth
 from lagjax._analysis._solve import shortest_solution
-from lagjax._display import as_printed
 from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
 from lagjax._linear import dependent_rows, diagonal_scale, factorize, least_norm, schur_complement
 from lagjax._linear import rank as rank_of
+from lagjax._results import as_printed
 from lagjax._system import System
 from lagjax._validate import is_concrete
 

@@ -11,9 +11,9 @@ from jaxtyping import Array
 from lagjax._analysis._noether import State, euler_lagrange
 from lagjax._analysis._scene import Scene
 from lagjax._analysis._states import moved_by_rounding, random_states
-from lagjax._display import as_printed
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
+from lagjax._results import as_printed
 from lagjax._system import System, require_system
 
 PyTree = Any

@@ -23,9 +23,9 @@ from lagjax._analysis._potential import with_potential
 from lagjax._analysis._scene import Scene
 from lagjax._analysis._states import moved_by_rounding, random_states
 from lagjax._arguments import accept
-from lagjax._display import as_printed
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
+from lagjax._results import as_printed
 from lagjax._system import System
 from lagjax._trajectory import Trajectory
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from lagjax._display import as_printed
+from lagjax._results import as_printed
 
 Level = Literal["error", "warning", "advice"]
 _ORDER = {"error": 0, "warning": 1, "advice": 2}

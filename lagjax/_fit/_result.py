@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
+from lagjax._display import cell, intervals
 from lagjax._doubles import with_doubles
 from lagjax._fit._density import Density
 from lagjax._fit._noise import AbstractNoise, NoiseScale
@@ -34,8 +35,6 @@ from lagjax._fit._residuals import Point, Residuals, SystemPart
 from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._search import Waterfall
 from lagjax._fit._uncertainty import Experiments, Information, rank_experiments, start_covariances
-from lagjax._notebook import cell
-from lagjax._tables import intervals
 
 PyTree = Any
 

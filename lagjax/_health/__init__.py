@@ -34,12 +34,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax._diagnosis import diagnosis, ended_of, with_numbers
-from lagjax._display import as_printed
 from lagjax._health._borders import Met, is_piecewise, met
 from lagjax._health._compare import global_error
 from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, Members, measured
 from lagjax._layout import Layout
-from lagjax._results import RESULTS, advice
+from lagjax._results import RESULTS, advice, as_printed
 from lagjax._system import System
 from lagjax._validate import is_concrete
 

@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._display import numbers_at
 from lagjax._doubles import DOUBLE
 from lagjax._health._laws import Law, Sample, power_at, sample_at
 from lagjax._layout import Layout
+from lagjax._platform import numbers_at
 from lagjax._validate import is_concrete
 
 PyTree = Any

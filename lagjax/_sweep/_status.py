@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._display import as_printed
+from lagjax._results import as_printed
 from lagjax._sweep._members import text_of
 from lagjax._sweep._store import Store
 from lagjax._sweep._workers import claimed

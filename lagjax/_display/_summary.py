@@ -8,13 +8,11 @@ Numbers that have no value yet, inside `jax.jit` or `jax.vmap`, are left out. Th
 `equinox.tree_pprint(trajectory)`.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import numpy as np
-from jax.core import Tracer
 
+from lagjax._platform import is_known
 from lagjax._results import ENDED_WELL, name_of
 
 COUNTS = ("num_steps", "num_rejected_steps")
@@ -32,18 +30,6 @@ def summary(trajectory) -> str:
     if not all(hasattr(leaf, "shape") and hasattr(leaf, "dtype") for leaf in leaves):
         return eqx.tree_pformat(trajectory)
     return "\n".join([_contents(trajectory), _span(trajectory), _verdict(trajectory)])
-
-
-def as_printed(result, printer, cycle: bool) -> None:
-    """Let IPython show the `str` of a result, which is meant for reading, and not its fields.
-
-    A class takes it as its `_repr_pretty_`. Where `str` has no values to show, inside `jax.jit`, it is the fields.
-    """
-    try:
-        text = str(result)
-    except Exception:  # a display must not fail
-        text = repr(result)
-    printer.text(text)
 
 
 def times_of_members(trajectory) -> np.ndarray:
@@ -111,21 +97,6 @@ def _verdict(trajectory) -> str:
     first = tuple(int(i) for i in failed[0])
     shown = first[0] if len(first) == 1 else first
     return f"{', '.join(parts)}: the first that failed is member {shown}, at t = {times[first]:.6g}"
-
-
-def is_known(x: Any) -> bool:
-    """True if the values of an array can be read here: it is neither traced, nor a shape alone, nor deleted."""
-    if isinstance(x, Tracer):
-        return False
-    if isinstance(x, jax.Array):
-        return x.is_fully_addressable and not x.is_deleted()
-    return isinstance(x, np.ndarray | np.generic)
-
-
-def numbers_at(array, place: tuple) -> np.ndarray:
-    """`array[place]` in NumPy; of an array on another device only that much is copied from there."""
-    elsewhere = isinstance(array, jax.Array) and any(device.platform != "cpu" for device in array.devices())
-    return np.asarray(array[place] if elsewhere else np.asarray(array)[place])
 
 
 def _range(values: np.ndarray) -> str:

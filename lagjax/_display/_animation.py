@@ -20,15 +20,16 @@ import numpy as np
 
 from lagjax._arguments import Function, accept
 from lagjax._diagnosis import with_numbers
-from lagjax._display import is_known, numbers_at, times_of_members
+from lagjax._display._notebook import COLORS
+from lagjax._display._summary import times_of_members
 from lagjax._health import Members
 from lagjax._layout import Layout
+from lagjax._platform import is_known, numbers_at
 
 PyTree = Any
 MEMBERS = 50  # that are drawn of a batch, the first ones
 FRAMES = 20_000  # of which a film has fewer
 TRAIL = 2.0  # seconds of the film over which a trace fades
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _VIDEO, _PAGE = (".mp4", ".m4v", ".mov", ".webm"), (".html", ".htm")
 _LARGEST = 2000.0  # megabytes of a page, more than `FRAMES` make
 _SIZE, _DPI = 4.8, 100  # inches of a side, and dots in one

@@ -15,11 +15,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._display import is_known, numbers_at, times_of_members
+from lagjax._display._summary import times_of_members
+from lagjax._platform import is_known, numbers_at
 from lagjax._results import ENDED_WELL
 
 MEMBERS, OUTPUTS, COORDINATES = 30, 400, 6  # that are drawn
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # of Okabe & Ito (2008)
 _SIZE, _DPI = (5.2, 1.9), 144  # inches, and the dots of a fine screen
 
 

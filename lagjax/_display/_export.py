@@ -9,8 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._display import is_known, times_of_members
+from lagjax._display._summary import times_of_members
 from lagjax._layout import Layout
+from lagjax._platform import is_known
 
 PyTree = Any
 
