@@ -69,7 +69,7 @@ class Design:
     def _random(self, names, start: int, count: int) -> np.ndarray:
         """Member k takes numbers k·d … k·d + d − 1 of the counter-based generator Philox 4×64."""
         bits = np.random.Philox(key=self._key(names))
-        block, inside = divmod(start * len(names), 4)  # the counter goes on by one for each four numbers
+        block, inside = divmod(start * len(names), 4)  # the counter advances by one for every four numbers
         bits.advance(block)
         numbers = np.random.Generator(bits).random(inside + count * len(names))
         return numbers[inside:].reshape(-1, len(names))

@@ -23,7 +23,7 @@ import pytest
 import lagjax
 from lagjax import __main__ as command_line
 from lagjax import designs
-from lagjax._sweep import _job, _statistics, _store, _workers
+from lagjax._sweep import _description, _job, _statistics, _store, _workers
 from lagjax._sweep._members import Grid, axes_of
 from lagjax._sweep._store import Store
 
@@ -246,7 +246,7 @@ def test_latin_hypercube_has_one_point_in_each_part():
     np.testing.assert_array_equal(np.sort(np.floor(50 * values), axis=0).T, [np.arange(50)] * 2)
 
 
-# ---- to go on --------------------------------------------------------------------------------------------------------
+# ---- to continue -----------------------------------------------------------------------------------------------------
 
 
 def begun(folder, units=0, **changes):
@@ -453,7 +453,7 @@ def test_another_kind_of_cpu_goes_on_and_is_told(tmp_path, undisturbed, monkeypa
     begun(tmp_path, 2)
     here = _job.cpu()
     monkeypatch.setattr(_job, "cpu", lambda: "an abacus")
-    with pytest.warns(UserWarning, match=r"begun on a CPU of the kind .*, and goes on here on an abacus"):
+    with pytest.warns(UserWarning, match=r"begun on a CPU of the kind .*, and continues here on an abacus"):
         told = swept(tmp_path).status()
     assert told.cpus == (here, "an abacus") and "an abacus: their members" in str(told)
     assert digests(tmp_path) == undisturbed
@@ -551,6 +551,12 @@ def test_a_process_that_has_ended_is_dead_at_once(store):
         assert other.claim(0)
 
 
+def test_functions_in_stores_of_earlier_files_are_found():
+    for module, name in (("_scene", "Motions"), ("_scene", "Left"), ("_sections", "Sections")):
+        kind = _description.unpacked(f"clagjax._sweep.{module}\n{name}\n.".encode(), [])
+        assert kind is getattr(_description, {"Motions": "Description", "Left": "FinalStates"}.get(name, name))
+
+
 # ---- to grow ---------------------------------------------------------------------------------------------------------
 
 
@@ -613,7 +619,7 @@ def test_a_later_end_goes_on_from_the_states_that_are_kept(tmp_path):
     other = {**RULE, "store": tmp_path / "other", "extend": first.store}
     with pytest.raises(ValueError, match=r"axes: .* in the store, now"):
         lagjax.sweep(PENDULUM, {**OVER, "length": [1.0]}, TO_TWO, **other)
-    with pytest.raises(ValueError, match=r"(?s)which cannot go on.*q0"):
+    with pytest.raises(ValueError, match=r"(?s)which cannot continue.*q0"):
         lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**other, "q0": 0.5})
     with pytest.raises(ValueError, match="does not have the states in which its motions ended"):
         lagjax.sweep(PENDULUM, OVER, TS + 2.0, **{**other, "extend": swept(tmp_path).store})
@@ -910,7 +916,7 @@ def test_a_hybrid_scene(tmp_path):  # compiles the motion of a ball for one shap
     for name, value in (("event", lambda q, v: q), ("crossings", {"section": lambda q, v: v}), ("solver", "Tsit5")):
         with pytest.raises(ValueError, match=f"{name} of sweep: for the motion of one System"):
             lagjax.sweep(scene, **BOUNCES, store=tmp_path / "other", **{name: value})
-    with pytest.raises(ValueError, match="A hybrid motion does not go on from a store"):
+    with pytest.raises(ValueError, match="A hybrid motion cannot continue from a store"):
         later = BOUNCES | {"ts": np.linspace(1.5, 2.0, 3)}
         lagjax.sweep(scene, **later, store=tmp_path / "later", extend=tmp_path / "store")
 

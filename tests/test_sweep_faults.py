@@ -139,7 +139,7 @@ def test_the_first_look_stays_within_the_memory(tmp_path, monkeypatch):
 
 def test_the_first_look_at_many_axes_is_as_small():
     over = {f"x{k}": [0.0, 1.0] for k in range(40)}
-    points = _begin._few(axes_of(over), lagjax._sweep._description.Description(*[None] * 8))
+    points = _begin._sample_points(axes_of(over), lagjax._sweep._description.Description(*[None] * 8))
     assert 2048 < len(points["x0"]) <= 4096
 
 

@@ -3,8 +3,8 @@
     Trajectory ─► Course of each member ─► states at the frames ─► positions of points ─► pictures ─► a file
 
 A trajectory is known at its output times alone. Between two of them the state follows the cubic that has q and q̇ of
-both ends (Hermite); across a change of mode of a hybrid motion it ends with the state before it, and goes on along the
-parabola that meets the next output, since the velocity after a reset is not recorded.
+both ends (Hermite); across a change of mode of a hybrid motion it ends with the state before it, and continues along
+the parabola that meets the next output, since the velocity after a reset is not recorded.
 """
 
 import shutil

@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 from lagjax._hybrid import Hybrid, Scene, require_scene
-from lagjax._sweep._begin import begin, first_look, goes_on, left_in, repair, require_same
+from lagjax._sweep._begin import begin, continues, final_states_of, first_look, repair, require_same
 from lagjax._sweep._description import Description, Sections
 from lagjax._sweep._job import Job, compute, in_doubles, precision
 from lagjax._sweep._members import axes_of
@@ -44,7 +44,7 @@ PyTree = Any
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that has been begun: the path of its `store`, and what can be asked of it.
+    """A sweep that was begun, known by the path of its `store`: its members, progress, statistics and damage.
 
     `lagjax.Sweep(path)` opens a store without the script that made it. `print` it for its status.
 
@@ -90,7 +90,7 @@ class Sweep:
         return status(Store(self.store))
 
     def statistics(self) -> dict[str, Summary]:
-        """The statistics that `reduce` asked for, of all units that are done, by the names of the quantities."""
+        """The statistics named in `reduce` over all finished units, by the names of the quantities."""
         store = Store(self.store)
         spec, totals = store.spec(), {}
         for unit in sorted(store.done()) if spec["reduce"] else ():
@@ -227,13 +227,13 @@ def sweep(
     with precision(in_doubles()), child or nullcontext():
         if place.is_there() and other is not None and not place.spec()["goes_on_from"]:
             other = None  # of which the members were taken: it may be gone
-        if other is not None and goes_on(other, description):
+        if other is not None and continues(other, description):
             if isinstance(system, Hybrid):
                 raise ValueError(
-                    "A hybrid motion does not go on from a store, which has no mode at the end of it: begin again at "
+                    "A hybrid motion cannot continue from a store, which does not keep its last mode: begin again at "
                     f"ts[0], with another store than {str(extend)!r}."
                 )
-            description = replace(description, left=left_in(other, axes, description))
+            description = replace(description, left=final_states_of(other, axes, description))
         if not place.is_there():
             begin(place, axes, description, unit, child.look if child else first_look, other)
         spec = place.spec()

@@ -3,7 +3,7 @@
     points ──start──► (q0, qdot0, params) ──run_batch──► Trajectory, Crossings ──keep──► values, change of energy
 
 The user's functions are for one member. Where they are written in jax.numpy they are compiled for all members of a
-batch at once; else they are called member by member, which `slow` tells.
+batch at once; else they are called member by member, and `slow` says why.
 """
 
 import dataclasses
@@ -146,7 +146,7 @@ class Batches:
             except NOT_TRACEABLE as why:
                 self.slow["keep"] = _first_line(why)
         drift = np.asarray(self._drift_alone(motions.arrays, motions.params)) if self.conserves else None
-        kept, complaints = self._one_by_one(motions)
+        kept, complaints = self._keep_one_by_one(motions)
         return kept, drift, complaints
 
     # ---- compiled for all members ----
@@ -166,24 +166,24 @@ class Batches:
         return start
 
     def _compiled(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
-        """The kept values of all members at once; members for which `keep` raises while it runs are blank, and told."""
+        """The kept values of all members at once; blank, with a complaint, where `keep` raises while it runs."""
         everyone = np.arange(len(motions.run.result._value))
         try:
-            return *self._of_some(motions, None), {}
+            return *self._keep_members(motions, None), {}
         except jax.errors.JaxRuntimeError:
-            complaints = self._raising(motions, everyone)
+            complaints = self._find_raising(motions, everyone)
             well = np.setdiff1d(everyone, list(complaints))
             if not complaints or not well.size:  # too little memory; or it always raises
                 raise
         bad = np.isin(everyone, list(complaints))
-        kept, drift = self._of_some(motions, np.where(bad, well[0], everyone))
+        kept, drift = self._keep_members(motions, np.where(bad, well[0], everyone))
         for name, x in kept.items():
             kept[name] = np.where(
                 bad.reshape(-1, *[1] * (x.ndim - 1)), Quantity(name, x.shape[1:], x.dtype).nothing, x
             ).astype(x.dtype)
         return kept, None if drift is None else np.where(bad, np.nan, drift), complaints
 
-    def _of_some(self, motions: "_BatchMotions", which: np.ndarray | None) -> tuple[dict[str, np.ndarray], Any]:
+    def _keep_members(self, motions: "_BatchMotions", which: np.ndarray | None) -> tuple[dict[str, np.ndarray], Any]:
         """The kept values of these members (B,), by default of all in their order, and the change of their energy."""
         arrays = motions.arrays, motions.params
         if which is not None:
@@ -191,13 +191,13 @@ class Batches:
         kept, drift = self._keep_all(*arrays)
         return {name: np.asarray(x) for name, x in _by_name(kept).items()}, None if drift is None else np.asarray(drift)
 
-    def _raising(self, motions: "_BatchMotions", everyone: np.ndarray) -> dict[int, str]:
+    def _find_raising(self, motions: "_BatchMotions", everyone: np.ndarray) -> dict[int, str]:
         """The members for which `keep` raises, as from a callback, and what: by halves, in batches of the same size."""
         found, waiting = {}, [everyone]
         while waiting and len(found) <= _MOST_RAISE:
             some = waiting.pop()
             try:
-                self._of_some(motions, np.resize(some, len(everyone)))
+                self._keep_members(motions, np.resize(some, len(everyone)))
             except jax.errors.JaxRuntimeError as error:
                 half = len(some) // 2
                 if half:
@@ -252,13 +252,13 @@ class Batches:
 
     # ---- member by member ----
 
-    def _one_by_one(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
+    def _keep_one_by_one(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
         """The result of `keep` for each member, called with numbers; and the complaints about these results."""
         rows, errors = self._rows(motions)
         if not self.quantities and not any(rows):
             raise errors[0]  # at the first look, of all members
         complaints = {k: f"keep raised {type(error).__name__}: {_first_line(error)}" for k, error in errors.items()}
-        expected = self.quantities or _common([row for row in rows if row])
+        expected = self.quantities or _common_quantities([row for row in rows if row])
         for k, row in enumerate(rows):
             if row is not None and (wrong := _misfit(expected, row)):
                 rows[k], complaints[k] = None, wrong
@@ -273,7 +273,7 @@ class Batches:
                 one, crossed, of_member = jax.tree.map(lambda x, k=k: x[k], (*arrays, params))
                 kept = self._kept(self._trajectory(one, of_member), crossed)
                 rows.append({name: np.asarray(x) for name, x in _by_name(kept).items()})
-            except Exception as error:  # of the user's function: it costs this member, and nobody else
+            except Exception as error:  # of the user's function: only this member is lost
                 rows.append(None)
                 errors[k] = error
         return rows, errors
@@ -295,7 +295,7 @@ def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarra
         try:
             row = function({name: float(x[k]) for name, x in points.items()})
             rows.append(jax.tree.map(lambda x: np.asarray(x, float), row))
-        except Exception as error:  # of the user's function: it costs this member, and nobody else
+        except Exception as error:  # of the user's function: only this member is lost
             rows.append(None)
             errors[k] = error
     well = next((row for row in rows if row is not None), None)
@@ -311,7 +311,7 @@ def quantities_of(kept: Kept) -> list[Quantity]:
     return [Quantity(name, x.shape[1:], x.dtype) for name, x in kept.values.items()]
 
 
-def _common(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
+def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
     """The quantities of the first of some members, of the type that holds what all of them keep: 1 and 1.5 are floats.
 
     Where there is no such type it is that of the first; the others then have a misfit.
@@ -409,7 +409,7 @@ def _hybrid_batch(scene: Hybrid, axes: tuple, **tolerances) -> Callable:
 def run_batch(
     system: Scene, values: dict[str, PyTree], ts, axes: tuple, settings: dict[str, Any], sections: Sections | None
 ) -> tuple[Trajectory, Any]:
-    """The motions of B members, and what was noted on the way: `Crossings`, or a dict of them, None without sections.
+    """The motions of B members and their crossings: `Crossings`, or a dict of them, None without sections.
 
     `values` are q0, qdot0 and params by name, and `axes` their `batch_axes` of `simulate_batch`. Every leaf of the
     crossings has the members in front.
@@ -422,18 +422,18 @@ def run_batch(
         return simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings), None
     of_leaves, size = axes_per_leaf(values, axes)
     batch = Batch.of(system, values, of_leaves, size, ts, settings["rtol"], settings["atol"], settings["max_steps"])
-    solution, noted = _along(batch, sections)
+    solution, noted = _follow_crossings(batch, sections)
     if len(ts) == 2 and not has_constraints(system):
         params = as_arrays(params, batch.member.layout.dtype)
-        run = trajectory_of(batch.member, MachineCode(), _with_ends(solution, batch), batch.y0, params, axes[2])
+        run = trajectory_of(batch.member, MachineCode(), _with_ends_as_path(solution, batch), batch.y0, params, axes[2])
     else:
         run = simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings)
-        noted = _of_those_that_start(noted, np.asarray(run.result._value) != _INCONSISTENT)
+        noted = _drop_inconsistent(noted, np.asarray(run.result._value) != _INCONSISTENT)
     ok = (solution.result == SUCCESSFUL) & (noted.count <= sections.count)
     return run, as_crossings(batch.member.layout, sections.names, noted, ok)
 
 
-def _along(batch: Batch, sections: Sections) -> tuple[Solution, Noted]:
+def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted]:
     """The motions from the first to the last time, and the crossings of G sections, each with that axis in front."""
     section = dict(sections.by_name()) if sections.names else sections.functions[0]
     surfaces = surfaces_in(batch.member, sections_of(section)[1], sections.directions, sections.names)
@@ -446,14 +446,14 @@ def _along(batch: Batch, sections: Sections) -> tuple[Solution, Noted]:
     return solution, Noted(rows[:, :, :-1, 0], rows[:, :, :-1, 1:], rows[:, :, -1, 0])
 
 
-def _with_ends(solution: Solution, batch: Batch) -> Solution:
+def _with_ends_as_path(solution: Solution, batch: Batch) -> Solution:
     """The solution with the states at the first and the last time, NaN where that was not reached, as its path."""
     reached = (solution.result == SUCCESSFUL)[:, None]
     path = np.stack([np.asarray(batch.y0), np.where(reached, solution.y_end, np.nan)], axis=1)
     return solution._replace(path=path)
 
 
-def _of_those_that_start(noted: Noted, starts: np.ndarray) -> Noted:
-    """The same without the crossings of members that are not on their constraints, and were not to be followed."""
+def _drop_inconsistent(noted: Noted, starts: np.ndarray) -> Noted:
+    """The crossings without those of members that do not start on their constraints and are not followed."""
     t, y = np.where(starts[:, None], noted.t, np.nan), np.where(starts[:, None, None], noted.y, np.nan)
     return Noted(t, y, np.where(starts, noted.count, 0))

@@ -7,7 +7,7 @@ member of the other store that is done. In a unit of the new store the known mem
 along each axis. Units of which all are known are written at once; of the others the known members stand aside, until
 their unit is computed.
 
-**A later end**: what is kept of a motion does not tell how it continues; its last state does, where `keep` returns
+**A later end**: the kept values do not determine how a motion continues; its last state does, where `keep` returns
 `trajectory.end` by some name. The new store has the same members, and output times that begin at the last one of the
 other.
 """
@@ -29,7 +29,7 @@ from lagjax._layout import Layout
 from lagjax._results import ENDED_WELL, RESULTS, code_of
 from lagjax._sweep import _batch
 from lagjax._sweep._batch import Kept, batches_of, label, names_of, quantities_of
-from lagjax._sweep._description import MOTION, Description, Left, difference, packed, texts, users_path
+from lagjax._sweep._description import MOTION, Description, FinalStates, difference, packed, texts, users_path
 from lagjax._sweep._job import Job, cpu, goes_on_from, in_doubles, require_versions, states, versions
 from lagjax._sweep._members import RESERVED, Axis, Grid, in_words, points_of
 from lagjax._sweep._store import FORMAT, KNOWN, NOT_DONE, RESULT, Quantity, Store, arrays_as_bytes
@@ -45,14 +45,14 @@ def first_look(description: Description, points: dict[str, np.ndarray]) -> tuple
     """The kept values of a few members, the seconds that one of them takes, and whether the energy is constant."""
     conserves = _conserves(description, points)
     batches = batches_of(description, conserves)
-    points = _some(points, UNIT_BYTES // max(1, batches.bytes_of_one(points)))
+    points = _thin(points, UNIT_BYTES // max(1, batches.bytes_of_one(points)))
     batches(points)  # which compiles
     began = time.perf_counter()
     kept = batches(points)
     return kept, (time.perf_counter() - began) / len(kept.result), conserves
 
 
-def _some(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
+def _thin(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
     """At most this many of these points, one at least."""
     count = len(next(iter(points.values())))
     return {name: x[:: -(-count // max(1, most))] for name, x in points.items()}
@@ -71,8 +71,8 @@ def begin(
 ) -> None:
     """Make the store, after a look at what a few members take and keep, with the members that `extend` knows."""
     scene = packed(description)
-    points, shape = _few(axes, description), tuple(axis.size for axis in axes)
-    points = _some(points, _room(description, points))
+    points, shape = _sample_points(axes, description), tuple(axis.size for axis in axes)
+    points = _thin(points, _members_in_memory(description, points))
     kept, seconds, conserves = look(description, points)
     quantities = quantities_of(kept)
     _require_names(quantities, axes, description.reduce)
@@ -94,11 +94,11 @@ def begin(
     with store.made_aside() as new:
         new.create(spec, scene, axes, title, {NOT_DONE: "not_done"} | {code: label(code) for code in codes})
         if extend is not None:
-            carry(extend, new)
+            copy_members(extend, new)
 
 
-def _few(axes: tuple[Axis, ...], description: Description) -> dict[str, np.ndarray]:
-    """Points of some thousand members, evenly spread over the grid; of designs, and of what goes on, the first ones."""
+def _sample_points(axes: tuple[Axis, ...], description: Description) -> dict[str, np.ndarray]:
+    """Points of some thousand members: evenly spread over the grid; the first ones of designs and continued motions."""
     sides, shape = [], []
     for axis in axes:
         _, values = next(axis.pieces())
@@ -121,7 +121,7 @@ def _conserves(description: Description, points: dict[str, np.ndarray]) -> bool:
 
 
 def _unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantities: list[Quantity]) -> int:
-    """The members of a unit: what is asked for, or as many as take `SECONDS`, few enough to be held in memory."""
+    """The members of a unit: the number given, or as many as take `SECONDS` and fit into `UNIT_BYTES`."""
     if unit is not None:
         if isinstance(unit, bool) or not isinstance(unit, int | np.integer) or unit < 1:
             raise ValueError(f"unit must be a positive whole number of members; got {unit!r}.")
@@ -135,10 +135,10 @@ def _unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantit
 def _batch_size(description: Description, points: dict[str, np.ndarray], kept: Kept) -> int:
     """The most members of a batch: their paths take at most `PATH_BYTES`."""
     most = _batch.MOST if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
-    return max(1, min(most, _room(description, points)))
+    return max(1, min(most, _members_in_memory(description, points)))
 
 
-def _room(description: Description, points: dict[str, np.ndarray]) -> int:
+def _members_in_memory(description: Description, points: dict[str, np.ndarray]) -> int:
     """The members whose paths, and what is noted on the way, take `PATH_BYTES`; none where one takes more."""
     q, qdot, _ = description.start({name: x[0] for name, x in points.items()})
     states = 2 * Layout.of(q, qdot).size
@@ -223,17 +223,17 @@ def require_extensible(old: Store, spec: dict, now: dict) -> None:
         later = ""
         if spec["ts"] != now["ts"]:
             later = (
-                "\nWhat is kept of a motion does not tell how it goes on. For a later end give ts that begin at "
+                "\nThe kept values do not determine how a motion continues. For a later end give ts that begin at "
                 f"{spec['ts']['ends'][1]:g}, where the motions of that store end; else leave extend= away."
             )
         raise ValueError(f"{old.path} has members of another description. What differs:\n" + "\n".join(lines) + later)
 
 
-def carry(old: Store, new: Store) -> int:
-    """Take what is known from `old` into `new`, of which nothing is done yet; how many members that is."""
+def copy_members(old: Store, new: Store) -> int:
+    """Copy the members that `old` has into `new`, of which nothing is done yet; return their number."""
     before, spec, total = old.spec(), new.spec(), 0
     (new.job / KNOWN).mkdir(exist_ok=True)
-    grid, places = new.grid(spec), list(map(partial(_places, old, new), before["axes"], spec["axes"]))
+    grid, places = new.grid(spec), list(map(partial(_matching_places, old, new), before["axes"], spec["axes"]))
     if not all(place.common for place in places):
         warnings.warn(
             f"{old.path} has no member that is also in `over`, so that all are computed: compare the values of its "
@@ -246,21 +246,21 @@ def carry(old: Store, new: Store) -> int:
         inside = [np.flatnonzero(x >= 0) for x in box]
         if not all(len(x) for x in inside):
             continue
-        found = _read(old, before, [x[i] for x, i in zip(box, inside, strict=True)])
+        found = _read_members(old, before, [x[i] for x, i in zip(box, inside, strict=True)])
         which = np.ravel_multi_index(np.ix_(*inside), grid.box_shape(unit)).ravel()
         done = found[RESULT.name] >= 0
         which, found = which[done], {name: x[done] for name, x in found.items()}
         total += len(which)
         if len(which) == grid.size(unit):
-            new.coordinates(spec["axes"], grid.box(unit))  # which nobody else would write
-            new.write_unit(spec, unit, found, _record(grid, unit, found[RESULT.name], spec), b"")
+            new.coordinates(spec["axes"], grid.box(unit))  # which no worker of this unit would write
+            new.write_unit(spec, unit, found, _record_of_known(grid, unit, found[RESULT.name], spec), b"")
         elif len(which):
             data = arrays_as_bytes({"which": which, **{f"of {name}": x for name, x in found.items()}})
             new.write(new.job / KNOWN / f"{unit}.npz", data, f"{unit}-known")
     return total
 
 
-class _Places(NamedTuple):
+class _MatchingPlaces(NamedTuple):
     """For places along an axis of the new store those in the old one with the same values; −1 where there is none.
 
     `known` (size,) lists them; None where both have one rule, by which the first `common` ones are the same.
@@ -276,18 +276,18 @@ class _Places(NamedTuple):
         return np.where(numbers < self.common, numbers, -1)
 
 
-def _places(old: Store, new: Store, of_old: dict, of_new: dict) -> _Places:
+def _matching_places(old: Store, new: Store, of_old: dict, of_new: dict) -> _MatchingPlaces:
     rules = [{name: x for name, x in axis.items() if name != "size"} for axis in (of_old, of_new)]
     if rules[0] == rules[1] and of_old["rule"] in GROWING:
-        return _Places(min(of_old["size"], of_new["size"]), None)
+        return _MatchingPlaces(min(of_old["size"], of_new["size"]), None)
     sides = [s.coordinates([axis], (slice(0, axis["size"]),))[0] for s, axis in ((old, of_old), (new, of_new))]
     before, now = (np.stack([side[name] for name in of_new["names"]], axis=1) for side in sides)
     known = {row.tobytes(): k for k, row in enumerate(before)}
     found = np.array([known.get(row.tobytes(), -1) for row in now])
-    return _Places(int(np.sum(found >= 0)), found)
+    return _MatchingPlaces(int(np.sum(found >= 0)), found)
 
 
-def _read(old: Store, spec: dict, places: list[np.ndarray]) -> dict[str, np.ndarray]:
+def _read_members(old: Store, spec: dict, places: list[np.ndarray]) -> dict[str, np.ndarray]:
     """The stored values of a product of members, (members, …) by name."""
     runs = [slice(int(x[0]), int(x[-1]) + 1) if np.all(np.diff(x) == 1) else x for x in places]  # read as they lie
     found = {}
@@ -297,7 +297,7 @@ def _read(old: Store, spec: dict, places: list[np.ndarray]) -> dict[str, np.ndar
     return found
 
 
-def _record(grid: Grid, unit: int, result: np.ndarray, spec: dict) -> dict:
+def _record_of_known(grid: Grid, unit: int, result: np.ndarray, spec: dict) -> dict:
     codes, counts = np.unique(result, return_counts=True)
     failed = np.flatnonzero(~np.isin(result, ENDED_WELL))[:100]
     numbers = grid.numbers(unit, failed)
@@ -311,12 +311,12 @@ def _record(grid: Grid, unit: int, result: np.ndarray, spec: dict) -> dict:
 # ---- a later end -----------------------------------------------------------------------------------------------------
 
 
-def goes_on(other: Store, description: Description) -> bool:
+def continues(other: Store, description: Description) -> bool:
     """True if the output times of these motions begin at the last one of a store."""
     return float(description.ts[0]) == other.spec()["ts"]["ends"][1]
 
 
-def left_in(other: Store, axes: tuple[Axis, ...], description: Description) -> Left:
+def final_states_of(other: Store, axes: tuple[Axis, ...], description: Description) -> FinalStates:
     """The ends of the motions. Raises `ValueError` for other ones, and where not all ends are there."""
     spec = other.spec()
     require_versions(other, spec)
@@ -332,18 +332,19 @@ def left_in(other: Store, axes: tuple[Axis, ...], description: Description) -> L
         lines.append(change)
     if lines:
         raise ValueError(
-            f"{other.path} has motions of another description, which cannot go on. What differs:\n" + "\n".join(lines)
+            f"{other.path} has motions of another description, which cannot continue. What differs:\n"
+            + "\n".join(lines)
         )
     if left := other.grid(spec).units - len(other.done()):
-        raise ValueError(f"{other.path}: {left} units are not done; motions can go on when they are.")
+        raise ValueError(f"{other.path}: {left} units are not done; motions can continue when they are.")
     q, qdot, _ = description.shapes(names)
     shapes = {x.name: x.shape for x in other.quantities(spec)}
     for prefix in (name.removesuffix(".t") for name in shapes if name.endswith(".t")):
         end = names_of({prefix: State(jnp.zeros(()), q, qdot)})[prefix]
         wanted = zip(jax.tree.leaves((end.q, end.qdot)), jax.tree.leaves((q, qdot)), strict=True)
         if all(shapes.get(name) == jnp.shape(x) for name, x in wanted):
-            return Left(str(other.path), end.q, end.qdot)
+            return FinalStates(str(other.path), end.q, end.qdot)
     raise ValueError(
-        f"{other.path} does not have the states in which its motions ended, from which they could go on: let keep "
+        f"{other.path} does not have the states in which its motions ended, from which they could continue: let keep "
         "return them, as in {'end': trajectory.end, …}."
     )

@@ -98,8 +98,8 @@ def _parameters(keep: Callable) -> list[str]:
         return []
 
 
-class Left(NamedTuple):
-    """The store of motions that go on: the path of the store, and its names of the leaves of q and q̇ at the end."""
+class FinalStates(NamedTuple):
+    """The states from which motions continue: the path of their store, and its names of the leaves of q and q̇."""
 
     path: str
     q: PyTree
@@ -126,8 +126,8 @@ class Description:
     keep: Callable
     reduce: dict[str, Statistics]
     settings: dict[str, Any]  # of `simulate_batch`: rtol, atol, max_steps, event, solver
-    sections: Sections | None = None  # of which keep is told the crossings
-    left: Left | None = None  # where they go on from, instead of q0 and qdot0
+    sections: Sections | None = None  # whose crossings keep gets
+    left: FinalStates | None = None  # the states from which they continue, instead of q0 and qdot0
 
     def start(self, point: dict[str, Any]) -> tuple[PyTree, PyTree, PyTree]:
         """(q0, qdot0, params) of the member at a point. Raises `ValueError` where they ask it for another name."""
@@ -276,7 +276,7 @@ class _Unpickler(pickle.Unpickler):
 
 _MOVED = {
     ("lagjax._sweep._scene", "Motions"): (__name__, "Description"),
-    ("lagjax._sweep._scene", "Left"): (__name__, "Left"),
+    ("lagjax._sweep._scene", "Left"): (__name__, "FinalStates"),
     ("lagjax._sweep._sections", "Sections"): (__name__, "Sections"),
 }
 

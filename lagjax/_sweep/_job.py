@@ -27,7 +27,7 @@ from llvmlite import binding as llvm
 
 from lagjax._results import ENDED_WELL, SUCCESSFUL
 from lagjax._sweep._batch import CRASHED, KEEP_FAILED, Batches, Kept, batches_of, label
-from lagjax._sweep._description import Description, Left, difference, texts, unpacked
+from lagjax._sweep._description import Description, FinalStates, difference, texts, unpacked
 from lagjax._sweep._members import Grid, points_of
 from lagjax._sweep._statistics import partial_of, to_bytes
 from lagjax._sweep._store import RESULT, Store
@@ -48,8 +48,8 @@ class Job:
         """The job of a store whose functions are at hand."""
         if spec.get("cpu", cpu()) != cpu():
             warnings.warn(
-                f"{store.path} was begun on a CPU of the kind {spec['cpu']}, and goes on here on {cpu()}: members that "
-                "are computed here may differ from what that one would give, as by a change of rounding.",
+                f"{store.path} was begun on a CPU of the kind {spec['cpu']}, and continues here on {cpu()}: members "
+                "that are computed here may differ from those of that one, as by a change of rounding.",
                 stacklevel=4,
             )
         batches = batches_of(description, spec["conserves"])
@@ -72,32 +72,32 @@ def in_doubles() -> bool:
 
 @contextmanager
 def precision(doubles: bool) -> Iterator[None]:
-    """With numbers of the precision that the store was begun with, in this thread and in those of XLA.
+    """Compute in the precision of the store, in this thread and in those of XLA.
 
     XLA calls callbacks of `keep` from threads of its own, which see the setting of the process alone: that is changed
     for so long, where it is another one. Of several stores in one process the first to come decides on it.
     """
-    with _sharing:
-        if not _inside:
-            _before.append(_of_process())
-            _set_of_process(doubles)
-        _inside.append(doubles)
+    with _precision_lock:
+        if not _active_precisions:
+            _process_precision.append(_doubles_in_process())
+            _set_doubles_in_process(doubles)
+        _active_precisions.append(doubles)
     try:
         with jax.enable_x64(doubles):
             yield
     finally:
-        with _sharing:
-            _inside.remove(doubles)
-            if not _inside:
-                _set_of_process(_before.pop())
+        with _precision_lock:
+            _active_precisions.remove(doubles)
+            if not _active_precisions:
+                _set_doubles_in_process(_process_precision.pop())
 
 
-_sharing = threading.Lock()
-_inside: list[bool] = []  # the precisions of all who are inside
-_before: list[bool] = []  # that of the process before the first one came, while somebody is inside
+_precision_lock = threading.Lock()
+_active_precisions: list[bool] = []  # the precisions of all who are inside
+_process_precision: list[bool] = []  # that of the process before the first one came, while somebody is inside
 
 
-def _of_process() -> bool:
+def _doubles_in_process() -> bool:
     """True if this process computes in doubles, whatever this thread has chosen: as a thread sees it that has not."""
     seen: list[bool] = []
     thread = threading.Thread(target=lambda: seen.append(in_doubles()))
@@ -106,8 +106,8 @@ def _of_process() -> bool:
     return seen[0]
 
 
-def _set_of_process(doubles: bool) -> None:
-    if _of_process() != doubles:
+def _set_doubles_in_process(doubles: bool) -> None:
+    if _doubles_in_process() != doubles:
         jax.config.update("jax_enable_x64", doubles)
 
 
@@ -116,7 +116,7 @@ def goes_on_from(description: Description, store: Store) -> str | None:
     return None if description.left is None else os.path.relpath(description.left.path, store.path.parent)
 
 
-def _left_here(description: Description, store: Store, path: str | None) -> Description:
+def _relocated(description: Description, store: Store, path: str | None) -> Description:
     """The motions of a store, left where `path` leads from its folder. Raises `FileNotFoundError` if that is gone."""
     if description.left is None or path is None:
         return description
@@ -140,7 +140,7 @@ def _opened(path: str, content: str) -> Job:
     spec = store.spec()
     require_versions(store, spec)
     with precision(bool(spec["x64"])):
-        description = _left_here(unpacked(store.scene(), spec["path"]), store, spec["goes_on_from"])
+        description = _relocated(unpacked(store.scene(), spec["path"]), store, spec["goes_on_from"])
         names = [name for axis in spec["axes"] for name in axis["names"]]
         if change := difference(spec["scene"], texts(description, names)):
             raise ValueError(f"{store.path}: the scene is not here what it was when the store was begun.\n{change}")
@@ -173,7 +173,7 @@ def require_versions(store: Store, spec: dict) -> None:
     if other:
         raise ValueError(
             f"{store.path} was begun with {'; '.join(other)}: its numbers would not be of one program. Install that "
-            "version to go on, or begin another store. What is there can be read."
+            "version to continue, or begin another store. The finished members can be read."
         )
 
 
@@ -203,7 +203,7 @@ def parts(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
 
 
 def starts(job: Job, unit: int) -> tuple[Callable[[np.ndarray], dict[str, np.ndarray]], np.ndarray]:
-    """The points of some members of a unit, as a function; and the ends of all of them before, where they go on."""
+    """The points of some members of a unit, as a function; and the earlier results of all, of motions that continue."""
     box, shape = job.grid.box(unit), job.grid.box_shape(unit)
     axes, more, before = job.store.coordinates(job.spec["axes"], box), {}, np.full(job.grid.size(unit), SUCCESSFUL)
     if job.description.left is not None:
@@ -211,12 +211,12 @@ def starts(job: Job, unit: int) -> tuple[Callable[[np.ndarray], dict[str, np.nda
     return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in more.items()}, before
 
 
-def _nobody(batch: int) -> None:
+def _ignore(batch: int) -> None:
     pass
 
 
 def compute(
-    job: Job, unit: int, crashed: Mapping[int, str] = MappingProxyType({}), tell: Callable[[int], None] = _nobody
+    job: Job, unit: int, crashed: Mapping[int, str] = MappingProxyType({}), notify: Callable[[int], None] = _ignore
 ) -> Unit:
     """Compute a unit without members that are known to end their process, and how; `tell(k)` before the k-th batch."""
     began, spent = time.monotonic(), time.process_time()
@@ -227,8 +227,8 @@ def compute(
     for name, x in of_known.items():
         values[name][known] = x
     for k, (which, count) in enumerate(parts(job, unit)):
-        tell(k)
-        kept, own = job.batches(points(_without(which, crashed))), which[:count]
+        notify(k)
+        kept, own = job.batches(points(_replace_crashed(which, crashed))), which[:count]
         job.require_engine(kept)
         for name, x in {**kept.values, RESULT.name: kept.result}.items():
             values[name][own] = x[:count]
@@ -236,24 +236,24 @@ def compute(
             drifts[own] = kept.drift[:count]
         complaints |= {int(own[j]): text for j, text in kept.complaints.items() if j < count}
     ended = np.flatnonzero(before != SUCCESSFUL)  # before these motions began
-    _blank(job, values, drifts, ended, before[ended])
-    _blank(job, values, drifts, list(crashed), CRASHED)
+    _clear_members(job, values, drifts, ended, before[ended])
+    _clear_members(job, values, drifts, list(crashed), CRASHED)
     complaints |= crashed
     record = _record(job, unit, values[RESULT.name], drifts, complaints)
     record |= {"seconds": time.monotonic() - began, "cpu_seconds": time.process_time() - spent}
     return Unit(values, record, _statistics(job, unit, values))
 
 
-def _without(which: np.ndarray, crashed: Mapping[int, str]) -> np.ndarray:
-    """Members of a batch with another one of them in the place of those that `crashed`."""
+def _replace_crashed(which: np.ndarray, crashed: Mapping[int, str]) -> np.ndarray:
+    """The members of a batch; a healthy one replaces each of those that `crashed`."""
     bad = np.isin(which, list(crashed))
     if bad.all():
         raise ValueError("All members of a batch end their process: look at one of them alone, with `simulate`.")
     return np.where(bad, which[~bad][0], which)
 
 
-def _blank(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, which, result) -> None:
-    """Members of which nothing is known but their results."""
+def _clear_members(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, which, result) -> None:
+    """Set members, of which only the results are known, to the filling."""
     for q in job.batches.quantities:
         values[q.name][which] = q.nothing
     values[RESULT.name][which], drifts[which] = result, np.nan
@@ -290,10 +290,10 @@ def _statistics(job: Job, unit: int, values: dict[str, np.ndarray]) -> bytes:
     return to_bytes({name: partial_of(how, values[name], ok, numbers) for name, how in job.description.reduce.items()})
 
 
-def states(left: Left, box: tuple[slice, ...]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Of the members of a box, (m, …) by name, the states to go on from, and how they ended (m,).
+def states(left: FinalStates, box: tuple[slice, ...]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The states (m, …) by name from which the members of a box continue, and their results (m,) before.
 
-    The states of members that came to no end, or to one of their own by an event, are NaN: they do not go on.
+    States of members that failed or were ended by an event are NaN: they do not continue.
     """
     store = Store(Path(left.path))
 

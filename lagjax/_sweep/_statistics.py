@@ -1,4 +1,4 @@
-"""`Statistics`: what is said of a quantity over all members, without a list of them.
+"""`Statistics`: moments, extremes, histograms and quantiles of a quantity over all members, without a list of them.
 
 Each unit has one `Partial`, which stands in the store; they are merged in the order of the units, so that the bits of
 the result do not depend on who computed what, and when. Counts, histograms and quantiles are whole numbers; mean and
@@ -82,7 +82,7 @@ class Summary(NamedTuple):
     - `mean`, `variance`: of what entered, the variance with n − 1.
     - `min`, `max`, and `min_member`, `max_member`: the numbers of the members that have them, −1 without any.
     - `histogram` (…, B), `outside` (…, 2): counts, and those below and above; None without edges.
-    - `quantiles` (…, Q): of the levels that were asked for; None without.
+    - `quantiles` (…, Q): at the given levels; None without levels.
     """
 
     count: np.ndarray

@@ -1,4 +1,4 @@
-"""`Status`: how far a sweep has come, read from the store by anybody at any time."""
+"""`Status`: the progress of a sweep, read from its store at any time by any process."""
 
 import sys
 import time
@@ -12,7 +12,7 @@ from lagjax._sweep._store import Store
 from lagjax._sweep._workers import claimed
 
 WELL = ("successful", "event_occurred")
-_RECENT = 32  # units from which the rate is told
+_RECENT = 32  # units whose times give the rate
 _NAMED = 5  # failures that are printed
 _LISTED = 100  # failures that are listed; the array `result` has all
 
@@ -55,7 +55,7 @@ class Status(NamedTuple):
     drift: tuple[float, int, dict[str, float]] | None
     slow: dict[str, str]
     cpus: tuple[str, ...] = ()
-    damaged: dict[int, str] = {}  # noqa: RUF012  (a field of a NamedTuple, and nobody writes to it)
+    damaged: dict[int, str] = {}  # noqa: RUF012  (a field of a NamedTuple, never written to)
 
     _repr_pretty_ = as_printed
 

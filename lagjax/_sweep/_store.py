@@ -33,11 +33,11 @@ from lagjax._sweep._members import Axis, Grid
 from lagjax.designs import Design
 
 FORMAT = 3
-_FORMATS = (2, 3)  # that can be gone on with; chunks of format 2 have no checksum
+_FORMATS = (2, 3)  # that can be continued; chunks of format 2 have no checksum
 _CHECKSUM = 4  # bytes of it, at the end of a chunk
 JOB = ".sweep"
 KNOWN = "known"  # the folder of members that were taken from another store
-_LEFT = 3600.0  # seconds after which a file that nobody has touched is of a dead worker; those who live beat
+_LEFT = 3600.0  # seconds without a change after which a file belongs to a dead worker; a live one beats
 _ABANDONED = 86_400.0  # seconds after which a store that was never made ready is removed; to make one takes minutes
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM)
@@ -102,7 +102,7 @@ class Store:
             raise ValueError(
                 f"{self.path} is a store of format {spec.get('format')}, written by lagjax "
                 f"{spec.get('versions', {}).get('lagjax')}; this lagjax writes format {FORMAT}. xarray can read it as "
-                "it is; to go on with it, use that version."
+                "it is; to continue it, use that version."
             )
         return spec
 
@@ -178,11 +178,11 @@ class Store:
         for axis, part in zip(axes, box, strict=True):
             if _is_drawn_late(axis["rule"], axis["size"]):
                 for k in range(part.start // designs.SLICE, (part.stop - 1) // designs.SLICE + 1):
-                    self._draw(axis, k)
+                    self._write_coordinates(axis, k)
             sides.append({name: np.asarray(self.array(name)[part]) for name in axis["names"]})
         return sides
 
-    def _draw(self, axis: dict, k: int) -> None:
+    def _write_coordinates(self, axis: dict, k: int) -> None:
         """Write chunk k of the coordinates of a design, where it is not there; whoever does writes the same."""
         files = [self.path / name / "c" / str(k) for name in axis["names"]]
         if all(file.exists() for file in files):
