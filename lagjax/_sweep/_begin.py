@@ -26,11 +26,11 @@ import numpy as np
 
 from lagjax._hybrid import Hybrid
 from lagjax._layout import Layout
-from lagjax._results import ENDED_WELL, RESULTS, code_of
+from lagjax._results import RESULTS, code_of
 from lagjax._sweep import _batch
 from lagjax._sweep._batch import Kept, batches_of, label, names_of, quantities_of
 from lagjax._sweep._description import MOTION, Description, FinalStates, difference, packed, texts, users_path
-from lagjax._sweep._job import Job, cpu, goes_on_from, in_doubles, require_versions, states, versions
+from lagjax._sweep._job import Job, cpu, goes_on_from, in_doubles, record_of, require_versions, states, versions
 from lagjax._sweep._members import RESERVED, Axis, Grid, in_words, points_of
 from lagjax._sweep._store import FORMAT, KNOWN, NOT_DONE, RESULT, Quantity, Store, arrays_as_bytes
 from lagjax._trajectory import State
@@ -253,7 +253,8 @@ def copy_members(old: Store, new: Store) -> int:
         total += len(which)
         if len(which) == grid.size(unit):
             new.coordinates(spec["axes"], grid.box(unit))  # which no worker of this unit would write
-            new.write_unit(spec, unit, found, _record_of_known(grid, unit, found[RESULT.name], spec), b"")
+            record = record_of(grid, unit, found[RESULT.name], spec["engine"]) | {"seconds": 0.0, "cpu_seconds": 0.0}
+            new.write_unit(spec, unit, found, record, b"")
         elif len(which):
             data = arrays_as_bytes({"which": which, **{f"of {name}": x for name, x in found.items()}})
             new.write(new.job / KNOWN / f"{unit}.npz", data, f"{unit}-known")
@@ -295,17 +296,6 @@ def _read_members(old: Store, spec: dict, places: list[np.ndarray]) -> dict[str,
         values = np.asarray(old.array(q.name).oindex[(*runs, *(slice(None) for _ in q.shape))])
         found[q.name] = values.reshape(-1, *q.shape)
     return found
-
-
-def _record_of_known(grid: Grid, unit: int, result: np.ndarray, spec: dict) -> dict:
-    codes, counts = np.unique(result, return_counts=True)
-    failed = np.flatnonzero(~np.isin(result, ENDED_WELL))[:100]
-    numbers = grid.numbers(unit, failed)
-    return {
-        "unit": unit, "members": len(result), "engine": spec["engine"], "slow": {}, "seconds": 0.0, "cpu_seconds": 0.0,
-        "results": {label(int(code)): int(count) for code, count in zip(codes, counts, strict=True)},
-        "failed": [[int(k), label(int(result[j])), ""] for j, k in zip(failed, numbers, strict=True)],
-    }  # fmt: skip
 
 
 # ---- a later end -----------------------------------------------------------------------------------------------------

@@ -179,6 +179,7 @@ def require_versions(store: Store, spec: dict) -> None:
 
 # ---- a unit ----------------------------------------------------------------------------------------------------------
 
+NONE: Mapping[int, str] = MappingProxyType({})
 _NAMED = 100  # failures of a unit that are named in its record; the array `result` has them all
 
 
@@ -215,9 +216,7 @@ def _ignore(batch: int) -> None:
     pass
 
 
-def compute(
-    job: Job, unit: int, crashed: Mapping[int, str] = MappingProxyType({}), notify: Callable[[int], None] = _ignore
-) -> Unit:
+def compute(job: Job, unit: int, crashed: Mapping[int, str] = NONE, notify: Callable[[int], None] = _ignore) -> Unit:
     """Compute a unit without members that are known to end their process, and how; `tell(k)` before the k-th batch."""
     began, spent = time.monotonic(), time.process_time()
     size, (points, before) = job.grid.size(unit), starts(job, unit)
@@ -239,7 +238,11 @@ def compute(
     _clear_members(job, values, drifts, ended, before[ended])
     _clear_members(job, values, drifts, list(crashed), CRASHED)
     complaints |= crashed
-    record = _record(job, unit, values[RESULT.name], drifts, complaints)
+    result = values[RESULT.name]
+    record = record_of(job.grid, unit, result, job.spec["engine"], complaints) | _largest_drift(
+        job, unit, result, drifts
+    )
+    record |= {"cpu": cpu(), "slow": job.batches.slow}
     record |= {"seconds": time.monotonic() - began, "cpu_seconds": time.process_time() - spent}
     return Unit(values, record, _statistics(job, unit, values))
 
@@ -259,27 +262,29 @@ def _clear_members(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, 
     values[RESULT.name][which], drifts[which] = result, np.nan
 
 
-def _record(job: Job, unit: int, result: np.ndarray, drifts: np.ndarray, complaints: dict[int, str]) -> dict:
-    """The notes on a unit: how members ended, the largest change of energy, and what failed."""
-    counts = np.bincount(result)
-    record = {
+def record_of(grid: Grid, unit: int, result: np.ndarray, engine: str, complaints: Mapping[int, str] = NONE) -> dict:
+    """The record of a unit: its `result`s (m,) counted by name, and the first members that failed, with complaints."""
+    counts, failed = np.bincount(result), np.flatnonzero(~np.isin(result, ENDED_WELL))[:_NAMED]
+    return {
         "unit": unit,
         "members": len(result),
-        "engine": job.spec["engine"],
-        "cpu": cpu(),
-        "slow": job.batches.slow,
+        "engine": engine,
+        "slow": {},
+        "results": {label(int(code)): int(counts[code]) for code in np.flatnonzero(counts)},
+        "failed": [
+            [int(number), label(int(result[j])), complaints.get(int(j), "")]
+            for j, number in zip(failed, grid.numbers(unit, failed), strict=True)
+        ],
     }
-    record["results"] = {label(int(code)): int(counts[code]) for code in np.flatnonzero(counts)}
-    failed = np.flatnonzero(~np.isin(result, ENDED_WELL))[:_NAMED]
-    record["failed"] = [
-        [int(number), label(int(result[j])), complaints.get(int(j), "")]
-        for j, number in zip(failed, job.grid.numbers(unit, failed), strict=True)
-    ]
+
+
+def _largest_drift(job: Job, unit: int, result: np.ndarray, drifts: np.ndarray) -> dict:
+    """The entry "drift" of a record: the largest change of energy and its member; none where no energy is known."""
     drifts = np.where(np.isin(result, (*ENDED_WELL, KEEP_FAILED)), drifts, np.nan)
-    if np.isfinite(drifts).any():
-        worst = int(np.nanargmax(drifts))
-        record["drift"] = [float(drifts[worst]), int(job.grid.numbers(unit, np.array([worst]))[0])]
-    return record
+    if not np.isfinite(drifts).any():
+        return {}
+    worst = int(np.nanargmax(drifts))
+    return {"drift": [float(drifts[worst]), int(job.grid.numbers(unit, np.array([worst]))[0])]}
 
 
 def _statistics(job: Job, unit: int, values: dict[str, np.ndarray]) -> bytes:

@@ -239,8 +239,7 @@ def run_unit(path: str, unit: int) -> bool:
         if unit in job.store.done() or not worker.claim(unit):
             return False
         with precision(bool(job.spec["x64"])):
-            job.store.write_unit(job.spec, unit, *compute(job, unit))
-        worker.release(unit)
+            _write(job, worker, lambda: None, unit, compute(job, unit))
     return True
 
 
