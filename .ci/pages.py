@@ -123,10 +123,10 @@ def on_config(config):
     config.nav = [
         {"lagjax": "index.md"},
         {"Guide": [{page.stem: _on_the_site(page).as_posix()} for page in guide()]},
-        {"Method and figures": [f"{name}.md" for name in ("method", "benchmarks", "problems", "development")]},
+        {"Method and figures": [f"{name}.md" for name in ("method", "benchmarks", "problems")]},
         {"Reference": [{"By purpose": "reference.md"}, *_reference()]},
         {"Examples": [{path.stem.replace("_", " "): f"{path.stem}.md"} for path in examples()]},
-        {"Project": [{"Contributing": "CONTRIBUTING.md"}, {"Changes": "CHANGELOG.md"}]},
+        {"Project": ["development.md", {"Contributing": "CONTRIBUTING.md"}, {"Changes": "CHANGELOG.md"}, "release.md"]},
     ]
     return config
 
