@@ -130,7 +130,9 @@ FAMILIES = {  # functions of two doubles and an integer; exact ones, and those o
     "of the library's": lambda a, b, n: (jax.nn.sigmoid(a), lax.rsqrt(a)),
     "circular": lambda a, b, n: (jnp.sin(a), jnp.cos(a), jnp.sin(b), jnp.cos(a + b)),
     "constants": lambda a, b, n: (1.5, True, a),
-    "weights": lambda a, b, n: xp.stacked([xp.binade(a), xp.binade(b)]),  # a formula: it comes from no primitive
+    "weights": lambda a, b, n: xp.stacked(  # a formula: these come from no primitive
+        [xp.binade(a), xp.binade(b), xp.where(xp.prefers(a, b), a, b)]
+    ),
 }  # fmt: skip
 SPECIAL = [0.0, -0.0, 1.0, -1.0, 0.5, 2.5, -2.5, np.inf, -np.inf, np.nan, 1e-310]
 
