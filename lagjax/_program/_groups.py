@@ -16,6 +16,7 @@ from lagjax._program._operations import LOOK_UPS, OPERATIONS, in_numpy
 _LEAST, _FEWER = 2000, 20
 # States beyond which the values of single nodes are arrays that are long enough.
 MOST_STATES = 256
+_NONE = np.empty(0, np.intp), np.empty(0, np.intp)
 # Numbers that are held at a time, 16 MB: more states are taken in parts.
 MOST_HELD = 2**21
 
@@ -72,11 +73,11 @@ class Groups(NamedTuple):
 
     def transposed(self, values: dict[str, np.ndarray], cotangents: Sequence) -> Iterator[tuple[int, np.ndarray]]:
         """The positions of the inputs to which something flows from the outputs, each with what does, (S,)."""
-        flows, still = np.zeros((2, self.counts["float"]), bool)
+        flows, still = np.zeros((2, self.counts.get("float", 0)), bool)
         found = np.zeros_like(values["float"])
         if "float" in self.constants:  # nothing flows on from these
             still[self.constants["float"][0]] = True
-        rows, positions = self.outputs["float"]
+        rows, positions = self.outputs.get("float", _NONE)
         moving = ~still[rows]
         for row, position in zip(rows[moving].tolist(), positions[moving].tolist(), strict=True):
             if cotangents[position] is not None:
@@ -98,7 +99,8 @@ class Groups(NamedTuple):
                     _add(found, of[some], np.broadcast_to(part, here.shape))
                     flows[of[some]] = True
             flows[still] = False
-        for row, position in zip(*(x.tolist() for x in self.inputs.get("float", ((np.empty(0),) * 2))), strict=True):
+        rows, positions = self.inputs.get("float", _NONE)
+        for row, position in zip(rows.tolist(), positions.tolist(), strict=True):
             if flows[row]:
                 yield position, found[row]
 
