@@ -628,8 +628,10 @@ def test_lanes_broadcast():
 # ---- groups of alike operations --------------------------------------------------------------------------------------
 
 
-def test_groups_have_the_values_and_derivatives_of_single_nodes():
+@pytest.mark.parametrize("held", [2**21, 20_000])  # all states together; a few at a time
+def test_groups_have_the_values_and_derivatives_of_single_nodes(monkeypatch, held):
     # Pairs of bodies, of which some are beyond a border where the branch not taken has no derivative.
+    monkeypatch.setattr("lagjax._program._evaluate.MOST_HELD", held)
     i, j = np.triu_indices(50, 1)
 
     def forces(x, k):
@@ -645,8 +647,9 @@ def test_groups_have_the_values_and_derivatives_of_single_nodes():
     assert groups is not None and 50 * len(groups.groups) < len(program.nodes)
     columns = [*x, np.asarray(2)]
     np.testing.assert_allclose(program.evaluate_many(columns), evaluate(program.line, columns), rtol=1e-13)
-    for cotangents in ([1.0, -2.0] * 22, [None, x[0], *[None] * 42]):
-        found, expected = program.vjp_many(columns, cotangents), vjp(program.line, columns, cotangents)
+    one, many = [*x[:, 0], np.asarray(2)], [x[k] for k in range(44)]
+    for at, cotangents in [(columns, [1.0, -2.0] * 22), (columns, [None, x[0], *[None] * 42]), (one, many)]:
+        found, expected = program.vjp_many(at, cotangents), vjp(program.line, at, cotangents)
         assert [part is None for part in found] == [part is None for part in expected]
         for part, other in zip(found, expected, strict=True):
             if part is not None:

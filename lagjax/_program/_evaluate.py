@@ -4,7 +4,7 @@ Every node becomes one NumPy operation on a vector of states. That costs a micro
 node and state: less than XLA or LLVM take to compile a program, as long as it is not evaluated millions of times.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -29,7 +29,9 @@ def evaluate(line, columns: Sequence, steps: Callable | None = None, groups: Gro
     columns, precision, count = _prepared(line, columns, groups)
     results = np.empty((len(line.outputs), count), precision)
     if groups is not None and count <= MOST_STATES:
-        for part, values in _of_groups(groups, columns, precision, count):
+        for part in _parts(groups, count):
+            with np.errstate(all="ignore"):
+                values = groups.values([_cut(x, part) for x in columns], precision, part.stop - part.start)
             for kind, (rows, positions) in groups.outputs.items():
                 results[positions, part] = values[kind][rows]
         return results
@@ -43,19 +45,15 @@ def evaluate(line, columns: Sequence, steps: Callable | None = None, groups: Gro
     return results
 
 
-def _of_groups(groups: Groups, columns, precision, count: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
-    """The values of all nodes, for some states after the other."""
+def _parts(groups: Groups, count: int) -> list[slice]:
+    """The states that are looked at together."""
     size = max(1, MOST_HELD // sum(groups.counts.values()))
-    for start in range(0, count, size):
-        part = slice(start, min(start + size, count))
-        here = columns if size >= count else [_cut(x, part) for x in columns]
-        with np.errstate(all="ignore"):
-            yield part, groups.values(here, precision, part.stop - start)
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
 
 def _cut(x, part: slice):
     """Those of the numbers of some states; one that is that of all states stays."""
-    return x if np.size(x) == 1 else x[part]
+    return x if x is None or np.size(x) == 1 else x[part]
 
 
 def _prepared(line, columns, groups: Groups | None = None) -> tuple[list[np.ndarray], np.dtype, int]:
@@ -206,12 +204,14 @@ def vjp(line, columns: Sequence, cotangents: Sequence, groups: Groups | None = N
 
 def _vjp_of_groups(groups: Groups, columns, precision, count: int, cotangents) -> list:
     inputs: list = [None] * len(columns)
-    for part, values in _of_groups(groups, columns, precision, count):
-        here = cotangents if part == slice(0, count) else [x if x is None else _cut(x, part) for x in cotangents]
+    states = max([count, *[np.size(x) for x in cotangents]])
+    for part in _parts(groups, states):
+        size, here = part.stop - part.start, [_cut(x, part) for x in cotangents]
         with np.errstate(all="ignore"):
-            for i, flow in groups.transposed(values, here):
+            values = groups.values([_cut(x, part) for x in columns], precision, size if count > 1 else 1)
+            for i, flow in groups.transposed(values, here, size):
                 if inputs[i] is None:
-                    inputs[i] = np.zeros(count, precision)
+                    inputs[i] = np.zeros(states, precision)
                 inputs[i][part] += flow
     return inputs
 

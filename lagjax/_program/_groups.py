@@ -71,10 +71,15 @@ class Groups(NamedTuple):
             values[group.kind][group.rows] = found
         return values
 
-    def transposed(self, values: dict[str, np.ndarray], cotangents: Sequence) -> Iterator[tuple[int, np.ndarray]]:
-        """The positions of the inputs to which something flows from the outputs, each with what does, (S,)."""
+    def transposed(
+        self, values: dict[str, np.ndarray], cotangents: Sequence, states: int
+    ) -> Iterator[tuple[int, np.ndarray]]:
+        """The positions of the inputs to which something flows from the outputs, each with what does, (states,).
+
+        The values are those of all the states, or of one that has as many cotangents.
+        """
         flows, still = np.zeros((2, self.counts.get("float", 0)), bool)
-        found = np.zeros_like(values["float"])
+        found = np.zeros((len(flows), states), values["float"].dtype)
         if "float" in self.constants:  # nothing flows on from these
             still[self.constants["float"][0]] = True
         rows, positions = self.outputs.get("float", _NONE)
