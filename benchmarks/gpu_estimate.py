@@ -7,12 +7,13 @@ reads and writes of local memory are counted. `ptxas` (`pip install nvidia-cuda-
 registers, bytes of stack and spills a thread has. Each of these takes a member some time, if all threads are at work:
 
     arithmetic    132 multiprocessors × 64 instructions a cycle × 1.98 GHz
-    L1            132 × 16 doubles a cycle × 1.98 GHz
+    L1            132 × 16 doubles a cycle × 1.98 GHz, for local memory and spills
     HBM           3.35 TB/s, for the part of local memory that the caches (256 KB a multiprocessor, 50 MB for all) do
                   not hold, as if every access to that part missed them
 
-The longest of them is the estimate. Spills, latencies, divergence and instruction caches come on top. The last column
-is measured: the same members in machine code on this machine's cores.
+The longest of them is the estimate. Latencies, divergence and instruction caches come on top. Every scene is counted in
+the form that it would have there (`_native._gpu.form_for`) and with its series in local memory. The last column is
+measured: the same members in machine code on this machine's cores.
 """
 
 import re
@@ -38,6 +39,7 @@ STORE = Path(__file__).parent / "results" / "gpu_estimate.json"
 CLOCK, MULTIPROCESSORS, ARITHMETIC, L1, HBM = 1.98e9, 132, 64, 16, 3.35e12
 REGISTERS, L1_BYTES, L2_BYTES = 65536, 256 * 1024, 50e6  # of a multiprocessor; L2 of all of them
 MEMBERS, BATCH, DURATION, RTOL = 4, 4096, 5.0, 1e-9
+FORMS = {"as chosen": gpu.form_for, "in memory": lambda series, order: gpu.Form(order, unrolled=False)}
 SCENES = {
     "pendulum": scenes.pendulum,
     "Kepler": scenes.kepler,
@@ -56,8 +58,8 @@ def starts(scene, members: int) -> tuple:
     return q0, jax.tree.map(lambda x: jnp.multiply.outer(scales, x), scene.qdot0)
 
 
-def counted(scene) -> tuple[str, dict, float]:
-    """The PTX of a scene's motion, its instructions a step, and the steps of a member."""
+def counted(scene, form=gpu.form_for) -> tuple[str, dict, float]:
+    """The PTX of a scene's motion, in a form, its instructions a step, and the steps of a member."""
     programs, counts = [], {}
 
     def launch(program, operands, results):
@@ -75,14 +77,14 @@ def counted(scene) -> tuple[str, dict, float]:
     def lower_by(rule):
         mlir.register_lowering(_transforms.run_p, rule, platform="cpu")
 
-    kept, _gpu.launch = _gpu.launch, launch
+    kept, _gpu.launch, gpu.form_for = (_gpu.launch, gpu.form_for), launch, form
     try:  # the rule of GPUs on the CPU
         lower_by(mlir.lower_fun(_transforms._run_for_gpus, multiple_results=True))
         run = jax.jit(lambda q0, v0: motions(scene, q0, v0, solver=lagjax.MachineCode()).stats)
         stats = jax.tree.map(np.asarray, run(*starts(scene, MEMBERS)))
     finally:
         lower_by(_transforms._for_cpus(_transforms._run_compiled))
-        _gpu.launch = kept
+        _gpu.launch, gpu.form_for = kept
         jax.clear_caches()
     steps = stats["num_steps"].sum()
     return programs[0], {name: count / steps for name, count in counts.items()}, float(steps) / MEMBERS
@@ -111,10 +113,10 @@ def assembled(program: str) -> dict | None:
 
 def bounds(a_step: dict, steps: float, thread: dict) -> dict:
     """The least times of a member in nanoseconds."""
-    moved = steps * (a_step["local loads"] + a_step["local stores"])
+    moved = steps * (a_step["local loads"] + a_step["local stores"] + thread["spills"] / 8)
     resident = min(gpu.MOST_BLOCKS * gpu.THREADS // MULTIPROCESSORS, REGISTERS // thread["registers"])
     held = max(L1_BYTES, L2_BYTES / MULTIPROCESSORS)
-    beyond = max(0.0, 1.0 - held / (resident * thread["stack"]))
+    beyond = max(0.0, 1.0 - held / max(held, resident * thread["stack"]))
     peak = MULTIPROCESSORS * CLOCK
     return {
         "arithmetic_ns": 1e9 * steps * a_step["float64"] / (peak * ARITHMETIC),
@@ -139,11 +141,14 @@ def main() -> None:
     rows = []
     for name, make in SCENES.items():
         scene = make()
-        program, a_step, steps = counted(scene)
-        thread = assembled(program)
-        row = {"scene": name, "steps": steps, **{f"{kind} a step": count for kind, count in a_step.items()}}
-        row |= {**thread, **bounds(a_step, steps, thread)} if thread is not None else {}
-        rows.append(row | {"cpu_ns": on_this_machine(scene)})
+        cpu = on_this_machine(scene)
+        for form, choose in FORMS.items():
+            program, a_step, steps = counted(scene, choose)
+            thread = assembled(program)
+            row = {"scene": name, "form": form, "steps": steps}
+            row |= {f"{kind} a step": count for kind, count in a_step.items()}
+            row |= {**thread, **bounds(a_step, steps, thread)} if thread is not None else {}
+            rows.append(row | {"cpu_ns": cpu})
     print(_report.table(rows))
     note = "an estimate from counted instructions; not run on a GPU"
     _report.write_json(STORE, {**_report.circumstances(), "note": note, "duration": DURATION, "scenes": rows})

@@ -9,6 +9,7 @@ import importlib
 import re
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import jax
@@ -23,7 +24,7 @@ from benchmarks._ptx import PtxOnCpu
 from lagjax import scenes
 from lagjax._machine_code import _gpu, _transforms
 from lagjax._machine_code._call import on_host
-from lagjax._native._gpu import RESULTS, grid, libdevice, words
+from lagjax._native._gpu import RESULTS, Form, form_for, grid, libdevice, words
 
 TS, MACHINE_CODE = np.linspace(0.0, 1.0, 5), lagjax.MachineCode()
 translated = functools.lru_cache(maxsize=64)(PtxOnCpu)
@@ -94,13 +95,27 @@ def agree(here, there, tolerance=1e-9):
 # ---- the numbers -----------------------------------------------------------------------------------------------------
 
 
-def test_a_batch_is_that_of_the_cpu(on_the_ptx):
+@pytest.mark.parametrize("form", [None, Form(13, unrolled=True), Form(13, unrolled=False)])
+def test_a_batch_is_that_of_the_cpu(on_the_ptx, monkeypatch, form):
     scene = scenes.double_pendulum()
     q0 = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 2))
-    batch = jax.vmap(lambda q0: motion(scene, q0, 0 * q0))
-    here = on_the_ptx(batch, q0)
-    agree(here, jax.jit(batch)(q0))
+    batch = jax.vmap(lambda q0: motion(scene, q0, 0 * q0, rtol=1e-9))
+    if form is not None:
+        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda series, order: form)
+    *here, steps = on_the_ptx(batch, q0)
+    *there, of_cpu = jax.jit(batch)(q0)
+    agree(here, there)
     assert on_the_ptx.launches == [7]
+    # A form of its own has a lower order, and more steps of the same error.
+    assert (steps > of_cpu).all() if form is None else (steps == of_cpu).all()
+
+
+def test_coefficients_that_are_few_are_unrolled(monkeypatch):
+    programs = {form: program_of(scenes.pendulum(), monkeypatch, form) for form in (True, False)}
+    assert ".local" not in programs[True] and ".local" in programs[False]
+    few, many = types.SimpleNamespace(rows=6, size=2), types.SimpleNamespace(rows=39, size=3)
+    assert form_for(few, 13) == (13, True) and form_for(many, 13) == (13, False)
+    assert form_for(types.SimpleNamespace(rows=17, size=2), 13) == (11, True)
 
 
 @pytest.mark.slow
@@ -188,9 +203,11 @@ def test_single_precision(on_the_ptx):
     agree(here, there, 1e-6)
 
 
-def program_of(scene):
+def program_of(scene, monkeypatch=None, unrolled=None):
     """The PTX of a scene's motion. Skips the test where that needs libdevice, which is not here."""
     programs = []
+    if monkeypatch is not None:
+        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda series, order: Form(order, unrolled))
     transforms_are_new()
 
     def launch(program, operands, results):
@@ -256,7 +273,7 @@ def test_the_grid_covers_the_members_and_is_bounded():
 
 
 def test_words_are_the_bits_of_doubles():
-    given = words(members=3, times=2, ts_stride=0, params_stride=0, order=13, max_steps=9, room_of_notes=0, rtol=0.5,
+    given = words(members=3, times=2, ts_stride=0, params_stride=0, max_steps=9, room_of_notes=0, rtol=0.5,
                   atol=0.0)  # fmt: skip
     assert given[:2] == [3, 2] and np.array(given[-2:]).view(float).tolist() == [0.5, 0.0]
     assert RESULTS[:2] == ("next_member", "path")
@@ -274,7 +291,8 @@ def test_a_scene_that_cannot_go_to_a_gpu_says_why():
 
 
 @pytest.mark.slow
-def test_instructions_are_counted():
+def test_instructions_are_counted(monkeypatch):
+    monkeypatch.setattr("lagjax._native._gpu.form_for", lambda series, order: Form(order, unrolled=False))
     # Of a pendulum's step at order 13: every product of two series of 13 terms alone has 91 products.
     gpu_estimate = importlib.import_module("benchmarks.gpu_estimate")
     program, a_step, steps = gpu_estimate.counted(scenes.pendulum())
@@ -299,7 +317,7 @@ STACK, SPILLS = 40_000, 4_000
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(ptxas() is None, reason="there is no ptxas: `pip install nvidia-cuda-nvcc-cu12` has it")
+@pytest.mark.skipif(ptxas() is None, reason="there is no ptxas: the extra `ptxas` has it")
 @pytest.mark.parametrize("make", scenes.ALL, ids=lambda make: make.__name__)
 def test_ptxas_assembles_every_ready_scene(make, tmp_path):
     program, source = program_of(make()), tmp_path / "k.ptx"

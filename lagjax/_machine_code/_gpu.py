@@ -22,15 +22,15 @@ def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
 
     Raises `ValueError` where the scene cannot go to a GPU, saying why.
     """
+    rtol, atol, max_steps, _, notes = tolerances
     try:
-        program = flow.kernel.program_for_gpus
+        program = flow.kernel.program_for_gpus(rtol)
     except Unlowerable as reason:
         raise ValueError(f"solver=lagjax.MachineCode() cannot integrate this scene on a GPU: {reason}.") from None
     members, times = len(y0), ts.shape[1]
-    rtol, atol, max_steps, _, notes = tolerances
     numbers = gpu.words(
         members=members, times=times, ts_stride=times if len(ts) > 1 else 0,
-        params_stride=flow.numbers if len(params) > 1 else 0, order=_native.order_for(rtol), max_steps=max_steps,
+        params_stride=flow.numbers if len(params) > 1 else 0, max_steps=max_steps,
         room_of_notes=notes, rtol=rtol, atol=atol,
     )  # fmt: skip
     path = jnp.full((members, *flow.path_shape(times, notes)), jnp.nan)

@@ -2,9 +2,13 @@
 
 The module of one lane that runs on a CPU goes, unchanged, through LLVM's target for PTX, the assembly language that the
 driver turns into machine code. Its entry `integrate` builds the job on the stack of its thread and calls `begin` and
-`run`; a thread whose member has ended takes the next one from the counter that all share. Series stand in the memory of
-the thread. Functions that are no instruction come from libdevice, NVIDIA's library in LLVM's own form, which lies where
-pip has put `nvidia-cuda-nvcc`, on which `jax[cuda12]` depends.
+`run`; a thread whose member has ended takes the next one from the counter that all share. Functions that are no
+instruction come from libdevice, NVIDIA's library in LLVM's own form, which lies where pip has put `nvidia-cuda-nvcc`:
+`jax[cuda12]` depends on it.
+
+A program has one of two forms. Where the coefficients of a motion are few, the loops over orders are unrolled, at an
+order that is lower than a CPU's if that keeps them few: no array is left, and the coefficients are registers, some of
+which the assembler spills. Otherwise they stand in the memory of the thread.
 
 What is here needs no GPU: it is assembled and checked on CPUs, and has not run on a GPU yet.
 """
@@ -17,18 +21,22 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import llvmlite.binding as llvm
 
+from lagjax._native._constants import LEAST_ORDER
 from lagjax._native._frame import LANE
 from lagjax._native._integrator import JOB, Integrator
+from lagjax._native._ir import COUNTED
 from lagjax._program._graph import Unlowerable
+from lagjax._program._series import Series
 
 # The entry takes the addresses of these arrays, of doubles but for the words of `NUMBERS` and the counter.
 ARGUMENTS = ("ts", "y0", "params", "numbers", "next_member", "path")
 # A kernel's operands come first, then its results, of which the first two are the last two operands.
 RESULTS = ("next_member", "path", "y_end", "t_end", "code", "steps", "rejected")
-NUMBERS = ("members", "times", "ts_stride", "params_stride", "order", "max_steps", "room_of_notes", "rtol", "atol")
+NUMBERS = ("members", "times", "ts_stride", "params_stride", "max_steps", "room_of_notes", "rtol", "atol")
 # Threads of a block; and as many blocks as 132 multiprocessors hold with all registers of a thread: others would wait.
 THREADS, MOST_BLOCKS = 64, 528
 # Bytes that a thread may remember. The driver takes them for every thread that could be resident: of 2048 threads on
@@ -36,9 +44,28 @@ THREADS, MOST_BLOCKS = 64, 528
 LARGEST_THREAD = 2**15
 # Drivers of CUDA 12.0 read PTX 8.0, and make code from PTX for sm_70 for every processor since.
 _PROCESSOR, _VERSION = "sm_70", "+ptx80"
+# Coefficients of a motion, of its state and of the rows of its products, up to which it is unrolled. By the counts of
+# `benchmarks.gpu_estimate`, with registers and spills as ptxas reports them, that is the best order to a tenth for a
+# double pendulum (12), one with constraints (10) and a slider-crank (7); by a third more the spills of the latter two
+# no longer stay in the caches. A chain of three has twice as many, and gains nothing.
+MOST_COEFFICIENTS = 250
 _ROUNDS = 2**63 - 1  # `max_steps` ends every member, and so the kernel
+_TO_COUNTED = re.compile(rf'  br label %"({COUNTED}[.\d]*)"')
 _FAR_ANGLES = ("sin", "cos")  # the C library's part in a sine is that of angles beyond 2**20
 _lock = threading.Lock()
+
+
+class Form(NamedTuple):
+    """The order of the series, and whether the loops over orders are `unrolled`."""
+
+    order: int
+    unrolled: bool
+
+
+def form_for(series: Series, order: int) -> Form:
+    """The form that should take the least time, where a CPU takes series of this `order`."""
+    fitting = MOST_COEFFICIENTS // (series.rows + 2 * series.size)
+    return Form(min(order, fitting), True) if fitting >= LEAST_ORDER else Form(order, False)
 
 
 def grid(members: int) -> tuple[int, int]:
@@ -46,8 +73,8 @@ def grid(members: int) -> tuple[int, int]:
     return min(MOST_BLOCKS, max(1, -(-members // THREADS))), THREADS
 
 
-def program_for_gpus(integrator: Integrator) -> str:
-    """The PTX of an integrator of one lane, with the entry `integrate(*ARGUMENTS, *RESULTS)`.
+def program_for_gpus(integrator: Integrator, form: Form) -> str:
+    """The PTX of an integrator of one lane, in a form, with the entry `integrate(*ARGUMENTS, *RESULTS)`.
 
     Raises `Unlowerable`, whose text says why there is none: the memory of a thread, tables of numbers, functions that
     need libdevice where that is missing.
@@ -63,10 +90,10 @@ def program_for_gpus(integrator: Integrator) -> str:
     if motion.look_up.numbers is not None:
         raise Unlowerable("its tables of numbers (samples, jnp.interp, …) are not brought to a GPU; make them params")
     with _lock:
-        return _assembly(str(motion.module), size)
+        return _assembly(str(motion.module), size, form)
 
 
-def _assembly(text: str, size: int) -> str:
+def _assembly(text: str, size: int, form: Form) -> str:
     """PTX from the text of a module whose threads remember this many doubles."""
     machine = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3)
     text = text.replace('target triple = ""', f'target triple = "{machine.triple}"')
@@ -82,7 +109,8 @@ def _assembly(text: str, size: int) -> str:
             )
         text = re.sub(rf'@"?({"|".join(external)})"?\(', r"@__nv_\1(", text)
     public = r'define (?:internal )?(void|i64) (@"\w+"\([^)]*\))(?=\s*\{)'
-    module = llvm.parse_assembly(re.sub(public, r"define internal \1 \2", text) + _entry(size))
+    text = re.sub(public, r"define internal \1 \2", text) + _entry(size, form.order)
+    module = llvm.parse_assembly(_with_unrolled_loops(text) if form.unrolled else text)
     if library is not None:
         other = llvm.parse_bitcode(library)
         other.triple, other.data_layout = machine.triple, str(machine.target_data)
@@ -106,7 +134,20 @@ def _without_far_angles(text: str) -> str:
     return text
 
 
-def _entry(size: int) -> str:
+def _with_unrolled_loops(text: str) -> str:
+    """The text of a module in which the branches that close its counted loops ask for these to be unrolled."""
+    entered, lines = set(), []
+    for line in text.splitlines():
+        if line.startswith("define"):
+            entered = set()
+        elif branch := _TO_COUNTED.fullmatch(line):
+            line += ", !llvm.loop !0" if branch[1] in entered else ""  # the first branch to it enters the loop
+            entered.add(branch[1])
+        lines.append(line)
+    return "\n".join([*lines, "!0 = distinct !{!0, !1}", '!1 = !{!"llvm.loop.unroll.full"}', ""])
+
+
+def _entry(size: int, order: int) -> str:
     """The kernel's entry, in LLVM's language: a job on the stack, whose arrays are the arguments."""
     places = [*(f"ptr %{name}" for name in ARGUMENTS)]
     places += [f"ptr %{name}{'_out' if name in ARGUMENTS else ''}" for name in RESULTS]
@@ -123,7 +164,7 @@ def _entry(size: int) -> str:
         elif kind is ctypes.c_void_p:
             lines.append(f"  store ptr {known.get(name, 'null')}, ptr %field{i}")
         else:
-            lines.append(f"  store i64 0, ptr %field{i}")
+            lines.append(f"  store i64 {order if name == 'order' else 0}, ptr %field{i}")
     lines += [
         f"  call void @llvm.memset.p0.i64(ptr align 64 %memory, i8 0, i64 {8 * size}, i1 false)",
         '  call void @"begin"(ptr %job, ptr %memory, ptr %lanes)',
@@ -134,7 +175,7 @@ def _entry(size: int) -> str:
 
 
 def _optimised(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> llvm.ModuleRef:
-    """The module with its functions in one another, and its loops as they are."""
+    """The module with its functions in one another, and its loops as they are but for those that ask to be unrolled."""
     for function in module.functions:
         if not function.is_declaration and function.name != "integrate":
             function.add_function_attribute("alwaysinline")

@@ -26,6 +26,7 @@ from llvmlite import ir
 from lagjax._native._objects import kept
 
 DOUBLE, INTEGER, BIT, POINTER = ir.DoubleType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
+COUNTED = "counted"  # the name of the blocks at which counted loops begin
 _CONTRACT = ("contract",)
 # What LLVM itself calls for an intrinsic that the processor has no instruction for.
 _BEHIND_INTRINSICS = ("rint", "round", "floor", "ceil", "trunc", "fma", "fmod")
@@ -334,7 +335,7 @@ class Code:
     def loop(self, stop, start=0) -> Iterator[Value]:
         """Integers from `start` up to, without, `stop`."""
         counter = self.variable(self.as_value(start, INTEGER))
-        with self.repeat_while(lambda: self.load(counter, INTEGER) < stop):
+        with self.repeat_while(lambda: self.load(counter, INTEGER) < stop, name=COUNTED):
             i = self.load(counter, INTEGER)
             yield i
             self.store(i + 1, counter)
@@ -352,9 +353,9 @@ class Code:
         self.builder.position_at_end(end)
 
     @contextmanager
-    def repeat_while(self, condition) -> Iterator[None]:
+    def repeat_while(self, condition, name: str = "head") -> Iterator[None]:
         """The body again and again, as long as `condition()` holds before it."""
-        head, body, done = (self.function.append_basic_block(name) for name in ("head", "body", "done"))
+        head, body, done = (self.function.append_basic_block(name) for name in (name, "body", "done"))
         self.builder.branch(head)
         self.builder.position_at_end(head)
         self.builder.cbranch(condition().it, body, done)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lagjax._native import _gpu
 from lagjax._native._adjoint import Adjoint
 from lagjax._native._alone import fills_lanes
 from lagjax._native._constants import (
@@ -23,7 +24,6 @@ from lagjax._native._constants import (
     VECTORS_PER_THREAD,
 )
 from lagjax._native._frame import LANE, Layout
-from lagjax._native._gpu import program_for_gpus
 from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
@@ -149,6 +149,9 @@ class Kernel:
         self._options = guards, error_groups, levels[0]
         self.width = lanes() if width is None else width
         self._tangents = functools.cache(self._tangents_of)
+        self._programs_for_gpus = functools.cache(
+            lambda form: _gpu.program_for_gpus(self.of_members(1)._integrator(), form)
+        )
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
     def of_members(self, members: int) -> "Kernel":
@@ -178,10 +181,9 @@ class Kernel:
         forget_stages()
         return integrator
 
-    @functools.cached_property
-    def program_for_gpus(self) -> str:
+    def program_for_gpus(self, rtol: float) -> str:
         """The motion of a member in PTX (`_gpu`). Raises `Unlowerable` where a GPU cannot run it."""
-        return program_for_gpus(self.of_members(1)._integrator())
+        return self._programs_for_gpus(_gpu.form_for(self._parts[1], order_for(rtol)))
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
