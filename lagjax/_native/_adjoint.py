@@ -209,10 +209,10 @@ class Adjoint:
         for i in form.each(code, self.series.values):
             frame["values_ct", i] = 0.0
         with code.loop(frame.job("order") + 1) as k:
-            now = code.load(power, frame.vector)
+            now = power.value
             for i in form.each(code, self.states):
                 frame["y_ct", i, k] = frame["state_ct", i] * now
-            code.store(now * h, power)
+            power.value = now * h
         with code.loop(self.motion.width) as j:
             self._seed_outputs(frame, frame.lane(j))
         return frame.finish()
@@ -233,11 +233,11 @@ class Adjoint:
             row = (member * frame.job("times") + index) * self.states
             cotangents = code.element(frame.job("path_ct"), row)
             with code.loop(frame.job("order") + 1) as k:
-                now = code.load(power, DOUBLE)
+                now = power.value
                 for i in self.motion.form.each(code, self.states):
                     cotangent = code.load(code.element(cotangents, i), DOUBLE)
                     lane["y_ct", i, k] = lane["y_ct", i, k] + cotangent * now
-                code.store(now * s, power)
+                power.value = now * s
             lane["output"] = index - 1
 
     def _back_orders(self, back_sums: Code, back_recursion: Code) -> Code:
@@ -274,9 +274,9 @@ class Adjoint:
         rate = code.select(velocities > 0.0, rate, 0.0)
         term, power = code.variable(frame.constant(1.0)), code.variable(frame.constant(1.0))
         with code.loop(order - 1, start=0) as k:
-            code.store(code.load(term, frame.vector) * (rate * h) / code.as_double(k + 1), term)
+            term.value = term.value * (rate * h) / code.as_double(k + 1)
             with code.only_if(k > 0):
-                code.store(code.load(power, frame.vector) * h, power)
+                power.value = power.value * h
         # The last coefficient of the rows, beside the first two, which may both be near a zero.
         last, first = code.lanes_of(0.0), code.lanes_of(0.0)
         if self.series.rows:
@@ -284,8 +284,8 @@ class Adjoint:
             first = form.largest(
                 code, lambda i: code.maximum(size(frame["rows", i, 1]), size(frame["rows", i, 2]) * h), self.series.rows
             )
-        tail = code.select(first > 0.0, NEAR_ZERO * last * code.load(power, frame.vector) / first, 0.0)
-        frame["excess"] = code.maximum(code.maximum(code.load(term, frame.vector), tail), frame["excess"])
+        tail = code.select(first > 0.0, NEAR_ZERO * last * power.value / first, 0.0)
+        frame["excess"] = code.maximum(code.maximum(term.value, tail), frame["excess"])
         return frame.finish()
 
     def _back_sums(self) -> Code:

@@ -306,7 +306,7 @@ class Borders:
             self._pass_knots(frame, going)
         after = self.motion.evaluate_now(frame, line) if shaken else []
         for k, j in enumerate(shaken):
-            jump = code.intrinsic("fabs", after[k] - code.load(before[k], frame.vector))
+            jump = code.intrinsic("fabs", after[k] - before[k].value)
             least = code.intrinsic("fabs", after[k]) * ROUND_OFF + code.lanes_of(absolute_tolerance(frame))
             jumps = going & (jump > least)
             with frame.where(jumps):
@@ -358,9 +358,9 @@ class Borders:
         sum, last = code.variable(sum), code.variable(sum)
         with code.loop(degree, start=3) as i:
             c = code.intrinsic("fabs", frame["rows", row, degree - i])
-            code.store((code.load(sum, frame.vector) + c) * size, sum)
-            code.store(code.load(last, frame.vector) * size, last)
-        return code.load(sum, frame.vector), code.load(last, frame.vector)
+            sum.value = (sum.value + c) * size
+            last.value = last.value * size
+        return sum.value, last.value
 
     def _find_feature(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> None:
         """With its argument u: where α + β u is zero, the step ends."""
@@ -404,8 +404,8 @@ class Borders:
         with code.loop(degree) as i:
             c = frame["poly", degree - i]
             sign = code.select(c > 0.0, 1, -1.0)
-            code.store(code.select(code.compare("!=", c, 0.0), sign, code.load(leads, frame.vector)), leads)
-        return code.load(leads, frame.vector)
+            leads.value = code.select(code.compare("!=", c, 0.0), sign, leads.value)
+        return leads.value
 
     def _shorten(self, frame: Frame, degree: Value, rtol: Value, atol: Value) -> None:
         """Halve the interval until the last terms are below atol + rtol Σ |cₖ|."""
@@ -418,14 +418,13 @@ class Borders:
 
     def _look_closer(self, frame: Frame, degree: Value) -> None:
         """A root that comes early is as exact as what lies before it allows, and not the whole step."""
-        code, left = frame.code, frame.code.variable(integer(frame.code, MOST_LOOKS))
+        code = frame.code
 
         def early():
             is_root = (frame["is_root"] > 0.0) & (frame["poly", 0] > 0.0)
             return is_root & (frame["root"] < EARLY)
 
-        with code.repeat_while(lambda: code.any_lane(early()) & (code.load(left, INTEGER) > 0)):
-            code.store(code.load(left, INTEGER) - 1, left)
+        with code.repeat_while(lambda: code.any_lane(early()), at_most=MOST_LOOKS):
             straight = 0.0 - 4.0 * frame["poly", 0] / frame["poly", 1]  # for a root that is zero to rounding
             reach = code.select(frame["root"] > 0.0, 2.0 * frame["root"], straight)
             self.roots.stretch(frame, degree, code.select(early() & (reach > 0.0) & (reach < 1.0), reach, 1.0))
@@ -484,9 +483,9 @@ class Borders:
                 for i in motion.form.each(code, base):
                     size = rtol * code.intrinsic("fabs", state[i + part * n]) + code.lanes_of(atol)
                     moved = code.intrinsic("fabs", slopes[i + part * base]) * size
-                    code.store(code.load(error, frame.vector) + moved, error)
+                    error.value += moved
             rate, bend = self._rates(frame, order)
-            near = rate * rate <= 2.0 * (code.intrinsic("fabs", bend) * code.load(error, frame.vector))
+            near = rate * rate <= 2.0 * (code.intrinsic("fabs", bend) * error.value)
             near = near & ends & (frame["is_hit"] > 0.0)
             with frame.where(near):
                 frame["grazes"] = 1
@@ -502,11 +501,11 @@ class Borders:
             k = code.lanes_of(code.as_double(degree - i))
             c = code.variable(frame.constant(0.0))
             with code.loop(self.pieces) as j:
-                code.store(code.load(c, frame.vector) + frame["hit", j] * frame["rows", j + first, degree - i], c)
-            term = code.load(c, frame.vector) * k
-            code.store(code.load(bend, frame.vector) * h + code.load(rate, frame.vector), bend)
-            code.store(code.load(rate, frame.vector) * h + term, rate)
-        return code.load(rate, frame.vector), code.load(bend, frame.vector)
+                c.value = c.value + frame["hit", j] * frame["rows", j + first, degree - i]
+            term = c.value * k
+            bend.value = bend.value * h + rate.value
+            rate.value = rate.value * h + term
+        return rate.value, bend.value
 
     def _cross(self) -> Code:
         """`()`: after the step, the pieces beyond the borders that were reached."""

@@ -138,5 +138,5 @@ class Clocks:
         before = motion.evaluate(frame, motion.acceleration, moved, frame["h"])
         jump, total = self.jump(code, before, frame.vectors("after", motion.n)), code.variable(frame.constant(0.0))
         for i in motion.form.each(code, motion.n):
-            code.store(code.load(total, frame.vector) + frame["state_ct", i + motion.n] * jump(i), total)
-        return code.load(total, frame.vector), frame["has_after"] > 0.0
+            total.value = total.value + frame["state_ct", i + motion.n] * jump(i)
+        return total.value, frame["has_after"] > 0.0

@@ -28,10 +28,10 @@ from lagjax._native._constants import (
     WITHOUT_SERIES,
 )
 from lagjax._native._frame import Frame, Lane, integers
-from lagjax._native._ir import INTEGER, Code, Value
+from lagjax._native._ir import INTEGER, Code, Value, Variable
 from lagjax._native._output import Output
 from lagjax._native._roots import Roots
-from lagjax._native._series import Motion, double, integer
+from lagjax._native._series import Motion, double
 from lagjax._native._step import StepControl
 from lagjax._program._series import StraightLine
 
@@ -200,12 +200,12 @@ class Events:
         happens = frame["first_at"] < float("inf")
         latest, power = frame["first_at"] + frame["smallest"], code.variable(frame.constant(1.0))
         with code.loop(self.count) as g:
-            of = code.load(power, frame.vector)
+            of = power.value
             now = happens & (frame["root_at", g] <= latest)
             more = code.select(now, frame["change", g] * of, 0.0)
-            code.store(code.load(event, frame.vector) + more, event)
-            code.store(4.0 * of, power)
-        frame["event"] = code.select(happens, code.load(event, frame.vector), -1.0)
+            event.value += more
+            power.value = 4.0 * of
+        frame["event"] = code.select(happens, event.value, -1.0)
         with frame.where(happens):
             frame["last"] = 0.0
             frame["h"] = frame["first_at"] * frame["forward"]
@@ -244,9 +244,9 @@ class Events:
         with code.loop(degree + 1, start=1) as k:
             c = frame["poly", k]
             negative = code.select(c < 0.0, c, zero)
-            code.store(code.load(falls, frame.vector) - negative, falls)
-            code.store(code.load(rises, frame.vector) + (c - negative), rises)
-        start, falls, rises = frame["poly", 0], *(code.load(x, frame.vector) for x in (falls, rises))
+            falls.value -= negative
+            rises.value = rises.value + (c - negative)
+        start, falls, rises = frame["poly", 0], falls.value, rises.value
         last, before = (self.roots.last_terms(frame, degree, first) for first in (0, 3))
         size = start + falls + rises
         return (start > falls + last) & ~self._is_long(last, before, size)
@@ -279,7 +279,7 @@ class Events:
         self._along(frame, order, g, degree, ahead, moving & sound)
         self._without_series(frame, order, g, ahead, moving & ~sound)
         with frame.where(moving):
-            frame["side", g] = code.load(ahead, frame.vector)
+            frame["side", g] = ahead.value
 
     def _is_long(self, last: Value, before: Value, size: Value) -> Value:
         """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are."""
@@ -296,18 +296,15 @@ class Events:
         rate = frame["poly", 1]
         frame["poly", 1] = code.select((rests >= _ALONG) & (rate < 0.0), 0.0, rate)
 
-    def _along(self, frame: Frame, order: Value, g: Value, degree: Value, ahead: Value, where: Value) -> None:
+    def _along(self, frame: Frame, order: Value, g: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""
         code = frame.code
-        looking, left = (code.variable(x) for x in (
-            code.flag(where), integer(code, MOST_CHANGES),
-        ))  # fmt: skip
+        looking = code.variable(code.flag(where))
 
         def on():
-            return code.load(looking, frame.vector) > 0.0
+            return looking.value > 0.0
 
-        with code.repeat_while(lambda: code.any_lane(on()) & (code.load(left, INTEGER) > 0)):
-            code.store(code.load(left, INTEGER) - 1, left)
+        with code.repeat_while(lambda: code.any_lane(on()), at_most=MOST_CHANGES):
             frame.call(self.roots.next_root, degree)
             root, part = frame["root"], frame["part"]
             is_root = on() & (root < 1.0) & (frame["is_root"] > 0.0)
@@ -318,14 +315,14 @@ class Events:
                 frame["waits", g] = 1
             changes = is_root & ~waits
             with code.only_if(code.any_lane(changes)):
-                s = self._exact(frame, order, g, changes, code.load(ahead, frame.vector))
+                s = self._exact(frame, order, g, changes, ahead.value)
                 inside = code.intrinsic("fabs", s) <= code.intrinsic("fabs", frame["h"])  # else of the next step
                 goes_on = self._take(frame, order, g, changes & inside, s, ahead)
                 self.roots.turn(frame, degree, goes_on)
                 with frame.where(goes_on):
                     frame["begin"] = root
-                code.store(code.flag(goes_on), looking)
-            code.store(code.select(changes, code.load(looking, frame.vector), 0.0), looking)
+                looking.value = code.flag(goes_on)
+            looking.value = code.select(changes, looking.value, 0.0)
         self._see(frame, on(), frame["begin"] * frame["part"])
 
     def _see(self, frame: Frame, where: Value, seen: Value) -> None:
@@ -351,28 +348,27 @@ class Events:
         scale = frame["part"] * frame["h"]
         start, rate = root * scale, frame["slope"] / scale
         moving = code.flag(where & (root > 0.0))
-        at, going, left = (code.variable(x) for x in (start, moving, integer(code, MOST_CORRECTIONS)))
+        at, going = code.variable(start), code.variable(moving)
 
         def moves():  # each lane as long as it needs, so that its neighbours do not change its last digit
-            return code.load(going, frame.vector) > 0.0
+            return going.value > 0.0
 
-        with code.repeat_while(lambda: code.any_lane(moves()) & (code.load(left, INTEGER) > 0)):
-            code.store(code.load(left, INTEGER) - 1, left)
-            here = code.load(at, frame.vector)
+        with code.repeat_while(lambda: code.any_lane(moves()), at_most=MOST_CORRECTIONS):
+            here = at.value
             after = here - side * self._at(frame, order, g, here) / rate
             near = code.intrinsic("fabs", after - start) <= 0.1 * code.intrinsic("fabs", scale)
             after = code.select(moves() & near, after, here)
             after = code.select(after * frame["forward"] > 0.0, after, 0.0)
-            code.store(after, at)
+            at.value = after
             far = code.intrinsic("fabs", after - here) > INSTANT * frame["smallest"]
-            code.store(code.flag(far & moves()), going)
-        at = code.load(at, frame.vector)
+            going.value = code.flag(far & moves())
+        at = at.value
         lost = (frame["resting", g] > 0.0) & (code.intrinsic("fabs", at) <= 0.25 * INSTANT * frame["smallest"])
         return code.select(lost, 0.0, at)  # time does not move
 
-    def _take(self, frame: Frame, order: Value, g: Value, changes: Value, s: Value, ahead: Value) -> Value:
+    def _take(self, frame: Frame, order: Value, g: Value, changes: Value, s: Value, ahead: Variable) -> Value:
         """Changes at the times s: the event, or a note, where they are in the direction; which lanes go on beyond."""
-        code, side = frame.code, _now(frame, ahead)
+        code, side = frame.code, ahead.value
         direction = code.load(code.element(Value(code, self.table), g * 2, INTEGER), INTEGER)
         direction = code.lanes_of(code.as_double(direction))
         counts = changes & ~(side * direction > 0.0)
@@ -391,25 +387,25 @@ class Events:
             with frame.where(sooner):
                 frame["first_at"] = size
             goes_on = changes & ~counts
-        code.store(code.select(goes_on, 0.0 - side, side), ahead)
+        ahead.value = code.select(goes_on, 0.0 - side, side)
         now = frame["t"] + (frame["t_low"] + s)
         with frame.where(goes_on):
             frame["passed_at", g] = now
         return goes_on
 
-    def _without_series(self, frame: Frame, order: Value, g: Value, ahead: Value, where: Value) -> None:
+    def _without_series(self, frame: Frame, order: Value, g: Value, ahead: Variable, where: Value) -> None:
         """A part of the step, at whose end the guard is looked at; a change before that is found by bisection."""
-        code, side, h = frame.code, _now(frame, ahead), frame["h"]
+        code, side, h = frame.code, ahead.value, frame["h"]
         with code.only_if(code.any_lane(where)):
             self._see(frame, where, frame.constant(WITHOUT_SERIES))
             changes = where & (side * self._at(frame, order, g, h) < 0.0)
             low, high = code.variable(frame.constant(0.0)), code.variable(h)
             with code.loop(BISECTIONS):
-                middle = 0.5 * (code.load(low, frame.vector) + code.load(high, frame.vector))
+                middle = 0.5 * (low.value + high.value)
                 same = side * self._at(frame, order, g, middle) > 0.0
                 for end, here in ((low, same), (high, ~same)):
-                    code.store(code.select(here, middle, code.load(end, frame.vector)), end)
-            self._take(frame, order, g, changes, code.load(high, frame.vector), ahead)
+                    end.value = code.select(here, middle, end.value)
+            self._take(frame, order, g, changes, high.value, ahead)
 
     # ---- what is noted ----
 
@@ -441,7 +437,3 @@ class Events:
         rows = frame.job("room_of_notes") + 1
         return ((member * self.count + g) * rows + number) * (self.motion.states + 1)
 
-
-def _now(frame: Frame, variable: Value) -> Value:
-    """The value of a variable."""
-    return frame.code.load(variable, frame.vector)

@@ -57,8 +57,8 @@ class FirstSaltation:
         rate = code.variable(out[2 * self.base])
         for i in motion.form.each(code, self.base):
             moved = out[i] * state[i + motion.n] + out[i + self.base] * frame["rate_before", i]
-            code.store(code.load(rate, frame.vector) + moved, rate)
-        return out, code.load(rate, frame.vector)
+            rate.value += moved
+        return out, rate.value
 
     def note_hit(self, frame: Frame, table: GuardTable) -> None:
         """Which switching number the guard `crossed` has, into `hit`; none where a motion begins on the border."""
@@ -93,8 +93,8 @@ class FirstSaltation:
         """True if the acceleration of the motion itself jumps."""
         code, sum = frame.code, frame.code.variable(frame.constant(0.0))
         for i in self.motion.form.each(code, self.base):
-            code.store(code.load(sum, frame.vector) + code.intrinsic("fabs", jump(i)), sum)
-        return ~(code.load(sum, frame.vector) <= 0.0)
+            sum.value += code.intrinsic("fabs", jump(i))
+        return ~(sum.value <= 0.0)
 
     # ---- forward ----
 
@@ -122,16 +122,16 @@ class FirstSaltation:
                 change = code.variable(frame.constant(0.0))
                 for i in motion.form.each(code, self.base):
                     part = slopes[i] * state[i + d * inner] + slopes[i + self.base] * state[i + (n + d * inner)]
-                    code.store(code.load(change, frame.vector) + part, change)
+                    change.value += part
                 for k in motion.form.each(code, self.parameters):
                     part = slopes[k + (2 * self.base + 1)] * frame["params", k + d * numbers]
-                    code.store(code.load(change, frame.vector) + part, change)
+                    change.value += part
                 for k, table in enumerate(self.tables):
                     own = shifted(table, d * motion.of_member * inner // n)
                     first = len(self.by) + 2 * k
                     part = slopes[first + 1] * motion.look_up.take(frame, own, slopes[first])
-                    code.store(code.load(change, frame.vector) + part, change)
-                delay = 0.0 - code.load(change, frame.vector) / rate
+                    change.value += part
+                delay = 0.0 - change.value / rate
                 for i in motion.form.each(code, self.base):
                     self._move(frame, n + d * inner, i, jump, is_hit, delay)
                 if level:
@@ -168,8 +168,8 @@ class FirstSaltation:
         jump, total = self.jump(frame, frame.vectors("after", motion.n)), code.variable(frame.constant(0.0))
         for i in motion.form.each(code, motion.n):
             part = frame["state_ct", i + motion.n] * jump(i)
-            code.store(code.load(total, frame.vector) + part, total)
-        total, jumps = code.load(total, frame.vector), self.jumps(frame, jump)
+            total.value += part
+        total, jumps = total.value, self.jumps(frame, jump)
         gain = code.select(code.compare("!=", total, 0.0), 0.0 - total / rate, 0.0)
         if len(self.levels) > 1:
             gain = code.select(jumps, float("nan"), gain)

@@ -164,6 +164,23 @@ class Value:
         return Value(self.code, self.code.builder.not_(self.it))
 
 
+class Variable:
+    """A number or vector that changes: `value` is what it is here, and sets it. A register, after LLVM's passes."""
+
+    def __init__(self, place: Value, kind: ir.Type):
+        self._place, self._kind = place, kind
+
+    @property
+    def value(self) -> Value:
+        """What it is here."""
+        return self._place.code.load(self._place, self._kind)
+
+    @value.setter
+    def value(self, x: "Value | float") -> None:
+        code = self._place.code
+        code.store(code.as_value(x, self._kind), self._place)
+
+
 @functools.cache
 def _splat(kind: ir.Type, lanes: int) -> tuple[ir.Constant, ...]:
     """The constants that a number of this kind is put into all lanes with."""
@@ -248,6 +265,10 @@ class Code:
         a, b = self._alike(a, b)
         return self.select(a > b, a, b)
 
+    def largest_or_nan(self, a: Value, b: Value) -> Value:
+        """The larger; NaN where `b` is."""
+        return self.select(b <= a, a, b)
+
     def as_double(self, i: Value) -> Value:
         """Integers, or bits, as doubles."""
         if isinstance(i.it.type, ir.VectorType):
@@ -318,13 +339,14 @@ class Code:
         eight = ir.Constant(ir.VectorType(INTEGER, self.lanes), [8] * self.lanes)
         return function, eight, (ir.Constant(word, 8), every, nothing)
 
-    def variable(self, start: Value) -> Value:
-        """A place for a value that changes; registers, after LLVM's passes."""
+    def variable(self, start: Value) -> "Variable":
+        """A number or vector that changes, as it starts."""
         with self.builder.goto_entry_block():
             place = self.builder.alloca(start.it.type)
         place.align = self._alignment(start.it.type)
-        self.store(start, Value(self, place))
-        return Value(self, place)
+        variable = Variable(Value(self, place), start.it.type)
+        variable.value = start
+        return variable
 
     def _alignment(self, kind) -> int:
         return 8 * self.lanes if kind == self.vector else 8
@@ -335,10 +357,10 @@ class Code:
     def loop(self, stop, start=0) -> Iterator[Value]:
         """Integers from `start` up to, without, `stop`."""
         counter = self.variable(self.as_value(start, INTEGER))
-        with self.repeat_while(lambda: self.load(counter, INTEGER) < stop, name=COUNTED):
-            i = self.load(counter, INTEGER)
+        with self.repeat_while(lambda: counter.value < stop, name=COUNTED):
+            i = counter.value
             yield i
-            self.store(i + 1, counter)
+            counter.value = i + 1
 
     def cases(self, number: Value, values: range) -> Iterator[int]:
         """A switch: each of the `values` in turn, with the code written meanwhile for where `number` has it."""
@@ -353,13 +375,17 @@ class Code:
         self.builder.position_at_end(end)
 
     @contextmanager
-    def repeat_while(self, condition, name: str = "head") -> Iterator[None]:
-        """The body again and again, as long as `condition()` holds before it."""
+    def repeat_while(self, condition, at_most: "Value | int | None" = None, name: str = "head") -> Iterator[None]:
+        """The body again and again, as long as `condition()` holds before it, `at_most` this many times."""
+        left = None if at_most is None else self.variable(self.as_value(at_most, INTEGER))
         head, body, done = (self.function.append_basic_block(name) for name in (name, "body", "done"))
         self.builder.branch(head)
         self.builder.position_at_end(head)
-        self.builder.cbranch(condition().it, body, done)
+        again = condition()
+        self.builder.cbranch((again if left is None else again & (left.value > 0)).it, body, done)
         self.builder.position_at_end(body)
+        if left is not None:
+            left.value -= 1
         yield
         self.builder.branch(head)
         self.builder.position_at_end(done)

@@ -106,8 +106,8 @@ class LookUps:
         found = code.variable(code.as_value(1, INTEGER))
         with code.loop(count - 1) as i:
             before, after = (code.load(code.element(base, k * stride), DOUBLE) for k in (i, i + 1))
-            code.store(code.select(before < after, code.load(found, INTEGER), 0), found)
-        return code.finish(code.load(found, INTEGER))
+            found.value = code.select(before < after, found.value, 0)
+        return code.finish(found.value)
 
     @functools.cached_property
     def _locate(self) -> Code:
@@ -115,12 +115,12 @@ class LookUps:
         code = Code(self.module, "locate", [POINTER, INTEGER, INTEGER, INTEGER, DOUBLE], 1, result=DOUBLE)
         base, stride, count, closed, x = code.arguments
         low, high = code.variable(code.as_value(0, INTEGER)), code.variable(count)
-        with code.repeat_while(lambda: code.load(low, INTEGER) < code.load(high, INTEGER)):
-            middle = (code.load(low, INTEGER) + code.load(high, INTEGER)) / 2
+        with code.repeat_while(lambda: low.value < high.value):
+            middle = (low.value + high.value) / 2
             below = code.load(code.element(base, middle * stride), DOUBLE) <= x
-            code.store(code.select(below, middle + 1, code.load(low, INTEGER)), low)
-            code.store(code.select(below, code.load(high, INTEGER), middle), high)
-        found = code.load(low, INTEGER) - 1
+            low.value = code.select(below, middle + 1, low.value)
+            high.value = code.select(below, high.value, middle)
+        found = low.value - 1
         last = code.load(code.element(base, (count - 1) * stride), DOUBLE)
         ends = code.compare("==", x, last) & (closed > 0)
         return code.finish(code.as_double(code.select(ends, count - 2, found)))

@@ -16,7 +16,7 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._frame import CACHE_LINE, Frame, Numbers, Vectors, integers
-from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
+from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._packs import (
     ANYWHERE,
     ONE,
@@ -161,12 +161,12 @@ class Packed(Tables):
         head, end = (code.function.append_basic_block(name) for name in ("next", "end"))
         code.builder.branch(head)
         code.builder.position_at_end(head)
-        switch = code.builder.switch(word(code, code.load(at, POINTER), 0).it, end)
+        switch = code.builder.switch(word(code, at.value, 0).it, end)
         for (kind, modes), number in self._numbers.items():
             block = code.function.append_basic_block(kind.op)
             switch.add_case(ir.Constant(INTEGER, number), block)
             code.builder.position_at_end(block)
-            code.store(self._write_run(code.load(at, POINTER), kind, modes), at)
+            at.value = self._write_run(at.value, kind, modes)
             code.builder.branch(head)
         code.builder.position_at_end(end)
         frame.finish()

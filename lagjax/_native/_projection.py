@@ -51,9 +51,8 @@ class Projector:
             error = (far - ROUND_OFF * size) * frame["scale", i] * (1 / PROJECTION_TOLERANCES)
             # A start may be off by more, as much as is taken for consistent.
             error = code.select(first, far / (START * (1.0 + size)), error)
-            off = code.load(farthest, frame.vector)
-            code.store(code.select(error <= off, off, error), farthest)  # NaN goes through
-        return projected, code.load(farthest, frame.vector)
+            farthest.value = code.largest_or_nan(farthest.value, error)
+        return projected, farthest.value
 
     def _project(self) -> Code:
         """`()`: the end of the step back on the constraints, into `projected`; how far it was, into `defect`."""

@@ -49,16 +49,16 @@ class Roots:
         frame["poly", 0] = side * (motion.followed_value(frame, j) - level)
         power = code.variable(side * h)
         with code.loop(degree + 1, start=1) as k:
-            frame["poly", k] = motion.followed_coefficient(frame, j, k) * code.load(power, frame.vector)
-            code.store(code.load(power, frame.vector) * h, power)
+            frame["poly", k] = motion.followed_coefficient(frame, j, k) * power.value
+            power.value = power.value * h
         frame["poly", degree + 1] = 0.0
 
     def size(self, frame: Frame, degree: Value) -> Value:
         """Σ |cₖ|."""
         code, size = frame.code, frame.code.variable(frame.constant(0.0))
         with code.loop(degree + 1) as k:
-            code.store(code.load(size, frame.vector) + code.intrinsic("fabs", frame["poly", k]), size)
-        return code.load(size, frame.vector)
+            size.value += code.intrinsic("fabs", frame["poly", k])
+        return size.value
 
     def last_terms(self, frame: Frame, degree: Value, first: int = 0) -> Value:
         """The size of the last three, or of those before: one may have been divided away, one be zero by symmetry."""
@@ -69,13 +69,12 @@ class Roots:
         """Halve the interval as long as it is said to be long; `part` of it is left."""
         code = frame.code
         frame["part"] = 1.0
-        again, left = code.variable(integer(code, 1)), code.variable(integer(code, MOST_HALVINGS))
-        with code.repeat_while(lambda: (code.load(again, INTEGER) > 0) & (code.load(left, INTEGER) > 0)):
-            code.store(code.load(left, INTEGER) - 1, left)
-            code.store(integer(code, 0), again)
+        again = code.variable(integer(code, 1))
+        with code.repeat_while(lambda: again.value > 0, at_most=MOST_HALVINGS):
+            again.value = 0
             long = is_long()
             with code.only_if(code.any_lane(long)):
-                code.store(integer(code, 1), again)
+                again.value = 1
                 self.stretch(frame, degree, code.select(long, 0.5, 1.0))
 
     def stretch(self, frame: Frame, degree: Value, part: Value) -> None:
@@ -84,8 +83,8 @@ class Roots:
         frame["part"] = frame["part"] * part
         power = code.variable(frame.constant(1.0))
         with code.loop(degree + 1) as k:
-            frame["poly", k] = frame["poly", k] * code.load(power, frame.vector)
-            code.store(code.load(power, frame.vector) * part, power)
+            frame["poly", k] = frame["poly", k] * power.value
+            power.value = power.value * part
 
     # ---- its roots ----
 
@@ -104,7 +103,7 @@ class Roots:
         sums = {name: code.variable(zero) for name in ("falls", "rises", "down", "up")}
 
         def add(name: str, x: Value) -> None:
-            code.store(code.load(sums[name], frame.vector) + x, sums[name])
+            sums[name].value += x
 
         with code.loop(degree + 1, start=1) as k:
             c, number = frame["poly", k], code.as_double(k)
@@ -115,7 +114,7 @@ class Roots:
             add("down", negative * (0.0 - bend))
             add("up", positive * bend)
         for name, sum in sums.items():
-            frame[name] = code.load(sum, frame.vector)
+            frame[name] = sum.value
 
     def turn(self, frame: Frame, degree: Value, where: Value) -> None:
         """In some lanes the polynomial with the other sign."""
@@ -142,16 +141,13 @@ class Roots:
         bend = code.maximum(down, frame["up"])
         at_start = (ROOT_NOISE * EPS) * code.intrinsic("fabs", frame["poly", 0]) + frame["unsure"]
         along = (ROOT_NOISE * EPS) * (frame["falls"] + frame["rises"])
-        x, going, left = (code.variable(y) for y in (
-            frame["begin"], code.flag(searching), integer(code, MOST_MOVES),
-        ))  # fmt: skip
+        x, going = (code.variable(y) for y in (frame["begin"], code.flag(searching)))
 
         def active():
-            return code.load(going, frame.vector) > 0.0
+            return going.value > 0.0
 
-        with code.repeat_while(lambda: code.any_lane(active()) & (code.load(left, INTEGER) > 0)):
-            code.store(code.load(left, INTEGER) - 1, left)
-            here, now = code.load(x, frame.vector), active()
+        with code.repeat_while(lambda: code.any_lane(active()), at_most=MOST_MOVES):
+            here, now = x.value, active()
             value, slope = self._at(frame, degree, here)
             noise, left_out = at_start + along * here, frame["doubt"] * self._power(here)
             error = noise + left_out
@@ -171,13 +167,13 @@ class Roots:
             after = code.variable(here + numerator / denominator)
             with code.only_if(code.any_lane(open)):
                 hop = here + self._hop(frame, error, bend)
-                code.store(code.select(open, hop, code.load(after, frame.vector)), after)
-            after = code.load(after, frame.vector)
-            code.store(code.select(now, after, here), x)
-            code.store(code.flag(now & ~ends & (after < 1.0)), going)
+                after.value = code.select(open, hop, after.value)
+            after = after.value
+            x.value = code.select(now, after, here)
+            going.value = code.flag(now & ~ends & (after < 1.0))
         with frame.where(active()):
             frame["is_root"] = 0.0
-            frame["root"] = code.load(x, frame.vector)
+            frame["root"] = x.value
 
     def _note_root(self, frame: Frame, here: Value, known: tuple[Value, ...], is_root: Value, ends: Value) -> None:
         """The place of a root, or where the search ends; near it one step of Newton's more, and not a long one."""
@@ -206,7 +202,7 @@ class Roots:
         code = frame.code
         value, slope = code.variable(frame["poly", degree]), code.variable(frame.constant(0.0))
         with code.loop(degree + 1, start=1) as k:
-            before = code.load(value, frame.vector)
-            code.store(code.load(slope, frame.vector) * x + before, slope)
-            code.store(before * x + frame["poly", degree - k], value)
-        return code.load(value, frame.vector), code.load(slope, frame.vector)
+            before = value.value
+            slope.value = slope.value * x + before
+            value.value = before * x + frame["poly", degree - k]
+        return value.value, slope.value

@@ -215,10 +215,10 @@ class Saltation:
                     if row == 0:
                         ct = code.select(jumps(i), ct, 0.0) if part else frame.constant(0.0)
                     cotangents[i + (2 * row + part) * n] = ct
-                    code.store(code.load(sum, frame.vector) + code.intrinsic("fabs", ct), sum)
+                    sum.value += code.intrinsic("fabs", ct)
         line = self.jump.transposed(n, self.parameters, self.pieces)
         gains = motion.form.run(frame, line, *inputs, cotangents)
-        moves = (frame["is_hit"] > 0.0) & ~(code.load(sum, frame.vector) <= 0.0)
+        moves = (frame["is_hit"] > 0.0) & ~(sum.value <= 0.0)
         without = frame["grazes"] > 0.0
 
         def gain(row: int, i: Index) -> Value:

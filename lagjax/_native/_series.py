@@ -242,13 +242,13 @@ class Motion:
                 weight = code.lanes_of(code.as_double(k))
                 for j, i in enumerate(some):
                     c = frame["y", i, k]
-                    code.store(code.load(value[j], frame.vector) * s + c, value[j])
+                    value[j].value = value[j].value * s + c
                     if j in slope:
-                        code.store(code.load(slope[j], frame.vector) * s + c * weight, slope[j])
+                        slope[j].value = slope[j].value * s + c * weight
             for j, i in enumerate(some):
-                increments[i] = code.load(value[j], frame.vector) * s
+                increments[i] = value[j].value * s
             for j, i in velocities.items():
-                slopes[i] = code.load(slope[j], frame.vector)
+                slopes[i] = slope[j].value
         return increments, slopes
 
     def evaluate_now(self, frame: Frame, line: StraightLine) -> Numbers:
@@ -271,9 +271,7 @@ class Motion:
     @contextmanager
     def rounds(self, frame: Frame, count: Value) -> Iterator[None]:
         """A context: its body is one round, of `count` at most, as long as a lane is active."""
-        code, left = frame.code, frame.code.variable(count)
-        with code.repeat_while(lambda: self._any_active(frame) & (code.load(left, INTEGER) > 0)):
-            code.store(code.load(left, INTEGER) - 1, left)
+        with frame.code.repeat_while(lambda: self._any_active(frame), at_most=count):
             yield
 
     def more(self, frame: Frame) -> Value:

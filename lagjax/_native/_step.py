@@ -109,12 +109,11 @@ class StepControl:
                     frame["scale", i + half * n] = scale
                     for k in range(2):
                         error = code.intrinsic("fabs", frame["y", i + half * n, order - k]) * scale
-                        before = code.load(errors[k], frame.vector)
-                        code.store(code.select(error <= before, before, error), errors[k])  # NaN goes through
+                        errors[k].value = code.largest_or_nan(errors[k].value, error)
                     # An infinite slope may leave no trace in the last coefficients.
-                    sound = code.select(rate < float("inf"), code.load(errors[0], frame.vector), float("nan"))
-                    code.store(sound, errors[0])
-        return code.load(errors[0], frame.vector), code.load(errors[1], frame.vector)
+                    sound = code.select(rate < float("inf"), errors[0].value, float("nan"))
+                    errors[0].value = sound
+        return errors[0].value, errors[1].value
 
     def _floor(self, frame: Frame, half: int, part: int, sizes: Numbers) -> Value:
         """The absolute tolerance of the coordinates, or of the velocities (half 1), of a part of the motion."""
@@ -176,9 +175,9 @@ class StepControl:
         for i in motion.form.each(code, n):
             # What rounding leaves of an acceleration is not a defect of the series.
             excess = code.intrinsic("fabs", acceleration[i] - slopes[i]) - noise(i)
-            error, before = weight * excess * frame["scale", i + n], code.load(defect, frame.vector)
-            code.store(code.select(error <= before, before, error), defect)  # NaN goes through
-        frame["defect"] = code.load(defect, frame.vector)
+            error = weight * excess * frame["scale", i + n]
+            defect.value = code.largest_or_nan(defect.value, error)
+        frame["defect"] = defect.value
         return frame.finish()
 
     def _noise(self, frame: Frame, acceleration, increments, moved) -> Callable[[Index], Value]:
@@ -204,8 +203,8 @@ class StepControl:
         """Check the steps of all lanes, and halve those that fail, until none does."""
         code = frame.code
         again = code.variable(integer(code, 1))
-        with code.repeat_while(lambda: code.load(again, INTEGER) > 0):
-            code.store(integer(code, 0), again)
+        with code.repeat_while(lambda: again.value > 0):
+            again.value = 0
             frame["defect"] = 0.0
             for place in CHECKS:
                 frame.call(self.defect, order, double(code, place))
@@ -214,7 +213,7 @@ class StepControl:
                 frame.call(self.projector.project)
             bad = ~(frame["defect"] <= 1.0) & code.compare("!=", frame["h"], 0.0)
             with code.only_if(code.any_lane(bad)):
-                code.store(integer(code, 1), again)
+                again.value = 1
                 half = 0.5 * frame["h"]
                 small = bad & (code.intrinsic("fabs", half) < frame["smallest"])
                 frame["h"] = code.select(small, 0.0, code.select(bad, half, frame["h"]))

@@ -170,11 +170,11 @@ class _Sweep:
         call(code, self.of_plan("begin"), ir.VoidType(), *given)
         more = call(code, self.of_plan("run"), INTEGER, *given, self._counter(2), self.of_plan("rounds"))
         well = code.variable(code.select(code.compare("==", more, 0), code.as_value(1, INTEGER), 0))
-        with code.only_if(code.load(well, INTEGER) > 0), code.loop(self.members) as i:
+        with code.only_if(well.value > 0), code.loop(self.members) as i:
             ended = code.load(code.element(place["code"], i), DOUBLE)
             with code.only_if(code.compare("!=", ended, float(DONE))):
-                code.store(code.as_value(0, INTEGER), well)
-        return code.load(well, INTEGER) > 0
+                well.value = 0
+        return well.value > 0
 
     def _order(self) -> None:
         """The rows of the steps, member by member."""
@@ -182,10 +182,10 @@ class _Sweep:
         first = code.variable(code.as_value(0, INTEGER))
         with code.loop(self.members) as i:
             count = code.as_integer(code.load(code.element(place["steps"], i), DOUBLE))
-            begin = code.load(first, INTEGER)
+            begin = first.value
             code.store(count, code.element(place["counts"], i, INTEGER))
             code.store(begin, code.element(place["first_step"], i, INTEGER))
-            code.store(begin + count, first)
+            first.value = begin + count
         with code.loop(code.load(self._counter(1), INTEGER)) as i:
             row = code.element(place["rows"], i * width)
             member, step = (code.as_integer(code.load(code.element(row, k), DOUBLE)) for k in (2, 3))

@@ -94,8 +94,8 @@ class Tables:
         """The largest of this many numbers, which are not negative; NaN where the last one is."""
         largest = code.variable(code.lanes_of(0.0))
         for i in self.each(code, count):
-            code.store(code.maximum(code.load(largest, code.vector), numbers(i)), largest)
-        return code.load(largest, code.vector)
+            largest.value = code.maximum(largest.value, numbers(i))
+        return largest.value
 
     def largest_by_group(self, frame: Frame, numbers: Callable[[Value], Value], groups: Sequence[int]) -> Numbers:
         """For each of the numbers the largest one of its group: of those with the same number in `groups`."""
@@ -177,18 +177,18 @@ class Tables:
         head, end = (code.function.append_basic_block(name) for name in ("next", "end"))
         code.builder.branch(head)
         code.builder.position_at_end(head)
-        switch = code.builder.switch(word(code, code.load(at, POINTER), 0).it, end)
+        switch = code.builder.switch(word(code, at.value, 0).it, end)
         for (kind, times), number in self._kinds.items():
             block = code.function.append_basic_block(kind.op)
             switch.add_case(ir.Constant(INTEGER, number), block)
             code.builder.position_at_end(block)
-            words, size = code.load(at, POINTER), kind.operands + kind.results
+            words, size = at.value, kind.operands + kind.results
             for k in range(times):
                 where = [frame.at(word(code, words, 1 + k * size + i)) for i in range(size)]
                 operands = (code.load(address, frame.vector) for address in where[: kind.operands])
                 for result, address in zip(self._results(kind, operands), where[kind.operands :], strict=True):
                     code.store(result, code.element(address, shift) if kind.op == "store" else address)
-            code.store(code.element(words, 1 + times * size, WORD), at)
+            at.value = code.element(words, 1 + times * size, WORD)
             code.builder.branch(head)
         code.builder.position_at_end(end)
         frame.finish()

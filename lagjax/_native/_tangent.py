@@ -366,15 +366,15 @@ class Tangent:
         change = code.variable(frame.constant(0.0))
         for i in form.each(code, base):
             part = slopes[i] * frame["dy", i, 0] + slopes[i + base] * frame["dy", i + n, 0]
-            code.store(code.load(change, frame.vector) + part, change)
+            change.value += part
         for k in form.each(code, saltation.parameters):
             part = slopes[k + (2 * base + 1)] * frame["dparams", k]
-            code.store(code.load(change, frame.vector) + part, change)
+            change.value += part
         for k, table in enumerate(saltation.tables):
             first = len(saltation.by) + 2 * k
             entry = self.motion.look_up.take(frame, table._replace(tangents=True), slopes[first])
-            code.store(code.load(change, frame.vector) + slopes[first + 1] * entry, change)
-        delay = 0.0 - code.load(change, frame.vector) / self.number_of(frame, "rate")
+            change.value = change.value + slopes[first + 1] * entry
+        delay = 0.0 - change.value / self.number_of(frame, "rate")
         always = is_hit & (self.number_of(frame, "jumps") > 0.0)  # where the tangents of the motion jump themselves
         for first, count in ((0, base), (base, n - base)):
             if first:
@@ -491,11 +491,11 @@ class Tangent:
         for i in self.form.each(code, self.states):
             frame[name, i] = frame["dy", i, 0]
         with code.loop(order, start=0) as k:
-            before = code.load(power, frame.vector)
+            before = power.value
             now = before * s
             for i in self.form.each(code, self.states):
                 frame[name, i] = frame[name, i] + frame["dy", i, k + 1] * now
-            code.store(now, power)
+            power.value = now
             if powers:
                 frame["power_before"], frame["power"] = before, now
 
