@@ -136,7 +136,6 @@ class Clocks:
         motion, code = self.motion, frame.code
         moved = motion.moved(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
         before = motion.evaluate(frame, motion.acceleration, moved, frame["h"])
-        jump, total = self.jump(code, before, frame.vectors("after", motion.n)), code.variable(frame.constant(0.0))
-        for i in motion.form.each(code, motion.n):
-            total.value = total.value + frame["state_ct", i + motion.n] * jump(i)
-        return total.value, frame["has_after"] > 0.0
+        jump = self.jump(code, before, frame.vectors("after", motion.n))
+        total = code.total(frame["state_ct", i + motion.n] * jump(i) for i in motion.form.each(code, motion.n))
+        return total, frame["has_after"] > 0.0

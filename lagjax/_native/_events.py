@@ -436,4 +436,3 @@ class Events:
     def _row(self, frame: Frame, member: Value, g: Value, number: Value) -> Value:
         rows = frame.job("room_of_notes") + 1
         return ((member * self.count + g) * rows + number) * (self.motion.states + 1)
-

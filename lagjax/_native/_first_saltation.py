@@ -12,7 +12,8 @@ A motion with tangents, of which tangents are taken again, is a motion of its ow
 second derivatives are NaN.
 """
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 
 from lagjax._native._constants import JUMP_NOISE
 from lagjax._native._frame import Frame, Index, Numbers
@@ -20,7 +21,7 @@ from lagjax._native._ir import Code, Value
 from lagjax._native._saltation import GuardTable
 from lagjax._native._series import Motion
 from lagjax._program._borders import Borders, gradient
-from lagjax._program._look_ups import shifted
+from lagjax._program._look_ups import Table, shifted
 
 
 class FirstSaltation:
@@ -54,11 +55,17 @@ class FirstSaltation:
         motion, code = self.motion, frame.code
         chosen = [frame.vectors(name, self.pieces) for name in (("entry", "hit") if self.levels_move else ("hit",))]
         out = motion.form.run(frame, self.line, state, time, frame.vectors("params", motion.numbers), *chosen)
-        rate = code.variable(out[2 * self.base])
-        for i in motion.form.each(code, self.base):
-            moved = out[i] * state[i + motion.n] + out[i + self.base] * frame["rate_before", i]
-            rate.value += moved
-        return out, rate.value
+        moved = (
+            out[i] * state[i + motion.n] + out[i + self.base] * frame["rate_before", i]
+            for i in motion.form.each(code, self.base)
+        )
+        return out, code.total(moved, out[2 * self.base])
+
+    def by_entries(self, frame: Frame, slopes: Numbers, of: Callable[[Table], Table]) -> Iterator[Value]:
+        """The parts of δu by entries of tables, whose tangents are the entries of the table `of(table)`."""
+        for k, table in enumerate(self.tables):
+            first = len(self.by) + 2 * k
+            yield slopes[first + 1] * self.motion.look_up.take(frame, of(table), slopes[first])
 
     def note_hit(self, frame: Frame, table: GuardTable) -> None:
         """Which switching number the guard `crossed` has, into `hit`; none where a motion begins on the border."""
@@ -91,10 +98,9 @@ class FirstSaltation:
 
     def jumps(self, frame: Frame, jump: Callable) -> Value:
         """True if the acceleration of the motion itself jumps."""
-        code, sum = frame.code, frame.code.variable(frame.constant(0.0))
-        for i in self.motion.form.each(code, self.base):
-            sum.value += code.intrinsic("fabs", jump(i))
-        return ~(sum.value <= 0.0)
+        code = frame.code
+        sizes = (code.intrinsic("fabs", jump(i)) for i in self.motion.form.each(code, self.base))
+        return ~(code.total(sizes) <= 0.0)
 
     # ---- forward ----
 
@@ -119,19 +125,17 @@ class FirstSaltation:
         for level, (inner, outer) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
             numbers = self.parameters * inner // self.base
             for d in range(1, outer // inner):
-                change = code.variable(frame.constant(0.0))
-                for i in motion.form.each(code, self.base):
-                    part = slopes[i] * state[i + d * inner] + slopes[i + self.base] * state[i + (n + d * inner)]
-                    change.value += part
-                for k in motion.form.each(code, self.parameters):
-                    part = slopes[k + (2 * self.base + 1)] * frame["params", k + d * numbers]
-                    change.value += part
-                for k, table in enumerate(self.tables):
-                    own = shifted(table, d * motion.of_member * inner // n)
-                    first = len(self.by) + 2 * k
-                    part = slopes[first + 1] * motion.look_up.take(frame, own, slopes[first])
-                    change.value += part
-                delay = 0.0 - change.value / rate
+                by_state = (
+                    slopes[i] * state[i + d * inner] + slopes[i + self.base] * state[i + (n + d * inner)]
+                    for i in motion.form.each(code, self.base)
+                )
+                by_parameters = (
+                    slopes[k + (2 * self.base + 1)] * frame["params", k + d * numbers]
+                    for k in motion.form.each(code, self.parameters)
+                )
+                shift = d * motion.of_member * inner // n
+                entries = self.by_entries(frame, slopes, lambda table, shift=shift: shifted(table, shift))
+                delay = 0.0 - code.total(itertools.chain(by_state, by_parameters, entries)) / rate
                 for i in motion.form.each(code, self.base):
                     self._move(frame, n + d * inner, i, jump, is_hit, delay)
                 if level:
@@ -165,11 +169,9 @@ class FirstSaltation:
     def gain(self, frame: Frame, rate: Value) -> Value:
         """The multiple of ∂u that the cotangents gain: `after` holds a⁺, `state_ct` the cotangent behind the border."""
         motion, code = self.motion, frame.code
-        jump, total = self.jump(frame, frame.vectors("after", motion.n)), code.variable(frame.constant(0.0))
-        for i in motion.form.each(code, motion.n):
-            part = frame["state_ct", i + motion.n] * jump(i)
-            total.value += part
-        total, jumps = total.value, self.jumps(frame, jump)
+        jump = self.jump(frame, frame.vectors("after", motion.n))
+        total = code.total(frame["state_ct", i + motion.n] * jump(i) for i in motion.form.each(code, motion.n))
+        jumps = self.jumps(frame, jump)
         gain = code.select(code.compare("!=", total, 0.0), 0.0 - total / rate, 0.0)
         if len(self.levels) > 1:
             gain = code.select(jumps, float("nan"), gain)

@@ -14,7 +14,7 @@ import ctypes
 import ctypes.util
 import functools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -264,6 +264,13 @@ class Code:
         """The larger; `b` where they cannot be compared."""
         a, b = self._alike(a, b)
         return self.select(a > b, a, b)
+
+    def total(self, terms: Iterable[Value], start: "Value | float" = 0.0) -> Value:
+        """The sum of vectors, and of what it starts from; the terms may go round a loop of this code."""
+        total = self.variable(self.lanes_of(start))
+        for term in terms:
+            total.value += term
+        return total.value
 
     def largest_or_nan(self, a: Value, b: Value) -> Value:
         """The larger; NaN where `b` is."""

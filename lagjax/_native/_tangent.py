@@ -14,6 +14,7 @@ A step that suits the motion may be too long for its tangents: about an equilibr
 of a tangent does not. So the last two terms of their series are measured, and `excess` says how large they became.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -363,18 +364,15 @@ class Tangent:
         base = saltation.base
         slopes = self.numbers_of(frame, "slopes", saltation.slopes)
         jump = self.numbers_of(frame, "jump", n)
-        change = code.variable(frame.constant(0.0))
-        for i in form.each(code, base):
-            part = slopes[i] * frame["dy", i, 0] + slopes[i + base] * frame["dy", i + n, 0]
-            change.value += part
-        for k in form.each(code, saltation.parameters):
-            part = slopes[k + (2 * base + 1)] * frame["dparams", k]
-            change.value += part
-        for k, table in enumerate(saltation.tables):
-            first = len(saltation.by) + 2 * k
-            entry = self.motion.look_up.take(frame, table._replace(tangents=True), slopes[first])
-            change.value = change.value + slopes[first + 1] * entry
-        delay = 0.0 - change.value / self.number_of(frame, "rate")
+        by_state = (
+            slopes[i] * frame["dy", i, 0] + slopes[i + base] * frame["dy", i + n, 0] for i in form.each(code, base)
+        )
+        by_parameters = (
+            slopes[k + (2 * base + 1)] * frame["dparams", k] for k in form.each(code, saltation.parameters)
+        )
+        entries = saltation.by_entries(frame, slopes, lambda table: table._replace(tangents=True))
+        change = code.total(itertools.chain(by_state, by_parameters, entries))
+        delay = 0.0 - change / self.number_of(frame, "rate")
         always = is_hit & (self.number_of(frame, "jumps") > 0.0)  # where the tangents of the motion jump themselves
         for first, count in ((0, base), (base, n - base)):
             if first:
