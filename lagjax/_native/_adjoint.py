@@ -25,7 +25,7 @@ from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._look_ups import lane_of
-from lagjax._native._output import RECORDED, recall_pieces
+from lagjax._native._replay import Replay
 from lagjax._native._saltation import GuardTable, Saltation, jump_along
 from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._program._borders import Borders
@@ -82,7 +82,8 @@ class Adjoint:
         moving = dtypes[: len(dtypes) - self.motion.pieces]
         self.varied = [i for i, dtype in enumerate(moving) if dtype.kind == "f" and i != states]
         self.zeroth_order, self.tables, self.order_recursion = self._transposed(dtypes)
-        self.start_next = self._start_next()
+        self.replay = Replay(self.motion)
+        self.start_next = self.replay.start_next(self._begin_lane, self._take_member)
         steps = [self._seed(), self._back_orders(self._back_sums(), self._back_recursion()), self._back_start()]
         if projection is not None:
             self.projection_line, self.tables_of_projection = pullback_and_entries(
@@ -118,9 +119,7 @@ class Adjoint:
     def _begin(self) -> None:
         """`begin(job, memory, lanes)`: every lane takes a member."""
         frame = self.motion.function("begin", public=True)
-        self.motion.form.prepare(frame)
-        with frame.code.loop(self.motion.width) as lane:
-            frame.call(self.start_next, lane)
+        self.replay.begin(frame, self.start_next)
         frame.finish()
 
     def _run(self, steps: list[Code]) -> None:
@@ -129,75 +128,42 @@ class Adjoint:
         Returns 1 if there is more to do.
         """
         frame = self.motion.function("run", INTEGER, result=INTEGER, public=True)
-        code, (rounds,) = frame.code, frame.arguments
-        with self.motion.rounds(frame, rounds):
-            with code.loop(self.motion.width) as j:
-                self._recall(frame, frame.lane(j))
-            frame.call(self.motion.coefficients, frame.job("order"))
+        with self.replay.rounds(frame, frame.arguments[0], self._leave_step):
             for step in steps:
                 frame.call(step)
-            with code.loop(self.motion.width) as j:
-                self._end_or_go_on(frame, frame.lane(j), j)
         frame.finish(self.motion.more(frame))
 
     # ---- members and their steps ----
 
-    def _start_next(self) -> Code:
-        """`(lane)`: the lane takes the next member with steps, or none is left."""
-        frame = self.motion.function("start_next", INTEGER)
-        code, lane = frame.code, frame.lane(frame.arguments[0])
-        lane["step"], lane["member"] = 0, 0
-        with code.repeat_while(lambda: (lane["member"] >= 0) & (lane["step"] <= 0)):
-            member = frame.next_member()
-            there = member < frame.job("members")
-            lane["member"] = code.select(there, member, -1)
-            lane["step"] = frame.read("steps", code.select(there, member, 0), INTEGER)
-        member = lane["member"]
-        there = member >= 0
-        lane["active"] = code.flag(there)
-        lane["h"], lane["excess"] = 0.0, 0.0
+    def _begin_lane(self, frame: Frame, index: Value) -> None:
+        lane = frame.lane(index)
+        lane["excess"] = 0.0
         if self.motion.pieces:
             lane["has_after"] = 0.0
         lane["step"] = lane["step"] - 1
         lane["output"] = frame.job("times") - 2
-        with code.only_if(there):
-            for i in self.motion.form.each(code, self.states):
-                lane["state_ct", i] = frame.read("y_ct", member * self.states + i)
-            first = member * frame.job("params_stride")
-            lane["first_number"] = code.as_double(first)
-            with code.loop(self.motion.parameters) as i:
-                lane["params", i] = frame.read("params", first + self.motion.place_of_number(code, i))
-                lane["params_ct", i] = 0.0
-        return frame.finish()
 
-    def _recall(self, frame: Frame, lane: Lane) -> None:
-        """The time, size and first state of the step that the lane is to go back."""
-        member = lane["member"]
-        with frame.code.only_if(member >= 0):
-            row = (frame.read("first_step", member, INTEGER) + lane["step"]) * (
-                self.states + RECORDED + self.motion.recorded_pieces
-            )
-            lane["t"] = frame.read("record", row)
-            lane["h"] = frame.read("record", row + 1)
-            for i in self.motion.form.each(frame.code, self.states):
-                lane["y", i] = frame.read("record", row + (i + RECORDED))
-            recall_pieces(self.motion, frame, lane, row)
+    def _take_member(self, frame: Frame, lane: Lane, member: Value) -> None:
+        """The cotangent of the end of a member's motion."""
+        for i in self.motion.form.each(frame.code, self.states):
+            lane["state_ct", i] = frame.read("y_ct", member * self.states + i)
+        with frame.code.loop(self.motion.parameters) as i:
+            lane["params_ct", i] = 0.0
 
-    def _end_or_go_on(self, frame: Frame, lane: Lane, index: Value) -> None:
+    def _leave_step(self, frame: Frame, lane: Lane, index: Value) -> None:
         """One step less to go back; after the first one, write down the cotangents and take the next member."""
         code, member = frame.code, lane["member"]
-        with code.only_if(member >= 0):
-            left = lane["step"] - 1
-            lane["step"] = left
-            with code.only_if(left < 0):
-                for i in self.motion.form.each(code, self.states):
-                    frame.write("y_ct", member * self.states + i, lane["state_ct", i])
-                with code.loop(self.motion.parameters) as i:
-                    place = member * self.motion.of_member + self.motion.place_of_number(code, i)
-                    before = frame.read("params_ct", place)  # it may be an entry of a table, too
-                    frame.write("params_ct", place, lane["params_ct", i] + before)
-                frame.write("excess", member, lane["excess"])
-                frame.call(self.start_next, index)
+        left = lane["step"] - 1
+        lane["step"] = left
+        with code.only_if(left < 0):
+            for i in self.motion.form.each(code, self.states):
+                frame.write("y_ct", member * self.states + i, lane["state_ct", i])
+            with code.loop(self.motion.parameters) as i:
+                place = member * self.motion.of_member + self.motion.place_of_number(code, i)
+                before = frame.read("params_ct", place)  # it may be an entry of a table, too
+                frame.write("params_ct", place, lane["params_ct", i] + before)
+            frame.write("excess", member, lane["excess"])
+            frame.call(self.start_next, index)
 
     # ---- the transpose of a step ----
 

@@ -27,7 +27,7 @@ from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Lane, Layout, Vectors, integers, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
-from lagjax._native._output import RECORDED, recall_pieces
+from lagjax._native._replay import Replay
 from lagjax._native._saltation import GuardTable, Saltation, jump_along
 from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._native._tables import Tables
@@ -92,7 +92,8 @@ class Tangent:
         moving = dtypes[: len(dtypes) - pieces]
         self.varied = [i for i, dtype in enumerate(moving) if dtype.kind == "f" and i != states]
         self._derive(dtypes, projection)
-        self.start_next = self._start_next()
+        self.replay = Replay(self.motion)
+        self.start_next = self.replay.start_next(self._begin_lane, lambda frame, lane, member: None)
         self.cauchy_products, self.recursion = self._cauchy_products(), self._recursion()
         steps = [self._take(), self._series(), self._end(), self._measure(), self._outputs(), self._leave()]
         if projection is not None:
@@ -184,11 +185,9 @@ class Tangent:
     def _begin(self) -> None:
         """`begin(job, memory, lanes)`: every lane takes a member."""
         frame = self.motion.function("begin", public=True)
-        self.motion.form.prepare(frame)
         if self.form is not self.motion.form:
             self.form.prepare(frame)
-        with frame.code.loop(self.motion.width) as lane:
-            frame.call(self.start_next, lane)
+        self.replay.begin(frame, self.start_next)
         frame.finish()
 
     def _run(self, steps: list[Code]) -> None:
@@ -199,10 +198,8 @@ class Tangent:
         frame = self.motion.function("run", INTEGER, result=INTEGER, public=True)
         code, (rounds,) = frame.code, frame.arguments
         directions, per_group = frame.job("directions"), self.lanes // self.motion.width
-        with self.motion.rounds(frame, rounds):
-            with code.loop(self.motion.width) as j:
-                self._recall(frame, frame.lane(j))
-            frame.call(self.motion.coefficients, frame.job("order"))
+        with self.replay.rounds(frame, rounds, self._leave_step):
+            self._await_end(frame)
             if isinstance(self.saltation, FirstSaltation):
                 frame.call(self.begin_behind)
             if self.projection is not None:
@@ -214,8 +211,6 @@ class Tangent:
                 frame.call(self.note_border)
             if self.clocks is not None:
                 frame.call(self.note_knot)
-            with code.loop(self.motion.width) as j:
-                self._end_or_go_on(frame, frame.lane(j), j)
         frame.finish(self.motion.more(frame))
 
     def _move(self, frame: Frame) -> None:
@@ -227,62 +222,37 @@ class Tangent:
 
     # ---- members and their steps ----
 
-    def _start_next(self) -> Code:
-        """`(lane)`: the lane takes the next member with steps, or none is left."""
-        frame = self.motion.function("start_next", INTEGER)
-        code, index = frame.code, frame.arguments[0]
+    def _begin_lane(self, frame: Frame, index: Value) -> None:
         lane = frame.lane(index)
-        lane["step"], lane["member"] = 0, 0
-        with code.repeat_while(lambda: (lane["member"] >= 0) & (lane["step"] <= 0)):
-            member = frame.next_member()
-            there = member < frame.job("members")
-            lane["member"] = code.select(there, member, -1)
-            lane["step"] = frame.read("steps", code.select(there, member, 0), INTEGER)
-        member = lane["member"]
-        there = member >= 0
-        lane["active"] = code.flag(there)
-        lane["h"], lane["step"], lane["output"] = 0.0, 0, 1
+        lane["step"], lane["output"] = 0, 1
         for tangents in self.lanes_of_tangents(frame, index):
             tangents["excess"] = 0.0
         if self.saltation is not None:
             lane["is_hit"] = 0.0
         if self.clocks is not None:
             lane["knot_of"] = 0.0
-        first = member * frame.job("params_stride")
-        with code.only_if(there):
-            lane["first_number"] = code.as_double(first)
-            with code.loop(self.motion.parameters) as i:
-                lane["params", i] = frame.read("params", first + self.motion.place_of_number(code, i))
-        return frame.finish()
 
-    def _recall(self, frame: Frame, lane: Lane) -> None:
-        """The time, size and first state of the step that the lane is to take; and where the next step begins."""
-        code, member = frame.code, lane["member"]
-        with code.only_if(member >= 0):
-            step = lane["step"]
-            size = self.states + RECORDED + self.motion.recorded_pieces
-            row = (frame.read("first_step", member, INTEGER) + step) * size
-            lane["t"] = frame.read("record", row)
-            lane["h"] = frame.read("record", row + 1)
-            for i in self.motion.form.each(code, self.states):
-                lane["y", i] = frame.read("record", row + (i + RECORDED))
-            lane["next_begin"] = lane["h"] * float("inf")  # of the last step: all outputs that are left
-            with code.only_if(step + 1 < frame.read("steps", member, INTEGER)):
-                lane["next_begin"] = frame.read("record", row + size)
-            recall_pieces(self.motion, frame, lane, row)
+    def _await_end(self, frame: Frame) -> None:
+        """Where the next step of every lane begins."""
+        code = frame.code
+        with code.loop(self.motion.width) as index:
+            lane = frame.lane(index)
+            with code.only_if(lane["member"] >= 0):
+                lane["next_begin"] = lane["h"] * float("inf")  # of the last step: all outputs that are left
+                with code.only_if(lane["step"] + 1 < frame.read("steps", lane["member"], INTEGER)):
+                    lane["next_begin"] = self.replay.begin_of_next(frame, lane)
 
-    def _end_or_go_on(self, frame: Frame, lane: Lane, index: Value) -> None:
+    def _leave_step(self, frame: Frame, lane: Lane, index: Value) -> None:
         """One step more; after the last one, write down how large the last terms were and take the next member."""
         code, member, tangents = frame.code, lane["member"], self.lanes_of_tangents(frame, index)
-        with code.only_if(member >= 0):
-            lane["step"] = lane["step"] + 1
-            lane["output"] = code.as_integer(tangents[0]["next_output"])
-            with code.only_if(lane["step"] >= frame.read("steps", member, INTEGER)):
-                largest = double(code, 0.0)
-                for of_lane in tangents:
-                    largest = code.maximum(of_lane["excess"], largest)
-                frame.write("excess", member, largest)
-                frame.call(self.start_next, index)
+        lane["step"] = lane["step"] + 1
+        lane["output"] = code.as_integer(tangents[0]["next_output"])
+        with code.only_if(lane["step"] >= frame.read("steps", member, INTEGER)):
+            largest = double(code, 0.0)
+            for of_lane in tangents:
+                largest = code.maximum(of_lane["excess"], largest)
+            frame.write("excess", member, largest)
+            frame.call(self.start_next, index)
 
     # ---- one step along one direction in every lane; `group` numbers the directions ----
 

@@ -1,0 +1,85 @@
+"""The steps that the members of a batch have taken, once more: the loop of its derivatives, forward or back.
+
+Every lane carries one member. A round takes one step of the record (`_output`) in each lane: it makes the series of the
+motion again, and a derivative moves tangents or cotangents over the step. A lane whose member has no step left takes
+the next member that has any.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from lagjax._native._frame import Frame, Lane
+from lagjax._native._ir import INTEGER, Code, Value
+from lagjax._native._output import RECORDED, recall_pieces
+from lagjax._native._series import Motion
+
+
+class Replay:
+    """The members and the recorded steps of a motion; a lane's `step` numbers the one that it is at."""
+
+    def __init__(self, motion: Motion):
+        self.motion = motion
+        self._size = motion.states + RECORDED + motion.recorded_pieces  # of what is recorded of a step
+
+    def start_next(self, begin: Callable[[Frame, Value], None], take: Callable[[Frame, Lane, Value], None]) -> Code:
+        """`(lane)`: the lane takes the next member with steps, or none is left.
+
+        `begin(frame, index)` sets the numbers of a lane, `take(frame, lane, member)` those of a member that is there.
+        """
+        frame = self.motion.function("start_next", INTEGER)
+        code, index = frame.code, frame.arguments[0]
+        lane = frame.lane(index)
+        lane["step"], lane["member"] = 0, 0
+        with code.repeat_while(lambda: (lane["member"] >= 0) & (lane["step"] <= 0)):
+            member = frame.next_member()
+            there = member < frame.job("members")
+            lane["member"] = code.select(there, member, -1)
+            lane["step"] = frame.read("steps", code.select(there, member, 0), INTEGER)
+        member = lane["member"]
+        there = member >= 0
+        lane["active"] = code.flag(there)
+        lane["h"] = 0.0
+        begin(frame, index)
+        with code.only_if(there):
+            take(frame, lane, member)
+            first = member * frame.job("params_stride")
+            lane["first_number"] = code.as_double(first)
+            with code.loop(self.motion.parameters) as i:
+                lane["params", i] = frame.read("params", first + self.motion.place_of_number(code, i))
+        return frame.finish()
+
+    def begin(self, frame: Frame, start_next: Code) -> None:
+        """Every lane takes a member."""
+        self.motion.form.prepare(frame)
+        with frame.code.loop(self.motion.width) as lane:
+            frame.call(start_next, lane)
+
+    @contextmanager
+    def rounds(self, frame: Frame, rounds: Value, leave: Callable[[Frame, Lane, Value], None]) -> Iterator[None]:
+        """A context: its body takes one step in every lane, whose series is there; then `leave(frame, lane, index)`."""
+        code = frame.code
+        with self.motion.rounds(frame, rounds):
+            with code.loop(self.motion.width) as index:
+                self._recall(frame, frame.lane(index))
+            frame.call(self.motion.coefficients, frame.job("order"))
+            yield
+            with code.loop(self.motion.width) as index, code.only_if(frame.lane(index)["member"] >= 0):
+                leave(frame, frame.lane(index), index)
+
+    def row(self, frame: Frame, lane: Lane) -> Value:
+        """The place in the record of the step that a lane is at."""
+        return (frame.read("first_step", lane["member"], INTEGER) + lane["step"]) * self._size
+
+    def begin_of_next(self, frame: Frame, lane: Lane) -> Value:
+        """The time at which the step after the one at hand begins."""
+        return frame.read("record", self.row(frame, lane) + self._size)
+
+    def _recall(self, frame: Frame, lane: Lane) -> None:
+        """The time, size and first state of the step that the lane is at."""
+        with frame.code.only_if(lane["member"] >= 0):
+            row = self.row(frame, lane)
+            lane["t"] = frame.read("record", row)
+            lane["h"] = frame.read("record", row + 1)
+            for i in self.motion.form.each(frame.code, self.motion.states):
+                lane["y", i] = frame.read("record", row + (i + RECORDED))
+            recall_pieces(self.motion, frame, lane, row)
