@@ -103,14 +103,13 @@ def _count(
     for run, rows, members in store.runs(again.ticket):
         for row, member in zip(rows, members, strict=True):
             table = run.table[run.first[member] : run.first[member] + run.counts[member]]
-            place, crossed = places[row], table[:, -1]
+            place, crossed, grazes = places[row], table[:, -2], table[:, -1] > 0
             along = table[:, flow.states + 4 : flow.states + 4 + pieces][:, slides] > 0.5
             begins = along & ~np.vstack([np.zeros((1, len(slides)), bool), along[:-1]])
-            number = np.clip(np.floor(crossed).astype(int) - 1, 0, len(guards))
+            number = np.clip(crossed.astype(int) - 1, 0, len(guards))
             at_border = (crossed > 0) & (number < len(guards)) & ~leaves[number]
             # A border that the motion slides along from there on has not been crossed.
             to_slide = np.append(np.any(begins, axis=1)[1:], False) & enters[number]
-            grazes = (crossed > 0) & (crossed % 1 > 0)
             into.slid[place] += int(begins.sum())
             into.crossed[place] += int((at_border & ~to_slide).sum())
             into.grazed[place] += int(grazes.sum())

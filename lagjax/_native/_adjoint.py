@@ -71,7 +71,7 @@ class Adjoint:
         jump = jump_along(borders, levels or (n,))
         if borders is not None:
             fields |= FirstSaltation.fields(pieces, (n,)) if jump is None else Saltation.fields(pieces)
-            fields |= {"after": n, "pieces_after": pieces, "has_after": 1, "crossed": 1}
+            fields |= {"after": n, "pieces_after": pieces, "has_after": 1, "crossed": 1, "grazes": 1}
         large = is_large(program, projection, times=2, more=() if jump is None else [jump.line] * 2)
         self.motion = Motion(
             "adjoint", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen

@@ -43,7 +43,7 @@ class Clocks:
 
     def is_crossed(self, frame: Frame) -> Value:
         """True if a step ends at an entry of one of them, or of two tables."""
-        crossed = frame.code.intrinsic("floor", frame["crossed"])
+        crossed = frame["crossed"]
         found = frame.code.compare("==", crossed, self.coincide)
         for c, _, _ in self.tables:
             found = found | frame.code.compare("==", crossed, float(self.first + c))
@@ -57,7 +57,7 @@ class Clocks:
     def note(self, frame: Frame, accelerations: Numbers) -> None:
         """The accelerations before an entry, which table it is of, and its number."""
         code, crossed = frame.code, self.is_crossed(frame)
-        frame["knot_of"] = code.select(crossed, code.intrinsic("floor", frame["crossed"]), 0.0)
+        frame["knot_of"] = code.select(crossed, frame["crossed"], 0.0)
         for i in self.motion.form.each(code, self.motion.n):
             frame["before_knot", i] = accelerations[i]
         for c, j, _ in self.tables:

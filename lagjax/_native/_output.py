@@ -6,7 +6,6 @@ from lagjax._native._ir import Value
 from lagjax._native._projection import Projector
 from lagjax._native._series import Motion
 
-GRAZED = 0.5
 RECORDED = 4  # numbers of a step that are written down before its state: time, size, member, number of the step
 
 
@@ -96,11 +95,12 @@ class Output:
                     self._record_pieces(frame, lane, row + (RECORDED + motion.states))
 
     def _record_pieces(self, frame: Frame, lane: Lane, row: Value) -> None:
-        """The pieces of the step, and the number of the border that it ends at; a half more where that is grazed."""
+        """The pieces of the step, the number of the border that it ends at, and whether that is grazed."""
         pieces = self.motion.pieces
         with frame.code.loop(pieces) as j:
             frame.write("record", row + j, lane["params", j + self.motion.parameters])
-        frame.write("record", row + pieces, lane["crossed"] + lane["grazes"] * GRAZED)
+        frame.write("record", row + pieces, lane["crossed"])
+        frame.write("record", row + (pieces + 1), lane["grazes"])
 
     # ---- the end of a member ----
 
@@ -117,12 +117,3 @@ class Output:
             if states:
                 with code.only_if(done):
                     frame.write("path", self.place(frame, member, frame.job("times") - 1, i), x)
-
-
-def recall_pieces(motion: Motion, frame: Frame, lane: Lane, row: Value) -> None:
-    """From a row of what was written down the pieces of a step, and the number of the border that it ends at."""
-    if motion.pieces:
-        first = row + (RECORDED + motion.states)
-        with frame.code.loop(motion.pieces) as j:
-            lane["params", j + motion.parameters] = frame.read("record", first + j)
-        lane["crossed"] = frame.read("record", first + motion.pieces)

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 from lagjax._native._frame import Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
-from lagjax._native._output import RECORDED, recall_pieces
+from lagjax._native._output import RECORDED
 from lagjax._native._series import Motion
 
 
@@ -75,11 +75,17 @@ class Replay:
         return frame.read("record", self.row(frame, lane) + self._size)
 
     def _recall(self, frame: Frame, lane: Lane) -> None:
-        """The time, size and first state of the step that the lane is at."""
-        with frame.code.only_if(lane["member"] >= 0):
+        """The time, size, first state and pieces of the step that the lane is at, and the border that it ends at."""
+        motion, code = self.motion, frame.code
+        with code.only_if(lane["member"] >= 0):
             row = self.row(frame, lane)
             lane["t"] = frame.read("record", row)
             lane["h"] = frame.read("record", row + 1)
-            for i in self.motion.form.each(frame.code, self.motion.states):
+            for i in motion.form.each(code, motion.states):
                 lane["y", i] = frame.read("record", row + (i + RECORDED))
-            recall_pieces(self.motion, frame, lane, row)
+            if motion.pieces:
+                first = row + (RECORDED + motion.states)
+                with code.loop(motion.pieces) as j:
+                    lane["params", j + motion.parameters] = frame.read("record", first + j)
+                for k, name in enumerate(("crossed", "grazes")):
+                    lane[name] = frame.read("record", first + (motion.pieces + k))

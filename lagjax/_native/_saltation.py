@@ -50,7 +50,7 @@ class GuardTable:
 
         In the lanes `where` a step ends at one, which are all of them by default.
         """
-        motion, code, crossed = self.motion, frame.code, frame.code.intrinsic("floor", frame["crossed"])
+        motion, code, crossed = self.motion, frame.code, frame["crossed"]
         where = frame.constant(0.0) <= 0.0 if where is None else where
         with frame.where(where):
             frame["is_hit"] = 0.0
@@ -176,8 +176,6 @@ class Saltation:
         """The state at the end of a step, and what is to be known of the border there."""
         motion, code = self.motion, frame.code
         self.table.note_hit(frame)
-        grazes = frame["crossed"] > code.intrinsic("floor", frame["crossed"])
-        frame["grazes"] = grazes
         moved = motion.moved(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
         for i in motion.form.each(code, motion.states):
             frame["edge", i] = moved[i]

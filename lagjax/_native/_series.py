@@ -61,7 +61,7 @@ class Motion:
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
         self.numbers = program.size - self.states - 1  # parameters, and the pieces of a piecewise program
         self.pieces, self.parameters, self.kept = pieces, self.numbers - pieces, kept
-        self.recorded_pieces = pieces and pieces + 1  # what is written down behind the state of a step
+        self.recorded_pieces = pieces and pieces + 2  # numbers that are recorded behind the state of a step
         self.keep_sums, self.job = keep_sums, job
         self.module = ir.Module(name)
         self.module.triple = ""

@@ -73,7 +73,7 @@ class Tangent:
         pieces = 0 if borders is None else len(borders.switches)
         if borders is not None:
             fields |= FirstSaltation.fields(pieces, (n,)) if jump is None else Saltation.fields(pieces)
-            fields["crossed"] = 1
+            fields |= {"crossed": 1, "grazes": 1}
         self.motion = Motion(
             "tangent", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
         )
