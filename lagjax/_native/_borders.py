@@ -12,6 +12,7 @@ does not decide on which side the next step begins.
 
 import itertools
 from collections.abc import Iterator
+from enum import IntEnum
 
 from lagjax._native._clocks import Clocks
 from lagjax._native._constants import (
@@ -47,7 +48,19 @@ from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
 from lagjax._program._saltation import Jump, looks_up
 
 NOWHERE = 1e300  # a level that no switching number comes to
-SLIDING = 4.0  # a guard that stays zero; for others that touch the border the number of zero rates, plus one
+
+
+class Touch(IntEnum):
+    """How a guard meets its border where a step begins: not, by its value, with its first rates, or for good.
+
+    Numbers between count the rates that are zero, and one for the value.
+    """
+
+    NONE = 0
+    VALUE = 1
+    RATE = 2
+    SECOND_RATE = 3
+    SLIDING = 4
 
 
 class Borders:
@@ -88,12 +101,12 @@ class Borders:
     def fields(borders: _borders.Borders, levels: tuple[int, ...]) -> dict:
         """The fields of a thread's memory.
 
-        `touching` is 1 for a guard that is zero where the step begins, 2 where its rate is, too, 3 with the next one,
-        and 4 where it stays so; `stays` for a piece that is not decided anew; `crossed` is the number of the guard that
-        the step ends at, from 1 on, or 0, and `beyond` the piece there. `planned_h` is the step without borders, `cut`
-        with them, `part` how much of it a series covers, and `idle_crossings` counts those without a step. `at_rest` is
-        1 where the motion would be there in no time. `approach` is how long the step was from which on others have
-        ended before a border without a series beyond it, 0 where the last one did not.
+        `touch` is the `Touch` of every guard where the step begins; `stays` is 1 for a piece that is not decided anew;
+        `crossed` is the number of the guard that the step ends at, from 1 on, or 0, and `beyond` the piece there.
+        `planned_h` is the step without borders, `cut` with them, `part` the share of it that a series covers, and
+        `idle_crossings` counts those without a step. `at_rest` is 1 where the motion would be there in no time.
+        `approach` is the length of the step from which on others have ended before a border without a series beyond it,
+        0 where the last one did not.
         """
         numbers = (
             "at_knots",
@@ -110,7 +123,7 @@ class Borders:
             "approach",
             "next_approach",
         )
-        fields = {"touching": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
+        fields = {"touch": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
         fields["level"] = len(borders.guards) if _borders.TABLE in borders.kinds else 0
         of_tangents = FirstSaltation.fields(len(borders.switches), levels) | Saltation.fields(len(borders.switches))
         return fields | Roots.fields(MAX_ORDER + 2) | of_tangents
@@ -129,7 +142,7 @@ class Borders:
             lane[name] = 0.0
         lane["undecided"] = 1.0
         with frame.code.loop(len(self.guards)) as g:
-            lane["touching", g] = 0.0
+            lane["touch", g] = Touch.NONE
         with frame.code.loop(self.pieces) as j:
             lane["stays", j] = 0.0
             lane["params", j + self.motion.parameters] = 0.0
@@ -156,7 +169,7 @@ class Borders:
                 with code.only_if(slide >= 0):
                     slides = undecided & (self._piece(frame, slide) > 0.0)
                     with frame.where(slides):
-                        frame["touching", g] = SLIDING
+                        frame["touch", g] = Touch.SLIDING
             frame["undecided"] = 0.0
         return frame.finish()
 
@@ -206,7 +219,7 @@ class Borders:
         is_share = code.lanes_of(code.flag(self.table.place(code, g, "on") >= 0)) > 0.0
         undecided = code.compare("==", side, 0.0)
         # Nothing is looked for along the border that the motion slides on, or in the share of one that does not.
-        idle = (frame["touching", g] >= SLIDING) | (undecided & is_share)
+        idle = (frame["touch", g] >= Touch.SLIDING) | (undecided & is_share)
         with code.only_if(code.any_lane(~idle)):
             self.roots.polynomial(frame, j, degree, h, code.select(undecided, 1.0, side), level)
             self._look_along(frame, g, degree, h, undecided, beyond, idle)
@@ -217,13 +230,13 @@ class Borders:
         self._divide(frame, g, degree)
         # A border that it touches is not left, or gone back over, by less than what nobody asks for.
         nothing = self.roots.size(frame, degree) <= NEGLIGIBLE * code.lanes_of(absolute_tolerance(frame))
-        idle = idle | (nothing & (frame["touching", g] > 0.0) & ~undecided)
+        idle = idle | (nothing & (frame["touch", g] > Touch.NONE) & ~undecided)
         self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame))
         frame.call(self.roots.first_root, degree)
         self._look_closer(frame, degree)
         # At rest but for what it gains in so little time: u̇ is of the size of ü t.
         gain = 4.0 * (code.intrinsic("fabs", frame["poly", 2]) * frame["root"])
-        at_rest = (frame["touching", g] > 0.0) | (code.intrinsic("fabs", frame["poly", 1]) <= gain)
+        at_rest = (frame["touch", g] > Touch.NONE) | (code.intrinsic("fabs", frame["poly", 1]) <= gain)
         # A number that is zero leaves zero as its first coefficient says, or stays.
         leaves = undecided & code.compare("!=", leads, 0.0)
         root = code.select(undecided, code.select(leaves, 0.0, 2.0), self._place(frame))
@@ -313,7 +326,7 @@ class Borders:
                 frame["stays", j] = 0.0
                 for g, guard in enumerate(self.guards):
                     if guard.piece == j:
-                        frame["touching", g] = 0.0
+                        frame["touch", g] = Touch.NONE
                         if guard.slide >= 0:
                             frame["params", self.motion.parameters + guard.slide] = 0.0
 
@@ -438,14 +451,14 @@ class Borders:
     def _divide(self, frame: Frame, g: Value, degree: Value) -> None:
         """Divide the polynomial of guard g, where it begins at zero, by as many powers as vanish."""
         code = frame.code
-        touching = frame["touching", g]
-        divided = touching > 0.0
+        touch = frame["touch", g]
+        divided = touch > Touch.NONE
         for power in range(3):
             with code.only_if(code.any_lane(divided)), code.loop(degree + 1) as k:
                 with frame.where(divided):
                     frame["poly", k] = frame["poly", k + 1]
             vanishes = code.compare("==", frame["poly", 0], 0.0)
-            divided = divided & (vanishes | (touching > float(power + 1)))
+            divided = divided & (vanishes | (touch > float(power + Touch.VALUE)))
 
     # ---- beyond it ----
 
@@ -514,9 +527,9 @@ class Borders:
         stepped, crossed = frame["stepped"] > 0.0, frame["crossed"]
         crosses, was_cut = crossed > 0.0, code.compare("!=", frame["cut"], frame["planned_h"])
         with code.loop(len(self.guards)) as g:
-            ends = stepped & (frame["touching", g] < SLIDING)
+            ends = stepped & (frame["touch", g] < Touch.SLIDING)
             with frame.where(ends):
-                frame["touching", g] = 0.0
+                frame["touch", g] = Touch.NONE
         with code.only_if(code.any_lane(crosses | was_cut)):
             # What a cut step was to be says more about the next one than what it became.
             planned = code.intrinsic("fabs", frame["planned_h"])
@@ -563,21 +576,23 @@ class Borders:
             place = j + self.motion.parameters
             by_position = code.lanes_of(code.flag(self.table.place(code, g, "order") > 1)) > 0.0
             bounces = no_time & by_position
-            slides = hit & (bounces | (again & (frame["touching", g] > 0.0)))
+            slides = hit & (bounces | (again & (frame["touch", g] > Touch.NONE)))
             slides = slides & (code.lanes_of(code.as_double(slide)) >= 0.0)
             with frame.where(hit & ~slides):
                 frame["params", place] = frame["beyond"]
             # A share jumps to where it is: it need not touch the border that it had crossed before.
             is_share = code.lanes_of(code.flag(self.table.place(code, g, "on") >= 0)) > 0.0
             with frame.where(hit):
-                frame["touching", back] = code.select(is_share, 0.0, code.select(slides, SLIDING, 1.0))
+                frame["touch", back] = code.select(
+                    is_share, Touch.NONE, code.select(slides, Touch.SLIDING, Touch.VALUE)
+                )
             with code.only_if(slide >= 0):
                 with frame.where(slides):
                     frame["params", slide + self.motion.parameters] = 1
             self._leave(frame, g, hit, again)
         with code.loop(len(self.guards)) as g:
             j = self.table.place(code, g, "piece")
-            with frame.where(frame["touching", g] > 0.0):
+            with frame.where(frame["touch", g] > Touch.NONE):
                 frame["stays", j] = 1
 
     def _leave(self, frame: Frame, g: Value, hit: Value, again: Value) -> None:
@@ -592,4 +607,4 @@ class Borders:
             order = code.lanes_of(code.as_double(self.table.place(code, on, "order")))
             with frame.where(hit):
                 frame["params", place] = self.table.number(code, g, "goes_on")
-                frame["touching", on] = code.select(again, order, order + 1.0)
+                frame["touch", on] = code.select(again, order, order + Touch.VALUE)
