@@ -9,6 +9,8 @@ where the series of a guard does not say what it does beyond. Where a guard has 
 what is zero, the step is short, and its end is looked at.
 """
 
+from enum import IntEnum
+
 import numpy as np
 
 from lagjax._native._constants import (
@@ -35,8 +37,20 @@ from lagjax._native._series import Motion, double
 from lagjax._native._step import StepControl
 from lagjax._program._series import StraightLine
 
-_FALLS, _RISES = 1.0, 2.0  # the kinds of changes
-_ON, _ALONG = 1.0, 2.0  # a motion that begins on the surface, and one that does not leave it at a rate
+
+class Change(IntEnum):
+    """The sign of a guard's rate where it changes sign."""
+
+    FALLS = 1
+    RISES = 2
+
+
+class Rest(IntEnum):
+    """The place where a motion begins: off the surface of a guard, on it, or on it and with a rate of zero."""
+
+    OFF = 0
+    ON = 1
+    ALONG = 2
 
 
 class Events:
@@ -140,14 +154,14 @@ class Events:
                 unclear = code.select(code.compare("!=", before, 0.0), 0.0, later)
                 going = code.select(leaves, rate * frame["forward"], code.select(bends, turn, unclear))
                 met = fresh & on_it & (going * before < 0.0) & (before * float(self.directions[i]) <= 0.0)
-                kind = code.select(before > 0.0, _FALLS, _RISES)
+                kind = code.select(before > 0.0, Change.FALLS, Change.RISES)
                 frame["met", i] = code.select(met, kind, 0.0)
                 stays = met | code.compare("==", going, 0.0)
                 side = code.select(on_it, code.select(stays, before, going), value)
                 with frame.where(fresh):
                     frame["side", i] = self._sign(frame, side)
-                rests = code.select(on_it, code.select(leaves, _ON, _ALONG), 0.0)
-                frame["resting", i] = code.select(fresh, rests, 0.0)
+                rests = code.select(on_it, code.select(leaves, Rest.ON, Rest.ALONG), Rest.OFF)
+                frame["resting", i] = code.select(fresh, rests, Rest.OFF)
         return frame.finish()
 
     def _side_before(self, frame: Frame, i: int) -> Value:
@@ -273,7 +287,9 @@ class Events:
         instant = 0.25 * frame["smallest"]  # no time is known better than this
         frame["instant"] = instant / (code.intrinsic("fabs", h) * frame["part"])
         rounding = (ROOT_NOISE * EPS) * frame["kept", g]
-        rounding = code.select((rounding < float("inf")) & code.compare("!=", frame["resting", g], _ON), rounding, 0.0)
+        rounding = code.select(
+            (rounding < float("inf")) & code.compare("!=", frame["resting", g], Rest.ON), rounding, 0.0
+        )
         frame["unsure"] = code.intrinsic("fabs", frame["poly", 1]) * frame["instant"] + rounding
         ahead = code.variable(side)
         self._along(frame, order, g, degree, ahead, moving & sound)
@@ -290,11 +306,11 @@ class Events:
         code, rests = frame.code, frame["resting", g]
         since = code.intrinsic("fabs", frame["t"] - frame["passed_at", g])
         known = (since <= INSTANT * frame["smallest"]) | (frame["waited", g] > 0.0)
-        on = (rests > 0.0) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= CONTINUOUS * size))
+        on = (rests > Rest.OFF) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= CONTINUOUS * size))
         with frame.where(on):
             frame["poly", 0] = 0.0
         rate = frame["poly", 1]
-        frame["poly", 1] = code.select((rests >= _ALONG) & (rate < 0.0), 0.0, rate)
+        frame["poly", 1] = code.select((rests >= Rest.ALONG) & (rate < 0.0), 0.0, rate)
 
     def _along(self, frame: Frame, order: Value, g: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""
@@ -382,7 +398,7 @@ class Events:
             size = code.intrinsic("fabs", s)
             with frame.where(counts):
                 frame["root_at", g] = size
-                frame["change", g] = code.select(side > 0.0, _FALLS, _RISES)
+                frame["change", g] = code.select(side > 0.0, Change.FALLS, Change.RISES)
             sooner = counts & (size < frame["first_at"])
             with frame.where(sooner):
                 frame["first_at"] = size
