@@ -32,14 +32,14 @@ import lagjax
 from benchmarks import _report
 from benchmarks._ptx import PtxOnCpu
 from lagjax import scenes
-from lagjax._machine_code import _gpu, _transforms
+from lagjax._machine_code import _gpu_launch, _primitives
 from lagjax._native import gpu
 
 STORE = Path(__file__).parent / "results" / "gpu_estimate.json"
 CLOCK, MULTIPROCESSORS, ARITHMETIC, L1, HBM = 1.98e9, 132, 64, 16, 3.35e12
 REGISTERS, L1_BYTES, L2_BYTES = 65536, 256 * 1024, 50e6  # of a multiprocessor; L2 of all of them
 MEMBERS, BATCH, DURATION, RTOL = 4, 4096, 5.0, 1e-9
-FORMS = {"as chosen": gpu.form_for, "in memory": lambda series, order: gpu.Form(order, unrolled=False)}
+FORMS = {"as chosen": gpu.form_for, "in memory": lambda series, order: gpu.GpuForm(order, unrolled=False)}
 SCENES = {
     "pendulum": scenes.pendulum,
     "Kepler": scenes.kepler,
@@ -75,16 +75,16 @@ def counted(scene, form=gpu.form_for) -> tuple[str, dict, float]:
         return list(jax.pure_callback(host, tuple(results), *operands))
 
     def lower_by(rule):
-        mlir.register_lowering(_transforms.run_p, rule, platform="cpu")
+        mlir.register_lowering(_primitives.run_p, rule, platform="cpu")
 
-    kept, _gpu.launch, gpu.form_for = (_gpu.launch, gpu.form_for), launch, form
+    kept, _gpu_launch.launch, gpu.form_for = (_gpu_launch.launch, gpu.form_for), launch, form
     try:  # the rule of GPUs on the CPU
-        lower_by(mlir.lower_fun(_transforms._run_for_gpus, multiple_results=True))
+        lower_by(mlir.lower_fun(_primitives._run_for_gpus, multiple_results=True))
         run = jax.jit(lambda q0, v0: motions(scene, q0, v0, solver=lagjax.MachineCode()).stats)
         stats = jax.tree.map(np.asarray, run(*starts(scene, MEMBERS)))
     finally:
-        lower_by(_transforms._for_cpus(_transforms._run_compiled))
-        _gpu.launch, gpu.form_for = kept
+        lower_by(_primitives._for_cpus(_primitives._run_compiled))
+        _gpu_launch.launch, gpu.form_for = kept
         jax.clear_caches()
     steps = stats["num_steps"].sum()
     return programs[0], {name: count / steps for name, count in counts.items()}, float(steps) / MEMBERS

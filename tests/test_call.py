@@ -19,7 +19,7 @@ import pytest
 
 import lagjax
 from lagjax import _native
-from lagjax._machine_code import _call, _transforms
+from lagjax._machine_code import _call, _primitives
 
 SCENE = lagjax.scenes.double_pendulum()
 TS = np.linspace(0.0, 1.0, 4)
@@ -31,13 +31,13 @@ def on_host(monkeypatch):
     """The arguments of every run, or of what is left of one, that Python is asked for."""
     asked = []
     for name in ("_run_on_host", "_run_gone_on_with", "_run_again", "_jvp_on_host", "_vjp_on_host"):
-        function = getattr(_transforms, name)
+        function = getattr(_primitives, name)
 
         def counted(*args, function=function, **settings):
             asked.append(args)
             return function(*args, **settings)
 
-        monkeypatch.setattr(_transforms, name, counted)
+        monkeypatch.setattr(_primitives, name, counted)
     return asked
 
 
@@ -105,7 +105,7 @@ def eagerly(function, monkeypatch):
     """What a derivative is on the host, over steps that were kept."""
     with monkeypatch.context() as patch:
         patch.setattr(_call, "NO_HANDLER", "this test says so")
-        _transforms._compiled.cache_clear()
+        _primitives._compiled.cache_clear()
         return function()
 
 
@@ -298,7 +298,7 @@ def in_many_programs():
 
     _machine_code._made.cache_clear()
     _derivation._derived_once.cache_clear()
-    _transforms._compiled.cache_clear()
+    _primitives._compiled.cache_clear()
     import gc
 
     gc.collect()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lagjax import _native
-from lagjax._native import _kernel, _packs, _schedule, _series
+from lagjax._native import _kernel, _packs, _schedule, _taylor
 from lagjax._native._packs import ANYWHERE, ONE, SIDE_BY_SIDE
 from lagjax._program import OPERATIONS, lower
 
@@ -128,7 +128,7 @@ def test_no_products():
 
 def test_members_of_a_large_scene_are_integrated_one_after_the_other(monkeypatch):
     """As they are side by side, to the last bit."""
-    monkeypatch.setattr(_series, "LARGEST_LINE", -1)
+    monkeypatch.setattr(_taylor, "LARGEST_LINE", -1)
     monkeypatch.setattr(_packs, "LEAST_FILLED", 0)
     program = cluster(5)
     kernel = _native.Kernel(program, 10)
@@ -144,7 +144,7 @@ def test_members_of_a_large_scene_are_integrated_one_after_the_other(monkeypatch
 
 
 def test_the_choice_is_made_once_and_nothing_stays_of_the_compilation(monkeypatch):
-    monkeypatch.setattr(_series, "LARGEST_LINE", -1)
+    monkeypatch.setattr(_taylor, "LARGEST_LINE", -1)
     monkeypatch.setattr(_kernel, "LARGEST_SHARED", 0)
     kernel = _native.Kernel(cluster(9), 18)
     alone = kernel.to_run(8)
@@ -155,7 +155,7 @@ def test_the_choice_is_made_once_and_nothing_stays_of_the_compilation(monkeypatc
 
 
 def test_a_scene_in_which_everything_waits_for_what_comes_before_keeps_members_in_lanes(monkeypatch):
-    monkeypatch.setattr(_series, "LARGEST_LINE", -1)
+    monkeypatch.setattr(_taylor, "LARGEST_LINE", -1)
     monkeypatch.setattr(_kernel, "LARGEST_SHARED", 0)
 
     def row(q, v, t):  # each of forty coordinates drives the next
@@ -177,6 +177,6 @@ def test_the_code_does_not_grow_with_the_scene(monkeypatch):
         module = Integrator(program, _native.recurrences(program, 2 * count), width=1).motion.module
         return sum(len(block.instructions) for function in module.functions for block in function.blocks)
 
-    monkeypatch.setattr(_series, "LARGEST_LINE", -1)
+    monkeypatch.setattr(_taylor, "LARGEST_LINE", -1)
     monkeypatch.setattr(_packs, "LEAST_FILLED", 0)
     assert instructions(20) < 2 * instructions(5)

@@ -22,9 +22,9 @@ from jax.interpreters import mlir
 import lagjax
 from benchmarks._ptx import PtxOnCpu
 from lagjax import scenes
-from lagjax._machine_code import _gpu, _transforms
+from lagjax._machine_code import _gpu_launch, _primitives
 from lagjax._machine_code._call import on_host
-from lagjax._native._gpu import RESULTS, Form, form_for, grid, libdevice, words
+from lagjax._native._gpu import RESULTS, GpuForm, form_for, grid, libdevice, words
 
 TS, MACHINE_CODE = np.linspace(0.0, 1.0, 5), lagjax.MachineCode()
 translated = functools.lru_cache(maxsize=64)(PtxOnCpu)
@@ -32,7 +32,7 @@ translated = functools.lru_cache(maxsize=64)(PtxOnCpu)
 
 def transforms_are_new():
     """What was lowered by other rules is forgotten."""
-    _transforms._compiled.cache_clear()
+    _primitives._compiled.cache_clear()
     jax.clear_caches()
 
 
@@ -56,14 +56,14 @@ def on_the_ptx(monkeypatch):
 
     def run(function, *args):
         places = {
-            _transforms.run_p: (_transforms._run_for_gpus, _transforms._run_compiled),
-            _transforms.jvp_p: (_transforms._jvp_for_gpus, _transforms._jvp_compiled),
-            _transforms.vjp_p: (_transforms._vjp_for_gpus, _transforms._vjp_compiled),
+            _primitives.run_p: (_primitives._run_for_gpus, _primitives._run_compiled),
+            _primitives.jvp_p: (_primitives._jvp_for_gpus, _primitives._jvp_compiled),
+            _primitives.vjp_p: (_primitives._vjp_for_gpus, _primitives._vjp_compiled),
         }
 
         def register(for_gpus):
             for primitive, (on_gpus, on_cpus) in places.items():
-                rule = mlir.lower_fun(on_gpus, multiple_results=True) if for_gpus else _transforms._for_cpus(on_cpus)
+                rule = mlir.lower_fun(on_gpus, multiple_results=True) if for_gpus else _primitives._for_cpus(on_cpus)
                 mlir.register_lowering(primitive, rule, platform="cpu")
             transforms_are_new()
 
@@ -73,7 +73,7 @@ def on_the_ptx(monkeypatch):
         finally:
             register(for_gpus=False)
 
-    monkeypatch.setattr(_gpu, "launch", launch)
+    monkeypatch.setattr(_gpu_launch, "launch", launch)
     run.launches = launches
     return run
 
@@ -95,7 +95,7 @@ def agree(here, there, tolerance=1e-9):
 # ---- the numbers -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", [None, Form(13, unrolled=True), Form(13, unrolled=False)])
+@pytest.mark.parametrize("form", [None, GpuForm(13, unrolled=True), GpuForm(13, unrolled=False)])
 def test_a_batch_is_that_of_the_cpu(on_the_ptx, monkeypatch, form):
     scene = scenes.double_pendulum()
     q0 = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 2))
@@ -207,7 +207,7 @@ def program_of(scene, monkeypatch=None, unrolled=None):
     """The PTX of a scene's motion. Skips the test where that needs libdevice, which is not here."""
     programs = []
     if monkeypatch is not None:
-        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda series, order: Form(order, unrolled))
+        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda series, order: GpuForm(order, unrolled))
     transforms_are_new()
 
     def launch(program, operands, results):
@@ -215,7 +215,7 @@ def program_of(scene, monkeypatch=None, unrolled=None):
         return [jnp.zeros(x.shape, x.dtype) for x in results]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_gpu, "launch", launch)
+        patch.setattr(_gpu_launch, "launch", launch)
         try:
             jax.jit(lambda q0: motion(scene, q0, scene.qdot0)[0]).trace(scene.q0).lower(lowering_platforms=("cuda",))
         except ValueError as reason:
@@ -292,7 +292,7 @@ def test_a_scene_that_cannot_go_to_a_gpu_says_why():
 
 @pytest.mark.slow
 def test_instructions_are_counted(monkeypatch):
-    monkeypatch.setattr("lagjax._native._gpu.form_for", lambda series, order: Form(order, unrolled=False))
+    monkeypatch.setattr("lagjax._native._gpu.form_for", lambda series, order: GpuForm(order, unrolled=False))
     # Of a pendulum's step at order 13: every product of two series of 13 terms alone has 91 products.
     gpu_estimate = importlib.import_module("benchmarks.gpu_estimate")
     program, a_step, steps = gpu_estimate.counted(scenes.pendulum())

@@ -9,7 +9,7 @@ import lagjax
 from lagjax import _native
 from lagjax._derivation import derivation_of, numbers_of
 from lagjax._layout import Layout
-from lagjax._native import _packs, _schedule, _series
+from lagjax._native import _packs, _schedule, _taylor
 from lagjax._native._integrator import Integrator
 from lagjax._program import OPERATIONS, Unlowerable, lower
 
@@ -24,7 +24,7 @@ def in_all_forms(*parts, **options):
     """A kernel written down operation by operation, one as tables, and one as tables with alike operations in lanes."""
     for border, width in ((10**9, None), (-1, None), (-1, 1)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(_series, "LARGEST_LINE", border)
+            patch.setattr(_taylor, "LARGEST_LINE", border)
             patch.setattr(_packs, "LEAST_FILLED", 0)
             kernel = _native.Kernel(*parts, **options, width=width)
             if width is None:
@@ -174,7 +174,7 @@ def instructions(acceleration, size):
     borders, series = _native.pieces_of(program, (size,)) or (None, _native.recurrences(program, size))
     program = program if borders is None else borders.program
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_series, "LARGEST_LINE", -1)
+        patch.setattr(_taylor, "LARGEST_LINE", -1)
         functions = Integrator(program, series, borders=borders, width=8).motion.module.functions
     return sum(len(block.instructions) for function in functions for block in function.blocks)
 

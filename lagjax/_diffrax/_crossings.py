@@ -1,7 +1,7 @@
 """Jumps of the acceleration that a motion of diffrax crosses: derivatives over its steps are wrong there.
 
 A border u(y, t, p) = 0 at which the acceleration jumps from a⁻ to a⁺ adds (a⁻ − a⁺) δt to a tangent of the velocities,
-with δt = −δu / u̇ (`_program._saltation`). Steps of diffrax go across it and lack that: the derivative is not
+with δt = −δu / u̇ (`_program._jump`). Steps of diffrax go across it and lack that: the derivative is not
 inaccurate but another one. Where only the slope of the acceleration changes nothing is added to first derivatives, and
 those over steps are right to their tolerance; nor where u depends on the time alone, for then δu = 0.
 

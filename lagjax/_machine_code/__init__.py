@@ -1,6 +1,6 @@
-"""`MachineCode`: the engine on CPUs (`_gpu`: on GPUs), Taylor series in machine code made for the scene.
+"""`MachineCode`: the engine on CPUs (`_gpu_launch`: on GPUs), Taylor series in machine code made for the scene.
 
-Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is traced; ─► `_transforms`, the flow as primitives
+Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is traced; ─► `_primitives`, the flow as primitives
 of JAX, where something is. All of that is in float64; a problem in float32 goes through the door of `_doubles` first.
 """
 
@@ -15,9 +15,9 @@ import numpy as np
 
 from lagjax._derivation import Derivation
 from lagjax._doubles import in_doubles
-from lagjax._machine_code import _transforms
+from lagjax._machine_code import _primitives
+from lagjax._machine_code._crossing import MOST_GUARDS, Noted, along_crossings, surfaces_of, surfaces_of_event, to_event
 from lagjax._machine_code._derivatives import jvp, projected_start, vjp
-from lagjax._machine_code._events import MOST_GUARDS, Noted, along_crossings, surfaces_of, surfaces_of_event, to_event
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
 from lagjax._machine_code._steps import KEPT, StepStore
 from lagjax._machine_code._surfaces import Guarded, Surfaces, moved_with, require_one_number, vector_of
@@ -127,7 +127,7 @@ class MachineCode(AbstractEngine):
             return Solution._make([*(x[0] for x in flow.run(ts, y0, params, tolerances)[:-1]), None])
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
         if problem.event is None:
-            return _transforms.run(flow, tolerances, ts, y0, params)
+            return _primitives.run(flow, tolerances, ts, y0, params)
         return to_event(flow, _without_guards(problem), _surfaces_of(problem), tolerances)(ts, y0, params)
 
     def solve_to_event(self, problem: Problem, sides) -> Solution:
@@ -137,7 +137,7 @@ class MachineCode(AbstractEngine):
         """
         ts, y0, numbers = map(jax.lax.stop_gradient, (problem.ts, problem.y0, problem.vector))
         numbers = jnp.concatenate([numbers, jnp.asarray(sides, float)])
-        return _transforms.run(flow_of(problem), tolerances_of(problem), ts, y0, numbers)
+        return _primitives.run(flow_of(problem), tolerances_of(problem), ts, y0, numbers)
 
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
         """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""

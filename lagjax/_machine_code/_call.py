@@ -120,7 +120,7 @@ def _register() -> None:
 @functools.cache
 def _registered() -> None:
     addresses = {_TARGET: _native.handler().address}
-    addresses |= {f"lagjax_{kind}": _native.sweep_handler(kind).address for kind in _SWEEPS}
+    addresses |= {f"lagjax_{kind}": _native.derivative_handler(kind).address for kind in _SWEEPS}
     for target, address in addresses.items():
         jax.ffi.register_ffi_target(target, _capsule(address), platform="cpu", api_version=1)
 

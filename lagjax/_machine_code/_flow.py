@@ -1,6 +1,6 @@
 """`Flow`: the flow map of a scalar program in machine code, (output times, initial state, params) → states.
 
-Everything here works on NumPy arrays with one row a member; `_derivatives` has its derivatives, `_transforms` makes
+Everything here works on NumPy arrays with one row a member; `_derivatives` has its derivatives, `_primitives` makes
 functions of both that JAX can transform.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from lagjax import _native
 from lagjax._machine_code._steps import LARGEST_KEPT, Steps, StepStore
-from lagjax._machine_code._tangent import tangent_programs
+from lagjax._machine_code._variational import tangent_programs
 from lagjax._problem import Solution
 from lagjax._program import Program, Unlowerable, machine_memory, operations_that_fit
 from lagjax._results import RESULTS, SUCCESSFUL, code_of

@@ -6,23 +6,27 @@ XLA compiles one operation after the other for all members of a batch; here one 
 operations, four or eight side by side in the lanes of vector registers, and nothing leaves the first caches. A step is
 one Taylor series, of the order that the tolerance asks for.
 
-    _ir          LLVM's instructions, written like arithmetic;  _objects: machine code kept on disk
-    _lanes       the operations of a program on vectors, one by one: the form of small kernels
-    _tables      the form of large ones: operations are data that one loop walks along;  _schedule: in which order
-    _look_ups    entries of tables, read from where the numbers of a member lie
-    _constants   every numerical choice, with its reason
-    _frame       what a function of a kernel sees: the memory of its thread, the lanes, the job
-    _series      the coefficients of a motion, and what is read off them along a step
-    _projection  the way back to the constraints;  _rank_drops: where these become dependent
-    _step        step control
-    _guards      functions of the state that are watched;  _events: where they change sign
-    _roots       where a polynomial is zero: borders and guards have series
-    _clocks      derivatives by the instants at which a table goes on
-    _output      what is written down
-    _integrator  all of these, round by round;  _tangent, _adjoint: its derivatives, forward and back
-    _kernel      both as functions of arrays;  _threads: on several cores, interruptible;  _handler: as a call of XLA
-    _sweep       derivatives of short motions as calls of XLA
-    _gpu         the motion of one lane as a program for NVIDIA GPUs
+    _ir                  LLVM's instructions, written like arithmetic;  _objects: machine code kept on disk
+    _lanes               the operations of a program on vectors, one by one: the form of small kernels
+    _tables              the form of large ones: operations are data that one loop walks along;  _schedule: their order
+    _packs, _packed      large kernels of one member, whose alike operations stand in the lanes;  _single_member
+    _table_reads         entries of tables, read from where the numbers of a member lie
+    _constants           every numerical choice, with its reason
+    _frame               the memory of a thread, the lanes and the job, as a function of a kernel sees them
+    _taylor              the coefficients of a motion, and what is read off them along a step
+    _projection          the way back to the constraints;  _rank_drops: where these become dependent
+    _step                step control
+    _border_control      the borders of a piecewise program: a step ends at the first one
+    _guards              functions of the state that are watched;  _events: where they change sign
+    _roots               the zeros of a polynomial: borders and guards have series
+    _output              the outputs, and the record of steps
+    _integrator          all of these, round by round
+    _replay              recorded steps once more, for derivatives;  _tangent, _adjoint: forward and back
+    _saltation           the jump of derivatives at a border;  _first_saltation: of a program that looks up tables
+    _time_knots          derivatives by the instants at which a table goes on
+    _kernel              motions and derivatives as functions of arrays;  _threads: on several cores, interruptible
+    _handler             the motion as a call of XLA;  _derivative_handler: derivatives of short motions
+    _gpu                 the motion of one lane as a program for NVIDIA GPUs
 
 Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).
 """
@@ -43,6 +47,7 @@ from lagjax._native._constants import (
     SMALLEST_STEP,
     STEP_TOO_SMALL,
 )
+from lagjax._native._derivative_handler import DerivativePlan, derivative_handler
 from lagjax._native._guards import Guards, watched
 from lagjax._native._handler import Plan, handler, unavailable
 from lagjax._native._ir import lanes
@@ -58,14 +63,42 @@ from lagjax._native._kernel import (
     recurrences,
     require_recurrences,
 )
-from lagjax._native._series import is_large
-from lagjax._native._sweep import SweepPlan, sweep_handler
+from lagjax._native._taylor import is_large
 from lagjax._native._threads import each_of
 
 __all__ = [
-    "ATOL_OVER_MOTION", "ATOL_OVER_RTOL", "DISCONTINUOUS", "DONE", "EVENT", "GUARD_NOISE", "INSTANT", "NOT_FINITE",
-    "OUT_OF_STEPS", "PROJECTION_FAILED", "SINGULAR", "SMALLEST_STEP", "STEP_TOO_SMALL",
-    "Begun", "Guards", "Kernel", "Outcome", "Plan", "Projection", "SweepPlan", "cores", "each_of", "floor_of",
-    "gpu", "handler", "is_large", "lanes", "order_for", "pieces_of", "recurrences", "require_recurrences",
-    "sweep_handler", "unavailable", "watched",
+    "ATOL_OVER_MOTION",
+    "ATOL_OVER_RTOL",
+    "DISCONTINUOUS",
+    "DONE",
+    "EVENT",
+    "GUARD_NOISE",
+    "INSTANT",
+    "NOT_FINITE",
+    "OUT_OF_STEPS",
+    "PROJECTION_FAILED",
+    "SINGULAR",
+    "SMALLEST_STEP",
+    "STEP_TOO_SMALL",
+    "Begun",
+    "DerivativePlan",
+    "Guards",
+    "Kernel",
+    "Outcome",
+    "Plan",
+    "Projection",
+    "cores",
+    "derivative_handler",
+    "each_of",
+    "floor_of",
+    "gpu",
+    "handler",
+    "is_large",
+    "lanes",
+    "order_for",
+    "pieces_of",
+    "recurrences",
+    "require_recurrences",
+    "unavailable",
+    "watched",
 ]  # fmt: skip

@@ -19,15 +19,15 @@ Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3.2, 13.
 
 from llvmlite import ir
 
-from lagjax._native._clocks import Clocks
 from lagjax._native._constants import MAX_ORDER, NEAR_ZERO
 from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
-from lagjax._native._look_ups import lane_of
 from lagjax._native._replay import Replay
 from lagjax._native._saltation import GuardTable, Saltation, jump_along
-from lagjax._native._series import Chosen, Motion, double, integer, is_large
+from lagjax._native._table_reads import lane_of
+from lagjax._native._taylor import Chosen, TaylorSeries, double, integer, is_large
+from lagjax._native._time_knots import TimeKnots
 from lagjax._program._borders import Borders
 from lagjax._program._differentiation import pullback, pullback_and_entries
 from lagjax._program._look_ups import Table
@@ -73,7 +73,7 @@ class Adjoint:
             fields |= FirstSaltation.fields(pieces, (n,)) if jump is None else Saltation.fields(pieces)
             fields |= {"after": n, "pieces_after": pieces, "has_after": 1, "crossed": 1, "grazes": 1}
         large = is_large(program, projection, times=2, more=() if jump is None else [jump.line] * 2)
-        self.motion = Motion(
+        self.motion = TaylorSeries(
             "adjoint", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
         )
         self.n, self.states, self.series = n, states, series
@@ -98,7 +98,7 @@ class Adjoint:
 
     def _back_at_end(self, borders: "Borders", levels: tuple[int, ...], jump) -> list[Code]:
         """Go back over the end of a step: over the border that it met, and over a knot of samples."""
-        clocks = Clocks(self.motion, borders)
+        clocks = TimeKnots(self.motion, borders)
         at_knot = [self._back_knot(clocks, levels)] if clocks.exist else []
         if jump is None:
             return [self._back_first_border(borders, levels), *at_knot]
@@ -373,8 +373,8 @@ class Adjoint:
             self._store_entries(frame, saltation.tables, slopes, len(saltation.by), gain)
         return frame.finish()
 
-    def _back_knot(self, clocks: Clocks, levels: tuple[int, ...]) -> Code:
-        """To the entry of a table that the time is on, where a step ends at one (`_clocks`)."""
+    def _back_knot(self, clocks: TimeKnots, levels: tuple[int, ...]) -> Code:
+        """To the entry of a table that the time is on, where a step ends at one (`_time_knots`)."""
         frame = self.motion.function("back_knot")
         code = frame.code
         with code.only_if(code.any_lane(clocks.is_crossed(frame))):

@@ -33,8 +33,8 @@ from lagjax._native._frame import Frame, Lane, integers
 from lagjax._native._ir import INTEGER, Code, Value, Variable
 from lagjax._native._output import Output
 from lagjax._native._roots import Roots
-from lagjax._native._series import Motion, double
 from lagjax._native._step import StepControl
+from lagjax._native._taylor import TaylorSeries, double
 from lagjax._program._series import StraightLine
 
 
@@ -45,7 +45,7 @@ class Change(IntEnum):
     RISES = 2
 
 
-class Rest(IntEnum):
+class Start(IntEnum):
     """The place where a motion begins: off the surface of a guard, on it, or on it and with a rate of zero."""
 
     OFF = 0
@@ -62,7 +62,7 @@ class Events:
 
     def __init__(
         self,
-        motion: Motion,
+        motion: TaylorSeries,
         step: StepControl,
         output: Output,
         roots: Roots,
@@ -160,8 +160,8 @@ class Events:
                 side = code.select(on_it, code.select(stays, before, going), value)
                 with frame.where(fresh):
                     frame["side", i] = self._sign(frame, side)
-                rests = code.select(on_it, code.select(leaves, Rest.ON, Rest.ALONG), Rest.OFF)
-                frame["resting", i] = code.select(fresh, rests, Rest.OFF)
+                rests = code.select(on_it, code.select(leaves, Start.ON, Start.ALONG), Start.OFF)
+                frame["resting", i] = code.select(fresh, rests, Start.OFF)
         return frame.finish()
 
     def _side_before(self, frame: Frame, i: int) -> Value:
@@ -288,7 +288,7 @@ class Events:
         frame["instant"] = instant / (code.intrinsic("fabs", h) * frame["part"])
         rounding = (ROOT_NOISE * EPS) * frame["kept", g]
         rounding = code.select(
-            (rounding < float("inf")) & code.compare("!=", frame["resting", g], Rest.ON), rounding, 0.0
+            (rounding < float("inf")) & code.compare("!=", frame["resting", g], Start.ON), rounding, 0.0
         )
         frame["unsure"] = code.intrinsic("fabs", frame["poly", 1]) * frame["instant"] + rounding
         ahead = code.variable(side)
@@ -306,11 +306,11 @@ class Events:
         code, rests = frame.code, frame["resting", g]
         since = code.intrinsic("fabs", frame["t"] - frame["passed_at", g])
         known = (since <= INSTANT * frame["smallest"]) | (frame["waited", g] > 0.0)
-        on = (rests > Rest.OFF) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= CONTINUOUS * size))
+        on = (rests > Start.OFF) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= CONTINUOUS * size))
         with frame.where(on):
             frame["poly", 0] = 0.0
         rate = frame["poly", 1]
-        frame["poly", 1] = code.select((rests >= Rest.ALONG) & (rate < 0.0), 0.0, rate)
+        frame["poly", 1] = code.select((rests >= Start.ALONG) & (rate < 0.0), 0.0, rate)
 
     def _along(self, frame: Frame, order: Value, g: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""

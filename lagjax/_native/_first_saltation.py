@@ -19,7 +19,7 @@ from lagjax._native._constants import JUMP_NOISE
 from lagjax._native._frame import Frame, Index, Numbers
 from lagjax._native._ir import Code, Value
 from lagjax._native._saltation import GuardTable
-from lagjax._native._series import Motion
+from lagjax._native._taylor import TaylorSeries
 from lagjax._program._borders import Borders, gradient
 from lagjax._program._look_ups import Table, shifted
 
@@ -30,7 +30,7 @@ class FirstSaltation:
     `levels` holds the coordinates of the motion, then with its tangents, then with tangents of these, and so on.
     """
 
-    def __init__(self, motion: Motion, borders: Borders, levels: tuple[int, ...]):
+    def __init__(self, motion: TaylorSeries, borders: Borders, levels: tuple[int, ...]):
         self.motion, self.levels, self.pieces = motion, levels, motion.pieces
         self.base, n = levels[0], levels[-1]
         self.parameters = motion.parameters * self.base // n  # of the motion alone

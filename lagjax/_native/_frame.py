@@ -1,7 +1,7 @@
 """A function of a kernel, and what it reads: the memory of its thread by name, one lane of it, the job of all threads.
 
 A thread works on as many members as a vector has lanes. Its memory is an array of vectors, one element a lane; a
-`Layout` gives each of them a name. A `Frame` is a function of the kernel under construction, which reads and writes
+`Memory` gives each of them a name. A `Frame` is a function of the kernel under construction, which reads and writes
 these like dictionaries:
 
     frame["h"] = 0.5 * frame["h"]               the steps of all lanes, a vector
@@ -54,13 +54,13 @@ def integers(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
     return table
 
 
-class Layout:
+class Memory:
     """The places of the vectors of a thread: `fields` gives each name a number of vectors, or rows and columns of them.
 
     `width` is the lanes of a vector. A layout `beside` another one has vectors of another width in the same memory.
     """
 
-    def __init__(self, width: int, fields: Mapping[str, int | tuple[int, int]], beside: "Layout | None" = None):
+    def __init__(self, width: int, fields: Mapping[str, int | tuple[int, int]], beside: "Memory | None" = None):
         self.width, self._columns, self._offsets = width, {}, {}
         self._doubles = [0] if beside is None else beside._doubles  # of all that share the memory
         for name, shape in fields.items():
@@ -124,7 +124,7 @@ class Vectors:
 class Frame:
     """A function of a kernel under construction, with named access to all that it sees."""
 
-    def __init__(self, module: ir.Module, layout: Layout, job: type, name: str, *kinds: ir.Type, **options):
+    def __init__(self, module: ir.Module, layout: Memory, job: type, name: str, *kinds: ir.Type, **options):
         self.code = Code(module, name, [POINTER] * 3 + list(kinds), layout.width, **options)
         self.layout, self.width, self.vector = layout, layout.width, self.code.vector
         self._fields = dict(job._fields_)
@@ -191,7 +191,7 @@ class Frame:
         """One lane of the memory."""
         return Lane(self, index)
 
-    def beside(self, layout: Layout) -> "Frame":
+    def beside(self, layout: Memory) -> "Frame":
         """The same function, which sees the fields of another layout of the same memory."""
         other = copy.copy(self)
         other.layout, other.width = layout, layout.width

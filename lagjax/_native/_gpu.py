@@ -55,17 +55,17 @@ _FAR_ANGLES = ("sin", "cos")  # the C library's part in a sine is that of angles
 _lock = threading.Lock()
 
 
-class Form(NamedTuple):
+class GpuForm(NamedTuple):
     """The order of the series, and whether the loops over orders are `unrolled`."""
 
     order: int
     unrolled: bool
 
 
-def form_for(series: Series, order: int) -> Form:
+def form_for(series: Series, order: int) -> GpuForm:
     """The form that should take the least time, where a CPU takes series of this `order`."""
     fitting = MOST_COEFFICIENTS // (series.rows + 2 * series.size)
-    return Form(min(order, fitting), True) if fitting >= LEAST_ORDER else Form(order, False)
+    return GpuForm(min(order, fitting), True) if fitting >= LEAST_ORDER else GpuForm(order, False)
 
 
 def grid(members: int) -> tuple[int, int]:
@@ -73,7 +73,7 @@ def grid(members: int) -> tuple[int, int]:
     return min(MOST_BLOCKS, max(1, -(-members // THREADS))), THREADS
 
 
-def program_for_gpus(integrator: Integrator, form: Form) -> str:
+def program_for_gpus(integrator: Integrator, form: GpuForm) -> str:
     """The PTX of an integrator of one lane, in a form, with the entry `integrate(*ARGUMENTS, *RESULTS)`.
 
     Raises `Unlowerable`, whose text says why there is none: the memory of a thread, tables of numbers, functions that
@@ -93,7 +93,7 @@ def program_for_gpus(integrator: Integrator, form: Form) -> str:
         return _assembly(str(motion.module), size, form)
 
 
-def _assembly(text: str, size: int, form: Form) -> str:
+def _assembly(text: str, size: int, form: GpuForm) -> str:
     """PTX from the text of a module whose threads remember this many doubles."""
     machine = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3)
     text = text.replace('target triple = ""', f'target triple = "{machine.triple}"')

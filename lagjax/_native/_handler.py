@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._frame import CACHE_LINE, LANE, Layout
+from lagjax._native._frame import CACHE_LINE, LANE, Memory
 from lagjax._native._integrator import JOB
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compiled, lanes
 
@@ -103,12 +103,12 @@ class Rest(NamedTuple):
     next_member: np.ndarray
 
     @staticmethod
-    def size(layout: Layout) -> int:
+    def size(layout: Memory) -> int:
         """Its size in doubles."""
         return layout.size + CACHE_LINE + _INTEGERS
 
     @classmethod
-    def of(cls, array: np.ndarray, layout: Layout) -> "Rest":
+    def of(cls, array: np.ndarray, layout: Memory) -> "Rest":
         """From what a handler wrote: a copy."""
         integers = array[-_INTEGERS:].view(np.int64).copy()
         lanes, (skipped, *_) = np.split(integers, [-_OTHERS])

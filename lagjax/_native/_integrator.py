@@ -2,9 +2,9 @@
 
 Every lane of a vector carries one member. A round takes one step in each lane:
 
-    coefficients   q and q̇ as power series about the present time (`_series`)
+    coefficients   q and q̇ as power series about the present time (`_taylor`)
     choose         the step that the last two coefficients allow, per lane (`_step`); it ends at the first border of a
-                   piecewise program (`_borders`)
+                   piecewise program (`_border_control`)
     check          the series must satisfy the equations of motion along the step, and end near its constraints
                    (`_projection`), or the step is halved
     stop           where a guard changes sign the step ends (`_events`)
@@ -16,8 +16,7 @@ so that no lane waits for another. Several threads may do so at once: they share
 """
 
 from lagjax._native import _rank_drops
-from lagjax._native._alone import MotionAlone, fills_lanes
-from lagjax._native._borders import Borders
+from lagjax._native._border_control import BorderControl
 from lagjax._native._constants import DONE, EVENT, FIRST_STEP, MAX_ORDER, OUT_OF_STEPS, RUNNING, SMALLEST_STEP
 from lagjax._native._events import Events
 from lagjax._native._frame import Frame, Lane, job
@@ -27,8 +26,9 @@ from lagjax._native._output import Output
 from lagjax._native._projection import Projector
 from lagjax._native._roots import Roots
 from lagjax._native._saltation import jump_over
-from lagjax._native._series import Chosen, Motion, double, integer, is_large
+from lagjax._native._single_member import SingleMember, fills_lanes
 from lagjax._native._step import PARTS, StepControl
+from lagjax._native._taylor import Chosen, TaylorSeries, double, integer, is_large
 from lagjax._program import _borders
 from lagjax._program._borders import reads_inputs
 from lagjax._program._series import Recurrent, Series
@@ -76,12 +76,12 @@ class Integrator:
         if guards is not None:
             fields |= Roots.fields(MAX_ORDER + 2)
         if borders is not None:
-            fields |= Borders.fields(borders, levels or (n,))
+            fields |= BorderControl.fields(borders, levels or (n,))
         pieces = 0 if borders is None else len(borders.switches)
         jump = None if borders is None or borders.motion is None else jump_over(borders, levels)
         large = is_large(program, projection, guards, more=() if jump is None else [jump.line])
         alone = large and width == 1 and borders is None and chosen is None
-        kind = MotionAlone if alone and fills_lanes(series) else Motion
+        kind = SingleMember if alone and fills_lanes(series) else TaylorSeries
         self.motion = motion = kind(
             "motion", program, series, JOB, fields, large, width, pieces=pieces, chosen=chosen, kept=self.guards
         )  # fmt: skip
@@ -90,7 +90,7 @@ class Integrator:
         )  # fmt: skip
         groups = tuple(range(n)) if error_groups is None else error_groups
         self.step = StepControl(motion, groups, self.projector, self.base_size)
-        self.borders = borders and Borders(motion, borders, levels or (n,), projection is not None, jump)
+        self.borders = borders and BorderControl(motion, borders, levels or (n,), projection is not None, jump)
         self.output = Output(motion, self.projector)
         self.events = guards and self._events(program, guards)
         self.start_next = self._start_next()

@@ -172,7 +172,7 @@ class Variable:
 
     @property
     def value(self) -> Value:
-        """What it is here."""
+        """The number or vector at this place of the code."""
         return self._place.code.load(self._place, self._kind)
 
     @value.setter

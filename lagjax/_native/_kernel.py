@@ -13,7 +13,6 @@ import numpy as np
 
 from lagjax._native import _gpu
 from lagjax._native._adjoint import Adjoint
-from lagjax._native._alone import fills_lanes
 from lagjax._native._constants import (
     ATOL_OVER_RTOL,
     DONE,
@@ -23,25 +22,26 @@ from lagjax._native._constants import (
     MOTIONS_PER_ADJOINT,
     VECTORS_PER_THREAD,
 )
-from lagjax._native._frame import LANE, Layout
+from lagjax._native._derivative_handler import DerivativePlan
+from lagjax._native._frame import LANE, Memory
 from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import compiled, lanes
-from lagjax._native._look_ups import SET_NUMBERS
 from lagjax._native._output import RECORDED
 from lagjax._native._packs import forget_stages
 from lagjax._native._schedule import forget_joined
-from lagjax._native._series import Chosen, Motion, is_large
-from lagjax._native._sweep import SweepPlan
+from lagjax._native._single_member import fills_lanes
+from lagjax._native._table_reads import SET_NUMBERS
 from lagjax._native._tangent import Tangent
+from lagjax._native._taylor import Chosen, TaylorSeries, is_large
 from lagjax._native._threads import SLICE, in_slices, together
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
+from lagjax._program._jump import looks_up, with_levels
 from lagjax._program._look_ups import BESIDE, shifted
 from lagjax._program._memory import without_collections
 from lagjax._program._operations import LOOK_UPS
-from lagjax._program._saltation import looks_up, with_levels
 from lagjax._program._series import Recurrent, Series, StraightLine, series
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
@@ -358,14 +358,14 @@ class Kernel:
 
     def sweep_plan(
         self, kind: str, members: int, times: int, directions: int, rtol: float, atol: float, max_steps: int
-    ) -> SweepPlan:
+    ) -> DerivativePlan:
         """The plan of derivatives of this many members; it lives as long as this kernel."""
         motion = self.of_members(members)._forward
         sweep, _ = self._forward_along(members, directions) if kind == "jvp" else self._back_over(members)
         rounds, others = self.rounds_of_sweep, self.numbers if kind == "vjp" else directions * times * self.states
         sizes = (size for of in (motion, sweep) for size in (of.layout.size, len(LANE) * of.layout.width))
         memory, integers, memory_of_sweep, integers_of_sweep = sizes
-        return SweepPlan(
+        return DerivativePlan(
             *motion.places, *sweep.places, memory, integers, memory_of_sweep, integers_of_sweep, self.states,
             self.numbers, order_for(rtol), max_steps, rounds, rounds * motion.layout.width, directions, others, rtol,
             atol, floor_of(rtol, atol),
@@ -408,7 +408,7 @@ class _Compiled:
     that are written down behind the state of a step.
     """
 
-    def __init__(self, motion: Motion, layout: Layout, job: Callable, rounds: int, pointers: int, more: int = 0):
+    def __init__(self, motion: TaylorSeries, layout: Memory, job: Callable, rounds: int, pointers: int, more: int = 0):
         self.rounds, self.more = rounds, more
         self.layout, self._job, self._counts_idle = layout, job, pointers == 4
         self._numbers = motion.look_up.numbers

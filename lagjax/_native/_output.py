@@ -4,7 +4,7 @@ from lagjax._native._constants import DONE
 from lagjax._native._frame import Frame, Index, Lane
 from lagjax._native._ir import Value
 from lagjax._native._projection import Projector
-from lagjax._native._series import Motion
+from lagjax._native._taylor import TaylorSeries
 
 RECORDED = 4  # numbers of a step that are written down before its state: time, size, member, number of the step
 
@@ -12,7 +12,7 @@ RECORDED = 4  # numbers of a step that are written down before its state: time, 
 class Output:
     """Writes into the arrays of the job."""
 
-    def __init__(self, motion: Motion, projector: Projector | None):
+    def __init__(self, motion: TaylorSeries, projector: Projector | None):
         self.motion, self.projector = motion, projector
 
     @staticmethod

@@ -29,18 +29,18 @@ from lagjax._native._packs import (
     staged,
     with_few_modes,
 )
-from lagjax._native._schedule import Kind, Same
+from lagjax._native._schedule import OperationKind, Same
 from lagjax._native._tables import WORD, Tables, word
 from lagjax._program._series import StraightLine
 
-_COPY, _STORE = (Kind(op, None, ("float",), "float", (None,)) for op in ("copy", "store"))
+_COPY, _STORE = (OperationKind(op, None, ("float",), "float", (None,)) for op in ("copy", "store"))
 
 
 class _Program(NamedTuple):
     """A program with the kinds of its operations, in stages; its last outputs, this many, are stored somewhere else."""
 
     line: StraightLine
-    kinds: list[Kind]
+    kinds: list[OperationKind]
     stages: list[Stage]
     stored: int
 
@@ -53,7 +53,7 @@ class Packed(Tables):
 
     def __init__(self, function, wide, sincos: Code, lanes: int):
         self.lanes = lanes
-        self._numbers: dict[tuple[Kind, tuple[int, ...]], int] = {}
+        self._numbers: dict[tuple[OperationKind, tuple[int, ...]], int] = {}
         self._programs: dict[int, _Program] = {}  # by the program, which lives as long
         self._arranged: dict[tuple, tuple[Arranged, str]] = {}
         super().__init__(function, sincos, wide)
@@ -138,7 +138,7 @@ class Packed(Tables):
 
     # ---- the table of a program ----
 
-    def _piece(self, kind: Kind, run: Run) -> list[int]:
+    def _piece(self, kind: OperationKind, run: Run) -> list[int]:
         """The words of a run."""
         number = self._numbers.setdefault((kind, run.modes), len(self._numbers) + 1)
         vectors = -(-run.count // self.lanes)
@@ -171,7 +171,7 @@ class Packed(Tables):
         code.builder.position_at_end(end)
         frame.finish()
 
-    def _write_run(self, words: Value, kind: Kind, modes: tuple[int, ...]) -> Value:
+    def _write_run(self, words: Value, kind: OperationKind, modes: tuple[int, ...]) -> Value:
         """The code of a run; where the next one begins."""
         frame, code, lanes = self._execute, self._execute.code, self.lanes
         shift = frame.arguments[1]

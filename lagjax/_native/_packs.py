@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._native._constants import LEAST_FILLED, LEAST_RUN, LONG_RUN, OFTEN_PACKED
-from lagjax._native._schedule import Kind, Operation, Same, joined
+from lagjax._native._schedule import OperationKind, Same, ScheduledOperation, joined
 from lagjax._program._series import StraightLine
 
 # How an operand of a run lies in memory: consecutive numbers, one number, or anywhere.
@@ -49,10 +49,10 @@ class Run(NamedTuple):
     results: tuple[int, ...]
 
 
-def stages(operations: Sequence[Operation], nodes: int, kept: Sequence[int]) -> list[Stage]:
+def stages(operations: Sequence[ScheduledOperation], nodes: int, kept: Sequence[int]) -> list[Stage]:
     """The stages of a program of this many nodes, in an order in which they can run; nodes that are `kept` live on."""
     level = [0] * nodes
-    groups: dict[tuple[int, int], list[Operation]] = {}
+    groups: dict[tuple[int, int], list[ScheduledOperation]] = {}
     for operation in operations:
         depth = 1 + max((level[x] for x in operation.operands), default=0)
         for x in operation.results:
@@ -73,7 +73,7 @@ def stages(operations: Sequence[Operation], nodes: int, kept: Sequence[int]) -> 
 
 
 @functools.lru_cache(maxsize=4)  # asked for when it is decided how a motion runs, and when it is compiled
-def staged(same: Same) -> tuple[list[Kind], list[Stage]]:
+def staged(same: Same) -> tuple[list[OperationKind], list[Stage]]:
     """A program in stages, and the kinds of their operations."""
     kinds, operations = joined(same.line)
     return kinds, stages(operations, len(same.line.nodes), same.line.outputs)

@@ -8,7 +8,7 @@ then the projection has failed, and the step is halved.
 from lagjax._native._constants import PROJECTION_TOLERANCES, ROUND_OFF, START
 from lagjax._native._frame import Frame, Index, Numbers
 from lagjax._native._ir import Code, Value
-from lagjax._native._series import Motion
+from lagjax._native._taylor import TaylorSeries
 from lagjax._program._series import Recurrent
 
 
@@ -18,7 +18,7 @@ class Projector:
     The others are derivatives of them, which follow: how far they move says nothing about the step.
     """
 
-    def __init__(self, motion: Motion, state: Recurrent, velocity_scale: Recurrent, base_size: int):
+    def __init__(self, motion: TaylorSeries, state: Recurrent, velocity_scale: Recurrent, base_size: int):
         self.motion, self.base_size = motion, base_size
         self.state, self.velocity_scale = state.line, velocity_scale.line
         self.project = self._project()

@@ -11,13 +11,13 @@ from contextlib import contextmanager
 from lagjax._native._frame import Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._output import RECORDED
-from lagjax._native._series import Motion
+from lagjax._native._taylor import TaylorSeries
 
 
 class Replay:
     """The members and the recorded steps of a motion; a lane's `step` numbers the one that it is at."""
 
-    def __init__(self, motion: Motion):
+    def __init__(self, motion: TaylorSeries):
         self.motion = motion
         self._size = motion.states + RECORDED + motion.recorded_pieces  # of what is recorded of a step
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from lagjax._native._constants import EPS, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE
 from lagjax._native._frame import Frame
 from lagjax._native._ir import INTEGER, Code, Value
-from lagjax._native._series import Motion, integer
+from lagjax._native._taylor import TaylorSeries, integer
 
 
 class Roots:
@@ -30,7 +30,7 @@ class Roots:
     `slope` at the root, and how well P is known there, in `error`.
     """
 
-    def __init__(self, motion: Motion):
+    def __init__(self, motion: TaylorSeries):
         self.motion = motion
         self.next_root = self._next_root()
         self.first_root = self._first_root()

@@ -1,4 +1,4 @@
-"""Derivatives at a border: the jump of tangents, and of cotangents, to every order (`_program._saltation`).
+"""Derivatives at a border: the jump of tangents, and of cotangents, to every order (`_program._jump`).
 
 The border is crossed at another time when the motion is varied; up to then the acceleration is a⁻, and from then on a⁺.
 First tangents of a velocity jump by (a⁻ − a⁺) δt where the acceleration jumps, tangents of tangents also where only its
@@ -14,9 +14,9 @@ import numpy as np
 from lagjax._native._constants import JUMP_NOISE
 from lagjax._native._frame import Frame, Index, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
-from lagjax._native._series import Motion
+from lagjax._native._taylor import TaylorSeries
 from lagjax._program._borders import Borders
-from lagjax._program._saltation import Jump, looks_up, over_border
+from lagjax._program._jump import Jump, looks_up, over_border
 
 NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "goes_on")
 PLACES = ("piece", "back", "slide", "on", "order", "of_table")
@@ -25,7 +25,7 @@ PLACES = ("piece", "back", "slide", "on", "order", "of_table")
 class GuardTable:
     """The guards of all pieces (`_program._borders.Guard`) as constants of a kernel, for loops over them."""
 
-    def __init__(self, motion: Motion, borders: Borders):
+    def __init__(self, motion: TaylorSeries, borders: Borders):
         self.motion = motion
         numbers = np.array([[getattr(guard, name) for name in NUMBERS] for guard in borders.guards] or [[0.0]])
         self._numbers = integers(motion.module, np.frombuffer(numbers.tobytes(), np.int64))
@@ -90,7 +90,7 @@ def jump_along(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
 class Saltation:
     """The jumps (`jump_over`) of a motion with tangents, whose first `base` coordinates are the motion alone."""
 
-    def __init__(self, motion: Motion, borders: Borders, base: int, jump: Jump):
+    def __init__(self, motion: TaylorSeries, borders: Borders, base: int, jump: Jump):
         self.motion, self.base, self.pieces, self.jump = motion, base, motion.pieces, jump
         self.table = GuardTable(motion, borders)
         self.parameters = motion.parameters * self.base // motion.n  # of the motion alone

@@ -20,7 +20,7 @@ from lagjax._program._series import StraightLine
 _JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))
 
 
-class Kind(NamedTuple):
+class OperationKind(NamedTuple):
     """The kind of an operation: its name and attribute, and the kinds ("float", "bool", …) of operands and result.
 
     `parts` has an entry for each operand: the operation that it is the result of, if that belongs to this one, or None.
@@ -30,7 +30,7 @@ class Kind(NamedTuple):
     attribute: object
     kinds: tuple[str, ...]
     result: str
-    parts: "tuple[Kind | None, ...]"
+    parts: "tuple[OperationKind | None, ...]"
 
     @property
     def operands(self) -> int:
@@ -43,7 +43,7 @@ class Kind(NamedTuple):
         return 2 if self.op == "sincos" else 1
 
 
-class Operation(NamedTuple):
+class ScheduledOperation(NamedTuple):
     """An operation: its kind, as a number, the nodes that it reads, and those that it makes (-1: nobody reads it)."""
 
     kind: int
@@ -60,8 +60,8 @@ class Schedule(NamedTuple):
     `constants` the number of one that is a number.
     """
 
-    kinds: list[Kind]
-    groups: list[list[Operation]]
+    kinds: list[OperationKind]
+    groups: list[list[ScheduledOperation]]
     slots: dict[int, int]
     staying: int
     size: int
@@ -99,14 +99,14 @@ class Same:
         return isinstance(other, Same) and self.line is other.line
 
 
-def joined(line: StraightLine) -> tuple[list[Kind], list[Operation]]:
+def joined(line: StraightLine) -> tuple[list[OperationKind], list[ScheduledOperation]]:
     """The operations that the outputs of a program need, each after those that it reads, and their kinds."""
     kinds, operations = _joined_of(Same(line))
     return kinds.all, operations
 
 
 @functools.lru_cache(maxsize=4)  # asked for when it is decided how a motion runs, and when it is compiled
-def _joined_of(same: Same) -> tuple["_Kinds", list[Operation]]:
+def _joined_of(same: Same) -> tuple["_Kinds", list[ScheduledOperation]]:
     uses, kinds = count_uses(same.line.nodes, same.line.outputs), _Kinds()
     return kinds, _joined(_operations(same.line, uses, kinds), uses, kinds)
 
@@ -123,14 +123,14 @@ class _Kinds:
     """The kinds of the operations of a program, numbered as they come."""
 
     def __init__(self):
-        self.all: list[Kind] = []
+        self.all: list[OperationKind] = []
         self.operands: list[int] = []
-        self._numbers: dict[Kind, int] = {}
+        self._numbers: dict[OperationKind, int] = {}
         self._joined: dict[tuple[int, int, int], int] = {}
 
     def number(self, op: str, attribute: object, kinds: tuple[str, ...], result: str) -> int:
         """The number of a kind that consists of one operation."""
-        return self._number(Kind(op, attribute, kinds, result, (None,) * len(kinds)))
+        return self._number(OperationKind(op, attribute, kinds, result, (None,) * len(kinds)))
 
     def joined(self, kind: int, place: int, part: int) -> int:
         """The kind whose operand at this place, counted over all that it reads, is made by another."""
@@ -139,7 +139,7 @@ class _Kinds:
             self._joined[key] = self._number(_with_part(self.all[kind], place, self.all[part]))
         return self._joined[key]
 
-    def _number(self, kind: Kind) -> int:
+    def _number(self, kind: OperationKind) -> int:
         number = self._numbers.setdefault(kind, len(self.all))
         if number == len(self.all):
             self.all.append(kind)
@@ -147,7 +147,7 @@ class _Kinds:
         return number
 
 
-def _with_part(kind: Kind, place: int, part: Kind) -> Kind:
+def _with_part(kind: OperationKind, place: int, part: OperationKind) -> OperationKind:
     parts = list(kind.parts)
     for k, inner in enumerate(parts):
         width = 1 if inner is None else inner.operands
@@ -158,7 +158,7 @@ def _with_part(kind: Kind, place: int, part: Kind) -> Kind:
     return kind._replace(parts=tuple(parts))
 
 
-def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Operation]:
+def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
     """The operations that the outputs need, each after those that it reads."""
     angles, operations, numbers = _angles(line, uses), [], {}
     for i, (op, operands, attribute) in enumerate(line.nodes):
@@ -174,7 +174,7 @@ def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Oper
         )
         if key not in numbers:
             numbers[key] = kinds.number(op, attribute, tuple(line.kinds[x] for x in operands), line.kinds[i])
-        operations.append(Operation(numbers[key], operands, results))
+        operations.append(ScheduledOperation(numbers[key], operands, results))
     return operations
 
 
@@ -188,8 +188,8 @@ def _angles(line: StraightLine, uses: list[int]) -> dict[int, list[int]]:
 
 
 def _outputs(
-    line: StraightLine, operations: list[Operation], kinds: _Kinds, staying: int
-) -> tuple[dict[int, int], list[Operation]]:
+    line: StraightLine, operations: list[ScheduledOperation], kinds: _Kinds, staying: int
+) -> tuple[dict[int, int], list[ScheduledOperation]]:
     """Which of the first outputs every node is; and the copies for those that no operation makes, or that are an
     earlier output too, and for all other outputs.
 
@@ -200,18 +200,18 @@ def _outputs(
     copies, copy, store = [], *(kinds.number(op, None, ("float",), "float") for op in ("copy", "store"))
     for k, i in enumerate(line.outputs):
         if k >= staying:
-            copies.append(Operation(store, (i,), (len(line.nodes) + k,)))
+            copies.append(ScheduledOperation(store, (i,), (len(line.nodes) + k,)))
         elif i in made and i not in outputs:
             outputs[i] = k
         else:
             outputs[len(line.nodes) + k] = k
-            copies.append(Operation(copy, (i,), (len(line.nodes) + k,)))
+            copies.append(ScheduledOperation(copy, (i,), (len(line.nodes) + k,)))
     return outputs, copies
 
 
-def _in_order(operations: list[Operation], copies: list[Operation]) -> list[Operation]:
+def _in_order(operations: list[ScheduledOperation], copies: list[ScheduledOperation]) -> list[ScheduledOperation]:
     """The operations, each followed by the copies of its results."""
-    of: dict[int, list[Operation]] = {}
+    of: dict[int, list[ScheduledOperation]] = {}
     for copy in copies:
         of.setdefault(copy.operands[0], []).append(copy)
     ordered = []
@@ -225,7 +225,7 @@ def _in_order(operations: list[Operation], copies: list[Operation]) -> list[Oper
 # ---- what often comes together ---------------------------------------------------------------------------------------
 
 
-def _joined(operations: list[Operation], uses: list[int], kinds: _Kinds) -> list[Operation]:
+def _joined(operations: list[ScheduledOperation], uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
     """The operations, with a result that only one other reads computed inside that one, where such a pair comes often.
 
     Pairs of pairs come often too, and so on: byte-pair encoding, with trees for strings. A product that only one sum
@@ -244,8 +244,8 @@ def _joined(operations: list[Operation], uses: list[int], kinds: _Kinds) -> list
 class _Work:
     """Operations by the node that they make, in order; those that have become a part of another are None."""
 
-    def __init__(self, operations: list[Operation], uses: list[int], kinds: _Kinds):
-        self.by_node: list[Operation | None] = [None] * len(uses)
+    def __init__(self, operations: list[ScheduledOperation], uses: list[int], kinds: _Kinds):
+        self.by_node: list[ScheduledOperation | None] = [None] * len(uses)
         self._single, self._kinds = bytearray(len(uses)), kinds
         for operation in operations:
             first = max(operation.results) if min(operation.results) < 0 else min(operation.results)
@@ -315,13 +315,13 @@ class _Work:
         assert inner is not None
         self.by_node[x] = None
         operands = operands[:place] + inner.operands + operands[place + 1 :]
-        self.by_node[i] = Operation(self._kinds.joined(kind, place, inner.kind), operands, results)
+        self.by_node[i] = ScheduledOperation(self._kinds.joined(kind, place, inner.kind), operands, results)
 
 
 # ---- order -----------------------------------------------------------------------------------------------------------
 
 
-def _grouped(operations: list[Operation]) -> list[list[Operation]]:
+def _grouped(operations: list[ScheduledOperation]) -> list[list[ScheduledOperation]]:
     """Operations of one kind that do not wait for each other, in an order that respects all others.
 
     Of the next `WINDOW` operations, in the order in which the program has them, the kind goes first that fills a step
@@ -354,7 +354,7 @@ def _grouped(operations: list[Operation]) -> list[list[Operation]]:
     return groups
 
 
-def _edges(operations: list[Operation]) -> tuple[list[list[int]], list[int]]:
+def _edges(operations: list[ScheduledOperation]) -> tuple[list[list[int]], list[int]]:
     """For every operation those that read its results, as often as they do, and how many operands it waits for."""
     maker = {x: k for k, operation in enumerate(operations) for x in operation.results}
     users: list[list[int]] = [[] for _ in operations]
@@ -371,7 +371,7 @@ def _edges(operations: list[Operation]) -> tuple[list[list[int]], list[int]]:
 
 
 def _slots(
-    groups: list[list[Operation]], outputs: dict[int, int], count: int, nodes: int
+    groups: list[list[ScheduledOperation]], outputs: dict[int, int], count: int, nodes: int
 ) -> tuple[dict[int, int], int]:
     """A slot for every result, the one that became free last first; inputs and constants have none here.
 

@@ -40,7 +40,7 @@ from lagjax._native._constants import (
 from lagjax._native._frame import Frame, Index, Numbers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._projection import Projector, end_of_step
-from lagjax._native._series import Motion, double, integer
+from lagjax._native._taylor import TaylorSeries, double, integer
 
 PARTS = 2  # the motion, and derivatives of it
 
@@ -51,7 +51,9 @@ class StepControl:
     The first `base_size` coordinates are the motion, the others derivatives of it.
     """
 
-    def __init__(self, motion: Motion, error_groups: tuple[int, ...], projector: Projector | None, base_size: int):
+    def __init__(
+        self, motion: TaylorSeries, error_groups: tuple[int, ...], projector: Projector | None, base_size: int
+    ):
         self.motion, self.error_groups, self.projector = motion, error_groups, projector
         # The motion, and the derivatives that follow it, whose units are others.
         self.parts = [(0, base_size)] + [(base_size, motion.n - base_size)] * (motion.n > base_size)

@@ -20,7 +20,7 @@ from lagjax._native._constants import TIMES
 from lagjax._native._frame import Frame, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
 from lagjax._native._lanes import apply, sines_and_cosines
-from lagjax._native._schedule import Kind, Operation, Schedule, schedule
+from lagjax._native._schedule import OperationKind, Schedule, ScheduledOperation, schedule
 from lagjax._program._operations import LOOK_UPS
 from lagjax._program._series import StraightLine
 
@@ -35,7 +35,7 @@ class Tables:
 
     def __init__(self, function, sincos: Code, executing=None, look_up: Callable | None = None):
         self._sincos, self._look_up = sincos, look_up
-        self._kinds: dict[tuple[Kind, int], int] = {}
+        self._kinds: dict[tuple[OperationKind, int], int] = {}
         self._constants: dict[bytes, int] = {}
         self._fields: list[str] = []
         self._schedules: dict[int, tuple[StraightLine, Schedule]] = {}  # by the program, which lives as long
@@ -155,7 +155,7 @@ class Tables:
 
     # ---- the table of a program ----
 
-    def _words(self, kind: Kind, group: list[Operation], places: dict[int, int]) -> list[int]:
+    def _words(self, kind: OperationKind, group: list[ScheduledOperation], places: dict[int, int]) -> list[int]:
         """The operations of a group, all of one kind, this many at a time as there is code for."""
         start, words = 0, []
         while start < len(group):
@@ -193,7 +193,7 @@ class Tables:
         code.builder.position_at_end(end)
         frame.finish()
 
-    def _results(self, kind: Kind, operands: Iterator[Value]) -> tuple[Value, ...]:
+    def _results(self, kind: OperationKind, operands: Iterator[Value]) -> tuple[Value, ...]:
         """The results of an operation, from those of the numbers that it reads; a bool is 1 or 0."""
         code = self._execute.code
         xs = [next(operands) if part is None else self._results(part, operands)[0] for part in kind.parts]

@@ -21,19 +21,19 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._clocks import Clocks
 from lagjax._native._constants import MAX_ORDER
 from lagjax._native._first_saltation import FirstSaltation
-from lagjax._native._frame import Frame, Lane, Layout, Vectors, integers, job
+from lagjax._native._frame import Frame, Lane, Memory, Vectors, integers, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
 from lagjax._native._replay import Replay
 from lagjax._native._saltation import GuardTable, Saltation, jump_along
-from lagjax._native._series import Chosen, Motion, double, integer, is_large
 from lagjax._native._tables import Tables
+from lagjax._native._taylor import Chosen, TaylorSeries, double, integer, is_large
+from lagjax._native._time_knots import TimeKnots
 from lagjax._program._borders import Borders
 from lagjax._program._differentiation import pushforward
-from lagjax._program._saltation import Jump
+from lagjax._program._jump import Jump
 from lagjax._program._series import Recurrent, Series
 
 # `y_dot` is the tangent of the start, and becomes that of the end.
@@ -74,16 +74,16 @@ class Tangent:
         if borders is not None:
             fields |= FirstSaltation.fields(pieces, (n,)) if jump is None else Saltation.fields(pieces)
             fields |= {"crossed": 1, "grazes": 1}
-        self.motion = Motion(
+        self.motion = TaylorSeries(
             "tangent", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
         )
         self.n, self.states, self.series, self.lanes, self.numbers = n, states, series, lanes, self.motion.parameters
-        self.clocks: Clocks | None = None
+        self.clocks: TimeKnots | None = None
         self.base = levels[0] if levels else n
         self.saltation: Saltation | FirstSaltation | None = None
         if borders is not None:
             self._note_borders(borders, levels or (n,), jump)
-        self.layout = Layout(lanes, self._fields(), beside=self.motion.layout)
+        self.layout = Memory(lanes, self._fields(), beside=self.motion.layout)
         sincos = sincos_function(self.motion.module, lanes, "sincos_of_tangents")
         look_up = self.motion.look_up
         self.form = Tables(self.function, sincos, look_up=look_up) if large else Lines(sincos, look_up)
@@ -115,7 +115,7 @@ class Tangent:
             self.motion.layout.extend_by(self.saltation.fields_along())
             self.begin_behind = self.saltation.note_begin()
             self.note_border = self.saltation.note_end(GuardTable(self.motion, borders))
-        clocks = Clocks(self.motion, borders)
+        clocks = TimeKnots(self.motion, borders)
         if clocks.exist:
             self.motion.layout.extend_by(clocks.fields())
             self.clocks, self.note_knot = clocks, clocks.note_end()
@@ -233,7 +233,7 @@ class Tangent:
             lane["knot_of"] = 0.0
 
     def _await_end(self, frame: Frame) -> None:
-        """Where the next step of every lane begins."""
+        """Set the beginning of the next step of every lane, up to which outputs belong to this one."""
         code = frame.code
         with code.loop(self.motion.width) as index:
             lane = frame.lane(index)
@@ -296,7 +296,7 @@ class Tangent:
                 self._jump_at_knot(frame, self.clocks)
         return frame.finish()
 
-    def _jump_at_knot(self, frame: Frame, clocks: Clocks) -> None:
+    def _jump_at_knot(self, frame: Frame, clocks: TimeKnots) -> None:
         """The tangents behind an entry of a table that the time is on, at the beginning of the step from there."""
         code, n = frame.code, self.n
         knot_of, knot = self.number_of(frame, "knot_of"), self.number_of(frame, "knot")

@@ -21,7 +21,7 @@ _NONE = np.empty(0, np.intp), np.empty(0, np.intp)
 MOST_HELD = 2**21
 
 
-class Group(NamedTuple):
+class NodeGroup(NamedTuple):
     """Nodes of one operation and one kind: their rows among the values of that kind, and those of each operand."""
 
     op: str
@@ -42,7 +42,7 @@ class Groups(NamedTuple):
     counts: dict[str, int]
     constants: dict[str, tuple[np.ndarray, np.ndarray]]
     inputs: dict[str, tuple[np.ndarray, np.ndarray]]
-    groups: tuple[Group, ...]
+    groups: tuple[NodeGroup, ...]
     outputs: dict[str, tuple[np.ndarray, np.ndarray]]
 
     def kinds_of_inputs(self) -> dict[int, str]:
@@ -156,5 +156,5 @@ def groups_of(line) -> Groups | None:
             continue
         operands = np.array([nodes[k][1] for k in members], dtype=np.intp)
         each = tuple((of, at[operands[:, j]]) for j, of in enumerate(of_operands))
-        groups.append(Group(op, attribute, kind, at[members], each))
+        groups.append(NodeGroup(op, attribute, kind, at[members], each))
     return Groups(counts, leaves["constant"], leaves["input"], tuple(groups), ends)

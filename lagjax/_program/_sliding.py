@@ -58,7 +58,7 @@ def with_sliding(
     if not slides:
         return None
     if linear is not None and len(slides) <= MOST_SLIDING:
-        done = _Unknowns(line, n, first, switches, slides, linear).finished()
+        done = _SlidingForces(line, n, first, switches, slides, linear).finished()
         if done is not None:
             return done
     if len(slides) > MOST_COPIES or len(line.nodes) > LARGEST_COPIED or any(slide.order > 1 for slide in slides):
@@ -69,7 +69,7 @@ def with_sliding(
 # ---- as unknowns of the linear system --------------------------------------------------------------------------------
 
 
-class _Unknowns:
+class _SlidingForces:
     """The program with μ, one number for each of the pieces, as unknowns."""
 
     def __init__(self, line, n, first, switches, slides, linear):

@@ -21,7 +21,7 @@ from lagjax._custom import differentiated_as
 from lagjax._derivation import Derivation
 from lagjax._failures import differentiable_where, lost_unless
 from lagjax._layout import halves
-from lagjax._machine_code import _transforms
+from lagjax._machine_code import _primitives
 from lagjax._machine_code._flow import Flow, Tolerances
 from lagjax._machine_code._surfaces import Surfaces, moved_with, require_one_number
 from lagjax._problem import Problem, Solution, has_own_root_finder
@@ -117,7 +117,7 @@ def to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Toleranc
 
 def _to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params) -> Solution:
     still = jax.lax.stop_gradient
-    solution = jax.tree.map(still, _transforms.run(guarded, tolerances, still(ts), still(y0), still(params)))
+    solution = jax.tree.map(still, _primitives.run(guarded, tolerances, still(ts), still(y0), still(params)))
     reached = jnp.isfinite(solution.path).all(axis=1)
     values, where = (solution.path, solution.y_end, solution.t_end), (solution.result, solution.event)
     varied = _varied_to_event(flow, surfaces, tolerances)
@@ -141,7 +141,7 @@ def _varied_to_event(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
         end = jnp.where(fired, stop, ts[-1])
         times = jnp.where((end - ts) * (ts[-1] - ts[0]) >= 0, ts, end)
         times = jnp.concatenate([ts[:1], times[1:-1], end[None]])
-        solution = _transforms.run(flow, tolerances, times, y0, params)
+        solution = _primitives.run(flow, tolerances, times, y0, params)
         t_end, y_end, earlier = end, solution.y_end, jnp.asarray(False)
         for k, moved in enumerate(ways):
             taken = fired & (((event >> (2 * k)) & 3) > 0) & ~earlier
@@ -168,7 +168,7 @@ def _along_crossings(
     noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params
 ) -> tuple[Solution, Noted]:
     still = jax.lax.stop_gradient
-    solution = jax.tree.map(still, _transforms.run(noting, tolerances, still(ts), still(y0), still(params)))
+    solution = jax.tree.map(still, _primitives.run(noting, tolerances, still(ts), still(y0), still(params)))
     noted = Noted.read(solution.path, len(surfaces.directions))
     varied = _varied_crossings(flow, surfaces, tolerances._replace(notes=0))
     t, y = differentiated_as(varied, (noted.t, noted.y), ts, y0, params, noted.t)
@@ -188,7 +188,7 @@ def _varied_crossings(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
         there = jnp.isfinite(t)
         times = jnp.where(there, _before(ts, t), jax.lax.stop_gradient(ts[-1])).ravel()
         order = jnp.argsort(times * jnp.sign(ts[-1] - ts[0]))
-        solution = _transforms.run(
+        solution = _primitives.run(
             flow, tolerances, jnp.concatenate([ts[:1], times[order], ts[-1:]]), y0, params
         )  # fmt: skip
         path = jnp.zeros_like(solution.path[1:-1]).at[order].set(solution.path[1:-1])

@@ -14,15 +14,15 @@ from collections.abc import Callable
 from lagjax._native._constants import JUMP_NOISE
 from lagjax._native._frame import Frame, Numbers
 from lagjax._native._ir import Code, Value
-from lagjax._native._series import Motion
+from lagjax._native._taylor import TaylorSeries
 from lagjax._program._borders import Borders
 from lagjax._program._look_ups import Table, shifted
 
 
-class Clocks:
+class TimeKnots:
     """The tables of a motion that the time is on, and whose entries are numbers of a member."""
 
-    def __init__(self, motion: Motion, borders: Borders):
+    def __init__(self, motion: TaylorSeries, borders: Borders):
         self.motion, self.first = motion, len(borders.guards) + 1
         of_pieces = []
         for c, j in enumerate(borders.clocks):

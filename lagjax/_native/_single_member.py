@@ -10,13 +10,13 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._constants import MAX_ORDER
-from lagjax._native._frame import CACHE_LINE, Frame, Index, Layout, Vectors, integers
+from lagjax._native._frame import CACHE_LINE, Frame, Index, Memory, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value, lanes
 from lagjax._native._lanes import sincos_function
 from lagjax._native._packed import Packed
 from lagjax._native._packs import ANYWHERE, SIDE_BY_SIDE, Run, fills, runs_of_products, with_few_modes
-from lagjax._native._series import Motion, mixed_sum, square_sum
 from lagjax._native._tables import WORD, word
+from lagjax._native._taylor import TaylorSeries, mixed_sum, square_sum
 from lagjax._program._series import Series
 
 
@@ -25,8 +25,8 @@ def fills_lanes(series: Series) -> bool:
     return fills(series.order_recursion, lanes())
 
 
-class MotionAlone(Motion):
-    """A `Motion` of width one, as tables of vectors."""
+class SingleMember(TaylorSeries):
+    """A `TaylorSeries` of width one, as tables of vectors."""
 
     def _fields(self) -> dict:
         rows = -(-(self.series.rows + lanes()) // CACHE_LINE)
@@ -49,7 +49,7 @@ class MotionAlone(Motion):
 
     def _wide(self, name: str, *kinds: ir.Type) -> Frame:
         """A new function whose vectors have the lanes of the processor."""
-        return Frame(self.module, Layout(lanes(), {}), self.job, name, *kinds)
+        return Frame(self.module, Memory(lanes(), {}), self.job, name, *kinds)
 
     # ---- what lies where ----
 

@@ -27,7 +27,7 @@ _SIZES = ("memory", "lane_integers", "memory_of_sweep", "lane_integers_of_sweep"
 _NUMBERS = ("states", "numbers", "order", "max_steps", "rounds", "room", "directions", "others")
 
 
-class SweepPlan(ctypes.Structure):
+class DerivativePlan(ctypes.Structure):
     """The plan of a handler: the functions of both kernels, doubles and integers of a thread of each, and how to run.
 
     Steps of `room` are written down; `rounds` are those of the motion. `others` counts the doubles of a member in the
@@ -87,7 +87,7 @@ class SweepHandler:
 _lock = threading.Lock()
 
 
-def sweep_handler(kind: str) -> SweepHandler:
+def derivative_handler(kind: str) -> SweepHandler:
     """The one of this process, of "jvp" or "vjp"."""
     with _lock:
         return _made(kind)
@@ -116,7 +116,7 @@ class _Sweep:
 
     def of_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
         """A field of the plan."""
-        return at(self.plan, getattr(SweepPlan, name).offset, kind)
+        return at(self.plan, getattr(DerivativePlan, name).offset, kind)
 
     def _carve(self) -> None:
         """Give every array of the scratch its place: the memories of both kernels first, on cache lines, of zeros."""

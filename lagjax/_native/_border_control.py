@@ -14,7 +14,6 @@ import itertools
 from collections.abc import Iterator
 from enum import IntEnum
 
-from lagjax._native._clocks import Clocks
 from lagjax._native._constants import (
     ABRUPT,
     ARGUMENT,
@@ -41,17 +40,18 @@ from lagjax._native._frame import Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._roots import Roots
 from lagjax._native._saltation import NUMBERS, GuardTable, Saltation
-from lagjax._native._series import Motion, double, integer
 from lagjax._native._step import absolute_tolerance
+from lagjax._native._taylor import TaylorSeries, double, integer
+from lagjax._native._time_knots import TimeKnots
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
-from lagjax._program._saltation import Jump, looks_up
+from lagjax._program._jump import Jump, looks_up
 
 NOWHERE = 1e300  # a level that no switching number comes to
 
 
 class Touch(IntEnum):
-    """How a guard meets its border where a step begins: not, by its value, with its first rates, or for good.
+    """The contact of a guard with its border where a step begins: none, of its value, of its rates too, for good.
 
     Numbers between count the rates that are zero, and one for the value.
     """
@@ -63,7 +63,7 @@ class Touch(IntEnum):
     SLIDING = 4
 
 
-class Borders:
+class BorderControl:
     """The borders of a motion, whose pieces are its last parameters.
 
     Where it `returns` to long steps (`_rank_drops`), it does not go back over a border, nor because of one. With
@@ -71,7 +71,7 @@ class Borders:
     """
 
     def __init__(
-        self, motion: Motion, borders: _borders.Borders, levels: tuple[int, ...], returns: bool, jump: Jump | None
+        self, motion: TaylorSeries, borders: _borders.Borders, levels: tuple[int, ...], returns: bool, jump: Jump | None
     ):
         self.returns, base = returns, levels[0]
         self.motion, self.borders, self.guards = motion, borders, borders.guards
@@ -80,7 +80,7 @@ class Borders:
             self.stop = self._stop()
             return
         self.table = GuardTable(motion, borders)
-        self.clocks = Clocks(motion, borders)
+        self.clocks = TimeKnots(motion, borders)
         self.decide, self.stop = self._decide(), self._stop()
         self.note, self.jump = None, None
         if jump is not None:

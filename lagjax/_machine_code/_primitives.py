@@ -35,10 +35,10 @@ from jax.interpreters import ad, batching, mlir
 from lagjax._machine_code import _derivatives
 from lagjax._machine_code._call import has_handler, has_sweep, on_host, run_by_handler, sweep_by_handler
 from lagjax._machine_code._flow import Flow, Tolerances
-from lagjax._machine_code._gpu import run_on_gpu
+from lagjax._machine_code._gpu_launch import run_on_gpu
 from lagjax._machine_code._rates import rate
 from lagjax._machine_code._steps import KEPT
-from lagjax._machine_code._tangent import from_rows, to_rows
+from lagjax._machine_code._variational import from_rows, to_rows
 from lagjax._native import Begun
 from lagjax._problem import Solution
 from lagjax._results import SUCCESSFUL

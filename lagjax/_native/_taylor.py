@@ -3,7 +3,7 @@
     sums            Σ' aⱼ bₖ₋ⱼ for every Cauchy product, at order k
     coefficients    the series of q and q̇ to the order asked for: zeroth order, then one order after the other
 
-`_program._series` derives what they compute. All other parts of a kernel are built on a `Motion`.
+`_program._series` derives what they compute. All other parts of a kernel are built on a `TaylorSeries`.
 """
 
 import functools
@@ -15,10 +15,10 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._constants import LARGEST_LINE, MAX_ORDER, OPERATIONS_PER_COORDINATE
-from lagjax._native._frame import Frame, Index, Layout, Numbers, Vectors, integers
+from lagjax._native._frame import Frame, Index, Memory, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
-from lagjax._native._look_ups import LookUps
+from lagjax._native._table_reads import LookUps
 from lagjax._native._tables import Tables
 from lagjax._program._series import Recurrent, Series, StraightLine
 
@@ -26,18 +26,18 @@ from lagjax._program._series import Recurrent, Series, StraightLine
 class Chosen(NamedTuple):
     """Which of the numbers of a member are parameters of a motion: those at `positions`, `of` this many.
 
-    The others are only looked up (`_look_ups`).
+    The others are only looked up (`_table_reads`).
     """
 
     positions: tuple[int, ...]
     of: int
 
 
-class Motion:
+class TaylorSeries:
     """A module with the functions `sums` and `coefficients` of a motion, for others to be built on.
 
     The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n. `fields`
-    names what else a thread remembers (see `Layout`), `job` the structure that all threads share. `large` kernels are
+    names what else a thread remembers (see `Memory`), `job` the structure that all threads share. `large` kernels are
     written as tables (see `is_large`). Vectors have `width` lanes. The last of the numbers of the program are its
     `pieces`, the others the `chosen` ones of a member, or all. Of its outputs this many are `kept`, behind the first
     ones. With `keep_sums` the sums of every order stay in
@@ -68,7 +68,7 @@ class Motion:
         self.look_up = LookUps(self.module)
         self.of_member = self.parameters if chosen is None else chosen.of
         self._chosen = None if chosen is None else integers(self.module, np.array(chosen.positions, np.int64))
-        self.layout = Layout(width, self._fields() | fields)
+        self.layout = Memory(width, self._fields() | fields)
         self.width, self.vector = self.layout.width, ir.VectorType(DOUBLE, self.layout.width)
         self.large = large
         self.form = self._form()
