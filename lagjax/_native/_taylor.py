@@ -289,8 +289,8 @@ def is_large(program: Recurrent, projection=None, guards=None, times: int = 1, m
         lines += [projection.state.line, projection.velocity_scale.line]
     if guards is not None:
         lines.append(guards.program.line)
-    operations = sum(len(line.nodes) for line in lines) + OPERATIONS_PER_COORDINATE * len(program.line.outputs)
-    return times * operations + sum(len(line.nodes) for line in more) > LARGEST_LINE
+    operations = times * sum(len(line.nodes) for line in lines) + sum(len(line.nodes) for line in more)
+    return operations + OPERATIONS_PER_COORDINATE * len(program.line.outputs) > LARGEST_LINE
 
 
 def integer(code: Code, x: int) -> Value:
