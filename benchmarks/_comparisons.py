@@ -27,7 +27,7 @@ from lagjax._derivation import derivation_of
 from lagjax._diffrax._equations import Equations, form_of
 from lagjax._layout import Layout
 from lagjax._machine_code import MachineCode
-from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, compiled, lanes
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, compile_module, lanes
 from lagjax._native._lanes import emit, sincos_function
 from lagjax._problem import Problem
 from lagjax._program import StraightLine, lower
@@ -121,7 +121,7 @@ def _in_machine_code(case: Case) -> Callable[[], None] | None:
         for place, x, slope in zip(places, y, [*y[n:], *emit(code, line, y.__getitem__, sincos, None)], strict=True):
             code.store(slope * 1e-30 + x, place)
     code.finish()
-    engine, at = compiled(module, ("evaluate",))
+    engine, at = compile_module(module, ("evaluate",))
     function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(at["evaluate"])
     rows = -(-case.batch // width)
     padded = np.resize(np.asarray(case.states, float), (rows * width, 2 * n)).reshape(rows, width, 2 * n)

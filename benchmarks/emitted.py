@@ -4,8 +4,8 @@
     python -m benchmarks.emitted --compare FOLDER    # at the one after: exit code 0 where no text differs
 
 A step that only says the compiler in other words must leave every line. The texts are those of LLVM's modules before
-any pass, as `_native._ir.compiled` gets them, one file for each scene, form and module in the order of their making.
-They depend on the width of vectors: compare on one kind of machine.
+any pass, as `_native._ir.compile_module` gets them, one file for each scene, form and module in the order of their
+making. They depend on the width of vectors: compare on one kind of machine.
 """
 
 import argparse
@@ -118,7 +118,7 @@ FEW = {"springs_100": (motion, batch, reverse), "knife_edge": (motion, reverse),
 def texts() -> dict[str, str]:
     """The text of every module, by scene, form and number."""
     found: dict[str, str] = {}
-    before = _ir.kept
+    before = _ir.load_or_make
     for name, scene in scenes().items():
         for form in FEW.get(name, FORMS):
             made: list[str] = []
@@ -127,11 +127,11 @@ def texts() -> dict[str, str]:
                 made.append(text)
                 return before(make, text, *more)
 
-            _ir.kept = noted
+            _ir.load_or_make = noted
             try:
                 jax.block_until_ready(form(*scene))
             finally:
-                _ir.kept = before
+                _ir.load_or_make = before
             found |= {f"{name}.{form.__name__}.{k}.ll": text for k, text in enumerate(made)}
     return found
 

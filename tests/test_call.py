@@ -30,7 +30,7 @@ Q = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 2))
 def on_host(monkeypatch):
     """The arguments of every run, or of what is left of one, that Python is asked for."""
     asked = []
-    for name in ("_run_on_host", "_run_gone_on_with", "_run_again", "_jvp_on_host", "_vjp_on_host"):
+    for name in ("_run_on_host", "_continue_run", "_run_again", "_jvp_on_host", "_vjp_on_host"):
         function = getattr(_primitives, name)
 
         def counted(*args, function=function, **settings):

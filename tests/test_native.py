@@ -48,7 +48,7 @@ def lanewise(body, *columns):
         is_bit = value.it.type.element == _ir.BIT
         code.store(code.as_double(value) if is_bit else value, code.element(results, i * WIDTH))
     code.finish()
-    _engine, at = _ir.compiled(module, ("test",))
+    _engine, at = _ir.compile_module(module, ("test",))
     function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(at["test"])
     count = len(columns[0])
     padded = np.zeros((len(columns), -(-count // WIDTH) * WIDTH))
@@ -680,14 +680,14 @@ def test_a_member_alone_is_bit_for_bit_the_member_of_a_batch(make):
     ).kernel
     numbers = np.concatenate([np.zeros(0), *(np.ravel(x) for x in jax.tree.leaves(scene.params))])[None]
     states, ts = np.tile(np.concatenate(y0), (3, 1)), TWO_TIMES[None]
-    runs = [kernel.of_members(len(y))(ts, y, numbers, 1e-9, 1e-12, 1000, 3000) for y in (states[:1], states)]
+    runs = [kernel.for_members(len(y))(ts, y, numbers, 1e-9, 1e-12, 1000, 3000) for y in (states[:1], states)]
     alone, together = runs
     for one, all_ in zip(alone[:6], together[:6], strict=True):
         np.testing.assert_array_equal(one[0], all_[1])
-    assert kernel.of_members(1).width == 1 and kernel.of_members(2) is kernel
+    assert kernel.for_members(1).width == 1 and kernel.for_members(2) is kernel
     order, cotangents = _kernel.order_for(1e-9), (np.ones_like(together.path), np.ones_like(together.y_end))
     back = [
-        kernel.of_members(len(run.steps)).vjp(
+        kernel.for_members(len(run.steps)).vjp(
             ts, numbers, run.table, run.steps.cumsum() - run.steps, run.steps,
             *(c[: len(run.steps)] for c in cotangents), order,
         )

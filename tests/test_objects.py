@@ -83,12 +83,12 @@ def test_a_folder_that_cannot_be_written_is_no_failure(cache, monkeypatch, tmp_p
 def test_what_was_not_used_for_longest_goes_first(cache, monkeypatch):
     monkeypatch.setattr(_objects, "LARGEST_CACHE", 10_000)
     for k in range(9):  # of 1000 bytes and some, of which a tenth does not fit
-        assert _objects.kept(lambda k=k: bytes([k]) * 1000, str(k)) == bytes([k]) * 1000
+        assert _objects.load_or_make(lambda k=k: bytes([k]) * 1000, str(k)) == bytes([k]) * 1000
         for file in cache.iterdir():  # in order, however coarse the clock of the files is
             age = time.time() - 1000 + file.read_bytes()[-1]
             os.utime(file, (age, age))
-    assert _objects.kept(lambda: b"unused", "0") == bytes(1000)  # it is used now
-    _objects.kept(lambda: bytes([9]) * 1000, "9")
+    assert _objects.load_or_make(lambda: b"unused", "0") == bytes(1000)  # it is used now
+    _objects.load_or_make(lambda: bytes([9]) * 1000, "9")
     left = {file.read_bytes()[-1] for file in cache.iterdir()}
     assert {0, 9} < left and left <= {0, 3, 4, 5, 6, 7, 8, 9}
 
@@ -97,7 +97,7 @@ def test_many_may_write_and_read_at_once(cache):
     def work():
         for k in range(50):
             content = bytes([k % 5]) * 10_000
-            assert _objects.kept(lambda content=content: content, str(k % 5)) == content
+            assert _objects.load_or_make(lambda content=content: content, str(k % 5)) == content
             if k % 7 == 0:
                 for file in cache.iterdir():
                     file.unlink(missing_ok=True)

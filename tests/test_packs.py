@@ -65,8 +65,8 @@ def computed(line, numbers, few_modes):
         if op in ("input", "constant"):
             places[node] = next(after)
             memory[places[node]] = numbers[attribute] if op == "input" else attribute
-    plan = _packs.arranged(program, places, 2000, LANES)
-    runs = _packs.with_few_modes(plan.runs, LANES) if few_modes else plan.runs
+    plan = _packs.arrangement(program, places, 2000, LANES)
+    runs = _packs.limit_modes(plan.runs, LANES) if few_modes else plan.runs
     with np.errstate(all="ignore"):  # lanes beyond the last operation hold anything
         for run in runs:
             for at, operands in lanes_of(run, memory):
@@ -101,12 +101,12 @@ def test_what_is_alike_in_a_scene_stands_side_by_side():
 
 def test_how_operands_lie():
     i = np.arange(6)
-    (run,) = _packs.runs_of(3, np.array([10 + i, 0 * i + 5, 7 * i]), np.array([100]))
+    (run,) = _packs.vector_runs(3, np.array([10 + i, 0 * i + 5, 7 * i]), np.array([100]))
     assert run[:3] == (3, (SIDE_BY_SIDE, ONE, ANYWHERE), 6) and run.operands[:2] == (10, 5) and run.results == (100,)
     # Rows of a triangle: a number for each row, columns side by side, and a third operand that lies anywhere.
     row, column = np.tril_indices(12)
     at = np.array([1000 + row, column, 3 * row**2 + 5 * column, 2000 + np.arange(len(row))])
-    runs = _packs.runs_of(0, at, np.array([0]))
+    runs = _packs.vector_runs(0, at, np.array([0]))
     assert sum(run.count for run in runs) == len(row)
     long = [run for run in runs if run.modes == (ONE, SIDE_BY_SIDE, ANYWHERE, SIDE_BY_SIDE)]
     assert [run.count for run in long] == [5, 6, 7, 8, 9, 10, 11, 12]
@@ -117,13 +117,13 @@ def test_products_come_in_long_runs():
     """Two families of products of the same rows, whose pairs alternate."""
     i = np.arange(50)
     at = np.stack([np.repeat(i, 2), np.stack([100 + i, 300 + i], axis=1).ravel()])
-    parts = list(_packs.runs_of_products(at, 0))
+    parts = list(_packs.product_runs(at, 0))
     assert len(parts) == 2 and all(run.modes == (SIDE_BY_SIDE, SIDE_BY_SIDE) for run, _ in parts)
     assert sorted(np.concatenate([members for _, members in parts])) == list(range(100))
 
 
 def test_no_products():
-    assert not list(_packs.runs_of_products(np.zeros((2, 0), int), 0)) and not _packs.runs_of(0, np.zeros((1, 0)), [0])
+    assert not list(_packs.product_runs(np.zeros((2, 0), int), 0)) and not _packs.vector_runs(0, np.zeros((1, 0)), [0])
 
 
 def test_members_of_a_large_scene_are_integrated_one_after_the_other(monkeypatch):
@@ -136,7 +136,7 @@ def test_members_of_a_large_scene_are_integrated_one_after_the_other(monkeypatch
     monkeypatch.setattr(_kernel, "LARGEST_SHARED", 0)
     kernel = _native.Kernel(program, 10)
     alone = kernel.to_run(8)
-    assert alone.width == 1 and kernel.of_members(8) is kernel
+    assert alone.width == 1 and kernel.for_members(8) is kernel
     y0, ts = np.random.default_rng(1).normal(size=(3, 20)), np.linspace(0.0, 1.0, 5)[None]
     runs = [k(ts, y0, np.zeros((1, 0)), 1e-9, 1e-12, 1000) for k in (kernel, alone)]
     for side_by_side, one_by_one in zip(*(run[:6] for run in runs), strict=True):
@@ -150,8 +150,8 @@ def test_the_choice_is_made_once_and_nothing_stays_of_the_compilation(monkeypatc
     alone = kernel.to_run(8)
     kernel.to_run(8)._forward  # noqa: B018
     monkeypatch.setattr(_kernel, "fills_lanes", None)
-    assert kernel.to_run(3) is alone is kernel.of_members(1)
-    assert not _packs.staged.cache_info().currsize and not _schedule._joined_of.cache_info().currsize
+    assert kernel.to_run(3) is alone is kernel.for_members(1)
+    assert not _packs.program_stages.cache_info().currsize and not _schedule._joined_of.cache_info().currsize
 
 
 def test_a_scene_in_which_everything_waits_for_what_comes_before_keeps_members_in_lanes(monkeypatch):

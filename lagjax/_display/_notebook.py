@@ -80,8 +80,8 @@ def _draw(figure, trajectory) -> None:
 
 def _of_members(leaf, rank: int, members: np.ndarray, outputs: np.ndarray, place: tuple[int, ...]) -> np.ndarray:
     """One scalar coordinate of some members at some outputs, (members, outputs), without a copy of the others."""
-    of_members = np.unravel_index(members[:, None], leaf.shape[:rank]) if rank else ()
-    return np.atleast_2d(numbers_at(leaf, (*of_members, outputs[None, :] if rank else outputs, *place)))
+    for_members = np.unravel_index(members[:, None], leaf.shape[:rank]) if rank else ()
+    return np.atleast_2d(numbers_at(leaf, (*for_members, outputs[None, :] if rank else outputs, *place)))
 
 
 def plain(ax) -> None:

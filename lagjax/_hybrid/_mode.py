@@ -29,8 +29,8 @@ from lagjax._machine_code import (
     Guards,
     MachineCode,
     Surfaces,
+    crossing_variation,
     flow_of,
-    moved_with,
     require_one_number,
     vector_of,
 )
@@ -165,9 +165,9 @@ class Mode(NamedTuple):
     def crossing(self, k: int) -> Callable:
         """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero and stays so as what went in varies.
 
-        See `_machine_code.moved_with`.
+        See `_machine_code.crossing_variation`.
         """
-        moved = moved_with(self._surfaces, flow_of(self.problem).anywhere, k)
+        moved = crossing_variation(self._surfaces, flow_of(self.problem).anywhere, k)
         return lambda taken, t, y, numbers: differentiated_as(moved, (t, y), taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):

@@ -20,7 +20,7 @@ from lagjax._machine_code._crossing import MOST_GUARDS, Noted, along_crossings, 
 from lagjax._machine_code._derivatives import jvp, projected_start, vjp
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
 from lagjax._machine_code._steps import KEPT, StepStore
-from lagjax._machine_code._surfaces import Guarded, Surfaces, moved_with, require_one_number, vector_of
+from lagjax._machine_code._surfaces import Guarded, Surfaces, crossing_variation, require_one_number, vector_of
 from lagjax._native import Guards, watched
 from lagjax._platform import default_platform
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
@@ -38,9 +38,9 @@ __all__ = [
     "StepStore",
     "Surfaces",
     "Tolerances",
+    "crossing_variation",
     "flow_of",
     "jvp",
-    "moved_with",
     "projected_start",
     "require_one_number",
     "surfaces_of",

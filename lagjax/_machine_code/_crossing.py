@@ -2,7 +2,7 @@
 
     located   by machine code that watches guards along the steps, without derivatives
     varied    by one more run, without guards, whose outputs are at the times that were located: the states there vary
-              as at any output time, and with them the times (`_surfaces.moved_with`)
+              as at any output time, and with them the times (`_surfaces.crossing_variation`)
 
 The second run is only for derivatives. Its outputs lie some roundings before the crossings: where a force jumps on the
 surface itself, the state, its rate and its derivatives are then all those before the jump, and agree.
@@ -23,7 +23,7 @@ from lagjax._failures import differentiable_where, lost_unless
 from lagjax._layout import halves
 from lagjax._machine_code import _primitives
 from lagjax._machine_code._flow import Flow, Tolerances
-from lagjax._machine_code._surfaces import Surfaces, moved_with, require_one_number
+from lagjax._machine_code._surfaces import Surfaces, crossing_variation, require_one_number
 from lagjax._problem import Problem, Solution, has_own_root_finder
 from lagjax._program import Unlowerable
 from lagjax._results import ENDED_WELL, EVENT_OCCURRED
@@ -133,7 +133,7 @@ def _to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Toleran
 @functools.lru_cache(maxsize=64)
 def _varied_to_event(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     """`(ts, y0, params, t_end, result, event)` → path, y_end, t_end, for the sake of their derivatives."""
-    ways = [moved_with(surfaces, flow.anywhere, k) for k in range(len(surfaces.directions))]
+    ways = [crossing_variation(surfaces, flow.anywhere, k) for k in range(len(surfaces.directions))]
 
     @jax.jit
     def varied(ts, y0, params, t_stop, result, event):
@@ -181,7 +181,7 @@ def _along_crossings(
 @functools.lru_cache(maxsize=64)
 def _varied_crossings(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     """`(ts, y0, params, t)` → t (G, room) and y (G, room, 2n), for the sake of their derivatives."""
-    ways = [moved_with(surfaces, flow.anywhere, k) for k in range(len(surfaces.directions))]
+    ways = [crossing_variation(surfaces, flow.anywhere, k) for k in range(len(surfaces.directions))]
 
     @jax.jit
     def varied(ts, y0, params, t):

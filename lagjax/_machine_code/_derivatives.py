@@ -101,7 +101,7 @@ def _jvp_over_steps(
             if _over_divided(flow, steps, members[k], params[row[0]], tolerances, excess[k : k + 1], again) is None:
                 path_dot[row], y_dot[row] = np.nan, np.nan
 
-        _native.each_of(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
+        _native.map_in_threads(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
     at_start = np.broadcast_to((ts == ts[:, :1])[:, None], path_dot.shape[:3])  # also where there was no step
     return np.where(at_start[..., None], dy0[:, :, None], path_dot), y_dot
 
@@ -177,7 +177,7 @@ def _vjp_over_steps(
             else:
                 back(better, row, np.zeros(1, int))  # here, so that no more than one table a thread is kept
 
-        _native.each_of(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
+        _native.map_in_threads(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
     at_start = (ts == ts[:, :1])[:, :, None]  # outputs that are the initial state; steps begin after them
     return y_ct + np.sum(path_ct * at_start, axis=1), params_ct
 

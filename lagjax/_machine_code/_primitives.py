@@ -84,7 +84,7 @@ def _run_on_host(ts, y0, params, *, flow, tolerances, keep):
     return _in_batch(flow.run(*rows, tolerances, KEPT if keep else None)[:_OUTPUTS], batch)
 
 
-def _run_gone_on_with(ts, y0, params, *begun, flow, tolerances, **_):
+def _continue_run(ts, y0, params, *begun, flow, tolerances, **_):
     """The results of a run of rows of members, of which a handler has done what it could."""
     return flow.run(ts, y0, params, tolerances, begun=Begun(*begun))[:_OUTPUTS]
 
@@ -374,7 +374,7 @@ def _batched(primitive):
     return rule
 
 
-def _several_at_once(primitive, outputs_after):
+def _batch_of_batches(primitive, outputs_after):
     """Directions, or cotangents, of one motion are followed together: `outputs_after` axes come after theirs."""
 
     def rule(args, axes, **settings):
@@ -437,7 +437,7 @@ def _run_compiled(ts, y0, params, *, flow, tolerances, keep):
         if not (short or (not keep and has_handler(flow, math.prod(batch)))):
             return on_host(functools.partial(_run_on_host, **settings), shapes, ts, y0, params)
         of_rows = [jax.ShapeDtypeStruct((len(rows[1]), *x.shape[len(batch) :]), x.dtype) for x in shapes]
-        host = functools.partial(_run_again if keep else _run_gone_on_with, **settings)
+        host = functools.partial(_run_again if keep else _continue_run, **settings)
         rounds = flow.kernel.rounds_of_sweep if keep else None
         return _in_batch(run_by_handler(flow, tolerances, host, of_rows, *rows, rounds=rounds), batch)
 
@@ -553,8 +553,8 @@ for _primitive, _form in ((run_p, _run_for_gpus), (jvp_p, _jvp_for_gpus), (vjp_p
 
 for _primitive, _jvp, _transpose, _batching in (
     (run_p, _derivative_of_run, None, _batched(run_p)),
-    (jvp_p, _derivative_of_jvp, _transposed(vjp_p), _several_at_once(jvp_p, (2, 1))),
-    (vjp_p, _derivative_of_vjp, _transposed(jvp_p), _several_at_once(vjp_p, (1, 1))),
+    (jvp_p, _derivative_of_jvp, _transposed(vjp_p), _batch_of_batches(jvp_p, (2, 1))),
+    (vjp_p, _derivative_of_vjp, _transposed(jvp_p), _batch_of_batches(vjp_p, (1, 1))),
     (curvature_p, _derivative_of_curvature, _curvature_transpose, _batched(curvature_p)),
 ):
     ad.primitive_jvps[_primitive] = _jvp

@@ -5,7 +5,7 @@ from the implicit function: with g the guard and ġ its rate along the motion,
 
     dt* = −dg / ġ        dy* = dy + ẏ dt*
 
-and the same to second order (`moved_with`).
+and the same to second order (`crossing_variation`).
 """
 
 from collections.abc import Callable, Sequence
@@ -113,7 +113,7 @@ def require_one_number(value, what: str) -> jax.Array:
     return value
 
 
-def moved_with(surfaces: Surfaces, program: Program, k: int) -> Callable:
+def crossing_variation(surfaces: Surfaces, program: Program, k: int) -> Callable:
     """`(taken, t, y, numbers)` → (t, y): how the state at t, where guard k is zero, moves to where it is zero then.
 
     With δg the variation of the guard, f the rate of the state by the `program` of q̈, and ′ the derivative along the

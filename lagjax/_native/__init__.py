@@ -64,7 +64,7 @@ from lagjax._native._kernel import (
     require_recurrences,
 )
 from lagjax._native._taylor import is_large
-from lagjax._native._threads import each_of
+from lagjax._native._threads import map_in_threads
 
 __all__ = [
     "ATOL_OVER_MOTION",
@@ -89,12 +89,12 @@ __all__ = [
     "Projection",
     "cores",
     "derivative_handler",
-    "each_of",
     "floor_of",
     "gpu",
     "handler",
     "is_large",
     "lanes",
+    "map_in_threads",
     "order_for",
     "pieces_of",
     "recurrences",

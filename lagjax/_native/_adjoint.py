@@ -84,25 +84,29 @@ class Adjoint:
         self.zeroth_order, self.tables, self.order_recursion = self._transposed(dtypes)
         self.replay = Replay(self.motion)
         self.start_next = self.replay.start_next(self._begin_lane, self._take_member)
-        steps = [self._seed(), self._back_orders(self._back_sums(), self._back_recursion()), self._back_start()]
+        steps = [
+            self._seed(),
+            self._transpose_orders(self._transpose_sums(), self._transpose_recursion()),
+            self._transpose_start(),
+        ]
         if projection is not None:
             self.projection_line, self.tables_of_projection = pullback_and_entries(
                 projection.state.line, dtypes, self.varied, range(states)
             )
-            steps.insert(0, self._back_projection())
+            steps.insert(0, self._transpose_projection())
         if borders is not None:
-            steps = [*self._back_at_end(borders, levels or (n,), jump), *steps, self._note_after()]
+            steps = [*self._transpose_end(borders, levels or (n,), jump), *steps, self._note_after()]
         self._run(steps)
         self._begin()
         self.motion.finish()
 
-    def _back_at_end(self, borders: "Borders", levels: tuple[int, ...], jump) -> list[Code]:
+    def _transpose_end(self, borders: "Borders", levels: tuple[int, ...], jump) -> list[Code]:
         """Go back over the end of a step: over the border that it met, and over a knot of samples."""
         clocks = TimeKnots(self.motion, borders)
-        at_knot = [self._back_knot(clocks, levels)] if clocks.exist else []
+        at_knot = [self._transpose_knot(clocks, levels)] if clocks.exist else []
         if jump is None:
-            return [self._back_first_border(borders, levels), *at_knot]
-        return [self._back_border(Saltation(self.motion, borders, levels[0], jump)), *at_knot]
+            return [self._transpose_first_border(borders, levels), *at_knot]
+        return [self._transpose_border(Saltation(self.motion, borders, levels[0], jump)), *at_knot]
 
     def _transposed(self, dtypes):
         """The transposes of the zeroth order and of the order recursion."""
@@ -206,11 +210,11 @@ class Adjoint:
                 power.value = now * s
             lane["output"] = index - 1
 
-    def _back_orders(self, back_sums: Code, back_recursion: Code) -> Code:
+    def _transpose_orders(self, back_sums: Code, back_recursion: Code) -> Code:
         """From the last order to the first: the transposes of the Cauchy products, then of the recursion."""
         frame = self.motion.function("back_orders")
         code, order = frame.code, frame.job("order")
-        measured = self._measured()
+        measured = self._last_terms()
         for i in self.motion.form.each(code, self.states):
             frame["before", i] = frame["y_ct", i, order - 1]
         with code.loop(order, start=1) as i:
@@ -220,7 +224,7 @@ class Adjoint:
                 frame.call(measured)
         return frame.finish()
 
-    def _measured(self) -> Code:
+    def _last_terms(self) -> Code:
         """The bound of the last terms of the series of a tangent, from the transpose of the last order."""
         frame = self.motion.function("measured")
         code, form, n, order = frame.code, self.motion.form, self.n, frame.job("order")
@@ -254,7 +258,7 @@ class Adjoint:
         frame["excess"] = code.maximum(code.maximum(term.value, tail), frame["excess"])
         return frame.finish()
 
-    def _back_sums(self) -> Code:
+    def _transpose_sums(self) -> Code:
         """`(k, order)`: the cotangents of the rows at order k, from those of the sums of higher orders."""
         frame = self.motion.function("back_sums", INTEGER, INTEGER)
         code, (k, order) = frame.code, frame.arguments
@@ -271,12 +275,12 @@ class Adjoint:
             for table, pairs, first in zip(tables, kinds, (0, len(kinds[0])), strict=True):
                 if pairs:
                     with code.loop(len(pairs)) as i:
-                        self._back_sum(frame, table, i, first, k, terms)
+                        self._transpose_sum(frame, table, i, first, k, terms)
             code.builder.branch(end)
         code.builder.position_at_end(end)
         return frame.finish()
 
-    def _back_sum(self, frame: Frame, table, i: Value, first: int, k: Value, terms: int) -> None:
+    def _transpose_sum(self, frame: Frame, table, i: Value, first: int, k: Value, terms: int) -> None:
         """s = Σ' aⱼ bₖ₋ⱼ at orders k + 1, …: its cotangent times b is one of a, and times a one of b."""
         code, width, products = frame.code, self.motion.width, len(self.series.cauchy_products)
         # The cotangents of higher orders lie where the sums themselves were.
@@ -293,7 +297,7 @@ class Adjoint:
             address = code.element(frame.address("rows_ct"), offset / MAX_ORDER)
             code.store(code.load(address, frame.vector) + total, address)
 
-    def _back_recursion(self) -> Code:
+    def _transpose_recursion(self) -> Code:
         """`(k)`: from the cotangents of order k + 1, and of the rows, to those of order k and of the sums.
 
         Those of the sums take the place of the sums, which nobody reads again: all of it fits into the first cache.
@@ -314,7 +318,7 @@ class Adjoint:
             _add(frame, out[i + self.states], "values_ct", i)
         return frame.finish()
 
-    def _back_start(self) -> Code:
+    def _transpose_start(self) -> Code:
         """From the cotangents of the first orders, and of what the recursion read, to that of the state."""
         frame, form = self.motion.function("back_start"), self.motion.form
         for i in form.each(frame.code, self.n):
@@ -326,7 +330,7 @@ class Adjoint:
         self._store_entries(frame, self.tables, out, len(self.varied))
         return frame.finish()
 
-    def _back_projection(self) -> Code:
+    def _transpose_projection(self) -> Code:
         """From the state on the constraints to the end of the series before it was put there."""
         frame = self.motion.function("back_projection")
         h, motion = frame["h"], self.motion
@@ -338,7 +342,7 @@ class Adjoint:
         self._store_entries(frame, self.tables_of_projection, out, len(self.varied))
         return frame.finish()
 
-    def _back_border(self, saltation: Saltation) -> Code:
+    def _transpose_border(self, saltation: Saltation) -> Code:
         """From behind the border that a step ends at to before it (`_saltation`)."""
         motion = self.motion
         motion.layout.extend_by(saltation.fields_along())
@@ -347,7 +351,7 @@ class Adjoint:
         frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], 0.0)
         with code.only_if(code.any_lane(frame["crossed"] > 0.0)):
             saltation.note_edge(frame)
-            gain = saltation.gained(frame, frame.vectors("pieces_after", motion.pieces))
+            gain = saltation.cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))
             for row in range(saltation.jump.lower):
                 for part in range(2):
                     for i in motion.form.each(code, base):
@@ -356,7 +360,7 @@ class Adjoint:
                     _add(frame, gain(row, k + 2 * base), "params_ct", k + row * numbers)
         return frame.finish()
 
-    def _back_first_border(self, borders: Borders, levels: tuple[int, ...]) -> Code:
+    def _transpose_first_border(self, borders: Borders, levels: tuple[int, ...]) -> Code:
         """`_back_border` of a program that looks up tables (`_first_saltation`)."""
         motion, saltation = self.motion, FirstSaltation(self.motion, borders, levels)
         table, frame = GuardTable(motion, borders), motion.function("back_border")
@@ -373,7 +377,7 @@ class Adjoint:
             self._store_entries(frame, saltation.tables, slopes, len(saltation.by), gain)
         return frame.finish()
 
-    def _back_knot(self, clocks: TimeKnots, levels: tuple[int, ...]) -> Code:
+    def _transpose_knot(self, clocks: TimeKnots, levels: tuple[int, ...]) -> Code:
         """To the entry of a table that the time is on, where a step ends at one (`_time_knots`)."""
         frame = self.motion.function("back_knot")
         code = frame.code

@@ -18,7 +18,7 @@ from lagjax._native import _adjoint, _integrator, _tangent
 from lagjax._native._constants import DONE
 from lagjax._native._frame import CACHE_LINE
 from lagjax._native._handler import at, call, handler_function, job_of
-from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compiled, lanes
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module, lanes
 from lagjax._native._output import RECORDED
 
 _COUNTERS = 4  # next member of both sweeps, next row, lanes that stood empty
@@ -43,8 +43,8 @@ class DerivativePlan(ctypes.Structure):
     def scratch(self, members: int, times: int) -> int:
         """The doubles that a handler needs for itself."""
         rows = 2 * self.room * (self.states + RECORDED)
-        of_members = members * (times * self.states + self.states + 4 + 2)
-        return rows + of_members + _COUNTERS + sum(getattr(self, name) for name in _SIZES) + 2 * CACHE_LINE
+        for_members = members * (times * self.states + self.states + 4 + 2)
+        return rows + for_members + _COUNTERS + sum(getattr(self, name) for name in _SIZES) + 2 * CACHE_LINE
 
 
 class Kind(NamedTuple):
@@ -80,7 +80,7 @@ class SweepHandler:
         module = ir.Module(kind)
         module.triple = ""
         handler_function(module, _Sweep(module, KINDS[kind]).code, len(ARGUMENTS), len(RESULTS))
-        self._engine, places = compiled(module, ("handler",))
+        self._engine, places = compile_module(module, ("handler",))
         self.address = places["handler"]
 
 

@@ -22,7 +22,7 @@ from llvmlite import ir
 
 from lagjax._native._frame import CACHE_LINE, LANE, Memory
 from lagjax._native._integrator import JOB
-from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compiled, lanes
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module, lanes
 
 MAJOR, MINOR = 0, 3
 # The structures that a handler reads, field by field, as the header declares them.
@@ -122,7 +122,7 @@ class Rest(NamedTuple):
         return bool(array[-1:].view(np.int64)[0])
 
     @staticmethod
-    def idle_of(array: np.ndarray) -> int:
+    def idle_lanes(array: np.ndarray) -> int:
         """The steps that lanes stood empty for, from what a handler wrote."""
         return int(array[-3:-2].view(np.int64)[0])
 
@@ -156,7 +156,7 @@ class Handler:
         module = ir.Module("handler")
         module.triple = ""
         handler_function(module, _Run(module).code, len(ARGUMENTS), len(RESULTS))
-        self._engine, places = compiled(module, ("handler", "begin_run"))
+        self._engine, places = compile_module(module, ("handler", "begin_run"))
         self.address, pointers = places["handler"], 1 + len(ARGUMENTS) + len(RESULTS)
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_int64] * 4)
         self.begin = kind(places["begin_run"])

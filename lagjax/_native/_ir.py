@@ -23,7 +23,7 @@ import llvmlite
 import llvmlite.binding as llvm
 from llvmlite import ir
 
-from lagjax._native._objects import kept
+from lagjax._native._objects import load_or_make
 
 DOUBLE, INTEGER, BIT, POINTER = ir.DoubleType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
 COUNTED = "counted"  # the name of the blocks at which counted loops begin
@@ -78,14 +78,14 @@ def lanes() -> int:
 _PASSES = ("sroa", "dead_code_elimination")
 
 
-def compiled(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
+def compile_module(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
     """Machine code for a module, and where its functions are. It lives as long as the engine."""
     text = str(module)
     level = 1 if len(text) > _LARGE else 2
     machine = _machine(level)
     by = llvm.llvm_version_info, llvmlite.__version__, machine.triple, _PASSES, level
     processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-    made = kept(lambda: _object(text, level), text, repr(by), *processor)
+    made = load_or_make(lambda: _object(text, level), text, repr(by), *processor)
     empty = llvm.parse_assembly("")
     engine = llvm.create_mcjit_compiler(empty, machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(made))

@@ -27,7 +27,7 @@ from lagjax._native._frame import LANE, Memory
 from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
-from lagjax._native._ir import compiled, lanes
+from lagjax._native._ir import compile_module, lanes
 from lagjax._native._output import RECORDED
 from lagjax._native._packs import forget_stages
 from lagjax._native._schedule import forget_joined
@@ -35,7 +35,7 @@ from lagjax._native._single_member import fills_lanes
 from lagjax._native._table_reads import SET_NUMBERS
 from lagjax._native._tangent import Tangent
 from lagjax._native._taylor import Chosen, TaylorSeries, is_large
-from lagjax._native._threads import SLICE, in_slices, together
+from lagjax._native._threads import SLICE, run_in_slices, run_on_threads
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
 from lagjax._program._jump import looks_up, with_levels
@@ -150,17 +150,17 @@ class Kernel:
         self.width = lanes() if width is None else width
         self._tangents = functools.cache(self._tangents_of)
         self._programs_for_gpus = functools.cache(
-            lambda form: _gpu.program_for_gpus(self.of_members(1)._integrator(), form)
+            lambda form: _gpu.program_for_gpus(self.for_members(1)._integrator(), form)
         )
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
-    def of_members(self, members: int) -> "Kernel":
+    def for_members(self, members: int) -> "Kernel":
         """The kernel for this many members: for one alone without lanes, which would be computed for nobody."""
         return self._alone if members == 1 < self.width else self
 
     def to_run(self, members: int) -> "Kernel":
         """The kernel that integrates this many members: one after the other where lanes would not fit in a cache."""
-        return self.of_members(1 if self._one_by_one else members)
+        return self.for_members(1 if self._one_by_one else members)
 
     @functools.cached_property
     def _one_by_one(self) -> bool:
@@ -235,7 +235,7 @@ class Kernel:
         else:
             path, y_end, t_end, code, steps, rejected, rest = begun
             if not Rest.more(rest):
-                return _outcome(path, y_end, t_end, code, steps, rejected, Rest.idle_of(rest))
+                return _outcome(path, y_end, t_end, code, steps, rejected, Rest.idle_lanes(rest))
         rest = None if begun is None else Rest.of(begun.rest, self._forward.layout)
         table, rows = None, np.zeros(1, np.int64)
         if room:  # the system provides pages when they are written to
@@ -285,13 +285,13 @@ class Kernel:
         )  # fmt: skip
         members, times = path_ct.shape[:2]
         numbers = dict(**self._strides(ts, params), members=members, times=times, order=order)
-        back, threads = self._back_over(members)
+        back, threads = self._transpose_kernel(members)
         back(arrays, numbers, threads)
         return y_ct, params_ct, excess
 
-    def _back_over(self, members: int) -> "tuple[_Compiled, int]":
+    def _transpose_kernel(self, members: int) -> "tuple[_Compiled, int]":
         """The transpose for this many members, and on how many threads."""
-        kernel = self.of_members(1 if members < self.width / 2 else members)  # few are as fast one after the other
+        kernel = self.for_members(1 if members < self.width / 2 else members)  # few are as fast one after the other
         # A vector of members is as much work as the motions of several, and worth a thread the sooner.
         return kernel._backward, min(kernel.threads(members * MOTIONS_PER_ADJOINT), -(-members // kernel.width))
 
@@ -319,22 +319,22 @@ class Kernel:
             **self._strides(ts, params), members=members, times=times, order=order, directions=directions,
             floor=floor,
         )  # fmt: skip
-        forward, threads = self._forward_along(members, directions)
+        forward, threads = self._tangent_kernel(members, directions)
         forward(arrays, numbers, threads)
         return path_dot, y_dot, excess
 
-    def _forward_along(self, members: int, directions: int) -> "tuple[_Compiled, int]":
+    def _tangent_kernel(self, members: int, directions: int) -> "tuple[_Compiled, int]":
         """The tangents of this many members along this many directions, and on how many threads."""
         if directions > 1 and members < self.width / 2:
             return self._tangents(True), min(cores(), members)
-        kernel = self.of_members(members)
+        kernel = self.for_members(members)
         # A vector of members is as much work as there are directions, and worth a thread the sooner.
         return kernel._tangents(False), min(kernel.threads(members * directions), -(-members // kernel.width))
 
     def _tangents_of(self, side_by_side: bool) -> "_Compiled":
         """The kernel of tangents, whose directions stand side by side or members do; compiled when first asked for."""
         with without_collections():
-            tangent = Tangent(*self._along_steps, width=1 if side_by_side else self.width, lanes=self.width)
+            tangent = Tangent(*self._derivative_parts, width=1 if side_by_side else self.width, lanes=self.width)
         forget_joined()
         forget_stages()
         return _Compiled(tangent.motion, tangent.motion.layout, tangent.job, self._rounds, pointers=3)
@@ -360,8 +360,8 @@ class Kernel:
         self, kind: str, members: int, times: int, directions: int, rtol: float, atol: float, max_steps: int
     ) -> DerivativePlan:
         """The plan of derivatives of this many members; it lives as long as this kernel."""
-        motion = self.of_members(members)._forward
-        sweep, _ = self._forward_along(members, directions) if kind == "jvp" else self._back_over(members)
+        motion = self.for_members(members)._forward
+        sweep, _ = self._tangent_kernel(members, directions) if kind == "jvp" else self._transpose_kernel(members)
         rounds, others = self.rounds_of_sweep, self.numbers if kind == "vjp" else directions * times * self.states
         sizes = (size for of in (motion, sweep) for size in (of.layout.size, len(LANE) * of.layout.width))
         memory, integers, memory_of_sweep, integers_of_sweep = sizes
@@ -372,7 +372,7 @@ class Kernel:
         )  # fmt: skip
 
     @property
-    def _along_steps(self) -> tuple:
+    def _derivative_parts(self) -> tuple:
         """The parts of derivatives over steps that have been taken: features do not matter to these."""
         if self.borders is not None and self.borders.switches:
             parts = self._parts
@@ -386,7 +386,7 @@ class Kernel:
     def _backward(self) -> "_Compiled":
         """The transpose, compiled when it is first asked for."""
         with without_collections():
-            adjoint = Adjoint(*self._along_steps, width=self.width)
+            adjoint = Adjoint(*self._derivative_parts, width=self.width)
         forget_joined()
         forget_stages()
         return _Compiled(adjoint.motion, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
@@ -414,7 +414,7 @@ class _Compiled:
         self._numbers = motion.look_up.numbers
         names = ("begin", "run") if self._numbers is None else ("begin", "run", SET_NUMBERS)
         # The engine holds the code that the others point to.
-        self._engine, at = compiled(motion.module, names)
+        self._engine, at = compile_module(motion.module, names)
         if self._numbers is not None:
             ctypes.CFUNCTYPE(None, ctypes.c_void_p)(at[SET_NUMBERS])(self._numbers.ctypes.data)
         self.places = at["begin"], at["run"]
@@ -439,10 +439,10 @@ class _Compiled:
                 self._begin(*mine)
             if self._counts_idle:
                 mine.append(idle.ctypes.data)
-            in_slices(functools.partial(self._run, *mine), stopped, self.rounds)
+            run_in_slices(functools.partial(self._run, *mine), stopped, self.rounds)
             return int(idle[0])
 
-        return together(work, threads)
+        return run_on_threads(work, threads)
 
 
 def _outcome(path, y_end, t_end, code, steps, rejected, idle: int, table=None) -> Outcome:
@@ -452,11 +452,11 @@ def _outcome(path, y_end, t_end, code, steps, rejected, idle: int, table=None) -
         reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
         path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
     code, steps, rejected = (numbers.astype(int) for numbers in (code, steps, rejected))
-    recorded = (None, None) if table is None else _by_member(table, steps)
+    recorded = (None, None) if table is None else _sort_by_member(table, steps)
     return Outcome(path, y_end, t_end, code, steps, rejected, idle, *recorded)
 
 
-def _by_member(table: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sort_by_member(table: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The rows of the members that all `steps` (N,) are there of, one member after the other; and which these are.
 
     A step that was undone was written down more than once: the last time counts.
@@ -470,7 +470,7 @@ def _by_member(table: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.nda
     places[(np.cumsum(counts) - counts)[member[lasting]] + step[lasting]] = lasting
     if (places < 0).any():  # one was undone and is not there again
         missing = np.repeat(np.arange(len(steps)), counts)[places < 0]
-        return _by_member(table[~np.isin(member, missing)], steps)
+        return _sort_by_member(table[~np.isin(member, missing)], steps)
     return np.take(table, places, axis=0, mode="clip"), complete  # a third of the time of `table[places]`
 
 

@@ -41,7 +41,7 @@ def folder() -> Path | None:
     return base / "lagjax" / "objects"
 
 
-def kept(make: Callable[[], bytes], *made_from: str) -> bytes:
+def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
     """The object that `make` returns, or the one that it returned for the same texts in this or another process."""
     place = folder()
     if place is None:

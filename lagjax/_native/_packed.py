@@ -24,10 +24,10 @@ from lagjax._native._packs import (
     Arranged,
     Run,
     Stage,
-    arranged,
-    runs_of,
-    staged,
-    with_few_modes,
+    arrangement,
+    limit_modes,
+    program_stages,
+    vector_runs,
 )
 from lagjax._native._schedule import OperationKind, Same
 from lagjax._native._tables import WORD, Tables, word
@@ -75,9 +75,9 @@ class Packed(Tables):
         plan, name, staying = self._arrangement(line, self._places(frame, inputs), stored)
         kinds = self._programs[id(line)].kinds
         outputs = plan.places[list(line.outputs)]
-        runs = [(kinds[run.kind], run) for run in with_few_modes(plan.runs, self.lanes)]
+        runs = [(kinds[run.kind], run) for run in limit_modes(plan.runs, self.lanes)]
         first = self._layout.place(name, 0)
-        runs += [(_COPY, run) for run in runs_of(0, outputs[None, :staying], np.array([first])) if staying]
+        runs += [(_COPY, run) for run in vector_runs(0, outputs[None, :staying], np.array([first])) if staying]
         if to is not None:
             runs += [(_STORE, run) for run in _stores(outputs[len(outputs) - stored :], to)]
         words = [number for kind, run in runs for number in self._piece(kind, run)]
@@ -95,7 +95,7 @@ class Packed(Tables):
             plan, _, _ = self._arrangement(line, inputs, stored)
         else:
             places = self._places_of(line, inputs)
-            plan = arranged(self._program(line, stored), places, self._layout.end, self.lanes)
+            plan = arrangement(self._program(line, stored), places, self._layout.end, self.lanes)
         staying = len(line.outputs) - stored
         first = {node: k - staying for k, node in reversed(list(enumerate(line.outputs[:staying])))}
         keys = [first.get(node, int(plan.places[node])) for node in line.outputs[staying:]]
@@ -116,7 +116,7 @@ class Packed(Tables):
             places = self._places_of(line, inputs)
             staying = len(line.outputs) - stored
             begin = -(-(self._layout.end + staying + self.lanes) // CACHE_LINE) * CACHE_LINE
-            plan = arranged(program, places, begin, self.lanes)
+            plan = arrangement(program, places, begin, self.lanes)
             self._arranged[key] = plan, self._field(begin - self._layout.end + plan.size)
         plan, name = self._arranged[key]
         return plan, name, len(line.outputs) - stored
@@ -133,7 +133,7 @@ class Packed(Tables):
 
     def _program(self, line: StraightLine, stored: int) -> list[Stage]:
         if id(line) not in self._programs:
-            self._programs[id(line)] = _Program(line, *staged(Same(line)), stored)
+            self._programs[id(line)] = _Program(line, *program_stages(Same(line)), stored)
         return self._programs[id(line)].stages
 
     # ---- the table of a program ----
@@ -207,4 +207,4 @@ def _stores(places: np.ndarray, to: Vectors) -> Iterator[Run]:
     targets = np.array([to.place(i) for i in range(len(to))])
     order = np.argsort(targets)
     assert (np.diff(targets[order]) == 1).all()
-    yield from runs_of(0, places[order][None], targets[order][:1])
+    yield from vector_runs(0, places[order][None], targets[order][:1])

@@ -73,7 +73,7 @@ def stages(operations: Sequence[ScheduledOperation], nodes: int, kept: Sequence[
 
 
 @functools.lru_cache(maxsize=4)  # asked for when it is decided how a motion runs, and when it is compiled
-def staged(same: Same) -> tuple[list[OperationKind], list[Stage]]:
+def program_stages(same: Same) -> tuple[list[OperationKind], list[Stage]]:
     """A program in stages, and the kinds of their operations."""
     kinds, operations = joined(same.line)
     return kinds, stages(operations, len(same.line.nodes), same.line.outputs)
@@ -81,12 +81,12 @@ def staged(same: Same) -> tuple[list[OperationKind], list[Stage]]:
 
 def forget_stages() -> None:
     """Forget what was kept of programs for their compilation: it is large, and of no use afterwards."""
-    staged.cache_clear()
+    program_stages.cache_clear()
 
 
 def fills(line: StraightLine, width: int) -> bool:
     """True if most lanes of this many have something to do where alike operations of a program stand in them."""
-    _, program = staged(Same(line))
+    _, program = program_stages(Same(line))
     counts = np.array([stage.results.shape[1] for stage in program])
     return bool(counts.sum() >= LEAST_FILLED * width * (-(-counts // width)).sum())
 
@@ -99,7 +99,7 @@ class Arranged(NamedTuple):
     size: int
 
 
-def arranged(program: list[Stage], places: np.ndarray, first: int, width: int) -> Arranged:
+def arrangement(program: list[Stage], places: np.ndarray, first: int, width: int) -> Arranged:
     """The program in runs of vectors of this many lanes.
 
     `places` has where the inputs and the numbers lie; results get places from `first` on. Behind the results of a stage
@@ -123,7 +123,7 @@ def arranged(program: list[Stage], places: np.ndarray, first: int, width: int) -
                 there = np.flatnonzero(row >= 0)
                 places[row[there]] = begin + there
             ends.setdefault(max(stage.last, s), []).append((begin, size))
-        runs += runs_of(stage.kind, at, np.array(begins))
+        runs += vector_runs(stage.kind, at, np.array(begins))
         for begin, size in ends.pop(s, ()):
             room.give_back(begin, size)
     return Arranged(runs, places, room.end - first)
@@ -178,7 +178,7 @@ def side_by_side(at: np.ndarray) -> np.ndarray:
     return best
 
 
-def runs_of_products(at: np.ndarray, kind: int) -> Iterator[tuple[Run, np.ndarray]]:
+def product_runs(at: np.ndarray, kind: int) -> Iterator[tuple[Run, np.ndarray]]:
     """N products of rows `at` (2, N), or squares (1, N), in runs as long as they come, and the products of each."""
     left, searching = np.arange(at.shape[1]), True
     while left.size:
@@ -198,12 +198,12 @@ def _in_orders(at: np.ndarray, kind: int) -> Iterator[list[tuple[Run, np.ndarray
     """The runs of products in several orders: by one row and then the other, and by their distance."""
     for keys in [at[::-1], at, np.array([at[0], at[1] - at[0]])] if len(at) == 2 else [at]:
         order = np.lexsort(keys)
-        some = runs_of(kind, at[:, order], np.zeros(1, int))
+        some = vector_runs(kind, at[:, order], np.zeros(1, int))
         ends = np.cumsum([run.count for run in some])
         yield [(run, order[end - run.count : end]) for run, end in zip(some, ends, strict=True)]
 
 
-def runs_of(kind: int, at: np.ndarray, results: np.ndarray) -> list[Run]:
+def vector_runs(kind: int, at: np.ndarray, results: np.ndarray) -> list[Run]:
     """The runs of operations in this order, whose operands lie at `at` (m, N), with the places of the first results."""
     count = at.shape[1]
     if not count:
@@ -261,7 +261,7 @@ def _pieces(sound: np.ndarray, begin: int, end: int) -> list[tuple[int, int]]:
     return [*pieces, (done, end)] if done < end else pieces
 
 
-def with_few_modes(runs: list[Run], width: int) -> list[Run]:
+def limit_modes(runs: list[Run], width: int) -> list[Run]:
     """The runs, rare combinations of modes given up: what lies side by side, or is one number, also lies anywhere."""
     counts: dict[tuple, int] = {}
     for run in runs:

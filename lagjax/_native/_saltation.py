@@ -16,7 +16,7 @@ from lagjax._native._frame import Frame, Index, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries
 from lagjax._program._borders import Borders
-from lagjax._program._jump import Jump, looks_up, over_border
+from lagjax._program._jump import Jump, jump_at_border, looks_up
 
 NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "goes_on")
 PLACES = ("piece", "back", "slide", "on", "order", "of_table")
@@ -76,7 +76,7 @@ def jump_over(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
     if borders is None or not borders.switches or len(levels) < 2 or looks_up(borders.program):
         return None
     directions = tuple(outer // inner - 1 for inner, outer in itertools.pairwise(levels))
-    return over_border(borders.motion or borders, levels[0], directions)
+    return jump_at_border(borders.motion or borders, levels[0], directions)
 
 
 def jump_along(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
@@ -114,7 +114,7 @@ class Saltation:
 
         return jumps
 
-    def jumped(self, frame: Frame, out: Numbers, is_hit: Value, grazes: Value) -> Callable:
+    def tangent_jumps(self, frame: Frame, out: Numbers, is_hit: Value, grazes: Value) -> Callable:
         """`(row, i, part)`: what is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
         code, n = frame.code, self.base
         first = (len(self.jump.orders) - 1) * 2 * n
@@ -156,7 +156,7 @@ class Saltation:
                 _field(frame, "params", motion.parameters - numbers, numbers),
             ]  # fmt: skip
             out = motion.form.run(frame, self.jump.line, *parts)
-            added = self.jumped(frame, out, is_hit, frame["grazes"] > 0.0)
+            added = self.tangent_jumps(frame, out, is_hit, frame["grazes"] > 0.0)
             for row in range(1, len(self.jump.orders)):
                 for part in range(2):
                     for i in motion.form.each(code, base):
@@ -196,7 +196,7 @@ class Saltation:
             numbers("pieces_before", self.pieces), behind, numbers("hit", self.pieces),
         ]  # fmt: skip
 
-    def gained(self, frame: Frame, behind: Vectors) -> Callable:
+    def cotangent_jumps(self, frame: Frame, behind: Vectors) -> Callable:
         """`(row, i)`: what the cotangent of number i of a row, q, q̇ and then the parameters, gains at the `edge`.
 
         Of `state_ct`, with the pieces `behind` the border.

@@ -17,7 +17,7 @@ from lagjax._native._frame import CACHE_LINE, Frame, Index, Memory, Vectors, int
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value, lanes
 from lagjax._native._lanes import sincos_function
 from lagjax._native._packed import Packed
-from lagjax._native._packs import ANYWHERE, SIDE_BY_SIDE, Run, fills, runs_of_products, with_few_modes
+from lagjax._native._packs import ANYWHERE, SIDE_BY_SIDE, Run, fills, limit_modes, product_runs
 from lagjax._native._tables import WORD, word
 from lagjax._native._taylor import TaylorSeries, mixed_sum, square_sum
 from lagjax._program._series import Series
@@ -86,7 +86,7 @@ class SingleMember(TaylorSeries):
         for kind, which in enumerate((np.flatnonzero(~squares), np.flatnonzero(squares))):
             if which.size:
                 at = pairs[which].T[: 2 - kind]
-                for run, members in runs_of_products(at, kind):
+                for run, members in product_runs(at, kind):
                     # Vectors are written as a whole, in any order.
                     sums[which[members]] = end + np.arange(run.count)
                     runs.append(run._replace(results=(end,)))
@@ -119,7 +119,7 @@ class SingleMember(TaylorSeries):
 
     def _runs_by_modes(self) -> dict[tuple, list[Run]]:
         by_modes: dict[tuple, list[Run]] = {}
-        for run in with_few_modes(self._products[0], lanes()):
+        for run in limit_modes(self._products[0], lanes()):
             by_modes.setdefault((run.kind, run.modes), []).append(run)
         return by_modes
 

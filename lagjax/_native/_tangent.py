@@ -321,7 +321,7 @@ class Tangent:
         tangents = [frame.vectors("dy", n, lambda i: (i, 0)), frame.vectors("dy", n, lambda i: (i + n, 0))]
         inputs = saltation.at_edge(numbers, numbers("params", self.motion.pieces, behind))
         out = form.run(frame, jump.line, *inputs, *tangents, frame.vectors("dparams", self.numbers))
-        added = saltation.jumped(frame, out, is_hit, self.number_of(frame, "grazes") > 0.0)
+        added = saltation.tangent_jumps(frame, out, is_hit, self.number_of(frame, "grazes") > 0.0)
         for row in range(jump.lower):
             for part in range(2):
                 for i in form.each(frame.code, base):

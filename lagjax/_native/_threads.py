@@ -19,7 +19,7 @@ _outer = threading.local()  # `stopped` of the work that a helper does: whatever
 SLICE = 0.03  # seconds, more or less: a tenth of what a hand at the keyboard notices, a thousand times what it costs
 
 
-def in_slices(run: Callable[[int], int], stopped: Callable[[], bool], rounds: int) -> None:
+def run_in_slices(run: Callable[[int], int], stopped: Callable[[], bool], rounds: int) -> None:
     """Call `run(rounds)` until it returns 0, or until `stopped()`; with as many rounds as take about a `SLICE`.
 
     The first time with as many as are given here.
@@ -35,7 +35,7 @@ def in_slices(run: Callable[[int], int], stopped: Callable[[], bool], rounds: in
             rounds = max(1, rounds // 2)
 
 
-def together(work: Callable[[Callable[[], bool]], int], count: int) -> int:
+def run_on_threads(work: Callable[[Callable[[], bool]], int], count: int) -> int:
     """The sum of what `work(stopped)` returns on `count` threads, of which the caller's is one.
 
     Raises what one of them raises, after all have ended: `stopped()` tells the others. All that the work needs must
@@ -75,7 +75,7 @@ def together(work: Callable[[Callable[[], bool]], int], count: int) -> int:
     return total
 
 
-def each_of(places: Sequence, work: Callable[[Any], Any], count: int) -> list:
+def map_in_threads(places: Sequence, work: Callable[[Any], Any], count: int) -> list:
     """The results of `work(place)` for all places, which `count` threads take one after the other.
 
     The first is done before the others begin: it compiles what all of them need.
@@ -90,7 +90,7 @@ def each_of(places: Sequence, work: Callable[[Any], Any], count: int) -> list:
             results[k] = work(places[k])
         return 0
 
-    together(go, max(1, min(count, len(places) - 1)))
+    run_on_threads(go, max(1, min(count, len(places) - 1)))
     return results
 
 

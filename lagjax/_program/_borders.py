@@ -563,7 +563,7 @@ def _moduli(line: StraightLine) -> dict[int, tuple[int, int]]:
     """
     nodes, found = line.nodes, {}
 
-    def is_sign_apart(i: int, r: int, y: int) -> bool:
+    def is_separate_sign(i: int, r: int, y: int) -> bool:
         """True if node i says that (r < 0) ≠ (y < 0)."""
         op, operands, _ = nodes[i]
         positive = nodes[y][2] > 0 if nodes[y][0] == "constant" else None
@@ -587,7 +587,7 @@ def _moduli(line: StraightLine) -> dict[int, tuple[int, int]]:
         x, y = nodes[r][1]
         parts = nodes[condition][1]
         not_zero = [p for p in parts if nodes[p][0] == "ne" and r in nodes[p][1]]
-        apart = [p for p in parts if is_sign_apart(p, r, y)]
+        apart = [p for p in parts if is_separate_sign(p, r, y)]
         if set(nodes[total][1]) == {r, y} and not_zero and apart:
             found[i] = x, y
     return found

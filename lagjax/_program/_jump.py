@@ -138,7 +138,7 @@ def _renumbered(line: StraightLine, places: dict[int, int]) -> StraightLine:
 # ---- the jump --------------------------------------------------------------------------------------------------------
 
 
-def over_border(borders: Borders, size: int, directions: tuple[int, ...]) -> Jump:
+def jump_at_border(borders: Borders, size: int, directions: tuple[int, ...]) -> Jump:
     """The jump of the tangents of a motion, of tangents of these and so on, along this many `directions` each.
 
     `borders` are those of the motion alone. Raises `Unlowerable` where directions are of too many kinds.

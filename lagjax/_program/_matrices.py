@@ -157,7 +157,7 @@ def cholesky(a):
     return xp.stacked([xp.stacked(row) for row in rows])
 
 
-def substituted(a, b, lower: bool, unit_diagonal: bool):
+def substitute(a, b, lower: bool, unit_diagonal: bool):
     """X with A X = B, for a triangular A (n, n) and B (n, m)."""
     n = a.shape[0]
     unknowns: dict[int, Any] = {}
@@ -265,7 +265,7 @@ def _triangular_solve(expansion, params, a, b):
     if params["transpose_a"] == params["left_side"]:  # X A = B is Aᵀ Xᵀ = Bᵀ
         a, lower = np.swapaxes(a, -1, -2), not lower
     turned = b if params["left_side"] else np.swapaxes(b, -1, -2)
-    (x,) = _each("a triangular system", lambda a, b: [substituted(a, b, lower, unit)], expansion, a, turned)
+    (x,) = _each("a triangular system", lambda a, b: [substitute(a, b, lower, unit)], expansion, a, turned)
     return x if params["left_side"] else np.swapaxes(x, -1, -2)
 
 

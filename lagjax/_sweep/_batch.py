@@ -135,8 +135,8 @@ class Batches:
             description.system, values, ts, self._axes, description.settings, description.sections
         )
         self._tolerances = None if isinstance(description.system, Hybrid) else run.tolerances
-        of_members = values["params"] if self._axes[2] == 0 else None
-        return _BatchMotions(run, crossings, (_arrays(run), crossings), of_members), complaints
+        for_members = values["params"] if self._axes[2] == 0 else None
+        return _BatchMotions(run, crossings, (_arrays(run), crossings), for_members), complaints
 
     def _kept_of(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
         """The result of `keep` for each member, the change of its energy, and the members for which `keep` raised."""
