@@ -39,7 +39,7 @@ STORE = Path(__file__).parent / "results" / "gpu_estimate.json"
 CLOCK, MULTIPROCESSORS, ARITHMETIC, L1, HBM = 1.98e9, 132, 64, 16, 3.35e12
 REGISTERS, L1_BYTES, L2_BYTES = 65536, 256 * 1024, 50e6  # of a multiprocessor; L2 of all of them
 MEMBERS, BATCH, DURATION, RTOL = 4, 4096, 5.0, 1e-9
-FORMS = {"as chosen": gpu.form_for, "in memory": lambda series, order: gpu.GpuForm(order, unrolled=False)}
+FORMS = {"as chosen": gpu.form_for, "in memory": lambda lane, order: gpu.GpuForm(order, unrolled=False)}
 SCENES = {
     "pendulum": scenes.pendulum,
     "Kepler": scenes.kepler,

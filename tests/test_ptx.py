@@ -9,7 +9,6 @@ import importlib
 import re
 import subprocess
 import sys
-import types
 from pathlib import Path
 
 import jax
@@ -24,7 +23,7 @@ from benchmarks._ptx import PtxOnCpu
 from lagjax import scenes
 from lagjax._machine_code import _gpu_launch, _primitives
 from lagjax._machine_code._call import on_host
-from lagjax._native._gpu import RESULTS, GpuForm, form_for, grid, libdevice, words
+from lagjax._native._gpu import RESULTS, GpuForm, OneLane, form_for, grid, libdevice, words
 
 TS, MACHINE_CODE = np.linspace(0.0, 1.0, 5), lagjax.MachineCode()
 translated = functools.lru_cache(maxsize=64)(PtxOnCpu)
@@ -101,7 +100,7 @@ def test_a_batch_is_that_of_the_cpu(on_the_ptx, monkeypatch, form):
     q0 = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 2))
     batch = jax.vmap(lambda q0: motion(scene, q0, 0 * q0, rtol=1e-9))
     if form is not None:
-        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda series, order: form)
+        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda lane, order: form)
     *here, steps = on_the_ptx(batch, q0)
     *there, of_cpu = jax.jit(batch)(q0)
     agree(here, there)
@@ -113,9 +112,9 @@ def test_a_batch_is_that_of_the_cpu(on_the_ptx, monkeypatch, form):
 def test_coefficients_that_are_few_are_unrolled(monkeypatch):
     programs = {form: program_of(scenes.pendulum(), monkeypatch, form) for form in (True, False)}
     assert ".local" not in programs[True] and ".local" in programs[False]
-    few, many = types.SimpleNamespace(rows=6, size=2), types.SimpleNamespace(rows=39, size=3)
-    assert form_for(few, 13) == (13, True) and form_for(many, 13) == (13, False)
-    assert form_for(types.SimpleNamespace(rows=17, size=2), 13) == (11, True)
+    few, more, many, large = (OneLane("", 0, *of) for of in [(10, False), (21, False), (45, False), (10, True)])
+    assert form_for(few, 13) == (13, True) and form_for(more, 13) == (11, True)
+    assert form_for(many, 13) == form_for(large, 13) == (13, False)
 
 
 @pytest.mark.slow
@@ -207,7 +206,7 @@ def program_of(scene, monkeypatch=None, unrolled=None):
     """The PTX of a scene's motion. Skips the test where that needs libdevice, which is not here."""
     programs = []
     if monkeypatch is not None:
-        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda series, order: GpuForm(order, unrolled))
+        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda lane, order: GpuForm(order, unrolled))
     transforms_are_new()
 
     def launch(program, operands, results):
@@ -292,7 +291,7 @@ def test_a_scene_that_cannot_go_to_a_gpu_says_why():
 
 @pytest.mark.slow
 def test_instructions_are_counted(monkeypatch):
-    monkeypatch.setattr("lagjax._native._gpu.form_for", lambda series, order: GpuForm(order, unrolled=False))
+    monkeypatch.setattr("lagjax._native._gpu.form_for", lambda lane, order: GpuForm(order, unrolled=False))
     # Of a pendulum's step at order 13: every product of two series of 13 terms alone has 91 products.
     gpu_estimate = importlib.import_module("benchmarks.gpu_estimate")
     program, a_step, steps = gpu_estimate.counted(scenes.pendulum())

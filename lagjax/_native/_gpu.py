@@ -30,7 +30,6 @@ from lagjax._native._frame import LANE
 from lagjax._native._integrator import JOB, Integrator
 from lagjax._native._ir import COUNTED
 from lagjax._program._graph import Unlowerable
-from lagjax._program._series import Series
 
 # The entry takes the addresses of these arrays, of doubles but for the words of `NUMBERS` and the counter.
 ARGUMENTS = ("ts", "y0", "params", "numbers", "next_member", "path")
@@ -62,10 +61,22 @@ class GpuForm(NamedTuple):
     unrolled: bool
 
 
-def form_for(series: Series, order: int) -> GpuForm:
+class OneLane(NamedTuple):
+    """The text of an integrator of one lane, the doubles that a thread remembers, and how many series it has.
+
+    Of a motion in tables (`large`) no loop can be unrolled.
+    """
+
+    text: str
+    size: int
+    series: int
+    large: bool
+
+
+def form_for(lane: OneLane, order: int) -> GpuForm:
     """The form that should take the least time, where a CPU takes series of this `order`."""
-    fitting = MOST_COEFFICIENTS // (series.rows + 2 * series.size)
-    return GpuForm(min(order, fitting), True) if fitting >= LEAST_ORDER else GpuForm(order, False)
+    fitting = MOST_COEFFICIENTS // lane.series
+    return GpuForm(order, False) if lane.large or fitting < LEAST_ORDER else GpuForm(min(order, fitting), True)
 
 
 def grid(members: int) -> tuple[int, int]:
@@ -73,12 +84,8 @@ def grid(members: int) -> tuple[int, int]:
     return min(MOST_BLOCKS, max(1, -(-members // THREADS))), THREADS
 
 
-def program_for_gpus(integrator: Integrator, form: GpuForm) -> str:
-    """The PTX of an integrator of one lane, in a form, with the entry `integrate(*ARGUMENTS, *RESULTS)`.
-
-    Raises `Unlowerable`, whose text says why there is none: the memory of a thread, tables of numbers, functions that
-    need libdevice where that is missing.
-    """
+def one_lane(integrator: Integrator) -> OneLane:
+    """The text of an integrator. Raises `Unlowerable`, whose text says why a GPU cannot run it."""
     motion = integrator.motion
     assert motion.width == 1, "a thread follows one member"
     size = motion.layout.size
@@ -89,12 +96,19 @@ def program_for_gpus(integrator: Integrator, form: GpuForm) -> str:
         )  # fmt: skip
     if motion.look_up.numbers is not None:
         raise Unlowerable("its tables of numbers (samples, jnp.interp, …) are not brought to a GPU; make them params")
+    return OneLane(str(motion.module), size, motion.series.rows + motion.states, motion.large)
+
+
+def program_for_gpus(lane: OneLane, form: GpuForm) -> str:
+    """The PTX of an integrator in a form, with the entry `integrate(*ARGUMENTS, *RESULTS)`.
+
+    Raises `Unlowerable` where its functions need libdevice, and that is missing.
+    """
     with _lock:
-        return _assembly(str(motion.module), size, form)
+        return _assembly(lane.text, lane.size, form)
 
 
 def _assembly(text: str, size: int, form: GpuForm) -> str:
-    """PTX from the text of a module whose threads remember this many doubles."""
     machine = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3)
     text = text.replace('target triple = ""', f'target triple = "{machine.triple}"')
     text = text.replace('target datalayout = ""', f'target datalayout = "{machine.target_data}"')

@@ -149,9 +149,7 @@ class Kernel:
         self._options = guards, error_groups, levels[0]
         self.width = lanes() if width is None else width
         self._tangents = functools.cache(self._tangents_of)
-        self._programs_for_gpus = functools.cache(
-            lambda form: _gpu.program_for_gpus(self.for_members(1)._integrator(), form)
-        )
+        self._programs_for_gpus = functools.cache(lambda form: _gpu.program_for_gpus(self._one_lane, form))
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
     def for_members(self, members: int) -> "Kernel":
@@ -183,7 +181,11 @@ class Kernel:
 
     def program_for_gpus(self, rtol: float) -> str:
         """The motion of a member in PTX (`_gpu`). Raises `Unlowerable` where a GPU cannot run it."""
-        return self._programs_for_gpus(_gpu.form_for(self._parts[1], order_for(rtol)))
+        return self._programs_for_gpus(_gpu.form_for(self._one_lane, order_for(rtol)))
+
+    @functools.cached_property
+    def _one_lane(self) -> "_gpu.OneLane":
+        return _gpu.one_lane(self.for_members(1)._integrator())
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
