@@ -21,13 +21,15 @@ import numpy as np
 from lagjax._blame import Offender, offenders, pieces_of, poles
 from lagjax._check import check, listed
 from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
+from lagjax._failures import sentence
 from lagjax._layout import Layout, halves
-from lagjax._linear import eigen
+from lagjax._linear import eigen, null_directions
 from lagjax._platform import numbers_at
 from lagjax._program import Unlowerable
 from lagjax._results import RESULTS, code_of
 from lagjax._stopped import AHEAD
 from lagjax._system import System
+from lagjax._trajectory import Trajectory
 from lagjax._validate import not_finite
 
 LARGEST = 128  # coordinates up to which `check` is asked: it takes a second there
@@ -76,6 +78,19 @@ class Undefined(NamedTuple):
     t: float
     ahead: bool
     by_time: bool  # whether time alone, without the motion, leads there
+
+
+def described(trajectory: Trajectory, layout: Layout) -> str:
+    """The whole message of a single motion that failed: its result, its last state and the diagnosis."""
+    end, system = trajectory.end, trajectory.system
+    y_end = np.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
+    message = sentence(trajectory.result._value, end.t, trajectory.ts[-1], y_end, layout.names) or ""
+    if not isinstance(system, System):
+        return message
+    if trajectory.result == RESULTS.mass_matrix_singular:
+        mass = np.asarray(system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
+        message += f"\n{_describe_null(mass, layout.names)}"
+    return message + diagnosis(system, layout, trajectory.params, ended_of(trajectory, layout))
 
 
 def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
@@ -262,6 +277,27 @@ def _singular_mass(derivation: Derivation, ended: Ended) -> str:
     )
 
 
+def _describe_null(mass: np.ndarray, names: tuple[str, ...]) -> str:
+    """The coordinates, or their combinations, that carry no kinetic energy."""
+    unused = [name for name, row in zip(names, mass, strict=True) if not row.any()]
+    if unused:
+        return (
+            f"Singular there: L has no kinetic energy in the velocity of {', '.join(unused)} (absent from L, or linear "
+            "in it)."
+        )
+    combinations = []
+    for direction in null_directions(mass):
+        direction = direction / direction[np.argmax(np.abs(direction))]
+        terms = [f"{c:+.3g} d{name}" for c, name in zip(direction, names, strict=True) if abs(c) > 1e-6]
+        combinations.append(" ".join(terms))
+    if not combinations:
+        return (
+            "It is regular there, but not positive definite, and more than two coordinates are solved for without "
+            "pivoting: turn the sign of L, or give path='array' to System."
+        )
+    return f"Singular there: no kinetic energy along {'; '.join(combinations)}."
+
+
 @np.errstate(all="ignore")
 def _running_away(derivation: Derivation, ended: Ended) -> int | None:
     """The coordinate that runs away, to a pole or to infinity; None where none does."""
@@ -383,7 +419,9 @@ def _acceleration(derivation: Derivation, y: np.ndarray, t: float, numbers) -> n
 # ---- of a trajectory -------------------------------------------------------------------------------------------------
 
 
-def ended_of(trajectory, layout: Layout, member: tuple[int, ...] = (), numbers: np.ndarray | None = None) -> Ended:
+def ended_of(
+    trajectory: Trajectory, layout: Layout, member: tuple[int, ...] = (), numbers: np.ndarray | None = None
+) -> Ended:
     """The beginning and the end of a trajectory, or of one member of a batch; `numbers` (P,) are its parameters."""
 
     def of_member(tree, *index):
@@ -398,17 +436,3 @@ def ended_of(trajectory, layout: Layout, member: tuple[int, ...] = (), numbers: 
     y, y_first = of_member((end.q, end.qdot)), of_member((trajectory.q, trajectory.qdot), 0)
     by_resets = trajectory.transitions is not None
     return Ended(int(code), float(t), y, float(ts[-1]), float(ts[0]), y_first, int(steps), numbers, by_resets)
-
-
-def with_numbers(params, numbers: np.ndarray):
-    """Parameters with these numbers (P,) in the places of their own."""
-    own, rest = eqx.partition(params, eqx.is_array_like)
-    leaves, structure = jax.tree.flatten(own)
-    if not leaves:
-        return params
-    ends = np.cumsum([np.size(leaf) for leaf in leaves])[:-1]
-    parts = [
-        part.reshape(np.shape(leaf)).astype(np.result_type(leaf))
-        for part, leaf in zip(np.split(numbers, ends), leaves, strict=True)
-    ]
-    return eqx.combine(jax.tree.unflatten(structure, parts), rest)

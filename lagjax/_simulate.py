@@ -15,12 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import _linear
 from lagjax._consistent import has_constraints, inconsistent_members, require_consistent
-from lagjax._diagnosis import diagnosis, ended_of
 from lagjax._diffrax import Diffrax
 from lagjax._engine import asked_for, choose
-from lagjax._failures import raise_where_failed, sentence
+from lagjax._failures import raise_where_failed
 from lagjax._layout import Layout, halves
 from lagjax._lift import lifted, lifted_batch
 from lagjax._machine_code import MachineCode
@@ -278,38 +276,12 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
     end, code = trajectory.end, trajectory.result._value
     if is_concrete(code) and int(code) in ENDED_WELL:
         return trajectory
-    t_last, system = trajectory.ts[-1], trajectory.system
+    t_last = trajectory.ts[-1]
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((end, code, t_last))):
         y_end = jnp.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
         states = trajectory.q, trajectory.qdot, end
         states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)
         return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
-    y_end = np.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
-    message = sentence(code, end.t, t_last, y_end, layout.names) or ""
-    if trajectory.result == RESULTS.mass_matrix_singular and isinstance(system, System):
-        mass = np.asarray(system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
-        message += f"\n{_describe_null(mass, layout.names)}"
-    if isinstance(system, System):
-        message += diagnosis(system, layout, trajectory.params, ended_of(trajectory, layout))
-    raise SimulationError(message, trajectory)
+    from lagjax._diagnosis import described  # a motion that succeeds does not come here
 
-
-def _describe_null(mass: np.ndarray, names: tuple[str, ...]) -> str:
-    """The coordinates, or their combinations, that carry no kinetic energy."""
-    unused = [name for name, row in zip(names, mass, strict=True) if not row.any()]
-    if unused:
-        return (
-            f"Singular there: L has no kinetic energy in the velocity of {', '.join(unused)} (absent from L, or linear "
-            "in it)."
-        )
-    combinations = []
-    for direction in _linear.null_directions(mass):
-        direction = direction / direction[np.argmax(np.abs(direction))]
-        terms = [f"{c:+.3g} d{name}" for c, name in zip(direction, names, strict=True) if abs(c) > 1e-6]
-        combinations.append(" ".join(terms))
-    if not combinations:
-        return (
-            "It is regular there, but not positive definite, and more than two coordinates are solved for without "
-            "pivoting: turn the sign of L, or give path='array' to System."
-        )
-    return f"Singular there: no kinetic energy along {'; '.join(combinations)}."
+    raise SimulationError(described(trajectory, layout), trajectory)

@@ -1,23 +1,26 @@
 """`Trajectory`: what comes out, in the user's own pytree.
 
 Time is the first axis of `q` and `qdot`; the members of a batch are an axis before it. Quantities derived from the
-states are methods: they cost nothing until they are asked for, and they are differentiable.
+states are methods: they cost nothing until they are called, and they are differentiable. What judges and shows a
+motion (`_health`, `_display`) stands above it and is imported by the method that calls it.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._display import Animation, animated, dataset, frame, of_trajectory, summary
-from lagjax._health import Health, examine
 from lagjax._layout import Layout
 from lagjax._results import RESULTS
 from lagjax._system import System
+
+if TYPE_CHECKING:
+    from lagjax._display import Animation
+    from lagjax._health import Health
 
 PyTree = Any
 Number = jax.Array | np.ndarray
@@ -92,10 +95,14 @@ class Trajectory(eqx.Module):
 
     def __repr__(self) -> str:
         """Three lines; `equinox.tree_pprint` prints the fields."""
+        from lagjax._display import summary
+
         return summary(self)
 
     def _repr_html_(self) -> str | None:
         """The three lines and a small figure, for notebooks; None, and they show the lines, where there is none."""
+        from lagjax._display import of_trajectory
+
         return of_trajectory(self)
 
     @property
@@ -125,7 +132,7 @@ class Trajectory(eqx.Module):
         """f and a at every output time, in the structure of `multipliers`: the drift off the constraints."""
         return self._at_every_time("constraint_residual")
 
-    def health(self, reference: "Trajectory | None" = None) -> Health:
+    def health(self, reference: "Trajectory | None" = None) -> "Health":
         """The trust that this motion deserves: conservation laws, constraints, the mass matrix, gradients.
 
         Print the result for a report with a verdict, or read its fields, which have the batch axes of the trajectory
@@ -143,6 +150,8 @@ class Trajectory(eqx.Module):
         print(run.health(reference=lagjax.simulate(pendulum, 1.0, 0.0, run.ts, rtol=1e-6)))
         ```
         """
+        from lagjax._health import examine
+
         self.require_present()
         return examine(self, reference)
 
@@ -158,6 +167,8 @@ class Trajectory(eqx.Module):
 
         Raises `ImportError` when xarray is not installed.
         """
+        from lagjax._display import dataset
+
         return dataset(self, units, time_unit)
 
     def to_pandas(self, units: PyTree = None, time_unit: str | None = None):
@@ -178,9 +189,11 @@ class Trajectory(eqx.Module):
         print(table["q['x']"].max(), table.attrs["units"])
         ```
         """
+        from lagjax._display import frame
+
         return frame(self, units, time_unit)
 
-    def animate(self, points: Callable, trace: Any = None, *, speed: float = 1.0, fps: float = 30.0) -> Animation:
+    def animate(self, points: Callable, trace: Any = None, *, speed: float = 1.0, fps: float = 30.0) -> "Animation":
         """A film of this motion: an `Animation`, which `save` writes to a GIF, an MP4 or a page of HTML.
 
         - `points`: a function of q, and of `t` and `params` by name, that says where things are: an array (2,) or (3,)
@@ -205,6 +218,8 @@ class Trajectory(eqx.Module):
         film.save("pendulum.gif")
         ```
         """
+        from lagjax._display import animated
+
         return animated(self, points, trace, speed, fps)
 
     def over_members(self, function, *more) -> PyTree:

@@ -16,6 +16,7 @@ DEVELOPMENT = (Path(__file__).parent.parent / "docs" / "development.md").read_te
 # From the top of the street to its end, as the table there lists it. A new module must take a place in it.
 TABLE = DEVELOPMENT.split("## The street")[1].split("\n## ")[0]
 STREET = re.findall(r"^\| `(\w+)(?:\.py|/)` \|", TABLE, flags=re.MULTILINE)
+METHODS = {"_trajectory": {"_display", "_health"}}  # what a noun imports from below it, in methods that are called
 LEAVES = {"scenes", "plot", "results"}  # for users, tests, benchmarks and examples; imported by nothing on the street
 
 
@@ -50,7 +51,25 @@ def test_imports_point_up_the_street():
                 assert here in LEAVES and there in lagjax.__all__, f"{path} imports {there}"
                 continue
             assert there not in LEAVES, f"{path} imports the leaf {there}"
+            if there in METHODS.get(here, ()):
+                continue
             assert STREET.index(there) < STREET.index(here), f"{path} imports {there} from below"
+
+
+def test_a_trajectory_carries_no_judgement():
+    # What judges and shows a motion stands above it: it is imported by the method that calls it.
+    code = """
+import sys, jax.numpy as jnp, lagjax
+verbs = {f"lagjax._{name}" for name in ("check", "diagnosis", "health", "display")}
+import lagjax._trajectory
+assert not verbs & set(sys.modules), verbs & set(sys.modules)
+scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+run = lagjax.simulate(scene, 1.0, 0.0, jnp.linspace(0.0, 1.0, 3))
+assert not verbs & set(sys.modules), verbs & set(sys.modules)
+print(run, run.health())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and "nothing suspicious" in done.stdout, done.stderr
 
 
 def test_packages_have_doors():

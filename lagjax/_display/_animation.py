@@ -19,11 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function, accept
-from lagjax._diagnosis import with_numbers
 from lagjax._display._notebook import COLORS
 from lagjax._display._summary import times_of_members
-from lagjax._health import Members
 from lagjax._layout import Layout
+from lagjax._members import Members
 from lagjax._platform import is_known, numbers_at
 
 PyTree = Any
@@ -274,10 +273,8 @@ def _course(trajectory, members: Members, k: int) -> Course:
 
 def _positions(function: Function, members: Members, k: int, q: np.ndarray, times: np.ndarray) -> dict[str, np.ndarray]:
     """The points (frames, number, 2 or 3) of a member at its states q (frames, n), by name."""
-    numbers = np.array([x if np.ndim(x) == 0 else x[k] for x in members.numbers])
-    params = with_numbers(members.params, numbers)
     states = members.layout.restore(q.astype(members.layout.dtype))
-    drawn = _at_states(function, states, times.astype(members.layout.dtype), params)
+    drawn = _at_states(function, states, times.astype(members.layout.dtype), members.params_of(k))
     named = drawn if isinstance(drawn, dict) else {"": drawn}
     return {str(name): as_points(name, np.asarray(value), len(q)) for name, value in named.items()}
 

@@ -33,16 +33,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax._diagnosis import diagnosis, ended_of, with_numbers
+from lagjax._diagnosis import diagnosis, ended_of
 from lagjax._health._borders import Met, is_piecewise, met
 from lagjax._health._compare import global_error
-from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, Members, measured
+from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measured
 from lagjax._layout import Layout
+from lagjax._members import Members
 from lagjax._results import RESULTS, advice, as_printed
 from lagjax._system import System
 from lagjax._validate import is_concrete
 
-__all__ = ["Extreme", "Health", "Members", "examine"]
+__all__ = ["Extreme", "Health", "examine"]
 
 # The part of steps rejected beyond which the motion meets something that the step control does not get over.
 UNSTEADY = 0.5
@@ -82,16 +83,15 @@ def _diagnosis(trajectory) -> str:
     members = Members(trajectory)
     which = tuple(failed[0].tolist())
     layout, row = members.layout, int(np.ravel_multi_index(which, members.batch)) if which else 0
-    numbers = np.array([x if np.ndim(x) == 0 else x[row] for x in members.numbers])
-    ended = ended_of(trajectory, layout, which, numbers.astype(layout.dtype))
-    return diagnosis(trajectory.system, layout, with_numbers(members.params, numbers), ended).strip()
+    ended = ended_of(trajectory, layout, which, members.numbers_of(row).astype(layout.dtype))
+    return diagnosis(trajectory.system, layout, members.params_of(row), ended).strip()
 
 
 def _borders(trajectory) -> tuple[bool, Met[Array] | None]:
     """`met`, with the batch axes of the trajectory; of a piecewise scene not known where something is traced."""
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         members = Members(trajectory)
-        located, counts = met(trajectory, members)
+        located, counts = met(members)
         return located, counts and Met(*(jnp.asarray(np.reshape(x, members.batch)) for x in counts))
     system, piecewise = trajectory.system, []
     if not isinstance(system, System):

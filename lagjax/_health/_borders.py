@@ -11,8 +11,10 @@ import numpy as np
 
 from lagjax._blame import pieces_of
 from lagjax._derivation import derivation_of
+from lagjax._health._measure import path_of
 from lagjax._layout import Layout
 from lagjax._machine_code import Flow, StepStore, Tolerances, flow_of
+from lagjax._members import Members
 from lagjax._problem import Problem
 from lagjax._program import Unlowerable
 from lagjax._system import System
@@ -34,11 +36,9 @@ class Met(NamedTuple, Generic[Numbers]):
     t: Numbers
 
 
-def met(trajectory, members) -> tuple[bool, Met[np.ndarray] | None]:
-    """A flag that steps ended at the borders of the scene; and how the motion met them, None where that is not known.
-
-    `members` has the states and the parameters of all members (`_measure.Members`).
-    """
+def met(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
+    """A flag that steps ended at the borders of the scene; and how the motion met them; None where not known."""
+    trajectory = members.trajectory
     if not isinstance(trajectory.system, System):  # modes have transitions for that
         return True, None
     crossed, slid, grazed = (np.zeros(members.count, int) for _ in range(3))
@@ -47,7 +47,7 @@ def met(trajectory, members) -> tuple[bool, Met[np.ndarray] | None]:
         return True, nothing
     if trajectory.engine != "MachineCode" or trajectory.tolerances is None:
         return False, None
-    path = members.path()
+    path = path_of(members)
     start = np.concatenate([path.q[:, 0], path.qdot[:, 0]], axis=1)
     ts = np.stack([path.ts[:, 0], members.shared(trajectory.end.t, 0)], axis=1)
     accepted, rejected = (members.shared(trajectory.stats[f"num_{kind}_steps"], 0) for kind in ("accepted", "rejected"))

@@ -19,7 +19,7 @@ import numpy as np
 from lagjax._doubles import DOUBLE
 from lagjax._health._laws import Law, Sample, power_at, sample_at
 from lagjax._layout import Layout
-from lagjax._platform import numbers_at
+from lagjax._members import Members
 from lagjax._validate import is_concrete
 
 PyTree = Any
@@ -86,7 +86,7 @@ def measured(trajectory) -> tuple[dict[str, Any], Names]:
         members = Members(trajectory)
         laws = _laws(trajectory, members.layout, members.params)
         if all(law.lowered() for law in laws):
-            return members.report(laws), _names(laws, members.layout)
+            return _report_of(members, laws), _names(laws, members.layout)
     axes, tree = jax.tree.flatten(trajectory.params_axes, is_leaf=lambda axis: axis is None)  # hashable
     arrays = dataclasses.replace(trajectory, stats={}, params_axes=None)
     return _measured(arrays, tuple(axes), tree, jnp.asarray(steps))
@@ -122,129 +122,75 @@ def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
 # ---- in NumPy, all members at once -----------------------------------------------------------------------------------
 
 
-_SHARED = "shared"  # stands for the batch axis of what all members share
+def path_of(members: Members) -> Path:
+    """The states of all members."""
+    run, count = members.trajectory, members.count
+    ts = members.shared(run.ts, 1)
+    q, qdot = members.flat(run.q), members.flat(run.qdot)
+    mode = np.zeros(ts.shape, int) if run.mode is None else np.asarray(run.mode).reshape(ts.shape)
+    t, ends = ts, np.broadcast_to(np.arange(1, ts.shape[1]), (count, ts.shape[1] - 1))
+    if run.transitions is not None:
+        transitions = run.transitions
+        times = np.asarray(transitions.t).reshape(count, -1)
+        source = np.asarray(transitions.source).reshape(times.shape)
+        ends = _ends(np, ts, times)
+        more = (members.flat(transitions.q), members.flat(transitions.qdot), times, source)
+        q, qdot, t, mode = (np.concatenate(pair, axis=1) for pair in zip((q, qdot, t, mode), more, strict=True))
+    tolerances = run.tolerances
+    if tolerances is not None:
+        rtol, atol = (members.shared(x, 0).astype(q.dtype) for x in tolerances)
+        tolerances = np.maximum(rtol, np.finfo(q.dtype).eps), atol
+    steps = np.asarray(run.stats["num_accepted_steps"], q.dtype).reshape(count)
+    return Path(q, qdot, t, mode, ts, ends, steps, tolerances, _precision_of(run, q))
 
 
-class Members:
-    """The members of a trajectory of numbers along one axis."""
+def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
+    """The fields of `Health` that are measured, with the batch axes of the trajectory."""
+    path, momenta = path_of(members), _conserved(laws) or ()
+    starts = np.cumsum([0, *(len(law.names) for law in laws)])
 
-    def __init__(self, trajectory):
-        self.batch = np.shape(trajectory.result._value)
-        self.count, rank = math.prod(self.batch), len(self.batch)
-        first = jax.tree.map(lambda leaf: numbers_at(leaf, (0,) * (rank + 1)), (trajectory.q, trajectory.qdot))
-        self.layout, self._trajectory = Layout.of(*first), trajectory
-        # Of the axes of a batch, the innermost shares times and some parameters (`Trajectory.over_members`).
-        self._outer = rank - (rank > 0 and np.ndim(trajectory.ts) < 1 + rank)
-        self.numbers, self.params = self._parameters()
+    def by_mode(function: Callable, q, qdot, t, mode):
+        """`function(law, index, states…)` on the states of each mode, in the order of all states, (N, S, …)."""
+        shape, total = t.shape, None
+        q, qdot = (np.ascontiguousarray(x.reshape(-1, x.shape[-1])) for x in (q, qdot))
+        t, mode = t.reshape(-1), mode.reshape(-1)
+        member = np.repeat(np.arange(members.count), shape[1])
+        for index, law in enumerate(laws):
+            here = np.flatnonzero(mode == index)
+            if not len(here):
+                continue
+            numbers = [x if np.ndim(x) == 0 else x[member[here]] for x in members.numbers]
+            values = function(law, index, member[here], q[here], qdot[here], t[here], numbers)
+            if len(here) == len(mode):
+                total = values
+                break
+            if total is None:
+                total = jax.tree.map(lambda x: np.zeros((len(mode), *x.shape[1:]), x.dtype), values)
+            for all_states, part in zip(jax.tree.leaves(total), jax.tree.leaves(values), strict=True):
+                all_states[here] = part
+        return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), total)
 
-    def _parameters(self) -> tuple[list[np.ndarray], PyTree]:
-        """Every number in params, () where all members share it, else (N,); and the params of one member."""
-        axes = self._trajectory.params_axes
-        numbers, code = eqx.partition(self._trajectory.params, eqx.is_array_like)
-        axis_of_leaf = jax.tree.map(
-            lambda axis, part: jax.tree.map(lambda _: _SHARED if axis is None else axis, part),
-            axes, numbers, is_leaf=lambda axis: axis is None,
-        )  # fmt: skip
-        leaves, structure = jax.tree.flatten(numbers)
-        columns, of_one = [], []
-        for leaf, axis in zip(leaves, jax.tree.leaves(axis_of_leaf), strict=True):
-            each = np.asarray(leaf)
-            if self._outer < len(self.batch) and axis is _SHARED:
-                each = np.expand_dims(each, self._outer)
-            elif self._outer < len(self.batch):
-                each = np.moveaxis(each, axis + self._outer if axis >= 0 else axis, self._outer)
-            leading, shape = each.shape[: len(self.batch)], each.shape[len(self.batch) :]
-            of_one.append(each[(0,) * len(self.batch)])
-            if math.prod(leading) == 1:
-                columns += list(each.reshape(-1))
-            else:
-                columns += list(np.broadcast_to(each, self.batch + shape).reshape(self.count, -1).T)
-        return columns, eqx.combine(jax.tree.unflatten(structure, of_one), code)
+    def sampled(law, index, member, q, qdot, t, numbers) -> Sample:
+        tolerances = (0.0, 0.0) if path.tolerances is None else (x[member] for x in path.tolerances)
+        sample = law.samples(momenta, tuple(tolerances), q, qdot, t, numbers)
+        before, after = int(starts[index]), int(starts[-1] - starts[index + 1])
+        distances, rates = (np.pad(x, ((0, 0), (before, after))) for x in (sample.distances, sample.rates))
+        return sample._replace(distances=distances, rates=rates)
 
-    def _flat(self, tree: PyTree, axes: int = 1) -> np.ndarray:
-        """The leaves of q or qdot end to end, (N, S, n)."""
-        lead = len(self.batch) + axes
-        parts = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
-        parts = [x.reshape(self.count, *x.shape[len(self.batch) : lead], -1) for x in parts]
-        return np.concatenate(parts, axis=-1)
+    def powers(law, index, member, q, qdot, t, numbers):
+        return law.powers(q, qdot, t, numbers)
 
-    def shared(self, x, dimensions: int) -> np.ndarray:
-        """Times or tolerances, arrays of this many dimensions, for every member: (N, …), also where all share them."""
-        x = np.asarray(x)
-        if x.ndim < len(self.batch) + dimensions:
-            x = np.expand_dims(x, x.ndim - dimensions)
-        return np.broadcast_to(x, self.batch + x.shape[len(self.batch) :]).reshape(
-            self.count, *x.shape[len(self.batch) :]
-        )
+    def accelerations(law, index, member, q, qdot, t, numbers):
+        return law.accelerations(q, qdot, t, numbers)
 
-    def path(self) -> Path:
-        """The states of all members."""
-        run = self._trajectory
-        ts = self.shared(run.ts, 1)
-        q, qdot = self._flat(run.q), self._flat(run.qdot)
-        mode = np.zeros(ts.shape, int) if run.mode is None else np.asarray(run.mode).reshape(ts.shape)
-        t, ends = ts, np.broadcast_to(np.arange(1, ts.shape[1]), (self.count, ts.shape[1] - 1))
-        if run.transitions is not None:
-            transitions = run.transitions
-            times = np.asarray(transitions.t).reshape(self.count, -1)
-            source = np.asarray(transitions.source).reshape(times.shape)
-            ends = _ends(np, ts, times)
-            more = (self._flat(transitions.q), self._flat(transitions.qdot), times, source)
-            q, qdot, t, mode = (np.concatenate(pair, axis=1) for pair in zip((q, qdot, t, mode), more, strict=True))
-        tolerances = run.tolerances
-        if tolerances is not None:
-            rtol, atol = (self.shared(x, 0).astype(q.dtype) for x in tolerances)
-            tolerances = np.maximum(rtol, np.finfo(q.dtype).eps), atol
-        steps = np.asarray(run.stats["num_accepted_steps"], q.dtype).reshape(self.count)
-        return Path(q, qdot, t, mode, ts, ends, steps, tolerances, _precision_of(run, q))
+    def pieces(law, index, member, q, qdot, t, numbers):
+        return law.pieces(q, qdot, t, numbers)
 
-    def report(self, laws: list[Law]) -> dict[str, Any]:
-        """The fields of `Health` that are measured, with the batch axes of the trajectory."""
-        path, momenta = self.path(), _conserved(laws) or ()
-        starts = np.cumsum([0, *(len(law.names) for law in laws)])
-
-        def by_mode(function: Callable, q, qdot, t, mode):
-            """`function(law, index, states…)` on the states of each mode, in the order of all states, (N, S, …)."""
-            shape, total = t.shape, None
-            q, qdot = (np.ascontiguousarray(x.reshape(-1, x.shape[-1])) for x in (q, qdot))
-            t, mode = t.reshape(-1), mode.reshape(-1)
-            member = np.repeat(np.arange(self.count), shape[1])
-            for index, law in enumerate(laws):
-                here = np.flatnonzero(mode == index)
-                if not len(here):
-                    continue
-                numbers = [x if np.ndim(x) == 0 else x[member[here]] for x in self.numbers]
-                values = function(law, index, member[here], q[here], qdot[here], t[here], numbers)
-                if len(here) == len(mode):
-                    total = values
-                    break
-                if total is None:
-                    total = jax.tree.map(lambda x: np.zeros((len(mode), *x.shape[1:]), x.dtype), values)
-                for all_states, part in zip(jax.tree.leaves(total), jax.tree.leaves(values), strict=True):
-                    all_states[here] = part
-            return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), total)
-
-        def sampled(law, index, member, q, qdot, t, numbers) -> Sample:
-            tolerances = (0.0, 0.0) if path.tolerances is None else (x[member] for x in path.tolerances)
-            sample = law.samples(momenta, tuple(tolerances), q, qdot, t, numbers)
-            before, after = int(starts[index]), int(starts[-1] - starts[index + 1])
-            distances, rates = (np.pad(x, ((0, 0), (before, after))) for x in (sample.distances, sample.rates))
-            return sample._replace(distances=distances, rates=rates)
-
-        def powers(law, index, member, q, qdot, t, numbers):
-            return law.powers(q, qdot, t, numbers)
-
-        def accelerations(law, index, member, q, qdot, t, numbers):
-            return law.accelerations(q, qdot, t, numbers)
-
-        def pieces(law, index, member, q, qdot, t, numbers):
-            return law.pieces(q, qdot, t, numbers)
-
-        with np.errstate(all="ignore"):
-            decided = partial(by_mode, pieces) if any(law.decides for law in laws) else None
-            between = Between(partial(by_mode, powers), partial(by_mode, accelerations), decided)
-            fields = _report(path, laws, momenta, partial(by_mode, sampled), between)
-        return jax.tree.map(lambda x: jnp.asarray(np.reshape(x, self.batch + np.shape(x)[1:])), fields)
+    with np.errstate(all="ignore"):
+        decided = partial(by_mode, pieces) if any(law.decides for law in laws) else None
+        between = Between(partial(by_mode, powers), partial(by_mode, accelerations), decided)
+        fields = _report(path, laws, momenta, partial(by_mode, sampled), between)
+    return jax.tree.map(lambda x: jnp.asarray(np.reshape(x, members.batch + np.shape(x)[1:])), fields)
 
 
 # ---- in JAX, one member ----------------------------------------------------------------------------------------------
