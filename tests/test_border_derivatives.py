@@ -60,6 +60,7 @@ def exact(x):
     return jnp.sum(WEIGHTS * jnp.array([region, corner, spring, moving, friction]) ** 2)
 
 
+@pytest.mark.slow
 def test_first_derivatives():
     np.testing.assert_allclose(value(X), exact(X), rtol=1e-10)
     expected = jax.grad(exact)(X)

@@ -25,7 +25,11 @@ def gain(q, qdot, params):
 
 
 @pytest.mark.parametrize(
-    "noise, terms", [pytest.param(lagjax.Gaussian(), 10, marks=pytest.mark.slow), (lagjax.StudentT(4.0), 61)]
+    "noise, terms",
+    [
+        pytest.param(lagjax.Gaussian(), 10, marks=pytest.mark.slow),
+        pytest.param(lagjax.StudentT(4.0), 61, marks=pytest.mark.slow),
+    ],
 )
 def test_an_expansion_to_second_order_is_exact_where_signals_are_quadratic(noise, terms):
     # q is linear in its start, so gain · q + gain² is of second order in the gain and the start, and none is left out.

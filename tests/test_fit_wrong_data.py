@@ -205,6 +205,7 @@ def double(q, v, params):
     return kinetic + 9.81 * (2 * a * jnp.cos(q[0]) + b * jnp.cos(q[1]))
 
 
+@pytest.mark.slow
 def test_a_long_chaotic_record_is_followed_in_pieces():
     truth, ts = {"a": 1.0, "b": 0.8}, np.linspace(0.0, 60.0, 6001)
     q = np.asarray(lagjax.simulate(lagjax.System(double), np.array([2.0, 2.5]), np.zeros(2), ts, truth).q)

@@ -176,6 +176,7 @@ def test_a_jacobian_row_by_row_is_that_column_by_column():
     np.testing.assert_allclose(jax.jacrev(lambda x: path(x)[-1:])(x), exact(x)[-1:], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_on_a_constraint():
     # The bead's ellipse depends on a parameter; outputs are put on it, and so are the ends of steps.
     system = lagjax.System(sliding, constraints=ellipse)

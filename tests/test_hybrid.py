@@ -277,6 +277,7 @@ def test_derivatives_of_the_bouncing_ball():
     np.testing.assert_allclose(reverse[0], central(outcome, x), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_times():
     # By output times a state changes at its rate, by the start of the motion everything is later.
     def outcome(ts):
@@ -417,7 +418,7 @@ def test_the_earliest_wins_and_of_several_at_once_the_first_listed():
     assert run.transitions.source.tolist() == [0, 1, 2, -1] and run.transitions.target.tolist() == [1, 2, 0, -1]
 
 
-@pytest.mark.parametrize("direction", sweep([-1, 0, 1], kept=[-1]))
+@pytest.mark.parametrize("direction", sweep([-1, 0, 1], kept=[]))
 def test_a_surface_crossed_twice_within_a_step(direction):
     # Two crossings 2e-3, 2e-6 apart in a step of 0.06: between them the guard has the other sign.
     band = lambda q, v, params: (q - params["middle"]) ** 2 - params["half"] ** 2
@@ -440,7 +441,7 @@ def test_touching_is_not_crossing():
     assert run.stats["num_steps"] < 50
 
 
-@pytest.mark.parametrize("direction", sweep([-1, 0, 1], kept=[1]))
+@pytest.mark.parametrize("direction", sweep([-1, 0, 1], kept=[]))
 def test_a_start_on_the_surface_fires_where_it_moves_on_in_the_direction(direction):
     section = at("x", "all", "all", direction=direction)
     run = lambda q, v, x: hybrid({"all": OSCILLATOR}, [section], q, v, (0.0, 5.0), {"x": x}, max_transitions=3)

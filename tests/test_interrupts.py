@@ -149,5 +149,5 @@ def test_a_thread_that_fails_stops_the_others():
 
     failing, ended = threading.Lock(), []
     with pytest.raises(ValueError, match="of this thread"):
-        _threads.together(work, 3)
+        _threads.run_on_threads(work, 3)
     assert len(ended) == 2

@@ -50,7 +50,7 @@ def end(system, params, **options):
 
 
 @pytest.mark.parametrize(
-    "name", [name if i in (0, 6) else pytest.param(name, marks=pytest.mark.slow) for i, name in enumerate(FORCES)]
+    "name", [name if i == 6 else pytest.param(name, marks=pytest.mark.slow) for i, name in enumerate(FORCES)]
 )
 def test_derivatives_over_steps_are_right_or_refused(name):
     """Beside those of machine code, which ends a step at every border.

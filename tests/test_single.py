@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sweeps import sweep
 
 import lagjax
 from lagjax._doubles import in_doubles
@@ -159,13 +160,13 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", sweep(WAYS, kept=["jit grad", "jacfwd"]))
 def test_derivatives_of_a_motion(off, way):
     derivative = WAYS[way](last_angle)
     agrees(derivative(START, LENGTH), in_double(WAYS[way](last_angle), START, LENGTH), 4)
 
 
-@pytest.mark.parametrize("function", [second, rest, bounced, frequency])
+@pytest.mark.parametrize("function", sweep([second, rest, bounced, frequency], kept=[rest, frequency]))
 @pytest.mark.parametrize("way", ["jit grad", pytest.param("hessian", marks=pytest.mark.slow)])
 def test_derivatives_of_what_is_found_on_the_way(off, function, way):
     if (function, way) == (frequency, "hessian"):
@@ -176,6 +177,7 @@ def test_derivatives_of_what_is_found_on_the_way(off, function, way):
         assert x.dtype == np.float32 and abs(x - exact) <= 4 * EPS * size
 
 
+@pytest.mark.slow
 def test_batches_of_gradients_loops_and_branches(off):
     starts = np.linspace(0.5, 1.5, 5, dtype=np.float32)
     slopes = jax.vmap(jax.grad(last_angle), (0, None))

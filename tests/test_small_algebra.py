@@ -53,7 +53,7 @@ def geodesic(scale):
     return (g @ jsl.expm(jnp.linalg.solve(g, rate)))[jnp.array([0, 1, 2, 0, 0, 1]), jnp.array([0, 1, 2, 1, 2, 2])]
 
 
-@pytest.mark.parametrize("lagrangian", [by_inverse, pytest.param(by_cholesky, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("lagrangian", [pytest.param(way, marks=pytest.mark.slow) for way in (by_inverse, by_cholesky)])
 def test_geodesics_of_positive_matrices(lagrangian):
     system = lagjax.System(lagrangian)
     assert in_machine_code(system, Q, V)
@@ -214,6 +214,7 @@ def test_eigenvectors_are_orthogonal_and_diagonalise(n):
         assert np.abs(a @ vectors - vectors * values).max() <= 50 * eps * np.abs(values).max()
 
 
+@pytest.mark.slow
 def test_a_strained_cube_by_its_principal_stretches():
     # tr f(C) by the eigenvalues of C, and by its powers; through states where one principal stretch overtakes another.
     mass = jnp.array([1.0, 1.2, 0.8, 1.0, 0.9, 1.1])
@@ -374,6 +375,7 @@ def test_incomplete_functions_of_gamma(a):
     assert np.isnan(program.evaluate(-1.0)).all()
 
 
+@pytest.mark.slow
 def test_a_motion_between_exponential_and_gamma_integrals():
     special = jax.scipy.special
     system = lagjax.System(lambda q, v: 0.5 * v**2 - 0.3 * special.exp1(q) - special.gammainc(2.5, q))

@@ -899,6 +899,7 @@ BOUNCES = dict(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_hybrid_scene(tmp_path):  # compiles the motion of a ball for one shape, and for one member
     scene = bouncing()
     kept = lagjax.sweep(scene, **BOUNCES, store=tmp_path / "store").open()

@@ -77,6 +77,7 @@ def test_straight_lines_and_tables_have_the_same_tangents(flow, monkeypatch):
         np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_tangents_of_a_motion_at_rest():
     """At rest the series of a motion ends, and its steps could have any length: its tangents oscillate."""
     scene = lagjax.System(lambda q, v, params: 0.5 * v**2 + params * jnp.cos(q))
