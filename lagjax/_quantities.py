@@ -2,7 +2,7 @@
 
 JAX differentiates whole arrays: ∂²L/∂q̇² takes as many passes over L as there are coordinates, each full of zeros that
 are folded away afterwards, and JAX takes long to trace them. On scalars only what is there is differentiated. What it
-gives is the same; `tests/test_derivation.py` compares them.
+gives is the same; `tests/equations/test_derivation.py` compares them.
 """
 
 from collections.abc import Callable

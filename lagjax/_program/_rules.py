@@ -5,7 +5,7 @@ ids; a primitive that only moves data is NumPy's own function of the ids; a loop
 
 To support another primitive: an elementwise one needs a row in `_operations`, one that moves data a line in `MOVES`,
 anything else a function marked `@lowers("its_name")`, which gets the expansion, the parameters of the equation and the
-id arrays, and returns an id array (or a list of them). Each needs a row in `tests/test_program.py`.
+id arrays, and returns an id array (or a list of them). Each needs a row in `tests/program/test_program.py`.
 """
 
 import functools

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 import pytest
 
-PAGE = Path(__file__).parent.parent / "examples" / "playground.py"
+PAGE = Path(__file__).parents[2] / "examples" / "playground.py"
 # All text of the page, also inside of the elements that marimo draws, which are documents of their own.
 TEXT = """(function all(node) {
   return [...node.childNodes].map(n => n.nodeType == 3 ? n.data

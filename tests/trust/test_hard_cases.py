@@ -20,7 +20,7 @@ import lagjax
 mp = pytest.importorskip("mpmath", reason="the references are computed with it")
 pytest.importorskip("scipy", reason="the references are computed with it")
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks import hard_cases, hybrid_population, population, soak  # noqa: E402
 from benchmarks._hard import CASES, Case, Experiment, _constrained, _gravity, _integrable, _rotation  # noqa: E402

@@ -12,7 +12,7 @@ GTAU, NOISE = 35.0, 5e-6
 
 @pytest.fixture(autouse=True)
 def examples_on_path(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "examples"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
 
 
 def pushed(velocity, drive):

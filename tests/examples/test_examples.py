@@ -12,7 +12,7 @@ import pytest
 
 from lagjax.scenes import de421
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(autouse=True)

@@ -24,7 +24,7 @@ from lagjax._fit._verdict import shifts_without
 from lagjax._layout import Layout
 
 SIGMA = 5e-3
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(autouse=True)
@@ -379,7 +379,7 @@ def test_intervals_cover_the_truth(kind):
 
 @pytest.mark.slow
 def test_the_real_double_pendulum(capsys):
-    file = Path(__file__).parents[2] / "shared" / "data" / "kaheman2022_double_pendulum_identification.npz"
+    file = Path(__file__).parents[3] / "shared" / "data" / "kaheman2022_double_pendulum_identification.npz"
     if not file.exists():
         pytest.skip(f"the recordings are not at {file}")
     fits, errors = importlib.import_module("double_pendulum_fit").main([str(file)])
@@ -418,7 +418,7 @@ def test_a_state_of_first_order_is_the_velocity_of_a_coordinate():
 
 @pytest.mark.slow
 def test_the_real_axis_with_dry_friction(capsys):
-    file = Path(__file__).parents[2] / "shared" / "data" / "emps_identification.npz"
+    file = Path(__file__).parents[3] / "shared" / "data" / "emps_identification.npz"
     if not file.exists():
         pytest.skip(f"the record is not at {file}")
     fits, name, errors = importlib.import_module("emps").main([str(file)])

@@ -9,7 +9,7 @@ from sweeps import sweep
 
 import lagjax
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 # The guide goes on from the README, page after page in the order in which that names them.
 GUIDE = [ROOT / name for name in dict.fromkeys(re.findall(r"docs/guide/\w+\.md", README))]

@@ -11,7 +11,7 @@ import pytest
 
 import lagjax
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PUBLIC = {name: getattr(lagjax, name) for name in (*lagjax.__all__, *lagjax.results.__all__)}
 
 

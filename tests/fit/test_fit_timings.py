@@ -129,7 +129,7 @@ def test_the_density_of_timings_and_records_has_the_gradient_of_differences_also
 
 @pytest.mark.slow
 def test_the_transit_times_of_trappist_1_are_those_of_the_published_fit(monkeypatch, capsys):
-    root = Path(__file__).parent.parent
+    root = Path(__file__).parents[2]
     files = [root.parent / "shared" / "data" / f"trappist1_{name}.csv" for name in FILES]
     if not all(file.exists() for file in files):
         pytest.skip(f"the transit times are not at {files[0]}")

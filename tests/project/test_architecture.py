@@ -12,7 +12,7 @@ import lagjax
 
 PACKAGE = Path(lagjax.__file__).parent
 
-DEVELOPMENT = (Path(__file__).parent.parent / "docs" / "development.md").read_text()
+DEVELOPMENT = (Path(__file__).parents[2] / "docs" / "development.md").read_text()
 # From the top of the street to its end, as the table there lists it. A new module must take a place in it.
 TABLE = DEVELOPMENT.split("## The street")[1].split("\n## ")[0]
 STREET = re.findall(r"^\| `(\w+)(?:\.py|/)` \|", TABLE, flags=re.MULTILINE)

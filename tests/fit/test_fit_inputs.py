@@ -263,7 +263,7 @@ def test_what_is_wrong_with_times_of_inputs_is_a_sentence():
 
 @pytest.mark.slow
 def test_a_silverbox_is_known_to_its_noise():
-    file = Path(__file__).parents[2] / "shared" / "data" / "silverbox_multisines.npz"
+    file = Path(__file__).parents[3] / "shared" / "data" / "silverbox_multisines.npz"
     if not file.exists():
         pytest.skip("the recording is not there")
     data = np.load(file)

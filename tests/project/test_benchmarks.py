@@ -19,7 +19,7 @@ TOLERANCES = (1e-4, 1e-8)
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
 
 
 def of_benchmarks(name):

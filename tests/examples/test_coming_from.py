@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-PAGE = Path(__file__).parent.parent / "examples" / "coming_from.py"
+PAGE = Path(__file__).parents[2] / "examples" / "coming_from.py"
 FIRST, *CELLS = re.findall(r"^# %%\n(.*?)(?=^# %%|\Z)", PAGE.read_text(), flags=re.MULTILINE | re.DOTALL)
 PEERS = {re.search(r"differ by", cell) and re.search(r'f"(\w+) and', cell)[1]: cell for cell in CELLS}
 

@@ -15,7 +15,7 @@ from lagjax._fit._parameters import Parameters, Unbounded
 from lagjax._fit._search import Reader, time_scales
 
 TS = np.linspace(0.0, 4.0, 101)
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(autouse=True)
