@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core, source_info_util
 
+from lagjax._motion import Motion
 from lagjax._program import OPERATIONS, in_jax, written_out
 
 _PACKAGE = os.path.dirname(os.path.abspath(__file__))
@@ -133,6 +134,20 @@ _SIDES = {
     "cond": lambda result, which, *operands: which,
 }
 _LOOPS = ("scan", "while", "sort")  # which decide inside: the whole numbers that come out tell on which side
+
+
+def borders_of_motion(motion: Motion, *state) -> list[tuple[str, str, Any]]:
+    """`borders` of L, the forces and the dissipation of a scene."""
+    return [border for function in _functions_of(motion) for border in borders(function, *state)]
+
+
+def pieces_of_motion(motion: Motion, *state) -> list[tuple[str, str, int]]:
+    """`pieces_of` L, the forces and the dissipation of a scene."""
+    return [piece for function in _functions_of(motion) for piece in pieces_of(function, *state)]
+
+
+def _functions_of(motion: Motion) -> list[Callable]:
+    return [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
 
 
 def _side_of(name: str) -> Callable | None:

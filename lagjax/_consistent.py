@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._constraints import TOLERANCE, sizes
-from lagjax._derivation import columns_of, derivation_of, numbers_of
 from lagjax._layout import Layout
 from lagjax._linear import dependent_rows, diagonal_scale, schur_complements
-from lagjax._program import Unlowerable
+from lagjax._many_states import Sample
 from lagjax._validate import is_concrete
 
 PyTree = Any
@@ -139,14 +138,9 @@ def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree
     """The start of a motion, measured without compiling anything where the scene has programs."""
     q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)]) for x in (q0, qdot0))
     q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, ts[0]))
-    derivation = derivation_of(system, layout, params)
-    try:
-        numbers = numbers_of(eqx.filter(params, eqx.is_array_like))
-        evaluated = derivation.evaluate(_ASKED, columns_of(q[None], qdot[None], t, numbers))
-        of = {name: value[0] for name, value in evaluated.items()}
-    except Unlowerable:
-        of = {name: np.asarray(value) for name, value in _compiled(system, layout, q, qdot, t, params).items()}
-    on_positions = np.arange(len(of["residual"])) < derivation.position_count
+    sample = Sample.of(system, layout, q[None], qdot[None], t, params)
+    of = {name: value[0] for name, value in sample.quantities(*_ASKED).items()}
+    on_positions = np.arange(len(of["residual"])) < sample.derivation.position_count
     unit = diagonal_scale(of["mass_matrix"])
     size_q, size_qdot = sizes(unit, q, qdot, abs(float(ts[-1]) - float(t)) or np.inf)
     return _Start(
@@ -163,13 +157,6 @@ def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree
 
 
 _ASKED = ("mass_matrix", "jacobian", "gamma", "residual", "rates", "driving")
-
-
-@eqx.filter_jit
-def _compiled(system, layout: Layout, q, qdot, t, params: PyTree) -> dict[str, jax.Array]:
-    """The quantities `_ASKED` at one state, compiled."""
-    values = system.motion(layout, params).quantities(q, qdot, t, eqx.filter(params, eqx.is_array_like))
-    return {name: values[name] for name in _ASKED}
 
 
 def has_constraints(system) -> bool:

@@ -20,10 +20,11 @@ import numpy as np
 
 from lagjax._blame import Offender, offenders, pieces_of, poles
 from lagjax._check import check, listed
-from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
+from lagjax._derivation import Derivation, derivation_of, numbers_of
 from lagjax._failures import sentence
 from lagjax._layout import Layout, halves
 from lagjax._linear import eigen, null_directions
+from lagjax._many_states import Sample, is_lowered
 from lagjax._platform import numbers_at
 from lagjax._program import Unlowerable
 from lagjax._results import RESULTS, code_of
@@ -154,9 +155,9 @@ def _ahead(ended: Ended, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _undefined(derivation: Derivation, ended: Ended) -> Undefined | None:
     """The first of the scene's quantities that is not finite at the end or just ahead; None where all are."""
     try:
-        rate = np.concatenate([halves(ended.y)[1], _acceleration(derivation, ended.y, ended.t, ended.numbers)])
+        rate = np.concatenate([halves(ended.y)[1], _acceleration(derivation, ended)])
         y, t = _ahead(ended, rate)
-        values = _evaluated(derivation, [name for name, *_ in _QUANTITIES], y, t, ended.numbers)
+        values = Sample.along(derivation, y, t, ended.numbers).quantities(*(name for name, *_ in _QUANTITIES))
     except Unlowerable:
         return None
     return _first_undefined(derivation.layout, ended, y, t, values)
@@ -164,7 +165,7 @@ def _undefined(derivation: Derivation, ended: Ended) -> Undefined | None:
 
 def _undefined_by_jax(derivation: Derivation, params, ended: Ended) -> Undefined | None:
     """The same for a scene without programs, of which only forces and the gradient of L are looked at."""
-    if _has_programs(derivation) or derivation.layout.size > LARGEST:
+    if is_lowered(derivation) or derivation.layout.size > LARGEST:
         return None
     motion, numbers = derivation.motion, jax.tree.map(jnp.asarray, eqx.filter(params, eqx.is_array_like))
     slope = jax.grad(motion.lagrangian)
@@ -257,7 +258,7 @@ def _singular_mass(derivation: Derivation, ended: Ended) -> str:
         return ""
     try:
         y, t = np.stack([ended.y_first, ended.y]), np.array([ended.t_first, ended.t])
-        first, last = _evaluated(derivation, ["mass_matrix"], y, t, ended.numbers)["mass_matrix"]
+        first, last = Sample.along(derivation, y, t, ended.numbers).quantities("mass_matrix")["mass_matrix"]
     except Unlowerable:
         return ""
     if not np.isfinite([first, last]).all():
@@ -304,7 +305,7 @@ def _running_away(derivation: Derivation, ended: Ended) -> int | None:
     if _CODES[ended.code] not in ("dt_min_reached", "nonfinite_state"):
         return None
     try:
-        acceleration = np.abs(_acceleration(derivation, ended.y, ended.t, ended.numbers))
+        acceleration = np.abs(_acceleration(derivation, ended))
     except Unlowerable:
         return None
     _, velocity = halves(np.abs(ended.y))
@@ -361,7 +362,7 @@ _EXPLAIN = (
 
 def _checked(system: System, derivation: Derivation, state, params, ended: Ended) -> str:
     """The first finding of `check` at the end that explains the failure."""
-    if derivation.layout.size > (LARGEST if _has_programs(derivation) else 16):
+    if derivation.layout.size > (LARGEST if is_lowered(derivation) else 16):
         return ""
     q, qdot = state
     found = {finding.kind: finding for finding in reversed(list(check(system, q, qdot, ended.t, params)))}
@@ -394,26 +395,9 @@ def _budget(ended: Ended) -> str:
     )
 
 
-# ---- values ----------------------------------------------------------------------------------------------------------
-
-
-def _has_programs(derivation: Derivation) -> bool:
-    try:
-        derivation.program("mass_matrix")
-    except Unlowerable:
-        return False
-    return True
-
-
-def _evaluated(derivation: Derivation, names, y: np.ndarray, t: np.ndarray, numbers) -> dict[str, np.ndarray]:
-    """Quantities at states (S, 2n) and times (S,), each (S, …)."""
-    return derivation.evaluate(names, columns_of(*halves(y), t, list(numbers)))
-
-
-def _acceleration(derivation: Derivation, y: np.ndarray, t: float, numbers) -> np.ndarray:
-    """q̈ (n,) at a state (2n,)."""
-    program = derivation.acceleration
-    return program.evaluate_many(columns_of(*halves(y[None]), t, list(numbers)))[: derivation.layout.size, 0]
+def _acceleration(derivation: Derivation, ended: Ended) -> np.ndarray:
+    """q̈ (n,) at the end."""
+    return Sample.along(derivation, ended.y[None], ended.t, ended.numbers).acceleration()[0]
 
 
 # ---- of a trajectory -------------------------------------------------------------------------------------------------

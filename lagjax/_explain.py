@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lagjax._blame import pieces_of as pieces_in
+from lagjax._blame import pieces_of_motion
 from lagjax._diffrax import ArrayEquations, form_of
 from lagjax._engine import choose
 from lagjax._linear import dependent_rows
@@ -182,10 +182,9 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
 
 def _borders_in_lines(problem: Problem) -> dict[str, Any]:
     """The piecewise operations of the user's functions, by their lines."""
-    motion, n = problem.derivation.motion, problem.derivation.layout.size
-    functions = [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
+    n = problem.derivation.layout.size
     state = problem.y0[:n], problem.y0[n:], problem.ts[0], problem.numbers
-    pieces = [piece for function in functions for piece in pieces_in(function, *state)]
+    pieces = pieces_of_motion(problem.derivation.motion, *state)
     names = tuple(f"{name}{place}" for name, place, size in pieces for _ in range(size))
     return {"borders": names, "borders_located": not names}
 

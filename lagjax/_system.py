@@ -18,11 +18,12 @@ from jaxtyping import Array, Float
 
 from lagjax._arguments import Function, accept, present
 from lagjax._constraints import Constraints
-from lagjax._derivation import columns_of, derivation_of, numbers_of
+from lagjax._derivation import derivation_of, numbers_of
 from lagjax._diffrax import form_of
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
 from lagjax._linear import saddle_many, schur_complements
+from lagjax._many_states import Sample
 from lagjax._motion import Motion
 from lagjax._problem import Problem
 from lagjax._program import Unlowerable
@@ -326,7 +327,7 @@ class System(eqx.Module):
         q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, t))
         numbers = numbers_of(eqx.filter(params, eqx.is_array_like))
         try:
-            values = derivation_of(self, layout, params).evaluate(names, columns_of(q, qdot, t, numbers))
+            values = Sample(derivation_of(self, layout, params), q, qdot, t, numbers).quantities(*names)
         except Unlowerable:
             return None
         with np.errstate(all="ignore"):

@@ -14,7 +14,7 @@ import numpy as np
 from lagjax._check._borders import OF_FORCE
 from lagjax._check._findings import Finding, listed
 from lagjax._check._measure import Scene
-from lagjax._derivation import numbers_of
+from lagjax._many_states import Sample
 from lagjax._program import BELOW, Borders, StraightLine, Unlowerable, evaluate, live
 
 _PLACES = np.concatenate([s * np.geomspace(1e-3, 1e3, 61) for s in (-1, 1)])  # to start from, in sizes of the number
@@ -33,8 +33,8 @@ class _Along(NamedTuple):
 
     @property
     def start(self) -> float:
-        q, v, t, _ = self.scene.state
-        return float(np.concatenate([np.ravel(q), np.ravel(v), np.ravel(t)])[self.i])
+        here = self.scene.sample
+        return float([*here.q[0], *here.qdot[0], here.t][self.i])
 
     def function(self, node: int) -> Callable[[np.ndarray], np.ndarray]:
         """A node of the program with pieces, (S,), where the input is (S,): on the pieces that belong there."""
@@ -45,7 +45,7 @@ class _Along(NamedTuple):
         decide = StraightLine(*live(*borders.decide[:2], [borders.decide.outputs[j] for j in read]))
 
         def at(x):
-            columns, pieces = self._columns(x), np.zeros((count, len(x)))
+            columns, pieces = self._sample(x).columns, np.zeros((count, len(x)))
             if read:
                 pieces[read] = np.nan_to_num(evaluate(decide, [*columns, *np.zeros(2 * count)]))
             return evaluate(value, [*columns, *pieces])[0]
@@ -53,13 +53,13 @@ class _Along(NamedTuple):
         return at
 
     def accelerations(self, x: np.ndarray) -> np.ndarray:
-        return self.scene.derivation.acceleration.evaluate_many(self._columns(x))[: self.scene.layout.size]
+        return self._sample(x).acceleration().T
 
-    def _columns(self, x: np.ndarray) -> list:
-        q, v, t, params = self.scene.state
-        columns = [np.full(len(x), float(number)) for number in (*np.ravel(q), *np.ravel(v), t)]
-        columns[self.i] = x
-        return [*columns, *numbers_of(params)]
+    def _sample(self, x: np.ndarray) -> Sample:
+        n, here = self.scene.layout.size, self.scene.sample
+        y = np.tile([*here.q[0], *here.qdot[0], here.t], (len(x), 1))
+        y[:, self.i] = x
+        return self.scene.at(y[:, :n], y[:, n:-1], y[:, -1])
 
 
 def findings(scene: Scene) -> list[Finding]:

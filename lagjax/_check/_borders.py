@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._blame import borders, pieces_of
+from lagjax._blame import borders_of_motion, pieces_of_motion
 from lagjax._check._findings import Finding
 from lagjax._check._measure import Scene
 from lagjax._derivation import numbers_of
@@ -23,6 +23,9 @@ OF_FORCE = (
     "A motion across it is right: machine code ends a step there, and what is pushed onto it from both sides rests on "
     "it; steps of diffrax shrink, and a motion of diffrax that crosses it has no derivatives."
 )
+_COMPARED = {
+    "lagrangian": "L", "momentum": "the momentum", "mass_matrix": "the mass matrix", "force": "the force",
+}  # fmt: skip
 _REACH = 10  # the steps of the search: 2⁻⁹, 2⁻⁸ … 1 sizes of a coordinate
 
 
@@ -38,17 +41,15 @@ class Jump(NamedTuple):
 
 def findings(scene: Scene) -> list[Finding]:
     """A finding about the nearest jump, if there is one."""
-    motion = scene.motion
-    functions = [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
-    pieces = [piece for function in functions for piece in pieces_of(function, *scene.state)]
+    pieces = pieces_of_motion(scene.motion, *scene.state)
     if not pieces:
         return []
     *y, _ = scene.state
     start = np.concatenate([np.ravel(x) for x in y])
-    sides, evaluate = _functions_of_states(scene, functions)
+    sides = _sides_of_states(scene)
     labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
     jumps = [
-        _first_jump(sides, evaluate, start, sign * vector, (name, size), labels)
+        _first_jump(scene, sides, start, sign * vector, (name, size), labels)
         for name, size, vector in _directions(scene)
         for sign in (1, -1)
     ]
@@ -56,41 +57,24 @@ def findings(scene: Scene) -> list[Finding]:
     return [] if nearest is None else [_finding(nearest)]
 
 
-def _functions_of_states(scene: Scene, functions: list[Callable]) -> tuple[Callable, Callable]:
-    """Two functions of states (S, 2n + 1): on which sides of the borders they are, and (L, p, M, F) at them.
+def _sides_of_states(scene: Scene) -> Callable:
+    """A function of states (S, 2n + 1): on which sides of the borders they are.
 
-    They are programs where the scene has them, else compiled by XLA.
+    It is a program where the scene has them, else compiled by XLA.
     """
-    n, derivation, params = scene.layout.size, scene.derivation, scene.state[3]
+    n, params = scene.layout.size, scene.state[3]
 
     def sides_at(q, v, t, params):
-        of_functions = [border for function in functions for border in borders(function, q, v, t, params)]
-        return jnp.concatenate([jnp.ravel(side) for _, _, side in of_functions])
+        of_motion = borders_of_motion(scene.motion, q, v, t, params)
+        return jnp.concatenate([jnp.ravel(side) for _, _, side in of_motion])
 
-    names = ("lagrangian", "momentum", "mass_matrix", "force")
-    try:
-        derivation.program(*names)
-        program, numbers = lower(sides_at, *scene.state), numbers_of(params)
-
-        def sides(points):
-            return program.evaluate_many([*points.T, *numbers]).T
-
-        def evaluate(points):
-            values = derivation.evaluate(names, [*points.T, *numbers])
-            return [values[name] for name in names]
-
-        return sides, evaluate
-    except Unlowerable:
-        motion = scene.motion
-
-        def at(point):
-            return point[:n], point[n:-1], point[-1], params
-
-        def evaluate_one(point):
-            mass, force = motion.mass_matrix_and_force(*at(point))
-            return motion.lagrangian(*at(point)), motion.momentum(*at(point)), mass, force
-
-        return jax.jit(jax.vmap(lambda point: sides_at(*at(point)))), jax.jit(jax.vmap(evaluate_one))
+    if scene.is_lowered:
+        try:
+            program, numbers = lower(sides_at, *scene.state), numbers_of(params)
+            return lambda points: program.evaluate_many([*points.T, *numbers]).T
+        except Unlowerable:
+            pass
+    return jax.jit(jax.vmap(lambda point: sides_at(point[:n], point[n:-1], point[-1], params)))
 
 
 def _directions(scene: Scene) -> list[tuple[str, float, np.ndarray]]:
@@ -101,7 +85,7 @@ def _directions(scene: Scene) -> list[tuple[str, float, np.ndarray]]:
     return list(zip(scene.names, scene.sizes, axes, strict=True))
 
 
-def _first_jump(sides: Callable, evaluate: Callable, start, vector, axis, labels: list[str]) -> Jump | None:
+def _first_jump(scene: Scene, sides: Callable, start, vector, axis, labels: list[str]) -> Jump | None:
     """The nearest border along `vector`, if something jumps there."""
     eps, vector = float(np.finfo(start.dtype).eps), np.asarray(vector, start.dtype)
 
@@ -126,9 +110,10 @@ def _first_jump(sides: Callable, evaluate: Callable, start, vector, axis, labels
     place = int(np.argmax(there != here))
     # The change is compared with the size at the state, at the border and a little beyond: a force that sets in at zero
     # does not jump.
-    on_both_sides = evaluate(at([inside if past else -beyond, beyond, 0.0, beyond + 0.1]))
-    for what, values in zip(("L", "the momentum", "the mass matrix", "the force"), on_both_sides, strict=True):
-        one, other, *_ = values = np.asarray(values)
+    both_sides, n = at([inside if past else -beyond, beyond, 0.0, beyond + 0.1]), scene.layout.size
+    values_of = scene.at(both_sides[:, :n], both_sides[:, n:-1], both_sides[:, -1]).quantities(*_COMPARED)
+    for name, what in _COMPARED.items():
+        one, other, *_ = values = values_of[name]
         if np.isfinite(one).all() and np.isfinite(other).all():
             if np.abs(one - other).max() > np.sqrt(eps) * np.nanmax(np.abs(values)):
                 sizes = beyond if past else 0.0

@@ -24,7 +24,7 @@ def findings(scene: Scene) -> list[Finding]:
     reported = _not_finite(scene)
     if reported:
         return reported
-    if scene.layout.size > _ALL_AT_ONCE and scene.measured.sides is None and _agree(scene):
+    if scene.layout.size > _ALL_AT_ONCE and scene.is_lowered and _agree(scene):
         return []
     sides = scene.sides()
     return [finding for block in _blocks(scene, sides.round_off) for finding in _compared(scene, sides, *block)]

@@ -1,7 +1,6 @@
 """Everything that `check` computes: the values and derivatives of a scene at a state and at states around it.
 
-The scene's programs are evaluated in NumPy, which compiles nothing. A scene without programs (arrays in its functions,
-operations without a scalar form, far too many of them) is compiled by XLA.
+A `Sample` evaluates the scene: by its programs in NumPy, which compiles nothing, or else compiled by XLA.
 """
 
 from typing import Any, NamedTuple
@@ -12,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._check._differences import ladder
-from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
+from lagjax._derivation import Derivation, numbers_of
 from lagjax._layout import Layout
 from lagjax._linear import augment
+from lagjax._many_states import Sample, is_lowered
 from lagjax._motion import Motion
 from lagjax._program import Unlowerable
 from lagjax._scales import Scales
@@ -23,8 +23,6 @@ from lagjax._validate import as_arrays
 
 PyTree = Any
 
-# Coordinates up to which XLA takes all differences side by side; with more, memory grows like their square.
-_LARGEST_AT_ONCE = 16
 _NEARBY = 4  # states with other positions, and as many with other velocities
 
 
@@ -33,10 +31,9 @@ class Scene(NamedTuple):
 
     system: System
     layout: Layout
-    derivation: Derivation
-    motion: Motion
     arguments: tuple  # q, qdot, t, params in the user's pytrees
     state: tuple  # q, q̇, t and the numbers in params
+    sample: Sample  # the state, alone
     sizes: np.ndarray  # of q, then of q̇, and of the time along the motion
     steps: np.ndarray  # of the differences, (rungs, 2n + 1), along the same directions
     measured: "Measured"
@@ -46,15 +43,22 @@ class Scene(NamedTuple):
         """Measure `system` at a state."""
         q, qdot, t, params = as_arrays((q, qdot, 1.0 * t, params), layout.dtype)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)
-        derivation = derivation_of(system, layout, params)
-        scales = _scales(derivation, state)
+        flat = [np.asarray(x) for x in state[:3]]
+        here = Sample.of(system, layout, flat[0][None], flat[1][None], flat[2], params)
+        scales = _scales(here)
         sizes = _sizes(q, qdot, scales)
         steps, offsets = ladder(sizes, layout.dtype), _offsets(sizes, scales, layout.dtype)
-        try:
-            measured = _evaluated(derivation, state, offsets)
-        except Unlowerable:
-            measured = jax.tree.map(np.asarray, _measure(system, q, qdot, t, params, steps, offsets))
-        return cls(system, layout, derivation, derivation.motion, (q, qdot, t, params), state, sizes, steps, measured)
+        return cls(system, layout, (q, qdot, t, params), state, here, sizes, steps, _measured(here, offsets))
+
+    @property
+    def derivation(self) -> Derivation:
+        """The programs of the scene."""
+        return self.sample.derivation
+
+    @property
+    def motion(self) -> Motion:
+        """The functions of the scene, in flat coordinates."""
+        return self.derivation.motion
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -64,17 +68,18 @@ class Scene(NamedTuple):
 
     def sides(self) -> "Sides":
         """The outputs on both sides of the state, along every coordinate and velocity and along the motion."""
-        if self.measured.sides is not None:
-            return self.measured.sides
         minus, plus = self.beside(np.eye(2 * self.layout.size + 1), self.steps)
-        q, qdot, *_ = self.state
-        one, here = columns_of(np.asarray(q)[None], np.asarray(qdot)[None], *self._others), self.measured
-        noise = self.derivation.program(*_COMPARED).round_off_many(one)[:, 0]
-        lost = {name: value[0] for name, value in self.derivation.round_off(_DERIVED, one).items()}
+        one, here = self.sample, self.measured
         drift = {
             "lagrangian_by_q": here.by_q, "given_force": here.extra,
             "dissipation_by_qdot": here.by_v_of_dissipation, "force": here.force,
         }  # fmt: skip
+        if not self.is_lowered:
+            by_v = here.by_v_of_dissipation
+            of_terms = (here.by_q,), (here.momentum[0],), (here.mass[0],), drift.values(), (by_v,), (here.jacobian[0],)
+            return Sides(minus, plus, np.zeros_like(here.here), tuple(_rounding(*terms) for terms in of_terms))
+        noise = self.derivation.program(*_COMPARED).round_off_many(one.columns)[:, 0]
+        lost = {name: value[0] for name, value in one.round_off(*_DERIVED).items()}
         of_drift = sum(lost[name] + np.finfo(self.layout.dtype).eps * abs(value) for name, value in drift.items())
         round_off = (
             lost["lagrangian_by_q"], lost["momentum"], lost["mass_matrix"], of_drift, lost["dissipation_by_qdot"],
@@ -83,7 +88,7 @@ class Scene(NamedTuple):
         return Sides(minus, plus, noise, round_off)
 
     def beside(self, directions: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The outputs of `Measured.here` at steps back and ahead, each (directions, rungs, outputs), by programs.
+        """The outputs of `Measured.here` at steps back and ahead, each (directions, rungs, outputs).
 
         `directions` (D, 2n + 1) are combinations of the coordinates, the velocities and the motion; `steps` (rungs, D).
         """
@@ -92,15 +97,18 @@ class Scene(NamedTuple):
         axes[-1, :n] = v
         moves = np.stack([-steps, steps]).transpose(2, 0, 1)[..., None] * (directions @ axes)[:, None, None]
         along = (np.concatenate([q, v, t[None]]) + moves).reshape(-1, 2 * n + 1).astype(q.dtype)
-        _, numbers = self._others
-        sides = self.derivation.program(*_COMPARED).evaluate_many([*along.T, *numbers]).T
+        sides = self.at(along[:, :n], along[:, n:-1], along[:, -1]).flat(*_COMPARED)
         sides = sides.reshape(len(directions), 2, len(steps), -1)
         return sides[:, 0], sides[:, 1]
 
+    def at(self, q: np.ndarray, qdot: np.ndarray, t: np.ndarray) -> Sample:
+        """The scene at other states."""
+        return self.sample._replace(q=q, qdot=qdot, t=t)
+
     @property
-    def _others(self) -> tuple[np.ndarray, list]:
-        """The time, and every number in params."""
-        return np.asarray(self.state[2]), numbers_of(self.state[3])
+    def is_lowered(self) -> bool:
+        """True if the scene has programs."""
+        return is_lowered(self.derivation)
 
     @property
     def lagrangian(self) -> np.ndarray:
@@ -179,7 +187,6 @@ class Measured(NamedTuple):
     velocity: Any  # (states, n)
     power: Any  # Σ q̇ᵢ ∂D/∂q̇ᵢ, which D takes out of the motion, and Σ |q̇ᵢ ∂D/∂q̇ᵢ|, (states, 2)
     here: Any  # the outputs L, p, D (if there is one), f and a at the state, (outputs,)
-    sides: "Sides | None"  # None: they are yet to be evaluated, by programs
 
 
 class Sides(NamedTuple):
@@ -191,12 +198,12 @@ class Sides(NamedTuple):
     round_off: Any  # how far it may move by_q, momentum, mass, drift, by_v_of_dissipation and the rows of G, each alike
 
 
-def _scales(derivation: Derivation, state) -> Scales:
-    """The sizes of coordinates, velocities and the time at the state; one, where the scene does not tell."""
-    q, v, t, numbers = *(np.asarray(x, np.float64) for x in state[:3]), numbers_of(state[3])
+def _scales(here: Sample) -> Scales:
+    """The sizes of coordinates, velocities and the time at a state; one, where the scene does not tell."""
+    q, v, t = (np.asarray(x, np.float64) for x in (here.q[0], here.qdot[0], here.t))
 
     def evaluated(name, q, v):
-        return derivation.evaluate((name,), columns_of(q, v, t, numbers))[name]
+        return here._replace(q=q, qdot=v, t=t, scene=None).quantities(name)[name]
 
     try:
         scales = Scales.of(evaluated, q, v)
@@ -240,36 +247,34 @@ def _offsets(sizes: np.ndarray, scales: Scales, dtype) -> np.ndarray:
 
 
 _COMPARED = ("lagrangian", "momentum", "dissipation", "residual")
+_NEARBY_QUANTITIES = (
+    "momentum", "mass_matrix", "jacobian", "lagrangian_by_q", "force", "given_force", "gamma", "dissipation_by_qdot",
+)  # fmt: skip
 _DERIVED = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissipation_by_qdot", "force", "jacobian")
 
 
-def _evaluated(derivation: Derivation, state, offsets: np.ndarray) -> Measured:
-    """The measurements, by the programs of a derivation; raises `Unlowerable` where it has none."""
-    q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
-    n = len(q)
-    names = ("momentum", "mass_matrix", "jacobian", "lagrangian_by_q", "force", "given_force", "gamma")
-    names += ("dissipation_by_qdot",)
-    near = derivation.evaluate(names, columns_of(q + offsets[:, :n], v + offsets[:, n:], t, numbers))
-    velocity = v + offsets[:, n:]
-    power = np.zeros((len(offsets), 2))
-    if not derivation.absent("dissipation_by_qdot").all():
-        damping = columns_of(q + 0 * offsets[:, :n], velocity, t, numbers)
-        terms = derivation.evaluate(("dissipation_by_qdot",), damping)["dissipation_by_qdot"] * velocity
+def _measured(here: Sample, offsets: np.ndarray) -> Measured:
+    """The measurements at the state and at `offsets` (states, 2n) from it."""
+    n = here.derivation.layout.size
+    velocity = here.qdot + offsets[:, n:]
+    near = here._replace(q=here.q + offsets[:, :n], qdot=velocity)
+    of, power = near.quantities(*_NEARBY_QUANTITIES), np.zeros((len(offsets), 2))
+    if here.derivation.motion.dissipation is not None:
+        damping = near._replace(q=here.q + 0 * offsets[:, :n]).quantities("dissipation_by_qdot")
+        terms = damping["dissipation_by_qdot"] * velocity
         power = np.stack([terms.sum(axis=1), np.abs(terms).sum(axis=1)], axis=1)
-    here = derivation.program(*_COMPARED).evaluate_many(columns_of(q[None], v[None], t, numbers))
     return Measured(
-        by_q=near["lagrangian_by_q"][0],
-        momentum=near["momentum"],
-        mass=near["mass_matrix"],
-        force=near["force"][0],
-        extra=near["given_force"][0],
-        by_v_of_dissipation=near["dissipation_by_qdot"][0],
-        jacobian=near["jacobian"],
-        gamma=near["gamma"][0],
+        by_q=of["lagrangian_by_q"][0],
+        momentum=of["momentum"],
+        mass=of["mass_matrix"],
+        force=of["force"][0],
+        extra=of["given_force"][0],
+        by_v_of_dissipation=of["dissipation_by_qdot"][0],
+        jacobian=of["jacobian"],
+        gamma=of["gamma"][0],
         velocity=velocity,
         power=power,
-        here=here[:, 0],
-        sides=None,
+        here=here.flat(*_COMPARED)[0],
     )
 
 
@@ -295,74 +300,14 @@ def _program_variation(derivation: Derivation, state, acceleration, multipliers)
     return np.stack([np.zeros(n + m) if bar is None else np.broadcast_to(bar, n + m) for bar in derivatives], axis=1)
 
 
-@eqx.filter_jit
-def _measure(system: System, q, qdot, t, params, steps, offsets) -> Measured:
-    layout = Layout.of(q, qdot)
-    motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
-    n, q, v = layout.size, layout.flatten(q), layout.flatten(qdot)
-    state = q, v, t, numbers
-
-    damped = Motion(motion.lagrangian, None, motion.dissipation)
-
-    def nearby(offset):
-        at = q + offset[:n], v + offset[n:], t, numbers
-        equations = motion.constraints.jacobian_and_gamma(*at)
-        return motion.momentum(*at), *motion.mass_matrix_and_force(*at), *equations, at[1]
-
-    def dissipated(offset):
-        at = q, v + offset[n:], t, numbers
-        terms = -damped.nonconservative_force(*at) * at[1]
-        return jnp.stack([terms.sum(), jnp.abs(terms).sum()])
-
-    def everything(y):
-        at = y[:n], y[n:-1], y[-1], numbers
-        parts = [motion.lagrangian(*at)[None], motion.momentum(*at)]
-        parts += [] if motion.dissipation is None else [motion.dissipation(*at)[None]]
-        return jnp.concatenate([*parts, motion.residual(*at)])
-
-    def along(direction, h):
-        return jax.vmap(lambda h: everything(y + h * direction))(jnp.concatenate([-h, h])).reshape(2, len(h), -1)
-
-    y = jnp.concatenate([q, v, t[None]])
-    directions = jnp.eye(2 * n + 1, dtype=y.dtype).at[-1, :n].set(v)
-    small = n <= _LARGEST_AT_ONCE
-    sides = jax.vmap(along)(directions, steps.T) if small else jax.lax.map(lambda x: along(*x), (directions, steps.T))
-    momentum, mass, force, jacobian, gamma, velocity = jax.vmap(nearby)(offsets)
-    by_q = Motion(motion.lagrangian, None, None).generalized_force(*state)
-    extra = jnp.zeros_like(q) if motion.forces is None else motion.forces(*state)
-    dragging = -damped.nonconservative_force(*state)
-
-    return Measured(
-        by_q=by_q,
-        momentum=momentum,
-        mass=mass,
-        force=force[0],
-        extra=extra,
-        by_v_of_dissipation=dragging,
-        jacobian=jacobian,
-        gamma=gamma[0],
-        velocity=velocity,
-        power=jax.vmap(dissipated)(offsets),
-        here=everything(y),
-        sides=Sides(
-            sides[:, 0],
-            sides[:, 1],
-            jnp.zeros_like(everything(y)),
-            (
-                *map(_rounding, (by_q, momentum[0], mass[0])), _rounding(by_q, extra, dragging, force[0]),
-                *map(_rounding, (dragging, jacobian[0])),
-            ),
-        ),
-    )  # fmt: skip
-
-
 def _rounding(*terms):
     """The rounding of derivatives whose terms are not known one by one, in the shape of the first of `terms`.
 
     Four units of round-off of the sum of the largest terms.
     """
-    size = sum(jnp.max(jnp.abs(term), initial=0.0) for term in terms)
-    return jnp.full(terms[0].shape, 4 * jnp.finfo(terms[0].dtype).eps * size)
+    first, *_ = terms
+    size = sum(np.max(np.abs(term), initial=0.0) for term in terms)
+    return np.full(first.shape, 4 * np.finfo(first.dtype).eps * size)
 
 
 @eqx.filter_jit

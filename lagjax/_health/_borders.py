@@ -9,7 +9,7 @@ from typing import Generic, NamedTuple, TypeVar
 import jax
 import numpy as np
 
-from lagjax._blame import pieces_of
+from lagjax._blame import pieces_of_motion
 from lagjax._derivation import derivation_of
 from lagjax._health._measure import path_of
 from lagjax._layout import Layout
@@ -71,9 +71,8 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
     try:
         return derivation.borders is not None and bool(derivation.borders.switches)
     except Unlowerable:  # arrays; as `_explain` asks
-        motion, rest = derivation.motion, np.zeros(layout.size, layout.dtype)
-        functions = [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
-        return any(pieces_of(f, rest, rest, rest.sum(), params) for f in functions)
+        rest = np.zeros(layout.size, layout.dtype)
+        return bool(pieces_of_motion(derivation.motion, rest, rest, rest.sum(), params))
 
 
 def _portions(places: np.ndarray, numbers: np.ndarray) -> list[np.ndarray]:

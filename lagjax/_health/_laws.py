@@ -1,10 +1,10 @@
 """The measurements at the states of a motion whose laws are known, in two ways.
 
-`Law.samples` evaluates the programs of the scene in NumPy, for many states at once and without compiling anything.
-`sample_at` is the same for one state in JAX: for values that are being traced, and for scenes that have no programs.
+`Law.measurements` takes a `Sample` of many states, which programs evaluate in NumPy without compiling anything.
+`measurements_at` is the same for one state in JAX: for values that are being traced, and for scenes without programs.
 """
 
-from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._constraints import distances
-from lagjax._derivation import Derivation, columns_of, derivation_of
+from lagjax._derivation import Derivation, derivation_of
 from lagjax._layout import Layout
-from lagjax._linear import saddle_many
+from lagjax._many_states import SADDLE, Sample, solved
 from lagjax._motion import Motion
-from lagjax._program import Program, Unlowerable, evaluate, lower
+from lagjax._program import Program, Unlowerable, lower
 from lagjax._system import System
 
 _CHUNK = 2**21  # numbers that programs return together, 16 MB
@@ -25,7 +25,7 @@ _STORED = 2**20  # values that a transposed derivative stores between its two pa
 _DERIVATIVE_BUDGET = 20_000  # operations of the program that computes a doubtful derivative a second time
 
 
-class Sample(NamedTuple):
+class Measurements(NamedTuple):
     """The measurements at one state; at S states every field has a first axis (S, …)."""
 
     conserved: Any  # c: h, then k − 1 momenta, (k,)
@@ -62,119 +62,71 @@ class Law(NamedTuple):
 
     # ---- by programs, in NumPy ----
 
-    def lowered(self) -> bool:
-        """True if the scene has the programs that `samples` evaluates."""
-        try:
-            return bool(self.derivation.program("mass_matrix").shapes)
-        except Unlowerable:
-            return False
+    def measurements(self, momenta: tuple[int, ...], tolerances, sample: Sample) -> Measurements:
+        """The `Measurements` at S states; `tolerances` are rtol and atol, () or (S,) each."""
+        return sample.in_parts(partial(self._measurements, momenta), self._portion(_QUANTITIES), *tolerances)
 
-    def samples(self, momenta: tuple[int, ...], tolerances, q, qdot, t, numbers: Sequence) -> Sample:
-        """A `Sample` of S states: `q`, `qdot` (S, n), `t` (S,), `numbers` and `tolerances` () or (S,) each."""
-        width = sum(self.derivation.count(name) for name in _QUANTITIES)
-        return _in_parts(
-            lambda *part: self._samples(momenta, *part),
-            max(1, _CHUNK // width),
-            len(q),
-            tolerances,
-            q,
-            qdot,
-            t,
-            numbers,
-        )
-
-    def powers(self, q, qdot, t, numbers: Sequence) -> np.ndarray:
+    def powers(self, sample: Sample) -> np.ndarray:
         """dh/dt at S states, shape (S,)."""
-        width = sum(self.derivation.count(name) for name in _QUANTITIES)
-        return _in_parts(self._powers, max(1, _CHUNK // width), len(q), q, qdot, t, numbers)
+        return sample.in_parts(self._powers, self._portion(_QUANTITIES))
 
-    def accelerations(self, q, qdot, t, numbers: Sequence) -> np.ndarray:
+    def accelerations(self, sample: Sample) -> np.ndarray:
         """q̈ at S states, shape (S, n)."""
-        width = sum(self.derivation.count(name) for name in _SYSTEM)
-        return _in_parts(self._accelerations, max(1, _CHUNK // width), len(q), q, qdot, t, numbers)
+        return sample.in_parts(Sample.solved, self._portion(SADDLE))
 
-    def _accelerations(self, q, qdot, t, numbers) -> np.ndarray:
-        with np.errstate(all="ignore"):
-            return _solved(self.derivation.evaluate(_SYSTEM, columns_of(q, qdot, t, numbers)))[0]
+    def _portion(self, names: tuple[str, ...]) -> int:
+        """The number of states of which programs return these quantities together."""
+        return max(1, _CHUNK // sum(self.derivation.count(name) for name in names))
 
-    @property
-    def decides(self) -> bool:
-        """True if the accelerations are known to be made of pieces."""
-        try:
-            borders = self.derivation.borders
-        except Unlowerable:
-            return False
-        return borders is not None and bool(borders.switches)
-
-    def pieces(self, q, qdot, t, numbers: Sequence) -> np.ndarray:
-        """A number for each of S states, shape (S,), that is another one where other pieces are decided on."""
-        if not self.decides:
-            return np.zeros(len(q))
-        borders = self.derivation.borders
-        flags = np.zeros(2 * len(borders.switches))
-        found = evaluate(borders.decide, [*columns_of(q, qdot, t, numbers), *flags])
-        return np.sqrt(np.arange(2, 2 + len(found))) @ np.where(np.isfinite(found), found, 0.5)
-
-    def _samples(self, momenta, tolerances, q, qdot, t, numbers) -> Sample:
-        columns, derivation = columns_of(q, qdot, t, numbers), self.derivation
-        of = derivation.evaluate(_QUANTITIES, columns)
+    def _measurements(self, momenta, sample: Sample, *tolerances) -> Measurements:
+        q, qdot, of = sample.q, sample.qdot, sample.quantities(*_QUANTITIES)
         (rtol, atol), far, fast = (np.reshape(x, (-1, 1)) for x in tolerances), np.abs(q), np.abs(qdot)
         with np.errstate(all="ignore"):
             energy = np.einsum("si,si->s", of["momentum"], qdot) - of["lagrangian"]
             conserved = np.concatenate([energy[:, None], of["momentum"][:, list(momenta)]], axis=1)
-            by_q = np.abs(np.concatenate([of["energy_by_q"][:, None], self._momenta_by_q(momenta, columns)], axis=1))
+            by_q = np.abs(np.concatenate([of["energy_by_q"][:, None], sample.momenta_by_q(momenta)], axis=1))
             of_energy = np.einsum("sij,sj->si", of["mass_matrix"], qdot)[:, None]
             by_qdot = np.abs(np.concatenate([of_energy, of["mass_matrix"][:, list(momenta)]], axis=1))
             sizes = np.einsum("ski,si->sk", by_q, far) + np.einsum("ski,si->sk", by_qdot, fast)
             sizes[:, 0] += np.einsum("si,si->s", np.abs(of["momentum"]), fast) + np.abs(of["lagrangian"])
             slopes = np.einsum("ski,si->sk", by_q, rtol * far + atol)
             slopes += np.einsum("ski,si->sk", by_qdot, rtol * fast + atol)
-            off_q, off_qdot = distances(of["residual"], of["rates"], of["jacobian"], derivation.position_count)
+            off_q, off_qdot = distances(of["residual"], of["rates"], of["jacobian"], self.derivation.position_count)
             power, acceleration = np.zeros(len(q), q.dtype), np.zeros_like(q)
             if self.works:
-                acceleration, multipliers = _solved(of)
+                acceleration, multipliers = solved(of)
                 power = _power_of(of, qdot, multipliers)
-            return Sample(
+            return Measurements(
                 conserved, slopes, sizes, power, acceleration, off_q, off_qdot,
-                _conditions(of["mass_matrix"]), self._finite(columns),
+                _conditions(of["mass_matrix"]), self._finite(sample),
             )  # fmt: skip
 
-    def _momenta_by_q(self, momenta, columns) -> np.ndarray:
-        """∂pᵢ/∂q of the coordinates i in `momenta` at S states, (S, len(momenta), n)."""
-        n, count = self.derivation.layout.size, max(np.size(x) for x in columns)
-        if not momenta:
-            return np.zeros((count, 0, n), columns[0].dtype)
-        rows = self.derivation.momenta_by_q(momenta).evaluate_many(columns)
-        return np.broadcast_to(rows, (rows.shape[0], count)).T.reshape(count, len(momenta), n)
-
-    def _powers(self, q, qdot, t, numbers) -> np.ndarray:
+    def _powers(self, sample: Sample) -> np.ndarray:
         if not self.works:
-            return np.zeros(len(q), q.dtype)
+            return np.zeros(len(sample.q), sample.q.dtype)
         driven = not self.derivation.absent("driving").all()
-        names = _SOURCES + (_SYSTEM if driven else ())
-        of = self.derivation.evaluate(names, columns_of(q, qdot, t, numbers))
+        of = sample.quantities(*_SOURCES, *(SADDLE if driven else ()))
         with np.errstate(all="ignore"):
-            return _power_of(of, qdot, _solved(of)[1] if driven else np.zeros_like(of["driving"]))
+            return _power_of(of, sample.qdot, solved(of)[1] if driven else np.zeros_like(of["driving"]))
 
-    def _finite(self, columns) -> np.ndarray:
+    def _finite(self, sample: Sample) -> np.ndarray:
         """True if M, F, G and γ have finite derivatives by all inputs at S states, (S,).
 
         One transposed derivative of the sum of them all is taken, which a single NaN makes NaN. The program's own
         operations answer first. Where they say no, the program may have written a power as a root, or the user may have
         given a rule for a derivative: there the derivative of the functions themselves decides.
         """
-        program = self.derivation.program(*_SYSTEM)
-        count = max(np.size(x) for x in columns)
+        program = self.derivation.program(*SADDLE)
 
-        def finite_at(*part):
-            bars = [bar for bar in program.vjp_many(part, [1.0] * len(program.outputs)) if bar is not None]
-            finite = np.all([np.isfinite(np.broadcast_to(bar, part[0].shape)) for bar in bars], axis=0)
-            return np.broadcast_to(finite, part[0].shape)
+        def finite_at(part: Sample):
+            bars = program.vjp_many(part.columns, [1.0] * len(program.outputs))
+            flags = [np.isfinite(np.broadcast_to(bar, len(part.q))) for bar in bars if bar is not None]
+            return np.broadcast_to(np.all(flags, axis=0), len(part.q))
 
-        finite = _in_parts(finite_at, max(1, _STORED // len(program.nodes)), count, *columns)
+        finite = sample.in_parts(finite_at, max(1, _STORED // len(program.nodes)))
         if finite.all():
             return finite
-        doubtful = [x if np.ndim(x) == 0 else x[~finite] for x in columns]
+        doubtful = [x if np.ndim(x) == 0 else x[~finite] for x in sample.columns]
         try:
             slopes = self._total_slopes.evaluate_many(doubtful)
         except Unlowerable:
@@ -191,26 +143,8 @@ class Law(NamedTuple):
         )
 
 
-_SYSTEM = ("mass_matrix", "force", "jacobian", "gamma")
 _SOURCES = ("lagrangian_by_t", "nonconservative_force", "driving")
-_QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *_SYSTEM, *_SOURCES)
-
-
-def _in_parts(function: Callable, size: int, count: int, *arguments):
-    """`function` of `count` states, evaluated on at most `size` of them at a time; single numbers go to every part."""
-
-    def cut(x, start):
-        return x if np.ndim(x) == 0 else x[start : start + size]
-
-    parts = [
-        function(*jax.tree.map(lambda x, k=start: cut(x, k), arguments, is_leaf=lambda x: isinstance(x, np.ndarray)))
-        for start in range(0, count, size)
-    ]
-    return parts[0] if len(parts) == 1 else jax.tree.map(lambda *some: np.concatenate(some), *parts)
-
-
-def _solved(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    return saddle_many(*(of[name] for name in _SYSTEM))
+_QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *SADDLE, *_SOURCES)
 
 
 def _power_of(of: dict[str, np.ndarray], qdot, multipliers) -> np.ndarray:
@@ -267,15 +201,15 @@ def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int,
 # ---- one state, in JAX -----------------------------------------------------------------------------------------------
 
 
-def sample_at(law: Law, momenta: tuple[int, ...], tolerances, q, qdot, t, params) -> Sample:
-    """A `Sample` of one state, with the momenta of the coordinates in `momenta`."""
+def measurements_at(law: Law, momenta: tuple[int, ...], tolerances, q, qdot, t, params) -> Measurements:
+    """The `Measurements` at one state, with the momenta of the coordinates in `momenta`."""
     motion, state = law.motion, (q, qdot, t, params)
     conserved = motion.energy_and_momenta(momenta, *state)
     by_q, by_qdot = map(jnp.abs, jax.jacrev(motion.energy_and_momenta, argnums=(1, 2))(momenta, *state))
     (rtol, atol), far, fast = tolerances, jnp.abs(q), jnp.abs(qdot)
     terms = jnp.abs(motion.momentum(*state)) @ fast + jnp.abs(motion.lagrangian(*state))
     off_q, off_qdot = motion.constraints.distances(*state)
-    return Sample(
+    return Measurements(
         conserved=conserved,
         slopes=by_q @ (rtol * far + atol) + by_qdot @ (rtol * fast + atol),
         sizes=(by_q @ far + by_qdot @ fast).at[0].add(terms),

@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._doubles import DOUBLE
-from lagjax._health._laws import Law, Sample, power_at, sample_at
+from lagjax._health._laws import Law, Measurements, measurements_at, power_at
 from lagjax._layout import Layout
+from lagjax._many_states import Sample, borders_of, is_lowered
 from lagjax._members import Members
 from lagjax._validate import is_concrete
 
@@ -85,7 +86,7 @@ def measured(trajectory) -> tuple[dict[str, Any], Names]:
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         members = Members(trajectory)
         laws = _laws(trajectory, members.layout, members.params)
-        if all(law.lowered() for law in laws):
+        if all(is_lowered(law.derivation) for law in laws):
             return _report_of(members, laws), _names(laws, members.layout)
     axes, tree = jax.tree.flatten(trajectory.params_axes, is_leaf=lambda axis: axis is None)  # hashable
     arrays = dataclasses.replace(trajectory, stats={}, params_axes=None)
@@ -150,7 +151,7 @@ def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
     starts = np.cumsum([0, *(len(law.names) for law in laws)])
 
     def by_mode(function: Callable, q, qdot, t, mode):
-        """`function(law, index, states…)` on the states of each mode, in the order of all states, (N, S, …)."""
+        """`function(law, index, member, sample)` on the states of each mode, in the order of all states, (N, S, …)."""
         shape, total = t.shape, None
         q, qdot = (np.ascontiguousarray(x.reshape(-1, x.shape[-1])) for x in (q, qdot))
         t, mode = t.reshape(-1), mode.reshape(-1)
@@ -160,7 +161,8 @@ def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
             if not len(here):
                 continue
             numbers = [x if np.ndim(x) == 0 else x[member[here]] for x in members.numbers]
-            values = function(law, index, member[here], q[here], qdot[here], t[here], numbers)
+            sample = Sample(law.derivation, q[here], qdot[here], t[here], numbers)
+            values = function(law, index, member[here], sample)
             if len(here) == len(mode):
                 total = values
                 break
@@ -170,26 +172,21 @@ def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
                 all_states[here] = part
         return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), total)
 
-    def sampled(law, index, member, q, qdot, t, numbers) -> Sample:
+    def measured(law, index, member, sample) -> Measurements:
         tolerances = (0.0, 0.0) if path.tolerances is None else (x[member] for x in path.tolerances)
-        sample = law.samples(momenta, tuple(tolerances), q, qdot, t, numbers)
+        found = law.measurements(momenta, tuple(tolerances), sample)
         before, after = int(starts[index]), int(starts[-1] - starts[index + 1])
-        distances, rates = (np.pad(x, ((0, 0), (before, after))) for x in (sample.distances, sample.rates))
-        return sample._replace(distances=distances, rates=rates)
+        distances, rates = (np.pad(x, ((0, 0), (before, after))) for x in (found.distances, found.rates))
+        return found._replace(distances=distances, rates=rates)
 
-    def powers(law, index, member, q, qdot, t, numbers):
-        return law.powers(q, qdot, t, numbers)
-
-    def accelerations(law, index, member, q, qdot, t, numbers):
-        return law.accelerations(q, qdot, t, numbers)
-
-    def pieces(law, index, member, q, qdot, t, numbers):
-        return law.pieces(q, qdot, t, numbers)
+    def along(function: Callable) -> Callable:
+        return partial(by_mode, lambda law, index, member, sample: function(law, sample))
 
     with np.errstate(all="ignore"):
-        decided = partial(by_mode, pieces) if any(law.decides for law in laws) else None
-        between = Between(partial(by_mode, powers), partial(by_mode, accelerations), decided)
-        fields = _report(path, laws, momenta, partial(by_mode, sampled), between)
+        decides = any(borders_of(law.derivation) is not None for law in laws)
+        decided = along(lambda law, sample: sample.pieces()) if decides else None
+        between = Between(along(Law.powers), along(Law.accelerations), decided)
+        fields = _report(path, laws, momenta, partial(by_mode, measured), between)
     return jax.tree.map(lambda x: jnp.asarray(np.reshape(x, members.batch + np.shape(x)[1:])), fields)
 
 
@@ -214,7 +211,7 @@ def _measured(trajectory, axes, tree, steps):
         def chunked(function):
             return lambda *states: _in_chunks(partial(_in_its_mode, laws, function), states, size)
 
-        sample = chunked(lambda law, q, v, t: sample_at(law, momenta, tolerances, q, v, t, numbers))
+        sample = chunked(lambda law, q, v, t: measurements_at(law, momenta, tolerances, q, v, t, numbers))
         between = Between(
             chunked(lambda law, q, v, t: power_at(law, q, v, t, numbers)),
             chunked(lambda law, q, v, t: law.motion.acceleration(q, v, t, numbers)),
@@ -248,7 +245,7 @@ def _in_its_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
     total = None
     for index, law in enumerate(laws):
         value = function(law, q, qdot, t)
-        if isinstance(value, Sample):
+        if isinstance(value, Measurements):
             distances, rates = (
                 jnp.zeros(starts[-1], q.dtype).at[starts[index] : starts[index + 1]].set(of_law)
                 for of_law in (value.distances, value.rates)
@@ -277,7 +274,7 @@ def _in_chunks(function, arrays, size: int):
 
 
 def _report(path: Path, laws: list[Law], momenta: tuple[int, ...], sample: Callable, between: "Between") -> dict:
-    """All measured fields; `sample(q, qdot, t, mode)` gives `Sample`s of states."""
+    """All measured fields; `sample(q, qdot, t, mode)` gives the `Measurements` at states."""
     xp, axis, T, dtype = path.library, path.time, path.ts.shape[-1], path.q.dtype
     q, qdot, t, mode = path[:4]
     reached = xp.isfinite(q).all(axis=-1) & xp.isfinite(qdot).all(axis=-1) & (mode >= 0)
@@ -338,7 +335,7 @@ def _ends(xp, ts, transitions):
     return xp.where(between, T + first, xp.arange(1, T))
 
 
-def _drifts(path: Path, laws, momenta, samples: Sample, reached, between: "Between") -> tuple[Any, Any]:
+def _drifts(path: Path, laws, momenta, samples: Measurements, reached, between: "Between") -> tuple[Any, Any]:
     """|h − h₀ − W| and |pᵢ − pᵢ₀| at every output, a column each, and how far W may be off, (…).
 
     A piece of the path, from an output to its entry in `ends`, counts for a quantity that its mode conserves; whatever
@@ -394,7 +391,7 @@ _CORRECTIONS = np.linalg.inv(_BENDS).T @ _VANISHING  # (2, 8)
 INSIDE = 1e-9  # how far from its ends a piece of the path is asked what its program decides there
 
 
-def _work(path: Path, samples: Sample, measurable, between: Between) -> tuple[Any, Any]:
+def _work(path: Path, samples: Measurements, measurable, between: Between) -> tuple[Any, Any]:
     """∫ P dt over every piece, (…, T − 1), and how far the sum of them may be off, (…).
 
     Between its ends the motion is replaced by a polynomial. The one of degree five that has their q, q̇ and q̈ is off by
@@ -508,7 +505,7 @@ def _amplitude(xp, q, on_path):
     return xp.where(largest > rounding, largest, math.inf)
 
 
-def _limits(path: Path, here: Sample, on_path) -> tuple[Any, Any]:
+def _limits(path: Path, here: Measurements, on_path) -> tuple[Any, Any]:
     """The largest drift of h and the momenta by errors of steps and round-off, and their sizes, (…, k) each.
 
     Fixed steps have no tolerances: there `VISIBLE` of the size is the limit.

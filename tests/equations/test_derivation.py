@@ -9,6 +9,7 @@ from jax import lax
 
 import lagjax
 from lagjax import _derivation, _diffrax, _machine_code, _program, scenes
+from lagjax import _many_states as many_states
 from lagjax._check import _measure as of_check
 from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._health import _measure as of_health
@@ -205,7 +206,7 @@ def test_check_and_health_compile_nothing_where_there_are_programs(monkeypatch):
     def compiled(*_):
         raise AssertionError("compiled by XLA")
 
-    monkeypatch.setattr(of_check, "_measure", compiled)
+    monkeypatch.setattr(many_states, "_compiled", compiled)
     monkeypatch.setattr(of_check, "_variation", compiled)
     monkeypatch.setattr(of_health, "_measured", compiled)
     for make in (scenes.rolling_cylinder, scenes.damped_driven_oscillator):
