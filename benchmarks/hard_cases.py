@@ -4,8 +4,8 @@
     python -m benchmarks.hard_cases --only Kepler Arenstorf --no-peers
 
 Prints one table and keeps it, with commit, versions and machine, in `benchmarks/results/hard_cases.json`, and draws
-`hard_cases.png` beside it. The cases are in `benchmarks/_hard/`; `tests/trust/test_hard_cases.py` holds every one of them to
-its bound. Errors are absolute and in the units of the case, unless its name says otherwise.
+`hard_cases.png` beside it. The cases are in `benchmarks/_hard/`; `tests/trust/test_hard_cases.py` holds every one of
+them to its bound. Errors are absolute and in the units of the case, unless its name says otherwise.
 """
 
 import argparse

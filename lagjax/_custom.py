@@ -1,8 +1,8 @@
 """Values whose derivatives are those of another expression.
 
 `jax.custom_jvp` says the same, but inside `jax.lax.scan` its rule is lost where forward mode goes over reverse mode
-(jax 0.10: the value is then differentiated instead, without a word; tests/equations/test_custom.py keeps the case). A primitive
-of its own is not seen through.
+(jax 0.10: the value is then differentiated instead, without a word; tests/equations/test_custom.py keeps the case). A
+primitive of its own is not seen through.
 """
 
 from collections.abc import Callable
