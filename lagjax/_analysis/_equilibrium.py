@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._settle import settle
 from lagjax._analysis._solve import levenberg_marquardt, relative_size, shortest_preimage, shortest_solution
 from lagjax._doubles import accepts_singles
@@ -77,7 +77,7 @@ def equilibrium(
     """
     require_flag(throw, "throw")
     require_flag(stable, "stable")
-    scene = Scene.of(system, q, qdot, params)
+    scene = SceneState.of(system, q, qdot, params)
     scene.require_autonomous("An equilibrium")
     require_steady(scene)
     if stable:
@@ -91,7 +91,7 @@ def equilibrium(
     return Equilibrium(scene.layout.restore(place), of_user, ok)
 
 
-def _at_rest(scene: Scene, qdot: PyTree) -> Scene:
+def _at_rest(scene: SceneState, qdot: PyTree) -> SceneState:
     """The scene where it comes to rest with friction. Raises where that cannot be followed."""
     if qdot is not None:
         raise ValueError("stable=True finds where a scene comes to rest: leave qdot out, or look at normal_modes.")
@@ -100,10 +100,10 @@ def _at_rest(scene: Scene, qdot: PyTree) -> Scene:
             "stable=True follows a motion until it rests, and cannot be traced: find q outside of jit, vmap and grad, "
             "and give it to equilibrium(system, q, params) inside; derivatives by params are right there."
         )
-    return Scene.of(scene.system, settle(scene), None, scene.params)
+    return SceneState.of(scene.system, settle(scene), None, scene.params)
 
 
-def require_steady(scene: Scene) -> None:
+def require_steady(scene: SceneState) -> None:
     """Raise `ValueError` where a coordinate that something depends on has a velocity."""
     if not scene.concrete or scene.lowered is None:
         return
@@ -127,8 +127,8 @@ _TINY = 1e-6
 
 @eqx.filter_jit
 def _found(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
-    """q (n,), λ (m,) and whether they are an equilibrium, of a scene made of `Scene.arguments`."""
-    scene = Scene.flat(*arguments)
+    """q (n,), λ (m,) and whether they are an equilibrium, of a scene made of `SceneState.arguments`."""
+    scene = SceneState.flat(*arguments)
     n = scene.layout.size
 
     def residual(z: Unknowns) -> Unknowns:
@@ -166,14 +166,14 @@ def _units(mass: Float[Array, "n n"], jacobian: Float[Array, "n+m n+m"]) -> Unkn
     return jnp.concatenate([1 / root, jnp.where(found, of_q / jnp.where(found, of_multipliers, 1), 1)])
 
 
-def balance(scene: Scene, q: Vector, multipliers: Array) -> Unknowns:
+def balance(scene: SceneState, q: Vector, multipliers: Array) -> Unknowns:
     """F + Gᵀλ (n,), then the constraints on positions and a zero for each on velocities (m,): zero in equilibrium."""
     force, jacobian = scene.force(q, scene.qdot), scene.jacobian(q, scene.qdot)
     rows = scene.motion.constraints.residual(q, scene.qdot, jnp.zeros((), q.dtype), scene.numbers)
     return jnp.concatenate([force + jacobian.T @ multipliers, rows])
 
 
-def least_multipliers(scene: Scene, q: Vector) -> Array:
+def least_multipliers(scene: SceneState, q: Vector) -> Array:
     """λ (m,) that leave the smallest force F + Gᵀλ; of least norm where constraints are redundant."""
     if not scene.constrained:
         return jnp.zeros(0, q.dtype)
@@ -205,7 +205,7 @@ def _is_root(residual, z: Unknowns, least: Unknowns) -> Bool[Array, ""]:
     return jnp.all(jnp.abs(residual(z)) <= jnp.sqrt(jnp.finfo(z.dtype).eps) * size)
 
 
-def _sentence(scene: Scene) -> str:
+def _sentence(scene: SceneState) -> str:
     """The reason why no equilibrium was found from the guess."""
     force = scene.force(scene.q, scene.qdot)
     gradient = jax.jacfwd(scene.force)(scene.q, scene.qdot)

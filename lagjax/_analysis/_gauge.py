@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lagjax._analysis._fields import Fields
-from lagjax._analysis._noether import State, variation
+from lagjax._analysis._noether import FlatState, variation
 from lagjax._analysis._potential import along_line
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene_state import SceneState
+from lagjax._analysis._transformations import Fields
 from lagjax._doubles import accepts_singles
 
 # Parts of the terms of Λ that count as zero, and what the gradient of G may be off.
@@ -38,7 +38,7 @@ class Changes(NamedTuple):
     gradients: np.ndarray
 
 
-def changes_of(scene: Scene, fields: Fields, weights: np.ndarray, states: State) -> tuple[Changes, State]:
+def changes_of(scene: SceneState, fields: Fields, weights: np.ndarray, states: FlatState) -> tuple[Changes, FlatState]:
     """Those of the transformations with these weights (D, K), at the states where they are finite, and these states.
 
     Raises `ValueError` where there are none.
@@ -50,10 +50,10 @@ def changes_of(scene: Scene, fields: Fields, weights: np.ndarray, states: State)
             "The Lagrangian is finite at no state about (q, qdot), although derivatives are: give a state in "
             "the middle of where motions take place."
         )
-    return Changes(*(x[well] for x in parts)), State(*(x[well] for x in states))
+    return Changes(*(x[well] for x in parts)), FlatState(*(x[well] for x in states))
 
 
-def gauge_of(scene: Scene, fields: Fields, weights: np.ndarray, k: int, changes: Changes) -> Callable | None:
+def gauge_of(scene: SceneState, fields: Fields, weights: np.ndarray, k: int, changes: Changes) -> Callable | None:
     """G(q, t=0.0, params=None) of the symmetry with these weights (K,), number k; None where L does not change."""
     values, slopes, at_rest, sizes = (x[:, k] for x in changes[:4])
     size = sizes.max()
@@ -63,7 +63,7 @@ def gauge_of(scene: Scene, fields: Fields, weights: np.ndarray, k: int, changes:
     return _function(scene, fields, weights, bool(spread and np.abs(at_rest).max() <= _ZERO * size))
 
 
-def is_right(gauge: Callable, scene: Scene, fields: Fields, k: int, changes: Changes, states: State) -> bool:
+def is_right(gauge: Callable, scene: SceneState, fields: Fields, k: int, changes: Changes, states: FlatState) -> bool:
     """True if ∂G/∂q and ∂G/∂t are what transformation number k asks for, at some of the states of `changes`.
 
     Of a piecewise L each piece may have a G of its own, and there is none for all.
@@ -85,13 +85,13 @@ def is_right(gauge: Callable, scene: Scene, fields: Fields, k: int, changes: Cha
     )
 
 
-def _function(scene: Scene, fields: Fields, weights: np.ndarray, constant: bool) -> Callable:
+def _function(scene: SceneState, fields: Fields, weights: np.ndarray, constant: bool) -> Callable:
     layout, system = scene.layout, scene.system
     reference = np.asarray(scene.q)
 
     @accepts_singles(("q",), ("t", "params"))
     def gauge(q, t=0.0, params=None):
-        there = Scene.flat(system, layout, layout.flatten(q), jnp.zeros(layout.size, layout.dtype), params)
+        there = SceneState.flat(system, layout, layout.flatten(q), jnp.zeros(layout.size, layout.dtype), params)
         transform = fields.transform(jnp.asarray(weights, layout.dtype), params)
         start, t = jnp.asarray(reference, layout.dtype), jnp.asarray(t, layout.dtype)
 
@@ -112,9 +112,9 @@ def _function(scene: Scene, fields: Fields, weights: np.ndarray, constant: bool)
 
 
 @eqx.filter_jit
-def _changes(weights: Array, fields: Fields, states: State, *arguments) -> tuple:
+def _changes(weights: Array, fields: Fields, states: FlatState, *arguments) -> tuple:
     """The fields of `Changes`."""
-    scene = Scene.flat(*arguments)
+    scene = SceneState.flat(*arguments)
 
     def of_state(state):
         return jax.lax.map(lambda w: _change(scene, fields, fields.transform(w, scene.params), state), weights)
@@ -122,7 +122,7 @@ def _changes(weights: Array, fields: Fields, states: State, *arguments) -> tuple
     return jax.lax.map(of_state, states)
 
 
-def _change(scene: Scene, fields: Fields, transform: Callable, state: State) -> tuple:
+def _change(scene: SceneState, fields: Fields, transform: Callable, state: FlatState) -> tuple:
     q, qdot, t = state.q, state.qdot, state.t
 
     def change(qdot):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._smooth import is_smooth, require_smooth
 from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
@@ -63,7 +63,7 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
     print(lagjax.linearize(pendulum, 0.0).A)  # [[0, 1], [-9.81, 0]]
     ```
     """
-    scene = Scene.of(system, q, qdot, params)
+    scene = SceneState.of(system, q, qdot, params)
     scene.require_autonomous("A linearization")
     require_smooth(scene, "A linearization")
     return Linearization(*_linearized(*scene.arguments), names=scene.layout.names)
@@ -71,7 +71,7 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
 
 @eqx.filter_jit
 def _linearized(*arguments) -> tuple:
-    scene = Scene.flat(*arguments)
+    scene = SceneState.flat(*arguments)
     n, q, qdot = scene.layout.size, scene.q, scene.qdot
     motion, t, numbers = scene.motion, jnp.zeros((), q.dtype), scene.numbers
     zero, one = jnp.zeros((n, n), q.dtype), jnp.eye(n, dtype=q.dtype)
@@ -88,7 +88,7 @@ def _linearized(*arguments) -> tuple:
     return a, b, mass, 0.5 * (rates + rates.T), 0.5 * (rates - rates.T), stiffness, jacobian
 
 
-def matrices(scene: Scene, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array]:
+def matrices(scene: SceneState, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array]:
     """M, C + G, K of small deviations from the motion through (q, q̇), (n, n) each, and the constraint Jacobian (m, n).
 
     They are minus the derivatives of F + Gᵀλ − M q̈ at fixed q̈ and λ.
@@ -110,7 +110,7 @@ def matrices(scene: Scene, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array]:
     return mass, -rates, -stiffness, jacobian
 
 
-def steady_matrices(scene: Scene, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array, Vector]:
+def steady_matrices(scene: SceneState, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array, Vector]:
     """`matrices` at an equilibrium, where q̈ is zero whatever M is, and what is left of the forces there (n,)."""
     jacobian = scene.jacobian(q, scene.qdot)
     force = scene.force(q, scene.qdot)

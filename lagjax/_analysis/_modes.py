@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from lagjax._analysis._eigen import exponents_and_modes, null_space, symmetric_modes
 from lagjax._analysis._equilibrium import require_steady
 from lagjax._analysis._linearize import steady_matrices
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._smooth import is_smooth, require_smooth
 from lagjax._analysis._solve import shortest_solution
 from lagjax._doubles import accepts_singles
@@ -122,7 +122,7 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     print(lagjax.normal_modes(pendulum, 0.0))  # sqrt(9.81)
     ```
     """
-    scene = Scene.of(system, q, qdot, params)
+    scene = SceneState.of(system, q, qdot, params)
     scene.require_autonomous("A normal mode")
     require_steady(scene)
     require_smooth(scene, "A normal mode")
@@ -153,7 +153,7 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
 _BALANCED = 1e-6
 
 
-def _rank(scene: Scene) -> int:
+def _rank(scene: SceneState) -> int:
     """The number of independent constraints at q; all of them where there are no numbers to ask."""
     if not scene.constrained:
         return 0
@@ -172,7 +172,7 @@ def _rank(scene: Scene) -> int:
 @eqx.filter_jit
 def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> tuple:
     """Exponents (k, 2) and shapes (k, n) of the k degrees of freedom, and how far q is from an equilibrium."""
-    scene = Scene.flat(*arguments)
+    scene = SceneState.flat(*arguments)
     q = scene.q
     matrices = steady_matrices(scene, q)
     unit = jax.lax.stop_gradient(diagonal_scale(matrices[0]))
@@ -211,7 +211,7 @@ def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
 
 
 def _distance(
-    scene: Scene, unit: Vector, jacobian: Float[Array, "m n"], left: Vector, stiffness: Matrix
+    scene: SceneState, unit: Vector, jacobian: Float[Array, "m n"], left: Vector, stiffness: Matrix
 ) -> Float[Array, ""]:
     """The distance of q from an equilibrium, in units of its size: by the forces that are left, and by the constraints.
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene_state import SceneState
 from lagjax._arguments import Function, accept, present
 from lagjax._layout import Layout
 from lagjax._program import Unlowerable
@@ -43,7 +43,7 @@ def cyclic_coordinates(system: System, q: PyTree, qdot: PyTree, params: PyTree =
     lagjax.cyclic_coordinates(kepler, {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 1.0})  # ("q['phi']",)
     ```
     """
-    scene = Scene.of(system, q, qdot, params)
+    scene = SceneState.of(system, q, qdot, params)
     try:
         read = scene.derivation.reads("lagrangian")
     except Unlowerable as reason:
@@ -124,7 +124,7 @@ def _is_like(value: PyTree, layout: Layout) -> bool:
 # ---- the variation of L ----------------------------------------------------------------------------------------------
 
 
-class State(NamedTuple):
+class FlatState(NamedTuple):
     """A state off the motion as well as on it: q, q̇ and q̈ (n,) are anything, at the time t."""
 
     q: Vector
@@ -133,7 +133,7 @@ class State(NamedTuple):
     t: Float[Array, ""]
 
 
-def variation(scene: Scene, transform: Callable, q: Vector, qdot: Vector, t) -> Float[Array, ""]:
+def variation(scene: SceneState, transform: Callable, q: Vector, qdot: Vector, t) -> Float[Array, ""]:
     """Λ of the transformation (ξ, τ) = `transform(q, t)`."""
 
     def lagrangian(q, qdot, t):
@@ -144,7 +144,7 @@ def variation(scene: Scene, transform: Callable, q: Vector, qdot: Vector, t) -> 
     return moved + value * rate_of_time
 
 
-def euler_lagrange(function: Callable, state: State) -> tuple[Vector, Vector]:
+def euler_lagrange(function: Callable, state: FlatState) -> tuple[Vector, Vector]:
     """d/dt ∂Λ/∂q̇ and ∂Λ/∂q (n,) of a function Λ(q, q̇, t): their difference is zero where Λ is some dG(q, t)/dt."""
     by_q, by_qdot = jax.grad(function, argnums=0), jax.grad(function, argnums=1)
     place = state.q, state.qdot, state.t

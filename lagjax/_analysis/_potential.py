@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lagjax._analysis._noether import State
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._noether import FlatState
+from lagjax._analysis._scene_state import SceneState
 from lagjax._scales import Scales
 from lagjax._system import System
 
@@ -69,7 +69,7 @@ def _work(force: Callable, start: Array, end: Array, scale: np.ndarray) -> Array
     return jnp.where(sure, fine[best, 0], jnp.nan)
 
 
-def with_potential(scene: Scene, scales: Scales, states: State) -> Scene:
+def with_potential(scene: SceneState, scales: Scales, states: FlatState) -> SceneState:
     """The scene with its forces in L where they have a potential, as far as some states tell; else the scene."""
     if scene.motion.forces is None or not _have_potential(scene, scales, states):
         return scene
@@ -94,10 +94,10 @@ def with_potential(scene: Scene, scales: Scales, states: State) -> Scene:
         constraints=system.constraints,
         velocity_constraints=system.velocity_constraints,
     )
-    return Scene.of(whole, layout.restore(scene.q), layout.restore(scene.qdot), scene.params)
+    return SceneState.of(whole, layout.restore(scene.q), layout.restore(scene.qdot), scene.params)
 
 
-def _have_potential(scene: Scene, scales: Scales, states: State) -> bool:
+def _have_potential(scene: SceneState, scales: Scales, states: FlatState) -> bool:
     terms = [np.asarray(x) for x in _derivatives(states, *scene.arguments)]
     well = np.logical_and.reduce([np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in terms])
     if not well.any():
@@ -111,9 +111,9 @@ def _have_potential(scene: Scene, scales: Scales, states: State) -> bool:
 
 
 @eqx.filter_jit
-def _derivatives(states: State, *arguments) -> tuple[Array, Array, Array]:
+def _derivatives(states: FlatState, *arguments) -> tuple[Array, Array, Array]:
     """Q (S, n), ∂Q/∂q and ∂Q/∂q̇ (S, n, n)."""
-    scene = Scene.flat(*arguments)
+    scene = SceneState.flat(*arguments)
 
     def of_state(state):
         def force(q, qdot):

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from lagjax._analysis._coordinates import asking
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene_state import SceneState
 from lagjax._arguments import present
 from lagjax._layout import Layout
 from lagjax._linear import factorize
@@ -68,7 +68,7 @@ def routhian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> 
     print(radial.names)  # ("q['r']",)
     ```
     """
-    scene = Scene.of(system, q, qdot, params)
+    scene = SceneState.of(system, q, qdot, params)
     if scene.constrained or system.forces is not None or system.dissipation is not None:
         raise ValueError("routhian is of systems without constraints, forces and dissipation: R is a Lagrangian alone.")
     gone, layout = np.array(scene.conserved, int), scene.layout

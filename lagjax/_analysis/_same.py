@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lagjax._analysis._noether import State, euler_lagrange
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._noether import FlatState, euler_lagrange
+from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._states import moved_by_rounding, random_states
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
@@ -83,7 +83,7 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     ```
     """
     a, b = require_system(a), require_system(b)
-    scenes = Scene.of(a, q, qdot, params), Scene.of(b, q, qdot, params)
+    scenes = SceneState.of(a, q, qdot, params), SceneState.of(b, q, qdot, params)
     if any(scene.constrained for scene in scenes):
         raise ValueError("same_motion compares Lagrangians: give systems without constraints.")
     if not all(scene.concrete for scene in scenes):
@@ -108,7 +108,7 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     return SameMotion(bool(same), factor, residual, threshold, where)
 
 
-def _compared(scenes, states: State) -> tuple[float, np.ndarray, np.ndarray] | None:
+def _compared(scenes, states: FlatState) -> tuple[float, np.ndarray, np.ndarray] | None:
     """The factor f, |E_a − f E_b| over its terms (S, n), and which states are finite (S,); None where few are."""
     (of_a, size_a), (of_b, size_b) = (map(np.asarray, _equations(states, *scene.arguments)) for scene in scenes)
     well = np.asarray(np.isfinite(of_a).all(axis=1) & np.isfinite(of_b).all(axis=1))
@@ -128,9 +128,9 @@ def _compared(scenes, states: State) -> tuple[float, np.ndarray, np.ndarray] | N
 
 
 @eqx.filter_jit
-def _equations(states: State, *arguments) -> tuple[Array, Array]:
+def _equations(states: FlatState, *arguments) -> tuple[Array, Array]:
     """E (S, n) and the size of its terms (S, n)."""
-    scene = Scene.flat(*arguments)
+    scene = SceneState.flat(*arguments)
 
     def lagrangian(q, qdot, t):
         return scene.motion.lagrangian(q, qdot, t, scene.numbers)
@@ -143,7 +143,7 @@ def _equations(states: State, *arguments) -> tuple[Array, Array]:
     return jax.lax.map(of_state, states)
 
 
-def _place(layout: Layout, states: State, k: int, coordinate: int) -> str:
+def _place(layout: Layout, states: FlatState, k: int, coordinate: int) -> str:
     def shown(x):
         return ", ".join(f"{value:.4g}" for value in x[k][:8]) + (", …" if x.shape[1] > 8 else "")
 

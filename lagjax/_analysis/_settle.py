@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import levenberg_marquardt
 from lagjax._results import SimulationError
 from lagjax._simulate import simulate
@@ -26,7 +26,7 @@ _STAGES, _TIMES, _AT_REST = 16, 20.0, 1e-4
 _RTOL = 1e-6
 
 
-def settle(scene: Scene) -> PyTree:
+def settle(scene: SceneState) -> PyTree:
     """q where the scene comes to rest with friction, in the user's pytree. Raises `ValueError` where it does not."""
     scales, layout = scene.scales, scene.layout
     aside = np.asarray(scene.q) + _ASIDE * scales.q * np.cos(np.arange(1.0, layout.size + 1))
@@ -50,7 +50,7 @@ def settle(scene: Scene) -> PyTree:
     )
 
 
-def _near_constraints(scene: Scene, q: PyTree) -> PyTree:
+def _near_constraints(scene: SceneState, q: PyTree) -> PyTree:
     """q after damped steps to where the constraints hold: the projection needs to begin near."""
     place = scene.layout.flatten(q)
     unit = jnp.asarray(scene.scales.q, place.dtype)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene_state import SceneState
 from lagjax._blame import borders, pieces_of
 
 # Where forces are compared, in sizes of a coordinate. A border within the first distance is at the state: equilibria
@@ -34,7 +34,7 @@ class _Rough(NamedTuple):
     changed: Bool[Array, "2n sides"]
 
 
-def is_smooth(scene: Scene) -> Bool[Array, ""]:
+def is_smooth(scene: SceneState) -> Bool[Array, ""]:
     """True if the forces have derivatives at the state of a scene."""
     if not _pieces(scene):
         return jnp.asarray(True)
@@ -42,7 +42,7 @@ def is_smooth(scene: Scene) -> Bool[Array, ""]:
     return ~jnp.any(rough.jumps | rough.kinks)
 
 
-def require_smooth(scene: Scene, what: str) -> None:
+def require_smooth(scene: SceneState, what: str) -> None:
     """Raise `ValueError` where the force jumps or has a kink at the state, naming the coordinate and the line."""
     if not scene.concrete or not (pieces := _pieces(scene)):
         return
@@ -60,21 +60,21 @@ def require_smooth(scene: Scene, what: str) -> None:
         )
 
 
-def _pieces(scene: Scene) -> list[tuple[str, str, int]]:
+def _pieces(scene: SceneState) -> list[tuple[str, str, int]]:
     """The borders of the functions of a scene: name, place, and how many numbers each compares."""
     return [piece for function in _functions(scene) for piece in pieces_of(function, *_state(scene))]
 
 
-def _functions(scene: Scene) -> list:
+def _functions(scene: SceneState) -> list:
     motion = scene.motion
     return [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
 
 
-def _state(scene: Scene) -> tuple:
+def _state(scene: SceneState) -> tuple:
     return scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers
 
 
-def _rough(scene: Scene) -> _Rough:
+def _rough(scene: SceneState) -> _Rough:
     q, v, t, numbers = jax.lax.stop_gradient(_state(scene))
     n, eps = len(q), jnp.finfo(q.dtype).eps
 

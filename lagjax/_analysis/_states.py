@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._analysis._noether import State
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._noether import FlatState
+from lagjax._analysis._scene_state import SceneState
 from lagjax._scales import Scales
 
 # How far states are drawn from that of the scene, in its scales: so that they do not come near an origin that is one
@@ -19,7 +19,7 @@ _FAR = 5.0
 _THIRD = 3
 
 
-def random_states(scene: Scene, scales: Scales, count: int, seed: int, piecewise: bool) -> State:
+def random_states(scene: SceneState, scales: Scales, count: int, seed: int, piecewise: bool) -> FlatState:
     """Random states about that of the scene, (count, …) each, on the constraints if there are any."""
     size, random = scene.layout.size, np.random.default_rng(seed)
     draws, t = random.uniform(-1, 1, (3, count, size)), random.uniform(-1, 1, count)
@@ -29,7 +29,7 @@ def random_states(scene: Scene, scales: Scales, count: int, seed: int, piecewise
     if scene.constrained:
         q, qdot = _projected(q, qdot, t, scene.system, scene.layout, scene.params)
     dtype = scene.layout.dtype
-    return State(*(jnp.asarray(x, dtype) for x in (q, qdot, scales.qdot / scales.t * draws[2], t)))
+    return FlatState(*(jnp.asarray(x, dtype) for x in (q, qdot, scales.qdot / scales.t * draws[2], t)))
 
 
 @eqx.filter_jit
@@ -38,10 +38,10 @@ def _projected(q, qdot, t, system, layout, params):
     return jax.vmap(lambda *y: motion.nearest_consistent(*y, numbers))(q, qdot, t)
 
 
-def moved_by_rounding(states: State) -> State:
+def moved_by_rounding(states: FlatState) -> FlatState:
     """The same states but for a few units in the last place, other ones in every number."""
     random = np.random.default_rng(0)
-    return State(*(x * (1 + _LAST * np.finfo(float).eps * random.choice([-1.0, 1.0], x.shape)) for x in states))
+    return FlatState(*(x * (1 + _LAST * np.finfo(float).eps * random.choice([-1.0, 1.0], x.shape)) for x in states))
 
 
 _LAST = 4  # units in the last place, which change what rounding leaves and nothing else

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax._analysis._fields import Fields, fields_of, named
 from lagjax._analysis._gauge import changes_of, gauge_of, is_right
-from lagjax._analysis._noether import State, euler_lagrange, flat_generator, variation
+from lagjax._analysis._noether import FlatState, euler_lagrange, flat_generator, variation
 from lagjax._analysis._potential import with_potential
-from lagjax._analysis._scene import Scene
+from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._states import moved_by_rounding, random_states
+from lagjax._analysis._transformations import Fields, fields_of, named
 from lagjax._arguments import accept
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
@@ -148,7 +148,7 @@ def conserved_quantities(
     print(lagjax.conserved_quantities(kepler, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.2])))  # energy, angular momentum
     ```
     """
-    scene = Scene.of(system, q, qdot, params)
+    scene = SceneState.of(system, q, qdot, params)
     if not scene.concrete:
         raise ValueError("conserved_quantities looks at numbers: call it outside of jit, vmap and grad, on one state.")
     piecewise, scales = scene.piecewise, scene.scales
@@ -215,7 +215,7 @@ class _Measured(NamedTuple):
         return vectors[rank:].T
 
 
-def _measured(scene: Scene, fields: Fields, states: State) -> _Measured:
+def _measured(scene: SceneState, fields: Fields, states: FlatState) -> _Measured:
     """The columns where they are finite, and their noise: how much they differ between states that hardly do."""
     of_lagrangian, of_others = _finite(*map(np.asarray, _columns(fields, states, *scene.arguments)))
     beside = _finite(*map(np.asarray, _columns(fields, moved_by_rounding(states), *scene.arguments)))
@@ -236,12 +236,12 @@ def _own(generators, layout: Layout) -> dict[str, Callable]:
 
 
 @eqx.filter_jit
-def _columns(fields: Fields, states: State, *arguments) -> tuple[Array, Array]:
+def _columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Array]:
     """The change under each of K transformations at S states: of L (S, n, K), of forces and constraints (S, r, K).
 
     Both in units of the terms that would have to cancel, so that entries are of order one unless there is a symmetry.
     """
-    scene = Scene.flat(*arguments)
+    scene = SceneState.flat(*arguments)
 
     def lagrangian(q, qdot, t):
         return scene.motion.lagrangian(q, qdot, t, scene.numbers)
@@ -264,7 +264,7 @@ def _columns(fields: Fields, states: State, *arguments) -> tuple[Array, Array]:
     return of_l / jnp.where(size > 0, size, 1), of_others / jnp.where(others > 0, others, 1)
 
 
-def _work(scene: Scene, transform: Callable, state: State) -> Array:
+def _work(scene: SceneState, transform: Callable, state: FlatState) -> Array:
     """The work of forces on ξ − q̇ τ (1,) or (0,), and the rates (m,) at which it leaves constraints."""
     (change, of_time), place = transform(state.q, state.t), (state.q, state.qdot, state.t, scene.numbers)
     moved = change - state.qdot * of_time
@@ -362,7 +362,9 @@ _SHOWN = 6
 # ---- the charge ------------------------------------------------------------------------------------------------------
 
 
-def _quantities(scene: Scene, fields: Fields, chosen: list, states: State) -> tuple[list[Conserved], list[str]]:
+def _quantities(
+    scene: SceneState, fields: Fields, chosen: list, states: FlatState
+) -> tuple[list[Conserved], list[str]]:
     """The conserved quantities of the chosen symmetries, and what is to be said about others."""
     if not chosen:
         return [], []
@@ -403,7 +405,7 @@ def _outside(rows: np.ndarray, row: np.ndarray) -> float:
     return float(np.linalg.norm(row - basis.T @ (basis @ row)) / size)
 
 
-def _charge(scene: Scene, fields: Fields, weights: np.ndarray, gauge: Callable | None) -> Callable:
+def _charge(scene: SceneState, fields: Fields, weights: np.ndarray, gauge: Callable | None) -> Callable:
     """p·ξ − h τ − G of the symmetry with these weights (K,)."""
     system, layout = scene.system, scene.layout
 

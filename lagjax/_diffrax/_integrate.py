@@ -18,8 +18,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from lagjax._diffrax._crossings import AdaptiveWrapper, Noting, may_jump, noting
 from lagjax._diffrax._equations import Equations
+from lagjax._diffrax._jumps import AdaptiveWrapper, Noting, may_jump, noting
 from lagjax._diffrax._solvers import Projected
 from lagjax._failures import differentiable_where
 from lagjax._layout import halves

@@ -60,7 +60,7 @@ from lagjax._fit._records import (
     whole,
 )
 from lagjax._fit._report import draw_record, record_matrix
-from lagjax._fit._residuals import Failure, Residuals, SystemResiduals
+from lagjax._fit._residuals import LostTrial, Residuals, SystemResiduals
 from lagjax._fit._result import Covariance, Fit, SignalNoise
 from lagjax._fit._search import (
     Reader,
@@ -522,7 +522,7 @@ class _Printer:
 
     def __call__(self, trial) -> None:
         self.trials += 1
-        if isinstance(trial, Failure):
+        if isinstance(trial, LostTrial):
             text = f"the motion failed. {trial.text.splitlines()[0]}"
         else:
             rms = np.sqrt(np.mean(trial.flat() ** 2, axis=0)) / self.size

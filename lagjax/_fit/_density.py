@@ -61,7 +61,7 @@ from scipy.special import polygamma
 from lagjax._doubles import accepts_singles
 from lagjax._fit._noise import AbstractNoise, NoiseScale, StudentT
 from lagjax._fit._parameters import AbstractSeparable
-from lagjax._fit._residuals import Failure, Point, Residuals, compressed
+from lagjax._fit._residuals import LostTrial, Residuals, Trial, compressed
 
 _LEAST_DOF, _MOST_DOF = 1.0, 200.0  # ν is between these, with a flat density of its logarithm
 
@@ -84,7 +84,7 @@ class Density:
     """
 
     def __init__(
-        self, question: Residuals, noise: AbstractNoise, point: Point, widths: NoiseScale, shares: np.ndarray,
+        self, question: Residuals, noise: AbstractNoise, point: Trial, widths: NoiseScale, shares: np.ndarray,
         prior: Callable | None = None,
     ):  # fmt: skip
         self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths
@@ -389,7 +389,7 @@ def expanded(chart: Chart) -> Surrogate | str:
     if size > _LARGEST and not plain:
         return f"The expansion of its residuals to second order would hold {size} numbers, more than {_LARGEST}."
     found = _bent(chart, states)
-    if isinstance(found, Failure):
+    if isinstance(found, LostTrial):
         return f"One standard deviation from the fit a motion fails. {question.where(found)}"
     middle, slopes, bends = found
     blocks = []
@@ -405,22 +405,22 @@ def expanded(chart: Chart) -> Surrogate | str:
     return Surrogate(chart, blocks)
 
 
-def _bent(chart: Chart, states: int) -> tuple[Point, list[np.ndarray], list[np.ndarray]] | Failure:
+def _bent(chart: Chart, states: int) -> tuple[Trial, list[np.ndarray], list[np.ndarray]] | LostTrial:
     """The trial at the centre, and of every batch J (N, T, S, d) and H (N, T, S, d, d); or the motion that failed."""
 
-    def at(zeta: np.ndarray) -> tuple[Point, list[np.ndarray]] | Failure:
+    def at(zeta: np.ndarray) -> tuple[Trial, list[np.ndarray]] | LostTrial:
         trial = _trial(chart, zeta)
-        return trial if isinstance(trial, Failure) else (trial, _jacobians(chart, trial, zeta, states))
+        return trial if isinstance(trial, LostTrial) else (trial, _jacobians(chart, trial, zeta, states))
 
     ways, columns = _ways(chart.density, states), []
     centre = at(np.zeros(len(chart.centre)))
-    if isinstance(centre, Failure):
+    if isinstance(centre, LostTrial):
         return centre
     for way, step in zip(ways.T, chart.room(ways), strict=True):
         right, left = at(step * way), at(-step * way)
-        if isinstance(right, Failure):
+        if isinstance(right, LostTrial):
             return right
-        if isinstance(left, Failure):
+        if isinstance(left, LostTrial):
             return left
         columns.append([(more - less) / (2 * step) for more, less in zip(right[1], left[1], strict=True)])
     return centre[0], centre[1], [np.stack(of_batch, axis=-1) for of_batch in zip(*columns, strict=True)]
@@ -441,14 +441,14 @@ def _ways(density: Density, states: int) -> np.ndarray:
     return ways[:-1]
 
 
-def _trial(chart: Chart, zeta: np.ndarray) -> Point | Failure:
+def _trial(chart: Chart, zeta: np.ndarray) -> Trial | LostTrial:
     """The residuals and their derivatives at ζ (D,)."""
     density, x = chart.density, chart.at(zeta)
     starts = np.where(density.of_starts < len(x), np.append(x, 0.0)[density.of_starts], density.point.starts)
     return density.question.evaluate(x[: len(density.point.u)], starts, notify=False)
 
 
-def _jacobians(chart: Chart, trial: Point, zeta: np.ndarray, states: int) -> list[np.ndarray]:
+def _jacobians(chart: Chart, trial: Trial, zeta: np.ndarray, states: int) -> list[np.ndarray]:
     """The slopes of the weighted residuals of every batch by ζ, (N, T, S, d)."""
     density = chart.density
     question, free, places = density.question, len(density.point.u), _places(density, states)

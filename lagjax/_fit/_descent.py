@@ -38,7 +38,7 @@ import numpy as np
 
 from lagjax._fit._density import Density
 from lagjax._fit._noise import AbstractNoise, NoiseScale
-from lagjax._fit._residuals import Failure, Point, Residuals, compressed, triangle_of
+from lagjax._fit._residuals import LostTrial, Residuals, Trial, compressed, triangle_of
 from lagjax._fit._uncertainty import independent_share
 
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
@@ -64,7 +64,7 @@ class Descent(NamedTuple):
     """The end of a search: the last trial, its noise, whether it converged, how many trials, a sentence, and the
     residuals that it minimised, `question`."""
 
-    point: Point
+    point: Trial
     widths: NoiseScale
     converged: bool
     trials: int
@@ -72,7 +72,7 @@ class Descent(NamedTuple):
     question: Residuals
 
 
-class Step(NamedTuple):
+class DescentStep(NamedTuple):
     """δu (F,), δs (N, 2n), and by how much half the sum of squares falls if all is linear."""
 
     u: np.ndarray
@@ -108,16 +108,16 @@ def minimise(
     enough: float,
     limit: int = 60,
     anchor: Anchor | None = None,
-) -> Descent | Failure:
+) -> Descent | LostTrial:
     """The unknowns that make the measurements likeliest, by a search from (u, starts).
 
     It ends when a step without damping, within the reach of the transforms, promises to lower half the sum of squares,
     in units of the noise, by less than `enough`, correlated residuals counted for what they are worth: then no
     parameter is further than √(2 enough) standard deviations from the minimum.
-    A `Failure` is returned where the motion from the first trial cannot be followed.
+    A `LostTrial` is returned where the motion from the first trial cannot be followed.
     """
     point = question.evaluate(u, starts)
-    if isinstance(point, Failure):
+    if isinstance(point, LostTrial):
         return point
     anchor = Anchor.none(u) if anchor is None else anchor
     damping, trials, falls = _FIRST, 1, [(1, np.inf)]
@@ -154,13 +154,13 @@ class _Model(NamedTuple):
     limits: tuple[np.ndarray, np.ndarray]
     cost: float
 
-    def step(self, damping: float) -> Step:
+    def step(self, damping: float) -> DescentStep:
         """The damped step from the trial."""
         scale = column_norms(self.triangles, self.states)
         return eliminate(self.triangles, self.states, scale, damping, self.pull, self.limits)
 
 
-def _model(question: Residuals, point: Point, noise: AbstractNoise, anchor: Anchor) -> _Model:
+def _model(question: Residuals, point: Trial, noise: AbstractNoise, anchor: Anchor) -> _Model:
     widths = question.widths(point, noise)
     factors = question.factors(point, widths)
     triangles, cost = question.triangles(point, factors), question.cost(point, factors) + anchor.cost(point.u)
@@ -169,8 +169,8 @@ def _model(question: Residuals, point: Point, noise: AbstractNoise, anchor: Anch
 
 
 def _descended(
-    question: Residuals, point: Point, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
-) -> tuple[Point | None, float, int]:
+    question: Residuals, point: Trial, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
+) -> tuple[Trial | None, float, int]:
     """The first trial that is better, the damping to go on with, and the count of trials.
 
     There is none, but None, after `limit` trials, or where steps promise no more than sums of squares are rounded to.
@@ -182,7 +182,7 @@ def _descended(
             break
         trial = question.evaluate(question.parameters.stepped(point.u, step.u), point.starts + step.starts)
         trials += 1
-        if not isinstance(trial, Failure):
+        if not isinstance(trial, LostTrial):
             fall = model.cost - question.cost(trial, model.factors) - anchor.cost(trial.u)
             if fall > 0.0:
                 return trial, max(_LEAST, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3)), trials
@@ -190,7 +190,7 @@ def _descended(
     return None, damping, trials
 
 
-def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, limits=(-np.inf, np.inf)) -> Step:
+def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, limits=(-np.inf, np.inf)) -> DescentStep:
     """The damped step for the triangles (N, D + 1, D + 1) of all pieces, whose first `states` columns are starts.
 
     `scale` holds the norms of the columns (`column_norms`), and `pull` is (weight, residuals), (F,) each, of an anchor
@@ -209,7 +209,7 @@ def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, l
     whole = np.concatenate([ds, np.broadcast_to(du, (pieces, free)), np.ones((pieces, 1))], axis=1)
     after = np.sum((triangles @ whole[..., None]) ** 2)
     gain = np.sum(triangles[..., -1] ** 2) - after + np.sum(pull[1] ** 2) - np.sum((pull[1] + pull[0] * du) ** 2)
-    return Step(du, ds, float(0.5 * gain))
+    return DescentStep(du, ds, float(0.5 * gain))
 
 
 def _within_limits(rest: np.ndarray, of_u: np.ndarray, damping: float, limits) -> np.ndarray:
@@ -240,16 +240,16 @@ _STILL = 1.0  # what log L may gain over the last tenth of the steps where the d
 def descend_gradient(
     question: Residuals, u: np.ndarray, starts: np.ndarray, noise: AbstractNoise, steps: int,
     notify: Callable[[str], None] | None = None,
-) -> tuple[np.ndarray, np.ndarray, bool] | Failure:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, bool] | LostTrial:  # fmt: skip
     """u (F,), the starts (N, 2n) after this many steps, and whether log L has come to rest.
 
-    A `Failure` where the motion from the first trial cannot be followed; later ones are passed over.
+    A `LostTrial` where the motion from the first trial cannot be followed; later ones are passed over.
     """
     optax = _optax()
     whole = NoiseScale(question.size, np.full(len(question.size), np.inf))
-    density = Density(question, noise, Point(u, starts, [], []), whole, np.ones(len(question.size)))
+    density = Density(question, noise, Trial(u, starts, [], []), whole, np.ones(len(question.size)))
     first = _with_noise(density, question, noise)
-    if isinstance(first, Failure):
+    if isinstance(first, LostTrial):
         return first
     scale = jnp.asarray(_units(density, first), density.dtype)
     cost = lambda z: -density.log_likelihood(first + scale * z) / question.measured  # noqa: E731
@@ -272,21 +272,21 @@ def descend_gradient(
         if notify is not None:
             notify(f"step {(k + 1) * _PORTION}: log likelihood {-costs[-1] * question.measured:.6g}")
     if not np.isfinite(costs[-1]):
-        return Failure(0, "The gradient is not finite at any trial.")
+        return LostTrial(0, "The gradient is not finite at any trial.")
     x = np.asarray(first + scale * carry[2][1], float)
     rest = costs[-max(1, len(costs) // 10) - 1] if len(costs) > 1 else np.inf
     at = density.unknowns(jnp.asarray(x, scale.dtype))
     return x[: len(u)], np.asarray(at.starts, float), bool((rest - costs[-1]) * question.measured < _STILL)
 
 
-def _with_noise(density: Density, question: Residuals, noise: AbstractNoise) -> np.ndarray | Failure:
+def _with_noise(density: Density, question: Residuals, noise: AbstractNoise) -> np.ndarray | LostTrial:
     """The first x (D,), with the noise that its residuals have."""
     at = density.unknowns(jnp.asarray(density.first, density.dtype))
     left = [np.asarray(residuals, float) for residuals in density.residuals(at)]
     for batch, residuals in zip(question.batches, left, strict=True):
         bad = ~np.isfinite(residuals).all(axis=(1, 2))
         if bad.any():
-            return Failure(
+            return LostTrial(
                 int(batch.rows[int(np.argmax(bad))]), "Its motion could not be followed from the first trial."
             )
     flat = np.concatenate([r.reshape(-1, r.shape[-1]) for r in left])
@@ -313,10 +313,10 @@ def _units(density: Density, x: np.ndarray) -> np.ndarray:
 
 def as_descent(
     question: Residuals, u: np.ndarray, starts: np.ndarray, noise, steps: int, rest: bool
-) -> Descent | Failure:
+) -> Descent | LostTrial:
     """The result of the descent, with the derivatives that intervals need."""
     point = question.evaluate(u, starts)
-    if isinstance(point, Failure):
+    if isinstance(point, LostTrial):
         return point
     text = f"The descent by gradients came to rest within {steps} steps."
     if not rest:

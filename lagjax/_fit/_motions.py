@@ -27,7 +27,7 @@ import numpy as np
 from lagjax._engine import choose
 from lagjax._failures import sentence
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Driven, Form, Table, asks, started
+from lagjax._fit._records import Driven, Form, SampleTable, asks, started
 from lagjax._hybrid import Hybrid, Scene, first_law, follow
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import KEPT, Flow, MachineCode, flow_of, jvp, projected_start, tolerances_of
@@ -40,7 +40,7 @@ from lagjax._system import System
 PyTree = Any
 
 
-class Motion(NamedTuple):
+class RecordMotion(NamedTuple):
     """N motions: `path` (N, T, 2n), `tangents` (N, D, T, 2n), and how each ended: `result`, `t_end` (N,), `y_end`."""
 
     path: np.ndarray
@@ -73,8 +73,8 @@ class AbstractMotions(abc.ABC):
     @abc.abstractmethod
     def follow(
         self, ts: np.ndarray, y0: np.ndarray, numbers: np.ndarray, y0_dot: np.ndarray, numbers_dot: np.ndarray,
-        table: Table | None = None,
-    ) -> Motion:  # fmt: skip
+        table: SampleTable | None = None,
+    ) -> RecordMotion:  # fmt: skip
         """The motions from `y0` (N, 2n) at `ts` (N, T) for all parameters `numbers` (P,) and a table of inputs a row.
 
         Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (D, P). Rows may have parameters of their own, (N, P)
@@ -82,7 +82,7 @@ class AbstractMotions(abc.ABC):
         """
 
     @abc.abstractmethod
-    def rate(self, t: np.ndarray, y: np.ndarray, numbers: np.ndarray, table: Table | None = None) -> np.ndarray:
+    def rate(self, t: np.ndarray, y: np.ndarray, numbers: np.ndarray, table: SampleTable | None = None) -> np.ndarray:
         """q̈ (M, n) at M states `y` (M, 2n) and times `t` (M,), with a table of inputs for each."""
 
 
@@ -112,7 +112,7 @@ class _ByMachineCode(AbstractMotions):
         self.problem, self.tolerances, self.is_driven = problem, tolerances_of(problem(2)), is_driven
         self.projection = None if is_driven else flow_of(problem(2)).projection
 
-    def _flow(self, numbers: np.ndarray, table: Table | None) -> tuple[Flow, np.ndarray]:
+    def _flow(self, numbers: np.ndarray, table: SampleTable | None) -> tuple[Flow, np.ndarray]:
         """The flow of the scene with inputs of this room, made once for all that are equal, and its parameters."""
         if table is None or not self.is_driven:
             return flow_of(self.problem(2)), np.atleast_2d(numbers)
@@ -122,12 +122,12 @@ class _ByMachineCode(AbstractMotions):
         flow, params = self._flow(numbers, table)
         run = flow.run(ts, y0, params, self.tolerances, KEPT)
         if not y0_dot.shape[1]:
-            return Motion(run.path, np.zeros((len(y0), 0, *run.path.shape[1:])), run.result, run.t_end, run.y_end)
+            return RecordMotion(run.path, np.zeros((len(y0), 0, *run.path.shape[1:])), run.result, run.t_end, run.y_end)
         params_dot = np.zeros((*y0_dot.shape[:2], params.shape[1]))
         params_dot[..., : numbers.shape[-1]] = numbers_dot
         steps = run.path, run.result, run.accepted, run.ticket
         tangents, _ = jvp(flow, ts, y0, params, steps, y0_dot, params_dot, self.tolerances)
-        return Motion(run.path, tangents, run.result, run.t_end, run.y_end)
+        return RecordMotion(run.path, tangents, run.result, run.t_end, run.y_end)
 
     def rate(self, t, y, numbers, table=None):
         flow, params = self._flow(numbers, table)
@@ -177,7 +177,7 @@ class _ByJAX(AbstractMotions):
         numbers_dot = np.broadcast_to(numbers_dot, (*y0_dot.shape[:2], numbers.shape[-1]))
         arrays = jax.tree.map(self._array, (ts, y0, numbers, y0_dot, numbers_dot, table))
         (path, result, t_end, y_end), tangents = jax.tree.map(np.asarray, self._follow(*arrays))
-        return Motion(path.astype(float), tangents.astype(float), result, t_end, y_end)
+        return RecordMotion(path.astype(float), tangents.astype(float), result, t_end, y_end)
 
     def rate(self, t, y, numbers, table=None):
         return np.asarray(self._rate(*jax.tree.map(self._array, (t, y, numbers, table))), float)

@@ -17,7 +17,7 @@ from lagjax._fit._descent import minimise
 from lagjax._fit._noise import Known, NoiseScale
 from lagjax._fit._profile import effective_share
 from lagjax._fit._records import Guess, Record, in_structure, known_start, require_alike, require_held
-from lagjax._fit._residuals import Failure, Point, Residuals, SystemPart, SystemResiduals
+from lagjax._fit._residuals import LostTrial, Residuals, SystemPart, SystemResiduals, Trial
 from lagjax._fit._search import reader_of
 from lagjax._fit._sensors import UNCLEAR, on_circle
 from lagjax._fit._uncertainty import covariance_of_one_start, signal_deviations
@@ -90,8 +90,8 @@ def predicted(fit, record: Record, system: str | None) -> Prediction:
         point = question.evaluate(np.zeros(0), state[None])
     else:
         done = minimise(question, np.zeros(0), state[None], Known(part.of_sensors(fit.widths)), enough=1e-3)
-        point = done if isinstance(done, Failure) else done.point
-    if isinstance(point, Failure):
+        point = done if isinstance(done, LostTrial) else done.point
+    if isinstance(point, LostTrial):
         raise ValueError(question.where(point))
     n = layout.size
     start = layout.restore(point.starts[0, :n]), layout.restore(point.starts[0, n:])
@@ -110,7 +110,7 @@ def predicted(fit, record: Record, system: str | None) -> Prediction:
     return Prediction(trajectory, shown, missed, start, uncertain, noise)
 
 
-def _shown(fit, part: SystemPart, record: Record, question: Residuals, point: Point):
+def _shown(fit, part: SystemPart, record: Record, question: Residuals, point: Trial):
     """The signals (T, S) of a record that was followed, at all its times, and their standard signal_deviations."""
     planned, slopes = _followed(fit, part.system, record, point.starts[0])
     known, states = fit.information, question.states
@@ -126,7 +126,7 @@ def _followed(fit, of: SystemResiduals, record: Record, state: np.ndarray) -> tu
     everywhere = replace(record, values=in_structure(np.zeros_like(record.matrix), record), weights=None)
     about = Residuals([of.of_records([everywhere], np.array([True]), fit.parameters)])
     full = about.evaluate(fit.u, state[None])
-    if isinstance(full, Failure):
+    if isinstance(full, LostTrial):
         raise ValueError(about.where(full))
     shown = np.where(about.batches[0].weights[0] > 0, full.residuals[0][0], np.nan)  # NaN before a delay is over
     return replace(record, values=in_structure(shown, record)), full.slopes[0][0]

@@ -34,7 +34,7 @@ from scipy.special import stdtrit
 
 from lagjax._fit._descent import minimise
 from lagjax._fit._noise import Known, NoiseScale, log_likelihood
-from lagjax._fit._residuals import Failure, Residuals
+from lagjax._fit._residuals import LostTrial, Residuals
 from lagjax._fit._uncertainty import Information
 
 _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT = 1e-2, 40  # a record left out is then known to a hundredth of its noise
@@ -131,12 +131,12 @@ def left_out(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths
     for group in range(folds):
         rest = _part(question, groups != group)
         done = minimise(rest, u, states[groups != group], law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
-        if isinstance(done, Failure):
+        if isinstance(done, LostTrial):
             return failed
         apart = _part(question, groups == group).with_parameters(question.parameters.kept(done.point.u))
         known = _of_signals(apart.names, (question.names, widths), (rest.names, done.widths))
         end = minimise(apart, np.zeros(0), states[groups == group], Known(known), _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
-        if isinstance(end, Failure):
+        if isinstance(end, LostTrial):
             return failed
         square, weight = (apart.weights * end.point.flat() ** 2).sum(axis=0), apart.weights.sum(axis=0)
         shown = weight > 0
@@ -223,7 +223,7 @@ class _Line:
         self.scale = white / reported if np.isfinite(reported) and reported > 0 else 1.0 / known.lost
         self.wide = min(float(np.sqrt(reported)), float(question.parameters.reach[which]))
         done = minimise(question, u, starts, Known(widths), _ENOUGH, _TRIALS)
-        if isinstance(done, Failure):
+        if isinstance(done, LostTrial):
             raise ValueError(question.where(done))
         self.u, point = done.point.u, done.point
         self.best = log_likelihood(widths, point.flat(), question.weights)
@@ -239,7 +239,7 @@ class _Line:
         question = self.question.with_parameters(self.question.parameters.kept(u, self.which))
         for others, starts in self._guesses(at):
             done = minimise(question, others, starts, Known(self.widths), _ENOUGH, _TRIALS)
-            if not isinstance(done, Failure):
+            if not isinstance(done, LostTrial):
                 lost = self.best - log_likelihood(self.widths, done.point.flat(), question.weights)
                 self.places.append(_Place(at, done.point.u, done.point.starts, 2.0 * self.scale * lost))
                 return self.places[-1].deviance
@@ -260,7 +260,7 @@ class _Line:
         """The minimum that a search from one place ends in: the unknown and D there."""
         u = np.insert(place.others, self.which, place.at)
         done = minimise(self.question, u, place.starts, Known(self.widths), _ENOUGH, 2 * _TRIALS)
-        if isinstance(done, Failure):
+        if isinstance(done, LostTrial):
             return None
         lost = self.best - log_likelihood(self.widths, done.point.flat(), self.question.weights)
         return float(done.point.u[self.which]), 2.0 * self.scale * lost

@@ -1,6 +1,6 @@
 """Records: the measurements as the user gives them, their sampled inputs, and rows of them in batches.
 
-It holds `Form` and `Table` (inputs), `Record` (one recording) and `Samples` (pieces of records side by side).
+It holds `Form` and `SampleTable` (inputs), `Record` (one recording) and `Samples` (pieces of records side by side).
 
 **Inputs.** A scene whose functions ask for `inputs` becomes one whose functions ask for `t` and `params` alone: its
 parameters are those of the user and, beside them, one table of samples (`Driven`), in which the input at the time t is
@@ -35,7 +35,7 @@ _LEAST_ROOM, _GROWTH = 16, 4  # of tables: at most four times what is needed, an
 _FUNCTIONS = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
 
 
-class Table(NamedTuple):
+class SampleTable(NamedTuple):
     """The inputs of N pieces of records: I numbers at K instants, `knots` (N, K) and `values` (N, K, I).
 
     Some samples about a piece are among them where its input asks for them, and behind the last one instants that still
@@ -56,9 +56,9 @@ class Table(NamedTuple):
         parts = np.broadcast_to(numbers, (count, numbers.shape[-1])), self.knots, self.values.reshape(count, -1)
         return np.concatenate(parts, axis=1)
 
-    def select(self, rows) -> "Table":
+    def select(self, rows) -> "SampleTable":
         """The tables of some of the pieces."""
-        return Table(self.knots[rows], self.values[rows])
+        return SampleTable(self.knots[rows], self.values[rows])
 
 
 class Driven(NamedTuple):
@@ -143,7 +143,7 @@ def room_for(count: int) -> int:
     return room
 
 
-def table_of(pieces: list[tuple[np.ndarray, np.ndarray]], hold: str) -> Table:
+def table_of(pieces: list[tuple[np.ndarray, np.ndarray]], hold: str) -> SampleTable:
     """The tables of N pieces, each given by its times (k,) and inputs (k, I), side by side.
 
     What they are filled up with changes nothing up to the last sample: functions of time are those of (k,) samples.
@@ -155,13 +155,13 @@ def table_of(pieces: list[tuple[np.ndarray, np.ndarray]], hold: str) -> Table:
         spacing = (ts[-1] - ts[0]) / (count - 1) if count > 1 else max(1.0, abs(ts[0]))
         knots[row] = np.concatenate([ts, ts[-1] + spacing * np.arange(1, room - count + 1)])
         values[row, :count], values[row, count:] = inputs, continued(inputs, room - count, hold)
-    return Table(knots, values)
+    return SampleTable(knots, values)
 
 
-def at_instants(ts: np.ndarray, inputs: np.ndarray) -> Table:
+def at_instants(ts: np.ndarray, inputs: np.ndarray) -> SampleTable:
     """Tables that hold one input each, `inputs` (M, I), at and after its time `ts` (M,)."""
     later = np.maximum(1.0, np.abs(ts))
-    return Table(np.stack([ts, ts + later], axis=1), np.stack([inputs, inputs], axis=1))
+    return SampleTable(np.stack([ts, ts + later], axis=1), np.stack([inputs, inputs], axis=1))
 
 
 def looked_up(ts: np.ndarray, inputs: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -178,7 +178,7 @@ def about(ts: np.ndarray, begin: float, end: float, hold: str) -> slice:
 
 
 @functools.partial(jax.jit, static_argnames="hold")
-def inputs_at(table: Table, ts, hold: str) -> tuple[Any, Any]:
+def inputs_at(table: SampleTable, ts, hold: str) -> tuple[Any, Any]:
     """The inputs (N, T, I) at the times `ts` (N, T) of the pieces of a table, and their rates there."""
 
     def of(knots, values, ts):
@@ -202,7 +202,7 @@ class Guess(NamedTuple):
     qdot: PyTree
 
 
-class Measured:
+class MeasuredSignal:
     """The measurements of one motion: a `Record`, or `Timings`."""
 
     ts: np.ndarray
@@ -215,7 +215,7 @@ class Measured:
 
 
 @dataclass(frozen=True, eq=False)
-class Record(Measured):
+class Record(MeasuredSignal):
     """One recording: what was measured at which times.
 
     - `ts` (T,): the times, strictly increasing, T ≥ 2. Records need not be equally long, nor equally spaced.
@@ -404,7 +404,7 @@ def _require_covered(record: Record) -> None:
         )
 
 
-def require_held(record: Measured, hold: str, name: str) -> None:
+def require_held(record: MeasuredSignal, hold: str, name: str) -> None:
     """Raise `ValueError` where the inputs of a record cannot go on between samples as `hold` says."""
     if not isinstance(record, Record) or record.inputs is None or hold == "zero":
         return
@@ -507,7 +507,7 @@ class Samples(NamedTuple):
     values: np.ndarray
     weights: np.ndarray
     inputs: np.ndarray
-    table: Table | None
+    table: SampleTable | None
 
 
 def batches(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16, hold: str = "zero") -> list[Samples]:
@@ -553,13 +553,13 @@ def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, 
 
 def require_alike(records) -> list[Any]:
     """The records and timings as a list. Raises where there is none, or where records differ in their signals."""
-    if not isinstance(records, Measured | Iterable):
+    if not isinstance(records, MeasuredSignal | Iterable):
         raise TypeError(f"records must be a lagjax.Record, or a list of them; got {type(records).__name__}.")
-    listed = [records] if isinstance(records, Measured) else list(records)
+    listed = [records] if isinstance(records, MeasuredSignal) else list(records)
     if not listed:
         raise ValueError("records is empty: a fit needs at least one lagjax.Record.")
     for place, record in enumerate(listed):
-        if not isinstance(record, Measured):
+        if not isinstance(record, MeasuredSignal):
             raise TypeError(
                 f"records[{place}] must be a lagjax.Record, or lagjax.Timings; got {type(record).__name__}."
             )
@@ -594,7 +594,7 @@ def _require_alike(placed: list[tuple[int, Record]]) -> None:
         )
 
 
-def known_start(record: Measured, layout: Layout, place: int, params: PyTree) -> np.ndarray | None:
+def known_start(record: MeasuredSignal, layout: Layout, place: int, params: PyTree) -> np.ndarray | None:
     """The state (2n,) that a record says it starts from, known, guessed or of `params`; None where it says nothing."""
     if record.start is None:
         return None

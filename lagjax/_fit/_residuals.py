@@ -1,7 +1,7 @@
 """Residuals: the measured signals less those of the motions of a trial, with their derivatives.
 
 It holds `Residuals`, the problem that every search, density and interval is about, `SystemResiduals`, the part of it
-that is of one system, `Point`, one trial, and the triangles that rows are compressed to.
+that is of one system, `Trial`, one trial, and the triangles that rows are compressed to.
 
 The unknowns are u (F,), the free parameters as their transforms move them, and the starts (N, 2n) of the N pieces of
 records. A residual of piece k depends on u and on start k alone: the rows of a piece, D = 2n + F columns and the
@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit._motions import AbstractMotions, Manifold, Motion, Origins, Placed
+from lagjax._fit._motions import AbstractMotions, Manifold, Origins, Placed, RecordMotion
 from lagjax._fit._noise import AbstractNoise, NoiseScale, counts
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Piece, Samples, asks, at_instants, batches, inputs_at, started, whole
@@ -38,7 +38,7 @@ from lagjax._layout import Layout, halves
 from lagjax._system import System
 
 
-class Point(NamedTuple):
+class Trial(NamedTuple):
     """One trial: the unknowns, and for each batch the residuals (N, T, S) and their derivatives (N, T, S, D).
 
     Where starts lie on constraints `across` (N, 2n, 2n) takes a change of each to its part across these, which changes
@@ -56,7 +56,7 @@ class Point(NamedTuple):
         return np.concatenate([r.reshape(-1, r.shape[-1]) for r in self.residuals])
 
 
-class Failure(NamedTuple):
+class LostTrial(NamedTuple):
     """A trial whose motion could not be followed: the piece, and what became of it."""
 
     piece: int
@@ -171,7 +171,7 @@ class SystemResiduals:
 
     # ---- the trials of a search ----
 
-    def evaluate(self, u: np.ndarray, starts: np.ndarray) -> list[Point | Failure]:
+    def evaluate(self, u: np.ndarray, starts: np.ndarray) -> list[Trial | LostTrial]:
         """The residuals of K trials, u (K, F) and starts (K, N, 2n), or of each the first piece whose motion failed.
 
         The motions of all trials are one run for every batch of pieces.
@@ -180,16 +180,16 @@ class SystemResiduals:
         for batch in self.batches:
             going = [k for k, trial in enumerate(found) if isinstance(trial, _Trial)]
             for k, shown in zip(going, self._shown(batch, [found[k] for k in going]), strict=True):
-                if isinstance(shown, Failure):
+                if isinstance(shown, LostTrial):
                     found[k] = shown
                 else:
                     self._collect(batch, found[k], *shown)
         return [
-            one if isinstance(one, Failure) else Point(at, one.starts, one.residuals, one.slopes, self._across(one))
+            one if isinstance(one, LostTrial) else Trial(at, one.starts, one.residuals, one.slopes, self._across(one))
             for at, one in zip(u, found, strict=True)
         ]
 
-    def _begin(self, u: np.ndarray, starts: np.ndarray) -> _Trial | Failure:
+    def _begin(self, u: np.ndarray, starts: np.ndarray) -> _Trial | LostTrial:
         """The trial u (F,), starts (N, 2n), at the starts of its motions."""
         numbers, directions = self.parameters.numbers(u), self.parameters.directions(u)
         starts, moved = self.origins.move(starts, numbers, directions)
@@ -197,9 +197,11 @@ class SystemResiduals:
         if self.manifold is not None and self.fitted.any():
             starts, tangents, moved = self._placed(starts, moved, numbers, directions)
             if (lost := ~np.isfinite(starts).all(axis=1)).any():
-                return Failure(int(np.argmax(lost)), "No start near the one that was tried satisfies the constraints.")
+                return LostTrial(
+                    int(np.argmax(lost)), "No start near the one that was tried satisfies the constraints."
+                )
         if not (np.isfinite(numbers).all() and np.isfinite(directions).all() and np.isfinite(starts).all()):
-            return Failure(0, "A parameter is not finite.")
+            return LostTrial(0, "A parameter is not finite.")
         return _Trial(numbers, directions, starts, tangents, moved, [], [])
 
     def _placed(self, starts, moved, numbers, directions) -> Placed:
@@ -217,7 +219,7 @@ class SystemResiduals:
             return None
         return np.where(self.fitted[:, None, None], np.eye(self.states) - trial.tangents, 0.0)
 
-    def _shown(self, batch: Samples, trials: list[_Trial]) -> list[tuple[np.ndarray, np.ndarray] | Failure]:
+    def _shown(self, batch: Samples, trials: list[_Trial]) -> list[tuple[np.ndarray, np.ndarray] | LostTrial]:
         """Of each trial what is measured for a batch (N, T, S), and its tangents (N, T, S, D)."""
         clock = self.clocks.get(self.pieces[batch.rows[0]].record)
         if clock is not None:
@@ -227,7 +229,7 @@ class SystemResiduals:
         motions = self._follow(batch, batch.ts, trials)
         return [self._checked(batch, self._sensed(batch, *one)) for one in zip(trials, motions, strict=True)]
 
-    def _follow(self, batch: Samples, ts: np.ndarray, trials: list[_Trial]) -> list[Motion | Failure]:
+    def _follow(self, batch: Samples, ts: np.ndarray, trials: list[_Trial]) -> list[RecordMotion | LostTrial]:
         """The motions of each trial at the times `ts` (N, T) of the pieces of a batch, in one run of all."""
         if not trials:
             return []
@@ -243,10 +245,10 @@ class SystemResiduals:
         )  # fmt: skip
         found = []
         for k in range(count):
-            part = Motion(*(x[k * members : (k + 1) * members] for x in motion))
+            part = RecordMotion(*(x[k * members : (k + 1) * members] for x in motion))
             if not part.ok:
                 row, text = part.why_not(ts, self.layout)
-                part = Failure(int(batch.rows[row]), text)
+                part = LostTrial(int(batch.rows[row]), text)
             found.append(part)
         return found
 
@@ -260,26 +262,26 @@ class SystemResiduals:
         y0_dot[:, states:] = trial.moved[batch.rows]
         return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
 
-    def _sensed(self, batch: Samples, trial: _Trial, motion: Motion | Failure):
+    def _sensed(self, batch: Samples, trial: _Trial, motion: RecordMotion | LostTrial):
         """The signals of a motion, and their tangents."""
-        if isinstance(motion, Failure):
+        if isinstance(motion, LostTrial):
             return motion
         return self.signals.of(motion, batch.ts, batch.inputs, trial.numbers, self._directions(batch, trial)[1])
 
-    def _delayed(self, batch: Samples, trial: _Trial) -> tuple[np.ndarray, np.ndarray] | Failure:
+    def _delayed(self, batch: Samples, trial: _Trial) -> tuple[np.ndarray, np.ndarray] | LostTrial:
         """The signals of one trial, of each delay those that have it at earlier times, and their tangents."""
         delays, signals, numbers = self.signals.delays, self.signals, trial.numbers
         assert delays is not None
         numbers_dot = self._directions(batch, trial)[1]
         each = delays.at(numbers)
         if text := delays.refuses(each):
-            return Failure(int(batch.rows[0]), text)
+            return LostTrial(int(batch.rows[0]), text)
         values = np.zeros((*batch.ts.shape, len(signals.names)))
         slopes = np.zeros((*values.shape, len(numbers_dot)))
         for delay in each:
             ts = np.maximum(batch.ts - delay.value, batch.ts[:, :1])
             [motion] = self._follow(batch, ts, [trial])
-            if isinstance(motion, Failure):
+            if isinstance(motion, LostTrial):
                 return motion
             inputs, rates = self._inputs_at(batch, ts)
             ts_dot = -numbers_dot @ delay.slopes
@@ -298,9 +300,9 @@ class SystemResiduals:
         values, rates = inputs_at(batch.table, ts, self.signals.form.hold)
         return np.asarray(values), np.asarray(rates)
 
-    def _checked(self, batch: Samples, shown: tuple[np.ndarray, np.ndarray] | Failure):
+    def _checked(self, batch: Samples, shown: tuple[np.ndarray, np.ndarray] | LostTrial):
         """The signals and their tangents; a failure where one that counts is not finite."""
-        if isinstance(shown, Failure):
+        if isinstance(shown, LostTrial):
             return shown
         values, by_unknowns = shown
         counted = batch.weights[..., : len(self.signals.names)] > 0
@@ -308,7 +310,7 @@ class SystemResiduals:
         if bad.any():
             row, place, signal = np.argwhere(bad)[0]
             sample = self.pieces[batch.rows[row]].places[place]
-            return Failure(
+            return LostTrial(
                 int(batch.rows[row]),
                 f"What `observe` returns for {self.signals.names[signal]}, or its derivative, is not finite at sample "
                 f"{sample}, t = {batch.ts[row, place]:g}.",
@@ -321,10 +323,10 @@ class SystemResiduals:
         y0_dot, numbers_dot = self._directions(batch, trial)
         moved = clock.along(y0, numbers, y0_dot[0], numbers_dot)
         if moved is None:
-            return Failure(int(batch.rows[0]), clock.why_not(y0, numbers))
+            return LostTrial(int(batch.rows[0]), clock.why_not(y0, numbers))
         times, slopes = moved
         if not np.isfinite(slopes).all():
-            return Failure(int(batch.rows[0]), "The derivatives of its crossing times are not finite.")
+            return LostTrial(int(batch.rows[0]), "The derivatives of its crossing times are not finite.")
         return times[None, :, None], slopes[None, :, None]
 
     def _collect(self, batch: Samples, trial: _Trial, values: np.ndarray, by_unknowns: np.ndarray) -> None:
@@ -425,7 +427,7 @@ class Residuals:
         systems: Sequence[SystemResiduals],
         pieces: list[Piece] | None = None,
         fitted: np.ndarray | None = None,
-        watch: Callable[[Point | Failure], None] | None = None,
+        watch: Callable[[Trial | LostTrial], None] | None = None,
     ):
         self.systems, self.watch, self.parameters = list(systems), watch, systems[0].parameters
         self.records = [record for system in systems for record in system.records]
@@ -481,7 +483,7 @@ class Residuals:
 
     # ---- trials ----
 
-    def evaluate(self, u: np.ndarray, starts: np.ndarray, notify: bool = True) -> Point | Failure:
+    def evaluate(self, u: np.ndarray, starts: np.ndarray, notify: bool = True) -> Trial | LostTrial:
         """The residuals of one trial u (F,), starts (N, 2n), or the first piece whose motion failed.
 
         With `notify` false `watch` is not called.
@@ -491,24 +493,24 @@ class Residuals:
             self.watch(trial)
         return trial
 
-    def evaluate_trials(self, u: np.ndarray, starts: np.ndarray) -> list[Point | Failure]:
+    def evaluate_trials(self, u: np.ndarray, starts: np.ndarray) -> list[Trial | LostTrial]:
         """The residuals of K trials, u (K, F) and starts (K, N, 2n); of each the first piece whose motion failed."""
-        found: list[list[Point] | Failure] = [[] for _ in u]
+        found: list[list[Trial] | LostTrial] = [[] for _ in u]
         for part in self.parts:
-            going = [k for k, points in enumerate(found) if not isinstance(points, Failure)]
+            going = [k for k, points in enumerate(found) if not isinstance(points, LostTrial)]
             own = starts[going][:, part.rows, : part.system.states]
             for k, point in zip(going, part.system.evaluate(u[going], own), strict=True):
                 points = found[k]
-                if isinstance(point, Failure):
-                    found[k] = Failure(int(part.rows[point.piece]), point.text)
-                elif not isinstance(points, Failure):
+                if isinstance(point, LostTrial):
+                    found[k] = LostTrial(int(part.rows[point.piece]), point.text)
+                elif not isinstance(points, LostTrial):
                     points.append(point)
         return [
-            points if isinstance(points, Failure) else self._joined(y, points)
+            points if isinstance(points, LostTrial) else self._joined(y, points)
             for y, points in zip(starts, found, strict=True)
         ]
 
-    def _joined(self, starts: np.ndarray, points: list[Point]) -> Point:
+    def _joined(self, starts: np.ndarray, points: list[Trial]) -> Trial:
         """One trial of all systems from those of each."""
         if len(points) == 1 and self.parts[0].system.states == self.states:
             return points[0]
@@ -527,24 +529,24 @@ class Residuals:
                 by_unknowns[..., part.signals, self.states :] = moved[..., states:]
                 residuals.append(wide)
                 slopes.append(by_unknowns)
-        return Point(u, placed, residuals, slopes, across if across.any() else None)
+        return Trial(u, placed, residuals, slopes, across if across.any() else None)
 
-    def widths(self, point: Point, noise: AbstractNoise) -> NoiseScale:
+    def widths(self, point: Trial, noise: AbstractNoise) -> NoiseScale:
         """The noise of the signals that makes the residuals of a trial likeliest."""
         return noise.widths(point.flat(), self.weights, self.least)
 
-    def factors(self, point: Point, widths: NoiseScale) -> list[np.ndarray]:
+    def factors(self, point: Trial, widths: NoiseScale) -> list[np.ndarray]:
         """√count/σ of every sample, by which its residual enters the sum of squares."""
         return [
             np.sqrt(counts(widths, r, batch.weights)) / widths.sigma
             for r, batch in zip(point.residuals, self.batches, strict=True)
         ]
 
-    def cost(self, point: Point, factors: list[np.ndarray]) -> float:
+    def cost(self, point: Trial, factors: list[np.ndarray]) -> float:
         """Half the weighted sum of squares."""
         return 0.5 * sum(float(np.sum((f * r) ** 2)) for f, r in zip(factors, point.residuals, strict=True))
 
-    def triangles(self, point: Point, factors: list[np.ndarray]) -> np.ndarray:
+    def triangles(self, point: Trial, factors: list[np.ndarray]) -> np.ndarray:
         """The weighted rows of each piece, compressed: (N, D + 1, D + 1), the residual as last column."""
         columns = point.slopes[0].shape[-1] + 1
         found = np.zeros((len(self.pieces), columns, columns))
@@ -590,7 +592,7 @@ class Residuals:
     def _part_of(self, record: int) -> SystemPart:
         return next(part for part in self.parts if part.records.start <= record < part.records.stop)
 
-    def where(self, failure: Failure) -> str:
+    def where(self, failure: LostTrial) -> str:
         """A sentence for a failure, with the record's number."""
         piece = self.pieces[failure.piece]
         begin = self.records[piece.record].ts[piece.places[0]]

@@ -31,7 +31,7 @@ from lagjax._fit._report import (
     record_matrix,
     title_of,
 )
-from lagjax._fit._residuals import Point, Residuals, SystemPart
+from lagjax._fit._residuals import Residuals, SystemPart, Trial
 from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._search import Waterfall
 from lagjax._fit._uncertainty import Experiments, Information, rank_experiments, start_covariances
@@ -235,10 +235,10 @@ class Fit:
         return inference_data(density, draw(density, draws, chains, seed))
 
     @functools.cached_property
-    def _point(self) -> Point:
+    def _point(self) -> Trial:
         """The trial that the search ended at, computed anew."""
         point = self.question.evaluate(self.u, self.states)
-        assert isinstance(point, Point)  # it was computed before
+        assert isinstance(point, Trial)  # it was computed before
         return point
 
     def _quantile(self, level: float) -> float:

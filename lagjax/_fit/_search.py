@@ -60,7 +60,7 @@ from lagjax._fit._motions import AbstractMotions
 from lagjax._fit._noise import Gaussian, NoiseScale, log_likelihood
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Piece, Record, asks, at_instants, in_structure, inputs_between
-from lagjax._fit._residuals import Failure, Residuals, SystemResiduals
+from lagjax._fit._residuals import LostTrial, Residuals, SystemResiduals
 from lagjax._fit._sensors import continued
 from lagjax._fit._verdict import unexplained
 from lagjax._hybrid import Hybrid
@@ -466,7 +466,7 @@ def _evaluate_starts(question: Residuals, u: np.ndarray, starts: np.ndarray) -> 
     for begin in range(0, len(u), portion):
         some = slice(begin, begin + portion)
         for k, trial in enumerate(question.evaluate_trials(u[some], starts[some]), begin):
-            if not isinstance(trial, Failure):
+            if not isinstance(trial, LostTrial):
                 noise = question.widths(trial, Gaussian())
                 found.starts[k], found.misfits[k] = trial.starts, misfit(noise, question)
                 found.triangles[k] = question.triangles(trial, question.factors(trial, noise))
@@ -554,11 +554,11 @@ def search_records(question: Residuals, u, starts, noise, method: str, readers, 
         return _in_pieces(question, levels_done[good], levels_done[-1].widths, noise)
     done = minimise(question, u, starts, noise, _ENOUGH, _TRIALS)
     if levels_done and (
-        isinstance(done, Failure) or not done.converged or unexplained(question, done.point, done.widths).motion
+        isinstance(done, LostTrial) or not done.converged or unexplained(question, done.point, done.widths).motion
     ):
-        good = _last_followed_level([*levels_done, *([] if isinstance(done, Failure) else [done])])
+        good = _last_followed_level([*levels_done, *([] if isinstance(done, LostTrial) else [done])])
         if good < len(levels_done) and misfit(levels_done[good].widths, question) < _COARSE:
-            return _in_pieces(question, levels_done[good], None if isinstance(done, Failure) else done.widths, noise)
+            return _in_pieces(question, levels_done[good], None if isinstance(done, LostTrial) else done.widths, noise)
     return _require_followed(question, done)
 
 
@@ -598,7 +598,7 @@ def _in_pieces(question: Residuals, level: Descent, joined: NoiseScale | None, n
     pieces = complete(level.question.pieces, question.records)
     part = question.of(pieces, level.question.fitted)
     done = minimise(part, level.point.u, level.point.starts, noise, _ENOUGH, _TRIALS)
-    if isinstance(done, Failure):
+    if isinstance(done, LostTrial):
         return _require_followed(part, done)
     worse = (
         "fails" if joined is None else f"leaves {misfit(joined, question) / misfit(done.widths, part):.2g} times more"
@@ -622,14 +622,14 @@ def by_gradient(question: Residuals, u, y0, noise, readers: list[Reader | None] 
         u = _over_segments(question, u, noise, readers, tell)
         steps = _GRADIENT_STEPS // 3
     done = descend_gradient(question, u, y0, noise, steps, tell)
-    if not isinstance(done, Failure):
+    if not isinstance(done, LostTrial):
         done = as_descent(question, done[0], done[1], noise, _GRADIENT_STEPS, done[2])
     return _require_followed(question, done)
 
 
-def _require_followed(question: Residuals, done: Descent | Failure) -> Descent:
+def _require_followed(question: Residuals, done: Descent | LostTrial) -> Descent:
     """The result of a search. Raises `Unfollowed` where its motions could not be followed."""
-    if isinstance(done, Failure):
+    if isinstance(done, LostTrial):
         raise Unfollowed(question.where(done) + " Begin nearer: other params0, or starts that are known.")
     return done
 
@@ -652,7 +652,7 @@ def _fit_growing_segments(
     u, best, levels_done = begun.u, begun.best, [] if begun.first is None else [begun.first]
     for pieces in begun.cuts[1:]:
         done = search(pieces, u, best)
-        if isinstance(done, Failure):
+        if isinstance(done, LostTrial):
             break  # whole records then begin from the best so far, and say so if they fail as well
         u = done.point.u
         levels_done.append(done)
@@ -684,7 +684,7 @@ def _fit_shortest_segments(question: Residuals, u, starts, readers: list[Reader 
     if not cuts:
         return _ShortestSegments(u, cuts, best, -np.inf)
     done = search(cuts[0], u, best)
-    if isinstance(done, Failure):
+    if isinstance(done, LostTrial):
         return _ShortestSegments(u, cuts, best, np.inf)
     near = []
     for part in question.parts:
@@ -695,7 +695,7 @@ def _fit_shortest_segments(question: Residuals, u, starts, readers: list[Reader 
     return _ShortestSegments(done.point.u, cuts, best, float(np.mean(np.log(ratio))), done)
 
 
-def _fit_level(question: Residuals, pieces: list[Piece], u, best, noise, readers, anchor) -> Descent | Failure:
+def _fit_level(question: Residuals, pieces: list[Piece], u, best, noise, readers, anchor) -> Descent | LostTrial:
     """The search on one cut of the records. The states in `best`, by record and sample, begin it and take its end."""
     firsts = [(piece.record, int(piece.places[0])) for piece in pieces]
     for k, reader in enumerate(readers):
@@ -706,7 +706,7 @@ def _fit_level(question: Residuals, pieces: list[Piece], u, best, noise, readers
     part = question.of(pieces, np.array([question.fitted[k] or place > 0 for k, place in firsts]))
     y0 = np.stack([best[first] for first in firsts])
     done = minimise(part, u, y0, noise, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
-    if not isinstance(done, Failure):
+    if not isinstance(done, LostTrial):
         best |= dict(zip(firsts, done.point.starts, strict=True))
     return done
 
@@ -727,7 +727,7 @@ def _fit_short_windows(question: Residuals, u, noise, readers: list[Reader | Non
     part = Residuals(short)
     y0 = np.concatenate(states)[:, : part.states]
     done = minimise(part, u, y0, noise, _ENOUGH_OF_WINDOWS, _TRIALS_OF_LEVEL, anchor)
-    return u if isinstance(done, Failure) else done.point.u
+    return u if isinstance(done, LostTrial) else done.point.u
 
 
 def start_by_weak_form(question: Residuals, u: np.ndarray, readers: list[Reader | None]) -> np.ndarray:
@@ -747,7 +747,7 @@ def _over_segments(question: Residuals, u, noise, readers: list[Reader | None], 
         states = np.stack([pad_states(one.states(place)[0], question.states) for one, place in reading])
         part = question.of(pieces, np.ones(len(pieces), bool))
         done = descend_gradient(part, u, states, noise, 2 * _GRADIENT_STEPS // (3 * len(cuts)), tell)
-        if not isinstance(done, Failure):
+        if not isinstance(done, LostTrial):
             u = done[0]
     return u
 

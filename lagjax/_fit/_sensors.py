@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import accept
-from lagjax._fit._motions import Motion
+from lagjax._fit._motions import RecordMotion
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Form, Record, in_structure
 from lagjax._layout import Layout, halves
@@ -341,7 +341,7 @@ class Signals:
         self._at = jax.jit(jax.vmap(with_derivatives, in_axes=(0, 0, 0, None)))
 
     def of(
-        self, motion: Motion, ts: np.ndarray, inputs: np.ndarray, numbers: np.ndarray, numbers_dot: np.ndarray,
+        self, motion: RecordMotion, ts: np.ndarray, inputs: np.ndarray, numbers: np.ndarray, numbers_dot: np.ndarray,
         ts_dot: np.ndarray | None = None, rates: np.ndarray | None = None,
     ):  # fmt: skip
         """The signals (N, T, S) of motions, and their derivatives (N, T, S, D) along the directions of these.

@@ -22,7 +22,7 @@ import numpy as np
 from lagjax._crossings import directions_of, sections_of
 from lagjax._failures import sentence
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Guess, Measured, real_numbers, require_start
+from lagjax._fit._records import Guess, MeasuredSignal, real_numbers, require_start
 from lagjax._hybrid import Hybrid, Scene, Transition, follow
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import KEPT, MachineCode, Noted, Surfaces, flow_of, jvp, surfaces_of, tolerances_of, vjp
@@ -42,7 +42,7 @@ _SHARPER = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Timings(Measured):
+class Timings(MeasuredSignal):
     """Crossing times of one motion: transits of planets, a pendulum through a light gate, the bounces of a ball.
 
     - `section`: a function of (q, qdot), and of `t` and `params` by name, that returns one real number; a crossing is

@@ -58,7 +58,7 @@ import numpy as np
 
 from lagjax._fit._noise import NoiseScale
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._residuals import Failure, Point, Residuals, compressed
+from lagjax._fit._residuals import LostTrial, Residuals, Trial, compressed
 
 
 class Correlation(NamedTuple):
@@ -70,12 +70,12 @@ class Correlation(NamedTuple):
     neighbour: float
 
 
-def autocorrelations(question: Residuals, point: Point, widths: NoiseScale) -> list[Correlation]:
+def autocorrelations(question: Residuals, point: Trial, widths: NoiseScale) -> list[Correlation]:
     """The autocorrelation of the residuals of every signal (S,)."""
     return [_autocorrelation(question, point, widths, signal) for signal in range(len(widths.sigma))]
 
 
-def _autocorrelation(question: Residuals, point: Point, widths: NoiseScale, signal: int) -> Correlation:
+def _autocorrelation(question: Residuals, point: Trial, widths: NoiseScale, signal: int) -> Correlation:
     """The correlation of the residuals of one signal, over all pieces.
 
     It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
@@ -157,7 +157,7 @@ def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
     return np.einsum("ntf,ntg->fg", rows, smooth)
 
 
-def independent_share(question: Residuals, point: Point, widths: NoiseScale) -> float:
+def independent_share(question: Residuals, point: Trial, widths: NoiseScale) -> float:
     """The number of independent samples that one sample is worth, over all signals: at most 1."""
     laws = autocorrelations(question, point, widths)
     return sum(law.count / law.time for law in laws) / max(sum(law.count for law in laws), 1)
@@ -197,7 +197,7 @@ class Information(NamedTuple):
     lost: float
 
 
-def information(question: Residuals, point: Point, widths: NoiseScale) -> Information:
+def information(question: Residuals, point: Trial, widths: NoiseScale) -> Information:
     """The information of the data about the parameters, at the end of a search."""
     factors = [np.sqrt(b.weights) / widths.sigma for b in question.batches]
     triangles = question.triangles(point, factors)
@@ -247,7 +247,7 @@ def null_space(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarr
     return null, directions[~small].T / unit[:, None]
 
 
-def _is_lost(question: Residuals, point: Point) -> bool:
+def _is_lost(question: Residuals, point: Trial) -> bool:
     """True if the last digit of a parameter moves a signal by its size, because motions grow apart.
 
     Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
@@ -259,7 +259,7 @@ def _is_lost(question: Residuals, point: Point) -> bool:
     return moved > _LOST and growth(row_sizes(question, point)) > _LOST
 
 
-def confirmed_null(question: Residuals, point: Point, null: np.ndarray) -> np.ndarray:
+def confirmed_null(question: Residuals, point: Trial, null: np.ndarray) -> np.ndarray:
     """Those of the null directions (F, K) that are no work of rounding, (F, K′)."""
     sizes = row_sizes(question, point)
     if growth(sizes) < _GROWTH:
@@ -269,7 +269,7 @@ def confirmed_null(question: Residuals, point: Point, null: np.ndarray) -> np.nd
     return null_space(question.triangles(point, level), question.states)[0]
 
 
-def row_sizes(question: Residuals, point: Point) -> list[np.ndarray]:
+def row_sizes(question: Residuals, point: Trial) -> list[np.ndarray]:
     """The length of the row of each sample (N, T, S) of every batch, its columns as fractions of their largest."""
     largest = np.max([np.abs(slopes).max(axis=(0, 1, 2)) for slopes in point.slopes], axis=0)
     columns = np.where(largest > 0, largest, 1.0)
@@ -329,7 +329,7 @@ class StartCovariance(NamedTuple):
     follows: np.ndarray
 
 
-def start_covariances(question: Residuals, point: Point, widths: NoiseScale, known: Information) -> StartCovariance:
+def start_covariances(question: Residuals, point: Trial, widths: NoiseScale, known: Information) -> StartCovariance:
     """The uncertainty of the starts of all pieces at the end of a search; zero for those that are not fitted."""
     states, free, pieces = question.states, len(point.u), len(question.pieces)
     lags = [law.lags for law in autocorrelations(question, point, widths)]
@@ -408,7 +408,7 @@ _MOST_NAMES = 12  # in one sentence
 _LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
 
 
-def unseen_sentences(question: Residuals, point: Point, widths: NoiseScale, known: Information) -> tuple[str, ...]:
+def unseen_sentences(question: Residuals, point: Trial, widths: NoiseScale, known: Information) -> tuple[str, ...]:
     """A sentence for every set of parameters of which something is not seen, and one for those that rounding hides."""
     hidden = _sentence_on_rounding(question, point, known)
     null, parameters = known.confirmed, question.parameters
@@ -426,7 +426,7 @@ def unseen_sentences(question: Residuals, point: Point, widths: NoiseScale, know
     return (*found, *hidden)
 
 
-def _sentence_on_rounding(question: Residuals, point: Point, known: Information) -> tuple[str, ...]:
+def _sentence_on_rounding(question: Residuals, point: Trial, known: Information) -> tuple[str, ...]:
     """The sentence for parameters whose columns are drowned where sensitivities grow."""
     if known.confirmed.shape[1] == known.null.shape[1]:
         return ()
@@ -448,12 +448,12 @@ def _sentence_on_rounding(question: Residuals, point: Point, known: Information)
     )
 
 
-def _null_elsewhere(question: Residuals, point: Point, widths: NoiseScale):
+def _null_elsewhere(question: Residuals, point: Trial, widths: NoiseScale):
     """Other values u of the free parameters, a few per cent away, and the null directions there."""
     u = point.u
     near = u + question.parameters.sizes(u) * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
     other = question.evaluate(near, point.starts)
-    if isinstance(other, Failure):
+    if isinstance(other, LostTrial):
         return None
     factors = [np.sqrt(batch.weights) / widths.sigma for batch in question.batches]
     null = null_space(question.triangles(other, factors), question.states)[0]

@@ -38,7 +38,7 @@ from lagjax._fit._descent import Descent, column_norms, eliminate
 from lagjax._fit._noise import NoiseScale
 from lagjax._fit._parameters import Between, Parameters, Positive
 from lagjax._fit._records import Record, in_structure
-from lagjax._fit._residuals import Point, Residuals, compressed
+from lagjax._fit._residuals import Residuals, Trial, compressed
 from lagjax._fit._uncertainty import Information, correlated_power, orthogonal
 
 _WIDE = 3.0  # rad: a signal of a smaller range is not tried as degrees, which would leave it 0.05
@@ -224,7 +224,7 @@ class Unexplained(NamedTuple):
     worst: list[int]
 
 
-def unexplained(question: Residuals, point: Point, widths: NoiseScale) -> Unexplained:
+def unexplained(question: Residuals, point: Trial, widths: NoiseScale) -> Unexplained:
     """The share of the signals that a trial leaves, where that is much."""
     left, noisy, shares, doubted, many = [], [], [0.0], False, len(question.records) > 1
     of_records = np.zeros(len(question.records))
@@ -280,7 +280,7 @@ def _parts(rows: np.ndarray, values: np.ndarray, counts: np.ndarray) -> _Parts:
     return _Parts(samples, np.sum(counts * rows**2) / samples, motion, np.sum(counts * (values - mean) ** 2) / samples)
 
 
-def _rows_of_signal(question: Residuals, point: Point, widths: NoiseScale, signal: int) -> dict[int, tuple]:
+def _rows_of_signal(question: Residuals, point: Trial, widths: NoiseScale, signal: int) -> dict[int, tuple]:
     """Of every record that has a signal: residuals, values and how much each counts, (M, T) for its M pieces."""
     found: dict[int, list] = {}
     columns = zip(question.batches, point.residuals, question.factors(point, widths), strict=True)
@@ -304,7 +304,7 @@ def _deviations(known: Information) -> np.ndarray:
     return np.sqrt(np.nan_to_num(np.diag(known.covariance), posinf=0.0))
 
 
-def _at_ends(parameters: Parameters, point: Point, triangles, states: int, known: Information):
+def _at_ends(parameters: Parameters, point: Trial, triangles, states: int, known: Information):
     """Sentences for the numbers at the end of their sets, and for each unknown whether there is one (F,)."""
     found, named = [], np.zeros(len(parameters), bool)
     if known.null.shape[1] or not len(parameters):
@@ -378,7 +378,7 @@ def _disagreements(
     )
 
 
-def _motion(question: Residuals, point: Point, widths: NoiseScale) -> dict[int, float]:
+def _motion(question: Residuals, point: Trial, widths: NoiseScale) -> dict[int, float]:
     """Of every record the sum of squares that a trial leaves beyond white noise, in those of the noise."""
     found: dict[int, float] = {}
     for signal in range(len(question.names)):

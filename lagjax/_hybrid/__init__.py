@@ -19,7 +19,7 @@ import numpy as np
 from lagjax._consistent import require_consistent
 from lagjax._doubles import DOUBLE, in_doubles
 from lagjax._hybrid._mode import Transition
-from lagjax._hybrid._rounds import Ending, Plan, Record, hybrid_motion
+from lagjax._hybrid._rounds import Ending, RoundPlan, TransitionRecord, hybrid_motion
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode
 from lagjax._problem import Problem
@@ -139,13 +139,13 @@ def simulate_hybrid(
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
     require_consistent(modes[start], layout, problem.ts, q0, qdot0, problem.params)
     rtol, atol = float(MachineCode().rtol(problem.in_doubles)), None if atol is None else float(atol)
-    plan = Plan(modes, tuple(transitions), start, max_transitions, rtol, atol, max_steps)
+    plan = RoundPlan(modes, tuple(transitions), start, max_transitions, rtol, atol, max_steps)
     ending, record = _motion(plan, problem)
     trajectory = _trajectory(modes, problem, ending, record)
     return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory
 
 
-def _motion(plan: Plan, problem: Problem) -> tuple[Ending, Record]:
+def _motion(plan: RoundPlan, problem: Problem) -> tuple[Ending, TransitionRecord]:
     """The rounds of a problem, in float64, in its own precision."""
     given = problem.ts, problem.y0, problem.params
     if not problem.is_single:
@@ -154,7 +154,7 @@ def _motion(plan: Plan, problem: Problem) -> tuple[Ending, Record]:
     return in_doubles(lambda *given: hybrid_motion(plan, layout, *given), *given)
 
 
-def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: Record) -> Trajectory:
+def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:
     """The motion in the pytree of the user."""
     restore, (accepted, rejected) = problem.layout.restore, ending.steps
     (q, qdot), (q_end, qdot_end), (q_before, qdot_before) = map(halves, (ending.path, ending.y, record.y))

@@ -1,8 +1,8 @@
 """Families: modes whose functions differ by numbers alone are one program, which takes these numbers as parameters.
 
 Each function of a mode, of its system and of the transitions that leave it, is traced once. Modes of one trace but for
-floats in sums, products, comparisons and results are a `Family`: its functions are those of the first of them, with the
-numbers that differ beside the user's parameters (`_lift.Lifted`), a row of them for each mode.
+floats in sums, products, comparisons and results are a `SystemFamily`: its functions are those of the first of them,
+with the numbers that differ beside the user's parameters (`_lift.Lifted`), a row of them for each mode.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +30,7 @@ _ARITHMETIC = frozenset("add add_any sub mul div max min lt le gt ge eq ne selec
 MOST_NUMBERS = 64  # of a family: of more, as of matrices, zeros and ones would be worth more than a shared program
 
 
-class Family(NamedTuple):
+class SystemFamily(NamedTuple):
     """Modes that share a program: their places, a system and the transitions that leave it, and the numbers of each.
 
     The first axis of each of the `rows` is that of the modes; without any, the functions take the user's parameters.
@@ -61,7 +61,7 @@ class _Site(NamedTuple):
 
 def families(
     systems: Sequence[System], leaving: Sequence[tuple[Transition, ...]], layout: Layout, params
-) -> list[Family]:
+) -> list[SystemFamily]:
     """The modes of these systems, each with the transitions that `leave` it, as families in the order of the first."""
     found: list[tuple[list[int], list[list[_Traced | None]]]] = []
     for k, (system, transitions) in enumerate(zip(systems, leaving, strict=True)):
@@ -81,10 +81,10 @@ def families(
     return [_family(modes, traces, systems[modes[0]], leaving[modes[0]]) for modes, traces in found]
 
 
-def _family(modes, traces, system: System, leaving: tuple[Transition, ...]) -> Family:
+def _family(modes, traces, system: System, leaving: tuple[Transition, ...]) -> SystemFamily:
     """The family of modes of these traces; `system` and `leaving` are those of the first."""
     if len(modes) == 1:
-        return Family(tuple(modes), system, leaving, ())
+        return SystemFamily(tuple(modes), system, leaving, ())
     rows: list[np.ndarray] = []
     functions = iter([_shared(column, rows) for column in zip(*traces, strict=True)])
     system = with_functions(system, {role: next(functions) for role in ROLES})
@@ -93,7 +93,7 @@ def _family(modes, traces, system: System, leaving: tuple[Transition, ...]) -> F
         eqx.tree_at(lambda t: (t.guard, t.reset), transition, (guard, reset), is_leaf=lambda x: x is None)
         for transition, guard, reset in zip(leaving, rest[::2], rest[1::2], strict=True)
     )
-    return Family(tuple(modes), system, shared, tuple(rows))
+    return SystemFamily(tuple(modes), system, shared, tuple(rows))
 
 
 def _shared(column: tuple, rows: list[np.ndarray]) -> Function | None:

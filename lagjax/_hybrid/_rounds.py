@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._failures import lost_unless
-from lagjax._hybrid._families import Family, families
+from lagjax._hybrid._families import SystemFamily, families
 from lagjax._hybrid._mode import Mode, Transition, state_after
 from lagjax._layout import Layout
 from lagjax._lift import Lifted
@@ -34,7 +34,7 @@ STEADY = 0.05
 _LEAST = 1e-300  # a side of a guard that is exactly zero still has a sign
 
 
-class Plan(eqx.Module):
+class RoundPlan(eqx.Module):
     """The constants of all rounds: the modes by name, their transitions, and what a run may cost."""
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -51,7 +51,7 @@ class Plan(eqx.Module):
         self.start, self.max_transitions = start, max_transitions
         self.rtol, self.atol, self.max_steps = rtol, atol, max_steps
 
-    def groups(self, layout: Layout, params: PyTree) -> list["Group"]:
+    def groups(self, layout: Layout, params: PyTree) -> list["ModeGroup"]:
         """The modes with the transitions that leave them; those that differ by numbers alone are one group."""
         numbers = [tuple(k for k, t in enumerate(self.transitions) if t.source == name) for name in self.names]
         leaving = [tuple(self.transitions[k] for k in of_mode) for of_mode in numbers]
@@ -65,14 +65,14 @@ class Plan(eqx.Module):
             targets = np.array([[self.names.index(self.transitions[k].target) for k in row] for row in table], int)
             problem = Problem.about(family.system, layout, own, **limits)
             mode = Mode.of(self.names[first], problem, family.leaving, table[0], targets.reshape(table.shape)[0])
-            groups.append(Group(family, mode, table, targets.reshape(table.shape)))
+            groups.append(ModeGroup(family, mode, table, targets.reshape(table.shape)))
         return groups
 
 
-class Group(NamedTuple):
+class ModeGroup(NamedTuple):
     """The modes of a family: the first of them, and for each the places (modes, K) of its transitions and targets."""
 
-    family: Family
+    family: SystemFamily
     first: Mode
     numbers: np.ndarray
     targets: np.ndarray
@@ -91,7 +91,7 @@ class Ending(NamedTuple):
 
     t: jax.Array
     y: jax.Array  # (2n,)
-    mode: jax.Array  # its place in `Plan.names`
+    mode: jax.Array  # its place in `RoundPlan.names`
     going: jax.Array  # whether it goes on
     result: jax.Array  # the integer of a `lagjax.RESULTS`
     path: jax.Array  # (T, 2n), NaN where not reached
@@ -112,7 +112,7 @@ class Memory(NamedTuple):
     rounding: jax.Array
 
 
-class Record(NamedTuple):
+class TransitionRecord(NamedTuple):
     """One transition: its time, the state before the reset, and the modes on both sides; NaN and −1 without any."""
 
     t: jax.Array
@@ -135,7 +135,7 @@ class Exit(NamedTuple):
 
 
 @eqx.filter_jit
-def hybrid_motion(plan: Plan, layout: Layout, ts, y0, params: PyTree) -> tuple[Ending, Record]:
+def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Ending, TransitionRecord]:
     """The motion from y0 (2n,) at ts[0]: how it ended, and its transitions, with an axis of `max_transitions`."""
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     rounds, start = _Rounds.of(plan, plan.groups(layout, params), ts), plan.names.index(plan.start)
@@ -153,22 +153,24 @@ def hybrid_motion(plan: Plan, layout: Layout, ts, y0, params: PyTree) -> tuple[E
 
 
 class _Rounds(NamedTuple):
-    plan: Plan
-    groups: list[Group]
+    plan: RoundPlan
+    groups: list[ModeGroup]
     places: np.ndarray  # (modes, 2): of each mode its group, and which of that group it is
     ts: jax.Array
 
     @classmethod
-    def of(cls, plan: Plan, groups: list[Group], ts) -> "_Rounds":
+    def of(cls, plan: RoundPlan, groups: list[ModeGroup], ts) -> "_Rounds":
         places = np.zeros((len(plan.names), 2), int)
         for index, group in enumerate(groups):
             places[list(group.family.modes)] = [(index, row) for row in range(len(group.family.modes))]
         return cls(plan, groups, places, ts)
 
-    def one(self, before: Ending, count) -> tuple[Ending, Record]:
+    def one(self, before: Ending, count) -> tuple[Ending, TransitionRecord]:
         """One round: every group runs the members that are in its modes; the others are given no time."""
         after, fired = before, jnp.asarray(False)
-        record = Record(jnp.asarray(jnp.nan), jnp.full_like(before.y, jnp.nan), jnp.asarray(-1), jnp.asarray(-1))
+        record = TransitionRecord(
+            jnp.asarray(jnp.nan), jnp.full_like(before.y, jnp.nan), jnp.asarray(-1), jnp.asarray(-1)
+        )
         place, row = jnp.asarray(self.places)[before.mode]
         for index, group in enumerate(self.groups):
             here = before.going & (place == index)
@@ -187,7 +189,7 @@ class _Rounds(NamedTuple):
             off = off | (this & self.groups[index].mode(jnp.where(this, row, 0)).is_inconsistent(t, y))
         return off
 
-    def _in_mode(self, group: Group, row, before: Ending, here) -> tuple[Ending, jax.Array, Record]:
+    def _in_mode(self, group: ModeGroup, row, before: Ending, here) -> tuple[Ending, jax.Array, TransitionRecord]:
         """The round of the members that are `here`, in this mode of a group, and whether it ended with a transition."""
         mode, t_start = group.mode(jnp.where(here, row, 0)), jax.lax.stop_gradient(before.t)
         sides, rounding, lasting = self._sides(mode, before)
@@ -224,9 +226,9 @@ class _Rounds(NamedTuple):
             latest=exit.number,
             memory=memory,
         )
-        return after, event, Record(exit.t, exit.y, before.mode, exit.target)
+        return after, event, TransitionRecord(exit.t, exit.y, before.mode, exit.target)
 
-    def _through(self, group: Group, mode: Mode, place, changes, at_once, t, y, known) -> tuple[Exit, Memory]:
+    def _through(self, group: ModeGroup, mode: Mode, place, changes, at_once, t, y, known) -> tuple[Exit, Memory]:
         """Through the first transition whose bits in `changes` say that its guard falls (1) or rises (2)."""
         no, none = jnp.asarray(False), jnp.asarray(-1)
         exit = Exit(t, y, y, place, none, no, no, jnp.asarray(True))
@@ -328,7 +330,7 @@ def _pile_up(times, end) -> jax.Array:
     return lost | ((ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end))
 
 
-def _without_silent_zeros(ending: Ending, record: Record, inputs) -> tuple[Ending, Record]:
+def _without_silent_zeros(ending: Ending, record: TransitionRecord, inputs) -> tuple[Ending, TransitionRecord]:
     """Outputs (T, 2n) that were not reached and transitions that did not happen get derivatives that are NaN."""
     happened = record.source >= 0
     t, y = (lost_unless(which, x, inputs) for which, x in ((happened, record.t), (happened[:, None], record.y)))

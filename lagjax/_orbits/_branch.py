@@ -16,7 +16,7 @@ from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout, halves
 from lagjax._orbits._arcs import Arcs
 from lagjax._orbits._family import Family, begun, place_of
-from lagjax._orbits._follow import Follower, Point, Tangent, corrected, tangent_at
+from lagjax._orbits._follow import FamilyPoint, FamilyTangent, Follower, corrected, tangent_at
 from lagjax._orbits._orbit import RTOL, Orbit, told
 from lagjax._orbits._rank import decide
 from lagjax._orbits._starts import starts
@@ -87,7 +87,7 @@ def _follower(system: System, family: Family, k: int, turns: int, params, by: st
     return Follower(arcs.with_numbers(_numbers(arcs, place, family, k)), place, y0, period)
 
 
-def _orbit_of(follower: Follower, family: Family, k: int, turns: int) -> Point:
+def _orbit_of(follower: Follower, family: Family, k: int, turns: int) -> FamilyPoint:
     """Orbit k of a family, traversed once or twice."""
     period, _, y0 = _start(family, k, turns)
     return begun(follower, y0, period, _numbers(follower.arcs, follower.place, family, k))
@@ -106,7 +106,7 @@ def _numbers(arcs: Arcs, place: int | None, family: Family, k: int) -> np.ndarra
     return numbers
 
 
-def _beside(follower: Follower, here: Point, before: Tangent, size: float) -> Point | None:
+def _beside(follower: Follower, here: FamilyPoint, before: FamilyTangent, size: float) -> FamilyPoint | None:
     """The orbit at a distance from a branch point along the null vector that is no symmetry, nor of the old family.
 
     How many symmetries there are, and about which directions, is known from a neighbour on the old family: at the
@@ -122,6 +122,6 @@ def _beside(follower: Follower, here: Point, before: Tangent, size: float) -> Po
     left, sizes, _ = np.linalg.svd(null - known @ (known.T @ null), full_matrices=False)
     if not sizes[0] > 0.5:
         return None
-    across = Tangent(left[:, 0], before.rank, before.symmetries)
+    across = FamilyTangent(left[:, 0], before.rank, before.symmetries)
     there = corrected(follower, follower.moved(here, size * across.vector, 0.0), across)
     return None if there is None else there[0]

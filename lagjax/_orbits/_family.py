@@ -20,7 +20,16 @@ from lagjax._layout import halves, taken_apart
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
 from lagjax._orbits._floquet import passing, reduce
-from lagjax._orbits._follow import Follower, Point, Tangent, Whole, corrected, next_step, step_along, tangent_at
+from lagjax._orbits._follow import (
+    FamilyPoint,
+    FamilyTangent,
+    Follower,
+    Whole,
+    corrected,
+    next_step,
+    step_along,
+    tangent_at,
+)
 from lagjax._orbits._orbit import RTOL, Found, Orbit, arcs_each, told
 from lagjax._orbits._starts import starts
 from lagjax._system import System
@@ -142,15 +151,15 @@ class _Member(NamedTuple):
     doubling, and at the value where the family is to end.
     """
 
-    point: Point
-    tangent: Tangent
+    point: FamilyPoint
+    tangent: FamilyTangent
     symmetries: int
     found: Found
     tests: np.ndarray
     events: tuple[bool, bool, bool] = (False, False, False)
 
 
-def _member(follower: Follower, point: Point, tangent: Tangent, most: int | None) -> _Member:
+def _member(follower: Follower, point: FamilyPoint, tangent: FamilyTangent, most: int | None) -> _Member:
     """An orbit with its multipliers; at most `most` directions count as symmetries."""
     (symmetries,) = _shooting.symmetries(point.chain, most)
     count = symmetries.null.shape[2]
@@ -168,7 +177,7 @@ def _followed(follower: Follower, y0, period, step: float, count: int) -> tuple[
         follower.of_value = abs(until - follower.value(point)) or 1.0
     tangent = tangent_at(follower, point, None)
     if tangent is None:
-        alone = Tangent(np.zeros(point.matrix.shape[1]), 0, np.zeros((point.matrix.shape[1], 0)))
+        alone = FamilyTangent(np.zeros(point.matrix.shape[1]), 0, np.zeros((point.matrix.shape[1], 0)))
         message = "The orbit is alone: it closes at no other energy, or parameter, near its own."
         return [_member(follower, point, alone, None)], message
     wanted = until is None or until > follower.value(point)
@@ -191,7 +200,7 @@ def _followed(follower: Follower, y0, period, step: float, count: int) -> tuple[
     return members[:count], f"{count} orbits were found; the family goes on: raise count to follow it further."
 
 
-def begun(follower: Follower, y0: np.ndarray, period: np.ndarray, numbers: np.ndarray) -> Point:
+def begun(follower: Follower, y0: np.ndarray, period: np.ndarray, numbers: np.ndarray) -> FamilyPoint:
     """The orbit from which a family is followed, in as many arcs as it needs."""
     count = int(arcs_each(follower.arcs.with_numbers(numbers), y0, period)[0])
     return follower.within_growth(follower.begun(y0, period, count, numbers))
@@ -206,7 +215,7 @@ def _in_more_arcs(follower: Follower, member: _Member) -> _Member:
     return member if there is None else member._replace(point=there[0])
 
 
-def _end(follower: Follower, last: Point, stopped: bool) -> str:
+def _end(follower: Follower, last: FamilyPoint, stopped: bool) -> str:
     where = f"{follower.value(last):.9g}, with a period of {last.chain.periods()[0]:.6g}"
     if stopped:
         return f"The family ends at an equilibrium, near {where}."
@@ -275,7 +284,7 @@ def _zero(asked: dict[float, _Member], a: float, b: float, k: int) -> float:
 
 
 def _at(
-    follower: Follower, asked: dict[float, _Member], a: float, b: float, s: float, across: Tangent, left_out: int,
+    follower: Follower, asked: dict[float, _Member], a: float, b: float, s: float, across: FamilyTangent, left_out: int,
     most: int,
 ) -> _Member | None:  # fmt: skip
     """The orbit at an arc s between two of a family that were found at a and b; None where it is none of theirs."""
@@ -294,7 +303,7 @@ def _at(
 _ALONG = 0.7  # the cosine of the turn of a tangent between two neighbours, more than which they have by `step_along`
 
 
-def _rate(follower: Follower, member: _Member, across: Tangent) -> Whole:
+def _rate(follower: Follower, member: _Member, across: FamilyTangent) -> Whole:
     """The change of all numbers along the family by the arc across a tangent."""
     vector = member.tangent.vector / (member.tangent.vector @ across.vector)
     return follower.whole(member.point, vector, 0.0)

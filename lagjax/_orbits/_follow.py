@@ -40,7 +40,7 @@ _ROUNDING = 1e-11
 _LONGEST_GROWTH = 1e3
 
 
-class Point(NamedTuple):
+class FamilyPoint(NamedTuple):
     """An orbit of a family: its chain (of one member), the numbers of the scene, and the closing equations there.
 
     `matrix` (2n, 2n + F) are those of the first state and of what else is free, `right` (2n,) their right-hand side.
@@ -62,7 +62,7 @@ class Point(NamedTuple):
         return bool(self.chain.ok[0] and self.chain.closure()[0] <= share * self.chain.size()[0])
 
 
-class Tangent(NamedTuple):
+class FamilyTangent(NamedTuple):
     """The direction in which a family continues: the unit `vector` (2n + F,), the rank of the closing equations at a
     closed orbit, and its symmetries (2n + F, k), an orthonormal basis."""
 
@@ -79,7 +79,7 @@ class Whole(NamedTuple):
     numbers: np.ndarray
 
     @classmethod
-    def of(cls, point: Point) -> "Whole":
+    def of(cls, point: FamilyPoint) -> "Whole":
         """Those of a point."""
         return cls(point.chain.y, point.chain.period, point.numbers)
 
@@ -110,7 +110,7 @@ class Follower:
         """The closing conditions of an orbit with these parameters."""
         return Closing.plain(self.arcs.with_numbers(numbers))
 
-    def point(self, y, period, parts, numbers) -> Point:
+    def point(self, y, period, parts, numbers) -> FamilyPoint:
         """The chain through these states, (1, K, 2n), and its equations."""
         closing = self.closing(numbers)
         chain = _shooting.follow(closing, y, period, parts, self.units)
@@ -119,10 +119,10 @@ class Follower:
             columns.append(self._by_parameter(closing, y, period, parts, self.place))
         if not chain.ok[0]:
             nothing = np.zeros((0, 0))
-            return Point(chain, numbers, nothing, Condensed(nothing, nothing, nothing, ()), nothing)
+            return FamilyPoint(chain, numbers, nothing, Condensed(nothing, nothing, nothing, ()), nothing)
         condensed = condense(chain.growth, np.concatenate([*columns, chain.defect[..., None]], axis=3))
         matrix = np.concatenate([condensed.first + condensed.last, condensed.more[..., :-1]], axis=2)[0]
-        return Point(chain, numbers, matrix, condensed, condensed.more[0, :, -1])
+        return FamilyPoint(chain, numbers, matrix, condensed, condensed.more[0, :, -1])
 
     def _by_parameter(self, closing: Closing, y, period, parts, place: int) -> np.ndarray:
         """The derivatives (1, K, 2n, 1) of the ends of the arcs by the parameter at this place."""
@@ -135,7 +135,7 @@ class Follower:
         by_params = closing.arcs.follow(times, y[0] * state, direction).by_params
         return by_params[None] * self.of_parameter / state[:, None]
 
-    def whole(self, point: Point, first: np.ndarray, right: float) -> "Whole":
+    def whole(self, point: FamilyPoint, first: np.ndarray, right: float) -> "Whole":
         """The change of all states that goes with one of what is free, (2n + F,), as the linear equations have it."""
         states = point.chain.y.shape[2]
         z = np.append(first[states:], right)[None, :, None]
@@ -145,15 +145,15 @@ class Follower:
             by[self.place] = self.of_parameter * first[-1]
         return Whole(dy, first[states : states + 1] if self.period_is_free else np.zeros(1), by)
 
-    def moved(self, point: Point, first: np.ndarray, right: float) -> Point:
+    def moved(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
         """The point after a change (2n + F,) of what is free, and of the inner states with it."""
         return self.at(point, Whole.of(point).plus(self.whole(point, first, right)))
 
-    def at(self, point: Point, whole: "Whole") -> Point:
+    def at(self, point: FamilyPoint, whole: "Whole") -> FamilyPoint:
         """The point with these numbers, at the same parts of its period as another."""
         return self.point(whole.y, whole.period, point.chain.parts, whole.numbers)
 
-    def within_growth(self, point: Point) -> Point:
+    def within_growth(self, point: FamilyPoint) -> FamilyPoint:
         """The same orbit in more arcs where errors grow much along one; the same point where they do not."""
         count = point.chain.y.shape[1]
         growth = np.log(max(np.linalg.norm(one, 2) for one in point.chain.growth[0])) / np.log(_LONGEST_GROWTH)
@@ -162,12 +162,12 @@ class Follower:
             return point
         return self.begun(point.chain.states(), point.chain.periods(), count * more, point.numbers)
 
-    def begun(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> Point:
+    def begun(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> FamilyPoint:
         """The orbit from a state (1, 2n) in this many arcs, both in the units of the user."""
         parts, y = _shooting.guesses(self.closing(numbers), y0, period, count)
         return self.point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
 
-    def slope(self, point: Point) -> np.ndarray:
+    def slope(self, point: FamilyPoint) -> np.ndarray:
         """The direction (2n + F,), a unit vector, in which the value rises."""
         slope = np.zeros(point.matrix.shape[1])
         if self.place is not None:
@@ -177,13 +177,13 @@ class Follower:
             slope[: len(by_state)] = by_state / (np.linalg.norm(by_state) or 1.0)
         return slope
 
-    def value(self, point: Point) -> float:
+    def value(self, point: FamilyPoint) -> float:
         """The energy, or the parameter."""
         if self.place is not None:
             return float(point.numbers[self.place])
         return float(self.arcs.energy(0.0, point.chain.states())[0])
 
-    def energy(self, point: Point) -> float:
+    def energy(self, point: FamilyPoint) -> float:
         """h = p·q̇ − L."""
         return float(self.arcs.with_numbers(point.numbers).energy(0.0, point.chain.states())[0])
 
@@ -191,7 +191,9 @@ class Follower:
 _MOST_ARCS = 128
 
 
-def tangent_at(follower: Follower, point: Point, before: Tangent | None, left_out: int = 0) -> Tangent | None:
+def tangent_at(
+    follower: Follower, point: FamilyPoint, before: FamilyTangent | None, left_out: int = 0
+) -> FamilyTangent | None:
     """The direction of the family at a closed orbit: on from `before`, or at first that of a rising value.
 
     None where there is none: the orbit is alone. At a branch point, where the smallest `left_out` singular values are
@@ -217,7 +219,7 @@ def tangent_at(follower: Follower, point: Point, before: Tangent | None, left_ou
     length = np.linalg.norm(vector)
     if not length > 1e-6 * (np.linalg.norm(slope) if before is None else 1.0):
         return None
-    return Tangent(vector / length, rank, symmetries)
+    return FamilyTangent(vector / length, rank, symmetries)
 
 
 def _without(basis: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -228,15 +230,17 @@ def _without(basis: np.ndarray, vector: np.ndarray) -> np.ndarray:
     return basis @ np.linalg.svd(along[None], full_matrices=True)[2][1:].T
 
 
-class Step(NamedTuple):
+class FamilyStep(NamedTuple):
     """A corrected orbit with its tangent, and which share of its bounds the step took, 1 at most."""
 
-    point: Point
-    tangent: Tangent
+    point: FamilyPoint
+    tangent: FamilyTangent
     share: float
 
 
-def corrected(follower: Follower, point: Point, across: Tangent, left_out: int = 0) -> tuple[Point, np.ndarray] | None:
+def corrected(
+    follower: Follower, point: FamilyPoint, across: FamilyTangent, left_out: int = 0
+) -> tuple[FamilyPoint, np.ndarray] | None:
     """The orbit in the plane across a tangent, and the sizes of Newton's corrections; None where there is none.
 
     The smallest `left_out` singular values of the equations are left out, as at a branch point, where one is zero.
@@ -257,7 +261,7 @@ def corrected(follower: Follower, point: Point, across: Tangent, left_out: int =
     return (point, np.array(sizes)) if point.closed(CLOSED) else None
 
 
-def step_along(follower: Follower, last: Point, tangent: Tangent, step: float) -> Step | None:
+def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, step: float) -> FamilyStep | None:
     """The orbit one step on; None where the step was too long for the family."""
     there = corrected(follower, follower.moved(last, step * tangent.vector, 0.0), tangent)
     if there is None:
@@ -278,10 +282,10 @@ def step_along(follower: Follower, last: Point, tangent: Tangent, step: float) -
         np.arccos(cosine) / _TURN,
         np.sqrt(np.linalg.norm(askew) / _ASKEW),
     )
-    return Step(point, following, float(share)) if share <= 1 else None
+    return FamilyStep(point, following, float(share)) if share <= 1 else None
 
 
-def _chord(follower: Follower, last: Point, point: Point, step: float) -> np.ndarray:
+def _chord(follower: Follower, last: FamilyPoint, point: FamilyPoint, step: float) -> np.ndarray:
     """The change of what is free, (2n + F,), in units of the step."""
     change = point.free - last.free
     if not follower.period_is_free:
@@ -292,7 +296,7 @@ def _chord(follower: Follower, last: Point, point: Point, step: float) -> np.nda
     return change / step
 
 
-def next_step(step: float, there: Step) -> float:
+def next_step(step: float, there: FamilyStep) -> float:
     """The length of the next step: half to twice this one, so that it takes the usual share of its bounds."""
     longer = step * float(np.clip(_USUAL / max(there.share, 1e-300), 0.5, 2.0))
     return min(longer, _LONGEST * there.point.chain.size()[0])

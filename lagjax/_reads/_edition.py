@@ -24,7 +24,7 @@ from jax.core import Tracer
 
 from lagjax._reads._identity import CHANGING, Walk, array_text
 from lagjax._reads._marks import LARGEST_ARRAY, LARGEST_CONTAINER, SIZE, Marks
-from lagjax._reads._names import Names
+from lagjax._reads._names import ReadNames
 
 _MOST_THINGS = 2000  # functions, classes and objects of one walk, some 50 ms; what is beyond is told by its identity
 _MOST_EDITIONS = 256  # texts of one function that are known again
@@ -252,7 +252,7 @@ class _LiveWalk(Walk):
         if not users:
             self._of_libraries.add(id(attributes))
 
-    def meets(self, names: Names) -> None:
+    def meets(self, names: ReadNames) -> None:
         self._stored |= names.stored
         if self.names is not None:
             self.names = None if names.reflects else self.names | names.globals | names.attributes

@@ -23,7 +23,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._reads._names import Names, names_of
+from lagjax._reads._names import ReadNames, names_of
 
 _LONG = 400  # characters of a value that is shown; of a longer one its hash
 _DEEP = 50  # containers within containers: one that is deeper contains itself
@@ -69,7 +69,7 @@ class Walk:
         """True if an attribute of an object, a class or a function of the user is one of the things it reads."""
         return True
 
-    def meets(self, names: Names) -> None:
+    def meets(self, names: ReadNames) -> None:
         """Code that is among what is read names these."""
 
     def opaque(self, thing: Any) -> list[tuple[str, Any]]:

@@ -13,7 +13,7 @@ _REFLECTING = frozenset(
 _OF_GLOBALS = frozenset("LOAD_NAME STORE_NAME DELETE_NAME LOAD_FROM_DICT_OR_GLOBALS".split())
 
 
-class Names(NamedTuple):
+class ReadNames(NamedTuple):
     """The names in code, those in the functions inside of it included.
 
     `globals`; `attributes`; `imports`, each (level, module, names taken from it); `stored`: globals, free variables and
@@ -28,7 +28,7 @@ class Names(NamedTuple):
 
 
 @functools.lru_cache(maxsize=4096)
-def names_of(code: types.CodeType) -> Names:
+def names_of(code: types.CodeType) -> ReadNames:
     """The names in a code object, found once for each."""
     found: dict[str, set] = {"globals": set(), "attributes": set(), "stored": set()}
     imports: list[tuple[int, str, tuple[str, ...]]] = []
@@ -52,4 +52,4 @@ def names_of(code: types.CodeType) -> Names:
         imports += inner.imports
     reflects = bool(_REFLECTING & (found["globals"] | found["attributes"]))
     sets = {kind: frozenset(names) for kind, names in found.items()}
-    return Names(sets["globals"], sets["attributes"], tuple(imports), sets["stored"], reflects)
+    return ReadNames(sets["globals"], sets["attributes"], tuple(imports), sets["stored"], reflects)

@@ -10,6 +10,13 @@ Every function in `ALL` can be called without arguments, and returns a `Scene`.
 """
 
 from lagjax.scenes import _de421 as de421
+from lagjax.scenes._charges import (
+    charge_in_fields,
+    charge_in_uniform_fields,
+    gyration,
+    relativistic_charge_in_electric_field,
+    relativistic_charge_in_magnetic_field,
+)
 from lagjax.scenes._constrained import (
     Blade,
     Disc,
@@ -31,14 +38,7 @@ from lagjax.scenes._constrained import (
     slider_crank,
     wire_multiplier,
 )
-from lagjax.scenes._coordinates import Cartesian, Cylindrical, Polar, Spherical, convert
-from lagjax.scenes._fields import (
-    charge_in_fields,
-    charge_in_uniform_fields,
-    gyration,
-    relativistic_charge_in_electric_field,
-    relativistic_charge_in_magnetic_field,
-)
+from lagjax.scenes._coordinate_systems import Cartesian, Cylindrical, Polar, Spherical, convert
 from lagjax.scenes._gravity import (
     eccentric_anomaly,
     figure_eight,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._system import System
-from lagjax.scenes._coordinates import Cartesian, Polar, angular_momentum_z, convert
+from lagjax.scenes._coordinate_systems import Cartesian, Polar, angular_momentum_z, convert
 from lagjax.scenes._scene import Scene
 
 

@@ -21,7 +21,7 @@ PyTree = Any
 Vector = Float[Array, " n"]
 
 
-class Scene(NamedTuple):
+class SceneState(NamedTuple):
     """A scene at one state: its functions on vectors, and the numbers they take."""
 
     system: System
@@ -34,7 +34,7 @@ class Scene(NamedTuple):
     numbers: PyTree  # the numbers among them
 
     @classmethod
-    def of(cls, system: System, q: PyTree, qdot: PyTree | None, params: PyTree) -> "Scene":
+    def of(cls, system: System, q: PyTree, qdot: PyTree | None, params: PyTree) -> "SceneState":
         """A scene at the state (q, qdot), at rest where `qdot` is None.
 
         Raises `TypeError` or `ValueError`, with a sentence, for arguments that cannot be right.
@@ -47,7 +47,7 @@ class Scene(NamedTuple):
         return cls.flat(system, layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype))
 
     @classmethod
-    def flat(cls, system: System, layout: Layout, q: Vector, qdot: Vector, params: PyTree) -> "Scene":
+    def flat(cls, system: System, layout: Layout, q: Vector, qdot: Vector, params: PyTree) -> "SceneState":
         """A scene at the flat state (q, qdot), with params of arrays: what a compiled function is given."""
         motion, derivation = system.motion(layout, params), derivation_of(system, layout, params)
         return cls(system, layout, motion, derivation, q, qdot, params, eqx.filter(params, eqx.is_array_like))
@@ -169,7 +169,7 @@ class Scene(NamedTuple):
 @eqx.filter_jit
 def _evaluated(name: str, q, qdot, *arguments) -> Array:
     """Forces, momenta or mass matrices at states (S, n), of a scene without scalar programs."""
-    scene = Scene.flat(*arguments)
+    scene = SceneState.flat(*arguments)
 
     def momentum(q, qdot):
         return scene.motion.momentum(q, qdot, jnp.zeros((), q.dtype), scene.numbers)
