@@ -21,7 +21,7 @@ from lagjax._program import Program, Unlowerable, evaluate
 PyTree = Any
 
 SADDLE = ("mass_matrix", "force", "jacobian", "gamma")  # of M q̈ − Gᵀλ = F, G q̈ = γ
-_AT_ONCE = 2**16  # entries of mass matrices that XLA computes side by side: memory grows like their number
+_AT_ONCE = 2**20  # entries of mass matrices that XLA computes side by side, 8 MB: memory grows like their number
 
 
 class Sample(NamedTuple):
@@ -140,12 +140,21 @@ def solved(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 def _compiled(names: tuple[str, ...], system: Any, layout: Layout, q, qdot, t, params) -> dict[str, jax.Array]:
     motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
 
-    def at(state):
-        values = motion.quantities(*state, numbers)
+    def at(q, qdot, t):
+        values = motion.quantities(q, qdot, t, numbers)
         return {name: values[name] for name in names}
 
     if len(q) == 1:
-        return jax.tree.map(lambda x: x[None], at((q[0], qdot[0], jnp.ravel(t)[0])))
-    size = max(1, _AT_ONCE // layout.size**2)
-    states = q, qdot, jnp.broadcast_to(t, len(q))
-    return jax.vmap(at)(states) if len(q) <= size else jax.lax.map(at, states, batch_size=size)
+        return jax.tree.map(lambda x: x[None], at(q[0], qdot[0], jnp.ravel(t)[0]))
+    return in_chunks(at, (q, qdot, jnp.broadcast_to(t, len(q))), _AT_ONCE // layout.size**2)
+
+
+def in_chunks(function, arrays, size: int):
+    """`function` of each of the states in `arrays`, at most `size` of them at a time."""
+    count = len(arrays[0])
+    size = max(1, min(size, count))
+    missing = -count % size
+    padded = [jnp.concatenate([x, jnp.broadcast_to(x[-1:], (missing, *x.shape[1:]))]) for x in arrays]
+    chunks = [x.reshape(-1, size, *x.shape[1:]) for x in padded]
+    values = jax.lax.map(lambda chunk: jax.vmap(function)(*chunk), chunks)
+    return jax.tree.map(lambda x: x.reshape(x.shape[0] * size, *x.shape[2:])[:count], values)

@@ -19,7 +19,7 @@ import numpy as np
 from lagjax._doubles import DOUBLE
 from lagjax._health._laws import Law, Measurements, measurements_at, power_at
 from lagjax._layout import Layout
-from lagjax._many_states import Sample, borders_of, is_lowered
+from lagjax._many_states import Sample, borders_of, in_chunks, is_lowered
 from lagjax._members import Members
 from lagjax._validate import is_concrete
 
@@ -209,7 +209,7 @@ def _measured(trajectory, axes, tree, steps):
         size = _CHUNK // (members * layout.size**2)
 
         def chunked(function):
-            return lambda *states: _in_chunks(partial(_in_its_mode, laws, function), states, size)
+            return lambda *states: in_chunks(partial(_in_its_mode, laws, function), states, size)
 
         sample = chunked(lambda law, q, v, t: measurements_at(law, momenta, tolerances, q, v, t, numbers))
         between = Between(
@@ -257,17 +257,6 @@ def _in_its_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
 
 def _where(which, new, old):
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
-
-
-def _in_chunks(function, arrays, size: int):
-    """`function` of each of the states in `arrays`, at most `size` of them at a time."""
-    count = len(arrays[0])
-    size = max(1, min(size, count))
-    missing = -count % size
-    padded = [jnp.concatenate([x, jnp.broadcast_to(x[-1:], (missing, *x.shape[1:]))]) for x in arrays]
-    chunks = [x.reshape(-1, size, *x.shape[1:]) for x in padded]
-    values = jax.lax.map(lambda chunk: jax.vmap(function)(*chunk), chunks)
-    return jax.tree.map(lambda x: x.reshape(x.shape[0] * size, *x.shape[2:])[:count], values)
 
 
 # ---- what the path shows: arrays of either library -------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """What is derived from a scene once: programs evaluated without a compiler, and `explain` against what runs."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -375,3 +377,34 @@ def test_forces_between_bodies_take_what_one_would_write_by_hand():
     x = np.random.default_rng(0).normal(size=(count, 3))
     derivation = of(lagjax.System(lagrangian), x, x, {"m": np.ones(count)})
     assert derivation.acceleration.operations <= 22 * len(first) + 9 * count
+
+
+@pytest.mark.parametrize("constraints", [None, lambda q: q @ q - 1.0])
+def test_a_sample_without_programs_is_the_one_with_them(constraints, monkeypatch):
+    # Seven states in chunks of three, of which the last is not full.
+    monkeypatch.setattr(many_states, "_AT_ONCE", 27)
+    lagrangian = lambda q, v: 0.5 * v @ v * (1.0 + q[0] ** 2) - jnp.cos(q).sum()
+    random = np.random.default_rng(0)
+    q, qdot, t = random.standard_normal((7, 3)), random.standard_normal((7, 3)), np.linspace(0.0, 1.0, 7)
+    layout = Layout.of(jnp.ones(3), jnp.ones(3))
+    names = "force", "mass_matrix", "dissipation", "residual", "lagrangian"
+    lowered, compiled = (
+        many_states.Sample.of(scene, layout, q, qdot, t, None).quantities(*names)
+        for scene in (
+            lagjax.System(lagrangian, constraints=constraints),
+            lagjax.System(Held(lagrangian, jnp.ones(())), constraints=constraints),
+        )
+    )
+    for name in names:
+        np.testing.assert_allclose(compiled[name], lowered[name], rtol=1e-13, atol=1e-13)
+
+
+class Held(eqx.Module):
+    """A Lagrangian that holds an array of its own, so that its scene has no programs."""
+
+    function: Callable
+    one: jax.Array
+
+    def __call__(self, q, v):
+        """`function`, times one."""
+        return self.one * self.function(q, v)
