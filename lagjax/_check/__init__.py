@@ -16,9 +16,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from lagjax._check import _ahead, _borders, _constraints, _derivatives, _mass, _stiffness
+from lagjax._check import _ahead, _constraint_checks, _derivative_checks, _jumps_nearby, _mass, _stiffness
 from lagjax._check._findings import Finding, Findings, listed
-from lagjax._check._measure import Scene
+from lagjax._check._scene_at_start import CheckedScene
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
@@ -82,14 +82,14 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
 
 @accepts_singles(("q", "qdot"), ("t", "params"))
 def _about_scene(system, q, qdot, t, params) -> list[Finding]:
-    scene = Scene.of(system, Layout.of(q, qdot), q, qdot, t, params)
-    reported = _derivatives.findings(scene)
+    scene = CheckedScene.of(system, Layout.of(q, qdot), q, qdot, t, params)
+    reported = _derivative_checks.findings(scene)
     reported += _dissipation(scene)
-    reported += _constraints.findings(scene)
+    reported += _constraint_checks.findings(scene)
     reported += _mass.findings(scene)
     if not any(finding.level == "error" for finding in reported):
         known = {finding.where for finding in reported if finding.kind == "kink"}  # one finding for each direction
-        nearby = [finding for finding in _borders.findings(scene) if finding.where not in known]
+        nearby = [finding for finding in _jumps_nearby.findings(scene) if finding.where not in known]
         known |= {finding.where for finding in nearby}
         ahead = [finding for finding in _ahead.findings(scene) if finding.where not in known]
         reported += [*_acceleration(scene), *nearby, *ahead, *_stiffness.findings(scene)]
@@ -158,7 +158,7 @@ def _precision(layout: Layout, q, qdot, params) -> list[Finding]:
 # ---- what the forces do ----------------------------------------------------------------------------------------------
 
 
-def _dissipation(scene: Scene) -> list[Finding]:
+def _dissipation(scene: CheckedScene) -> list[Finding]:
     """A warning where the dissipation function puts energy into the motion at some velocity."""
     power, size = scene.measured.power.T
     usable = np.isfinite(power)
@@ -174,7 +174,7 @@ def _dissipation(scene: Scene) -> list[Finding]:
     return [Finding("creates_energy", "warning", (), message)]
 
 
-def _acceleration(scene: Scene) -> list[Finding]:
+def _acceleration(scene: CheckedScene) -> list[Finding]:
     bad = ~np.isfinite(scene.solved()[0])
     if not bad.any():
         return []
@@ -186,7 +186,7 @@ def _acceleration(scene: Scene) -> list[Finding]:
     return [Finding("acceleration_not_finite", "error", where, message)]
 
 
-def _time(scene: Scene) -> list[Finding]:
+def _time(scene: CheckedScene) -> list[Finding]:
     functions = [getattr(scene.system, role) for role in _ROLES]
     timed = tuple(role for role, f in zip(_ROLES, functions, strict=True) if f is not None and "t" in f.extras)
     if not timed:

@@ -3,7 +3,7 @@
 A force that is switched on at t = 5, or a barrier at q = 3, is found from the program before anything runs. A switching
 number u that reads one coordinate, one velocity or the time alone is followed by Newton's method from many places along
 it, and so is the largest value of what an exponential is taken of. Exact where u is linear, or quadratic; u may
-be periodic: the nearest ones are named. The rest are left to the search nearby (`_borders`).
+be periodic: the nearest ones are named. The rest are left to the search nearby (`_jumps_nearby`).
 """
 
 from collections.abc import Callable, Iterator
@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._check._borders import OF_FORCE
 from lagjax._check._findings import Finding, listed
-from lagjax._check._measure import Scene
+from lagjax._check._jumps_nearby import OF_FORCE
+from lagjax._check._scene_at_start import CheckedScene
 from lagjax._many_states import Sample
 from lagjax._program import BELOW, Borders, StraightLine, Unlowerable, evaluate, live
 
@@ -27,7 +27,7 @@ _NAMED = 4  # of many, as of a periodic force, the nearest
 class _Along(NamedTuple):
     """The motion's state with input number `i` varied alone, and what the accelerations decide on there."""
 
-    scene: Scene
+    scene: CheckedScene
     borders: Borders
     i: int
 
@@ -62,7 +62,7 @@ class _Along(NamedTuple):
         return self.scene.at(y[:, :n], y[:, n:-1], y[:, -1])
 
 
-def findings(scene: Scene) -> list[Finding]:
+def findings(scene: CheckedScene) -> list[Finding]:
     """Advice about what jumps, and about what is narrow, at a known value of one number."""
     try:
         borders = scene.derivation.borders

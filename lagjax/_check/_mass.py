@@ -15,12 +15,12 @@ examined, which is regular when the saddle point is (`_linear`). States nearby t
 import numpy as np
 
 from lagjax._check._findings import Finding, listed
-from lagjax._check._measure import Scene
+from lagjax._check._scene_at_start import CheckedScene
 from lagjax._linear import diagonal_scale, eigen, null_directions, singular_threshold
 from lagjax._problem import DEFAULT_RTOL
 
 
-def findings(scene: Scene) -> list[Finding]:
+def findings(scene: CheckedScene) -> list[Finding]:
     """All that there is to say about the mass matrix."""
     m, names = scene.measured, scene.layout.names
     augmented = scene.augmented
@@ -51,7 +51,7 @@ def _rounding(matrix: np.ndarray) -> float:
 # ---- singular --------------------------------------------------------------------------------------------------------
 
 
-def _singular(scene: Scene, augmented: np.ndarray, usable: list[int]) -> list[Finding]:
+def _singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int]) -> list[Finding]:
     """Findings for K (states, n, n) that is singular at the state; `usable` are the states nearby where K is finite."""
     names, constrained = scene.layout.names, scene.motion.constrained
     empty = [i for i in range(len(names)) if all(not augmented[k][i].any() for k in [0, *usable])]
@@ -83,7 +83,7 @@ def _empty(i: int, momenta: np.ndarray, name: str, constrained: bool) -> Finding
     return Finding(kind, "error", (name,), message)
 
 
-def _classified(scene: Scene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
+def _classified(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
     """The kind of a singularity with these null directions, and the rest of the sentence about it."""
     m = scene.measured
     if any(not len(directions) for k, directions in nearby.items() if not (m.velocity[k] != m.velocity[0]).any()):
@@ -118,7 +118,7 @@ def _classified(scene: Scene, here: np.ndarray, nearby: dict[int, np.ndarray]) -
     )
 
 
-def _homogeneous(scene: Scene, states: list[int]) -> bool:
+def _homogeneous(scene: CheckedScene, states: list[int]) -> bool:
     """True if M q̇ = 0 at all of these states: L is of degree one in the velocities."""
     m = scene.measured
 

@@ -4,13 +4,13 @@ import numpy as np
 
 from lagjax._check._findings import Finding
 from lagjax._check._mass import kernel
-from lagjax._check._measure import Scene
+from lagjax._check._scene_at_start import CheckedScene
 
 # The ratio of the time scales from which an explicit solver spends nearly all of its steps on the fastest.
 _RATIO = 1e4
 
 
-def findings(scene: Scene) -> list[Finding]:
+def findings(scene: CheckedScene) -> list[Finding]:
     """Advice where one part of the motion is much faster than another."""
     n, m = scene.layout.size, scene.measured
     # Constraints leave the velocities in the kernel of G free.

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function, accept
+from lagjax._batch_members import Members
 from lagjax._display._notebook import COLORS
 from lagjax._display._summary import times_of_members
 from lagjax._layout import Layout
-from lagjax._members import Members
 from lagjax._platform import is_known, numbers_at
 
 PyTree = Any

@@ -33,12 +33,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from lagjax._batch_members import Members
 from lagjax._diagnosis import diagnosis, ended_of
-from lagjax._health._borders import Met, is_piecewise, met
+from lagjax._health._border_counts import Met, is_piecewise, met
 from lagjax._health._compare import global_error
 from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measured
 from lagjax._layout import Layout
-from lagjax._members import Members
 from lagjax._results import RESULTS, advice, as_printed
 from lagjax._system import System
 from lagjax._validate import is_concrete

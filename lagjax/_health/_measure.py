@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._batch_members import Members
 from lagjax._doubles import DOUBLE
 from lagjax._health._laws import Law, Measurements, measurements_at, power_at
 from lagjax._layout import Layout
 from lagjax._many_states import Sample, borders_of, in_chunks, is_lowered
-from lagjax._members import Members
 from lagjax._validate import is_concrete
 
 PyTree = Any
@@ -53,7 +53,7 @@ class Names(eqx.Module):
     constraints: tuple[str, ...] = eqx.field(static=True)
 
 
-class Path(NamedTuple):
+class SampledPath(NamedTuple):
     """The S states of one member, or of N members with a first axis (N, …) in NumPy, and the tolerances of the run.
 
     The T outputs come first, then the states just before each transition.
@@ -123,7 +123,7 @@ def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
 # ---- in NumPy, all members at once -----------------------------------------------------------------------------------
 
 
-def path_of(members: Members) -> Path:
+def path_of(members: Members) -> SampledPath:
     """The states of all members."""
     run, count = members.trajectory, members.count
     ts = members.shared(run.ts, 1)
@@ -142,7 +142,7 @@ def path_of(members: Members) -> Path:
         rtol, atol = (members.shared(x, 0).astype(q.dtype) for x in tolerances)
         tolerances = np.maximum(rtol, np.finfo(q.dtype).eps), atol
     steps = np.asarray(run.stats["num_accepted_steps"], q.dtype).reshape(count)
-    return Path(q, qdot, t, mode, ts, ends, steps, tolerances, _precision_of(run, q))
+    return SampledPath(q, qdot, t, mode, ts, ends, steps, tolerances, _precision_of(run, q))
 
 
 def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
@@ -185,7 +185,7 @@ def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
     with np.errstate(all="ignore"):
         decides = any(borders_of(law.derivation) is not None for law in laws)
         decided = along(lambda law, sample: sample.pieces()) if decides else None
-        between = Between(along(Law.powers), along(Law.accelerations), decided)
+        between = Rates(along(Law.powers), along(Law.accelerations), decided)
         fields = _report(path, laws, momenta, partial(by_mode, measured), between)
     return jax.tree.map(lambda x: jnp.asarray(np.reshape(x, members.batch + np.shape(x)[1:])), fields)
 
@@ -212,7 +212,7 @@ def _measured(trajectory, axes, tree, steps):
             return lambda *states: in_chunks(partial(_in_its_mode, laws, function), states, size)
 
         sample = chunked(lambda law, q, v, t: measurements_at(law, momenta, tolerances, q, v, t, numbers))
-        between = Between(
+        between = Rates(
             chunked(lambda law, q, v, t: power_at(law, q, v, t, numbers)),
             chunked(lambda law, q, v, t: law.motion.acceleration(q, v, t, numbers)),
         )
@@ -222,7 +222,7 @@ def _measured(trajectory, axes, tree, steps):
     return fields, names["all"]
 
 
-def _path_of_one(layout: Layout, q, qdot, times_and_tolerances, mode, steps, transitions) -> Path:
+def _path_of_one(layout: Layout, q, qdot, times_and_tolerances, mode, steps, transitions) -> SampledPath:
     def flat(tree):
         return jax.vmap(layout.flatten)(tree)
 
@@ -236,7 +236,7 @@ def _path_of_one(layout: Layout, q, qdot, times_and_tolerances, mode, steps, tra
     if tolerances is not None:
         rtol, atol = (jnp.asarray(x, layout.dtype) for x in tolerances)
         tolerances = jnp.maximum(rtol, jnp.finfo(layout.dtype).eps), atol
-    return Path(q, v, t, mode, ts, ends, steps.astype(layout.dtype), tolerances, layout.dtype)
+    return SampledPath(q, v, t, mode, ts, ends, steps.astype(layout.dtype), tolerances, layout.dtype)
 
 
 def _in_its_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
@@ -262,7 +262,7 @@ def _where(which, new, old):
 # ---- what the path shows: arrays of either library -------------------------------------------------------------------
 
 
-def _report(path: Path, laws: list[Law], momenta: tuple[int, ...], sample: Callable, between: "Between") -> dict:
+def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample: Callable, between: "Rates") -> dict:
     """All measured fields; `sample(q, qdot, t, mode)` gives the `Measurements` at states."""
     xp, axis, T, dtype = path.library, path.time, path.ts.shape[-1], path.q.dtype
     q, qdot, t, mode = path[:4]
@@ -324,7 +324,7 @@ def _ends(xp, ts, transitions):
     return xp.where(between, T + first, xp.arange(1, T))
 
 
-def _drifts(path: Path, laws, momenta, samples: Measurements, reached, between: "Between") -> tuple[Any, Any]:
+def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, between: "Rates") -> tuple[Any, Any]:
     """|h − h₀ − W| and |pᵢ − pᵢ₀| at every output, a column each, and how far W may be off, (…).
 
     A piece of the path, from an output to its entry in `ends`, counts for a quantity that its mode conserves; whatever
@@ -355,7 +355,7 @@ def _at_ends(xp, axis: int, ends, x):
     return xp.take_along_axis(x, ends.reshape(ends.shape + (1,) * (x.ndim - ends.ndim)), axis=axis)
 
 
-class Between(NamedTuple):
+class Rates(NamedTuple):
     """Functions of states (q, q̇, t, mode) between outputs: dh/dt, q̈, and what changes where another piece decides."""
 
     power: Callable
@@ -380,7 +380,7 @@ _CORRECTIONS = np.linalg.inv(_BENDS).T @ _VANISHING  # (2, 8)
 INSIDE = 1e-9  # how far from its ends a piece of the path is asked what its program decides there
 
 
-def _work(path: Path, samples: Measurements, measurable, between: Between) -> tuple[Any, Any]:
+def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) -> tuple[Any, Any]:
     """∫ P dt over every piece, (…, T − 1), and how far the sum of them may be off, (…).
 
     Between its ends the motion is replaced by a polynomial. The one of degree five that has their q, q̇ and q̈ is off by
@@ -494,7 +494,7 @@ def _amplitude(xp, q, on_path):
     return xp.where(largest > rounding, largest, math.inf)
 
 
-def _limits(path: Path, here: Measurements, on_path) -> tuple[Any, Any]:
+def _limits(path: SampledPath, here: Measurements, on_path) -> tuple[Any, Any]:
     """The largest drift of h and the momenta by errors of steps and round-off, and their sizes, (…, k) each.
 
     Fixed steps have no tolerances: there `VISIBLE` of the size is the limit.

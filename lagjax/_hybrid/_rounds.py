@@ -98,10 +98,10 @@ class Ending(NamedTuple):
     modes: jax.Array  # (T,), −1 where not reached
     steps: jax.Array  # accepted, rejected
     latest: jax.Array  # the number of the transition before, −1 at the beginning
-    memory: "Memory"
+    memory: "GuardMemory"
 
 
-class Memory(NamedTuple):
+class GuardMemory(NamedTuple):
     """The sides of every guard just before the last reset, (K,): its value, and the side of its surface.
 
     Of a guard of another mode the value is NaN. `rounding` is that of the largest terms that a guard has had.
@@ -228,7 +228,7 @@ class _Rounds(NamedTuple):
         )
         return after, event, TransitionRecord(exit.t, exit.y, before.mode, exit.target)
 
-    def _through(self, group: ModeGroup, mode: Mode, place, changes, at_once, t, y, known) -> tuple[Exit, Memory]:
+    def _through(self, group: ModeGroup, mode: Mode, place, changes, at_once, t, y, known) -> tuple[Exit, GuardMemory]:
         """Through the first transition whose bits in `changes` say that its guard falls (1) or rises (2)."""
         no, none = jnp.asarray(False), jnp.asarray(-1)
         exit = Exit(t, y, y, place, none, no, no, jnp.asarray(True))
@@ -254,12 +254,12 @@ class _Rounds(NamedTuple):
 
     # ---- on which side of its surface every guard is ----
 
-    def no_memory(self, rounding) -> Memory:
+    def no_memory(self, rounding) -> GuardMemory:
         """Nothing is known of any guard but its rounding."""
         count = len(self.plan.transitions)
-        return Memory(jnp.full(count, jnp.nan), jnp.zeros(count), jnp.broadcast_to(rounding, (count,)))
+        return GuardMemory(jnp.full(count, jnp.nan), jnp.zeros(count), jnp.broadcast_to(rounding, (count,)))
 
-    def _memory(self, mode: Mode, guarded: Guarded, kinds, before: Memory, sides, stays) -> Memory:
+    def _memory(self, mode: Mode, guarded: Guarded, kinds, before: GuardMemory, sides, stays) -> GuardMemory:
         """The sides before a reset of the guards of this mode, which began on these `sides`.
 
         A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where it
@@ -272,7 +272,7 @@ class _Rounds(NamedTuple):
         here = jnp.where(kinds > 0, jnp.where(kinds == 1, 1.0, -1.0), here)
         nothing = self.no_memory(before.rounding)
         new = guarded.values, here, rounding
-        return Memory(*(x.at[numbers].set(of_mode) for x, of_mode in zip(nothing, new, strict=True)))
+        return GuardMemory(*(x.at[numbers].set(of_mode) for x, of_mode in zip(nothing, new, strict=True)))
 
     def _sides(self, mode: Mode, before: Ending) -> tuple[jax.Array, jax.Array, jax.Array]:
         """The sides from which a motion comes that begins in a mode, the rounding of guards, and until when they stay.

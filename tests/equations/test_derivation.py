@@ -12,7 +12,7 @@ from jax import lax
 import lagjax
 from lagjax import _derivation, _diffrax, _machine_code, _program, scenes
 from lagjax import _many_states as many_states
-from lagjax._check import _measure as of_check
+from lagjax._check import _scene_at_start as of_check
 from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._health import _measure as of_health
 from lagjax._layout import Layout

@@ -193,3 +193,16 @@ def test_docstrings_begin_with_their_subject():
             text = ast.get_docstring(node) if isinstance(node, kinds) else None
             name = getattr(node, "name", "its head")
             assert not (text or "").startswith(VAGUE), f"{path}: {name} says {text!r}: name the subject first"
+
+
+def test_files_and_classes_have_names_of_their_own():
+    """A name says where to look: a file, and a class at the top of one, is called as no other one is."""
+    files = [path.name for path in PACKAGE.rglob("*.py") if path.name not in ("__init__.py", "__main__.py")]
+    classes = [
+        node.name
+        for path in PACKAGE.rglob("*.py")
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.ClassDef)
+    ]
+    for names in (files, classes):
+        assert sorted(names) == sorted(set(names)), [name for name in set(names) if names.count(name) > 1]

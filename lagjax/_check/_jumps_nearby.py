@@ -14,7 +14,7 @@ import numpy as np
 
 from lagjax._blame import borders_of_motion, pieces_of_motion
 from lagjax._check._findings import Finding
-from lagjax._check._measure import Scene
+from lagjax._check._scene_at_start import CheckedScene
 from lagjax._derivation import numbers_of
 from lagjax._program import Unlowerable, lower
 
@@ -29,7 +29,7 @@ _COMPARED = {
 _REACH = 10  # the steps of the search: 2⁻⁹, 2⁻⁸ … 1 sizes of a coordinate
 
 
-class Jump(NamedTuple):
+class Discontinuity(NamedTuple):
     """A jump: its distance in sizes of a direction, the direction, the distance in units, the operation, what jumps."""
 
     sizes: float
@@ -39,7 +39,7 @@ class Jump(NamedTuple):
     what: str
 
 
-def findings(scene: Scene) -> list[Finding]:
+def findings(scene: CheckedScene) -> list[Finding]:
     """A finding about the nearest jump, if there is one."""
     pieces = pieces_of_motion(scene.motion, *scene.state)
     if not pieces:
@@ -57,7 +57,7 @@ def findings(scene: Scene) -> list[Finding]:
     return [] if nearest is None else [_finding(nearest)]
 
 
-def _sides_of_states(scene: Scene) -> Callable:
+def _sides_of_states(scene: CheckedScene) -> Callable:
     """A function of states (S, 2n + 1): on which sides of the borders they are.
 
     It is a program where the scene has them, else compiled by XLA.
@@ -77,7 +77,7 @@ def _sides_of_states(scene: Scene) -> Callable:
     return jax.jit(jax.vmap(lambda point: sides_at(point[:n], point[n:-1], point[-1], params)))
 
 
-def _directions(scene: Scene) -> list[tuple[str, float, np.ndarray]]:
+def _directions(scene: CheckedScene) -> list[tuple[str, float, np.ndarray]]:
     """(name, size, vector (2n + 1,)) of every direction: a coordinate or a velocity by its size, or the motion."""
     m, n = scene.measured, scene.layout.size
     axes = np.diag(scene.sizes)
@@ -85,7 +85,7 @@ def _directions(scene: Scene) -> list[tuple[str, float, np.ndarray]]:
     return list(zip(scene.names, scene.sizes, axes, strict=True))
 
 
-def _first_jump(scene: Scene, sides: Callable, start, vector, axis, labels: list[str]) -> Jump | None:
+def _first_jump(scene: CheckedScene, sides: Callable, start, vector, axis, labels: list[str]) -> Discontinuity | None:
     """The nearest border along `vector`, if something jumps there."""
     eps, vector = float(np.finfo(start.dtype).eps), np.asarray(vector, start.dtype)
 
@@ -117,11 +117,11 @@ def _first_jump(scene: Scene, sides: Callable, start, vector, axis, labels: list
         if np.isfinite(one).all() and np.isfinite(other).all():
             if np.abs(one - other).max() > np.sqrt(eps) * np.nanmax(np.abs(values)):
                 sizes = beyond if past else 0.0
-                return Jump(sizes, axis[0], sizes * axis[1], labels[place], what)
+                return Discontinuity(sizes, axis[0], sizes * axis[1], labels[place], what)
     return None
 
 
-def _finding(jump: Jump) -> Finding:
+def _finding(jump: Discontinuity) -> Finding:
     here = jump.sizes == 0
     where = "at this state" if here else f"{jump.distance:.3g} away along {jump.direction}"
     serious = jump.what in ("L", "the momentum")

@@ -9,12 +9,12 @@ from typing import Generic, NamedTuple, TypeVar
 import jax
 import numpy as np
 
+from lagjax._batch_members import Members
 from lagjax._blame import pieces_of_motion
 from lagjax._derivation import derivation_of
 from lagjax._health._measure import path_of
 from lagjax._layout import Layout
 from lagjax._machine_code import Flow, StepStore, Tolerances, flow_of
-from lagjax._members import Members
 from lagjax._problem import Problem
 from lagjax._program import Unlowerable
 from lagjax._system import System

@@ -26,7 +26,7 @@ PyTree = Any
 _NEARBY = 4  # states with other positions, and as many with other velocities
 
 
-class Scene(NamedTuple):
+class CheckedScene(NamedTuple):
     """A scene at a state, and what was measured there. Everything is flat; n coordinates, m constraints."""
 
     system: System
@@ -39,7 +39,7 @@ class Scene(NamedTuple):
     measured: "Measured"
 
     @classmethod
-    def of(cls, system: System, layout: Layout, q, qdot, t, params) -> "Scene":
+    def of(cls, system: System, layout: Layout, q, qdot, t, params) -> "CheckedScene":
         """Measure `system` at a state."""
         q, qdot, t, params = as_arrays((q, qdot, 1.0 * t, params), layout.dtype)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)

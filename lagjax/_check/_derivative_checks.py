@@ -3,10 +3,10 @@
 import numpy as np
 
 from lagjax._blame import Offender, offenders, pieces_of
-from lagjax._check._borders import OF_FORCE
 from lagjax._check._differences import Slopes, differ, ladder, slopes
 from lagjax._check._findings import Finding, listed
-from lagjax._check._measure import Scene, Sides
+from lagjax._check._jumps_nearby import OF_FORCE
+from lagjax._check._scene_at_start import CheckedScene, Sides
 
 _SHOWN = 3  # findings of one kind about one function
 # Coordinates beyond which derivatives are first compared along `_RANDOM` directions of q, as many of q̇, and along the
@@ -16,7 +16,7 @@ _ALL_AT_ONCE = 64
 _RANDOM = 8
 
 
-def findings(scene: Scene) -> list[Finding]:
+def findings(scene: CheckedScene) -> list[Finding]:
     """All there is to say about L, the forces and D, one after the other."""
     reported = _values(scene)
     if reported:
@@ -33,7 +33,7 @@ def findings(scene: Scene) -> list[Finding]:
 # ---- finite ----------------------------------------------------------------------------------------------------------
 
 
-def _values(scene: Scene) -> list[Finding]:
+def _values(scene: CheckedScene) -> list[Finding]:
     m, reported = scene.measured, []
     for role, name, value in (("lagrangian", "L", scene.lagrangian), ("forces", "The force", m.extra),
                               ("dissipation", "D", scene.dissipation)):  # fmt: skip
@@ -48,7 +48,7 @@ def _first_bad(value: np.ndarray) -> str:
     return str(value[~np.isfinite(value)].ravel()[0])
 
 
-def _not_finite(scene: Scene) -> list[Finding]:
+def _not_finite(scene: CheckedScene) -> list[Finding]:
     m, n, names = scene.measured, scene.layout.size, scene.names
     first = ~np.isfinite(np.concatenate([m.by_q, m.momentum[0]]))
     drag = ~np.isfinite(m.by_v_of_dissipation)
@@ -67,7 +67,7 @@ def _not_finite(scene: Scene) -> list[Finding]:
     return reported
 
 
-def _no_derivative(scene: Scene, role: str, what: str, where: tuple[str, ...], order: str) -> Finding:
+def _no_derivative(scene: CheckedScene, role: str, what: str, where: tuple[str, ...], order: str) -> Finding:
     message = f"{what} {listed(where)} is not finite at this state, although the function is"
     return Finding("derivative_not_finite", "error", where, message + _blame(scene, role, order))
 
@@ -92,7 +92,7 @@ _BRANCH = (
 )
 
 
-def _blame(scene: Scene, role: str, order: str) -> str:
+def _blame(scene: CheckedScene, role: str, order: str) -> str:
     """The end of a sentence: which operation, with which operands, in which line, and what to write instead."""
     wanted = {"value": ("value",), "first": ("value", "first derivative")}.get(order)
     offending = [o for o in offenders(getattr(scene.motion, role), *scene.state) if not wanted or o.fault in wanted]
@@ -107,7 +107,7 @@ def _remedy(offender: Offender) -> str:
     return _REMEDIES.get(offender.name, "Write it so that it is smooth there, or start elsewhere.")
 
 
-def _blame_for_kink(scene: Scene, role: str) -> str:
+def _blame_for_kink(scene: CheckedScene, role: str) -> str:
     function = getattr(scene.motion, role)
     places = list(dict.fromkeys(f"{name}{place}" for name, place, _ in pieces_of(function, *scene.state)))
     return f" (the function is pieced together by {listed(places, 3)})" if places else ""
@@ -116,7 +116,7 @@ def _blame_for_kink(scene: Scene, role: str) -> str:
 # ---- against finite differences --------------------------------------------------------------------------------------
 
 
-def _blocks(scene: Scene, round_off):
+def _blocks(scene: CheckedScene, round_off):
     """The derivatives that are compared, in blocks: a name, the role of the function, its derivatives, their names.
 
     The derivatives have the shape (directions, outputs); the last two entries are these directions, of the 2n + 1, and
@@ -148,12 +148,12 @@ def _blocks(scene: Scene, round_off):
     return [block for block in blocks if len(block[-1])]
 
 
-def position_count(scene: Scene) -> int:
+def position_count(scene: CheckedScene) -> int:
     """The number of constraints on positions, which come first."""
     return scene.derivation.position_count
 
 
-def _agree(scene: Scene) -> bool:
+def _agree(scene: CheckedScene) -> bool:
     """True if derivatives are the slopes along random directions, from both sides and from each."""
     n, dtype, m = scene.layout.size, scene.layout.dtype, scene.measured
     directions = np.zeros((2 * _RANDOM + 1, 2 * n + 1))
@@ -177,7 +177,7 @@ def _agree(scene: Scene) -> bool:
     return True
 
 
-def _compared(scene: Scene, sides: Sides, name, role, derivative, directions, outputs) -> list[Finding]:
+def _compared(scene: CheckedScene, sides: Sides, name, role, derivative, directions, outputs) -> list[Finding]:
     m, dtype, names = scene.measured, scene.layout.dtype, scene.names
     chosen = np.ix_(directions, range(sides.plus.shape[1]), outputs)
     place = _places(scene)[list(directions)]
@@ -217,7 +217,7 @@ def _compared(scene: Scene, sides: Sides, name, role, derivative, directions, ou
     return reported
 
 
-def _places(scene: Scene) -> np.ndarray:
+def _places(scene: CheckedScene) -> np.ndarray:
     """|q|, |q̇| and the time, (2n + 1,): the numbers of the state whose rounding moves what is computed from them."""
     q, v, t = (np.abs(np.asarray(x, float)) for x in scene.state[:3])
     speed = v.max()

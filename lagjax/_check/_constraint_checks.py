@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from lagjax._check._derivatives import position_count
+from lagjax._check._derivative_checks import position_count
 from lagjax._check._findings import Finding, listed
 from lagjax._check._mass import null_velocities
-from lagjax._check._measure import Scene
+from lagjax._check._scene_at_start import CheckedScene
 from lagjax._consistent import require_consistent
 from lagjax._layout import Layout
 from lagjax._linear import dependent_rows
 
 
-def findings(scene: Scene) -> list[Finding]:
+def findings(scene: CheckedScene) -> list[Finding]:
     """All there is to say about constraints on positions and on velocities."""
     if not scene.motion.constrained:
         return []
