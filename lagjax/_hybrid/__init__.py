@@ -36,7 +36,7 @@ PyTree = Any
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hybrid:
-    """A scene whose motion changes its laws, as one object: `fit` and `sweep` take it in the place of a `System`.
+    """A hybrid system as one object, modes and transitions: `fit` and `sweep` take it in place of a `System`.
 
     - `modes`, `transitions`, `start`, `max_transitions`: those of `simulate_hybrid`; every motion begins in the mode
       `start`.

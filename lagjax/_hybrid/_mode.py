@@ -44,7 +44,7 @@ MOST_GUARDS = 24  # two bits each in the code of an event, which the kernel keep
 
 
 class Transition(eqx.Module):
-    """From mode `source` to mode `target` where `guard(q, qdot)` changes sign.
+    """A switch from mode `source` to mode `target` where `guard(q, qdot)` changes sign.
 
     - `guard`: a real function; it may also ask, by name, for `t`, `params` and `multipliers`, the last as the
       constraints of the mode return them.
