@@ -141,8 +141,8 @@ def test_the_adjoints_of_two_vectors_of_members_go_on_two_threads_with_the_same_
     run = flow.run(TS, y0, numbers, TOLERANCES)
     residuals = run.path, run.result, run.accepted, run.ticket
     path_ct, end_ct = rng.normal(size=(members, 1, TS.size, 4)), rng.normal(size=(members, 1, 4))
-    asked, found, together = [], [], _kernel.together
-    monkeypatch.setattr(_kernel, "together", lambda work, count: (asked.append(count), together(work, count))[1])
+    asked, found, together = [], [], _kernel.run_on_threads
+    monkeypatch.setattr(_kernel, "run_on_threads", lambda work, count: (asked.append(count), together(work, count))[1])
     for cores in (1, 2):
         monkeypatch.setattr(_kernel, "cores", lambda cores=cores: cores)
         found.append(_derivatives.vjp(flow, TS, y0, numbers, residuals, path_ct, end_ct, TOLERANCES))
