@@ -34,14 +34,15 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **Parameters from recordings**
 
-- `fit`: the likeliest parameters with intervals, as a `Fit`
+- `fit`: the likeliest parameters with intervals, as a `Fit`; its methods return a `Profile`, a `Prediction`,
+  `Experiments`, a `Comparison`
 - `Record`, `Timings`, `Guess`, `Delayed`, `wrapped`: what was measured, and how
 - `Gaussian`, `StudentT`: the noise
 - `positive`, `between`, `angle`, `simplex`, `inertia`: what parameters may be
 
 **Many members, few numbers of each**
 
-- `sweep`: up to 10⁸ members in a store, as a `Sweep`, with its `Statistics` and `Status`
+- `sweep`: up to 10⁸ members in a store, as a `Sweep`, with its `Statistics` (a `Summary` each) and `Status`
 - `designs`: points to sweep over: random, Sobol's, Latin hypercubes
 
 **More**

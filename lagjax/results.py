@@ -29,8 +29,9 @@ Each of them is also found as `lagjax.Trajectory`, `lagjax.Orbit`, ….
 
 **Parameters and sweeps**
 
-- `Fit`: from `fit`
-- `Status`: from `Sweep.status`
+- `Fit`: from `fit`; `Profile`, `Prediction`, `Experiments`, `Comparison`: from its methods `profile`, `predict`,
+  `next_experiment`, `compare`
+- `Status`, `Summary`: from `Sweep.status`, `Sweep.statistics`
 
 ```python
 import jax.numpy as jnp, lagjax
@@ -62,21 +63,23 @@ from lagjax._check import Finding, Findings
 from lagjax._crossings import Crossings
 from lagjax._display import Animation
 from lagjax._explain import Explanation
-from lagjax._fit import Fit
+from lagjax._fit import Comparison, Experiments, Fit, Prediction, Profile
 from lagjax._health import Health
 from lagjax._orbits import Family, LyapunovExponent, Orbit, Path
 from lagjax._precision import WorkPrecision, WorkPrecisionRow
-from lagjax._sweep import Status
+from lagjax._sweep import Status, Summary
 from lagjax._trajectory import State, Trajectory, Transitions
 
 __all__ = [
     "Animation",
     "CanonicalTrajectory",
     "ChangedCoordinates",
+    "Comparison",
     "Conserved",
     "ConservedQuantities",
     "Crossings",
     "Equilibrium",
+    "Experiments",
     "Explanation",
     "Family",
     "Finding",
@@ -89,10 +92,13 @@ __all__ = [
     "Modes",
     "Orbit",
     "Path",
+    "Prediction",
+    "Profile",
     "Routhian",
     "SameMotion",
     "State",
     "Status",
+    "Summary",
     "Trajectory",
     "Transitions",
     "WorkPrecision",

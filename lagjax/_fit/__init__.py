@@ -44,6 +44,8 @@ from lagjax._fit._descent import Descent
 from lagjax._fit._motions import Manifold, motions_of
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
 from lagjax._fit._parameters import Parameters, angle, between, inertia, positive, reading_params, simplex
+from lagjax._fit._prediction import Prediction
+from lagjax._fit._profile import Comparison, Profile
 from lagjax._fit._records import (
     Form,
     Guess,
@@ -77,7 +79,7 @@ from lagjax._fit._search import (
 )
 from lagjax._fit._sensors import UNCLEAR, Delayed, Signals, require_no_jumps, sensors, wrapped
 from lagjax._fit._timings import Timings, clock_of
-from lagjax._fit._uncertainty import Information, information, unseen_sentences
+from lagjax._fit._uncertainty import Experiments, Information, information, unseen_sentences
 from lagjax._fit._verdict import (
     SECONDS,
     Unexplained,
@@ -93,10 +95,14 @@ from lagjax._problem import DEFAULT_RTOL
 from lagjax._samples import HOLDS
 
 __all__ = [
+    "Comparison",
     "Delayed",
+    "Experiments",
     "Fit",
     "Gaussian",
     "Guess",
+    "Prediction",
+    "Profile",
     "Record",
     "StudentT",
     "Timings",

@@ -268,7 +268,7 @@ class Fit:
     def next_experiment(
         self, candidates: Sequence[Record] | dict[str, Record], *, system: str | None = None
     ) -> Experiments:
-        """Which of several planned records would tell most about the free parameters: D-optimal design.
+        """Rank planned records by what they would tell about the free parameters: D-optimal design.
 
         Each is rated by the gain in log det of the information. `candidates`: records, or a dict of them by name, with
         times, weights, inputs and a start as they are planned. Their values are not read and may be NaN. A start
@@ -309,7 +309,7 @@ class Fit:
 
     @with_doubles
     def compare(self, other: "Fit | dict[str, Fit]", *, folds: int = 0) -> Comparison:
-        """Which of several fits of the same records the data prefer: this one against another, or a dict of others.
+        """Compare fits of the same records: this one with another, or with a dict of others.
 
         The fits are compared by AIC and BIC with effective numbers of samples, and with `folds` also by
         cross-validation: the records are divided into that many groups, each group is left out in turn, and is
