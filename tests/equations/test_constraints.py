@@ -327,9 +327,9 @@ def crank_alone(q, qdot, params):
     return code(scenes.slider_crank(1.0, 1.0).system.lagrangian)(whole, moving, params)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "solver",
-    [pytest.param(None, id="machine code"), pytest.param(diffrax.Dopri8(), id="diffrax", marks=pytest.mark.slow)],
+    "solver", [pytest.param(None, id="machine code"), pytest.param(diffrax.Dopri8(), id="diffrax")]
 )
 def test_slider_cranks_of_equal_bars_pass_their_dead_centre(solver):
     # At crank = π/2 the second constraint has no gradient, and the bars might go on together instead.

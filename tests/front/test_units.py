@@ -28,6 +28,7 @@ def test_other_random_states_find_the_same(seed):
 MOLECULE = lagjax.System(lambda q, v: 0.5e-26 * v**2 - 7e-19 * (1 - jnp.exp(-2e10 * (q - 1.2e-10))) ** 2)
 
 
+@pytest.mark.slow
 def test_a_molecule_in_metres_rests_at_its_bond_length():
     rest = lagjax.equilibrium(MOLECULE, 1.5e-10)
     np.testing.assert_allclose(rest.q, 1.2e-10, rtol=1e-14)

@@ -78,6 +78,7 @@ def matrix_with_vanishing_minors(x):
     return jnp.array([[x, 1.0, 0.0], [1.0, -x, 0.5], [0.3, 0.0, 1.0]])
 
 
+@pytest.mark.slow
 def test_a_motion_through_vanishing_minors():
     # The same potential by an adjugate, written out: no pivot, no border, the same steps.
     b = jnp.array([1.0, -0.5, 0.3])
