@@ -1,4 +1,4 @@
-"""Which operation of a user's function is to blame: its jaxpr, followed one equation at a time.
+"""The operation of a user's function that is to blame: its jaxpr, followed one equation at a time.
 
 Every equation is evaluated by itself. One whose result is not finite although its operands are, or whose own first
 or second derivative is not finite, is an `Offender`; comparisons and their like (|x|, max, sign, floor) are `borders`,

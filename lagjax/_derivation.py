@@ -289,7 +289,7 @@ class Derivation:
         return self._whole.read_by(self._positions(name))
 
     def absent(self, name: str) -> np.ndarray:
-        """Which numbers of this quantity are zero whatever the state, in its shape."""
+        """True for each number of this quantity that is zero whatever the state, in its shape."""
         zeros = [self._whole.constant(k) == 0 for k in self._positions(name)]
         return np.array(zeros, bool).reshape(self.shape(name))
 

@@ -110,12 +110,12 @@ class _State:
         return np.array(self.derivatives.along_one(values.tolist(), rates), dtype=np.int64)
 
     def zero(self, values: Ids) -> np.ndarray:
-        """Which numbers are zero whatever the state."""
+        """True for each number that is zero whatever the state."""
         graph = self.expansion.graph
         return np.array([graph.value(i) == 0 for i in values.ravel().tolist()], bool).reshape(values.shape)
 
     def varying(self, values: Ids) -> np.ndarray:
-        """Which numbers depend on q, q̇ or t."""
+        """True for each number that depends on q, q̇ or t."""
         graph = self.expansion.graph
         moving = {i for name in ("q", "qdot", "t") for i in self.ids[name].ravel().tolist()}
         for i in self.derivatives.below(values.ravel().tolist()):

@@ -414,7 +414,7 @@ def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> It
 
 
 def _fill(x: int, terms: Sequence[int], now: set[int], others: list[set[int]], moving: set[int]) -> None:
-    """Which entries of the energy are no longer zero once x is eliminated."""
+    """The entries of the energy that are no longer zero once x is eliminated."""
     coupled = others[x] - {x}
     for u in now:
         others[u].discard(x)

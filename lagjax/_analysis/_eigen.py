@@ -101,7 +101,7 @@ def _symmetric_jvp(primals, tangents):
 
 
 def _meet(values) -> Array:
-    """Which pairs of eigenvalues count as equal, (n, n), each with itself."""
+    """True for each pair of eigenvalues that count as equal, (n, n), each with itself."""
     values = jax.lax.stop_gradient(values)
     size = jnp.max(jnp.abs(values))
     allowed = _UNITS * len(values) ** 0.5 * jnp.finfo(size.dtype).eps * size

@@ -381,7 +381,7 @@ def _quantities(
 
 
 def _independent(names: list[str], gradients: np.ndarray) -> list[int]:
-    """Which to keep of D charges with these gradients (S, D, 2n): all that have a name, and of combinations and
+    """The charges to keep of D with these gradients (S, D, 2n): all that have a name, and of combinations and
     dilations those that are no function of the others.
 
     A function of others has a gradient in the space of theirs at every state. So the angular momentum of the centre of

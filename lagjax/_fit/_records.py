@@ -170,7 +170,7 @@ def looked_up(ts: np.ndarray, inputs: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def about(ts: np.ndarray, begin: float, end: float, hold: str) -> slice:
-    """Which of the samples at `ts` (K,) say what the input is from `begin` to `end`."""
+    """The samples at `ts` (K,) that determine the input from `begin` to `end`."""
     margin = MARGINS[hold]
     first = int(np.searchsorted(ts, begin, side="right")) - 1 - margin
     last = int(np.searchsorted(ts, end, side="left")) + 1 + margin

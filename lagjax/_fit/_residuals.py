@@ -139,7 +139,7 @@ class SystemResiduals:
         )  # fmt: skip
 
     def columns(self, record: int) -> slice:
-        """Which of the signals a record has."""
+        """The signals that a record has."""
         last = len(self.signals.names)
         return slice(last, last + 1) if record in self.clocks else slice(0, last)
 

@@ -274,7 +274,7 @@ def _jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
 
 
 def _returns(y: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Which steps belong to a sample that is off by itself: the next step leads back."""
+    """True for each step that belongs to a sample that is off by itself: the next step leads back."""
     back = np.zeros(len(steps), bool)
     alone = np.abs(y[2:] - y[:-2]) < 0.5 * np.minimum(steps[1:], steps[:-1])
     back[:-1] |= alone

@@ -57,7 +57,7 @@ class Surfaces(NamedTuple):
 
     @property
     def only_jump(self) -> np.ndarray:
-        """Which guards have no rate anywhere, (G,): they change their sign by jumps."""
+        """For every guard, (G,), true if it has no rate anywhere: it changes its sign by jumps."""
         count = len(self.directions)
         return np.array([self.complete.constant(count + k) == 0.0 for k in range(count)])
 
@@ -114,7 +114,7 @@ def require_one_number(value, what: str) -> jax.Array:
 
 
 def crossing_variation(surfaces: Surfaces, program: Program, k: int) -> Callable:
-    """`(taken, t, y, numbers)` → (t, y): how the state at t, where guard k is zero, moves to where it is zero then.
+    """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero, moved to where it is zero then.
 
     With δg the variation of the guard, f the rate of the state by the `program` of q̈, and ′ the derivative along the
     motion, the time moves by

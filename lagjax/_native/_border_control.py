@@ -477,7 +477,7 @@ class BorderControl:
             frame.call(self.graze)
 
     def _graze(self, base: int) -> Code:
-        """`()`: whether the border is grazed that the step ends at, into `grazes`.
+        """`()`: set `grazes` where the step ends at a border that it only grazes.
 
         With the rate u̇ of its switching number a motion that is moved by the tolerance, u by ε, does not cross it, or
         has before, where u̇² ≤ 2 |ü| ε.

@@ -68,7 +68,7 @@ class FirstSaltation:
             yield slopes[first + 1] * self.motion.look_up.take(frame, of(table), slopes[first])
 
     def note_hit(self, frame: Frame, table: GuardTable) -> None:
-        """Which switching number the guard `crossed` has, into `hit`; none where a motion begins on the border."""
+        """Set `hit` for the switching number of the guard `crossed`; for none where a motion begins on the border."""
         code = frame.code
         frame["is_hit"] = 0.0
         with code.loop(self.pieces) as j:
@@ -182,7 +182,7 @@ class FirstSaltation:
         return {"slopes": self.slopes, "rate": 1, "jump": self.motion.n, "jumps": 1}
 
     def note_end(self, table: GuardTable) -> Code:
-        """`()`: what is to be known of the border at the end of a step."""
+        """`()`: note the gradient and the rate of the border that a step ends at."""
         frame = self.motion.function("note_end")
         code = frame.code
         frame["is_hit"] = 0.0

@@ -106,7 +106,7 @@ class Saltation:
     # ---- what jumps ----
 
     def _jumps(self, code: Code, before: Numbers, behind: Numbers) -> Callable[[Index], Value]:
-        """`(i)`: whether acceleration i jumps by more than rounding."""
+        """`(i)`: true if acceleration i jumps by more than rounding."""
 
         def jumps(i):
             larger = code.maximum(code.intrinsic("fabs", before[i]), code.intrinsic("fabs", behind[i]))
@@ -115,7 +115,7 @@ class Saltation:
         return jumps
 
     def tangent_jumps(self, frame: Frame, out: Numbers, is_hit: Value, grazes: Value) -> Callable:
-        """`(row, i, part)`: what is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
+        """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
         code, n = frame.code, self.base
         first = (len(self.jump.orders) - 1) * 2 * n
         jumps = self._jumps(code, *(_some(out, first + k * n, n) for k in range(2)))
@@ -182,7 +182,7 @@ class Saltation:
         frame["edge_t"] = frame["t"] + frame["h"]
 
     def note_end(self) -> Code:
-        """`()`: what is to be known of the border at the end of a step."""
+        """`()`: note the state at the border that a step ends at."""
         frame = self.motion.function("note_end")
         frame["is_hit"] = 0.0
         with frame.code.only_if(frame.code.any_lane(frame["crossed"] > 0.0)):
@@ -197,7 +197,7 @@ class Saltation:
         ]  # fmt: skip
 
     def cotangent_jumps(self, frame: Frame, behind: Vectors) -> Callable:
-        """`(row, i)`: what the cotangent of number i of a row, q, q̇ and then the parameters, gains at the `edge`.
+        """`(row, i)`: the gain of the cotangent of number i of a row, q, q̇ and then the parameters, at the `edge`.
 
         Of `state_ct`, with the pieces `behind` the border.
         """

@@ -190,7 +190,7 @@ def _angles(line: StraightLine, uses: list[int]) -> dict[int, list[int]]:
 def _outputs(
     line: StraightLine, operations: list[ScheduledOperation], kinds: _Kinds, staying: int
 ) -> tuple[dict[int, int], list[ScheduledOperation]]:
-    """Which of the first outputs every node is; and the copies for those that no operation makes, or that are an
+    """The first outputs that every node is; and the copies for those that no operation makes, or that are an
     earlier output too, and for all other outputs.
 
     Of a program of N nodes, a copy for output k is node N + k.

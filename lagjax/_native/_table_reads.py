@@ -111,7 +111,7 @@ class LookUps:
 
     @functools.cached_property
     def _locate(self) -> Code:
-        """`(base, stride, count, closed, x)`: how many entries are at most x, less one."""
+        """`(base, stride, count, closed, x)`: the number of entries that are at most x, less one."""
         code = Code(self.module, "locate", [POINTER, INTEGER, INTEGER, INTEGER, DOUBLE], 1, result=DOUBLE)
         base, stride, count, closed, x = code.arguments
         low, high = code.variable(code.as_value(0, INTEGER)), code.variable(count)

@@ -24,7 +24,7 @@ from lagjax._program._series import Recurrent, Series, StraightLine
 
 
 class Chosen(NamedTuple):
-    """Which of the numbers of a member are parameters of a motion: those at `positions`, `of` this many.
+    """The numbers of a member that are parameters of a motion: those at `positions`, `of` this many.
 
     The others are only looked up (`_table_reads`).
     """

@@ -109,7 +109,7 @@ class TimeKnots:
     # ---- over steps that have been taken ----
 
     def note_end(self) -> Code:
-        """`()`: what is to be known of the entry at the end of a step."""
+        """`()`: note the entry that a step ends at, and the accelerations before it."""
         motion = self.motion
         frame = motion.function("note_knot")
         code = frame.code

@@ -104,7 +104,7 @@ class Derivatives:
         return [cotangents.get(i, self._number(0.0)) for i in by]
 
     def _varied(self, tape: Tape, nodes: list[int], by: frozenset[int]) -> list[bool]:
-        """Which scalars of a tape depend on the inputs `by`, and have a derivative."""
+        """For every scalar of a tape, true if it depends on the inputs `by` and has a derivative."""
         varied: list[bool] = []
         for k, (op, operands, attribute) in enumerate(tape.nodes):
             depends = attribute in by if op == "input" else any(varied[x] for x in operands)
@@ -378,7 +378,7 @@ class _PlacedLine(Derivatives):
         return [results[i] if i in results else self._number(0.0) for i in by]
 
     def _varied_by(self, inputs: frozenset[int], tables: bool) -> list[bool]:
-        """Which nodes depend on some inputs, or on entries of tables."""
+        """For every node, true if it depends on some inputs, or on entries of tables."""
         varied: list[bool] = []
         for (op, operands, attribute), kind in zip(self.line.nodes, self.line.kinds, strict=True):
             if op == "take":

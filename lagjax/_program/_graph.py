@@ -183,7 +183,7 @@ class Graph:
         return self.constant(float(np.frombuffer(numbers)[i - first]), "float")
 
     def position(self, i: int) -> int | None:
-        """Which input an id is, or None."""
+        """The input that an id is, or None."""
         if i >= NUMBERS:
             return None
         if i >= INPUTS:

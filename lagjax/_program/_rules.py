@@ -218,7 +218,7 @@ def read_by(equation) -> list:
 
 
 def formula_of(equation) -> str | None:
-    """Which of the functions of JAX that have a formula here a call is: "det", "slogdet", "expn", or None.
+    """The name of the function of JAX that a call is, if that has a formula here ("det", "slogdet", "expn"); or None.
 
     JAX has rules of its own for their derivatives, which agree with those of any formula for them.
     """

@@ -183,7 +183,7 @@ def test_old_names_say_the_new_one(name):
     assert told[0].filename == __file__
 
 
-VAGUE = ("What ", "How ", "Whether ", "Where ")
+VAGUE = ("What ", "How ", "Whether ", "Where ", "Which ")
 
 
 def test_docstrings_begin_with_their_subject():
