@@ -115,7 +115,7 @@ def _nothing_to_find(system, q0, qdot0, t, params) -> bool:
 
 
 def inconsistent_members(system, ts, values: dict, axes: dict) -> jax.Array | None:
-    """True for each member of a batch that starts off its constraints, shape (N,); None if that cannot be or cannot be known.
+    """True for each member of a batch that starts off its constraints, shape (N,); None if that cannot be known.
 
     `values` holds q0, qdot0 and params of the batch, `axes` which axis of each counts the members.
     """

@@ -87,7 +87,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
 
 
 def _moving(borders: Borders, node: int, moving: int) -> set[int]:
-    """The inputs among the first `moving` ones that a node reads, by itself and through the pieces that it depends on."""
+    """The inputs, of the first `moving` ones, that a node reads by itself and through the pieces it depends on."""
     first, read, seen, waiting = borders.program.size - len(borders.switches), set(), set(), [node]
     while waiting:
         inputs = borders.read_by(waiting.pop())

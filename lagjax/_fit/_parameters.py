@@ -799,7 +799,7 @@ def _spread(prefix: PyTree, tree, leaves: list, name: str) -> list:
 
 
 def _which_are_fitted(label: str, leaf, may_move, free) -> np.ndarray:
-    """True for each number of a leaf (n,) that is fitted. Raises where the user asks for that of one that cannot move."""
+    """True for each number of a leaf (n,) that is fitted. Raises where the user asks to fit one that cannot move."""
     wanted = np.asarray(may_move)
     if wanted.dtype != bool:
         raise TypeError(f"free must hold True or False; got {may_move!r} for {label}.")
