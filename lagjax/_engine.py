@@ -40,7 +40,6 @@ def asked_for(solver=None, dt=None, adjoint=None, progress: Any = False, rtol=No
 
 
 _MACHINE_CODE = MachineCode()
-ON_GPUS = "solver=lagjax.MachineCode() is for GPUs too, assembled and checked on a CPU, not yet run on a GPU"
 
 
 def choose(problem: Problem, asked: AbstractEngine | None = None) -> Choice:
@@ -55,7 +54,7 @@ def choose(problem: Problem, asked: AbstractEngine | None = None) -> Choice:
         if asked is not None:
             raise ValueError(_refused(refusal))
         if default_platform() == "gpu" and _MACHINE_CODE.lacks(problem) is None:
-            refusal += f"; {ON_GPUS}"
+            refusal += f"; {_MACHINE_CODE.outlook_on_gpus(problem)}"
         choice = Choice(Diffrax(), refusal)
     if refusal := choice.engine.refuses(problem):
         raise ValueError(f"{refusal}.")

@@ -74,7 +74,8 @@ class MachineCode(AbstractEngine):
     for CPUs, by `jax.export` too. That form is assembled and checked on a CPU, not yet run on a GPU. There, members
     that fail are not tried once more by another variant of the equations, and an angle beyond 2²⁰ ends a motion. A
     first derivative takes a motion with its tangents for every direction, in reverse mode for every number of the
-    start and of the parameters; higher ones are composed of these. Crossings and hybrid motion require a CPU.
+    start and of the parameters; higher ones are composed of these. Crossings and hybrid motion require a CPU. Where the
+    series of a scene do not fit into the registers of a thread, 16 cores of a CPU may be as fast (`System.explain`).
 
     Machine code requires a CPU or such a GPU, a scene whose acceleration is a scalar program of smooth or piecewise
     smooth operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;
@@ -115,6 +116,12 @@ class MachineCode(AbstractEngine):
             return surfaces
         flow = _flow_of(problem)
         return flow if isinstance(flow, str) else None
+
+    def outlook_on_gpus(self, problem: Problem) -> str:
+        """What to expect of the problem's machine code on a GPU, as the end of a sentence."""
+        with jax.enable_x64(True):
+            problem = problem.in_doubles if problem.is_single else problem
+            return _outlook_on_gpus(flow_of(problem), tolerances_of(problem).rtol)
 
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
@@ -171,6 +178,20 @@ class MachineCode(AbstractEngine):
 def _run(problem: Problem, given: tuple) -> Solution:
     ts, y0, params = given
     return flow_of(problem).run(ts, y0, params, tolerances_of(problem))
+
+
+def _outlook_on_gpus(flow: Flow, rtol: float) -> str:
+    try:
+        form = flow.kernel.form_for_gpus(rtol)
+    except Unlowerable as reason:
+        return f"nor can solver=lagjax.MachineCode() go to a GPU: {reason}"
+    outlook = "solver=lagjax.MachineCode() is for GPUs too, assembled and checked on a CPU, not yet run on a GPU"
+    if not form.unrolled:  # `benchmarks.gpu_estimate`: a chain of four, at the bandwidth of the memory
+        outlook += (
+            "; its series do not fit into the registers of a thread, and if the memory bounds it, it is no faster "
+            "there than on 16 cores of a CPU"
+        )
+    return outlook
 
 
 def _in_doubles(solve: Callable, problem: Problem):

@@ -181,7 +181,11 @@ class Kernel:
 
     def program_for_gpus(self, rtol: float) -> str:
         """The motion of a member in PTX (`_gpu`). Raises `Unlowerable` where a GPU cannot run it."""
-        return self._programs_for_gpus(_gpu.form_for(self._one_lane, order_for(rtol)))
+        return self._programs_for_gpus(self.form_for_gpus(rtol))
+
+    def form_for_gpus(self, rtol: float) -> "_gpu.GpuForm":
+        """The form of that program. Raises `Unlowerable` where a GPU cannot run it."""
+        return _gpu.form_for(self._one_lane, order_for(rtol))
 
     @functools.cached_property
     def _one_lane(self) -> "_gpu.OneLane":

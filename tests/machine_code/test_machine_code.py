@@ -55,6 +55,24 @@ def test_traced_tolerances_are_an_error_too():
         jax.jit(lambda rtol: lagjax.simulate(OSCILLATOR, 1.0, 0.0, TS, rtol=rtol, **INSIST).q)(1e-6)
 
 
+@pytest.mark.parametrize(
+    ("scene", "outlook"),
+    [
+        (lagjax.scenes.double_pendulum(), "not yet run on a GPU"),
+        (lagjax.scenes.chain(4), "no faster there than on 16 cores of a CPU"),
+        (lagjax.scenes.chain(60), "nor can solver=lagjax.MachineCode() go to a GPU: .* a CPU is the better choice"),
+    ],
+    ids=["registers", "memory", "too large"],
+)
+def test_on_a_gpu_the_explanation_follows_the_size_of_the_scene(monkeypatch, scene, outlook):
+    """Compiles nothing: an integrator of one lane is written down for each."""
+    for module in (machine_code, engine):
+        monkeypatch.setattr(module, "default_platform", lambda: "gpu")
+    explained = " ".join(str(scene.system.explain(scene.q0, scene.qdot0, params=scene.params)).split())
+    assert re.search(rf"diffrax.*{outlook.replace('(', '[(]').replace(')', '[)]')}", explained)
+    assert ("16 cores" in explained) == ("16 cores" in outlook)
+
+
 def test_where_it_runs_is_asked_anew_for_every_run(monkeypatch):
     """A machine with a GPU, where the device of a run may be the one and then the other."""
     with monkeypatch.context() as context:

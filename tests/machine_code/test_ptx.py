@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.interpreters import mlir
+from jax.sharding import AbstractMesh
+from jax.sharding import PartitionSpec as P
 
 import lagjax
 from benchmarks._ptx import PtxOnCpu
@@ -254,10 +256,17 @@ def test_the_lowering_launches_and_calls_nothing_else(dtype):
     def to_event(q0):
         return one(q0, event=lambda q, qdot: q)
 
-    one_member, many = dtype(1), np.ones(1000, dtype)
+    def repeated(q0):
+        return jax.lax.scan(lambda q, _: (one(q), q), q0, length=3)
+
+    one_member, many, over = dtype(1), np.ones(1000, dtype), P("members")
+    mesh = AbstractMesh((4,), ("members",))
+    on_four_gpus = jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=over, out_specs=over)
     # A derivative needs the motion itself and its tangents.
     for function, q0, calls in (
         (one, one_member, 1), (jax.vmap(one), many, 1), (to_event, one_member, None), (jax.grad(one), one_member, 2),
+        (jax.vmap(jax.grad(one)), many, 2), (jax.hessian(one), one_member, None), (repeated, one_member, 1),
+        (on_four_gpus, many, 1),
     ):  # fmt: skip
         text = jax.export.export(jax.jit(function), platforms=["cuda"], disabled_checks=[
             jax.export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.ptx")])(q0).mlir_module()  # fmt: skip
