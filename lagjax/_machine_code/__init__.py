@@ -118,7 +118,7 @@ class MachineCode(AbstractEngine):
         return flow if isinstance(flow, str) else None
 
     def outlook_on_gpus(self, problem: Problem) -> str:
-        """What to expect of the problem's machine code on a GPU, as the end of a sentence."""
+        """The outlook for the problem's machine code on a GPU, as the end of a sentence."""
         with jax.enable_x64(True):
             problem = problem.in_doubles if problem.is_single else problem
             return _outlook_on_gpus(flow_of(problem), tolerances_of(problem).rtol)
