@@ -58,9 +58,12 @@ def starts(scene, members: int) -> tuple:
     return q0, jax.tree.map(lambda x: jnp.multiply.outer(scales, x), scene.qdot0)
 
 
-def counted(scene, form=gpu.form_for) -> tuple[str, dict, float]:
-    """The PTX of a scene's motion, in a form, its instructions a step, and the steps of a member."""
-    programs, counts = [], {}
+def counted(scene, form=gpu.form_for, gradient=False) -> tuple[str, dict, float]:
+    """The PTX of a scene's motion, in a form, its instructions a step, and the steps of a member.
+
+    Of the `gradient` by the start and the parameters: of the motions with tangents, and the steps of all of a member.
+    """
+    programs, counts, steps = [], {}, []
 
     def launch(program, operands, results):
         def host(*arrays):
@@ -68,31 +71,41 @@ def counted(scene, form=gpu.form_for) -> tuple[str, dict, float]:
             arrays = [np.array(x) for x in arrays]
             outputs = [arrays[4], arrays[5], *(np.full(x.shape, np.nan) for x in results[2:])]
             translated.thread(0, 1, 0, 1, *(x.ctypes.data for x in (*arrays, *outputs)))
+            counts.clear()
             counts.update(translated.counts)
+            steps.append(outputs[5].sum() + outputs[6].sum())
             return tuple(outputs)
 
         programs.append(program)
         return list(jax.pure_callback(host, tuple(results), *operands))
 
-    def lower_by(rule):
-        mlir.register_lowering(_primitives.run_p, rule, platform="cpu")
+    def lower_by(rules):
+        for primitive, rule in zip((_primitives.run_p, _primitives.vjp_p), rules, strict=True):
+            mlir.register_lowering(primitive, rule, platform="cpu")
+
+    def ends(q0, v0, params):
+        return motions(scene, q0, v0, params, solver=lagjax.MachineCode()).end
+
+    def sum_of_ends(*given):
+        return sum(x.sum() for x in jax.tree.leaves(ends(*given)))
 
     kept, _gpu_launch.launch, gpu.form_for = (_gpu_launch.launch, gpu.form_for), launch, form
     try:  # the rule of GPUs on the CPU
-        lower_by(mlir.lower_fun(_primitives._run_for_gpus, multiple_results=True))
-        run = jax.jit(lambda q0, v0: motions(scene, q0, v0, solver=lagjax.MachineCode()).stats)
-        stats = jax.tree.map(np.asarray, run(*starts(scene, MEMBERS)))
+        of_gpus = _primitives._run_for_gpus, _primitives._vjp_for_gpus
+        lower_by(mlir.lower_fun(rule, multiple_results=True) for rule in of_gpus)
+        run = jax.jit(jax.grad(sum_of_ends, argnums=(0, 1, 2)) if gradient else ends)
+        jax.block_until_ready(run(*starts(scene, MEMBERS), jax.tree.map(jnp.asarray, scene.params)))
     finally:
-        lower_by(_primitives._for_cpus(_primitives._run_compiled))
+        lower_by(map(_primitives._for_cpus, (_primitives._run_compiled, _primitives._vjp_compiled)))
         _gpu_launch.launch, gpu.form_for = kept
         jax.clear_caches()
-    steps = stats["num_steps"].sum()
-    return programs[0], {name: count / steps for name, count in counts.items()}, float(steps) / MEMBERS
+    program, total = programs[-1], steps[-1]  # a gradient launches the motion before its tangents
+    return program, {name: count / total for name, count in counts.items()}, float(total) / MEMBERS
 
 
-def motions(scene, q0, v0, solver=None):
+def motions(scene, q0, v0, params, solver=None):
     ts = jnp.array([0.0, DURATION])
-    return lagjax.simulate_batch(scene.system, q0, v0, ts, scene.params, rtol=RTOL, solver=solver)
+    return lagjax.simulate_batch(scene.system, q0, v0, ts, params, rtol=RTOL, solver=solver)
 
 
 def assembled(program: str) -> dict | None:
@@ -131,7 +144,7 @@ def on_this_machine(scene) -> float:
     times = []
     for _ in range(6):
         begun = time.perf_counter()
-        jax.block_until_ready(motions(scene, q0, v0))
+        jax.block_until_ready(motions(scene, q0, v0, scene.params))
         times.append(time.perf_counter() - begun)
     return 1e9 * float(np.median(times[1:])) / BATCH
 
@@ -139,16 +152,21 @@ def on_this_machine(scene) -> float:
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     rows = []
+
+    def estimate(name, form, *code, **more):
+        program, a_step, steps = counted(*code)
+        thread = assembled(program)
+        row = {"scene": name, "form": form, "steps": steps}
+        row |= {f"{kind} a step": count for kind, count in a_step.items()}
+        row |= {**thread, **bounds(a_step, steps, thread)} if thread is not None else {}
+        rows.append(row | more)
+
     for name, make in SCENES.items():
         scene = make()
         cpu = on_this_machine(scene)
         for form, choose in FORMS.items():
-            program, a_step, steps = counted(scene, choose)
-            thread = assembled(program)
-            row = {"scene": name, "form": form, "steps": steps}
-            row |= {f"{kind} a step": count for kind, count in a_step.items()}
-            row |= {**thread, **bounds(a_step, steps, thread)} if thread is not None else {}
-            rows.append(row | {"cpu_ns": cpu})
+            estimate(name, form, scene, choose, cpu_ns=cpu)
+    estimate("double pendulum, gradient by 9 numbers", "as chosen", scenes.double_pendulum(), gpu.form_for, True)
     print(_report.table(rows))
     note = "an estimate from counted instructions; not run on a GPU"
     _report.write_json(STORE, {**_report.circumstances(), "note": note, "duration": DURATION, "scenes": rows})
