@@ -53,12 +53,21 @@ def choose(problem: Problem, asked: AbstractEngine | None = None) -> Choice:
             return Choice(_MACHINE_CODE, None)
         if asked is not None:
             raise ValueError(_refused(refusal))
-        if default_platform() == "gpu" and _MACHINE_CODE.lacks(problem) is None:
-            refusal += f"; {_MACHINE_CODE.outlook_on_gpus(problem)}"
         choice = Choice(Diffrax(), refusal)
     if refusal := choice.engine.refuses(problem):
         raise ValueError(f"{refusal}.")
     return choice
+
+
+def explain_refusal(problem: Problem) -> str | None:
+    """The reason why the default engine is not machine code, and the outlook for that on a GPU; None where it is.
+
+    It writes a program for GPUs down, which a run that only asks which engine it has does not wait for.
+    """
+    refusal = choose(problem).refusal
+    if refusal is not None and default_platform() == "gpu" and _MACHINE_CODE.lacks(problem) is None:
+        return f"{refusal}; {_MACHINE_CODE.outlook_on_gpus(problem)}"
+    return refusal
 
 
 def _refused(reason: str) -> str:
