@@ -58,12 +58,19 @@ def starts(scene, members: int) -> tuple:
     return q0, jax.tree.map(lambda x: jnp.multiply.outer(scales, x), scene.qdot0)
 
 
-def counted(scene, form=gpu.form_for, gradient=False) -> tuple[str, dict, float]:
-    """The PTX of a scene's motion, in a form, its instructions a step, and the steps of a member.
+def end_of(scene, *given):
+    """The end of a motion, from (q0, qdot0, params)."""
+    return motions(scene, *given, solver=lagjax.MachineCode()).end
 
-    Of the `gradient` by the start and the parameters: of the motions with tangents, and the steps of all of a member.
-    """
-    programs, counts, steps = [], {}, []
+
+def gradient_of(scene, *given):
+    """The gradient of the sum of its coordinates and velocities there, by all of these."""
+    return jax.grad(lambda given: sum(x.sum() for x in jax.tree.leaves(end_of(scene, *given))))(given)
+
+
+def counted(scene, form=gpu.form_for, result=end_of) -> tuple[str, dict, float]:
+    """The PTX of the last launch for a `result`, in a form, its instructions a step, and the steps of a member."""
+    launched = []
 
     def launch(program, operands, results):
         def host(*arrays):
@@ -71,36 +78,27 @@ def counted(scene, form=gpu.form_for, gradient=False) -> tuple[str, dict, float]
             arrays = [np.array(x) for x in arrays]
             outputs = [arrays[4], arrays[5], *(np.full(x.shape, np.nan) for x in results[2:])]
             translated.thread(0, 1, 0, 1, *(x.ctypes.data for x in (*arrays, *outputs)))
-            counts.clear()
-            counts.update(translated.counts)
-            steps.append(outputs[5].sum() + outputs[6].sum())
+            launched.append((program, translated.counts, outputs[5].sum() + outputs[6].sum()))
             return tuple(outputs)
 
-        programs.append(program)
         return list(jax.pure_callback(host, tuple(results), *operands))
 
     def lower_by(rules):
         for primitive, rule in zip((_primitives.run_p, _primitives.vjp_p), rules, strict=True):
             mlir.register_lowering(primitive, rule, platform="cpu")
 
-    def ends(q0, v0, params):
-        return motions(scene, q0, v0, params, solver=lagjax.MachineCode()).end
-
-    def sum_of_ends(*given):
-        return sum(x.sum() for x in jax.tree.leaves(ends(*given)))
-
     kept, _gpu_launch.launch, gpu.form_for = (_gpu_launch.launch, gpu.form_for), launch, form
     try:  # the rule of GPUs on the CPU
         of_gpus = _primitives._run_for_gpus, _primitives._vjp_for_gpus
         lower_by(mlir.lower_fun(rule, multiple_results=True) for rule in of_gpus)
-        run = jax.jit(jax.grad(sum_of_ends, argnums=(0, 1, 2)) if gradient else ends)
-        jax.block_until_ready(run(*starts(scene, MEMBERS), jax.tree.map(jnp.asarray, scene.params)))
+        given = *starts(scene, MEMBERS), jax.tree.map(jnp.asarray, scene.params)
+        jax.block_until_ready(jax.jit(lambda given: result(scene, *given))(given))
     finally:
         lower_by(map(_primitives._for_cpus, (_primitives._run_compiled, _primitives._vjp_compiled)))
         _gpu_launch.launch, gpu.form_for = kept
         jax.clear_caches()
-    program, total = programs[-1], steps[-1]  # a gradient launches the motion before its tangents
-    return program, {name: count / total for name, count in counts.items()}, float(total) / MEMBERS
+    program, counts, steps = launched[-1]
+    return program, {name: count / steps for name, count in counts.items()}, float(steps) / MEMBERS
 
 
 def motions(scene, q0, v0, params, solver=None):
@@ -166,7 +164,7 @@ def main() -> None:
         cpu = on_this_machine(scene)
         for form, choose in FORMS.items():
             estimate(name, form, scene, choose, cpu_ns=cpu)
-    estimate("double pendulum, gradient by 9 numbers", "as chosen", scenes.double_pendulum(), gpu.form_for, True)
+    estimate("double pendulum, gradient by 9 numbers", "as chosen", scenes.double_pendulum(), gpu.form_for, gradient_of)
     print(_report.table(rows))
     note = "an estimate from counted instructions; not run on a GPU"
     _report.write_json(STORE, {**_report.circumstances(), "note": note, "duration": DURATION, "scenes": rows})

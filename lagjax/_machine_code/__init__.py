@@ -121,7 +121,17 @@ class MachineCode(AbstractEngine):
         """The outlook for the problem's machine code on a GPU, as the end of a sentence."""
         with jax.enable_x64(True):
             problem = problem.in_doubles if problem.is_single else problem
-            return _outlook_on_gpus(flow_of(problem), tolerances_of(problem).rtol)
+            try:
+                form = flow_of(problem).kernel.form_for_gpus(tolerances_of(problem).rtol)
+            except Unlowerable as reason:
+                return f"nor can solver=lagjax.MachineCode() go to a GPU: {reason}"
+        outlook = "solver=lagjax.MachineCode() is for GPUs too, assembled and checked on a CPU, not yet run on a GPU"
+        if not form.unrolled:  # `benchmarks.gpu_estimate`: a chain of four, at the bandwidth of the memory
+            outlook += (
+                "; its series do not fit into the registers of a thread, and if the memory bounds it, it is no faster "
+                "there than on 16 cores of a CPU"
+            )
+        return outlook
 
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
@@ -178,20 +188,6 @@ class MachineCode(AbstractEngine):
 def _run(problem: Problem, given: tuple) -> Solution:
     ts, y0, params = given
     return flow_of(problem).run(ts, y0, params, tolerances_of(problem))
-
-
-def _outlook_on_gpus(flow: Flow, rtol: float) -> str:
-    try:
-        form = flow.kernel.form_for_gpus(rtol)
-    except Unlowerable as reason:
-        return f"nor can solver=lagjax.MachineCode() go to a GPU: {reason}"
-    outlook = "solver=lagjax.MachineCode() is for GPUs too, assembled and checked on a CPU, not yet run on a GPU"
-    if not form.unrolled:  # `benchmarks.gpu_estimate`: a chain of four, at the bandwidth of the memory
-        outlook += (
-            "; its series do not fit into the registers of a thread, and if the memory bounds it, it is no faster "
-            "there than on 16 cores of a CPU"
-        )
-    return outlook
 
 
 def _in_doubles(solve: Callable, problem: Problem):

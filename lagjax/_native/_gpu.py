@@ -84,16 +84,21 @@ def grid(members: int) -> tuple[int, int]:
     return min(MOST_BLOCKS, max(1, -(-members // THREADS))), THREADS
 
 
+def require_room(doubles: int) -> None:
+    """Raise `Unlowerable` where a thread cannot remember this many numbers, which may be part of a motion's."""
+    if 8 * doubles > LARGEST_THREAD:
+        raise Unlowerable(
+            f"a thread of a GPU would have to remember at least {8 * doubles} bytes of a motion, "
+            f"more than {LARGEST_THREAD}; a CPU is the better choice"
+        )  # fmt: skip
+
+
 def one_lane(integrator: Integrator) -> OneLane:
     """The text of an integrator. Raises `Unlowerable`, whose text says why a GPU cannot run it."""
     motion = integrator.motion
     assert motion.width == 1, "a thread follows one member"
     size = motion.layout.size
-    if 8 * size > LARGEST_THREAD:
-        raise Unlowerable(
-            f"a thread of a GPU would have to remember {8 * size} bytes of a motion, more than {LARGEST_THREAD}; "
-            "a CPU is the better choice"
-        )  # fmt: skip
+    require_room(size)
     if motion.look_up.numbers is not None:
         raise Unlowerable("its tables of numbers (samples, jnp.interp, …) are not brought to a GPU; make them params")
     return OneLane(str(motion.module), size, motion.series.rows + motion.states, motion.large)

@@ -34,7 +34,7 @@ from lagjax._native._schedule import forget_joined
 from lagjax._native._single_member import fills_lanes
 from lagjax._native._table_reads import SET_NUMBERS
 from lagjax._native._tangent import Tangent
-from lagjax._native._taylor import Chosen, TaylorSeries, is_large
+from lagjax._native._taylor import Chosen, TaylorSeries, is_large, size_of_series
 from lagjax._native._threads import SLICE, run_in_slices, run_on_threads
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
@@ -189,6 +189,7 @@ class Kernel:
 
     @functools.cached_property
     def _one_lane(self) -> "_gpu.OneLane":
+        _gpu.require_room(size_of_series(self._parts[1]))  # before what is larger than that is written down
         return _gpu.one_lane(self.for_members(1)._integrator())
 
     @functools.cached_property

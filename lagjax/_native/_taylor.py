@@ -33,6 +33,11 @@ class Chosen(NamedTuple):
     of: int
 
 
+def size_of_series(series: Series) -> int:
+    """The doubles of the series of one member, of its state and of the rows of its products."""
+    return 2 * series.size * (MAX_ORDER + 1) + series.rows * MAX_ORDER
+
+
 class TaylorSeries:
     """A module with the functions `sums` and `coefficients` of a motion, for others to be built on.
 

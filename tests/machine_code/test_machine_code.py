@@ -60,7 +60,7 @@ def test_traced_tolerances_are_an_error_too():
     [
         (lagjax.scenes.double_pendulum(), "not yet run on a GPU"),
         (lagjax.scenes.chain(4), "no faster there than on 16 cores of a CPU"),
-        (lagjax.scenes.chain(60), "nor can solver=lagjax.MachineCode() go to a GPU: .* a CPU is the better choice"),
+        (lagjax.scenes.chain(60), "nor can solver=lagjax.MachineCode() go to a GPU: a thread of a GPU would"),
     ],
     ids=["registers", "memory", "too large"],
 )
@@ -69,7 +69,7 @@ def test_on_a_gpu_the_explanation_follows_the_size_of_the_scene(monkeypatch, sce
     for module in (machine_code, engine):
         monkeypatch.setattr(module, "default_platform", lambda: "gpu")
     explained = " ".join(str(scene.system.explain(scene.q0, scene.qdot0, params=scene.params)).split())
-    assert re.search(rf"diffrax.*{outlook.replace('(', '[(]').replace(')', '[)]')}", explained)
+    assert "diffrax" in explained and outlook in explained
     assert ("16 cores" in explained) == ("16 cores" in outlook)
 
 
