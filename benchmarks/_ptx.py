@@ -8,6 +8,7 @@ import re
 import struct
 
 import llvmlite.binding as llvm
+import numpy as np
 from llvmlite import ir
 
 I1, I32, I64, D, P = ir.IntType(1), ir.IntType(32), ir.IntType(64), ir.DoubleType(), ir.PointerType()
@@ -20,6 +21,15 @@ def jitted(module, *names):
     engine = llvm.create_mcjit_compiler(module, machine)
     engine.finalize_object()
     return engine, *(engine.get_function_address(name) for name in names)
+
+
+def outputs_of(entry, arrays, shapes):
+    """Copies of the arguments of a launch, and its results: NaN but for those that are arguments, too."""
+    arrays = [np.array(x) for x in arrays]
+    of_name = dict(zip(entry.arguments, arrays, strict=True))
+    outputs = [np.full(shape, np.nan) for shape in shapes]
+    outputs = [of_name.get(name, x) for name, x in zip(entry.results, [None, *outputs], strict=True)]
+    return arrays, outputs
 
 
 _NUMBERS = {
@@ -301,6 +311,10 @@ class PtxOnCpu:
             value = getattr(b, name)(read(0), read(1))
         elif name == "mul" and "lo" in parts:
             value = b.mul(read(0), read(1))
+        elif name == "mul" and "hi" in parts:
+            wide, extend = ir.IntType(2 * _NUMBERS[kind].width), b.sext if signed else b.zext
+            product = b.mul(extend(read(0), wide), extend(read(1), wide))
+            value = b.trunc(b.lshr(product, ir.Constant(wide, wide.width // 2)), _NUMBERS[kind])
         elif name in ("mul", "mad") and "wide" in parts:
             extend = b.sext if signed else b.zext
             value = b.mul(extend(read(0), I64), extend(read(1), I64))

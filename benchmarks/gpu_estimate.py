@@ -22,6 +22,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +31,7 @@ from jax.interpreters import mlir
 
 import lagjax
 from benchmarks import _report
-from benchmarks._ptx import PtxOnCpu
+from benchmarks._ptx import PtxOnCpu, outputs_of
 from lagjax import scenes
 from lagjax._machine_code import _gpu_launch, _primitives
 from lagjax._native import gpu
@@ -39,7 +40,8 @@ STORE = Path(__file__).parent / "results" / "gpu_estimate.json"
 CLOCK, MULTIPROCESSORS, ARITHMETIC, L1, HBM = 1.98e9, 132, 64, 16, 3.35e12
 REGISTERS, L1_BYTES, L2_BYTES = 65536, 256 * 1024, 50e6  # of a multiprocessor; L2 of all of them
 MEMBERS, BATCH, DURATION, RTOL = 4, 4096, 5.0, 1e-9
-FORMS = {"as chosen": gpu.form_for, "in memory": lambda lane, order: gpu.GpuForm(order, unrolled=False)}
+as_chosen = gpu.form_for
+FORMS = {"as chosen": as_chosen, "in memory": lambda _, lane, order: gpu.GpuForm(order, unrolled=False)}
 SCENES = {
     "pendulum": scenes.pendulum,
     "Kepler": scenes.kepler,
@@ -68,20 +70,34 @@ def gradient_of(scene, *given):
     return jax.grad(lambda given: sum(x.sum() for x in jax.tree.leaves(end_of(scene, *given))))(given)
 
 
-def counted(scene, form=gpu.form_for, result=end_of) -> tuple[str, dict, float]:
-    """The PTX of the last launch for a `result`, in a form, its instructions a step, and the steps of a member."""
+def form_of_transpose(_, lane: gpu.OneLane, order: int) -> gpu.GpuForm:
+    """The form of a transpose, for its motion too: so that both take the same steps."""
+    return as_chosen(gpu.TRANSPOSE, lane, order)
+
+
+class Counted(NamedTuple):
+    """The last launch for a result: its entry, its PTX, its instructions a step, and the steps of a member's motion."""
+
+    entry: gpu.Entry
+    program: str
+    a_step: dict[str, float]
+    steps: float
+
+
+def counted(scene, form=as_chosen, result=end_of) -> Counted:
+    """The instructions of a scene's `result`, in a form."""
     launched = []
 
-    def launch(program, operands, results):
+    def launch(entry, program, members, arrays, shapes):
         def host(*arrays):
             translated = PtxOnCpu(program, counting=True)
-            arrays = [np.array(x) for x in arrays]
-            outputs = [arrays[4], arrays[5], *(np.full(x.shape, np.nan) for x in results[2:])]
+            arrays, outputs = outputs_of(entry, arrays, shapes)
             translated.thread(0, 1, 0, 1, *(x.ctypes.data for x in (*arrays, *outputs)))
-            launched.append((program, translated.counts, outputs[5].sum() + outputs[6].sum()))
-            return tuple(outputs)
+            launched.append((entry, program, translated.counts, dict(zip(entry.results, outputs, strict=True))))
+            return tuple(outputs[1:])
 
-        return list(jax.pure_callback(host, tuple(results), *operands))
+        results = tuple(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes)
+        return list(jax.pure_callback(host, results, *(arrays[name] for name in entry.arguments)))
 
     def lower_by(rules):
         for primitive, rule in zip((_primitives.run_p, _primitives.vjp_p), rules, strict=True):
@@ -97,8 +113,10 @@ def counted(scene, form=gpu.form_for, result=end_of) -> tuple[str, dict, float]:
         lower_by(map(_primitives._for_cpus, (_primitives._run_compiled, _primitives._vjp_compiled)))
         _gpu_launch.launch, gpu.form_for = kept
         jax.clear_caches()
-    program, counts, steps = launched[-1]
-    return program, {name: count / steps for name, count in counts.items()}, float(steps) / MEMBERS
+    entry, program, counts, _ = launched[-1]
+    motion = launched[0][-1]  # a transpose does not write down how many steps it goes: as many, in the same form
+    steps = motion["steps"].sum() + motion["rejected"].sum()
+    return Counted(entry, program, {name: count / steps for name, count in counts.items()}, float(steps) / MEMBERS)
 
 
 def motions(scene, q0, v0, params, solver=None):
@@ -122,10 +140,11 @@ def assembled(program: str) -> dict | None:
     return {"registers": registers, "stack": stack, "spills": sum(spills)}
 
 
-def bounds(a_step: dict, steps: float, thread: dict) -> dict:
+def bounds(counted: Counted, thread: dict) -> dict:
     """The least times of a member in nanoseconds."""
+    entry, _, a_step, steps = counted
     moved = steps * (a_step["local loads"] + a_step["local stores"] + thread["spills"] / 8)
-    resident = min(gpu.MOST_BLOCKS * gpu.THREADS // MULTIPROCESSORS, REGISTERS // thread["registers"])
+    resident = min(gpu.MOST_BLOCKS[entry] * gpu.THREADS // MULTIPROCESSORS, REGISTERS // thread["registers"])
     held = max(L1_BYTES, L2_BYTES / MULTIPROCESSORS)
     beyond = max(0.0, 1.0 - held / max(held, resident * thread["stack"]))
     peak = MULTIPROCESSORS * CLOCK
@@ -152,11 +171,11 @@ def main() -> None:
     rows = []
 
     def estimate(name, form, *code, **more):
-        program, a_step, steps = counted(*code)
-        thread = assembled(program)
-        row = {"scene": name, "form": form, "steps": steps}
-        row |= {f"{kind} a step": count for kind, count in a_step.items()}
-        row |= {**thread, **bounds(a_step, steps, thread)} if thread is not None else {}
+        found = counted(*code)
+        thread = assembled(found.program)
+        row = {"scene": name, "form": form, "steps": found.steps}
+        row |= {f"{kind} a step": count for kind, count in found.a_step.items()}
+        row |= {**thread, **bounds(found, thread)} if thread is not None else {}
         rows.append(row | more)
 
     for name, make in SCENES.items():
@@ -164,7 +183,8 @@ def main() -> None:
         cpu = on_this_machine(scene)
         for form, choose in FORMS.items():
             estimate(name, form, scene, choose, cpu_ns=cpu)
-    estimate("double pendulum, gradient by 9 numbers", "as chosen", scenes.double_pendulum(), gpu.form_for, gradient_of)
+    for name in ("pendulum", "double pendulum", "chain of 4"):
+        estimate(f"{name}, transposed", "as chosen", SCENES[name](), form_of_transpose, gradient_of)
     print(_report.table(rows))
     note = "an estimate from counted instructions; not run on a GPU"
     _report.write_json(STORE, {**_report.circumstances(), "note": note, "duration": DURATION, "scenes": rows})

@@ -9,6 +9,7 @@ the number of parameters. A name that ends in `_ct` is a cotangent, one that end
 import functools
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -120,10 +121,7 @@ def vjp(flow: Flow, ts, y0, params, solution, path_ct, end_ct, tolerances: Toler
     members, m = end_ct.shape[:2]
     if m > flow.states + flow.numbers:
         return _vjp_by_jacobian(flow, ts, y0, params, solution, path_ct, end_ct, tolerances)
-    reached = np.isfinite(path)[:, None]
-    lost = ((path_ct != 0) & ~reached).any(axis=(2, 3))
-    lost |= (end_ct != 0).any(axis=2) & (result != SUCCESSFUL)[:, None]
-    path_ct = np.where(reached, path_ct, 0.0)
+    path_ct, lost = reached_cotangents(path, result, path_ct, end_ct)
     params = _for_all(params, members)
     params_ct = np.zeros((members, m, flow.numbers))
     if flow.projection is not None and path.shape[1] > 2:
@@ -144,6 +142,14 @@ def vjp(flow: Flow, ts, y0, params, solution, path_ct, end_ct, tolerances: Toler
         more = more + of_projection
     y_ct[lost], more[lost] = np.nan, np.nan
     return y_ct, more
+
+
+def reached_cotangents(path, result, path_ct, end_ct, library: Any = np) -> tuple:
+    """Cotangents (N, m, T, 2n), zero where an output was not reached; and whether one is lost there, (N, m)."""
+    reached = library.isfinite(path)[:, None]
+    lost = ((path_ct != 0) & ~reached).any(axis=(2, 3))
+    lost |= (end_ct != 0).any(axis=2) & (result != SUCCESSFUL)[:, None]
+    return library.where(reached, path_ct, 0.0), lost
 
 
 def _vjp_over_steps(

@@ -5,6 +5,9 @@ after a run on a CPU - a second try of members that failed, a look at what stopp
 that another variant of the program could follow ends with the code of the first.
 """
 
+import math
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,36 +25,60 @@ def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
 
     Raises `ValueError` where the scene cannot go to a GPU, saying why.
     """
-    rtol, atol, max_steps, _, notes = tolerances
+    *_, notes = tolerances
     try:
-        program = flow.kernel.program_for_gpus(rtol)
+        program = flow.kernel.motion_for_gpus(tolerances.rtol)
     except Unlowerable as reason:
         raise ValueError(f"solver=lagjax.MachineCode() cannot integrate this scene on a GPU: {reason}.") from None
-    members, times = len(y0), ts.shape[1]
-    numbers = gpu.words(
-        members=members, times=times, ts_stride=times if len(ts) > 1 else 0,
-        params_stride=flow.numbers if len(params) > 1 else 0, max_steps=max_steps,
-        room_of_notes=notes, rtol=rtol, atol=atol,
+    members, path = len(y0), jnp.full((len(y0), *flow.path_shape(ts.shape[1], notes)), jnp.nan)
+    arrays = _inputs(gpu.MOTION, ts, y0, params, flow, tolerances, room_of_notes=notes) | {"path": path}
+    shapes = [path.shape, y0.shape, *[(members,)] * 4]
+    return _solution(*launch(gpu.MOTION, program, members, arrays, shapes), states=not notes)
+
+
+def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct, end_ct) -> tuple | None:
+    """The cotangents of `y0` (N, 2n) and of the parameters (N, P), from those of outputs and ends.
+
+    `path_ct` is (N, T, 2n), of which the first and the last output are not looked at, `end_ct` (N, 2n). Then `excess`
+    (N,), as of `Kernel.vjp`, and which are done (N,): all but those with more steps than a thread can write down. None
+    where a GPU cannot go back over the steps of this scene.
+    """
+    try:
+        program, row = flow.kernel.transpose_for_gpus(tolerances.rtol)
+    except Unlowerable:
+        return None
+    members, threads = len(y0), math.prod(gpu.grid(gpu.TRANSPOSE, len(y0)))
+    room = min(tolerances.max_steps, gpu.LARGEST_RECORD // (threads * row))
+    arrays = _inputs(gpu.TRANSPOSE, ts, y0, params, flow, tolerances, room=room)
+    arrays |= {"path_ct": path_ct, "end_ct": end_ct}
+    shapes = [y0.shape, (members, max(1, flow.numbers)), (members,), (members,), (threads * room * row,)]
+    y_ct, params_ct, excess, done, _ = launch(gpu.TRANSPOSE, program, members, arrays, shapes)
+    return y_ct, params_ct[:, : flow.numbers], excess, done > 0
+
+
+def _inputs(entry: gpu.Entry, ts, y0, params, flow: Flow, tolerances: Tolerances, **more: int) -> dict[str, Any]:
+    """The arrays that all entries have."""
+    rtol, atol, max_steps, *_ = tolerances
+    numbers = entry.words(
+        members=len(y0), times=ts.shape[1], ts_stride=ts.shape[1] if len(ts) > 1 else 0,
+        params_stride=flow.numbers if len(params) > 1 else 0, max_steps=max_steps, rtol=rtol, atol=atol, **more,
     )  # fmt: skip
-    path = jnp.full((members, *flow.path_shape(times, notes)), jnp.nan)
     if not flow.numbers:
         params = jnp.zeros((1, 1))  # an array that has an address
-    operands = ts, y0, params, jnp.asarray(np.array(numbers, np.int64)), jnp.zeros(1, np.int64), path
-    shapes = [(1,), path.shape, y0.shape, *[(members,)] * 4]
-    kinds = [np.int64, *[np.float64] * 6]
-    results = [jax.ShapeDtypeStruct(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
-    return _solution(*launch(program, operands, results)[1:], states=not notes)
+    words, counter = jnp.asarray(np.array(numbers, np.int64)), jnp.zeros(1, np.int64)
+    return dict(ts=ts, y0=y0, params=params, numbers=words, next_member=counter)
 
 
-def launch(program: str, operands, results) -> list:
-    """Launch a program on its operands: `_native._gpu.RESULTS`, of these shapes."""
-    blocks, threads = gpu.grid(results[2].shape[0])
+def launch(entry: gpu.Entry, program: str, members: int, arrays: dict[str, Any], shapes: list[tuple]) -> list:
+    """Launch a program for this many members on the `arrays` of its entry; its results have these shapes."""
+    blocks, threads = gpu.grid(entry, members)
     sizes = dict(grid_x=blocks, grid_y=1, grid_z=1, block_x=threads, block_y=1, block_z=1, shared_mem_bytes=0)
     attributes = {name: np.int32(size) for name, size in sizes.items()}
-    # Nothing clears what a kernel writes to: the counter and the path are given, and written to where they are.
-    aliased = {gpu.ARGUMENTS.index(name): gpu.RESULTS.index(name) for name in ("next_member", "path")}
-    call = jax.ffi.ffi_call(_TARGET, results, input_output_aliases=aliased)
-    return list(call(*operands, name="integrate", kernel_type="ptx", kernel_data=program, **attributes))
+    results = [jax.ShapeDtypeStruct((1,), np.int64), *(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes)]
+    # Nothing clears what a kernel writes to: what must be clear is given, and written to where it is.
+    call = jax.ffi.ffi_call(_TARGET, results, input_output_aliases=entry.aliases)
+    given = (arrays[name] for name in entry.arguments)
+    return list(call(*given, name="integrate", kernel_type="ptx", kernel_data=program, **attributes))[1:]
 
 
 def _solution(path, y_end, t_end, code, steps, rejected, states: bool) -> tuple:

@@ -35,7 +35,7 @@ from jax.interpreters import ad, batching, mlir
 from lagjax._machine_code import _derivatives
 from lagjax._machine_code._call import has_handler, has_sweep, on_host, run_by_handler, sweep_by_handler
 from lagjax._machine_code._flow import Flow, Tolerances
-from lagjax._machine_code._gpu_launch import run_on_gpu
+from lagjax._machine_code._gpu_launch import run_on_gpu, transpose_on_gpu
 from lagjax._machine_code._rates import rate
 from lagjax._machine_code._steps import KEPT
 from lagjax._machine_code._variational import from_rows, to_rows
@@ -499,7 +499,7 @@ def _vjp_compiled(*args, **settings):
     return _swept_compiled(on_rows, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
 
 
-# ---- on a GPU: runs only, of the motion and of its tangents ----------------------------------------------------------
+# ---- on a GPU --------------------------------------------------------------------------------------------------------
 
 
 def _run_for_gpus(ts, y0, params, *, flow, tolerances, **_):
@@ -520,21 +520,59 @@ def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
         return [path * length[..., None], jnp.where(done, end * length, jnp.nan)]
 
 
-def _vjp_for_gpus(ts, y0, params, *given, flow, tolerances):
+def _vjp_for_gpus(*args, flow, tolerances):
+    """`vjp`: back over the steps of the motion; of constraints, and where the steps do not do, by tangents."""
+    settings = dict(flow=flow, tolerances=tolerances)
+    with jax.enable_x64(True):
+        rows, batch = _rows(args, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2), library=jnp)
+        ts, y0, params, path, result, *_, path_ct, end_ct = rows
+        members, m = end_ct.shape[:2]
+        few = m <= flow.states + flow.numbers and flow.projection is None
+        reached_ct, lost = _derivatives.reached_cotangents(path, result, path_ct, end_ct, library=jnp)
+        swept = few and _swept_on_gpu(ts, y0, params, reached_ct, result, end_ct, **settings)
+        if not swept:
+            return _vjp_by_tangents(*args, **settings)
+        *found, done = (x.reshape(members, m, *x.shape[1:]) for x in swept)
+        done = (done | lost).all(axis=1)
+
+        def with_tangents(*found):
+            times = jnp.where(done[:, None], ts[:, :1], ts)  # members that are done stay where they are
+            others = _vjp_by_tangents(times, y0, params, *rows[3:], **settings)
+            return tuple(jnp.where(done[:, None, None], a, b) for a, b in zip(found, others, strict=True))
+
+        found = jax.lax.cond(jnp.all(done), lambda *found: found, with_tangents, *found)
+        return _in_batch([jnp.where(lost[..., None], jnp.nan, x) for x in found], batch)
+
+
+def _swept_on_gpu(ts, y0, params, path_ct, result, end_ct, *, flow, tolerances):
+    """The cotangents that m ones of each member lead to, a row each, and whether these are right; None: it cannot."""
+    members, m = end_ct.shape[:2]
+    ts, params = (x if len(x) == 1 else jnp.repeat(x, m, axis=0) for x in (ts, params))
+    end_ct = end_ct + jnp.where((result == SUCCESSFUL)[:, None, None], path_ct[:, :, -1], 0.0)
+    path_ct = path_ct.reshape(members * m, *path_ct.shape[2:])
+    given = ts, jnp.repeat(y0, m, axis=0), params, path_ct, end_ct.reshape(members * m, -1)
+    if (swept := transpose_on_gpu(flow, tolerances, *given)) is None:
+        return None
+    y_ct, params_ct, excess, done = swept
+    at_start = (ts == ts[:, :1])[:, :-1, None]  # outputs that are the initial state; steps begin after them
+    y_ct = y_ct + jnp.sum(path_ct[:, :-1] * at_start, axis=1)
+    return y_ct, params_ct, done & (excess <= _derivatives.EXCESS * tolerances.rtol)
+
+
+def _vjp_by_tangents(ts, y0, params, *given, flow, tolerances):
     """`vjp`: the derivative along every number of the start and the parameters, times the cotangents."""
     *run, path_ct, end_ct = given
-    with jax.enable_x64(True):
-        batch = _batch_of((ts, y0, params), (1, 1, 1))
-        basis = jnp.broadcast_to(jnp.eye(count := flow.states + flow.numbers), (*batch, count, count))
-        along = basis[..., : flow.states], basis[..., flow.states :]
-        path, end = _jvp_for_gpus(ts, y0, params, *run, *along, flow=flow, tolerances=tolerances)
+    batch = _batch_of((ts, y0, params), (1, 1, 1))
+    basis = jnp.broadcast_to(jnp.eye(count := flow.states + flow.numbers), (*batch, count, count))
+    along = basis[..., : flow.states], basis[..., flow.states :]
+    path, end = _jvp_for_gpus(ts, y0, params, *run, *along, flow=flow, tolerances=tolerances)
 
-        def weighted(cotangent, values):  # what nobody asks about does not matter, even where it is not finite
-            return jnp.where(cotangent != 0, cotangent * values, 0.0)
+    def weighted(cotangent, values):  # what nobody asks about does not matter, even where it is not finite
+        return jnp.where(cotangent != 0, cotangent * values, 0.0)
 
-        total = jnp.sum(weighted(path_ct[..., :, None, :, :], path[..., None, :, :, :]), axis=(-1, -2))
-        total += jnp.sum(weighted(end_ct[..., :, None, :], end[..., None, :, :]), axis=-1)
-        return [total[..., : flow.states], total[..., flow.states :]]
+    total = jnp.sum(weighted(path_ct[..., :, None, :, :], path[..., None, :, :, :]), axis=(-1, -2))
+    total += jnp.sum(weighted(end_ct[..., :, None, :], end[..., None, :, :]), axis=-1)
+    return [total[..., : flow.states], total[..., flow.states :]]
 
 
 _on_host(run_p, _run_on_host, _run_shapes)

@@ -13,31 +13,26 @@ which the assembler spills. Otherwise they stand in the memory of the thread.
 What is here needs no GPU: it is assembled and checked on CPUs, and has not run on a GPU yet.
 """
 
-import ctypes
 import functools
 import os
 import re
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import llvmlite.binding as llvm
 
 from lagjax._native._constants import LEAST_ORDER
-from lagjax._native._frame import LANE
-from lagjax._native._integrator import JOB, Integrator
+from lagjax._native._gpu_entry import MOTION, TRANSPOSE, Entry, GpuForm, OneLane, motion_entry, transpose_entry
 from lagjax._native._ir import COUNTED
+from lagjax._native._taylor import TaylorSeries
 from lagjax._program._graph import Unlowerable
 
-# The entry takes the addresses of these arrays, of doubles but for the words of `NUMBERS` and the counter.
-ARGUMENTS = ("ts", "y0", "params", "numbers", "next_member", "path")
-# A kernel's operands come first, then its results, of which the first two are the last two operands.
-RESULTS = ("next_member", "path", "y_end", "t_end", "code", "steps", "rejected")
-NUMBERS = ("members", "times", "ts_stride", "params_stride", "max_steps", "room_of_notes", "rtol", "atol")
-# Threads of a block; and as many blocks as 132 multiprocessors hold with all registers of a thread: others would wait.
-THREADS, MOST_BLOCKS = 64, 528
+# Threads of a block, and blocks: a motion has as many as 132 multiprocessors hold with all registers of a thread, for
+# others would wait. With half as many, what a transpose spills stays in the caches, by `benchmarks.gpu_estimate`.
+THREADS = 64
+MOST_BLOCKS = {MOTION: 528, TRANSPOSE: 264}
 # Bytes that a thread may remember. The driver takes them for every thread that could be resident: of 2048 threads on
 # 132 multiprocessors 8 GiB.
 LARGEST_THREAD = 2**15
@@ -46,42 +41,26 @@ _PROCESSOR, _VERSION = "sm_70", "+ptx80"
 # Coefficients of a motion, of its state and of the rows of its products, up to which it is unrolled. By the counts of
 # `benchmarks.gpu_estimate`, with registers and spills as ptxas reports them, that is the best order to a tenth for a
 # double pendulum (12), one with constraints (10) and a slider-crank (7); by a third more the spills of the latter two
-# no longer stay in the caches. A chain of three has twice as many, and gains nothing.
-MOST_COEFFICIENTS = 250
-_ROUNDS = 2**63 - 1  # `max_steps` ends every member, and so the kernel
+# no longer stay in the caches. A chain of three has twice as many, and gains nothing. A transpose has three times the
+# values of a motion, and spills most of them; of a double pendulum it takes the least time at orders from 8 to 10.
+MOST_COEFFICIENTS = {MOTION: 250, TRANSPOSE: 200}
+# Doubles of the steps that all threads of a launch may write down: 2 GiB. Of a double pendulum, with as many threads as
+# there are, two thousand steps.
+LARGEST_RECORD = 2**28
 _TO_COUNTED = re.compile(rf'  br label %"({COUNTED}[.\d]*)"')
 _FAR_ANGLES = ("sin", "cos")  # the C library's part in a sine is that of angles beyond 2**20
 _lock = threading.Lock()
 
 
-class GpuForm(NamedTuple):
-    """The order of the series, and whether the loops over orders are `unrolled`."""
-
-    order: int
-    unrolled: bool
-
-
-class OneLane(NamedTuple):
-    """The text of an integrator of one lane, the doubles that a thread remembers, and how many series it has.
-
-    Of a motion in tables (`large`) no loop can be unrolled.
-    """
-
-    text: str
-    size: int
-    series: int
-    large: bool
-
-
-def form_for(lane: OneLane, order: int) -> GpuForm:
-    """The form that should take the least time, where a CPU takes series of this `order`."""
-    fitting = MOST_COEFFICIENTS // lane.series
+def form_for(entry: Entry, lane: OneLane, order: int) -> GpuForm:
+    """The form of a motion that should take the least time, where a CPU takes series of this `order`."""
+    fitting = MOST_COEFFICIENTS[entry] // lane.series
     return GpuForm(order, False) if lane.large or fitting < LEAST_ORDER else GpuForm(min(order, fitting), True)
 
 
-def grid(members: int) -> tuple[int, int]:
+def grid(entry: Entry, members: int) -> tuple[int, int]:
     """The blocks, and the threads of each, for this many members."""
-    return min(MOST_BLOCKS, max(1, -(-members // THREADS))), THREADS
+    return min(MOST_BLOCKS[entry], max(1, -(-members // THREADS))), THREADS
 
 
 def require_room(doubles: int) -> None:
@@ -93,52 +72,68 @@ def require_room(doubles: int) -> None:
         )  # fmt: skip
 
 
-def one_lane(integrator: Integrator) -> OneLane:
-    """The text of an integrator. Raises `Unlowerable`, whose text says why a GPU cannot run it."""
-    motion = integrator.motion
+def one_lane(motion: TaylorSeries) -> OneLane:
+    """The module of a motion. Raises `Unlowerable`, whose text says why a GPU cannot run it."""
     assert motion.width == 1, "a thread follows one member"
-    size = motion.layout.size
-    require_room(size)
+    require_room(motion.layout.size)
     if motion.look_up.numbers is not None:
         raise Unlowerable("its tables of numbers (samples, jnp.interp, …) are not brought to a GPU; make them params")
-    return OneLane(str(motion.module), size, motion.series.rows + motion.states, motion.large)
+    return OneLane.of(motion)
 
 
-def program_for_gpus(lane: OneLane, form: GpuForm) -> str:
-    """The PTX of an integrator in a form, with the entry `integrate(*ARGUMENTS, *RESULTS)`.
+def motion_for_gpus(lane: OneLane, form: GpuForm) -> str:
+    """The PTX of the entry `MOTION` of an integrator, in a form.
 
     Raises `Unlowerable` where its functions need libdevice, and that is missing.
     """
     with _lock:
-        return _assembly(lane.text, lane.size, form)
+        return _assembly(motion_entry(lane, form.order), [(lane.text, form)])
 
 
-def _assembly(text: str, size: int, form: GpuForm) -> str:
-    machine = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3)
-    text = text.replace('target triple = ""', f'target triple = "{machine.triple}"')
-    text = text.replace('target datalayout = ""', f'target datalayout = "{machine.target_data}"')
-    external, library = re.findall(r'^declare double @"?(\w+)"?\(', text, re.MULTILINE), None
-    text = _without_far_angles(text)
-    if external := sorted({*external} - {*_FAR_ANGLES} - {"llvm"}):
-        library = libdevice()
-        if library is None:
+def transpose_for_gpus(lane: OneLane, back: OneLane, form: GpuForm) -> str:
+    """The PTX of the entry `TRANSPOSE` of an integrator and of its adjoint, in a form.
+
+    Raises `Unlowerable` where that takes too much memory, or libdevice.
+    """
+    require_room(lane.size + back.size if form.unrolled else max(lane.size, back.size))
+    text = re.sub(r'@"(begin|run)"', r'@"\1_back"', back.text)
+    with _lock:
+        entry = transpose_entry(lane, back, form)
+        return _assembly(entry, [(lane.text, form), (text, form)])
+
+
+def _assembly(entry: str, parts: Sequence[tuple[str, GpuForm]]) -> str:
+    """The PTX of an entry, linked with the modules that it calls."""
+    machine, external = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3), set()
+    texts = [_with_unrolled_loops(text) if form.unrolled else text for text, form in parts]
+    for text in texts:
+        external |= {*re.findall(r'^declare double @"?(\w+)"?\(', text, re.MULTILINE)} - {*_FAR_ANGLES} - {"llvm"}
+    modules = [_parsed(text, external, machine) for text in (entry, *map(_without_far_angles, texts))]
+    if external:
+        if (library := libdevice()) is None:
             raise Unlowerable(
-                f"its {', '.join(external)} come from NVIDIA's libdevice, which is not here; "
+                f"its {', '.join(sorted(external))} come from NVIDIA's libdevice, which is not here; "
                 "`pip install nvidia-cuda-nvcc-cu12` has it"
             )
-        text = re.sub(rf'@"?({"|".join(external)})"?\(', r"@__nv_\1(", text)
-    public = r'define (?:internal )?(void|i64) (@"\w+"\([^)]*\))(?=\s*\{)'
-    text = re.sub(public, r"define internal \1 \2", text) + _entry(size, form.order)
-    module = llvm.parse_assembly(_with_unrolled_loops(text) if form.unrolled else text)
-    if library is not None:
-        other = llvm.parse_bitcode(library)
-        other.triple, other.data_layout = machine.triple, str(machine.target_data)
-        module.link_in(other)
-        for function in module.functions:
-            if not function.is_declaration and function.name != "integrate":
-                function.linkage = "internal"  # else all of the library stays
-    module.verify()
-    return machine.emit_assembly(_optimised(module, machine))
+        modules.append(llvm.parse_bitcode(library))
+        modules[-1].triple, modules[-1].data_layout = machine.triple, str(machine.target_data)
+    whole, *others = modules
+    for module in others:
+        whole.link_in(module)
+    for function in whole.functions:
+        if not function.is_declaration and function.name != "integrate":
+            function.linkage = "internal"  # else all of the library stays
+    whole.verify()
+    return machine.emit_assembly(_optimised(whole, machine))
+
+
+def _parsed(text: str, external: Iterable[str], machine: llvm.TargetMachine) -> llvm.ModuleRef:
+    """The module of a text for the machine; its `external` functions are those of libdevice."""
+    text = text.replace('target triple = ""', f'target triple = "{machine.triple}"')
+    text = text.replace('target datalayout = ""', f'target datalayout = "{machine.target_data}"')
+    if external:
+        text = re.sub(rf'@"?({"|".join(sorted(external))})"?\(', r"@__nv_\1(", text)
+    return llvm.parse_assembly(text)
 
 
 def _without_far_angles(text: str) -> str:
@@ -164,33 +159,6 @@ def _with_unrolled_loops(text: str) -> str:
             entered.add(branch[1])
         lines.append(line)
     return "\n".join([*lines, "!0 = distinct !{!0, !1}", '!1 = !{!"llvm.loop.unroll.full"}', ""])
-
-
-def _entry(size: int, order: int) -> str:
-    """The kernel's entry, in LLVM's language: a job on the stack, whose arrays are the arguments."""
-    places = [*(f"ptr %{name}" for name in ARGUMENTS)]
-    places += [f"ptr %{name}{'_out' if name in ARGUMENTS else ''}" for name in RESULTS]
-    lines = [f"define ptx_kernel void @integrate({', '.join(places)}) {{"]
-    lines += [f"  %memory = alloca [{size} x double], align 64", f"  %lanes = alloca [{len(LANE)} x i64]"]
-    lines += ["  %idle = alloca i64", f"  %job = alloca [{len(JOB._fields_)} x i64]", "  store i64 0, ptr %idle"]
-    known = {name: f"%{name}_out" if name in ARGUMENTS else f"%{name}" for name in RESULTS}
-    known |= {name: f"%{name}" for name in ("ts", "y0", "params")}
-    for i, (name, kind) in enumerate(JOB._fields_):
-        lines.append(f"  %field{i} = getelementptr i64, ptr %job, i64 {i}")
-        if name in NUMBERS:
-            lines.append(f"  %place{i} = getelementptr i64, ptr %numbers, i64 {NUMBERS.index(name)}")
-            lines += [f"  %value{i} = load i64, ptr %place{i}", f"  store i64 %value{i}, ptr %field{i}"]
-        elif kind is ctypes.c_void_p:
-            lines.append(f"  store ptr {known.get(name, 'null')}, ptr %field{i}")
-        else:
-            lines.append(f"  store i64 {order if name == 'order' else 0}, ptr %field{i}")
-    lines += [
-        f"  call void @llvm.memset.p0.i64(ptr align 64 %memory, i8 0, i64 {8 * size}, i1 false)",
-        '  call void @"begin"(ptr %job, ptr %memory, ptr %lanes)',
-        f'  %more = call i64 @"run"(ptr %job, ptr %memory, ptr %lanes, ptr %idle, i64 {_ROUNDS})',
-        "  ret void", "}", "declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)", "",
-    ]  # fmt: skip
-    return "\n".join(lines)
 
 
 def _optimised(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> llvm.ModuleRef:
@@ -224,12 +192,3 @@ def libdevice() -> bytes | None:
         for file in Path(folder).glob(f"{inside}/libdevice/libdevice.10.bc"):
             return file.read_bytes()
     return None
-
-
-# ---- what the entry is given -----------------------------------------------------------------------------------------
-
-
-def words(**numbers: float) -> list[int]:
-    """The `NUMBERS` of a launch as whole numbers of 64 bits: doubles by their bits."""
-    kinds: dict[str, Callable] = dict(JOB._fields_)
-    return [ctypes.c_int64.from_buffer_copy(kinds[name](numbers[name])).value for name in NUMBERS]

@@ -276,11 +276,7 @@ def job_of(code: Code, kind: type, fields: dict[str, Any]) -> Value:
     """A job on the stack, a structure of this kind; fields that are not named are zero."""
     kinds = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
     declared: Any = kind
-    with code.builder.goto_entry_block():
-        place = code.builder.alloca(ir.ArrayType(INTEGER, len(declared._fields_)))
-    place.align = 8
-    # A pointer of no kind, which llvmlite has no other way to make of one to an array.
-    job = Value(code, code.builder.inttoptr(code.builder.ptrtoint(place, INTEGER), POINTER))
+    job = code.stack(len(declared._fields_))
     for i, (name, of_field) in enumerate(declared._fields_):
         value = fields.get(name)
         if value is None:

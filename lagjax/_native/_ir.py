@@ -355,6 +355,14 @@ class Code:
         variable.value = start
         return variable
 
+    def stack(self, words: int, align: int = 8) -> Value:
+        """The address of this many words of 8 bytes on the stack, which hold anything."""
+        with self.builder.goto_entry_block():
+            place = self.builder.alloca(ir.ArrayType(INTEGER, words))
+        place.align = align
+        # A pointer of no kind, which llvmlite has no other way to make of one to an array.
+        return Value(self, self.builder.inttoptr(self.builder.ptrtoint(place, INTEGER), POINTER))
+
     def _alignment(self, kind) -> int:
         return 8 * self.lanes if kind == self.vector else 8
 

@@ -149,7 +149,10 @@ class Kernel:
         self._options = guards, error_groups, levels[0]
         self.width = lanes() if width is None else width
         self._tangents = functools.cache(self._tangents_of)
-        self._programs_for_gpus = functools.cache(lambda form: _gpu.program_for_gpus(self._one_lane, form))
+        self._motions_for_gpus = functools.cache(lambda form: _gpu.motion_for_gpus(self._one_lane, form))
+        self._transposes_for_gpus = functools.cache(
+            lambda form: _gpu.transpose_for_gpus(self._one_lane, self._one_lane_back, form)
+        )
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
     def for_members(self, members: int) -> "Kernel":
@@ -179,18 +182,30 @@ class Kernel:
         forget_stages()
         return integrator
 
-    def program_for_gpus(self, rtol: float) -> str:
+    def motion_for_gpus(self, rtol: float) -> str:
         """The motion of a member in PTX (`_gpu`). Raises `Unlowerable` where a GPU cannot run it."""
-        return self._programs_for_gpus(self.form_for_gpus(rtol))
+        return self._motions_for_gpus(self.form_for_gpus(rtol))
+
+    def transpose_for_gpus(self, rtol: float) -> tuple[str, int]:
+        """The motion of a member and back in PTX, and the doubles that are written down of a step.
+
+        Raises `Unlowerable` where a GPU cannot do so.
+        """
+        form = _gpu.form_for(_gpu.TRANSPOSE, self._one_lane, order_for(rtol))
+        return self._transposes_for_gpus(form), self._one_lane.row
 
     def form_for_gpus(self, rtol: float) -> "_gpu.GpuForm":
-        """The form of that program. Raises `Unlowerable` where a GPU cannot run it."""
-        return _gpu.form_for(self._one_lane, order_for(rtol))
+        """The form of a motion there. Raises `Unlowerable` where a GPU cannot run it."""
+        return _gpu.form_for(_gpu.MOTION, self._one_lane, order_for(rtol))
 
     @functools.cached_property
     def _one_lane(self) -> "_gpu.OneLane":
         _gpu.require_room(size_of_series(self._parts[1]))  # before what is larger than that is written down
-        return _gpu.one_lane(self.for_members(1)._integrator())
+        return _gpu.one_lane(self.for_members(1)._integrator().motion)
+
+    @functools.cached_property
+    def _one_lane_back(self) -> "_gpu.OneLane":
+        return _gpu.one_lane(self._adjoint(width=1).motion)
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
@@ -392,11 +407,15 @@ class Kernel:
     @functools.cached_property
     def _backward(self) -> "_Compiled":
         """The transpose, compiled when it is first asked for."""
+        adjoint = self._adjoint(self.width)
+        return _Compiled(adjoint.motion, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
+
+    def _adjoint(self, width: int) -> Adjoint:
         with without_collections():
-            adjoint = Adjoint(*self._derivative_parts, width=self.width)
+            adjoint = Adjoint(*self._derivative_parts, width=width)
         forget_joined()
         forget_stages()
-        return _Compiled(adjoint.motion, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
+        return adjoint
 
     def _strides(self, ts, params) -> dict[str, int]:
         return dict(

@@ -21,11 +21,11 @@ from jax.sharding import AbstractMesh
 from jax.sharding import PartitionSpec as P
 
 import lagjax
-from benchmarks._ptx import PtxOnCpu
+from benchmarks._ptx import PtxOnCpu, outputs_of
 from lagjax import scenes
 from lagjax._machine_code import _gpu_launch, _primitives
 from lagjax._machine_code._call import on_host
-from lagjax._native._gpu import RESULTS, GpuForm, OneLane, form_for, grid, libdevice, words
+from lagjax._native._gpu import MOTION, TRANSPOSE, GpuForm, OneLane, form_for, grid, libdevice
 
 TS, MACHINE_CODE = np.linspace(0.0, 1.0, 5), lagjax.MachineCode()
 translated = functools.lru_cache(maxsize=64)(PtxOnCpu)
@@ -42,18 +42,18 @@ def on_the_ptx(monkeypatch):
     """A function that runs another one on the PTX; and then `launches`, the members of each launch."""
     launches = []
 
-    def launch(program, operands, results):
+    def launch(entry, program, members, arrays, shapes):
         def host(*arrays):
-            arrays = [np.array(x) for x in arrays]
-            outputs = [arrays[4], arrays[5], *(np.full(x.shape, np.nan) for x in results[2:])]
+            arrays, outputs = outputs_of(entry, arrays, shapes)
             places = [x.ctypes.data for x in (*arrays, *outputs)]
-            launches.append(len(outputs[2]))
+            launches.append(members)
             for thread in range(3):  # the first one takes all members, the others find none
                 translated(program).thread(thread, 3, 0, 1, *places)
-            assert outputs[0][0] == len(outputs[2]) + 3, "threads share the counter"
-            return outputs
+            assert outputs[0][0] == members + 3, "threads share the counter"
+            return outputs[1:]
 
-        return on_host(host, results, *operands)
+        results = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
+        return on_host(host, results, *(arrays[name] for name in entry.arguments))
 
     def run(function, *args):
         places = {
@@ -102,7 +102,7 @@ def test_a_batch_is_that_of_the_cpu(on_the_ptx, monkeypatch, form):
     q0 = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 2))
     batch = jax.vmap(lambda q0: motion(scene, q0, 0 * q0, rtol=1e-9))
     if form is not None:
-        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda lane, order: form)
+        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: form)
     *here, steps = on_the_ptx(batch, q0)
     *there, of_cpu = jax.jit(batch)(q0)
     agree(here, there)
@@ -114,9 +114,12 @@ def test_a_batch_is_that_of_the_cpu(on_the_ptx, monkeypatch, form):
 def test_coefficients_that_are_few_are_unrolled(monkeypatch):
     programs = {form: program_of(scenes.pendulum(), monkeypatch, form) for form in (True, False)}
     assert ".local" not in programs[True] and ".local" in programs[False]
-    few, more, many, large = (OneLane("", 0, *of) for of in [(10, False), (21, False), (45, False), (10, True)])
-    assert form_for(few, 13) == (13, True) and form_for(more, 13) == (11, True)
-    assert form_for(many, 13) == form_for(large, 13) == (13, False)
+    few, more, many, large = (
+        OneLane("", 0, 4, 0, 8, *of) for of in [(10, False), (21, False), (45, False), (10, True)]
+    )
+    assert form_for(MOTION, few, 13) == (13, True) and form_for(MOTION, more, 13) == (11, True)
+    assert form_for(TRANSPOSE, more, 13) == (9, True)
+    assert form_for(MOTION, many, 13) == form_for(MOTION, large, 13) == (13, False)
 
 
 @pytest.mark.slow
@@ -208,12 +211,12 @@ def program_of(scene, monkeypatch=None, unrolled=None):
     """The PTX of a scene's motion. Skips the test where that needs libdevice, which is not here."""
     programs = []
     if monkeypatch is not None:
-        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda lane, order: GpuForm(order, unrolled))
+        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: GpuForm(order, unrolled))
     transforms_are_new()
 
-    def launch(program, operands, results):
+    def launch(entry, program, members, arrays, shapes):
         programs.append(program)
-        return [jnp.zeros(x.shape, x.dtype) for x in results]
+        return [jnp.zeros(shape) for shape in shapes]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_gpu_launch, "launch", launch)
@@ -262,10 +265,10 @@ def test_the_lowering_launches_and_calls_nothing_else(dtype):
     one_member, many, over = dtype(1), np.ones(1000, dtype), P("members")
     mesh = AbstractMesh((4,), ("members",))
     on_four_gpus = jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=over, out_specs=over)
-    # A derivative needs the motion itself and its tangents.
+    # A gradient needs the motion itself, its transpose, and tangents where the steps of that do not do.
     for function, q0, calls in (
-        (one, one_member, 1), (jax.vmap(one), many, 1), (to_event, one_member, None), (jax.grad(one), one_member, 2),
-        (jax.vmap(jax.grad(one)), many, 2), (jax.hessian(one), one_member, None), (repeated, one_member, 1),
+        (one, one_member, 1), (jax.vmap(one), many, 1), (to_event, one_member, None), (jax.grad(one), one_member, 3),
+        (jax.vmap(jax.grad(one)), many, 3), (jax.hessian(one), one_member, None), (repeated, one_member, 1),
         (on_four_gpus, many, 1),
     ):  # fmt: skip
         text = jax.export.export(jax.jit(function), platforms=["cuda"], disabled_checks=[
@@ -277,14 +280,15 @@ def test_the_lowering_launches_and_calls_nothing_else(dtype):
 
 
 def test_the_grid_covers_the_members_and_is_bounded():
-    assert grid(1) == (1, 64) and grid(65) == (2, 64) and grid(10**8) == (528, 64)
+    assert grid(MOTION, 1) == (1, 64) and grid(MOTION, 65) == (2, 64)
+    assert grid(MOTION, 10**8) == (528, 64) and grid(TRANSPOSE, 10**8) == (264, 64)
 
 
 def test_words_are_the_bits_of_doubles():
-    given = words(members=3, times=2, ts_stride=0, params_stride=0, max_steps=9, room_of_notes=0, rtol=0.5,
+    given = MOTION.words(members=3, times=2, ts_stride=0, params_stride=0, max_steps=9, room_of_notes=0, rtol=0.5,
                   atol=0.0)  # fmt: skip
     assert given[:2] == [3, 2] and np.array(given[-2:]).view(float).tolist() == [0.5, 0.0]
-    assert RESULTS[:2] == ("next_member", "path")
+    assert MOTION.aliases == {4: 0, 5: 1}  # the counter and the path are written to where they are
 
 
 def test_a_scene_that_cannot_go_to_a_gpu_says_why():
@@ -300,15 +304,17 @@ def test_a_scene_that_cannot_go_to_a_gpu_says_why():
 
 @pytest.mark.slow
 def test_instructions_are_counted(monkeypatch):
-    monkeypatch.setattr("lagjax._native._gpu.form_for", lambda lane, order: GpuForm(order, unrolled=False))
+    monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: GpuForm(order, unrolled=False))
     # Of a pendulum's step at order 13: every product of two series of 13 terms alone has 91 products.
     gpu_estimate = importlib.import_module("benchmarks.gpu_estimate")
-    program, a_step, steps = gpu_estimate.counted(scenes.pendulum())
-    assert program.count(".entry") == 1 and 10 < steps < 200
-    assert 300 < a_step["float64"] < 3000 and 0 < a_step["local stores"] < a_step["local loads"] < 3000
+    counted = gpu_estimate.counted(scenes.pendulum())
+    assert counted.program.count(".entry") == 1 and 10 < counted.steps < 200
+    once = counted.a_step
+    assert 300 < once["float64"] < 3000 and 0 < once["local stores"] < once["local loads"] < 3000
     thread = {"registers": 128, "stack": 4096, "spills": 0}
-    twice = gpu_estimate.bounds({name: 2 * count for name, count in a_step.items()}, steps, thread)
-    for name, bound in gpu_estimate.bounds(a_step, steps, thread).items():
+    more = counted._replace(a_step={name: 2 * count for name, count in once.items()})
+    twice = gpu_estimate.bounds(more, thread)
+    for name, bound in gpu_estimate.bounds(counted, thread).items():
         assert twice[name] == pytest.approx(2 * bound) and bound > 0
 
 

@@ -1,0 +1,255 @@
+"""The entries of programs for GPUs: what a thread does with the members that it takes.
+
+    MOTION       follow them, one after the other, until the counter that all threads share has come to the end
+    TRANSPOSE    of each: follow it with its steps written down, and go back over these from the last to the first
+
+The steps of a transpose stand in a record that is the thread's own and serves one member after the other, so that the
+memory does not grow with their number. A member with more steps than the record has `room` for is not `done`.
+"""
+
+import ctypes
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+from llvmlite import ir
+
+from lagjax._native import _adjoint, _integrator
+from lagjax._native._frame import CACHE_LINE, LANE
+from lagjax._native._handler import job_of
+from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value
+from lagjax._native._output import RECORDED
+from lagjax._native._taylor import TaylorSeries
+
+_ROUNDS = 2**63 - 1  # `max_steps` ends every member, and so the kernel
+_WORD = ir.IntType(32)
+_KINDS = {name: DOUBLE if kind is ctypes.c_double else INTEGER for name, kind in _integrator.JOB._fields_}
+
+
+class Entry(NamedTuple):
+    """A kernel by the names of its arguments and results, in their order, and of its `numbers`, which are one argument.
+
+    Arguments and results are the addresses of arrays of doubles, but for the words of `numbers` and the counter
+    `next_member`. A result that is an argument, too, is written to where that lies.
+    """
+
+    arguments: tuple[str, ...]
+    results: tuple[str, ...]
+    numbers: tuple[str, ...]
+
+    @property
+    def aliases(self) -> dict[int, int]:
+        """The places of arguments that are results, too: of each as an argument, and as a result."""
+        return {self.arguments.index(name): k for k, name in enumerate(self.results) if name in self.arguments}
+
+    def words(self, **numbers: float) -> list[int]:
+        """Its numbers as whole numbers of 64 bits: doubles by their bits."""
+        kinds: dict[str, Callable] = dict(_integrator.JOB._fields_)
+        return [ctypes.c_int64.from_buffer_copy(kinds[name](numbers[name])).value for name in self.numbers]
+
+
+_SIZES = ("members", "times", "ts_stride", "params_stride", "max_steps")
+MOTION = Entry(
+    ("ts", "y0", "params", "numbers", "next_member", "path"),
+    ("next_member", "path", "y_end", "t_end", "code", "steps", "rejected"),
+    (*_SIZES, "room_of_notes", "rtol", "atol"),
+)
+TRANSPOSE = Entry(
+    ("ts", "y0", "params", "path_ct", "end_ct", "numbers", "next_member"),
+    ("next_member", "y_ct", "params_ct", "excess", "done", "record"),
+    (*_SIZES, "room", "rtol", "atol"),
+)
+
+
+class GpuForm(NamedTuple):
+    """The order of the series, and whether the loops over orders are `unrolled`."""
+
+    order: int
+    unrolled: bool
+
+
+class OneLane(NamedTuple):
+    """The module of a motion in one lane: its text, and what an entry and the choice of a form must know of it.
+
+    A thread remembers `size` doubles. The motion has this many `states` (2n) and `numbers` of a member, `row` doubles
+    are written down of a step, and its series have this many rows, those of the state among them. Of a `large` motion,
+    which is in tables, no loop can be unrolled.
+    """
+
+    text: str
+    size: int
+    states: int
+    numbers: int
+    row: int
+    series: int
+    large: bool
+
+    @classmethod
+    def of(cls, motion: TaylorSeries) -> "OneLane":
+        """From the motion of an integrator or of an adjoint, whose module is finished."""
+        states, text = motion.states, str(motion.module)
+        row, series = states + RECORDED + motion.recorded_pieces, states + motion.series.rows
+        return cls(text, motion.layout.size, states, motion.of_member, row, series, motion.large)
+
+
+def motion_entry(motion: OneLane, order: int) -> str:
+    """The module of `MOTION`, in LLVM's language: `integrate(*arguments, *results)`.
+
+    It calls the `begin` and `run` of an integrator (`_integrator`).
+    """
+    thread = _Thread(MOTION)
+    fields = {name: thread.at[name] for name in (*MOTION.arguments[:3], *MOTION.results)}
+    fields |= {name: thread.number(name) for name in MOTION.numbers} | {"order": thread.whole(order)}
+    job = job_of(thread.code, _integrator.JOB, fields)
+    thread.run("", motion, job, thread.memory(motion.size), thread.words(1))
+    return thread.finish()
+
+
+def transpose_entry(motion: OneLane, adjoint: OneLane, form: GpuForm) -> str:
+    """The module of `TRANSPOSE`, in LLVM's language: `integrate(*arguments, *results)`.
+
+    It calls the `begin` and `run` of an integrator, and those of an adjoint under the names `begin_back` and `run_back`
+    (`_adjoint`).
+    """
+    return _Transpose(motion, adjoint, form).finish()
+
+
+class _Thread:
+    """The function `integrate` of an entry; `at` has the addresses of its results and of what is only an argument."""
+
+    def __init__(self, entry: Entry):
+        self.module = ir.Module("entry")
+        self.module.triple = ""
+        kinds = [POINTER] * (len(entry.arguments) + len(entry.results))
+        self.code = Code(self.module, "integrate", kinds, lanes=1, public=True)
+        self.lanes = self.words(len(LANE))
+        self.at = dict(zip((*entry.arguments, *entry.results), self.code.arguments, strict=True))
+        self._numbers = {
+            name: self.code.load(self.code.element(self.at["numbers"], i), _KINDS[name])
+            for i, name in enumerate(entry.numbers)
+        }  # fmt: skip
+
+    def finish(self) -> str:
+        """The text of the module."""
+        self.code.finish()
+        return str(self.module).replace("define void", "define ptx_kernel void")
+
+    def number(self, name: str) -> Value:
+        """One of the entry's numbers."""
+        return self._numbers[name]
+
+    def whole(self, x: int) -> Value:
+        """A whole number."""
+        return self.code.as_value(x, INTEGER)
+
+    def words(self, count: int) -> Value:
+        """The address of this many words of the thread's own."""
+        return self.code.stack(count)
+
+    def memory(self, doubles: int) -> Value:
+        """The address of the memory of a motion."""
+        return self.code.stack(doubles, align=8 * CACHE_LINE)
+
+    def run(self, name: str, motion: OneLane, job: Value, memory: Value, *more: Value) -> None:
+        """Begin and run the members of a job, all of them, in a memory that is cleared before."""
+        bits = ir.Constant(ir.IntType(8), 0), self.whole(8 * motion.size), ir.Constant(BIT, 0)
+        self._call("llvm.memset.p0.i64", memory, *bits)
+        self._call(f"begin{name}", job, memory, self.lanes)
+        self._call(f"run{name}", job, memory, self.lanes, *more, self.whole(_ROUNDS), result=INTEGER)
+
+    def _call(self, name: str, *arguments, result: ir.Type | None = None) -> Value:
+        """A function of another module, or one of LLVM's."""
+        values = [getattr(x, "it", x) for x in arguments]
+        function = self.module.globals.get(name)
+        if function is None:
+            kind = ir.FunctionType(result or ir.VoidType(), [x.type for x in values])
+            function = ir.Function(self.module, kind, name)
+        return Value(self.code, self.code.builder.call(function, values))
+
+    def index(self) -> Value:
+        """The number of the thread among all of a launch."""
+
+        def register(name):
+            read = self._call(f"llvm.nvvm.read.ptx.sreg.{name}.x", result=_WORD)
+            return Value(self.code, self.code.builder.zext(read.it, INTEGER))
+
+        return register("ctaid") * register("ntid") + register("tid")
+
+    @contextmanager
+    def members(self) -> Iterator[Value]:
+        """A context: its body is for every member that the thread takes."""
+        code, counter = self.code, self.at["next_member"]
+
+        def take() -> Value:
+            one = ir.Constant(INTEGER, 1)
+            return Value(code, code.builder.atomic_rmw("add", counter.it, one, "monotonic"))
+
+        member = code.variable(take())
+        with code.repeat_while(lambda: member.value < self.number("members")):
+            yield member.value
+            member.value = take()
+
+
+class _Transpose(_Thread):
+    """Writes down `transpose_entry`."""
+
+    def __init__(self, motion: OneLane, adjoint: OneLane, form: GpuForm):
+        super().__init__(TRANSPOSE)
+        code, states = self.code, motion.states
+        self.states, self.numbers = states, motion.numbers
+        self.common = {"members": self.whole(1), "order": self.whole(form.order)}
+        self.ends, self.path, self.y_end = self.words(2), self.words(2 * states), self.words(states)
+        names = ("t_end", "code", "steps", "rejected", "next_member", "next_row", "first_step", "steps_back", "idle")
+        self.own = {name: self.words(1) for name in names}
+        self.record = code.element(self.at["record"], self.index() * self.number("room") * motion.row)
+        self.motion, self.adjoint = motion, adjoint
+        # One memory after the other, or one for both: loops that are unrolled leave none of the first two.
+        shared = None if form.unrolled else self.memory(max(motion.size, adjoint.size))
+        self.memories = [shared or self.memory(lane.size) for lane in (motion, adjoint)]
+        with self.members() as member:
+            self._transpose(member)
+
+    def _transpose(self, member: Value) -> None:
+        """The results of a member."""
+        code, number = self.code, self.number
+
+        def of_member(name: str, stride: Value | int) -> Value:
+            return code.element(self.at[name], member * stride)
+
+        ts, params = of_member("ts", number("ts_stride")), of_member("params", number("params_stride"))
+        y_ct, params_ct = of_member("y_ct", self.states), of_member("params_ct", self.numbers)
+        self._follow(ts, of_member("y0", self.states), params)
+        with code.loop(self.whole(self.states)) as i:
+            code.store(code.load(code.element(of_member("end_ct", self.states), i), DOUBLE), code.element(y_ct, i))
+        with code.loop(self.whole(self.numbers)) as i:
+            code.store(code.as_value(0.0, DOUBLE), code.element(params_ct, i))
+        code.store(code.as_value(0.0, DOUBLE), of_member("excess", 1))
+        fits = code.load(self.own["next_row"], INTEGER) <= number("room")
+        code.store(code.flag(fits), of_member("done", 1))
+        with code.only_if(fits):
+            path_ct = of_member("path_ct", number("times") * self.states)
+            self._go_back(ts=ts, params=params, path_ct=path_ct, y_ct=y_ct, params_ct=params_ct,
+                          excess=of_member("excess", 1))  # fmt: skip
+
+    def _follow(self, ts: Value, y0: Value, params: Value) -> None:
+        """The motion from the first output time to the last one, with its steps written down."""
+        code, own = self.code, self.own
+        for i, time in enumerate((self.whole(0), self.number("times") - 1)):
+            code.store(code.load(code.element(ts, time), DOUBLE), code.element(self.ends, i))
+        for name in ("next_member", "next_row"):
+            code.store(self.whole(0), own[name])
+        fields = self.common | {name: own[name] for name in ("t_end", "code", "steps", "rejected")}
+        fields |= {name: own[name] for name in ("next_member", "next_row")} | dict(record=self.record)
+        fields |= dict(ts=self.ends, y0=y0, params=params, path=self.path, y_end=self.y_end, times=self.whole(2))
+        fields |= {name: self.number(name) for name in ("max_steps", "room", "rtol", "atol")}
+        self.run("", self.motion, job_of(code, _integrator.JOB, fields), self.memories[0], own["idle"])
+
+    def _go_back(self, **arrays: Value) -> None:
+        """The transposes of the steps that were written down, from the last one."""
+        code, own = self.code, self.own
+        taken = code.as_integer(code.load(own["steps"], DOUBLE))
+        for name, start in (("next_member", 0), ("first_step", 0), ("steps_back", taken)):
+            code.store(code.as_value(start, INTEGER), own[name])
+        fields = self.common | arrays | dict(next_member=own["next_member"], times=self.number("times"))
+        fields |= dict(record=self.record, first_step=own["first_step"], steps=own["steps_back"])
+        self.run("_back", self.adjoint, job_of(code, _adjoint.JOB, fields), self.memories[1])
