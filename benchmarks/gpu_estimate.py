@@ -113,8 +113,11 @@ def counted(scene, form=as_chosen, result=end_of) -> Counted:
         lower_by(map(_primitives._for_cpus, (_primitives._run_compiled, _primitives._vjp_compiled)))
         _gpu_launch.launch, gpu.form_for = kept
         jax.clear_caches()
-    entry, program, counts, _ = launched[-1]
-    motion = launched[0][-1]  # a transpose does not write down how many steps it goes: as many, in the same form
+    assert len(launched) <= 2, "a gradient that needs tangents, too, is not counted"
+    of_entry = {entry: (program, counts, results) for entry, program, counts, results in launched}
+    entry = gpu.TRANSPOSE if gpu.TRANSPOSE in of_entry else gpu.MOTION
+    (program, counts, _), (*_, motion) = of_entry[entry], of_entry[gpu.MOTION]
+    # A transpose does not write down how many steps it goes: in the same form as many as the motion.
     steps = motion["steps"].sum() + motion["rejected"].sum()
     return Counted(entry, program, {name: count / steps for name, count in counts.items()}, float(steps) / MEMBERS)
 

@@ -73,9 +73,11 @@ class MachineCode(AbstractEngine):
     On an NVIDIA GPU it integrates where it is asked for, one thread a member: `MachineCode()` is lowered for CUDA as
     for CPUs, by `jax.export` too. That form is assembled and checked on a CPU, not yet run on a GPU. There, members
     that fail are not tried once more by another variant of the equations, and an angle beyond 2²⁰ ends a motion. A
-    first derivative takes a motion with its tangents for every direction, in reverse mode for every number of the
-    start and of the parameters; higher ones are composed of these. Crossings and hybrid motion require a CPU. Where the
-    series of a scene do not fit into the registers of a thread, 16 cores of a CPU may be as fast (`System.explain`).
+    first derivative in forward mode takes a motion with its tangents for every direction; one in reverse mode goes
+    back over the steps, as on a CPU, and takes such tangents for every number with constraints alone, or where a
+    member's steps are too many or do not suit its derivatives. Higher ones are composed of these. Crossings and hybrid
+    motion require a CPU. Where the series of a scene do not fit into the registers of a thread, 16 cores of a CPU may
+    be as fast (`System.explain`).
 
     Machine code requires a CPU or such a GPU, a scene whose acceleration is a scalar program of smooth or piecewise
     smooth operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;

@@ -1,10 +1,10 @@
-"""The motion of a kernel as a program for NVIDIA GPUs: one thread a member.
+"""The motion of a kernel, and its transpose, as programs for NVIDIA GPUs: one thread a member.
 
-The module of one lane that runs on a CPU goes, unchanged, through LLVM's target for PTX, the assembly language that the
-driver turns into machine code. Its entry `integrate` builds the job on the stack of its thread and calls `begin` and
-`run`; a thread whose member has ended takes the next one from the counter that all share. Functions that are no
-instruction come from libdevice, NVIDIA's library in LLVM's own form, which lies where pip has put `nvidia-cuda-nvcc`:
-`jax[cuda12]` depends on it.
+The modules of one lane that run on a CPU go, unchanged, through LLVM's target for PTX, the assembly language that the
+driver turns into machine code. An entry (`_gpu_entry`) builds the job on the stack of its thread and calls their
+`begin` and `run`; a thread whose member has ended takes the next one from the counter that all share. Functions that
+are no instruction come from libdevice, NVIDIA's library in LLVM's own form, which lies where pip has put
+`nvidia-cuda-nvcc`: `jax[cuda12]` depends on it.
 
 A program has one of two forms. Where the coefficients of a motion are few, the loops over orders are unrolled, at an
 order that is lower than a CPU's if that keeps them few: no array is left, and the coefficients are registers, some of

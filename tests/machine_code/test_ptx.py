@@ -47,7 +47,7 @@ def on_the_ptx(monkeypatch):
             arrays, outputs = outputs_of(entry, arrays, shapes)
             places = [x.ctypes.data for x in (*arrays, *outputs)]
             launches.append(members)
-            for thread in range(3):  # the first one takes all members, the others find none
+            for thread in (2, 0, 1):  # the first one takes all members, the others find none
                 translated(program).thread(thread, 3, 0, 1, *places)
             assert outputs[0][0] == members + 3, "threads share the counter"
             return outputs[1:]
@@ -185,6 +185,66 @@ def test_derivatives_forward_and_reverse(on_the_ptx):
 
     for derivative in (jax.grad(total, (0, 1)), jax.jacfwd(total, (0, 1))):
         agree(on_the_ptx(derivative, scene.q0, scene.params), jax.jit(derivative)(scene.q0, scene.params), 1e-7)
+
+
+def swung(q0, scene=None, ts=TS, **how):
+    """A number of all outputs of a motion, from rest."""
+    scene = scenes.pendulum() if scene is None else scene
+    q, qdot, *_ = motion(scene, q0, 0 * q0, ts, **how)
+    return jnp.sum(jnp.sin(q) * jnp.arange(1.0, 6.0).reshape(5, *[1] * (q.ndim - 1))) + jnp.sum(qdot[-1])
+
+
+def test_a_gradient_is_one_launch_for_all_members(on_the_ptx):
+    """Compiles a pendulum's motion, transpose and tangents, as the two tests below."""
+    q0 = np.linspace(0.3, 2.8, 9)
+    gradient = jax.vmap(jax.grad(swung))
+    agree(on_the_ptx(gradient, q0), jax.jit(gradient)(q0), 1e-7)
+    assert on_the_ptx.launches == [9, 9]  # the motion itself, and there and back
+
+
+def test_members_whose_steps_do_not_do_take_tangents(on_the_ptx, monkeypatch):
+    """At rest a pendulum takes steps that its tangents cannot; and there may be no room for all steps."""
+    gradient, rest = jax.vmap(jax.grad(swung)), np.array([0.0, 0.5, 1.0])
+    agree(on_the_ptx(gradient, rest), jax.jit(gradient)(rest), 1e-7)
+    assert sorted(on_the_ptx.launches) == [3, 3, 15]  # tangents by two states and three parameters of each
+    on_the_ptx.launches.clear()
+    monkeypatch.setattr("lagjax._native._gpu.LARGEST_RECORD", 64 * 5 * 6)  # five steps
+    agree(on_the_ptx(gradient, rest + 1.0), jax.jit(gradient)(rest + 1.0), 1e-7)
+    assert sorted(on_the_ptx.launches) == [3, 3, 15]
+
+
+def test_gradients_of_motions_that_fail_are_those_of_the_cpu(on_the_ptx):
+    q0, far = np.array([0.01, 2.0]), 20.0 * TS
+
+    def of_outputs(q0):
+        q = motion(scenes.pendulum(), q0, 0.0, far, max_steps=30, rtol=1e-9)[0]
+        return jnp.sum(jnp.where(jnp.isfinite(q), q, 0.0))
+
+    def of_end(q0):
+        return motion(scenes.pendulum(), q0, 0.0, far, max_steps=30, rtol=1e-9)[0][-1]
+
+    for function in (of_outputs, of_end):
+        gradient = jax.vmap(jax.grad(function))
+        here, there = on_the_ptx(gradient, q0), jax.jit(gradient)(q0)
+        np.testing.assert_array_equal(np.isnan(here), np.isnan(there))
+        agree(here, there, 1e-6)
+    assert np.isnan(there).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["few", "many", "no numbers", "borders", "in memory", "own times"])
+def test_transposes(on_the_ptx, case):
+    chain, pendulum, ends = scenes.chain(4), scenes.pendulum(), np.arange(-1.0, 2.0)  # back, not at all, and on
+    falling = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+    derivative, given = {
+        "few": (jax.jacrev(lambda q0: motion(pendulum, q0, 0.0)[0][1:3]), (1.0,)),
+        "many": (jax.jacrev(lambda q0: motion(pendulum, q0, 0.0)[0]), (1.0,)),
+        "no numbers": (jax.grad(lambda q0: swung(q0, lagjax.System(lambda q, v: 0.5 * v**2 - q**4))), (1.0,)),
+        "borders": (jax.grad(lambda q0: swung(q0, falling, 5.0 * TS)), (1.0,)),
+        "in memory": (jax.grad(lambda q0, p: swung(q0, chain, params=p), (0, 1)), (chain.q0, chain.params)),
+        "own times": (jax.vmap(jax.grad(lambda q0, end: swung(q0, ts=end * TS), (0, 1))), (np.ones(3), ends)),
+    }[case]  # fmt: skip
+    agree(on_the_ptx(derivative, *given), jax.jit(derivative)(*given), 1e-7)
 
 
 @pytest.mark.slow
