@@ -23,7 +23,7 @@ shared; under `jax.vmap` it is still one call of machine code. Outside of `jit` 
 
 import functools
 import math
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -36,11 +36,13 @@ from lagjax._machine_code import _derivatives
 from lagjax._machine_code._call import has_handler, has_sweep, on_host, run_by_handler, sweep_by_handler
 from lagjax._machine_code._flow import Flow, Tolerances
 from lagjax._machine_code._gpu_launch import run_on_gpu, transpose_on_gpu
+from lagjax._machine_code._lines import outputs
 from lagjax._machine_code._rates import rate
 from lagjax._machine_code._steps import KEPT
 from lagjax._machine_code._variational import from_rows, to_rows
-from lagjax._native import Begun
+from lagjax._native import Begun, Projection
 from lagjax._problem import Solution
+from lagjax._program import Program
 from lagjax._results import SUCCESSFUL
 
 
@@ -172,6 +174,8 @@ def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
 
 def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
     """The start of the tangent flow, for a direction of length one; and the length."""
+    if flow.projection is not None:
+        dy0 = _projected_direction(flow, flow.projection, ts[..., 0], y0, params, dy0, dparams)
     length = jnp.max(jnp.abs(dy0), axis=-1, keepdims=True)
     if flow.numbers:
         length = jnp.maximum(*jnp.broadcast_arrays(length, jnp.max(jnp.abs(dparams), axis=-1, keepdims=True)))
@@ -179,6 +183,18 @@ def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
     start = from_rows(jnp.stack(jnp.broadcast_arrays(y0, dy0 / length), axis=-2))
     numbers = jnp.concatenate(jnp.broadcast_arrays(params, dparams / length), axis=-1)
     return (ts, start, numbers), length
+
+
+def _projected_direction(flow: Flow, projection: Projection, t, y0, params, dy0, dparams):
+    """The tangent of the projection of a start, at which a motion with constraints begins (see `_derivatives`)."""
+
+    def along(t, y, p, dy, dp):
+        def start(y, p):
+            return outputs(cast(Program, projection.state), flow.states, jnp.append(y, t), p)
+
+        return jax.jvp(start, (y, p), (dy, dp))[1]
+
+    return jnp.vectorize(along, signature="(),(s),(p),(s),(p)->(s)")(t, y0, params, dy0, dparams)
 
 
 def _residuals(solution: Solution):

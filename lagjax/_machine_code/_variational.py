@@ -60,7 +60,7 @@ def tangent_programs(
         return scale(*q[0], *v[0], t, *p[0])
 
     outputs = [(first + i, row) for first in (0, size) for row in every for i in range(size)]
-    scales = [(i, None) for i in range(size)]
+    scales = [(i, None) for i in range(len(scale.line.outputs))]  # of the motion, also where it has tangents
     return larger, Projection(
         _with_tangents(state, size, rows, numbers, outputs, projected),
         _with_tangents(scale, size, rows, numbers, scales, velocity_scale),

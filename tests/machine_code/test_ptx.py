@@ -169,6 +169,22 @@ def test_constraints(on_the_ptx):
     agree(here, jax.jit(lambda q0: motion(scene, q0, scene.qdot0))(scene.q0))
 
 
+@pytest.mark.slow
+def test_derivatives_with_constraints(on_the_ptx):
+    """By starts that leave the constraints, too: those of the nearest ones that do not."""
+    scene = scenes.cartesian_pendulum()
+
+    def total(q0, params):
+        return jnp.sum(motion(scene, q0, scene.qdot0, params=params)[0][-1])
+
+    def on_circle(angle):
+        return total(jnp.array([jnp.sin(angle), -jnp.cos(angle)]), scene.params)
+
+    at = scene.q0, scene.params
+    for function, given in (jax.grad(total, (0, 1)), at), (jax.jacfwd(total), at), (jax.hessian(on_circle), (0.6,)):
+        agree(on_the_ptx(function, *given), jax.jit(function)(*given), 1e-8)
+
+
 def test_borders_of_a_piecewise_scene(on_the_ptx):
     system = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
     here = on_the_ptx(lambda q0: motion(system, q0, 0.0, 5.0 * TS), 1.0)

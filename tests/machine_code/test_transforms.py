@@ -110,7 +110,7 @@ def test_second_derivatives_on_a_constraint_are_those_of_the_angle():
 
 
 @pytest.mark.slow
-def test_second_derivatives_by_a_start_that_moves_along_a_curved_constraint():
+def test_second_and_third_derivatives_by_a_start_that_moves_along_a_curved_constraint():
     circle = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], constraints=lambda q: q @ q - 1.0)
     pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + 9.81 * jnp.cos(q))
     ts = jnp.array([0.0, 1.3, 2.0])
@@ -127,6 +127,8 @@ def test_second_derivatives_by_a_start_that_moves_along_a_curved_constraint():
     for inner in (jax.grad, jax.jacfwd):
         for outer in (jax.grad, jax.jacfwd):
             np.testing.assert_allclose(outer(inner(on_circle))(0.65), exact, rtol=1e-8)
+    third = jax.jacfwd(jax.grad(jax.grad(by_angle)))(0.65)
+    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(jax.grad(on_circle)))(0.65), third, rtol=1e-7)
 
 
 @pytest.mark.slow
