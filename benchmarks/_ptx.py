@@ -11,7 +11,8 @@ import llvmlite.binding as llvm
 import numpy as np
 from llvmlite import ir
 
-I1, I32, I64, D, P = ir.IntType(1), ir.IntType(32), ir.IntType(64), ir.DoubleType(), ir.PointerType()
+I1, I32, I64 = ir.IntType(1), ir.IntType(32), ir.IntType(64)
+F, D, P = ir.FloatType(), ir.DoubleType(), ir.PointerType()
 
 
 def jitted(module, *names):
@@ -37,7 +38,7 @@ _NUMBERS = {
     "b64": I64,
     "s64": I64,
     "u64": I64,
-    "f32": ir.FloatType(),
+    "f32": F,
     "b8": ir.IntType(8),
     "u8": ir.IntType(8),
     "b16": ir.IntType(16),
@@ -47,7 +48,7 @@ _NUMBERS = {
     "u32": I32,
     "pred": I1,
 }
-COUNTED = "float64", "local loads", "local stores"
+COUNTED = "float64", "float32", "local loads", "local stores"
 _ARITHMETIC = frozenset(("add", "sub", "mul", "div", "fma", "max", "min", "sqrt", "rcp", "setp"))
 _SPECIAL = ("%tid.x", "%ntid.x", "%ctaid.x", "%nctaid.x")
 
@@ -57,7 +58,7 @@ class PtxOnCpu:
 
     A register is a variable of its bits; all spaces of addresses are one, that of the host. No calls, no barriers.
     Where it is `counting`, `counts` has how many instructions of the kinds in `COUNTED` it has executed so far: those
-    of the arithmetic of float64, and doubles read from and written to local memory.
+    of the arithmetic of float64 and float32, and numbers read from and written to local memory.
     """
 
     def __init__(self, ptx, counting=False):
@@ -135,7 +136,9 @@ class PtxOnCpu:
         kind = None
         if name in ("ld", "st") and parts[1] == "local":
             kind = "local loads" if name == "ld" else "local stores"
-        elif name in _ARITHMETIC and parts[-1] == "f64":
+        elif name in _ARITHMETIC and parts[-1] in ("f64", "f32"):
+            kind = "float64" if parts[-1] == "f64" else "float32"
+        elif name == "cvt" and "f64" in parts[-2:]:
             kind = "float64"
         if self._counters is not None and kind is not None:
             place = self.b.gep(self._counters, [I32(0), I32(COUNTED.index(kind))], inbounds=True)
@@ -303,7 +306,7 @@ class PtxOnCpu:
         elif name == "neg":
             value = b.fneg(read(0)) if floating else b.neg(read(0))
         elif name == "rcp":
-            value = b.fdiv(ir.Constant(D, 1.0), read(0))
+            value = b.fdiv(ir.Constant(_NUMBERS[kind], 1.0), read(0))
         elif name in ("min", "max"):
             compare = b.icmp_signed if signed else b.icmp_unsigned
             value = b.select(compare("<" if name == "min" else ">", read(0), read(1)), read(0), read(1))
@@ -332,15 +335,17 @@ class PtxOnCpu:
 
     def _convert(self, parts, x):
         b, (after, before) = self.b, parts[-2:]
-        value, t = self._read(x, before), _NUMBERS[after]
-        if before == "f64" and after == "f64":
+        value, t, floats = self._read(x, before), _NUMBERS[after], ("f64", "f32")
+        if before == after and before in floats:
             return self._intrinsic({"rni": "rint", "rmi": "floor", "rpi": "ceil", "rzi": "trunc"}[parts[1]], value)
-        if before == "f64":
+        if before in floats and after in floats:
+            return (b.fptrunc if after == "f32" else b.fpext)(value, t)
+        if before in floats:
             if parts[1] == "rni":
                 value = self._intrinsic("rint", value)
             return (b.fptosi if after.startswith("s") else b.fptoui)(value, t)
-        if after == "f64":
-            return (b.sitofp if before.startswith("s") else b.uitofp)(value, D)
+        if after in floats:
+            return (b.sitofp if before.startswith("s") else b.uitofp)(value, t)
         if t.width < value.type.width:
             return b.trunc(value, t)
         return (b.sext if before.startswith("s") else b.zext)(value, t) if t.width > value.type.width else value

@@ -66,6 +66,7 @@ class Problem:
     - `max_steps`: the budget of steps, rejected ones included.
     - `event`: functions of the user's state that end the motion.
     - `guards`: the same as a program for machine code (`_native.Guards`), whose signs end the motion; of hybrid motion.
+    - `is_rounded`: whether the solution, in float64, is rounded to float32 in the end.
     """
 
     system: Any
@@ -77,6 +78,7 @@ class Problem:
     max_steps: int = field(metadata={"static": True})
     event: diffrax.Event | None = None
     guards: Hashable = field(metadata={"static": True}, default=None)
+    is_rounded: bool = field(metadata={"static": True}, default=False)
 
     @classmethod
     def of(
@@ -145,7 +147,8 @@ class Problem:
             return np.asarray(leaf, DOUBLE) if is_concrete(leaf) else _zeros(np.shape(leaf), DOUBLE)
 
         params, ts, y0 = jax.tree.map(wide, (self.params, self.ts, self.y0))
-        return replace(self, layout=replace(self.layout, dtype=DOUBLE), params=params, ts=ts, y0=y0)
+        layout = replace(self.layout, dtype=DOUBLE)
+        return replace(self, layout=layout, params=params, ts=ts, y0=y0, is_rounded=True)
 
 
 class Batch(eqx.Module):

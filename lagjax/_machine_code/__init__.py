@@ -19,6 +19,7 @@ from lagjax._machine_code import _primitives
 from lagjax._machine_code._crossing import MOST_GUARDS, Noted, along_crossings, surfaces_of, surfaces_of_event, to_event
 from lagjax._machine_code._derivatives import jvp, projected_start, vjp
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
+from lagjax._machine_code._gpu_launch import form_for_gpus
 from lagjax._machine_code._steps import KEPT, StepStore
 from lagjax._machine_code._surfaces import Guarded, Surfaces, crossing_variation, require_one_number, vector_of
 from lagjax._native import Guards, watched
@@ -124,7 +125,7 @@ class MachineCode(AbstractEngine):
         with jax.enable_x64(True):
             problem = problem.in_doubles if problem.is_single else problem
             try:
-                form = flow_of(problem).kernel.form_for_gpus(tolerances_of(problem).rtol)
+                form = form_for_gpus(flow_of(problem), tolerances_of(problem))
             except Unlowerable as reason:
                 return f"nor can solver=lagjax.MachineCode() go to a GPU: {reason}"
         outlook = "solver=lagjax.MachineCode() is for GPUs too, assembled and checked on a CPU, not yet run on a GPU"
@@ -268,5 +269,7 @@ def _require_increasing(program: Program, vector) -> None:
 
 def tolerances_of(problem: Problem) -> Tolerances:
     """The numbers that say how exactly, and how long, a problem is integrated."""
-    atol = problem.tolerances[1]
-    return Tolerances(float(MachineCode().rtol(problem)), 0.0 if atol is None else float(atol), problem.max_steps)
+    rtol, atol = MachineCode().rtol(problem), problem.tolerances[1]
+    return Tolerances(
+        float(rtol), 0.0 if atol is None else float(atol), problem.max_steps, allow_singles=problem.is_rounded
+    )  # fmt: skip

@@ -33,7 +33,8 @@ _GIVEN_UP = (_SINGULAR, _NOT_FINITE, _SHRANK, _NOT_PROJECTED)  # what another va
 class Tolerances(NamedTuple):
     """The local error of a step, what a run may cost, and how often each guard may be noted on the way.
 
-    An atol of 0 stands for none given: it follows the size of the motion.
+    An atol of 0 stands for none given: it follows the size of the motion. Results that are rounded to float32 in the
+    end `allow_singles`, on a device that is much slower in float64.
     """
 
     rtol: float
@@ -41,6 +42,7 @@ class Tolerances(NamedTuple):
     max_steps: int
     tries: int = 4
     notes: int = 0
+    allow_singles: bool = False
 
     @property
     def perturbed(self) -> "Tolerances":
@@ -191,7 +193,7 @@ class Flow:
 
     def follow(self, ts, y0, params, tolerances, store=None, room=None, begun=None) -> Solution:
         """`run` without a look at what stopped a member: for another try, and for derivatives."""
-        rtol, atol, max_steps, _, notes = tolerances
+        rtol, atol, max_steps, _, notes, _ = tolerances
         if store is not None and room is None:
             room = min(max_steps * len(y0), LARGEST_KEPT // (self.states + 4))
         done = self.kernel.to_run(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes)

@@ -35,7 +35,7 @@ from jax.interpreters import ad, batching, mlir
 from lagjax._machine_code import _derivatives
 from lagjax._machine_code._call import has_handler, has_sweep, on_host, run_by_handler, sweep_by_handler
 from lagjax._machine_code._flow import Flow, Tolerances
-from lagjax._machine_code._gpu_launch import run_on_gpu, transpose_on_gpu
+from lagjax._machine_code._gpu_launch import for_device, run_on_gpu, transpose_on_gpu
 from lagjax._machine_code._lines import outputs
 from lagjax._machine_code._rates import rate
 from lagjax._machine_code._steps import KEPT
@@ -521,7 +521,7 @@ def _vjp_compiled(*args, **settings):
 def _run_for_gpus(ts, y0, params, *, flow, tolerances, **_):
     rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2), library=jnp)
     with jax.enable_x64(True):  # whatever was set where this is lowered
-        return _in_batch(run_on_gpu(flow, tolerances, *rows), batch)
+        return _in_batch(run_on_gpu(flow, for_device(flow, tolerances), *rows), batch)
 
 
 def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
@@ -538,7 +538,7 @@ def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
 
 def _vjp_for_gpus(*args, flow, tolerances):
     """`vjp`: back over the steps of the motion; of constraints, and where the steps do not do, by tangents."""
-    settings = dict(flow=flow, tolerances=tolerances)
+    settings = dict(flow=flow, tolerances=for_device(flow, tolerances))
     with jax.enable_x64(True):
         rows, batch = _rows(args, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2), library=jnp)
         ts, y0, params, path, result, *_, path_ct, end_ct = rows

@@ -56,6 +56,7 @@ class Adjoint:
         chosen: Chosen | None = None,
         *,
         width: int,
+        number: ir.Type = DOUBLE,
     ):
         n, states = series.size, 2 * series.size
         pieces = 0 if borders is None else len(borders.switches)
@@ -73,9 +74,11 @@ class Adjoint:
             fields |= FirstSaltation.fields(pieces, (n,)) if jump is None else Saltation.fields(pieces)
             fields |= {"after": n, "pieces_after": pieces, "has_after": 1, "crossed": 1, "grazes": 1}
         large = is_large(program, projection, times=2, more=() if jump is None else [jump.line] * 2)
+        number = DOUBLE if large else number  # tables do not tell the time from the state
         self.motion = TaylorSeries(
-            "adjoint", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
-        )
+            "adjoint", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen,
+            number=number,
+        )  # fmt: skip
         self.n, self.states, self.series = n, states, series
         dtypes = program.dtypes
         # All but the time and the pieces.
@@ -174,7 +177,7 @@ class Adjoint:
     def _seed(self) -> Code:
         """The cotangents of all coefficients, by the polynomials that they are used in."""
         frame = self.motion.function("seed")
-        code, h, power = frame.code, frame["h"], frame.code.variable(frame.constant(1.0))
+        code, h, power = frame.code, frame.code.lanes_of(frame["h"]), frame.code.variable(frame.constant(1.0))
         form = self.motion.form
         for i in form.each(code, self.series.values):
             frame["values_ct", i] = 0.0
@@ -228,7 +231,7 @@ class Adjoint:
         """The bound of the last terms of the series of a tangent, from the transpose of the last order."""
         frame = self.motion.function("measured")
         code, form, n, order = frame.code, self.motion.form, self.n, frame.job("order")
-        h, p = code.intrinsic("fabs", frame["h"]), code.as_double(frame.job("order"))
+        h, p = code.lanes_of(code.intrinsic("fabs", frame["h"])), code.as_number(frame.job("order"))
 
         def size(x):
             return code.intrinsic("fabs", x)
@@ -244,7 +247,7 @@ class Adjoint:
         rate = code.select(velocities > 0.0, rate, 0.0)
         term, power = code.variable(frame.constant(1.0)), code.variable(frame.constant(1.0))
         with code.loop(order - 1, start=0) as k:
-            term.value = term.value * (rate * h) / code.as_double(k + 1)
+            term.value = term.value * (rate * h) / code.as_number(k + 1)
             with code.only_if(k > 0):
                 power.value = power.value * h
         # The last coefficient of the rows, beside the first two, which may both be near a zero.
@@ -304,7 +307,7 @@ class Adjoint:
         """
         frame = self.motion.function("back_recursion", INTEGER)
         code, (k,), n, series, form = frame.code, frame.arguments, self.n, self.series, self.motion.form
-        inverse = 1.0 / code.as_double(k + 1)
+        inverse = 1.0 / code.as_number(k + 1)
         for i in form.each(code, n):  # q̇ₖ = (k+1) qₖ₊₁
             _add(frame, frame["y_ct", i, k + 1] * inverse, "y_ct", i + n, k)
         accelerations_ct = Vectors(n, lambda i: frame["y_ct", i + n, k + 1] * inverse)

@@ -31,7 +31,6 @@ from lagjax._native._constants import (
     NO_TIME,
     PAST,
     RISE,
-    ROUND_OFF,
     SHORT_OF,
     SWITCH_TOLERANCES,
 )
@@ -320,7 +319,7 @@ class BorderControl:
         after = self.motion.evaluate_now(frame, line) if shaken else []
         for k, j in enumerate(shaken):
             jump = code.intrinsic("fabs", after[k] - before[k].value)
-            least = code.intrinsic("fabs", after[k]) * ROUND_OFF + code.lanes_of(absolute_tolerance(frame))
+            least = code.intrinsic("fabs", after[k]) * frame.digits.round_off + code.lanes_of(absolute_tolerance(frame))
             jumps = going & (jump > least)
             with frame.where(jumps):
                 frame["stays", j] = 0.0

@@ -12,6 +12,10 @@ these like dictionaries:
 
 Every function takes three pointers, to the job, the memory and the integers of the lanes, and then what it is called
 with.
+
+The numbers of a state may be of single precision, in one lane; times, lengths of steps and counts are doubles all the
+same, and so are the arrays of the job. A number of single precision has the room of a double: of what a GPU keeps of a
+thread in memory, words that are not touched cost nothing but their room.
 """
 
 import copy
@@ -24,13 +28,19 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value
+from lagjax._native._constants import DIGITS, SINGLE_DIGITS, Digits
+from lagjax._native._ir import BIT, DOUBLE, FLOAT, INTEGER, POINTER, Code, Value, element_of
 
 Index = int | Value
 Numbers = Any  # vectors by their numbers: a list of values whose indices are known, or `Vectors`
 # Integers of a lane: which member it carries (-1: none), which output comes next, and which step.
 LANE = ("member", "output", "step")
 CACHE_LINE = 8  # doubles
+# What is a double, in whatever precision the state is: times, lengths of steps, counts and codes.
+_DOUBLES = frozenset(
+    "t t_low t_end t_before t_low_before h h_before forward smallest longest last due reached is_due "
+    "code event steps steps_before rejected first_number".split()
+)
 _KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
 
 
@@ -57,11 +67,19 @@ def integers(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
 class Memory:
     """The places of the vectors of a thread: `fields` gives each name a number of vectors, or rows and columns of them.
 
-    `width` is the lanes of a vector. A layout `beside` another one has vectors of another width in the same memory.
+    `width` is the lanes of a vector, `number` the type of the numbers of a state. A layout `beside` another one has
+    vectors of another width in the same memory.
     """
 
-    def __init__(self, width: int, fields: Mapping[str, int | tuple[int, int]], beside: "Memory | None" = None):
-        self.width, self._columns, self._offsets = width, {}, {}
+    def __init__(
+        self,
+        width: int,
+        fields: Mapping[str, int | tuple[int, int]],
+        beside: "Memory | None" = None,
+        number: ir.Type = DOUBLE,
+    ):
+        assert number == DOUBLE or width == 1, "lanes of single precision would not lie side by side"
+        self.width, self.number, self._columns, self._offsets = width, number, {}, {}
         self._doubles = [0] if beside is None else beside._doubles  # of all that share the memory
         for name, shape in fields.items():
             rows, columns = shape if isinstance(shape, tuple) else (shape, 1)
@@ -87,6 +105,10 @@ class Memory:
         """More fields, by name, of this many vectors each, behind all others."""
         for name, rows in fields.items():
             self.extend(name, rows)
+
+    def type_of(self, name: str) -> ir.Type:
+        """The type of the numbers of a field."""
+        return DOUBLE if name in _DOUBLES else self.number
 
     def place(self, name: str, *indices: Index) -> Any:
         """The first element of a vector, counted in doubles: `name`, `name[i]` or `name[i, k]`."""
@@ -125,7 +147,9 @@ class Frame:
     """A function of a kernel under construction, with named access to all that it sees."""
 
     def __init__(self, module: ir.Module, layout: Memory, job: type, name: str, *kinds: ir.Type, **options):
-        self.code = Code(module, name, [POINTER] * 3 + list(kinds), layout.width, **options)
+        self.code = Code(
+            module, name, [POINTER] * 3 + list(kinds), layout.width, number=layout.number, **options
+        )  # fmt: skip
         self.layout, self.width, self.vector = layout, layout.width, self.code.vector
         self._fields = dict(job._fields_)
         self._job, self._memory, self._integers, *self.arguments = self.code.arguments
@@ -133,16 +157,25 @@ class Frame:
 
     # ---- vectors, one element a lane ----
 
+    @property
+    def digits(self) -> Digits:
+        """What rounding does to the numbers of a state."""
+        return SINGLE_DIGITS if self.layout.number == FLOAT else DIGITS
+
     def __getitem__(self, key: "str | tuple") -> Value:
-        return self.code.load(self.address(*_parts(key)), self.vector)
+        name, *indices = _parts(key)
+        return self.code.load(self.address(name, *indices), self._vector_of(name))
 
     def __setitem__(self, key: "str | tuple", value: "Value | float") -> None:
-        value = self.code.lanes_of(value)
-        if value.it.type.element == BIT:
+        if isinstance(value, Value) and element_of(value.it.type) == BIT:
             value = self.code.flag(value)
+        value = self.code.as_value(value, self._vector_of(_parts(key)[0]))
         if self._mask is not None:
             value = self.code.select(self._mask, value, self[key])
         self.code.store(value, self.address(*_parts(key)))
+
+    def _vector_of(self, name: str) -> ir.Type:
+        return ir.VectorType(self.layout.type_of(name), self.width)
 
     @contextmanager
     def where(self, mask: Value) -> Iterator[None]:
@@ -210,6 +243,8 @@ class Frame:
 
     def write(self, name: str, index: Index, value: Value) -> None:
         """Set an element of an array that the job points to."""
+        if element_of(value.it.type) == FLOAT:
+            value = self.code.as_value(value, DOUBLE)
         self.code.store(value, self.code.element(self.job(name), index))
 
     def next_member(self) -> Value:
@@ -248,13 +283,15 @@ class Lane:
 
     def __getitem__(self, key: "str | tuple") -> Value:
         name, *indices = _parts(key)
-        kind = INTEGER if name in LANE else DOUBLE
-        return self._frame.code.load(self.address(name, *indices), kind)
+        return self._frame.code.load(self.address(name, *indices), self._type_of(name))
 
     def __setitem__(self, key: "str | tuple", value: "Value | float") -> None:
         name, *indices = _parts(key)
-        value = self._frame.code.as_value(value, INTEGER if name in LANE else DOUBLE)
+        value = self._frame.code.as_value(value, self._type_of(name))
         self._frame.code.store(value, self.address(name, *indices))
+
+    def _type_of(self, name: str) -> ir.Type:
+        return INTEGER if name in LANE else self._frame.layout.type_of(name)
 
     def address(self, name: str, *indices: Index) -> Value:
         """The address of a number of the lane."""

@@ -18,7 +18,7 @@ import os
 import re
 import sys
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import llvmlite.binding as llvm
@@ -26,7 +26,7 @@ import llvmlite.binding as llvm
 from lagjax._native._constants import LEAST_ORDER
 from lagjax._native._gpu_entry import MOTION, TRANSPOSE, Entry, GpuForm, OneLane, motion_entry, transpose_entry
 from lagjax._native._ir import COUNTED
-from lagjax._native._taylor import TaylorSeries
+from lagjax._native._taylor import TaylorSeries, order_for
 from lagjax._program._graph import Unlowerable
 
 # Threads of a block, and blocks: a motion has as many as 132 multiprocessors hold with all registers of a thread, for
@@ -52,9 +52,36 @@ _FAR_ANGLES = ("sin", "cos")  # the C library's part in a sine is that of angles
 _lock = threading.Lock()
 
 
+class GpuPrograms:
+    """The programs for GPUs of a kernel, made when they are asked for.
+
+    `motion` and `adjoint` write down the modules of one lane. The tolerance chooses the order of the series. All raise
+    `Unlowerable`, whose text says why, where a GPU cannot run the program.
+    """
+
+    def __init__(self, motion: Callable[[], TaylorSeries], adjoint: Callable[[], TaylorSeries], single: bool):
+        self.single = single
+        self._lane = functools.cache(lambda: one_lane(motion()))
+        self._lane_back = functools.cache(lambda: one_lane(adjoint()))
+        self._motion = functools.cache(lambda form: motion_for_gpus(self._lane(), form))
+        self._transpose = functools.cache(lambda form: transpose_for_gpus(self._lane(), self._lane_back(), form))
+
+    def form(self, entry: Entry, rtol: float) -> GpuForm:
+        """The form of the program of an entry."""
+        return form_for(entry, self._lane(), order_for(rtol))
+
+    def motion(self, rtol: float) -> str:
+        """The motion of a member in PTX."""
+        return self._motion(self.form(MOTION, rtol))
+
+    def transpose(self, rtol: float) -> tuple[str, int]:
+        """The motion of a member and back in PTX, and the doubles that are written down of a step."""
+        return self._transpose(self.form(TRANSPOSE, rtol)), self._lane().row
+
+
 def form_for(entry: Entry, lane: OneLane, order: int) -> GpuForm:
     """The form of a motion that should take the least time, where a CPU takes series of this `order`."""
-    fitting = MOST_COEFFICIENTS[entry] // lane.series
+    fitting = MOST_COEFFICIENTS[entry] * (2 if lane.single else 1) // lane.series  # a register has 32 bits
     return GpuForm(order, False) if lane.large or fitting < LEAST_ORDER else GpuForm(min(order, fitting), True)
 
 
@@ -107,7 +134,8 @@ def _assembly(entry: str, parts: Sequence[tuple[str, GpuForm]]) -> str:
     machine, external = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3), set()
     texts = [_with_unrolled_loops(text) if form.unrolled else text for text, form in parts]
     for text in texts:
-        external |= {*re.findall(r'^declare double @"?(\w+)"?\(', text, re.MULTILINE)} - {*_FAR_ANGLES} - {"llvm"}
+        external |= {*re.findall(r'^declare (?:double|float) @"?(\w+)"?\(', text, re.MULTILINE)}
+    external -= {*_FAR_ANGLES, "llvm"}
     modules = [_parsed(text, external, machine) for text in (entry, *map(_without_far_angles, texts))]
     if external:
         if (library := libdevice()) is None:

@@ -17,7 +17,7 @@ from llvmlite import ir
 from lagjax._native import _adjoint, _integrator
 from lagjax._native._frame import CACHE_LINE, LANE
 from lagjax._native._handler import job_of
-from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value
+from lagjax._native._ir import BIT, DOUBLE, FLOAT, INTEGER, POINTER, Code, Value
 from lagjax._native._output import RECORDED
 from lagjax._native._taylor import TaylorSeries
 
@@ -73,7 +73,7 @@ class OneLane(NamedTuple):
 
     A thread remembers `size` doubles. The motion has this many `states` (2n) and `numbers` of a member, `row` doubles
     are written down of a step, and its series have this many rows, those of the state among them. Of a `large` motion,
-    which is in tables, no loop can be unrolled.
+    which is in tables, no loop can be unrolled. The series may be of `single` precision.
     """
 
     text: str
@@ -83,13 +83,15 @@ class OneLane(NamedTuple):
     row: int
     series: int
     large: bool
+    single: bool = False
 
     @classmethod
     def of(cls, motion: TaylorSeries) -> "OneLane":
         """From the motion of an integrator or of an adjoint, whose module is finished."""
         states, text = motion.states, str(motion.module)
         row, series = states + RECORDED + motion.recorded_pieces, states + motion.series.rows
-        return cls(text, motion.layout.size, states, motion.of_member, row, series, motion.large)
+        single = motion.layout.number == FLOAT
+        return cls(text, motion.layout.size, states, motion.of_member, row, series, motion.large, single)
 
 
 def motion_entry(motion: OneLane, order: int) -> str:

@@ -15,13 +15,15 @@ Every lane of a vector carries one member. A round takes one step in each lane:
 so that no lane waits for another. Several threads may do so at once: they share the counter that hands out the members.
 """
 
+from llvmlite import ir
+
 from lagjax._native import _rank_drops
 from lagjax._native._border_control import BorderControl
 from lagjax._native._constants import DONE, EVENT, FIRST_STEP, MAX_ORDER, OUT_OF_STEPS, RUNNING, SMALLEST_STEP
 from lagjax._native._events import Events
 from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._guards import Guards
-from lagjax._native._ir import INTEGER, POINTER, Code, Value
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
 from lagjax._native._output import Output
 from lagjax._native._projection import Projector
 from lagjax._native._roots import Roots
@@ -47,7 +49,8 @@ class Integrator:
     """Builds the module, whose public functions are `begin` and `run`.
 
     Coordinates of one of the `error_groups` are measured by the largest of them. The first `base_size` coordinates are
-    the motion, the others derivatives of it, which follow where the projection takes it.
+    the motion, the others derivatives of it, which follow where the projection takes it. The state is of the type
+    `number`.
     """
 
     job = JOB
@@ -65,6 +68,7 @@ class Integrator:
         chosen: Chosen | None = None,
         *,
         width: int,
+        number: ir.Type = DOUBLE,
     ):
         n = series.size
         self.base_size = n if base_size is None else base_size
@@ -83,7 +87,8 @@ class Integrator:
         alone = large and width == 1 and borders is None and chosen is None
         kind = SingleMember if alone and fills_lanes(series) else TaylorSeries
         self.motion = motion = kind(
-            "motion", program, series, JOB, fields, large, width, pieces=pieces, chosen=chosen, kept=self.guards
+            "motion", program, series, JOB, fields, large, width, pieces=pieces, chosen=chosen, kept=self.guards,
+            number=number,
         )  # fmt: skip
         self.projector = projection and Projector(
             motion, projection.state, projection.velocity_scale, self.base_size

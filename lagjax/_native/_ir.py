@@ -8,6 +8,10 @@
 
 emits the loop. A number is a double, an integer (64 bits) or a vector of doubles, one for each lane. A sum of products
 may be contracted to fused multiply-adds; nothing else about the arithmetic is loosened.
+
+The vectors of a `Code` may be of single precision instead. As everywhere in C and NumPy a vector of doubles makes the
+result one of doubles, while a scalar takes the precision of the vector that it meets; what is stored is rounded to the
+type of its place.
 """
 
 import ctypes
@@ -25,7 +29,7 @@ from llvmlite import ir
 
 from lagjax._native._objects import load_or_make
 
-DOUBLE, INTEGER, BIT, POINTER = ir.DoubleType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
+DOUBLE, FLOAT, INTEGER, BIT, POINTER = ir.DoubleType(), ir.FloatType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
 COUNTED = "counted"  # the name of the blocks at which counted loops begin
 _CONTRACT = ("contract",)
 # What LLVM itself calls for an intrinsic that the processor has no instruction for.
@@ -181,6 +185,11 @@ class Variable:
         code.store(code.as_value(x, self._kind), self._place)
 
 
+def element_of(kind: ir.Type) -> ir.Type:
+    """The type of one lane of a vector; of a scalar its own."""
+    return kind.element if isinstance(kind, ir.VectorType) else kind
+
+
 @functools.cache
 def _splat(kind: ir.Type, lanes: int) -> tuple[ir.Constant, ...]:
     """The constants that a number of this kind is put into all lanes with."""
@@ -189,12 +198,19 @@ def _splat(kind: ir.Type, lanes: int) -> tuple[ir.Constant, ...]:
 
 
 class Code:
-    """The body of one function, growing at its end."""
+    """The body of one function, growing at its end; the type of its numbers is `DOUBLE` or `FLOAT`."""
 
     def __init__(
-        self, module: ir.Module, name: str, arguments: Sequence[ir.Type], lanes: int, result=None, public=False
+        self,
+        module: ir.Module,
+        name: str,
+        arguments: Sequence[ir.Type],
+        lanes: int,
+        result=None,
+        public=False,
+        number: ir.Type = DOUBLE,
     ):
-        self.lanes, self.vector = lanes, ir.VectorType(DOUBLE, lanes)
+        self.lanes, self.number, self.vector = lanes, number, ir.VectorType(number, lanes)
         self.module = module
         function = ir.Function(module, ir.FunctionType(result or ir.VoidType(), arguments), name)
         if not public:
@@ -206,9 +222,10 @@ class Code:
     # ---- numbers ----
 
     def as_value(self, x, like: ir.Type) -> Value:
-        """A Python number, or a value, in the type `like`; a double becomes a vector of equal lanes."""
+        """A Python number, or a value, in the type `like`; a scalar becomes a vector of equal lanes."""
         if not isinstance(x, Value):
             return Value(self, self._constant(x, like))
+        x = self._rounded(x, element_of(like))
         if isinstance(like, ir.VectorType) and not isinstance(x.it.type, ir.VectorType):
             undefined, begin, zeros = _splat(x.it.type, self.lanes)
             first = self.builder.insert_element(undefined, x.it, begin)
@@ -221,8 +238,16 @@ class Code:
             return ir.Constant(like, [ir.Constant(like.element, scalar(x))] * like.count)
         return ir.Constant(like, int(x) if isinstance(like, ir.IntType) else float(x))
 
+    def _rounded(self, x: Value, number: ir.Type) -> Value:
+        """Floating-point numbers in another precision; others as they are."""
+        kind, before = x.it.type, element_of(x.it.type)
+        if before == number or not {before, number} <= {DOUBLE, FLOAT}:
+            return x
+        kind = ir.VectorType(number, self.lanes) if isinstance(kind, ir.VectorType) else number
+        return Value(self, (self.builder.fptrunc if number == FLOAT else self.builder.fpext)(x.it, kind))
+
     def lanes_of(self, x) -> Value:
-        """A vector with one double in every lane."""
+        """A vector of the code's numbers, with one number in every lane or with those of another vector."""
         return self.as_value(x, self.vector)
 
     def arithmetic(self, op: str, a, b) -> Value:
@@ -245,7 +270,8 @@ class Code:
 
     def _alike(self, a, b) -> tuple[Value, Value]:
         types = [x.it.type for x in (a, b) if isinstance(x, Value)]
-        like = next((t for t in types if isinstance(t, ir.VectorType)), types[0])
+        types = [t for t in types if isinstance(t, ir.VectorType)] or types
+        like = next((t for t in types if element_of(t) == DOUBLE), types[0])
         return self.as_value(a, like), self.as_value(b, like)
 
     def select(self, condition: Value, yes, no) -> Value:
@@ -276,11 +302,15 @@ class Code:
         """The larger; NaN where `b` is."""
         return self.select(b <= a, a, b)
 
-    def as_double(self, i: Value) -> Value:
-        """Integers, or bits, as doubles."""
+    def as_number(self, i: Value) -> Value:
+        """Integers, or bits, as the code's numbers: small ones, that do not round."""
         if isinstance(i.it.type, ir.VectorType):
             convert = self.builder.uitofp if i.it.type.element == BIT else self.builder.sitofp
             return Value(self, convert(i.it, self.vector))
+        return Value(self, self.builder.sitofp(i.it, self.number))
+
+    def as_double(self, i: Value) -> Value:
+        """An integer as a double."""
         return Value(self, self.builder.sitofp(i.it, DOUBLE))
 
     def as_integer(self, x: Value) -> Value:
@@ -288,13 +318,16 @@ class Code:
         return Value(self, self.builder.fptosi(x.it, INTEGER))
 
     def bits(self, x: Value) -> Value:
-        """The bits of doubles as integers."""
-        return Value(self, self.builder.bitcast(x.it, ir.VectorType(INTEGER, self.lanes)))
+        """The bits of the code's numbers as integers."""
+        return Value(self, self.builder.bitcast(x.it, self._words))
 
     def from_bits(self, x: Value) -> Value:
-        """Doubles whose bits are these whole numbers."""
-        whole = self.builder.fptosi(x.it, ir.VectorType(INTEGER, self.lanes))
-        return Value(self, self.builder.bitcast(whole, self.vector))
+        """The code's numbers whose bits are these whole numbers."""
+        return Value(self, self.builder.bitcast(self.builder.fptosi(x.it, self._words), self.vector))
+
+    @property
+    def _words(self) -> ir.Type:
+        return ir.VectorType(INTEGER if self.number == DOUBLE else ir.IntType(32), self.lanes)
 
     # ---- memory ----
 
@@ -421,21 +454,26 @@ class Code:
     # ---- functions ----
 
     def intrinsic(self, name: str, *xs: Value) -> Value:
-        """One of LLVM's own functions, on doubles or on whole vectors."""
+        """One of LLVM's own functions, on scalars or on whole vectors."""
+        xs = self._alike(*xs) if len(xs) == 2 else xs
         kind = xs[0].it.type
-        full = f"llvm.{name}." + (f"v{self.lanes}f64" if isinstance(kind, ir.VectorType) else "f64")
+        bits = "f32" if element_of(kind) == FLOAT else "f64"
+        full = f"llvm.{name}." + (f"v{self.lanes}{bits}" if isinstance(kind, ir.VectorType) else bits)
         return self._call_by_name(full, kind, xs)
 
     def library(self, name: str, *xs: Value) -> Value:
-        """A function of the C library, on doubles or lane by lane: one evaluation a step serves all orders."""
+        """A function of the C library, on scalars or lane by lane: one evaluation a step serves all orders."""
+        xs = self._alike(*xs) if len(xs) == 2 else xs
+        kind, number = xs[0].it.type, element_of(xs[0].it.type)
+        name += "f" if number == FLOAT else ""
         _link(name)
-        if not isinstance(xs[0].it.type, ir.VectorType):
-            return self._call_by_name(name, DOUBLE, xs)
-        result = ir.Constant(self.vector, ir.Undefined)
+        if not isinstance(kind, ir.VectorType):
+            return self._call_by_name(name, number, xs)
+        result = ir.Constant(kind, ir.Undefined)
         for lane in range(self.lanes):
             index = ir.Constant(INTEGER, lane)
             elements = [Value(self, self.builder.extract_element(x.it, index)) for x in xs]
-            result = self.builder.insert_element(result, self._call_by_name(name, DOUBLE, elements).it, index)
+            result = self.builder.insert_element(result, self._call_by_name(name, number, elements).it, index)
         return Value(self, result)
 
     def _call_by_name(self, name, kind, xs):

@@ -3,13 +3,13 @@
 import ctypes
 import functools
 import itertools
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
 
 from lagjax._native import _gpu
 from lagjax._native._adjoint import Adjoint
@@ -17,7 +17,6 @@ from lagjax._native._constants import (
     ATOL_OVER_RTOL,
     DONE,
     LARGEST_SHARED,
-    LEAST_ORDER,
     MAX_ORDER,
     MOTIONS_PER_ADJOINT,
     VECTORS_PER_THREAD,
@@ -27,14 +26,14 @@ from lagjax._native._frame import LANE, Memory
 from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
-from lagjax._native._ir import compile_module, lanes
+from lagjax._native._ir import DOUBLE, FLOAT, compile_module, lanes
 from lagjax._native._output import RECORDED
 from lagjax._native._packs import forget_stages
 from lagjax._native._schedule import forget_joined
 from lagjax._native._single_member import fills_lanes
 from lagjax._native._table_reads import SET_NUMBERS
 from lagjax._native._tangent import Tangent
-from lagjax._native._taylor import Chosen, TaylorSeries, is_large, size_of_series
+from lagjax._native._taylor import Chosen, TaylorSeries, is_large, order_for, size_of_series
 from lagjax._native._threads import SLICE, run_in_slices, run_on_threads
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
@@ -149,10 +148,7 @@ class Kernel:
         self._options = guards, error_groups, levels[0]
         self.width = lanes() if width is None else width
         self._tangents = functools.cache(self._tangents_of)
-        self._motions_for_gpus = functools.cache(lambda form: _gpu.motion_for_gpus(self._one_lane, form))
-        self._transposes_for_gpus = functools.cache(
-            lambda form: _gpu.transpose_for_gpus(self._one_lane, self._one_lane_back, form)
-        )
+        self.for_gpus = functools.cache(self._for_gpus)
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
     def for_members(self, members: int) -> "Kernel":
@@ -173,39 +169,33 @@ class Kernel:
     def _alone(self) -> "Kernel":
         return Kernel(*self._given, width=1, motion=self._motion)
 
-    def _integrator(self) -> Integrator:
+    def _integrator(self, number: ir.Type = DOUBLE) -> Integrator:
         with without_collections():
             integrator = Integrator(
-                *self._parts, *self._options, self.borders, self._levels, self._chosen, width=self.width
+                *self._parts, *self._options, self.borders, self._levels, self._chosen, width=self.width, number=number
             )
         forget_joined()
         forget_stages()
         return integrator
 
-    def motion_for_gpus(self, rtol: float) -> str:
-        """The motion of a member in PTX (`_gpu`). Raises `Unlowerable` where a GPU cannot run it."""
-        return self._motions_for_gpus(self.form_for_gpus(rtol))
+    def _for_gpus(self, single: bool) -> "_gpu.GpuPrograms":
+        """The programs for GPUs; those in `single` precision of a kernel that `allows_singles`."""
+        number = FLOAT if single else DOUBLE
 
-    def transpose_for_gpus(self, rtol: float) -> tuple[str, int]:
-        """The motion of a member and back in PTX, and the doubles that are written down of a step.
+        def motion() -> TaylorSeries:
+            _gpu.require_room(size_of_series(self._parts[1]))  # before what is larger than that is written down
+            return self.for_members(1)._integrator(number).motion
 
-        Raises `Unlowerable` where a GPU cannot do so.
+        return _gpu.GpuPrograms(motion, lambda: self._adjoint(width=1, number=number).motion, single)
+
+    @property
+    def allows_singles(self) -> bool:
+        """True if a GPU may compute it in single precision: straight lines without borders and guards.
+
+        What decides about these is known to the digits of doubles.
         """
-        form = _gpu.form_for(_gpu.TRANSPOSE, self._one_lane, order_for(rtol))
-        return self._transposes_for_gpus(form), self._one_lane.row
-
-    def form_for_gpus(self, rtol: float) -> "_gpu.GpuForm":
-        """The form of a motion there. Raises `Unlowerable` where a GPU cannot run it."""
-        return _gpu.form_for(_gpu.MOTION, self._one_lane, order_for(rtol))
-
-    @functools.cached_property
-    def _one_lane(self) -> "_gpu.OneLane":
-        _gpu.require_room(size_of_series(self._parts[1]))  # before what is larger than that is written down
-        return _gpu.one_lane(self.for_members(1)._integrator().motion)
-
-    @functools.cached_property
-    def _one_lane_back(self) -> "_gpu.OneLane":
-        return _gpu.one_lane(self._adjoint(width=1).motion)
+        program, _, projection = self._parts
+        return self.borders is None and self._options[0] is None and not is_large(program, projection)
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
@@ -410,9 +400,9 @@ class Kernel:
         adjoint = self._adjoint(self.width)
         return _Compiled(adjoint.motion, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
 
-    def _adjoint(self, width: int) -> Adjoint:
+    def _adjoint(self, width: int, number: ir.Type = DOUBLE) -> Adjoint:
         with without_collections():
-            adjoint = Adjoint(*self._derivative_parts, width=width)
+            adjoint = Adjoint(*self._derivative_parts, width=width, number=number)
         forget_joined()
         forget_stages()
         return adjoint
@@ -607,11 +597,6 @@ def pieces_of(
 def floor_of(rtol: float, atol: float) -> float:
     """atol / rtol; by default (an atol of 0) what it is where nothing is small."""
     return atol / rtol if atol > 0 else ATOL_OVER_RTOL
-
-
-def order_for(rtol: float) -> int:
-    """The order whose series costs least: at the step that it allows, terms fall by e² each (Jorba & Zou, §3.2)."""
-    return min(MAX_ORDER, max(LEAST_ORDER, math.ceil(2 - math.log(rtol) / 2)))
 
 
 def cores() -> int:

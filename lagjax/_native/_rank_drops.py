@@ -8,7 +8,6 @@ from collections.abc import Iterator
 
 from lagjax._native._constants import MOST_RETURNS, RETAKEN, RUNNING, SHORTER
 from lagjax._native._frame import Frame
-from lagjax._native._ir import Value
 from lagjax._native._lanes import Lines
 from lagjax._native._tables import Tables
 
@@ -41,19 +40,17 @@ def return_or_remember(frame: Frame, form: Lines | Tables, states: int, guards: 
         frame["code"] = float(RUNNING)
         frame["h"] = 0.0
     for now, then in _beginnings(frame, form, states, guards):
-        here, there = code.load(now, frame.vector), code.load(then, frame.vector)
-        code.store(code.select(back, there, here), now)
-        code.store(code.select(new, here, there), then)
+        here, there = frame[now], frame[then]
+        frame[now] = code.select(back, there, here)
+        frame[then] = code.select(new, here, there)
 
 
-def _beginnings(frame: Frame, form: Lines | Tables, states: int, guards: int) -> Iterator[tuple[Value, Value]]:
-    """The addresses of what a step begins with, and of what the last long one began with."""
-    for i in form.each(frame.code, states):
-        yield frame.address("y", i), frame.address("y_before", i)
-    of_guards = dict.fromkeys(("side", "noted"), guards)
-    for name, count in {"low": states, **of_guards, **dict.fromkeys(("t", "t_low", "steps"), 1)}.items():
+def _beginnings(frame: Frame, form: Lines | Tables, states: int, guards: int) -> Iterator[tuple[tuple, tuple]]:
+    """What a step begins with, and what the last long one began with."""
+    fields = dict.fromkeys(("y", "low"), states) | dict.fromkeys(("side", "noted"), guards)
+    for name, count in (fields | dict.fromkeys(("t", "t_low", "steps"), 1)).items():
         for i in form.each(frame.code, count):
-            yield frame.address(name, i), frame.address(name + "_before", i)
+            yield (name, i), (name + "_before", i)
 
 
 def shorten(frame: Frame) -> None:

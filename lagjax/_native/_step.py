@@ -24,14 +24,10 @@ from lagjax._native._constants import (
     ATOL_OVER_MOTION,
     ATOL_OVER_RTOL,
     CHECKS,
-    EPS,
     GROWTH,
     GROWTH_AFTER_REJECTION,
-    LARGEST_UNIT,
     NOT_FINITE,
-    PLACES,
     PROJECTION_FAILED,
-    ROUND_OFF,
     RUNNING,
     SAFETY,
     SINGULAR,
@@ -77,7 +73,7 @@ class StepControl:
         """The step of every lane, into `h`: 0, and a code, where it cannot go on."""
         code = frame.code
         last, before = self._errors(frame, order)
-        p = code.as_double(order)
+        p = code.as_number(order)
         a, b = _power(code, last, -1.0 / p), _power(code, before, -1.0 / (p - 1.0))
         size, longest = SAFETY * code.select(a < b, a, b), frame["longest"]
         size = code.select(size < longest, size, longest)
@@ -123,7 +119,7 @@ class StepControl:
         given, rtol = (code.lanes_of(frame.job(name)) for name in ("atol", "rtol"))
         largest = form.largest(code, lambda i: sizes[first + i], count)
         step = code.intrinsic("fabs", frame["h"])
-        step = code.select(step > 0.0, step, frame["longest"])  # before the first step
+        step = code.lanes_of(code.select(step > 0.0, step, frame["longest"]))  # before the first step
         if half:
             frame["reach", place] = largest = code.maximum(frame["reach", place], largest)
             by_position = frame["reach", 2 * part] / step
@@ -144,7 +140,7 @@ class StepControl:
     def _sizes(self, frame: Frame, half: int) -> Numbers:
         """The size over the step of every coordinate, or of every velocity (half 1); the largest one of a group."""
         code, first = frame.code, half * self.motion.n
-        before = code.intrinsic("fabs", frame["h"])
+        before = code.lanes_of(code.intrinsic("fabs", frame["h"]))
 
         def largest(i):
             # A component that passes through zero is as large as it will be a step away.
@@ -173,7 +169,8 @@ class StepControl:
         moved = motion.moved(frame, increments)
         acceleration = motion.evaluate(frame, motion.acceleration, moved, s)
         noise = self._noise(frame, acceleration, increments, moved)
-        defect, weight = code.variable(frame["defect"]), code.intrinsic("fabs", h) / code.as_double(order + 1)
+        defect, size = code.variable(frame["defect"]), code.lanes_of(code.intrinsic("fabs", h))
+        weight = size / code.as_number(order + 1)
         for i in motion.form.each(code, n):
             # What rounding leaves of an acceleration is not a defect of the series.
             excess = code.intrinsic("fabs", acceleration[i] - slopes[i]) - noise(i)
@@ -184,7 +181,7 @@ class StepControl:
 
     def _noise(self, frame: Frame, acceleration, increments, moved) -> Callable[[Index], Value]:
         """The part of component i of an acceleration that rounding may leave at a place of the step."""
-        code, n, form = frame.code, self.motion.n, self.motion.form
+        code, n, form, digits = frame.code, self.motion.n, self.motion.form, frame.digits
 
         def size_of(numbers):
             return lambda i: code.intrinsic("fabs", numbers[i])
@@ -192,12 +189,12 @@ class StepControl:
         size = form.largest_by_group(frame, size_of(acceleration), self.error_groups)
         # Half a unit in the last place of q moves an acceleration by what it varies along the step, in proportion.
         place, moves = (form.largest(code, size_of(numbers), n) for numbers in (moved, increments))
-        unit = (PLACES * EPS) * place / moves
-        unit = code.select(unit < LARGEST_UNIT, unit, 0.0)  # what hardly moves is not what makes it vary
+        unit = digits.unit * place / moves
+        unit = code.select(unit < digits.largest_unit, unit, 0.0)  # what hardly moves is not what makes it vary
 
         def noise(i):
             change = code.intrinsic("fabs", acceleration[i] - frame["y", i + n, 1])
-            return ROUND_OFF * size[i] + unit * change
+            return digits.round_off * size[i] + unit * change
 
         return noise
 
@@ -278,14 +275,14 @@ def note_halved(frame: Frame, where: Value) -> None:
 def _power(code: Code, x: Value, exponent: Value) -> Value:
     """x**exponent to one per cent, for 0 < −exponent < 1/4, which is all that the size of a step needs.
 
-    The bits of a double, read as an integer, are nearly its logarithm; the parabolas mend the fractional part.
+    The bits of a number, read as an integer, are nearly its logarithm; the parabolas mend the fractional part.
     """
-    unit = float(2**52)
-    bits = code.as_double(code.bits(x)) / unit - 1023.0
+    unit, bias = (2.0**52, 1023.0) if code.number == DOUBLE else (2.0**23, 127.0)
+    bits = code.as_number(code.bits(x)) / unit - bias
     whole = code.intrinsic("floor", bits)
     part = bits - whole
     log2 = whole + part * (1.34 - 0.34 * part)
     target = code.lanes_of(exponent) * log2
     whole = code.intrinsic("floor", target)
     part = target - whole
-    return code.from_bits((whole + part * (0.66 + 0.34 * part) + 1023.0) * unit)
+    return code.from_bits((whole + part * (0.66 + 0.34 * part) + bias) * unit)

@@ -206,7 +206,7 @@ class Tables:
             return (self._look_up(self._execute, kind.op, kind.attribute, xs[0]),)
         xs = [code.compare("!=", x, 0.0) if of == "bool" else x for x, of in zip(xs, kind.kinds, strict=True)]
         result = apply(code, kind.op, xs, kind.attribute, kind.kinds, kind.result)
-        return (code.as_double(result) if kind.result == "bool" else result,)
+        return (code.as_number(result) if kind.result == "bool" else result,)
 
     def _write_prepare(self) -> None:
         """`()`: every constant in its place, in all lanes."""

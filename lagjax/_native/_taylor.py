@@ -7,6 +7,7 @@
 """
 
 import functools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -14,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._constants import LARGEST_LINE, MAX_ORDER, OPERATIONS_PER_COORDINATE
+from lagjax._native._constants import LARGEST_LINE, LEAST_ORDER, MAX_ORDER, OPERATIONS_PER_COORDINATE
 from lagjax._native._frame import Frame, Index, Memory, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
@@ -43,10 +44,10 @@ class TaylorSeries:
 
     The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n. `fields`
     names what else a thread remembers (see `Memory`), `job` the structure that all threads share. `large` kernels are
-    written as tables (see `is_large`). Vectors have `width` lanes. The last of the numbers of the program are its
-    `pieces`, the others the `chosen` ones of a member, or all. Of its outputs this many are `kept`, behind the first
-    ones. With `keep_sums` the sums of every order stay in
-    memory, not only those of the last.
+    written as tables (see `is_large`). Vectors have `width` lanes; the state and its series are of the type `number`.
+    The last of the numbers of the program are its `pieces`, the others the `chosen` ones of a member, or all. Of its
+    outputs this many are `kept`, behind the first ones. With `keep_sums` the sums of every order stay in memory, not
+    only those of the last.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class TaylorSeries:
         pieces: int = 0,
         chosen: "Chosen | None" = None,
         kept: int = 0,
+        number: ir.Type = DOUBLE,
     ):
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
         self.numbers = program.size - self.states - 1  # parameters, and the pieces of a piecewise program
@@ -73,8 +75,8 @@ class TaylorSeries:
         self.look_up = LookUps(self.module)
         self.of_member = self.parameters if chosen is None else chosen.of
         self._chosen = None if chosen is None else integers(self.module, np.array(chosen.positions, np.int64))
-        self.layout = Memory(width, self._fields() | fields)
-        self.width, self.vector = self.layout.width, ir.VectorType(DOUBLE, self.layout.width)
+        self.layout = Memory(width, self._fields() | fields, number=number)
+        self.width, self.vector = self.layout.width, ir.VectorType(number, self.layout.width)
         self.large = large
         self.form = self._form()
         # The program whose first outputs are q̈. As a table the zeroth order is there already, and little longer.
@@ -97,7 +99,7 @@ class TaylorSeries:
         }
 
     def _form(self) -> Lines | Tables:
-        sincos = sincos_function(self.module, self.width)
+        sincos = sincos_function(self.module, self.width, number=self.layout.number)
         return Tables(self.function, sincos, look_up=self.look_up) if self.large else Lines(sincos, self.look_up)
 
     def function(self, name: str, *kinds: ir.Type, **options) -> Frame:
@@ -175,7 +177,7 @@ class TaylorSeries:
         with code.loop(self._last_order(code, order) if self.pieces else order, start=1) as k:
             with code.only_if(k > 1):
                 frame.call(self._sums, k)
-            inverse = 1.0 / code.as_double(k + 1)
+            inverse = 1.0 / code.as_number(k + 1)
             out = form.run(frame, series.order_recursion, *self.at_order(frame, k), to=self.rows_at(frame, k))
             for i in form.each(code, n):
                 frame["y", i, k + 1] = frame["y", i + n, k] * inverse
@@ -218,7 +220,7 @@ class TaylorSeries:
 
     def at_order(self, frame: Frame, k: Value) -> list:
         """The inputs of the order recursion: the coefficients of order k, k, 1/k, the values and the sums."""
-        code, number, products = frame.code, frame.code.as_double(k), len(self.series.cauchy_products)
+        code, number, products = frame.code, frame.code.as_number(k), len(self.series.cauchy_products)
         time = code.select(code.compare("==", k, 1), number, 0.0)
         sums = self.sums(frame)
         if self.keep_sums:
@@ -238,13 +240,14 @@ class TaylorSeries:
         A few components at a time, so that none waits for the other.
         """
         code, increments, slopes = frame.code, self.form.room(frame, self.states), self.form.room(frame, self.n)
+        s = code.lanes_of(s)
         for some, velocities in self.form.strands(code, self.n):
             highest = [frame["y", i, order] for i in some]
             value = [code.variable(c) for c in highest]
-            slope = {j: code.variable(code.as_double(order) * highest[j]) for j in velocities}
+            slope = {j: code.variable(code.as_number(order) * highest[j]) for j in velocities}
             with code.loop(order, start=1) as at:
                 k = order - at
-                weight = code.lanes_of(code.as_double(k))
+                weight = code.lanes_of(code.as_number(k))
                 for j, i in enumerate(some):
                     c = frame["y", i, k]
                     value[j].value = value[j].value * s + c
@@ -296,6 +299,11 @@ def is_large(program: Recurrent, projection=None, guards=None, times: int = 1, m
         lines.append(guards.program.line)
     operations = times * sum(len(line.nodes) for line in lines) + sum(len(line.nodes) for line in more)
     return operations + OPERATIONS_PER_COORDINATE * len(program.line.outputs) > LARGEST_LINE
+
+
+def order_for(rtol: float) -> int:
+    """The order whose series costs least: at the step that it allows, terms fall by e² each (Jorba & Zou, §3.2)."""
+    return min(MAX_ORDER, max(LEAST_ORDER, math.ceil(2 - math.log(rtol) / 2)))
 
 
 def integer(code: Code, x: int) -> Value:

@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.flatten_util
@@ -283,8 +284,85 @@ def test_single_precision(on_the_ptx):
     agree(here, there, 1e-6)
 
 
-def program_of(scene, monkeypatch=None, unrolled=None):
-    """The PTX of a scene's motion. Skips the test where that needs libdevice, which is not here."""
+@pytest.fixture
+def slow_doubles(monkeypatch):
+    """A GPU whose float64 is slow, in the place of none; what was compiled for another one is forgotten."""
+    monkeypatch.setattr(_gpu_launch, "has_slow_doubles", lambda: True)
+    transforms_are_new()
+    yield
+    transforms_are_new()
+
+
+def singles(tree):
+    return jax.tree.map(lambda x: jnp.asarray(x, np.float32), tree)
+
+
+def in_single(scene, q0, ts=TS, **how):
+    """A motion of float32: its states, its result, the steps taken, and those refused."""
+    q0, qdot0, ts, params = singles((q0, scene.qdot0, ts, scene.params))
+    run = lagjax.simulate(scene.system, q0, qdot0, ts, params, solver=MACHINE_CODE, throw=False, **how)
+    return run.q, run.qdot, run.result._value, run.stats["num_accepted_steps"], run.stats["num_rejected_steps"]
+
+
+@pytest.mark.parametrize("form", [None, GpuForm(10, unrolled=False)])
+def test_states_of_single_precision(on_the_ptx, slow_doubles, monkeypatch, form):
+    """Within a few units in the last place of float32, in as many steps of 1e-6 as doubles take."""
+    scene, q0 = scenes.double_pendulum(), singles(np.random.default_rng(1).uniform(-1.0, 1.0, (3, 2)))
+    if form is not None:
+        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: form)
+    *here, result, steps, rejected = on_the_ptx(jax.vmap(lambda q0: in_single(scene, q0)), q0)
+    *there, _, of_doubles, _ = jax.jit(jax.vmap(lambda q0: in_single(scene, q0, rtol=1e-6)))(q0)
+    agree(here, there, 20 * 2.0**-24)
+    assert here[0].dtype == np.float32 and not result.any() and not rejected.any()
+    assert (steps <= of_doubles + 2).all()
+
+
+def test_the_arithmetic_of_single_precision_is_single(slow_doubles):
+    """Doubles are the time, the control of the step, and what is left of two angles and their difference."""
+    lines = program_of(scenes.double_pendulum(), dtype=np.float32).splitlines()
+    counts = {kind: sum(bool(re.search(rf"(add|sub|mul|fma|div)\.[\w.]*{kind}", line)) for line in lines)
+              for kind in ("f64", "f32")}  # fmt: skip
+    assert 20 < counts["f64"] < counts["f32"] / 10
+
+
+def test_the_time_of_single_precision_is_a_double(on_the_ptx, slow_doubles):
+    """After a thousand turns of the drive it has four digits as a float: the force would be wrong by a hundredth."""
+    system = lagjax.System(lambda q, qdot, t, params: 0.5 * qdot**2 + q * jnp.cos(params["w"] * t))
+    scene = SimpleNamespace(system=system, qdot0=0.0, params={"w": 3.7})
+
+    def driven(q0):
+        return in_single(scene, q0, 2000.0 + TS)[:2]
+
+    agree(on_the_ptx(driven, np.float32(0.0)), jax.jit(driven)(np.float32(0.0)), 1e-6)
+
+
+def test_derivatives_of_single_precision(on_the_ptx, slow_doubles):
+    scene = scenes.pendulum()
+
+    def end(q0):
+        return jnp.sum(in_single(scene, q0)[0] * jnp.arange(5.0, dtype=np.float32))
+
+    q0 = np.float32([0.3, 1.0, 2.5])
+    for derivative in (jax.vmap(jax.grad(end)), jax.vmap(jax.jacfwd(end))):
+        agree(on_the_ptx(derivative, q0), jax.jit(derivative)(q0), 1e-5)
+    assert on_the_ptx.launches == [3, 3, 3]  # the motion, there and back; and the motion with its tangents
+
+
+def test_borders_and_events_are_found_in_doubles(on_the_ptx, slow_doubles):
+    wedge = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+    wedge = SimpleNamespace(system=wedge, qdot0=0.0, params=None)
+
+    def to_event(q0):
+        ts, q0 = singles((3.0 * TS, q0))
+        how = dict(solver=MACHINE_CODE, event=lambda q, qdot: q)
+        return lagjax.simulate(scenes.pendulum().system, q0, 0 * q0, ts, singles(scenes.pendulum().params), **how).end.t
+
+    for function in (lambda q0: in_single(wedge, q0, 5.0 * TS)[0], to_event):
+        agree(on_the_ptx(function, np.float32(1.0)), jax.jit(function)(np.float32(1.0)), 2.0**-23)
+
+
+def program_of(scene, monkeypatch=None, unrolled=None, dtype=np.float64):
+    """The PTX of a scene's motion, of numbers of this type. Skips the test where libdevice is needed and not here."""
     programs = []
     if monkeypatch is not None:
         monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: GpuForm(order, unrolled))
@@ -297,7 +375,10 @@ def program_of(scene, monkeypatch=None, unrolled=None):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_gpu_launch, "launch", launch)
         try:
-            jax.jit(lambda q0: motion(scene, q0, scene.qdot0)[0]).trace(scene.q0).lower(lowering_platforms=("cuda",))
+            q0, qdot0, ts, params = jax.tree.map(
+                lambda x: jnp.asarray(x, dtype), (scene.q0, scene.qdot0, TS, scene.params)
+            )  # fmt: skip
+            jax.jit(lambda q0: motion(scene, q0, qdot0, ts, params)[0]).trace(q0).lower(lowering_platforms=("cuda",))
         except ValueError as reason:
             if "a CPU is the better choice" in str(reason):
                 assert scene.q0 is not None and len(jax.flatten_util.ravel_pytree(scene.q0)[0]) > 20, reason
@@ -318,6 +399,20 @@ def test_every_ready_scene(make, on_the_ptx):
         pytest.skip("libdevice has assembly of its own for a tangent, which is not translated")
     function = jax.jit(lambda q0: motion(scene, q0, scene.qdot0)[:4])
     agree(on_the_ptx(lambda q0: motion(scene, q0, scene.qdot0)[:4], scene.q0), function(scene.q0), 1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", scenes.ALL, ids=lambda make: make.__name__)
+def test_every_ready_scene_in_single_precision(make, on_the_ptx, slow_doubles):
+    """The restricted three bodies, and a pendulum that is driven into chaos, multiply a rounding by a few hundred."""
+    scene = make()
+    if "begin inline asm" in program_of(scene, dtype=np.float32):
+        pytest.skip("libdevice has assembly of its own for a tangent, which is not translated")
+
+    def states(q0):
+        return in_single(scene, q0)[:3]
+
+    agree(on_the_ptx(states, singles(scene.q0)), jax.jit(states)(singles(scene.q0)), 1e-4)
 
 
 # ---- the lowering ----------------------------------------------------------------------------------------------------
