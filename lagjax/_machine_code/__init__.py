@@ -69,11 +69,13 @@ class MachineCode(AbstractEngine):
     with the coefficients (q̈)ₖ by recurrences through the scalar operations of the acceleration. Four or eight members
     of a batch stand side by side in the vector registers of every core.
 
-    It computes in float64, also for a state in float32, whose results it rounds once.
+    It computes in float64, also for a state in float32, whose results it rounds once; but see below for GPUs.
 
     On an NVIDIA GPU it integrates where it is asked for, one thread a member: `MachineCode()` is lowered for CUDA as
-    for CPUs, by `jax.export` too. That form is assembled and checked on a CPU, not yet run on a GPU. There, members
-    that fail are not tried once more by another variant of the equations, and an angle beyond 2²⁰ ends a motion. A
+    for CPUs, by `jax.export` too. That form is assembled and checked on a CPU, not yet run on a GPU. Where a GPU is at
+    hand whose float64 is slow (all but those of data centres), the series of a state in float32 are in float32 too, the
+    time and the control of steps in float64, with an rtol of 1e-6 at least; a run with borders or events computes in
+    float64 there as well. On a GPU members that fail are not tried once more by another variant of the equations, and an angle beyond 2²⁰ ends a motion. A
     first derivative in forward mode takes a motion with its tangents for every direction; one in reverse mode goes
     back over the steps, as on a CPU, and takes such tangents for every number with constraints alone, or where a
     member's steps are too many or do not suit its derivatives. Higher ones are composed of these. Crossings and hybrid

@@ -478,7 +478,7 @@ def test_instructions_are_counted(monkeypatch):
     monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: GpuForm(order, unrolled=False))
     # Of a pendulum's step at order 13: every product of two series of 13 terms alone has 91 products.
     gpu_estimate = importlib.import_module("benchmarks.gpu_estimate")
-    counted = gpu_estimate.counted(scenes.pendulum())
+    counted = gpu_estimate.counted(gpu_estimate.Run(scenes.pendulum()))
     assert counted.program.count(".entry") == 1 and 10 < counted.steps < 200
     once = counted.a_step
     assert 300 < once["float64"] < 3000 and 0 < once["local stores"] < once["local loads"] < 3000
