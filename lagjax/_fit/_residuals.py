@@ -32,7 +32,7 @@ from lagjax._fit._noise import AbstractNoise, NoiseScale, counts
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Piece, Samples, asks, at_instants, batches, inputs_at, started, whole
 from lagjax._fit._sensors import Signals, on_circle
-from lagjax._fit._timings import AbstractClock
+from lagjax._fit._timings import Clock
 from lagjax._hybrid import Scene, follow
 from lagjax._layout import Layout, halves
 from lagjax._system import System
@@ -97,7 +97,7 @@ class SystemResiduals:
         parameters: Parameters,
         size: np.ndarray,
         rtol: float,
-        clocks: dict[int, AbstractClock] | None = None,
+        clocks: dict[int, Clock] | None = None,
         manifold: Manifold | None = None,
     ):
         self.name, self.scene = name, scene
@@ -317,14 +317,13 @@ class SystemResiduals:
             )
         return shown
 
-    def _timed(self, clock: AbstractClock, batch: Samples, trial: _Trial):
+    def _timed(self, clock: Clock, batch: Samples, trial: _Trial):
         """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D); or a failure."""
         y0, numbers = trial.starts[batch.rows[0]], trial.numbers
         y0_dot, numbers_dot = self._directions(batch, trial)
-        moved = clock.along(y0, numbers, y0_dot[0], numbers_dot)
-        if moved is None:
+        times, slopes = map(np.asarray, clock.along(y0, numbers, y0_dot[0], numbers_dot))
+        if not np.isfinite(times).all():
             return LostTrial(int(batch.rows[0]), clock.why_not(y0, numbers))
-        times, slopes = moved
         if not np.isfinite(slopes).all():
             return LostTrial(int(batch.rows[0]), "The derivatives of its crossing times are not finite.")
         return times[None, :, None], slopes[None, :, None]

@@ -1,15 +1,10 @@
 """`Timings`: instants at which a motion crossed sections, as data; and the times that a scene gives, with derivatives.
 
-A residual is the time of a crossing less the measured one. With s the section, ṡ its rate along the motion and δy how
-the state at the fixed time t* of the crossing moves, the crossing moves by
-
-    δt* = −(∂s/∂y · δy + ∂s/∂p · δp) / ṡ
-
-The crossings are noted along one run (`lagjax.crossings`), a second one gives the states there and their derivatives.
-Of hybrid motion (`lagjax.Hybrid`) the instants are those of its transitions, which have derivatives of their own.
+A residual is the time of a crossing less the measured one. The crossings, and their derivatives, are those of
+`lagjax.crossings`; of hybrid motion (`lagjax.Hybrid`) the instants are those of its transitions, with the derivatives
+of `lagjax.simulate_hybrid`.
 """
 
-import abc
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,10 +20,8 @@ from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Guess, MeasuredSignal, real_numbers, require_start
 from lagjax._hybrid import Hybrid, Scene, Transition, follow
 from lagjax._layout import Layout, halves
-from lagjax._machine_code import KEPT, MachineCode, Noted, Surfaces, flow_of, jvp, surfaces_of, tolerances_of, vjp
-from lagjax._problem import Problem
-from lagjax._program import Program, lower
-from lagjax._results import ENDED_WELL
+from lagjax._machine_code import MachineCode, Noted, surfaces_of
+from lagjax._problem import Problem, Solution
 from lagjax._system import System
 from lagjax._trajectory import Trajectory, Transitions
 
@@ -197,112 +190,123 @@ def _require_possible(flat: Flat, t0: float) -> None:
 # ---- the times that a scene gives ------------------------------------------------------------------------------------
 
 
-class Crossed(NamedTuple):
-    """M crossings of each of N motions: when, `t` (N, M), and `order` (N, M), in which these times increase.
-
-    `by_y` (N, M, 2n) and `by_numbers` (N, M, P) say how each moves with the state there, at a fixed time, and with the
-    parameters. `ok` (N,) is false where a motion failed, or has not all of the crossings: its times are NaN. The rest
-    is the run that came by, with its steps.
-    """
-
-    t: np.ndarray
-    order: np.ndarray
-    by_y: np.ndarray
-    by_numbers: np.ndarray
-    ok: np.ndarray
-    ts: np.ndarray
-    y0: np.ndarray
-    numbers: np.ndarray
-    steps: tuple
-
-
-class AbstractClock(abc.ABC):
+@dataclass(frozen=True, eq=False)
+class Clock:
     """The instants of one `Timings` in a scene, with their derivatives.
 
-    `times(y0, numbers)` gives the times (M,) as a function for `jax.jit`, `jax.vmap` and `jax.grad`; NaN where it
-    failed.
+    - `times(y0, numbers)`: the times (M,) of the motion from y0 (2n,) with the parameters `numbers` (P,), a function
+      for `jax.jit`, `jax.vmap` and `jax.grad`; NaN where it has not all of them.
+    - `along(y0, numbers, y0_dot, numbers_dot)`: the times, and how they move (M, D) along the directions `y0_dot`
+      (D, 2n), `numbers_dot` (D, P).
+    - `why_not(y0, numbers)`: why they are not all there, as a sentence.
     """
 
-    times: Callable
-
-    @abc.abstractmethod
-    def along(
-        self, y0: np.ndarray, numbers: np.ndarray, y0_dot: np.ndarray, numbers_dot: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The times (M,) of the motion from y0 (2n,) with the parameters `numbers` (P,), and how they move (M, D).
-
-        Directions are `y0_dot` (D, 2n) and `numbers_dot` (D, P). None where the motion has not all of the instants.
-        """
-
-    @abc.abstractmethod
-    def why_not(self, y0: np.ndarray, numbers: np.ndarray) -> str:
-        """Why the instants of a motion from y0 (2n,) with `numbers` (P,) are not all there."""
+    times: Callable[..., jax.Array]
+    along: Callable[..., tuple]
+    why_not: Callable[[np.ndarray, np.ndarray], str]
 
 
-def clock_of(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> AbstractClock:
+def clock_of(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
     """The clock of a scene. Raises `ValueError` where functions are asked of a hybrid one, or transitions of others."""
     is_of_transitions = isinstance(_sections(timings.section)[1][0], Transition)
     if isinstance(scene, Hybrid):
         if not is_of_transitions:
             raise ValueError("Of a lagjax.Hybrid only the times of its transitions are data: Timings(transition, …).")
-        return HybridClock(scene, layout, parameters, timings, rtol)
+        return _clock_of_transitions(scene, layout, parameters, timings, rtol)
     if is_of_transitions:
         raise ValueError("Times of transitions are of a lagjax.Hybrid: give that to `fit` in the place of the System.")
-    return Clock(scene, layout, parameters, timings, rtol)
+    return _clock_of_sections(scene, layout, parameters, timings, rtol)
 
 
-class HybridClock(AbstractClock):
-    """The times of transitions of hybrid motion, whose derivatives are those of `simulate_hybrid`."""
+def _clock_of_sections(system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
+    """The crossings of the sections, along one motion."""
+    flat, span, (keys, functions) = timings.flat, (float(timings.t0), _end(timings)), sections_of(timings.section)
+    params = parameters.restore(parameters.first)
+    problem = Problem.about(system, layout, params, ts=span, rtol=_SHARPER * rtol, max_steps=_BUDGET)
+    directions = directions_of(timings.direction, keys)
+    surfaces = MachineCode().refuses(problem) or surfaces_of(problem, functions, directions, "A section")
+    if isinstance(surfaces, str):
+        raise ValueError(f"Crossing times are found with machine code, and there is none for this scene: {surfaces}.")
+    room = int(flat.numbers.max()) + 1
 
-    def __init__(self, scene: Hybrid, layout: Layout, parameters: Parameters, timings: Timings, rtol: float):
-        self.flat, self.scene = timings.flat, scene
-        self.keys, transitions = _sections(timings.section)
-        self.ways = np.array([_way(scene, one) for one in transitions])[self.flat.which]
-        if scene.max_transitions < len(self.flat.times):
-            raise ValueError(
-                f"{len(self.flat.times)} transitions were timed, but Hybrid(max_transitions={scene.max_transitions}) "
-                "follows no more than that: give a larger budget."
-            )
-        self.span = np.array([float(timings.t0), _end(timings)])
-        source, target = (jnp.asarray(self.ways[:, k, None]) for k in (0, 1))
-        number = jnp.asarray(self.flat.numbers[:, None])
+    def motion(y0, numbers) -> Problem:
+        return dataclasses.replace(problem, y0=y0, params=parameters.restore(numbers))
 
-        def run(y0, numbers):
-            q, qdot = map(layout.restore, halves(y0))
-            return follow(scene, q, qdot, self.span, parameters.restore(numbers), rtol=rtol, throw=False)
+    def crossings(y0, numbers) -> tuple[Solution, Noted]:
+        return MachineCode().crossings(motion(y0, numbers), surfaces, room, 1 / _SHARPER)
 
-        def times(y0, numbers):
-            happened = _transitions(run(y0, numbers))
-            mine = (happened.source == source) & (happened.target == target)  # (M, K)
-            mine = mine & (jnp.cumsum(mine, axis=1) == number + 1)
-            place = jnp.argmax(mine, axis=1)
-            return jnp.where(mine.any(axis=1), happened.t[place], jnp.nan)
+    def times(y0, numbers):
+        return crossings(y0, numbers)[1].t[flat.which, flat.numbers]
 
-        def along(y0, numbers, *dot):
-            t, moved = jax.linearize(times, y0, numbers)
-            return t, jax.vmap(moved)(*dot).T
+    def along(y0, numbers, y0_dot, numbers_dot):
+        given = motion(y0, numbers), surfaces, room, 1 / _SHARPER
+        t, moved = map(np.asarray, MachineCode().crossing_tangents(*given, y0_dot, numbers_dot))
+        return t[flat.which, flat.numbers], moved[:, flat.which, flat.numbers].T
 
-        self.times, self._along = times, jax.jit(along)
-        self._ended = jax.jit(lambda y0, numbers: _ended(run(y0, numbers)))
-        self.layout = layout
-
-    def along(self, y0, numbers, y0_dot, numbers_dot):
-        """The times (M,) and how they move (M, D); see `AbstractClock`."""
-        t, slopes = (np.asarray(x, float) for x in self._along(y0, numbers, y0_dot, numbers_dot))
-        return (t, slopes) if np.isfinite(t).all() else None
-
-    def why_not(self, y0, numbers):
-        """Why the transitions of a motion are not all there."""
-        missing = ~np.isfinite(np.asarray(jax.jit(self.times)(y0, numbers)))
-        result, t_end, y_end, of_transitions = (np.asarray(x) for x in self._ended(y0, numbers))
+    def why_not(y0, numbers) -> str:
+        solution, noted = crossings(y0, numbers)
+        if text := sentence(solution.result, solution.t_end, span[1], solution.y_end, layout.names):
+            return text
+        missing = ~np.isfinite(noted.t[flat.which, flat.numbers])
+        if not missing.any():
+            return "Its crossings could not be followed."
         first = int(np.argmax(missing))
-        happened = int((of_transitions == self.ways[first]).all(axis=1).sum())
-        between = " to ".join(repr(tuple(self.scene.modes)[k]) for k in self.ways[first])
-        text = sentence(int(result), float(t_end), self.span[1], y_end, self.layout.names)
+        which = flat.which[first]
+        name = "" if keys is None else f" of section[{keys[which]!r}]"
+        return (
+            f"There are {int(noted.count[which])} crossings{name} up to t = {span[1]:g}, but number "
+            f"{flat.numbers[first]}, counted from 0, was measured."
+        )
+
+    return Clock(times, along, why_not)
+
+
+def _clock_of_transitions(
+    scene: Hybrid, layout: Layout, parameters: Parameters, timings: Timings, rtol: float
+) -> Clock:
+    """The times of transitions of hybrid motion, whose derivatives are those of `simulate_hybrid`."""
+    flat, span = timings.flat, np.array([float(timings.t0), _end(timings)])
+    _, transitions = _sections(timings.section)
+    ways = np.array([_way(scene, one) for one in transitions])[flat.which]
+    if scene.max_transitions < len(flat.times):
+        raise ValueError(
+            f"{len(flat.times)} transitions were timed, but Hybrid(max_transitions={scene.max_transitions}) "
+            "follows no more than that: give a larger budget."
+        )
+    source, target = (jnp.asarray(ways[:, k, None]) for k in (0, 1))
+    number = jnp.asarray(flat.numbers[:, None])
+
+    def run(y0, numbers):
+        q, qdot = map(layout.restore, halves(y0))
+        return follow(scene, q, qdot, span, parameters.restore(numbers), rtol=rtol, throw=False)
+
+    def times(y0, numbers):
+        happened = _transitions(run(y0, numbers))
+        mine = (happened.source == source) & (happened.target == target)  # (M, K)
+        mine = mine & (jnp.cumsum(mine, axis=1) == number + 1)
+        place = jnp.argmax(mine, axis=1)
+        return jnp.where(mine.any(axis=1), happened.t[place], jnp.nan)
+
+    @jax.jit
+    def along(y0, numbers, *directions):
+        t, moved = jax.linearize(times, y0, numbers)
+        return t, jax.vmap(moved)(*directions).T
+
+    ended = jax.jit(lambda y0, numbers: _ended(run(y0, numbers)))
+
+    def why_not(y0, numbers) -> str:
+        missing = ~np.isfinite(np.asarray(jax.jit(times)(y0, numbers)))
+        result, t_end, y_end, of_transitions = (np.asarray(x) for x in ended(y0, numbers))
+        first = int(np.argmax(missing))
+        happened = int((of_transitions == ways[first]).all(axis=1).sum())
+        between = " to ".join(repr(tuple(scene.modes)[k]) for k in ways[first])
+        text = sentence(int(result), float(t_end), span[1], y_end, layout.names)
         return (
             f"There are {happened} transitions from {between} up to t = {float(t_end):g}, but number "
-            f"{self.flat.numbers[first]}, counted from 0, was measured." + (f" {text}" if text else "")
+            f"{flat.numbers[first]}, counted from 0, was measured." + (f" {text}" if text else "")
         )
+
+    return Clock(times, along, why_not)
 
 
 def _ended(run: Trajectory) -> tuple:
@@ -331,174 +335,6 @@ def _way(scene: Hybrid, transition: Transition) -> tuple[int, int]:
             "give the one that was timed a mode of its own as target."
         )
     return names.index(way[0]), names.index(way[1])
-
-
-class Clock(AbstractClock):
-    """The crossings of one `Timings` in a scene: their times, and their derivatives forward and in reverse."""
-
-    def __init__(self, system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float):
-        self.flat, self.layout = timings.flat, layout
-        self.keys, functions = sections_of(timings.section)
-        self.span = np.array([float(timings.t0), _end(timings)])
-        params = parameters.restore(parameters.first)
-        problem = Problem.about(system, layout, params, ts=tuple(self.span), rtol=_SHARPER * rtol, max_steps=_BUDGET)
-        directions = directions_of(timings.direction, self.keys)
-        surfaces = MachineCode().refuses(problem) or surfaces_of(problem, functions, directions, "A section")
-        if isinstance(surfaces, str):
-            raise ValueError(
-                f"Crossing times are found with machine code, and there is none for this scene: {surfaces}."
-            )
-        self.noting = flow_of(dataclasses.replace(problem, guards=surfaces.guards(notes=True)))
-        self.flow, self.room = flow_of(problem), int(self.flat.numbers.max()) + 1
-        self.tolerances = tolerances_of(problem)
-        self.of_tangents = self.tolerances._replace(rtol=rtol, atol=self.tolerances.atol / _SHARPER)
-        self.sections, self._slopes = len(functions), _slopes_of(surfaces, layout.size, len(parameters.first))
-        self.times = self._as_function()
-
-    # ---- the crossings of N motions ----
-
-    def noted(self, y0: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """The times (N, M) at which motions from y0 (N, 2n) with the parameters `numbers` (N, P) cross, in one run.
-
-        NaN for a motion that has not all of the crossings.
-        """
-        noted = self.noting.run(self.span[None], y0, numbers, self.tolerances._replace(notes=self.room))
-        rows = noted.path.reshape(len(y0), self.sections, self.room + 1, -1)
-        t = rows[:, self.flat.which, self.flat.numbers, 0]
-        return np.where(np.isfinite(t).all(axis=1, keepdims=True), t, np.nan)
-
-    def crossed(self, y0: np.ndarray, numbers: np.ndarray, t: np.ndarray) -> Crossed:
-        """The crossings at the times t (N, M) that `noted` found for y0 (N, 2n) and `numbers` (N, P), by a second run.
-
-        A motion that has not all of them is followed at times spread over the span, so that the others have one run.
-        """
-        has_all = np.isfinite(t).all(axis=1, keepdims=True)
-        t = np.where(has_all, t, np.linspace(self.span[0], self.span[1], t.shape[1] + 1)[1:])
-        count, begin = len(y0), self.span[:1]
-        order = np.argsort(t, axis=1, kind="stable")
-        ts = np.concatenate([np.broadcast_to(begin, (count, 1)), np.take_along_axis(t, order, axis=1)], axis=1)
-        run = self.flow.run(ts, y0, numbers, self.tolerances, KEPT)
-        ok = np.ravel(has_all) & np.isin(run.result, ENDED_WELL)
-        y = np.empty((*t.shape, y0.shape[1]))
-        np.put_along_axis(y, order[..., None], run.path[:, 1:], axis=1)
-        by_y, by_numbers = self._moved(t, y, numbers)
-        steps = run.path, run.result, run.accepted, run.ticket
-        return Crossed(np.where(ok[:, None], t, np.nan), order, by_y, by_numbers, ok, ts, y0, numbers, steps)
-
-    def _moved(self, t: np.ndarray, y: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The slopes of the times t (N, M) of crossings by the states y (N, M, 2n) there, and by the parameters."""
-        (count, crossings, states), n = y.shape, self.layout.size
-        each = np.repeat(numbers, crossings, axis=0)
-        columns = *y.reshape(-1, states).T, t.ravel(), *each.T
-        which = np.tile(self.flat.which, count)
-        slopes = np.empty((len(which), states + 1 + each.shape[1]))
-        values = self._slopes.evaluate(*columns)
-        for k in range(self.sections):
-            own = which == k
-            for j, value in enumerate(values[k * slopes.shape[1] : (k + 1) * slopes.shape[1]]):
-                slopes[own, j] = value if np.ndim(value) == 0 else value[own]
-        pulled = [np.broadcast_to(x, len(which)) for x in self.flow.anywhere.evaluate(*columns)[:n]]
-        rate = np.concatenate([columns[n:states], pulled, np.ones((1, len(which)))]).T
-        slopes /= -np.einsum("ms,ms->m", slopes[:, : states + 1], rate)[:, None]
-        shape = count, crossings, -1
-        return slopes[:, :states].reshape(shape), slopes[:, states + 1 :].reshape(shape)
-
-    def why_not(self, y0: np.ndarray, numbers: np.ndarray) -> str:
-        """Why the crossings of a motion from y0 (2n,) with `numbers` (P,) are not all there."""
-        tolerances = self.tolerances._replace(notes=self.room)
-        noted = self.noting.run(self.span[None], y0[None], numbers[None], tolerances)
-        text = sentence(noted.result[0], noted.t_end[0], self.span[1], noted.y_end[0], self.layout.names)
-        if text:
-            return text
-        t, _, count = Noted.read(noted.path[0], self.sections)
-        missing = ~np.isfinite(t[self.flat.which, self.flat.numbers])
-        if not missing.any():
-            return "Its crossings could not be followed."
-        first = int(np.argmax(missing))
-        which = self.flat.which[first]
-        name = "" if self.keys is None else f" of section[{self.keys[which]!r}]"
-        return (
-            f"There are {int(count[which])} crossings{name} up to t = {self.span[1]:g}, but number "
-            f"{self.flat.numbers[first]}, counted from 0, was measured."
-        )
-
-    # ---- derivatives ----
-
-    def along(self, y0, numbers, y0_dot, numbers_dot):
-        """The times (M,) and how they move (M, D); see `AbstractClock`."""
-        y0, numbers = y0[None], numbers[None]
-        crossed = self.crossed(y0, numbers, self.noted(y0, numbers))
-        if not crossed.ok.all():
-            return None
-        return crossed.t[0], self.forward(crossed, y0_dot[None], numbers_dot[None])[0]
-
-    def forward(self, crossed: Crossed, y0_dot: np.ndarray, numbers_dot: np.ndarray) -> np.ndarray:
-        """Tangents of the times along D directions (N, M, D): of the starts (N, D, 2n), of the parameters (N, D, P)."""
-        tangents, _ = jvp(
-            self.flow, crossed.ts, crossed.y0, crossed.numbers, crossed.steps, y0_dot, numbers_dot, self.of_tangents
-        )  # fmt: skip
-        y_dot = np.empty((*crossed.t.shape, *y0_dot.shape[1:]))
-        np.put_along_axis(y_dot, crossed.order[..., None, None], np.moveaxis(tangents[:, :, 1:], 1, 2), axis=1)
-        moved = np.einsum("nms,nmds->nmd", crossed.by_y, y_dot)
-        return moved + np.einsum("nmp,ndp->nmd", crossed.by_numbers, numbers_dot)
-
-    def reverse(self, crossed: Crossed, t_ct: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The transpose of `forward`, from cotangents (N, M) of the times: of the starts (N, 2n), and (N, P)."""
-        path_ct = np.zeros((len(t_ct), 1, *crossed.steps[0].shape[1:]))
-        path_ct[:, 0, 1:] = np.take_along_axis(t_ct[..., None] * crossed.by_y, crossed.order[..., None], axis=1)
-        of_y0, of_numbers = vjp(
-            self.flow, crossed.ts, crossed.y0, crossed.numbers, crossed.steps, path_ct,
-            np.zeros((len(t_ct), 1, crossed.y0.shape[1])), self.of_tangents,
-        )  # fmt: skip
-        of_y0, of_numbers = of_y0[:, 0], of_numbers[:, 0] + np.einsum("nm,nmp->np", t_ct, crossed.by_numbers)
-        ok = crossed.ok[:, None]
-        return np.where(ok, of_y0, np.nan), np.where(ok, of_numbers, np.nan)
-
-    def _as_function(self):
-        """`(y0, numbers)` → the times (M,), a function for `jax.jit`, `jax.vmap` and `jax.grad`; NaN where it failed.
-
-        Members of a batch are one run. Its derivatives are those of first order, in reverse: the times that were noted
-        on the way forward are an argument of the way back, which runs to the states there.
-        """
-
-        def call(host, sizes, *arguments):
-            of = jax.tree.map(lambda size: jax.ShapeDtypeStruct((size,), np.float64), sizes)
-            return jax.pure_callback(host, of, *arguments, vmap_method="broadcast_all")
-
-        @jax.custom_vjp
-        def times(y0, numbers):
-            return call(self._times, len(self.flat.which), y0, numbers)
-
-        def forward(y0, numbers):
-            t = times(y0, numbers)
-            return t, (y0, numbers, t)
-
-        def backward(kept, t_ct):
-            return call(self._cotangents, tuple(x.shape[-1] for x in kept[:2]), *kept, t_ct)
-
-        times.defvjp(forward, backward)
-        return times
-
-    def _times(self, y0, numbers):
-        y0, numbers = (np.asarray(x, np.float64) for x in (y0, numbers))
-        t = self.noted(*(x.reshape(-1, x.shape[-1]) for x in (y0, numbers)))
-        return t.reshape(*y0.shape[:-1], -1)
-
-    def _cotangents(self, *arrays):
-        arrays = [np.asarray(x, np.float64) for x in arrays]
-        y0, numbers, t, t_ct = (x.reshape(-1, x.shape[-1]) for x in arrays)
-        found = self.reverse(self.crossed(y0, numbers, t), t_ct)
-        return tuple(x.reshape(like.shape) for x, like in zip(found, arrays[:2], strict=True))
-
-
-def _slopes_of(surfaces: Surfaces, size: int, numbers: int) -> Program:
-    """The derivatives of all sections by (q, q̇, t, params), one section after the other."""
-
-    def slopes(y, params):
-        by = jax.jacfwd(lambda y, params: jnp.stack(surfaces.values.at(y, params)), argnums=(0, 1))(y, params)
-        return jnp.concatenate(by, axis=1)
-
-    return lower(slopes, *(jax.ShapeDtypeStruct((count,), np.float64) for count in (2 * size + 1, numbers)))
 
 
 def _end(timings: Timings) -> float:

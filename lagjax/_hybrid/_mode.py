@@ -167,7 +167,7 @@ class Mode(NamedTuple):
 
         See `_machine_code.crossing_variation`.
         """
-        moved = crossing_variation(self._surfaces, flow_of(self.problem).anywhere, k)
+        moved = functools.partial(crossing_variation(self._surfaces, flow_of(self.problem).anywhere), k)
         return lambda taken, t, y, numbers: differentiated_as(moved, (t, y), taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):

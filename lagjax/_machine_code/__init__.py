@@ -16,7 +16,15 @@ import numpy as np
 from lagjax._derivation import Derivation
 from lagjax._doubles import in_doubles
 from lagjax._machine_code import _primitives
-from lagjax._machine_code._crossing import MOST_GUARDS, Noted, along_crossings, surfaces_of, surfaces_of_event, to_event
+from lagjax._machine_code._crossing import (
+    MOST_GUARDS,
+    Noted,
+    along_crossings,
+    crossing_tangents,
+    surfaces_of,
+    surfaces_of_event,
+    to_event,
+)
 from lagjax._machine_code._derivatives import jvp, projected_start, vjp
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
 from lagjax._machine_code._gpu_launch import form_for_gpus
@@ -75,12 +83,12 @@ class MachineCode(AbstractEngine):
     for CPUs, by `jax.export` too. That form is assembled and checked on a CPU, not yet run on a GPU. Where a GPU is at
     hand whose float64 is slow (all but those of data centres), the series of a state in float32 are in float32 too, the
     time and the control of steps in float64, with an rtol of 1e-6 at least; a run with borders or events computes in
-    float64 there as well. On a GPU members that fail are not tried once more by another variant of the equations, and an angle beyond 2²⁰ ends a motion. A
-    first derivative in forward mode takes a motion with its tangents for every direction; one in reverse mode goes
-    back over the steps, as on a CPU, and takes such tangents for every number with constraints alone, or where a
-    member's steps are too many or do not suit its derivatives. Higher ones are composed of these. Crossings and hybrid
-    motion require a CPU. Where the series of a scene do not fit into the registers of a thread, 16 cores of a CPU may
-    be as fast (`System.explain`).
+    float64 there as well. On a GPU members that fail are not tried once more by another variant of the equations, and
+    an angle beyond 2²⁰ ends a motion. A first derivative in forward mode takes a motion with its tangents for every
+    direction; one in reverse mode goes back over the steps, as on a CPU, and takes such tangents for every number with
+    constraints alone, or where a member's steps are too many or do not suit its derivatives. Higher ones are composed
+    of these. Crossings and hybrid motion require a CPU. Where the series of a scene do not fit into the registers of a
+    thread, 16 cores of a CPU may be as fast (`System.explain`).
 
     Machine code requires a CPU or such a GPU, a scene whose acceleration is a scalar program of smooth or piecewise
     smooth operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;
@@ -165,19 +173,29 @@ class MachineCode(AbstractEngine):
         """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""
         return self.refuses(dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True)))
 
-    def crossings(self, problem: Problem, surfaces: Surfaces, room: int) -> tuple[Solution, Noted]:
-        """The motion of one member, and the crossings of its surfaces, `room` for each, on the way."""
+    def crossings(self, problem: Problem, surfaces: Surfaces, room: int, slack: float = 1.0) -> tuple[Solution, Noted]:
+        """The motion of one member, and the crossings of its surfaces, `room` for each, on the way.
+
+        Derivatives are those of a tolerance that is `slack` times as large.
+        """
         if problem.is_single:
-            return _in_doubles(lambda problem: self.crossings(problem, surfaces, room), problem)
-        noting = dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True))
-        flow, tolerances = flow_of(noting), tolerances_of(problem)._replace(notes=room)
+            return _in_doubles(lambda problem: self.crossings(problem, surfaces, room, slack), problem)
+        noting, flow, surfaces, tolerances = _noting(problem, surfaces, room, slack)
         if problem.is_known:
             ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
-            solution = flow.run(ts, y0, params, tolerances)
+            solution = noting.run(ts, y0, params, tolerances)
             solution = Solution._make([*(x[0] for x in solution[:-1]), None])
             return solution, Noted.read(solution.path, len(surfaces.directions))
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
-        return along_crossings(flow, _without_guards(problem), surfaces, tolerances)(ts, y0, params)
+        return along_crossings(noting, flow, surfaces, tolerances)(ts, y0, params)
+
+    def crossing_tangents(self, problem: Problem, surfaces: Surfaces, room: int, slack: float, dy0, dparams):
+        """The times of the crossings (G, room), and their tangents (D, G, room), of a problem in float64.
+
+        They are along the directions `dy0` (D, 2n) of the start and `dparams` (D, P) of the parameters.
+        """
+        tangents = crossing_tangents(*_noting(problem, surfaces, room, slack))
+        return tangents(problem.ts, problem.y0, problem.vector, dy0, dparams)
 
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, in the lanes of vectors and on all cores."""
@@ -213,6 +231,13 @@ def flow_of(problem: Problem) -> Flow:
     if isinstance(flow, str):
         raise ValueError(f"There is no machine code for this scene: {flow}.")
     return flow
+
+
+def _noting(problem: Problem, surfaces: Surfaces, room: int, slack: float) -> tuple[Flow, Flow, Surfaces, Tolerances]:
+    """The flow that notes the crossings of surfaces, that without any, the surfaces, and the tolerances of both."""
+    noting = dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True))
+    tolerances = tolerances_of(problem)._replace(notes=room, slack=slack)
+    return flow_of(noting), _without_guards(problem), surfaces, tolerances
 
 
 def _without_guards(problem: Problem) -> Flow:

@@ -133,7 +133,7 @@ def _to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Toleran
 @functools.lru_cache(maxsize=64)
 def _varied_to_event(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     """`(ts, y0, params, t_end, result, event)` → path, y_end, t_end, for the sake of their derivatives."""
-    ways = [crossing_variation(surfaces, flow.anywhere, k) for k in range(len(surfaces.directions))]
+    moved, each = crossing_variation(surfaces, flow.anywhere), np.arange(len(surfaces.directions))
 
     @jax.jit
     def varied(ts, y0, params, t_stop, result, event):
@@ -142,12 +142,8 @@ def _varied_to_event(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
         times = jnp.where((end - ts) * (ts[-1] - ts[0]) >= 0, ts, end)
         times = jnp.concatenate([ts[:1], times[1:-1], end[None]])
         solution = _primitives.run(flow, tolerances, times, y0, params)
-        t_end, y_end, earlier = end, solution.y_end, jnp.asarray(False)
-        for k, moved in enumerate(ways):
-            taken = fired & (((event >> (2 * k)) & 3) > 0) & ~earlier
-            earlier = earlier | taken
-            t_k, y_k = moved(taken, end, solution.y_end, params)
-            t_end, y_end = jnp.where(taken, t_k, t_end), jnp.where(taken, y_k, y_end)
+        first = jnp.argmax(((event >> (2 * each)) & 3) > 0)
+        t_end, y_end = moved(first, fired, end, solution.y_end, params)
         return solution.path, y_end, t_end
 
     return varied
@@ -162,6 +158,26 @@ def along_crossings(
 ) -> Callable[..., tuple[Solution, Noted]]:
     """`(ts, y0, params)` → the motion to the last of `ts`, and its crossings, with first and second derivatives."""
     return jax.jit(functools.partial(_along_crossings, noting, flow, surfaces, tolerances))
+
+
+@functools.lru_cache(maxsize=64)
+def crossing_tangents(noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances) -> Callable:
+    """`(ts, y0, params, dy0, dparams)` → the times of crossings, (G, room), and their tangents, (D, G, room).
+
+    These are along D directions of the start, `dy0` (D, 2n), and of the parameters, `dparams` (D, P).
+    """
+
+    @jax.jit
+    def tangents(ts, y0, params, dy0, dparams):
+        def times(y0, params):
+            return _along_crossings(noting, flow, surfaces, tolerances, ts, y0, params)[1].t
+
+        def along(*direction):
+            return jax.jvp(times, (y0, params), direction)
+
+        return jax.vmap(along, out_axes=(None, 0))(dy0, dparams)
+
+    return tangents
 
 
 def _along_crossings(
@@ -181,7 +197,7 @@ def _along_crossings(
 @functools.lru_cache(maxsize=64)
 def _varied_crossings(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     """`(ts, y0, params, t)` → t (G, room) and y (G, room, 2n), for the sake of their derivatives."""
-    ways = [crossing_variation(surfaces, flow.anywhere, k) for k in range(len(surfaces.directions))]
+    moved, each = crossing_variation(surfaces, flow.anywhere), np.arange(len(surfaces.directions))
 
     @jax.jit
     def varied(ts, y0, params, t):
@@ -193,10 +209,8 @@ def _varied_crossings(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
         )  # fmt: skip
         path = jnp.zeros_like(solution.path[1:-1]).at[order].set(solution.path[1:-1])
         y, times = path.reshape(*t.shape, -1), times.reshape(t.shape)
-        moved = [
-            jax.vmap(way, (0, 0, 0, None))(*of, params) for way, *of in zip(ways, there, times, y, strict=True)
-        ]  # fmt: skip
-        return tuple(jnp.stack(part) for part in zip(*moved, strict=True))
+        of_section = jax.vmap(moved, (None, 0, 0, 0, None))
+        return jax.vmap(of_section, (0, 0, 0, 0, None))(each, there, times, y, params)
 
     return varied
 

@@ -21,9 +21,6 @@ from lagjax._program import Program, StraightLine, evaluate, pullback, pushforwa
 from lagjax._results import SUCCESSFUL
 
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
-# The last terms that the series of a tangent may have, relative to the tangent, in tolerances. What the series leaves
-# out is smaller by e² at least. Measured on all scenes: a motion that has its own scale takes steps with at most 300.
-EXCESS = 1000.0
 _ROOM_AGAIN = 2  # times the steps that were taken: those that are undone and those of a first try are written, too
 MOST_PARTS, TRIES = 64, 4  # of a step that is too long, at once; and how often they are divided once more
 
@@ -91,7 +88,7 @@ def _jvp_over_steps(
             times, params[rows], steps.table, steps.first[members], steps.counts[members], dy0[rows], dparams[rows],
             steps.order, tolerances.floor,
         )  # fmt: skip
-        return excess / (EXCESS * tolerances.rtol)
+        return excess / tolerances.largest_excess
 
     for steps, rows, members in _steps_of(flow, ts, y0, params, accepted, ticket, tolerances):
         excess = along(steps, rows, members)
@@ -164,7 +161,7 @@ def _vjp_over_steps(
             times, params[rows], steps.table, steps.first[members], steps.counts[members], path_ct[rows],
             end_ct[rows], steps.order,
         )  # fmt: skip
-        return excess > EXCESS * tolerances.rtol
+        return excess > tolerances.largest_excess
 
     for steps, rows, members in _steps_of(flow, ts, y0, params, accepted, ticket, tolerances):
         long = np.flatnonzero(back(steps, rows, members))
@@ -196,7 +193,7 @@ def _probed(flow: Flow, ts, params, tolerances, steps: Steps, rows, members) -> 
         ts if len(ts) == 1 else ts[rows], params[rows], steps.table, steps.first[members], steps.counts[members], y_dot,
         params_dot, steps.order, tolerances.floor,
     )[2]  # fmt: skip
-    return excess / (EXCESS * tolerances.rtol)
+    return excess / tolerances.largest_excess
 
 
 def _vjp_by_jacobian(

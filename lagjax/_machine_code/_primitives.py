@@ -490,7 +490,7 @@ def _jvp_compiled(*args, **settings):
         )
         path = jnp.where((ts == ts[:, :1])[:, None, :, None], dy0[:, :, None] / unit[..., None], path)
         path = path.at[:, :, -1].set(end)
-        done &= jnp.all(excess <= _derivatives.EXCESS * tolerances.rtol)
+        done &= jnp.all(excess <= tolerances.largest_excess)
         return path * unit[..., None], end * unit, done, needed
 
     return _swept_compiled(on_rows, _jvp_on_host, _jvp_shapes, (2, 2), args, settings)
@@ -507,7 +507,7 @@ def _vjp_compiled(*args, **settings):
         )
         at_start = (ts == ts[:, :1])[:, :-1, None]  # outputs that are the initial state; steps begin after them
         y_ct = y_ct + jnp.sum(path_ct[:, :-1] * at_start, axis=1)
-        done &= jnp.all(excess <= _derivatives.EXCESS * tolerances.rtol)
+        done &= jnp.all(excess <= tolerances.largest_excess)
         return y_ct[:, None], params_ct[:, None], done, needed
 
     if args[-1].shape[-2] != 1:
@@ -572,7 +572,7 @@ def _swept_on_gpu(ts, y0, params, path_ct, result, end_ct, *, flow, tolerances):
     y_ct, params_ct, excess, done = swept
     at_start = (ts == ts[:, :1])[:, :-1, None]  # outputs that are the initial state; steps begin after them
     y_ct = y_ct + jnp.sum(path_ct[:, :-1] * at_start, axis=1)
-    return y_ct, params_ct, done & (excess <= _derivatives.EXCESS * tolerances.rtol)
+    return y_ct, params_ct, done & (excess <= tolerances.largest_excess)
 
 
 def _vjp_by_tangents(ts, y0, params, *given, flow, tolerances):

@@ -113,8 +113,8 @@ def require_one_number(value, what: str) -> jax.Array:
     return value
 
 
-def crossing_variation(surfaces: Surfaces, program: Program, k: int) -> Callable:
-    """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero, moved to where it is zero then.
+def crossing_variation(surfaces: Surfaces, program: Program) -> Callable:
+    """`(k, taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero, moved to where it is zero then.
 
     With δg the variation of the guard, f the rate of the state by the `program` of q̈, and ′ the derivative along the
     motion, the time moves by
@@ -126,17 +126,13 @@ def crossing_variation(surfaces: Surfaces, program: Program, k: int) -> Callable
     """
     still, count = jax.lax.stop_gradient, len(surfaces.directions)
 
-    def rates(t, y, numbers):
-        n = y.shape[0] // 2
-        acceleration = outputs(program, n, jnp.append(y, t), numbers)
-        return outputs(surfaces.complete, 2 * count, jnp.append(y, t), numbers)[count + k], jnp.append(
-            y[n:], acceleration
-        )
+    def moved(k, taken, t, y, numbers):
+        def rates(t, y):
+            n, at = y.shape[0] // 2, (jnp.append(y, t), numbers)
+            return outputs(surfaces.complete, 2 * count, *at)[count + k], jnp.append(y[n:], outputs(program, n, *at))
 
-    def moved(taken, t, y, numbers):
-        value, (rate, slope) = surfaces.values.at(jnp.append(y, t), numbers)[k], rates(t, y, numbers)
-        direction = jnp.ones_like(t), slope
-        bend, turn = map(still, jax.jvp(lambda t, y: rates(t, y, numbers), (t, y), direction)[1])
+        value, (rate, slope) = outputs(surfaces.values, count, jnp.append(y, t), numbers)[k], rates(t, y)
+        bend, turn = map(still, jax.jvp(rates, (t, y), (jnp.ones_like(t), slope))[1])
         crosses = ~taken | (rate != 0)
         rate = jnp.where(taken & crosses, rate, 1.0)
         part = jnp.where(taken, value - still(value), 0.0) / rate

@@ -46,7 +46,7 @@ def return_or_remember(frame: Frame, form: Lines | Tables, states: int, guards: 
 
 
 def _beginnings(frame: Frame, form: Lines | Tables, states: int, guards: int) -> Iterator[tuple[tuple, tuple]]:
-    """What a step begins with, and what the last long one began with."""
+    """The fields that a step begins with, each with the one that keeps it of the last long step."""
     fields = dict.fromkeys(("y", "low"), states) | dict.fromkeys(("side", "noted"), guards)
     for name, count in (fields | dict.fromkeys(("t", "t_low", "steps"), 1)).items():
         for i in form.each(frame.code, count):
