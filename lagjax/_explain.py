@@ -14,7 +14,7 @@ from lagjax._blame import pieces_of_motion
 from lagjax._diffrax import ArrayEquations, form_of
 from lagjax._engine import choose, explain_refusal
 from lagjax._linear import dependent_rows
-from lagjax._native import is_large, pieces_of
+from lagjax._native import Nesting, is_large, pieces_of
 from lagjax._problem import Problem
 from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Program, Unlowerable
 from lagjax._results import as_printed
@@ -172,7 +172,7 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
         return _listed(tuple(inputs[i] for i in sorted(borders.read_by(node)) if i < len(inputs)))
 
     kinds = zip(borders.switches, borders.kinds, strict=True)
-    in_machine_code = choose(problem).refusal is None and pieces_of(derivation.acceleration, (n,)) is not None
+    in_machine_code = choose(problem).refusal is None and pieces_of(derivation.acceleration, Nesting(n)) is not None
     return {
         "borders": tuple(f"{_PIECES[kind]} {read_by(node)}" for node, kind in kinds if kind in _PIECES),
         "narrow": tuple(f"a function of {read_by(node)}" for node in borders.arguments),

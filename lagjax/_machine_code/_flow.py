@@ -92,10 +92,10 @@ class Flow:
 
     `parts` gives the program, which takes q, q̇, t and then the P parameters and gives q̈ and whether the mass matrix is
     singular, and the projection that keeps the motion on its constraints, or None. It is called when machine code is
-    first needed. `guards` end a motion early. `groups` (n,) numbers the coordinates whose errors are measured together,
-    and the first `levels[0]` coordinates are the motion, the first `levels[1]` that and its tangents, and so on.
-    `motion` gives the program of the motion alone, where the flow's has tangents too; `general` the flow of the variant
-    for any mass matrix: members that the regular variant cannot follow start again with it.
+    first needed. `guards` end a motion early. `groups` (n,) numbers the coordinates whose errors are measured together;
+    these may be those of a motion with its tangents (`nesting`). `motion` gives the program of the motion alone, where
+    the flow's has tangents too; `general` the flow of the variant for any mass matrix: members that the regular variant
+    cannot follow start again with it.
     """
 
     def __init__(
@@ -105,14 +105,14 @@ class Flow:
         numbers: int,
         guards: _native.Guards | None = None,
         groups: tuple[int, ...] | None = None,
-        levels: tuple[int, ...] | None = None,
+        nesting: _native.Nesting | None = None,
         general: "Callable[[], Flow | None]" = lambda: None,
         motion: "Callable[[], Program] | None" = None,
     ):
         self._of_motion: Callable = (lambda: self.program) if motion is None else motion
         self._parts, self.size, self.numbers, self.guards = functools.cache(parts), size, numbers, guards
         self.groups = tuple(range(size)) if groups is None else groups
-        self.levels = (size,) if levels is None else levels
+        self.nesting = nesting or _native.Nesting(size)
         self.general = functools.cache(general)
         self.tangent = functools.lru_cache(maxsize=8)(self._tangent)
 
@@ -167,7 +167,7 @@ class Flow:
     @functools.cached_property
     def kernel(self) -> _native.Kernel:
         """The machine code."""
-        parts = self.program, self.size, self.projection, self.guards, self.groups, self.levels
+        parts = self.program, self.size, self.projection, self.guards, self.groups, self.nesting
         return _native.Kernel(*parts, motion=self._of_motion())
 
     @property
@@ -277,8 +277,8 @@ class Flow:
         def parts():
             return tangent_programs(self.program, self.projection, n, directions)
 
-        levels = (*self.levels, rows * n)
-        return Flow(parts, rows * n, rows * self.numbers, None, groups, levels, general, self._of_motion)
+        nesting = self.nesting.with_tangents(directions)
+        return Flow(parts, rows * n, rows * self.numbers, None, groups, nesting, general, self._of_motion)
 
 
 def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:

@@ -65,6 +65,7 @@ from lagjax._native._kernel import (
 )
 from lagjax._native._taylor import is_large
 from lagjax._native._threads import map_in_threads
+from lagjax._program._jump import Nesting
 
 __all__ = [
     "ATOL_OVER_MOTION",
@@ -84,6 +85,7 @@ __all__ = [
     "DerivativePlan",
     "Guards",
     "Kernel",
+    "Nesting",
     "Outcome",
     "Plan",
     "Projection",

@@ -30,6 +30,7 @@ from lagjax._native._taylor import Chosen, TaylorSeries, double, integer, is_lar
 from lagjax._native._time_knots import TimeKnots
 from lagjax._program._borders import Borders
 from lagjax._program._differentiation import pullback, pullback_and_entries
+from lagjax._program._jump import Nesting
 from lagjax._program._look_ups import Table
 from lagjax._program._series import Recurrent, Series
 
@@ -52,7 +53,7 @@ class Adjoint:
         series: Series,
         projection=None,
         borders: "Borders | None" = None,
-        levels: tuple[int, ...] = (),
+        nesting: Nesting | None = None,
         chosen: Chosen | None = None,
         *,
         width: int,
@@ -69,9 +70,10 @@ class Adjoint:
             "before": states,
             **dict.fromkeys(("active", "excess"), 1),
         }
-        jump = jump_along(borders, levels or (n,))
+        nesting = nesting or Nesting(n)
+        jump = jump_along(borders, nesting)
         if borders is not None:
-            fields |= FirstSaltation.fields(pieces, (n,)) if jump is None else Saltation.fields(pieces)
+            fields |= FirstSaltation.fields(pieces, n) if jump is None else Saltation.fields(pieces)
             fields |= {"after": n, "pieces_after": pieces, "has_after": 1, "crossed": 1, "grazes": 1}
         large = is_large(program, projection, times=2, more=() if jump is None else [jump.line] * 2)
         number = DOUBLE if large else number  # tables do not tell the time from the state
@@ -98,18 +100,18 @@ class Adjoint:
             )
             steps.insert(0, self._transpose_projection())
         if borders is not None:
-            steps = [*self._transpose_end(borders, levels or (n,), jump), *steps, self._note_after()]
+            steps = [*self._transpose_end(borders, nesting, jump), *steps, self._note_after()]
         self._run(steps)
         self._begin()
         self.motion.finish()
 
-    def _transpose_end(self, borders: "Borders", levels: tuple[int, ...], jump) -> list[Code]:
+    def _transpose_end(self, borders: "Borders", nesting: Nesting, jump) -> list[Code]:
         """Go back over the end of a step: over the border that it met, and over a knot of samples."""
         clocks = TimeKnots(self.motion, borders)
-        at_knot = [self._transpose_knot(clocks, levels)] if clocks.exist else []
+        at_knot = [self._transpose_knot(clocks, nesting.base)] if clocks.exist else []
         if jump is None:
-            return [self._transpose_first_border(borders, levels), *at_knot]
-        return [self._transpose_border(Saltation(self.motion, borders, levels[0], jump)), *at_knot]
+            return [self._transpose_first_border(borders, nesting), *at_knot]
+        return [self._transpose_border(Saltation(self.motion, borders, nesting.base, jump)), *at_knot]
 
     def _transposed(self, dtypes):
         """The transposes of the zeroth order and of the order recursion."""
@@ -363,9 +365,9 @@ class Adjoint:
                     _add(frame, gain(row, k + 2 * base), "params_ct", k + row * numbers)
         return frame.finish()
 
-    def _transpose_first_border(self, borders: Borders, levels: tuple[int, ...]) -> Code:
+    def _transpose_first_border(self, borders: Borders, nesting: Nesting) -> Code:
         """`_back_border` of a program that looks up tables (`_first_saltation`)."""
-        motion, saltation = self.motion, FirstSaltation(self.motion, borders, levels)
+        motion, saltation = self.motion, FirstSaltation(self.motion, borders, nesting)
         table, frame = GuardTable(motion, borders), motion.function("back_border")
         code, base = frame.code, saltation.base
         frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], 0.0)
@@ -380,13 +382,13 @@ class Adjoint:
             self._store_entries(frame, saltation.tables, slopes, len(saltation.by), gain)
         return frame.finish()
 
-    def _transpose_knot(self, clocks: TimeKnots, levels: tuple[int, ...]) -> Code:
+    def _transpose_knot(self, clocks: TimeKnots, base: int) -> Code:
         """To the entry of a table that the time is on, where a step ends at one (`_time_knots`)."""
         frame = self.motion.function("back_knot")
         code = frame.code
         with code.only_if(code.any_lane(clocks.is_crossed(frame))):
             cotangent, there = clocks.cotangent(frame)
-            without = clocks.moves(frame, levels)
+            without = clocks.moves(frame, base)
             if without is not None:
                 for i in self.motion.form.each(code, self.states):
                     x = frame["state_ct", i]

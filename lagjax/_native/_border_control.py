@@ -44,7 +44,7 @@ from lagjax._native._taylor import TaylorSeries, double, integer
 from lagjax._native._time_knots import TimeKnots
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
-from lagjax._program._jump import Jump, looks_up
+from lagjax._program._jump import Jump, Nesting, looks_up
 
 NOWHERE = 1e300  # a level that no switching number comes to
 
@@ -66,13 +66,13 @@ class BorderControl:
     """The borders of a motion, whose pieces are its last parameters.
 
     Where it `returns` to long steps (`_rank_drops`), it does not go back over a border, nor because of one. With
-    tangents (`levels`) it has a `jump` of these.
+    tangents (`nesting`) it has a `jump` of these.
     """
 
     def __init__(
-        self, motion: TaylorSeries, borders: _borders.Borders, levels: tuple[int, ...], returns: bool, jump: Jump | None
+        self, motion: TaylorSeries, borders: _borders.Borders, nesting: Nesting, returns: bool, jump: Jump | None
     ):
-        self.returns, base = returns, levels[0]
+        self.returns, base = returns, nesting.base
         self.motion, self.borders, self.guards = motion, borders, borders.guards
         self.pieces, self.roots = motion.pieces, Roots(motion)
         if not self.pieces:
@@ -86,18 +86,18 @@ class BorderControl:
             saltation = Saltation(motion, borders, base, jump)
             motion.layout.extend_by(saltation.fields_along())
             self.note, self.jump = saltation.note(), saltation.apply()
-        elif len(levels) > 1:
-            first = FirstSaltation(motion, borders, levels)
+        elif nesting.directions:
+            first = FirstSaltation(motion, borders, nesting)
             self.note, self.jump = first.note(self.table), first.apply()
         self.graze = None if looks_up(borders.program) else self._graze(base)
         self.jump_at_knot = None
-        if self.clocks.exist and len(levels) > 1:
+        if self.clocks.exist and nesting.directions:
             motion.layout.extend_by(self.clocks.fields())
-            self.jump_at_knot = self.clocks.jump_of_tangents(levels)
+            self.jump_at_knot = self.clocks.jump_of_tangents(nesting)
         self.cross = self._cross()
 
     @staticmethod
-    def fields(borders: _borders.Borders, levels: tuple[int, ...]) -> dict:
+    def fields(borders: _borders.Borders, size: int) -> dict:
         """The fields of a thread's memory.
 
         `touch` is the `Touch` of every guard where the step begins; `stays` is 1 for a piece that is not decided anew;
@@ -124,7 +124,7 @@ class BorderControl:
         )
         fields = {"touch": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
         fields["level"] = len(borders.guards) if _borders.TABLE in borders.kinds else 0
-        of_tangents = FirstSaltation.fields(len(borders.switches), levels) | Saltation.fields(len(borders.switches))
+        of_tangents = FirstSaltation.fields(len(borders.switches), size) | Saltation.fields(len(borders.switches))
         return fields | Roots.fields(MAX_ORDER + 2) | of_tangents
 
     def begin(self, frame: Frame, lane: Lane) -> None:

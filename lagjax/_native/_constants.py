@@ -12,7 +12,7 @@ EPS = 2.0**-52  # from 1 to the next double
 
 
 class Digits(NamedTuple):
-    """What rounding does to the numbers of a state, and to what is computed from them.
+    """The rounding of the numbers of a state, and of what is computed from them.
 
     - `eps`: from 1 to the next number.
     - `round_off`: the rounding of an acceleration, and of a projected state, in parts of its size: some hundred

@@ -21,18 +21,16 @@ from lagjax._native._ir import Code, Value
 from lagjax._native._saltation import GuardTable
 from lagjax._native._taylor import TaylorSeries
 from lagjax._program._borders import Borders, gradient
+from lagjax._program._jump import Nesting
 from lagjax._program._look_ups import Table, shifted
 
 
 class FirstSaltation:
-    """The jumps of a motion over `levels[0]` coordinates with tangents.
+    """The jumps of a motion with nested tangents."""
 
-    `levels` holds the coordinates of the motion, then with its tangents, then with tangents of these, and so on.
-    """
-
-    def __init__(self, motion: TaylorSeries, borders: Borders, levels: tuple[int, ...]):
-        self.motion, self.levels, self.pieces = motion, levels, motion.pieces
-        self.base, n = levels[0], levels[-1]
+    def __init__(self, motion: TaylorSeries, borders: Borders, nesting: Nesting):
+        self.motion, self.nesting, self.pieces = motion, nesting, motion.pieces
+        self.base, n = nesting.base, nesting.size
         self.parameters = motion.parameters * self.base // n  # of the motion alone
         self.by = [*range(self.base), *range(n, n + self.base), *(2 * n + i for i in range(1 + self.parameters))]
         self.line, self.tables = gradient(borders, self.by)
@@ -44,9 +42,9 @@ class FirstSaltation:
         return len(self.by) + 2 * len(self.tables)
 
     @staticmethod
-    def fields(pieces: int, levels: tuple[int, ...]) -> dict:
+    def fields(pieces: int, size: int) -> dict:
         """The fields of a thread's memory: a⁻, which switching number is crossed, and at which entry of its table."""
-        return {"rate_before": levels[-1], "hit": pieces, "entry": pieces, "is_hit": 1}
+        return {"rate_before": size, "hit": pieces, "entry": pieces, "is_hit": 1}
 
     # ---- what both directions need ----
 
@@ -122,9 +120,9 @@ class FirstSaltation:
         after = motion.evaluate_now(frame, motion.acceleration)
         jump, is_hit = self.jump(frame, after), frame["is_hit"] > 0.0
         jumps = self.jumps(frame, jump)
-        for level, (inner, outer) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
+        for level, (inner, directions) in enumerate(self.nesting.levels):
             numbers = self.parameters * inner // self.base
-            for d in range(1, outer // inner):
+            for d in range(1, 1 + directions):
                 by_state = (
                     slopes[i] * state[i + d * inner] + slopes[i + self.base] * state[i + (n + d * inner)]
                     for i in motion.form.each(code, self.base)
@@ -173,7 +171,7 @@ class FirstSaltation:
         total = code.total(frame["state_ct", i + motion.n] * jump(i) for i in motion.form.each(code, motion.n))
         jumps = self.jumps(frame, jump)
         gain = code.select(code.compare("!=", total, 0.0), 0.0 - total / rate, 0.0)
-        if len(self.levels) > 1:
+        if self.nesting.directions:
             gain = code.select(jumps, float("nan"), gain)
         return code.select(frame["is_hit"] > 0.0, gain, 0.0)
 

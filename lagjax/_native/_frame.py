@@ -159,7 +159,7 @@ class Frame:
 
     @property
     def digits(self) -> Digits:
-        """What rounding does to the numbers of a state."""
+        """The rounding of the numbers of a state."""
         return SINGLE_DIGITS if self.layout.number == FLOAT else DIGITS
 
     def __getitem__(self, key: "str | tuple") -> Value:

@@ -33,6 +33,7 @@ from lagjax._native._step import PARTS, StepControl
 from lagjax._native._taylor import Chosen, TaylorSeries, double, integer, is_large
 from lagjax._program import _borders
 from lagjax._program._borders import reads_inputs
+from lagjax._program._jump import Nesting
 from lagjax._program._series import Recurrent, Series
 
 JOB = job(
@@ -48,8 +49,8 @@ JOB = job(
 class Integrator:
     """Builds the module, whose public functions are `begin` and `run`.
 
-    Coordinates of one of the `error_groups` are measured by the largest of them. The first `base_size` coordinates are
-    the motion, the others derivatives of it, which follow where the projection takes it. The state is of the type
+    Coordinates of one of the `error_groups` are measured by the largest of them. The first coordinates of a `nesting`
+    are the motion, the others derivatives of it, which follow where the projection takes it. The state is of the type
     `number`.
     """
 
@@ -62,16 +63,16 @@ class Integrator:
         projection=None,
         guards: Guards | None = None,
         error_groups: tuple[int, ...] | None = None,
-        base_size: int | None = None,
         borders: "_borders.Borders | None" = None,
-        levels: tuple[int, ...] = (),
+        nesting: Nesting | None = None,
         chosen: Chosen | None = None,
         *,
         width: int,
         number: ir.Type = DOUBLE,
     ):
         n = series.size
-        self.base_size = n if base_size is None else base_size
+        nesting = nesting or Nesting(n)
+        self.base_size = nesting.base
         self.guards = 0 if guards is None else len(guards.directions)
         self.notes = guards is not None and guards.notes  # in the place of states at output times
         fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards) | {"active": 1}
@@ -80,9 +81,9 @@ class Integrator:
         if guards is not None:
             fields |= Roots.fields(MAX_ORDER + 2)
         if borders is not None:
-            fields |= BorderControl.fields(borders, levels or (n,))
+            fields |= BorderControl.fields(borders, n)
         pieces = 0 if borders is None else len(borders.switches)
-        jump = None if borders is None or borders.motion is None else jump_over(borders, levels)
+        jump = None if borders is None or borders.motion is None else jump_over(borders, nesting)
         large = is_large(program, projection, guards, more=() if jump is None else [jump.line])
         alone = large and width == 1 and borders is None and chosen is None
         kind = SingleMember if alone and fills_lanes(series) else TaylorSeries
@@ -95,7 +96,7 @@ class Integrator:
         )  # fmt: skip
         groups = tuple(range(n)) if error_groups is None else error_groups
         self.step = StepControl(motion, groups, self.projector, self.base_size)
-        self.borders = borders and BorderControl(motion, borders, levels or (n,), projection is not None, jump)
+        self.borders = borders and BorderControl(motion, borders, nesting, projection is not None, jump)
         self.output = Output(motion, self.projector)
         self.events = guards and self._events(program, guards)
         self.start_next = self._start_next()

@@ -37,7 +37,7 @@ from lagjax._native._taylor import Chosen, TaylorSeries, is_large, order_for, si
 from lagjax._native._threads import SLICE, run_in_slices, run_on_threads
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
-from lagjax._program._jump import looks_up, with_levels
+from lagjax._program._jump import Nesting, looks_up, with_borders_of_tangents
 from lagjax._program._look_ups import BESIDE, shifted
 from lagjax._program._memory import without_collections
 from lagjax._program._operations import LOOK_UPS
@@ -108,11 +108,10 @@ class Kernel:
     applied to the state after every step, and to the outputs after the first. `guards`, again from the same inputs, end
     the motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises); or they are noted
     and the motion goes on: then there are notes in the place of states at output times. Errors are relative
-    to each coordinate, or to the largest one of those with the same number in `error_groups` (n,). Of the coordinates
-    the first `levels[0]` are the motion, the first `levels[1]` that and its tangents, and so on to all of them; then
-    `motion` is the program of the motion alone. Vectors
-    have `width` lanes, by default those of the processor. Raises `Unlowerable` where an operation has no Taylor series
-    or is not one of doubles.
+    to each coordinate, or to the largest one of those with the same number in `error_groups` (n,). The coordinates may
+    be those of a motion with its tangents (`nesting`); then `motion` is the program of the motion alone. Vectors have
+    `width` lanes, by default those of the processor. Raises `Unlowerable` where an operation has no Taylor series or is
+    not one of doubles.
     """
 
     def __init__(
@@ -122,30 +121,26 @@ class Kernel:
         projection: Projection | None = None,
         guards: Guards | None = None,
         error_groups: tuple[int, ...] | None = None,
-        levels: tuple[int, ...] | None = None,
+        nesting: Nesting | None = None,
         width: int | None = None,
         motion: Recurrent | None = None,
     ):
         self.states, self.numbers = 2 * size, program.size - 2 * size - 1
-        levels = (size,) if levels is None else levels
-        self._given, self.borders, self._levels = (
-            (program, size, projection, guards, error_groups, levels),
-            None,
-            levels,
-        )
+        self._nesting = nesting = nesting or Nesting(size)
+        self._given, self.borders = (program, size, projection, guards, error_groups, nesting), None
         program, projection, guards, self._chosen = parameters_chosen(
-            program, projection, guards, 2 * size + 1, size // levels[0]
+            program, projection, guards, 2 * size + 1, size // nesting.base
         )
         self._smooth = program, projection
         self._parts = program, recurrences(program, size), projection
         self._motion = motion
         if guards is not None:
-            whole, of_whole, self.borders = watched(program, size, guards.values, len(levels) == 1)
+            whole, of_whole, self.borders = watched(program, size, guards.values, not nesting.directions)
             self._parts = whole, of_whole, projection
-        elif pieces := pieces_of(program, levels, motion):
+        elif pieces := pieces_of(program, nesting, motion):
             self.borders, of_pieces = pieces
             self._parts = self.borders.program, of_pieces, projection
-        self._options = guards, error_groups, levels[0]
+        self._options = guards, error_groups
         self.width = lanes() if width is None else width
         self._tangents = functools.cache(self._tangents_of)
         self.for_gpus = functools.cache(self._for_gpus)
@@ -172,7 +167,7 @@ class Kernel:
     def _integrator(self, number: ir.Type = DOUBLE) -> Integrator:
         with without_collections():
             integrator = Integrator(
-                *self._parts, *self._options, self.borders, self._levels, self._chosen, width=self.width, number=number
+                *self._parts, *self._options, self.borders, self._nesting, self._chosen, width=self.width, number=number
             )
         forget_joined()
         forget_stages()
@@ -390,9 +385,9 @@ class Kernel:
             parts = self._parts
             if self._options[0] is not None:
                 parts = *along_pieces(self.borders, self._given[1]), parts[2]
-            return *parts, self.borders, self._levels, self._chosen
+            return *parts, self.borders, self._nesting, self._chosen
         program, projection = self._smooth
-        return program, recurrences(program, self._given[1]), projection, None, (), self._chosen
+        return program, recurrences(program, self._given[1]), projection, None, None, self._chosen
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
@@ -569,24 +564,22 @@ def recurrences(program: Recurrent, size: int) -> Series:
 
 
 @functools.lru_cache(maxsize=16)
-def pieces_of(
-    program: Recurrent, levels: tuple[int, ...], motion: Recurrent | None = None
-) -> "tuple[Borders, Series] | None":
+def pieces_of(program: Recurrent, nesting: Nesting, motion: Recurrent | None = None) -> "tuple[Borders, Series] | None":
     """The borders of a piecewise program, and the series of its motion along a piece; None where there are none.
 
-    Of a motion with its tangents (`levels`, see `Kernel`) they are those of the `motion` alone, moved along.
+    Of a motion with its tangents they are those of the `motion` alone, moved along.
     """
-    size = levels[-1]
-    if motion is not None and len(levels) > 1 and not looks_up(motion):
-        if (of_motion := pieces_of(motion, levels[:1])) is None:
+    size = nesting.size
+    if motion is not None and nesting.directions and not looks_up(motion):
+        if (of_motion := pieces_of(motion, Nesting(nesting.base))) is None:
             return None
         found = of_motion[0]
-        for inner, outer in itertools.pairwise(levels):
-            found = with_levels(found, inner, outer // inner - 1)
+        for inner, directions in nesting.levels:
+            found = with_borders_of_tangents(found, inner, directions)
         with without_collections():
             return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
     try:
-        if (found := borders(program, size, len(levels) == 1)) is not None:
+        if (found := borders(program, size, not nesting.directions)) is not None:
             with without_collections():
                 return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
     except Unlowerable:  # a switching number without a series, or more operations than that takes

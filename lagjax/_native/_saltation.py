@@ -6,7 +6,6 @@ derivative does. Where the border is grazed, so that a change of the state withi
 crossed, none of this exists: derivatives are NaN there, but for first ones where the acceleration is continuous.
 """
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -16,7 +15,7 @@ from lagjax._native._frame import Frame, Index, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries
 from lagjax._program._borders import Borders
-from lagjax._program._jump import Jump, jump_at_border, looks_up
+from lagjax._program._jump import Jump, Nesting, jump_at_border, looks_up
 
 NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "goes_on")
 PLACES = ("piece", "back", "slide", "on", "order", "of_table")
@@ -67,24 +66,21 @@ class GuardTable:
                 frame["is_hit"] = 1
 
 
-def jump_over(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
+def jump_over(borders: Borders | None, nesting: Nesting) -> Jump | None:
     """The jump of tangents at a border; None without borders, without tangents, and where tables are looked up.
 
-    `levels` holds the coordinates of the motion, then with its tangents, then with tangents of these, and so on; the
-    last tangents may be those of a derivative over steps that have been taken.
+    The last tangents may be those of a derivative over steps that have been taken.
     """
-    if borders is None or not borders.switches or len(levels) < 2 or looks_up(borders.program):
+    if borders is None or not borders.switches or not nesting.directions or looks_up(borders.program):
         return None
-    directions = tuple(outer // inner - 1 for inner, outer in itertools.pairwise(levels))
-    return jump_at_border(borders.motion or borders, levels[0], directions)
+    return jump_at_border(borders.motion or borders, *nesting)
 
 
-def jump_along(borders: Borders | None, levels: tuple[int, ...]) -> Jump | None:
-    """`jump_over` for tangents of the motion at hand, whose own `levels` these are."""
-    if borders is None:
+def jump_along(borders: Borders | None, nesting: Nesting) -> Jump | None:
+    """`jump_over` for tangents of the motion at hand, whose own `nesting` this is."""
+    if borders is None or (nesting.directions and borders.motion is None):
         return None
-    onwards = *levels, 2 * levels[-1]
-    return None if len(levels) > 1 and borders.motion is None else jump_over(borders, onwards)
+    return jump_over(borders, nesting.with_tangents(1))
 
 
 class Saltation:

@@ -33,7 +33,7 @@ from lagjax._native._taylor import Chosen, TaylorSeries, double, integer, is_lar
 from lagjax._native._time_knots import TimeKnots
 from lagjax._program._borders import Borders
 from lagjax._program._differentiation import pushforward
-from lagjax._program._jump import Jump
+from lagjax._program._jump import Jump, Nesting
 from lagjax._program._series import Recurrent, Series
 
 # `y_dot` is the tangent of the start, and becomes that of the end.
@@ -60,29 +60,30 @@ class Tangent:
         series: Series,
         projection=None,
         borders: "Borders | None" = None,
-        levels: tuple[int, ...] = (),
+        nesting: Nesting | None = None,
         chosen: Chosen | None = None,
         *,
         width: int,
         lanes: int,
     ):
         n, states = series.size, 2 * series.size
-        jump = jump_along(borders, levels or (n,))
+        nesting = nesting or Nesting(n)
+        jump = jump_along(borders, nesting)
         large = is_large(program, projection, times=2, more=() if jump is None else [jump.line])
         fields = {"active": 1, "next_begin": 1} | ({"moved": states} if projection is not None else {})
         pieces = 0 if borders is None else len(borders.switches)
         if borders is not None:
-            fields |= FirstSaltation.fields(pieces, (n,)) if jump is None else Saltation.fields(pieces)
+            fields |= FirstSaltation.fields(pieces, n) if jump is None else Saltation.fields(pieces)
             fields |= {"crossed": 1, "grazes": 1}
         self.motion = TaylorSeries(
             "tangent", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
         )
         self.n, self.states, self.series, self.lanes, self.numbers = n, states, series, lanes, self.motion.parameters
         self.clocks: TimeKnots | None = None
-        self.base = levels[0] if levels else n
+        self.base = nesting.base
         self.saltation: Saltation | FirstSaltation | None = None
         if borders is not None:
-            self._note_borders(borders, levels or (n,), jump)
+            self._note_borders(borders, nesting, jump)
         self.layout = Memory(lanes, self._fields(), beside=self.motion.layout)
         sincos = sincos_function(self.motion.module, lanes, "sincos_of_tangents")
         look_up = self.motion.look_up
@@ -104,14 +105,14 @@ class Tangent:
             self.form.finish()
         self.motion.finish()
 
-    def _note_borders(self, borders: Borders, levels: tuple[int, ...], jump: Jump | None) -> None:
+    def _note_borders(self, borders: Borders, nesting: Nesting, jump: Jump | None) -> None:
         """Build the functions that note a border at the end of a step, and jump over it."""
         if jump is not None:
-            self.saltation = Saltation(self.motion, borders, levels[0], jump)
+            self.saltation = Saltation(self.motion, borders, nesting.base, jump)
             self.motion.layout.extend_by(self.saltation.fields_along())
             self.note_border = self.saltation.note_end()
         else:
-            self.saltation = FirstSaltation(self.motion, borders, levels)
+            self.saltation = FirstSaltation(self.motion, borders, nesting)
             self.motion.layout.extend_by(self.saltation.fields_along())
             self.begin_behind = self.saltation.note_begin()
             self.note_border = self.saltation.note_end(GuardTable(self.motion, borders))

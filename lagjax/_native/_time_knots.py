@@ -8,7 +8,6 @@ A table of numbers has no such derivatives, and nothing is done for it. Second o
 acceleration jumps, and so are first ones by those of two tables that coincide: a⁻ − a⁺ is that of both.
 """
 
-import itertools
 from collections.abc import Callable
 
 from lagjax._native._constants import JUMP_NOISE
@@ -16,6 +15,7 @@ from lagjax._native._frame import Frame, Numbers
 from lagjax._native._ir import Code, Value
 from lagjax._native._taylor import TaylorSeries
 from lagjax._program._borders import Borders
+from lagjax._program._jump import Nesting
 from lagjax._program._look_ups import Table, shifted
 
 
@@ -86,16 +86,16 @@ class TimeKnots:
             total = code.select(code.compare("==", knot_of, float(self.first + c)), change, total)
         return total
 
-    def jump_of_tangents(self, levels: tuple[int, ...]) -> Code:
+    def jump_of_tangents(self, nesting: Nesting) -> Code:
         """`()`: the tangents of a motion with its tangents beyond the entry that was noted; see `Saltation`."""
         motion, n = self.motion, self.motion.n
         frame = motion.function("jump_at_knot")
-        code, base = frame.code, levels[0]
+        code, base = frame.code, nesting.base
         after = motion.evaluate_now(frame, motion.acceleration)
         jump, hit = self.jump(code, frame.vectors("before_knot", n), after), frame["knot_of"] > 0.0
         own = motion.of_member * base // n
-        for level, (inner, outer) in enumerate(itertools.pairwise(levels)):
-            for d in range(1, outer // inner):
+        for level, (inner, directions) in enumerate(nesting.levels):
+            for d in range(1, 1 + directions):
                 shift = own * (inner // base) * d
                 change = self.moved(frame, frame["knot_of"], frame["knot"], lambda t, s=shift: shifted(t, s))
                 moves = hit & code.compare("!=", change, 0.0)
@@ -119,9 +119,9 @@ class TimeKnots:
         frame["knot_of"] = code.select(self.is_crossed(frame), frame["knot_of"], 0.0)
         return frame.finish()
 
-    def moves(self, frame: Frame, levels: tuple[int, ...]) -> Value | None:
+    def moves(self, frame: Frame, base: int) -> Value | None:
         """True if the tangents of a motion with tangents jump at the end of a step: it has no derivatives there."""
-        code, found, base = frame.code, None, levels[0]
+        code, found = frame.code, None
         own = self.motion.of_member * base // self.motion.n
         for row in range(1, self.motion.n // base):
             for c, j, table in self.tables:

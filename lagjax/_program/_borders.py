@@ -103,7 +103,7 @@ class Borders(NamedTuple):
     takes the same and then m flags: it gives the pieces of a state, or the piece that is given where the flag is 1.
     `nested` says whether switching numbers depend on pieces. `tables` (m,) has that of every piece that is one of a
     table; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one with
-    tangents (`_jump.with_levels`).
+    tangents (`_jump.with_borders_of_tangents`).
     """
 
     program: Pieced

@@ -18,6 +18,7 @@ Circuits Syst. I 47 (2000) 204, §III.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -38,6 +39,31 @@ _STAGES: tuple[tuple[tuple[float, ...], ...], ...] = (
     ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)),
 )
 _LARGEST = 1000  # operations that one may become: a bound for errors
+
+
+class Nesting(NamedTuple):
+    """A motion of `base` coordinates, its tangents along `directions[0]` directions, tangents of both along the next.
+
+    The coordinates stand row after row: those of the motion, of its tangents, then of the tangents of all these rows.
+    """
+
+    base: int
+    directions: tuple[int, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """The number of all coordinates."""
+        return self.base * math.prod(1 + count for count in self.directions)
+
+    @property
+    def levels(self) -> list[tuple[int, int]]:
+        """For each level of tangents the coordinates that these are of, and the directions that they are along."""
+        return [(Nesting(self.base, self.directions[:k]).size, count) for k, count in enumerate(self.directions)]
+
+    def with_tangents(self, directions: int) -> "Nesting":
+        """The same with tangents of all of it along this many directions."""
+        return self._replace(directions=(*self.directions, directions))
+
 
 Jet = list  # of nodes of a graph, one a row: the number itself, then its derivatives; None where one is zero
 
@@ -92,7 +118,7 @@ def looks_up(program: Recurrent) -> bool:
     return any(op in ("take", "locate") for op, *_ in program.line.nodes)
 
 
-def with_levels(borders: Borders, size: int, directions: int) -> Borders:
+def with_borders_of_tangents(borders: Borders, size: int, directions: int) -> Borders:
     """The borders of a motion together with its tangents along this many directions; along a piece these are smooth.
 
     The inputs q, q̇ and the parameters have 1 + D rows, those of the motion and then one for each direction, and so have

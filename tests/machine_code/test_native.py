@@ -46,7 +46,7 @@ def lanewise(body, *columns):
     out = body(code, sincos, [code.load(code.element(given, i * WIDTH), code.vector) for i in range(len(columns))])
     for i, value in enumerate(out):
         is_bit = value.it.type.element == _ir.BIT
-        code.store(code.as_double(value) if is_bit else value, code.element(results, i * WIDTH))
+        code.store(code.as_number(value) if is_bit else value, code.element(results, i * WIDTH))
     code.finish()
     _engine, at = _ir.compile_module(module, ("test",))
     function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(at["test"])

@@ -171,7 +171,7 @@ def instructions(acceleration, size):
     """How many instructions the kernel of q̈ = `acceleration(q, v, t)` has, as tables."""
     states = jax.ShapeDtypeStruct((size,), float)
     program = lower(lambda q, v, t: (acceleration(q, v, t), False), states, states, 1.0)
-    borders, series = _native.pieces_of(program, (size,)) or (None, _native.recurrences(program, size))
+    borders, series = _native.pieces_of(program, _native.Nesting(size)) or (None, _native.recurrences(program, size))
     program = program if borders is None else borders.program
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_taylor, "LARGEST_LINE", -1)
