@@ -62,7 +62,7 @@ from typing import TYPE_CHECKING, Any
 
 from lagjax._system import System
 
-if TYPE_CHECKING:  # each is imported where it is first asked for: all of them take as long as JAX itself
+if TYPE_CHECKING:  # each is imported on first use: all of them take as long as JAX itself
     from lagjax import designs, plot, results, scenes
     from lagjax._analysis import (
         change_coordinates,

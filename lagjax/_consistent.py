@@ -1,7 +1,7 @@
 """The test that the start of a motion satisfies its constraints, before any work is done.
 
-What a start is measured by, and how far off it may be, stands in `_constraints`. Here it is asked of the user's own
-arguments, and answered with a sentence. Values that are being traced, as under `jax.jit`, are not looked at.
+What a start is measured by, and how far off it may be, stands in `_constraints`. Here it is evaluated with the user's
+own arguments, and answered with a sentence. Values that are being traced, as under `jax.jit`, are not looked at.
 """
 
 from typing import Any, NamedTuple
@@ -23,8 +23,9 @@ PyTree = Any
 def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> None:
     """Raise `ValueError`, naming the constraint, where the start of a single motion is inconsistent.
 
-    That is: a constraint is not finite, or has no gradient; so many are independent that nothing can move; two of them
-    contradict each other; or q0 or qdot0 is farther from one than `TOLERANCE` of its size.
+    That is: a constraint is not finite, or has no gradient; as many are independent as there are coordinates, so that
+    nothing can move; two of them contradict each other; or q0 or qdot0 is farther from one than `TOLERANCE` of its
+    size.
     """
     if not has_constraints(system) or not _all_concrete((ts, q0, qdot0, params, system)):
         return

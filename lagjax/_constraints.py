@@ -121,7 +121,7 @@ class Constraints(eqx.Module):
 
 # The distance from a constraint, over the size of q or q̇, up to which a motion may start: an initial state that was
 # computed or typed with six (three) digits. The first projection takes care of it. It would also take care of more, but
-# by moving the start to where nobody asked it to be.
+# by moving the start elsewhere.
 TOLERANCE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
 
 
@@ -306,7 +306,7 @@ def _holds(residual: Row, jacobian: Float[Array, "m n"], unit: Vector, *states: 
 
     A distance of √eps of the state is allowed: the last step of Newton's method was at the level of rounding, so that
     constraints which can hold do so far better, and those that contradict each other are off by far more. The second
-    term is for a gradient that vanishes, where rounding of the others' size is all that can be asked for. Coordinates
+    term is for a gradient that vanishes, where rounding of the others' size is the limit. Coordinates
     are in their `unit` (n,), and as large as in any of the states (n,).
     """
     lengths, eps = jnp.sqrt(jnp.sum((jacobian * unit) ** 2, axis=1)), jnp.finfo(residual.dtype).eps

@@ -99,7 +99,7 @@ def _lowered_once(make: Callable) -> property:
 class Derivation:
     """The derivation of a scene: its programs, and the facts that can be read off them.
 
-    Every program is lowered when it is first asked for. Each raises `Unlowerable`, with the end of a sentence, where
+    Every program is lowered on first use. Each raises `Unlowerable`, with the end of a sentence, where
     the scene has none: it is too large, or takes operations that have no scalar form.
     """
 
@@ -349,7 +349,7 @@ class Derivation:
         """A z = r with z = (x, −λ), as two functions of scalars.
 
         The first gives the entries of A, r, factors of A and whether it is singular; the second z, from the factors and
-        r. With constraints M is augmented by GᵀW G, unless it is constant and regular, or `regular_only` is asked for:
+        r. With constraints M is augmented by GᵀW G, unless it is constant and regular, or `regular_only` is set:
         that says where M is not regular enough.
         """
         n, m, regular = self.layout.size, self._rows(saddle), self._regular(saddle)

@@ -6,7 +6,7 @@ from, a pole that was reached, a mass matrix that has become singular, an escape
 the last state: a kink, a jump, stiff terms.
 
 All but the line and `check` is read off the scene's programs in NumPy, which compiles nothing. Looking for lines stops
-at scenes whose functions are longer than `LONGEST`, and `check` is asked for up to `LARGEST` coordinates: a failure
+at scenes whose functions are longer than `LONGEST`, and `check` is called up to `LARGEST` coordinates: a failure
 must not cost more than a motion does.
 """
 
@@ -33,7 +33,7 @@ from lagjax._system import System
 from lagjax._trajectory import Trajectory
 from lagjax._validate import not_finite
 
-LARGEST = 128  # coordinates up to which `check` is asked: it takes a second there
+LARGEST = 128  # coordinates up to which `check` is called: it takes a second there
 LONGEST = 4000  # equations of a function up to which they are gone through one by one: some 50 µs each
 # A motion that runs away does so on a time scale |q̇|/|q̈| (or |q|/|q̇|) that has shrunk to less than this part of the
 # whole: steps have shrunk to 1e-15 of it when they are given up, and smooth motions are followed to 1e-5 in the budget.
@@ -353,7 +353,7 @@ def _pole(derivation: Derivation, params, ended: Ended) -> Offender | None:
 
 # ---- what else there is ----------------------------------------------------------------------------------------------
 
-# Findings of `check` that explain why steps became short, in the order in which they are told.
+# Findings of `check` that explain why steps became short, in the order in which they are reported.
 _EXPLAIN = (
     "kink", "derivative_not_finite", "discontinuity", "coordinate_singularity", "near_coordinate_singularity",
     "singular_at_velocity", "wrong_derivative", "acceleration_not_finite", "creates_energy", "stiff",

@@ -1,6 +1,6 @@
 """`choose`: which engine integrates a problem. The one place where that is decided; `explain` prints its answer.
 
-Where nothing was asked for, it is machine code where the scene has it, else diffrax with its default solver. A solver,
+Without a choice by the user it is machine code where the scene has it, else diffrax with its default solver. A solver,
 fixed steps, an adjoint or a progress meter ask for diffrax; `solver=lagjax.MachineCode()` insists on machine code.
 """
 
@@ -32,8 +32,8 @@ def asked_for(solver=None, dt=None, adjoint=None, progress: Any = False, rtol=No
         "a progress meter": progress is not False,
     }
     if isinstance(solver, MachineCode):
-        for what, asked in others.items():
-            if asked:
+        for what, given in others.items():
+            if given:
                 raise ValueError(_refused(f"{what} was asked for".replace("steps was", "steps were")))
         return solver
     return Diffrax.of(solver, dt, adjoint, progress) if solver is not None or any(others.values()) else None

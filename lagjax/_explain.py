@@ -2,7 +2,7 @@
 
 Nothing here looks at numbers: a coordinate is cyclic when no operation of the reduced Lagrangian reads it, the energy
 is conserved when none reads the time, no force is given, and the constraints do no work: f does not read the time, and
-a(q, q̇) is zero at rest. Only which constraints depend on which is asked of one state.
+a(q, q̇) is zero at rest. Only the dependence of constraints on each other is decided at one state.
 """
 
 from dataclasses import dataclass, field, replace

@@ -82,7 +82,7 @@ def _at_once(result, *values, **settings):
 
 
 def _compiled(on_host):
-    """One comparison where all is well; the host is asked only where something failed."""
+    """One comparison where all is well; the host is called only where something failed."""
 
     def check(result, *values, **settings):
         def host(*arrays):
@@ -123,7 +123,7 @@ batching.primitive_batchers[check_p] = lambda args, axes, **settings: (
 
 
 def nan_unless(reached, x):
-    """`x` where `reached` holds, else NaN; so are its derivatives, but for the zero cotangent of what nobody uses."""
+    """`x` where `reached` holds, else NaN; so are its derivatives, but for the zero cotangent of an unused value."""
     return nan_unless_p.bind(jnp.broadcast_to(reached, jnp.shape(x)), x)
 
 

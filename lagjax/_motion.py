@@ -130,7 +130,7 @@ class Motion(eqx.Module):
     # ---- all of it ----
 
     def quantities(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> dict[str, Array]:
-        """Everything that is asked of a single state, by name, from one round of differentiation.
+        """All quantities of a single state, by name, from one round of differentiation.
 
         - `lagrangian` (), `momentum` (n,), `mass_matrix` (n, n), `lagrangian_by_q` (n,), `lagrangian_by_t` (),
           `energy_by_q` (n,).

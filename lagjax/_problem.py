@@ -225,7 +225,7 @@ class Solution(NamedTuple):
     - `accepted`, `rejected` (): counts of steps.
     - `event` (): which guards changed sign at the end, Σ 4ᵏ (1 where guard k falls, 2 where it rises); 0 without any.
     - `ticket` (): names the steps that are kept for the transpose of this motion, −1 where they are not.
-    - `idle`: of a batch as a whole, the steps for which a lane stood empty; None for one motion.
+    - `idle`: of a batch as a whole, the steps for which a lane was idle; None for one motion.
     """
 
     path: Float[Any, "*N T states"]

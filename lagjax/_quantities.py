@@ -171,7 +171,8 @@ def quantities(
     return result, recursion
 
 
-# What a Taylor series costs: a step takes about so many orders, and a sum over all lower orders half as many products.
+# What a Taylor series costs: a step takes about this many orders, and a sum over all lower orders half as many
+# products.
 _ORDERS = 20
 
 

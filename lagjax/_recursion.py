@@ -14,7 +14,7 @@ definitions of w:
 A velocity wₖ is eliminated with its definition, which puts Σ c w in its place in the energy: an exact step, after those
 that are defined by wₖ. A coordinate is eliminated after the velocities that it defines; its pivot is the energy of its
 motion where the parts behind it move freely. For a chain of bodies these steps are the articulated-body algorithm
-(Featherstone, *Rigid Body Dynamics Algorithms*, ch. 7), and nobody has told the chain: it is in the trace of L.
+(Featherstone, *Rigid Body Dynamics Algorithms*, ch. 7), and the chain is not declared: it is in the trace of L.
 
 The energy as a function of independent w need not be positive, though M is. A pivot that is lost, or negative, says so
 in the singularity flag, and the elimination of M itself (`_saddle`) takes over.
@@ -294,7 +294,8 @@ class RecursiveElimination:
 class _Elimination:
     """The entries of the energy while unknowns are eliminated, nodes of a graph.
 
-    `sizes` has what the entries on the diagonal would be if nothing had been taken off: lost pivots are told by these.
+    `sizes` has what the entries on the diagonal would be if nothing had been taken off: lost pivots are recognised by
+    these.
     """
 
     def __init__(self, elimination: RecursiveElimination, values: Scalars):

@@ -133,7 +133,7 @@ class SaddleElimination:
     def _eliminated(self, a) -> tuple[Any, Any, Any]:
         """L in the order of the pivots, D⁻¹, and whether a pivot was lost to round-off."""
         n, total = self.size, len(self.order)
-        # What is taken off the diagonal: by coordinates, and by constraints, which must be told apart in a constraint.
+        # What coordinates take off the diagonal, and what constraints do: in a constraint the two must stay separate.
         taken: list[list] = [[[], []] for _ in range(total)]
         inverse: list[Any] = [None] * total
         columns, losses = [], []

@@ -162,7 +162,7 @@ def _spacing(first, last, count: int) -> tuple:
 
 
 def continued(values: np.ndarray, count: int, hold: str) -> np.ndarray:
-    """So many samples (count, …) behind the last of `values` (K, …), at even instants, which change nothing before it.
+    """`count` samples (count, …) behind the last of `values` (K, …), at even instants, which change nothing before it.
 
     For "band" that takes 16 samples at least. It is what a table is filled up with: a parabola for "cubic", the
     reflection for "band", else the last sample.

@@ -1,4 +1,4 @@
-"""The classes of what lagjax returns, for annotations and `isinstance`; nobody has to construct them.
+"""The classes of what lagjax returns, for annotations and `isinstance`; users need not construct them.
 
 Each of them is also found as `lagjax.Trajectory`, `lagjax.Orbit`, ….
 

@@ -108,7 +108,7 @@ class ScalarEquations(Equations):
 def form_of(derivation: Derivation, path: str = "auto") -> "ScalarEquations | ArrayEquations":
     """The form of its equations that suits a scene; `path` "scalar" or "array" insists on one.
 
-    Raises `ValueError` when "scalar" is asked for and impossible, with the reason.
+    Raises `ValueError` where "scalar" is given and impossible, with the reason.
     """
     motion = derivation.motion
     if path == "array":

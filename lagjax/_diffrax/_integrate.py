@@ -1,8 +1,8 @@
 """One integration by diffrax, and its reverse-mode derivative.
 
 The motion is integrated with adaptive steps in a plain loop that keeps nothing. Its derivative is that of the same
-method taken over the *same steps*: when a gradient is asked for, the times of the accepted steps are recorded, and the
-backward pass differentiates a second integration that is told those times. It makes no decisions, so that recomputing
+method taken over the *same steps*: for a gradient the times of the accepted steps are recorded, and the
+backward pass differentiates a second integration with those times. It makes no decisions, so that recomputing
 a part of it (checkpointing) cannot decide otherwise, and it has no rejected steps. The sizes of the steps are not
 differentiated, as everywhere in diffrax.
 
@@ -78,7 +78,7 @@ def _differentiable(moving, method: Method, adjoint, event) -> Solution:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
         if isinstance(adjoint, diffrax.BacksolveAdjoint) or not may_jump(*_at_start(moving)):
             return _solve(moving, method, adjoint, event)
-        # Whether it is differentiated, and by what, nobody knows here: parameters count as fixed.
+        # It is not known here by what this will be differentiated: parameters count as fixed.
         solution, _, crossed = _call(moving, _noting(moving, method, None), adjoint, event)
         y_end, path = (differentiable_where(~crossed, x) for x in (solution.y_end, solution.path))
         return solution._replace(path=path, y_end=y_end)

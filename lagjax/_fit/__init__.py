@@ -321,7 +321,7 @@ def _scenes(system, records, params0, observe, hold: str) -> list[_GivenSystem]:
 
 
 def _require_one_beginning(question: Residuals, starts: int, method: str) -> None:
-    """Raise `ValueError` where many starts, or a descent by gradients, are asked for and cannot be."""
+    """Raise `ValueError` where many starts, or a descent by gradients, are chosen and cannot be."""
     if not len(question.parameters) and (method == "gradient" or starts > 1):
         raise ValueError(
             "No parameter is free, so there is one place to begin: leave `starts` at 1, and `method` at 'auto', which "

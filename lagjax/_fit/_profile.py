@@ -215,7 +215,7 @@ class _Place(NamedTuple):
 
 
 class _Line:
-    """The values of one unknown, of which every one asked for begins from its neighbours."""
+    """The values of one unknown, each of which begins from its neighbours."""
 
     def __init__(self, question: Residuals, u, starts, widths: NoiseScale, known: Information, which: int):
         self.question, self.widths, self.which = question, widths, which

@@ -70,7 +70,7 @@ class Driven(NamedTuple):
 
 
 class Form(NamedTuple):
-    """The structure of an input at one time, and how it goes on between samples, one of `lagjax._samples.HOLDS`."""
+    """The structure of an input at one time, and its interpolation between samples, one of `lagjax._samples.HOLDS`."""
 
     tree: Any
     shapes: tuple[tuple[int, ...], ...]

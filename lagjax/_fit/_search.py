@@ -5,7 +5,7 @@ It holds `Reader`, `fit_weak_form`, `Waterfall`, `searches` and `search_records`
 **Multiple shooting.** Over a long record the sum of squares has many minima: a wrong frequency is out of phase, a
 chaotic motion forgets its start. Over a segment shorter than the motion's own time scale there is one. So the records
 are first cut into short segments, each with a start of its own (multiple shooting), from states that local polynomials
-read off the data. When the parameters fit those, neighbours are joined and the joined segment goes on from the start of
+read off the data. When the parameters fit those, neighbours are joined and the joined segment keeps the start of
 its first part: its end then misses the data by as much as the states of two neighbours disagreed, which the next search
 closes. So the weight of continuity goes from none to all, in as many doublings as it takes to reach whole records. A
 level needs a rough answer only: the parameters must be good enough to predict a segment twice as long.
@@ -22,7 +22,7 @@ of a window, integration by parts takes the time derivative off the momentum:
 
 which asks for q and q̇ of the data and for no second derivative of them. It is linear where the parameters are, and has
 one minimum where long motions have many. It is not scaled like the noise, and biased by that of q̇: a start, from which
-the search then goes on. Each coordinate is divided by the size of its own ∫ φ̇ p, or else all masses would shrink to
+the search then continues. Each coordinate is divided by the size of its own ∫ φ̇ p, or else all masses would shrink to
 nothing together.
 Source: Messenger & Bortz, *Weak SINDy*, J. Comput. Phys. 443 (2021) 110525; Bortz, Messenger & Dukic, Bull. Math.
 Biol. 85 (2023) 110, for parameters.

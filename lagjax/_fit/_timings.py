@@ -207,7 +207,7 @@ class Clock:
 
 
 def clock_of(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
-    """The clock of a scene. Raises `ValueError` where functions are asked of a hybrid one, or transitions of others."""
+    """The clock of a scene. Raises `ValueError` for functions of a hybrid one, and for transitions of others."""
     is_of_transitions = isinstance(_sections(timings.section)[1][0], Transition)
     if isinstance(scene, Hybrid):
         if not is_of_transitions:

@@ -12,7 +12,7 @@ reported. A signal that never changes cannot be undone, and is named as it is.
 signal itself, about its mean: what they hold beyond white noise must be a small share of that. Noise alone may be as
 large as it is.
 
-At the end of a search every number is asked where it would go on a straight line: x + δx, the full step of Gauss and
+At the end of a search every number is moved along a straight line: x + δx, the full step of Gauss and
 Newton without bounds. A positive number that is smaller than its standard error is one that the data do not need; one
 whose step leads beyond a bound by more than two standard errors is held there by the bound alone.
 

@@ -17,7 +17,7 @@ times √(2n) `SLACK` for solvers that measure errors in root mean square, and r
 all, may grow with the motion: there is no bound for them, only a second trajectory to compare with.
 
 Between outputs the power is integrated along the polynomial of degree five that has q, q̇ and q̈ of both ends. That is
-of order six; how far it may be off is told by the cubic through q and q̇, of order four, and the trapezoidal rule.
+of order six; its error is estimated by the cubic through q and q̇, of order four, and the trapezoidal rule.
 Where the balance is off by more than a hundredth of the energy, and the work may be, the verdict says that it cannot
 be told. Source:
 Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.4 (error per step), §II.6 (Hermite

@@ -93,7 +93,7 @@ def _count(
 ) -> None:
     """Follow some motions, and add what they met `into` the counts at their places."""
     store, borders = StepStore(), flow.borders
-    assert borders is not None  # without a series there are none, and nobody asks
+    assert borders is not None  # without a series there are none, and none are counted
     again = flow.follow(*motions, tolerances, store, 2 * int(steps.sum()) + len(places))
     guards, pieces = borders.guards, len(borders.switches)
     # Numbers beyond those of guards are entries of tables that the time comes to, which are no borders.

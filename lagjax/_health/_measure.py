@@ -344,7 +344,7 @@ def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, be
     counted = conserves[xp.maximum(until(path.mode), 0)] & measurable[..., None]
     rise = values[..., 1:T, :] - start
     excused = rise - xp.where(counted, until(values) - start - expected, 0.0)
-    # Where the piece goes on to the next output this is what is expected, without the rounding of three differences.
+    # Where the piece lasts to the next output this is what is expected, without the rounding of three differences.
     excused = xp.where(counted & (ends < T)[..., None], expected, excused)
     before = xp.concatenate([xp.zeros_like(values[..., :1, :]), xp.cumsum(excused, axis=axis)], axis=axis)
     return xp.abs(values[..., :T, :] - values[..., :1, :] - before), work_error

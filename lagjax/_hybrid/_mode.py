@@ -49,7 +49,7 @@ class Transition(eqx.Module):
     - `guard`: a real function; it may also ask, by name, for `t`, `params` and `multipliers`, the last as the
       constraints of the mode return them.
     - `direction`: −1 only where the guard falls, +1 only where it rises, 0 for both. A guard that is zero to rounding
-      where a motion begins, and goes on in that direction, has been met: the transition happens at once, that of a
+      where a motion begins, and continues in that direction, has been met: the transition happens at once, that of a
       ball on the floor with a velocity into it. One that goes the other way, or a guard of both directions, has to
       leave zero first. Give contacts a direction.
     - `reset(q, qdot)` → (q, qdot): the state after the transition; it may also ask for `t` and `params`. None keeps it.

@@ -92,7 +92,7 @@ class Ending(NamedTuple):
     t: jax.Array
     y: jax.Array  # (2n,)
     mode: jax.Array  # its place in `RoundPlan.names`
-    going: jax.Array  # whether it goes on
+    going: jax.Array  # true while it continues
     result: jax.Array  # the integer of a `lagjax.RESULTS`
     path: jax.Array  # (T, 2n), NaN where not reached
     modes: jax.Array  # (T,), −1 where not reached

@@ -1,7 +1,7 @@
 """A run of machine code as XLA calls it: by a handler in machine code, and by Python for all that is rare.
 
     members that one thread works on ─► handler ─► all ended well? ─► yes: results, without Python
-                                                        └─ no: `Flow.run` goes on in a callback
+                                                        └─ no: `Flow.run` continues in a callback
     more members                     ─► `Flow.run` in a callback
     derivatives of a short run       ─► handlers, which run it once more; of others ─► `_derivatives` in a callback
 
@@ -60,7 +60,7 @@ def run_by_handler(
     """The run of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), N not too many for one thread.
 
     The handler goes this many `rounds`, by default those of a slice of time.
-    `host(ts, y0, params, *begun)` goes on with what the handler leaves undone (`_native.Begun`); its results, of these
+    `host(ts, y0, params, *begun)` continues what the handler leaves undone (`_native.Begun`); its results, of these
     `shapes`, are those of the whole.
     """
     _register()

@@ -62,7 +62,7 @@ def jvp(flow: Flow, ts, y0, params, solution, dy0, dparams, tolerances: Toleranc
 def _groups_of_directions(members: int, m: int) -> int:
     """Into how many rows the m directions of each member go.
 
-    Of one member alone, one row a thread. Of more members than lanes, two where fewer lanes then stand empty: twenty
+    Of one member alone, one row a thread. Of more members than lanes, two where fewer lanes are then idle: twenty
     members fill three vectors of eight badly, forty rows fill five. A row costs its directions and the motion itself.
     """
     lanes = _native.lanes()

@@ -191,7 +191,7 @@ class Flow:
 
         With a `store` the steps are kept there, up to `room` of all members: by default as many as may be kept. Results
         tell what stopped a member, and not only that its steps became too small, or too many. A run that a handler has
-        `begun` is gone on with.
+        `begun` is continued.
         """
         solution = self.follow(ts, y0, params, tolerances, store, room, begun)
         if (solution.result != SUCCESSFUL).any():

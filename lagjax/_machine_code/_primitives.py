@@ -111,7 +111,7 @@ def _vjp_on_host(ts, y0, params, path, result, accepted, ticket, path_ct, end_ct
 # ---- primitives ------------------------------------------------------------------------------------------------------
 
 run_p, jvp_p, vjp_p, curvature_p = (Primitive(f"lagjax_{name}") for name in ("run", "jvp", "vjp", "curvature"))
-# Of run: a `Solution` but for the last field, which is that of a batch. jvp and vjp are told about a run its ts, y0,
+# Of run: a `Solution` but for the last field, which is that of a batch. jvp and vjp take of a run its ts, y0,
 # params, path, result, accepted, ticket.
 _OUTPUTS, _GIVEN = len(Solution._fields) - 1, 7
 
@@ -583,7 +583,7 @@ def _vjp_by_tangents(ts, y0, params, *given, flow, tolerances):
     along = basis[..., : flow.states], basis[..., flow.states :]
     path, end = _jvp_for_gpus(ts, y0, params, *run, *along, flow=flow, tolerances=tolerances)
 
-    def weighted(cotangent, values):  # what nobody asks about does not matter, even where it is not finite
+    def weighted(cotangent, values):  # values without a cotangent do not matter, even where they are not finite
         return jnp.where(cotangent != 0, cotangent * values, 0.0)
 
     total = jnp.sum(weighted(path_ct[..., :, None, :, :], path[..., None, :, :, :]), axis=(-1, -2))

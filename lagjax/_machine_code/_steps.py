@@ -15,7 +15,7 @@ import numpy as np
 if TYPE_CHECKING:
     from lagjax._native import Kernel
 
-LARGEST_KEPT = 2**26  # numbers of steps that are kept for a derivative that is asked for next: half a GiB
+LARGEST_KEPT = 2**26  # numbers of steps that are kept for a derivative that may follow: half a GiB
 
 
 class Steps(NamedTuple):

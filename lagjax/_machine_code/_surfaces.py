@@ -49,9 +49,9 @@ class Surfaces(NamedTuple):
     directions: tuple[int, ...]
 
     def guards(self, notes: bool = False, remembers: bool = False) -> Guards:
-        """They as machine code watches them: a change ends the motion or, with `notes`, is written down.
+        """The surfaces as guards of machine code: a change ends the motion or, with `notes`, is written down.
 
-        A motion that `remembers` is told the side of each surface from which it comes (see `Guards`).
+        A motion that `remembers` is given the side of each surface from which it comes (see `Guards`).
         """
         return Guards(self.values, self.complete, self.directions, notes, remembers)
 

@@ -305,7 +305,7 @@ class Adjoint:
     def _transpose_recursion(self) -> Code:
         """`(k)`: from the cotangents of order k + 1, and of the rows, to those of order k and of the sums.
 
-        Those of the sums take the place of the sums, which nobody reads again: all of it fits into the first cache.
+        Those of the sums take the place of the sums, which are not read again: all of it fits into the first cache.
         """
         frame = self.motion.function("back_recursion", INTEGER)
         code, (k,), n, series, form = frame.code, frame.arguments, self.n, self.series, self.motion.form

@@ -227,7 +227,7 @@ class BorderControl:
         """The first root of guard g, whose polynomial is in `poly`; `beyond` it is that piece."""
         code, leads = frame.code, self._leads(frame, degree)
         self._divide(frame, g, degree)
-        # A border that it touches is not left, or gone back over, by less than what nobody asks for.
+        # A move of less than a part of atol does not count as leaving a border that the motion touches.
         nothing = self.roots.size(frame, degree) <= NEGLIGIBLE * code.lanes_of(absolute_tolerance(frame))
         idle = idle | (nothing & (frame["touch", g] > Touch.NONE) & ~undecided)
         self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame))
@@ -267,7 +267,7 @@ class BorderControl:
         return ((knot - frame["t"]) - frame["t_low"]) * forward, inside
 
     def _look_at_clock(self, frame: Frame, c: int, j: int, h: Value) -> None:
-        """The step ends at the next entry of a table that the time is on: nobody has to look for that."""
+        """The step ends at the next entry of a table that the time is on, which is known."""
         code = frame.code
         left, inside = self._until_next_knot(frame, j)
         left = code.maximum(left, frame.constant(0.0))
@@ -564,7 +564,7 @@ class BorderControl:
         """The pieces beyond the borders, which touch them; a piece that touches one is not decided anew.
 
         A motion that would go back over the border at once is pushed onto it from both sides: it slides. So does one
-        that has come back in no time that can be told: it bounces off the border, less and less, and comes to rest.
+        that has come back in no measurable time: it bounces off the border, less and less, and comes to rest.
         """
         code, again = frame.code, frame["stepped"] <= 0.0
         no_time = ~again & (code.intrinsic("fabs", frame["cut"]) <= NO_TIME * frame["smallest"])

@@ -64,34 +64,34 @@ LARGEST_ANGLE = 2.0**20
 # 1.4 times and as long. With twice as many operations LLVM takes 3 to 4 s. From 8000 on tables run faster, but for
 # dense mechanisms, whose numbers fit into registers: an arm of six joints, 5200 operations, takes 1.6 times as long.
 LARGEST_LINE = 1500
-# A coordinate counts as so many operations there: what control, output and sums do with it is written out too. Measured
-# on rows of masses with springs: LLVM takes 0.8 s for a straight line with 32 of them, 1.8 s with 60 and 8 s with 200,
-# and 0.3 s for tables, which run 1.1 times as long with 16, 1.0 to 1.2 with 32, 0.8 to 1.0 with 60. Doubled, it would
-# put 26 masses into tables in place of 44. A transpose has no more of it than a motion: for a chain of 8 and 32 masses
-# LLVM takes 0.3 s longer for straight lines, and tables run 1.8 and 1.3 times as long.
+# A coordinate counts as this many operations there: what control, output and sums do with it is written out too.
+# Measured on rows of masses with springs: LLVM takes 0.8 s for a straight line with 32 of them, 1.8 s with 60 and 8 s
+# with 200, and 0.3 s for tables, which run 1.1 times as long with 16, 1.0 to 1.2 with 32, 0.8 to 1.0 with 60. Doubled,
+# it would put 26 masses into tables in place of 44. A transpose has no more of it than a motion: for a chain of 8 and
+# 32 masses LLVM takes 0.3 s longer for straight lines, and tables run 1.8 and 1.3 times as long.
 OPERATIONS_PER_COORDINATE = 30
 # How many alike operations are written out for one step along a table. Measured: eight as well run as long, two at most
 # 7 % longer.
 TIMES = 4, 2, 1
-# Alike operations that are taken together, of so many next ones: what they have made is to be read while it is in the
-# first two caches. Measured: either, halved or doubled, changes less than 5 %.
+# `MOST` alike operations are taken together, of the next `WINDOW` ones: what they have made is to be read while it is
+# in the first two caches. Measured: either, halved or doubled, changes less than 5 %.
 MOST, WINDOW = 16, 4096
-# Operations are joined to one that reads so many numbers, where the same two come together so often; in so many rounds
-# of pairs of pairs. Measured: with 5 numbers chains run a fifth longer, with 20 as long; with half of `OFTEN` the code
-# is twice as long and runs no faster.
+# Operations are joined to one that reads at most `LARGEST_TREE` numbers, where the same two come together `OFTEN`; in
+# at most `ROUNDS` rounds of pairs of pairs. Measured: with 5 numbers chains run a fifth longer, with 20 as long; with
+# half of `OFTEN` the code is twice as long and runs no faster.
 LARGEST_TREE, OFTEN, ROUNDS = 10, 24, 12
 
-# For one member alone. Alike operations whose operands lie side by side are a run of their own from so many on; a
-# combination of how operands lie has code of its own where it is that of so many vectors, else its numbers lie
-# anywhere; products are sorted into runs of so many.
+# For one member alone. Alike operations whose operands lie side by side are a run of their own from `LEAST_RUN` on; a
+# combination of how operands lie has code of its own where it is that of `OFTEN_PACKED` vectors, else its numbers
+# lie anywhere; products are sorted into runs of `LONG_RUN`.
 LEAST_RUN, OFTEN_PACKED, LONG_RUN = 5, 8, 8
-# Alike operations stand in the lanes of one member where they fill so many of those of the order recursion. Measured
+# Alike operations stand in the lanes of one member where they fill at least this share in the order recursion. Measured
 # with eight lanes: chains of pendulums fill a quarter, a beam 0.3, an arm of six joints 0.46, and run 0.87 to 1.1 times
 # as fast as without lanes; 20 charges on a sphere and 12 bodies fill 0.9 and run twice as fast, 50 bodies five times.
 LEAST_FILLED = 0.5
 # Members of a large scene whose alike operations fill the lanes are integrated one after the other where the series of
-# as many members as there are lanes take so many bytes: with all that is read beside them they leave a second cache of
-# 2 MiB. Measured there, lanes for members take 0.6 times as long at 1.7 MB (20 bodies), 0.85 times at 2.0 MB (20
+# as many members as there are lanes take this many bytes: with all that is read beside them they leave a second cache
+# of 2 MiB. Measured there, lanes for members take 0.6 times as long at 1.7 MB (20 bodies), 0.85 times at 2.0 MB (20
 # charges on a sphere), 1.3 times at 2.5 MB (24 bodies), 1.8 times at 3.9 MB (30), 2.7 times at 11 MB (50 bodies).
 LARGEST_SHARED = 2**21
 
@@ -112,7 +112,7 @@ SAFETY = 0.9
 # narrow feature on the way. Each costs one acceleration.
 CHECKS = (0.5, 1.0)
 # A series that ends (free flight) allows any step, and a step that is too long sees nothing of what lies inside it. The
-# first step is at most this part of the whole time, every other one so many times the one before. Measured: with a
+# first step is at most this part of the whole time, every other one `GROWTH` times the one before. Measured: with a
 # growth of 10 a particle flies past a bump of the force in a tenth fewer steps with the same error, with 2.5 in a
 # quarter more. A doubled first step changes the steps about the first border by a tenth.
 FIRST_STEP, GROWTH = 1 / 16, 5.0
@@ -148,8 +148,9 @@ NEGLIGIBLE = 1e-3
 # A border that is reached within this part of the smallest step from another one is bounced off without end: the
 # motion rests on it. What is left of its velocity is as small as that.
 NO_TIME = 0.25
-# A switching number is known along a step where its last terms are so many tolerances of its size, at most. They are
-# less than one in a step that suits the state, unless the number is another one than that: there the step is halved.
+# A switching number is known along a step where its last terms are at most `SWITCH_TOLERANCES` tolerances of its size.
+# They are less than one in a step that suits the state, unless the number is another one than that: there the step is
+# halved.
 SWITCH_TOLERANCES, MOST_HALVINGS = 16.0, 64
 # exp(u) below u = −`FAINT` is 2e-35: nothing, whatever it is multiplied with. Above it, u may rise in one step by
 # `RISE` parts of the order p: then exp(u) is the sum of terms Rᵏ/k! that fall from the last one on, as step control

@@ -3,8 +3,8 @@
     run again, with the steps written down ─► in the order of the members ─► forward along directions, or back
 
 A motion that takes less time than Python does is run once more rather than have its steps travel through a program of
-JAX. Nothing is gone on with here: where the rounds of the plan are not enough, or a member does not reach its end, the
-handler says that it is not done, and who asked for it does otherwise.
+JAX. Nothing is continued here: where the rounds of the plan are not enough, or a member does not reach its end, the
+handler says that it is not done, and its caller takes another way.
 """
 
 import ctypes
@@ -21,7 +21,7 @@ from lagjax._native._handler import at, call, handler_function, job_of
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module, lanes
 from lagjax._native._output import RECORDED
 
-_COUNTERS = 4  # next member of both sweeps, next row, lanes that stood empty
+_COUNTERS = 4  # next member of both sweeps, next row, idle lanes
 _POINTERS = ("begin", "run", "begin_sweep", "run_sweep")
 _SIZES = ("memory", "lane_integers", "memory_of_sweep", "lane_integers_of_sweep")
 _NUMBERS = ("states", "numbers", "order", "max_steps", "rounds", "room", "directions", "others")

@@ -2,7 +2,7 @@
 
     begin_sides   which side of every surface a motion begins on
     look          for every guard the roots of its polynomial, one after the other (`_roots`), each to the last digit of
-                  the guard itself; those in its direction end the motion, or are written down and the motion goes on
+                  the guard itself; those in its direction end the motion, or are written down and the motion continues
 
 A guard changes sign, too, where it jumps, at a border of its own: that is seen where the next step begins. A step ends
 where the series of a guard does not say what it does beyond. Where a guard has no series at all, as the square root of

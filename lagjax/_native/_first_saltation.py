@@ -5,7 +5,7 @@ the acceleration is a⁻, and from then on a⁺, so that
 
     δv⁺ = δv⁻ + (a⁻ − a⁺) δt          λ⁻ = λ⁺ − ∇u (λᵥ · (a⁻ − a⁺)) / u̇
 
-while δq goes on as it is. Where a is continuous nothing happens. Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math.
+while δq stays as it is. Where a is continuous nothing happens. Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math.
 11 (1958) 225; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204, §III.
 
 A motion with tangents, of which tangents are taken again, is a motion of its own: where its own tangents jump too,

@@ -120,7 +120,7 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class Vectors:
-    """So many vectors in a row, as a list of them would be: `read(i)` gives one, and `write(i, x)` sets it.
+    """A number of vectors in a row, as a list of them would be: `read(i)` gives one, and `write(i, x)` sets it.
 
     `place(i)` tells where vector i lies, counted in doubles from the beginning of the thread's memory, if it is known;
     or where it would lie if `shift` were zero.
@@ -252,7 +252,7 @@ class Frame:
         return self.next("next_member")
 
     def next(self, name: str) -> Value:
-        """The value of a counter that all threads share, which goes on by one."""
+        """The value of a counter that all threads share, which grows by one."""
         counter = self.job(name)
         return Value(self.code, self.code.builder.atomic_rmw("add", counter.it, ir.Constant(INTEGER, 1), "monotonic"))
 

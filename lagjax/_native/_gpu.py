@@ -53,7 +53,7 @@ _lock = threading.Lock()
 
 
 class GpuPrograms:
-    """The programs for GPUs of a kernel, made when they are asked for.
+    """The programs for GPUs of a kernel, made on first use.
 
     `motion` and `adjoint` write down the modules of one lane. The tolerance chooses the order of the series. All raise
     `Unlowerable`, whose text says why, where a GPU cannot run the program.

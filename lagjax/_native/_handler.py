@@ -94,7 +94,7 @@ class Rest(NamedTuple):
 
     As an array of doubles, `size` of them, it begins with the memory, after as many doubles as are left before the next
     boundary of a cache line. At the end stand integers of 64 bits: those of the lanes, how many doubles were left, the
-    steps that lanes stood empty for, the next member, and 1 if there is more to do.
+    idle steps of lanes, the next member, and 1 if there is more to do.
     """
 
     memory: np.ndarray
@@ -123,7 +123,7 @@ class Rest(NamedTuple):
 
     @staticmethod
     def idle_lanes(array: np.ndarray) -> int:
-        """The steps that lanes stood empty for, from what a handler wrote."""
+        """The idle steps of lanes, from what a handler wrote."""
         return int(array[-3:-2].view(np.int64)[0])
 
 

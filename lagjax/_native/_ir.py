@@ -76,7 +76,7 @@ def lanes() -> int:
 
 
 # Loops over lanes and orders are written out by hand and every operation is shared already, so that little is left to
-# do: variables become registers, and what nobody uses goes. More gains nothing measurable in how a kernel runs, and
+# do: variables become registers, and unused results go. More gains nothing measurable in how a kernel runs, and
 # `new_gvn` and `simplify_cfg` end the process by failed assertions on straight lines of some thousand operations.
 # LLVM's default pipeline and `instruction_combine` lose some memory for every module in llvmlite.
 _PASSES = ("sroa", "dead_code_elimination")

@@ -44,7 +44,7 @@ from lagjax._program._operations import LOOK_UPS
 from lagjax._program._series import Recurrent, Series, StraightLine, series
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
-# It decides how long the first slice is, which nobody needs to know well.
+# It decides the length of the first slice, for which a rough value is enough.
 _SECONDS_AN_OPERATION = 1e-7
 # A derivative runs a motion again that takes a thirtieth of a slice, a millisecond at most: less than Python with kept
 # steps. Where fewer rounds than these are in that, hardly a motion ends in time, and would be run twice for nothing.
@@ -57,7 +57,7 @@ class Outcome(NamedTuple):
     - `path` (N, T, 2n): the states (q, q̇) at the output times, NaN where a member did not come.
     - `y_end` (N, 2n), `t_end` (N,): where each member ended; `code` (N,): how.
     - `steps`, `rejected` (N,): how many steps it took, and how many were too long.
-    - `idle`: how many steps lanes stood empty for.
+    - `idle`: the number of steps for which lanes were idle.
     - `table` (rows, 2n + 4): a row for every step that was written down, member by member: its time, its size, the
       number of the member, that of the step, its first state; None without. For a piecewise program the pieces follow,
       and the number of the border that the step ends at.
@@ -147,7 +147,7 @@ class Kernel:
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
     def for_members(self, members: int) -> "Kernel":
-        """The kernel for this many members: for one alone without lanes, which would be computed for nobody."""
+        """The kernel for this many members: for one alone without lanes, which would be idle."""
         return self._alone if members == 1 < self.width else self
 
     def to_run(self, members: int) -> "Kernel":
@@ -222,8 +222,8 @@ class Kernel:
     ) -> Outcome:
         """The motions from the states `y0` (N, 2n), all arrays of float64.
 
-        `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. So many
-        steps as there is `room` for are written down, for derivatives. What a handler has `begun` is gone on with.
+        `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. As many
+        steps as there is `room` for are written down, for derivatives. What a handler has `begun` is continued.
         Where guards are noted, with this much room for each, `path` holds the notes for one guard after the other: a
         time, and the state then, (N, guards (room + 1), 1 + 2n); behind them how many there would have been.
         """
@@ -339,7 +339,7 @@ class Kernel:
         return kernel._tangents(False), min(kernel.threads(members * directions), -(-members // kernel.width))
 
     def _tangents_of(self, side_by_side: bool) -> "_Compiled":
-        """The kernel of tangents, whose directions stand side by side or members do; compiled when first asked for."""
+        """The kernel of tangents, whose directions stand side by side or members do; compiled on first use."""
         with without_collections():
             tangent = Tangent(*self._derivative_parts, width=1 if side_by_side else self.width, lanes=self.width)
         forget_joined()
@@ -391,7 +391,7 @@ class Kernel:
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
-        """The transpose, compiled when it is first asked for."""
+        """The transpose, compiled on first use."""
         adjoint = self._adjoint(self.width)
         return _Compiled(adjoint.motion, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
 
@@ -435,7 +435,7 @@ class _Compiled:
     def __call__(
         self, arrays: Mapping[str, np.ndarray | None], numbers: Mapping[str, float], threads: int, rest=None
     ) -> int:
-        """Work on the arrays, from the beginning or from what is left to do; how many steps lanes stood empty for."""
+        """Work on the arrays, from the beginning or on the `rest` of a run; returns the number of idle steps."""
         addresses = {name: None if array is None else array.ctypes.data for name, array in arrays.items()}
         job = self._job(**addresses, **numbers)
 
@@ -555,7 +555,7 @@ def require_recurrences(program: Recurrent, size: int) -> None:
         recurrences(program, size)
 
 
-@functools.lru_cache(maxsize=16)  # asked for when it is decided what runs, and when that is compiled
+@functools.lru_cache(maxsize=16)  # used where the engine is chosen, and where it is compiled
 def recurrences(program: Recurrent, size: int) -> Series:
     """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
     require_lanes(program.line)

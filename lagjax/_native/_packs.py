@@ -27,7 +27,7 @@ class Stage(NamedTuple):
     """Alike operations, none of which waits for another.
 
     `kind` is their number, `operands` (m, N) the nodes that they read, `results` (r, N) those that they make (-1:
-    nobody reads it). The results are needed until stage `last`.
+    it is not read). The results are needed until stage `last`.
     """
 
     kind: int
@@ -68,11 +68,11 @@ def stages(operations: Sequence[ScheduledOperation], nodes: int, kept: Sequence[
         last[operands.ravel()] = s
         arrays.append((group[0].kind, operands, results))
     last[list(kept)] = len(ordered)
-    last[-1] = -1  # a result that nobody reads
+    last[-1] = -1  # an unused result
     return [Stage(kind, operands, results, int(last[results].max())) for kind, operands, results in arrays]
 
 
-@functools.lru_cache(maxsize=4)  # asked for when it is decided how a motion runs, and when it is compiled
+@functools.lru_cache(maxsize=4)  # used where the form of a motion is chosen, and where it is compiled
 def program_stages(same: Same) -> tuple[list[OperationKind], list[Stage]]:
     """A program in stages, and the kinds of their operations."""
     kinds, operations = joined(same.line)

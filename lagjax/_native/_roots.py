@@ -6,7 +6,7 @@ quadratically; past a touch, where P is zero to rounding and does not fall for c
 could do unseen.
 
 What a series leaves out is not rounding, but it is known: about as much as its last terms, times the power that follows
-them. Where P comes so near to zero without going through, nobody knows from here whether it does: the search ends
+them. Where P comes so near to zero without going through, that cannot be decided from here: the search ends
 there, and a step that ends there, too, has a series that knows.
 """
 

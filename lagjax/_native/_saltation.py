@@ -223,12 +223,12 @@ class Saltation:
 
 
 def _some(numbers: Numbers, first: int, count: int) -> Numbers:
-    """So many of some numbers, from one on."""
+    """A slice of numbers."""
     if isinstance(numbers, Vectors):
         return Vectors(count, lambda i: numbers[i + first])
     return numbers[first : first + count]
 
 
 def _field(frame: Frame, name: str, count: int, first: int = 0) -> Vectors:
-    """So many vectors of a field from one on."""
+    """A slice of the vectors of a field."""
     return frame.vectors(name, count, lambda i: (i + first,))

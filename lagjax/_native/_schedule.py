@@ -3,7 +3,7 @@
     operations   what the outputs need; sine and cosine of one angle are one operation with two results
     joined       operations that often come together are one: a product and the sum that reads it, and then larger trees
     groups       an order that puts alike operations, none of which waits for another, next to each other
-    slots        where every result lies, from when it is made until nobody reads it any more
+    slots        where every result lies, from its making to its last use
 
 Nothing here knows LLVM.
 """
@@ -44,7 +44,7 @@ class OperationKind(NamedTuple):
 
 
 class ScheduledOperation(NamedTuple):
-    """An operation: its kind, as a number, the nodes that it reads, and those that it makes (-1: nobody reads it)."""
+    """An operation: its kind, as a number, the nodes that it reads, and those that it makes (-1: unused)."""
 
     kind: int
     operands: tuple[int, ...]
@@ -105,7 +105,7 @@ def joined(line: StraightLine) -> tuple[list[OperationKind], list[ScheduledOpera
     return kinds.all, operations
 
 
-@functools.lru_cache(maxsize=4)  # asked for when it is decided how a motion runs, and when it is compiled
+@functools.lru_cache(maxsize=4)  # used where the form of a motion is chosen, and where it is compiled
 def _joined_of(same: Same) -> tuple["_Kinds", list[ScheduledOperation]]:
     uses, kinds = count_uses(same.line.nodes, same.line.outputs), _Kinds()
     return kinds, _joined(_operations(same.line, uses, kinds), uses, kinds)

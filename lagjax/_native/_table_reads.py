@@ -3,7 +3,7 @@
     take      an entry at a whole number, which is clipped to the table: no lane reads what is not there
     locate    the piece of an increasing table, by bisection; needed where a motion begins, not along it
 
-Tables that consist of numbers of the program lie in one array, whose address the module is told once it is compiled:
+Tables that consist of numbers of the program lie in one array, whose address the module is given once it is compiled:
 they are part of no text that LLVM reads.
 """
 
@@ -34,7 +34,7 @@ class LookUps:
         return np.concatenate([np.frombuffer(data) for data in self._begins]) if self._begins else None
 
     def finish(self) -> None:
-        """After all programs of the module: a function that is told where the tables of numbers are."""
+        """After all programs of the module: a function that takes the address of the tables of numbers."""
         if self._begins:
             code = Code(self.module, SET_NUMBERS, [POINTER], 1, public=True)
             code.builder.store(code.arguments[0].it, self._address_of_numbers, align=8)

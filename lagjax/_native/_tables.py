@@ -42,7 +42,7 @@ class Tables:
         self._execute: Frame = (executing or function)("execute", POINTER, INTEGER)
         self._prepare: Frame = function("prepare")
         self._module, self._layout = self._prepare.code.module, self._prepare.layout
-        self._nowhere = self._layout.place(self._field(1), 0)  # for results that nobody reads
+        self._nowhere = self._layout.place(self._field(1), 0)  # for unused results
 
     # ---- what a kernel is written with ----
 

@@ -1,7 +1,7 @@
 """A motion as a power series: the functions that make its coefficients, and what is read off them along a step.
 
     sums            Σ' aⱼ bₖ₋ⱼ for every Cauchy product, at order k
-    coefficients    the series of q and q̇ to the order asked for: zeroth order, then one order after the other
+    coefficients    the series of q and q̇ to an order: the zeroth, then one after the other
 
 `_program._series` derives what they compute. All other parts of a kernel are built on a `TaylorSeries`.
 """

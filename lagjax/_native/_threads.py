@@ -2,7 +2,7 @@
 
 Python looks at signals, and raises `KeyboardInterrupt`, on the main thread and between its own instructions only. Code
 that ran for a minute would keep it waiting for a minute. So it runs in slices of a few hundredths of a second, on the
-thread that asked for it as on the others; whoever raises between two slices ends the work of all.
+calling thread as on the others; whoever raises between two slices ends the work of all.
 
 Threads are started for each run, which costs less than a member does, and end with it: there is nothing that a fork
 could lose or that the end of the interpreter would wait for.
@@ -41,7 +41,7 @@ def run_on_threads(work: Callable[[Callable[[], bool]], int], count: int) -> int
     Raises what one of them raises, after all have ended: `stopped()` tells the others. All that the work needs must
     hang on `work`, so that no thread outlives it.
     """
-    if count == 1:  # nobody else is to be told, or waited for
+    if count == 1:  # there is no other thread to stop, or to wait for
         return work(getattr(_outer, "stopped", lambda: False))
     stop, ended, signal = threading.Event(), [], queue.SimpleQueue()
 
@@ -81,7 +81,7 @@ def map_in_threads(places: Sequence, work: Callable[[Any], Any], count: int) -> 
     The first is done before the others begin: it compiles what all of them need.
     """
     results = [work(place) for place in places[:1]] + [None] * (len(places) - 1)
-    left = iter(range(1, len(places)))  # one thread at a time is told the next
+    left = iter(range(1, len(places)))  # one thread at a time takes the next
 
     def go(stopped) -> int:
         for k in left:

@@ -22,7 +22,7 @@ A `Program` is called with one JAX scalar per input. Each may be an array of lan
 inputs broadcast, and every output, constants too, has the shape they broadcast to. The precision is that of the inputs.
 
 Derivatives of a program are those of the function it came from, custom rules included: they are traced from that
-function and lowered in turn, when they are first asked for.
+function and lowered in turn, on first use.
 """
 
 import functools

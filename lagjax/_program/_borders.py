@@ -32,7 +32,7 @@ from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._sliding import MOST_SLIDING, Slide, dot, with_sliding
 
-# The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders nobody has to look for.
+# The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders are known.
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK = range(6)
 LARGEST_WITH_ROUNDING = 500  # operations of numbers that are watched, and whose rounding is: three times as many
 # What a function is flat like: exp(u) below, exp(−|u|) on both sides, exp(−u²), or zero up to a border; and in which
@@ -56,7 +56,7 @@ class Guard(NamedTuple):
 
     Where both sides push onto the border of `piece`, piece number `slide` becomes 1: the motion slides along it, with
     α of the acceleration on the upper side and 1 − α of that on the lower one. α is the switching number of `slide`;
-    beyond its guards the motion goes on with the guard `on` at the piece `goes_on`. These are −1 where there is none.
+    beyond its guards the motion continues with the guard `on` at the piece `goes_on`. These are −1 where there is none.
     `order` is that of the rate of u that is zero there (`_sliding.Slide`). Where `of_table` is 1 the level is
     the entry of that number of the table of the piece.
     """
@@ -134,7 +134,7 @@ class Borders(NamedTuple):
 
     @property
     def shaken(self) -> tuple[int, ...]:
-        """The pieces whose switching numbers may jump as a clock goes on, or another piece changes."""
+        """The pieces whose switching numbers may jump at the next entry of a clock, or where another piece changes."""
         first = self.program.size - len(self.switches)
         pieces = {("input", (), first + j) for j, kind in enumerate(self.kinds) if kind != SLIDE}
         nodes, shaken = self.program.line.nodes, []
@@ -163,7 +163,7 @@ class Borders(NamedTuple):
 def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0) -> Borders | None:
     """The borders of a program of q, q̇, t and parameters whose first `size` outputs are q̈; None where it is smooth.
 
-    Along borders that depend on velocities the motion may slide (`slides`; see `_sliding`). So many of the last outputs
+    Along borders that depend on velocities the motion may slide (`slides`; see `_sliding`). As many of the last outputs
     are `watched` along the motion: what they decide on has borders too.
     """
     if _PIECEWISE.union(_FEATURES).isdisjoint(op for op, *_ in program.line.nodes):
@@ -445,7 +445,7 @@ class _Rewriting:
         return graph.apply("add", dot(graph, slopes[:n], velocities), slopes[2 * n])
 
     def _decide(self, count: int, slides: Sequence[Slide]) -> StraightLine:
-        """From the inputs, `count` pieces, and a flag for each that is to stay, to the pieces; a slide goes on.
+        """From the inputs, `count` pieces, and a flag for each that is to stay, to the pieces; a slide continues.
 
         A motion that begins on a border slides along it, and leaves it at once where it may; on one that depends on
         positions it has to be at rest. To begin with all of several borders takes few turns until it is known which

@@ -59,7 +59,7 @@ def _cut(x, part: slice):
 def _prepared(line, columns, groups: Groups | None = None) -> tuple[list[np.ndarray], np.dtype, int]:
     """The columns as arrays of their kinds, the precision of floats, and the number of states."""
     of_input = _kinds_of_inputs(line) if groups is None else groups.kinds_of_inputs()
-    read = {i: np.asarray(columns[i]) for i in of_input}  # what nobody reads is passed on as it is
+    read = {i: np.asarray(columns[i]) for i in of_input}  # unused columns are passed on as they are
     floats = [read[i].dtype for i, kind in of_input.items() if kind == "float"]
     precision = np.result_type(*floats) if floats else np.dtype(float)
     typed, sizes = list(columns), [np.size(x) for x in columns if getattr(x, "ndim", 0)]

@@ -1,4 +1,4 @@
-"""The graph of a scalar program: one node per distinct scalar, simplified as it is asked for.
+"""The graph of a scalar program: one node per distinct scalar, simplified as it is added.
 
 A node is a triple `(op, operands, attribute)`; its id is its position in `Graph.nodes`, so operands always come first.
 `op` is the name of an operation (`_operations.OPERATIONS`; those of `select` are predicate, value if false, value if

@@ -35,7 +35,7 @@ from lagjax._program._series import StraightLine
 
 # The rows of the largest matrix that is written out.
 LARGEST_MATRIX = 8
-# Unknowns of all the blocks of a system together: to look for the blocks among so many takes a tenth of a second.
+# Unknowns of all the blocks of a system together: to look for the blocks takes a tenth of a second here.
 _MOST_UNKNOWNS = 512
 
 
@@ -174,7 +174,7 @@ def substitute(a, b, lower: bool, unit_diagonal: bool):
 
 @lowers("custom_linear_solve")
 def _linear_solve(expansion, params, *arguments):
-    """A linear system by its matrix, however JAX was told to solve it: `linalg.solve` and `inv`, and what uses them."""
+    """A linear system by its matrix, for each solver of JAX: `linalg.solve` and `inv`, and what uses them."""
     count = params["const_lengths"].matvec
     right = arguments[count:]
     matrix = _matrix_of(expansion, params["jaxprs"].matvec, arguments[:count])

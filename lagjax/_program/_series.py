@@ -145,7 +145,7 @@ class _Recurrences:
                     self.coefficient(of)
 
     def _needed(self, linear) -> list[int]:
-        """The nodes whose coefficients are asked for: of the linear system, or of the outputs themselves."""
+        """The nodes whose coefficients are required: of the linear system, or of the outputs themselves."""
         if linear is None:
             return self.outputs[: self.size]
         return [*linear.right, *linear.entries.values(), *linear.others.values()]
@@ -320,7 +320,7 @@ class _Recurrences:
         return self.order_recursion.apply("mul", self.k, c) if by_order else c
 
     def _reached(self, roots: list[int]) -> list[tuple]:
-        """The keys of `_given` that these nodes of the recursion depend on, in the order they were first asked for."""
+        """The keys of `_given` that these nodes of the recursion depend on, in the order of their first use."""
         reached = set(self.order_recursion.below(roots))
         return [key for key, node in self._given.items() if node in reached]
 

@@ -26,7 +26,7 @@ from lagjax._reads._identity import CHANGING, Walk, array_text
 from lagjax._reads._marks import LARGEST_ARRAY, LARGEST_CONTAINER, SIZE, Marks
 from lagjax._reads._names import ReadNames
 
-_MOST_THINGS = 2000  # functions, classes and objects of one walk, some 50 ms; what is beyond is told by its identity
+_MOST_THINGS = 2000  # functions, classes and objects of one walk, some 50 ms; what is beyond is known by its identity
 _MOST_EDITIONS = 256  # texts of one function that are known again
 _CONSTRUCTING = frozenset(
     "__init__ __new__ __post_init__ __init_subclass__ __class_getitem__ __repr__ __str__ __del__".split()
@@ -89,7 +89,7 @@ class Edition:
 
     @property
     def __wrapped__(self) -> Callable:
-        return self.function  # which is what a walk goes on with
+        return self.function  # with which a walk continues
 
     def __repr__(self) -> str:
         return repr(self.function)
@@ -223,7 +223,7 @@ class _LiveWalk(Walk):
     def __init__(self, wanted: set[str] | None):
         super().__init__()
         self.marks = Marks()
-        self.held: list[Any] = []  # what is told by its identity
+        self.held: list[Any] = []  # what is known by its identity
         self.tracers: list[Any] = []
         self.names = None if wanted is None else set(wanted)  # None: all of them
         self._wanted = wanted

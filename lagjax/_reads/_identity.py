@@ -60,7 +60,7 @@ class Walk:
         return value
 
     def misses(self, place: dict, key: str) -> None:
-        """Nothing is there under a key that is asked for."""
+        """A key has no entry."""
 
     def counts(self, attributes: dict[str, Any], users: bool) -> None:
         """The attributes of an object, of which some are read, and others may be added; `users`: of a user's class."""
