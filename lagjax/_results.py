@@ -45,7 +45,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     constraint_rank_lost = (
         "The constraints became dependent on each other, and no longer determine how the motion continues: a dead "
         "point or a branching of the mechanism, or a constraint whose gradient vanishes. Stop before it with "
-        "event=..., give the constraint a form whose gradient stays away from zero, or drop one that follows from the others."
+        "event=..., give the constraint a form whose gradient stays away from zero, or drop one that follows from the "
+        "others."
     )
     projection_failed = (
         "The state could not be brought back to its constraints. Look whether they can still be met there: a rod that "
