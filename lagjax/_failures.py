@@ -29,12 +29,12 @@ def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
     """
     passed = check_p.bind(*map(jnp.asarray, (result, end[0], t_last, end[1])), names=names)
 
-    def through(leaf):
+    def checked(leaf):
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
             return leaf
         return jnp.where(passed == 0, leaf, jnp.nan)
 
-    return jax.tree.map(through, tree)
+    return jax.tree.map(checked, tree)
 
 
 def first_failed(result) -> tuple[int, ...] | None:

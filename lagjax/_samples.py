@@ -186,26 +186,26 @@ def _zero(knots, values, t):
     t = jnp.asarray(t, knots.dtype)
     i = _locate(knots, t, closed=False)
     (v,) = _window(values, i, 1)
-    return jnp.where(_beside(i < 0, v), jnp.nan, v)
+    return jnp.where(_expand_like(i < 0, v), jnp.nan, v)
 
 
 @jax.jit
 def _linear(knots, values, t):
     t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
     (x0, x1), (v0, v1) = _window(knots, i, 2), _window(values, i, 2)
-    slope = (v1 - v0) / _beside(x1 - x0, v0)
-    return jnp.where(_beside(inside, v0), v0 + slope * _beside(t - x0, v0), jnp.nan)
+    slope = (v1 - v0) / _expand_like(x1 - x0, v0)
+    return jnp.where(_expand_like(inside, v0), v0 + slope * _expand_like(t - x0, v0), jnp.nan)
 
 
 @jax.jit
 def _cubic(knots, values, t):
     t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
     (x0, x1), (v0, v1) = _window(knots, i, 2), _window(values, i, 2)
-    step, s = _beside(x1 - x0, v0), _beside(t - x0, v0)
+    step, s = _expand_like(x1 - x0, v0), _expand_like(t - x0, v0)
     chord = (v1 - v0) / step
     m0, m1 = _slopes(knots, values, i, chord)
     second, third = (3.0 * chord - 2.0 * m0 - m1) / step, (m0 + m1 - 2.0 * chord) / (step * step)
-    return jnp.where(_beside(inside, v0), v0 + s * (m0 + s * (second + s * third)), jnp.nan)
+    return jnp.where(_expand_like(inside, v0), v0 + s * (m0 + s * (second + s * third)), jnp.nan)
 
 
 @jax.jit
@@ -222,9 +222,9 @@ def _band(knots, values, t):
     v = v + (first - before) + (last - behind)
     coefficients = jnp.tensordot(v, _polynomials().astype(knots.dtype), axes=((i.ndim,), (1,)))
     total = [coefficients[..., d] for d in range(_DEGREE + 1)]
-    c = _beside(2.0 * (t - x0) / (x1 - x0) - 1.0, total[0])
+    c = _expand_like(2.0 * (t - x0) / (x1 - x0) - 1.0, total[0])
     u = functools.reduce(lambda u, coefficient: coefficient + c * u, total[::-1])
-    return jnp.where(_beside(inside, total[0]), u, jnp.nan)
+    return jnp.where(_expand_like(inside, total[0]), u, jnp.nan)
 
 
 @functools.cache
@@ -253,7 +253,7 @@ def _slopes(knots, values, i, chord):
         return chord, chord
     size = min(count, 4)
     x, v = _window(knots, i - 1, size), _window(values, i - 1, size)
-    steps = [_beside(b - a, v[0]) for a, b in itertools.pairwise(x)]
+    steps = [_expand_like(b - a, v[0]) for a, b in itertools.pairwise(x)]
     chords = [(b - a) / step for (a, b), step in zip(itertools.pairwise(v), steps, strict=True)]
 
     def about(k):  # sample k + 1 of the window
@@ -262,7 +262,7 @@ def _slopes(knots, values, i, chord):
     def at_end(one, other):  # of the first of two pieces, at its outer end
         return chords[one] - steps[one] * (chords[other] - chords[one]) / (steps[one] + steps[other])
 
-    first, last = _beside(i <= 0, v[0]), _beside(i >= count - 2, v[0])
+    first, last = _expand_like(i <= 0, v[0]), _expand_like(i >= count - 2, v[0])
     left, right = about(0), about(size - 3)
     m0 = jnp.where(first, at_end(0, 1), jnp.where(last, right, left))
     m1 = jnp.where(last, at_end(-1, -2), jnp.where(first, left, right))
@@ -281,7 +281,7 @@ def _window(table, start, size: int) -> list:
     return [jax.lax.index_in_dim(found, k, where, keepdims=False) for k in range(size)]
 
 
-def _beside(x, v):
+def _expand_like(x, v):
     """An array over times, for arithmetic with one over times and columns."""
     return x if x.ndim == v.ndim else x[..., None]
 

@@ -263,11 +263,11 @@ _as_they_are = jax.jit(lambda *arrays: arrays)
 def _refused(trajectory: Trajectory, inconsistent: jax.Array) -> Trajectory:
     """The same without the members that did not start on their constraints: they are NaN, and say so."""
 
-    def without(leaf):
+    def masked(leaf):
         return jnp.where(inconsistent.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.nan, leaf)
 
     result = result_from(jnp.where(inconsistent, RESULTS.inconsistent_start._value, trajectory.result._value))
-    q, qdot = jax.tree.map(without, (trajectory.q, trajectory.qdot))
+    q, qdot = jax.tree.map(masked, (trajectory.q, trajectory.qdot))
     return eqx.tree_at(lambda t: (t.q, t.qdot, t.result), trajectory, (q, qdot, result))
 
 

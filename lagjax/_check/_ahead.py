@@ -100,7 +100,7 @@ def _moving(borders: Borders, node: int, moving: int) -> set[int]:
 
 def _jumps(along: _Along, switches: list[Callable], name: str) -> Iterator[tuple[str, str]]:
     """A kind of finding, and the places where an acceleration jumps along the number."""
-    places = _apart(np.concatenate([_zeros(switch, along.start) for switch in switches]))
+    places = _distinct(np.concatenate([_zeros(switch, along.start) for switch in switches]))
     beside = 1e-7 * (1 + np.abs(places))
     before, after, more = (along.accelerations(places + k * beside) for k in (-1, 1, 3))
     size = np.abs([before, after, more]).max(axis=(0, 1))
@@ -179,7 +179,7 @@ def _moved(x: np.ndarray, move: np.ndarray, rest: float) -> tuple[np.ndarray, np
         return x, np.abs(move) <= rest * (1 + np.abs(x))
 
 
-def _apart(x: np.ndarray) -> np.ndarray:
+def _distinct(x: np.ndarray) -> np.ndarray:
     """The numbers once each, to rounding."""
     x = np.sort(x[np.isfinite(x)])
     return x[np.append(True, np.diff(x) > 1e-8 * (1 + np.abs(x[:-1])))] if x.size else x

@@ -140,12 +140,12 @@ def _looping(solver, adjoint):
     kinds = {diffrax.ForwardMode: "lax", diffrax.RecursiveCheckpointAdjoint: "checkpointed"}
     kind = kinds.get(type(adjoint), "bounded")
 
-    def within(part):
+    def with_scan_kind(part):
         if not isinstance(part, diffrax.AbstractRungeKutta) or part.scan_kind is not None:
             return part
         return eqx.tree_at(lambda s: s.scan_kind, part, kind, is_leaf=lambda leaf: leaf is None)
 
-    return jax.tree.map(within, solver, is_leaf=lambda part: isinstance(part, diffrax.AbstractRungeKutta))
+    return jax.tree.map(with_scan_kind, solver, is_leaf=lambda part: isinstance(part, diffrax.AbstractRungeKutta))
 
 
 @eqx.filter_custom_vjp
@@ -215,7 +215,7 @@ class _Replay(diffrax.AbstractStepSizeController):
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         """Accept, and go on to the next time."""
         next_ = self.times.at[controller_state].get(mode="fill", fill_value=jnp.inf)
-        begin, jumps = (t1, False) if self.jumps is None else self.jumps.beyond(t1)
+        begin, jumps = (t1, False) if self.jumps is None else self.jumps.next_start(t1)
         return True, begin, next_, jumps, controller_state + 1, diffrax.RESULTS.successful
 
 
@@ -244,7 +244,7 @@ class Jumps(eqx.Module):
         low, high = jnp.minimum(one, other), jnp.maximum(one, other)
         return Jumps(*(jnp.sort(jnp.where(jnp.isfinite(x), x, jnp.inf)) for x in (low, high)))
 
-    def beyond(self, t):
+    def next_start(self, t):
         """The time at which the step after one that ended at t begins, and whether that is behind a jump."""
         begin = _exchanged(t, self.before, self.behind)
         return begin, begin != t
@@ -286,5 +286,5 @@ class WithJumps(AdaptiveWrapper):
     def adapt_step_size(self, *arguments):
         """The controller's decision on a step; the next one ends at the first jump."""
         keep, begin, end, made_jump, state, result = self.controller.adapt_step_size(*arguments)
-        behind, jumps = self.jumps.beyond(begin)
+        behind, jumps = self.jumps.next_start(begin)
         return keep, behind, self.jumps.first(behind, end + (behind - begin)), made_jump | jumps, state, result

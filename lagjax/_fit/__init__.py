@@ -392,10 +392,10 @@ def _layout(system: Scene, records: list[Record], params0, form: Form | None) ->
 def _residuals_of(scene: _GivenSystem, parameters: Parameters) -> SystemResiduals:
     """The residuals of whole records of one system."""
     with errors_of_system(scene.name):
-        return _about(*scene, parameters)
+        return _system_residuals(*scene, parameters)
 
 
-def _about(name, system, records, observe, form, layout, parameters) -> SystemResiduals:
+def _system_residuals(name, system, records, observe, form, layout, parameters) -> SystemResiduals:
     rtol = DEFAULT_RTOL
     motions = motions_of(system, layout, parameters, rtol, None, form)
     recordings = [record for record in records if isinstance(record, Record)]

@@ -169,7 +169,7 @@ def looked_up(ts: np.ndarray, inputs: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(at, ts, column) for column in inputs.T], axis=-1)
 
 
-def about(ts: np.ndarray, begin: float, end: float, hold: str) -> slice:
+def samples_between(ts: np.ndarray, begin: float, end: float, hold: str) -> slice:
     """The samples at `ts` (K,) that determine the input from `begin` to `end`."""
     margin = MARGINS[hold]
     first = int(np.searchsorted(ts, begin, side="right")) - 1 - margin
@@ -541,7 +541,7 @@ def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, 
         ts[i] = np.concatenate([times, times[-1] + gap * np.arange(1, longest - count + 1)])
         values[i, :count], weights[i, :count] = np.where(weight > 0, measured, 0.0), weight
         at, samples = records[record].sampled_at, matrices[record][2]
-        between = about(at, times[0], times[-1], hold)
+        between = samples_between(at, times[0], times[-1], hold)
         sampled.append((at[between], samples[between]))
         if records[record].input_ts is None:
             inputs[i, :count], inputs[i, count:] = samples[places], samples[places[-1]]

@@ -494,8 +494,8 @@ def _sentence(parameters: Parameters, block: np.ndarray, spaces) -> str:
     names = [parameters.names[i] for i in block]
     if len(block) == 1:
         return f"Nothing that was measured depends on {names[0]}."
-    relative = [_within(direction / np.where(x != 0, x, 1.0)[:, None], block) for direction, x in spaces]
-    absolute = [_within(direction, block) for direction, _ in spaces]
+    relative = [_directions_within(direction / np.where(x != 0, x, 1.0)[:, None], block) for direction, x in spaces]
+    absolute = [_directions_within(direction, block) for direction, _ in spaces]
     if all(np.all(x[block] != 0) for _, x in spaces) and (rows := _whole_numbers(relative)) is not None:
         if relative[0].shape[1] == 1 and np.ptp(relative[0]) < _EXACT * np.abs(relative[0]).max():
             return f"A common factor of {_listed(names)} is not seen, only their ratios: keep one of them fixed."
@@ -511,7 +511,7 @@ def _sentence(parameters: Parameters, block: np.ndarray, spaces) -> str:
     )
 
 
-def _within(directions: np.ndarray, block: np.ndarray) -> np.ndarray:
+def _directions_within(directions: np.ndarray, block: np.ndarray) -> np.ndarray:
     """The directions that move only the parameters of one set, (len(block), K)."""
     outside = np.delete(directions, block, axis=0)
     if not outside.size:

@@ -207,7 +207,7 @@ class _Rounds(NamedTuple):
 
         at_once = here & (t_end == t_start)
         known = before.memory._replace(rounding=rounding), sides, t_end <= lasting
-        exit, memory = self._through(group, mode, before.mode, changes, at_once, t_end, y_end, known)
+        exit, memory = self._pass_transition(group, mode, before.mode, changes, at_once, t_end, y_end, known)
         event = (changes > 0) & ~exit.piled_up
         result = jnp.where(exit.piled_up, ZENO, jnp.where(here & ~event, located.result, before.result))
         # A reset may give NaN, and a guard that is NaN never fires.
@@ -228,7 +228,9 @@ class _Rounds(NamedTuple):
         )
         return after, event, TransitionRecord(exit.t, exit.y, before.mode, exit.target)
 
-    def _through(self, group: ModeGroup, mode: Mode, place, changes, at_once, t, y, known) -> tuple[Exit, GuardMemory]:
+    def _pass_transition(
+        self, group: ModeGroup, mode: Mode, place, changes, at_once, t, y, known
+    ) -> tuple[Exit, GuardMemory]:
         """Through the first transition whose bits in `changes` say that its guard falls (1) or rises (2)."""
         no, none = jnp.asarray(False), jnp.asarray(-1)
         exit = Exit(t, y, y, place, none, no, no, jnp.asarray(True))

@@ -137,7 +137,7 @@ def _varied_to_event(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
 
     @jax.jit
     def varied(ts, y0, params, t_stop, result, event):
-        fired, stop = result == EVENT_OCCURRED, _before(ts, t_stop)
+        fired, stop = result == EVENT_OCCURRED, _shortly_before(ts, t_stop)
         end = jnp.where(fired, stop, ts[-1])
         times = jnp.where((end - ts) * (ts[-1] - ts[0]) >= 0, ts, end)
         times = jnp.concatenate([ts[:1], times[1:-1], end[None]])
@@ -202,7 +202,7 @@ def _varied_crossings(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     @jax.jit
     def varied(ts, y0, params, t):
         there = jnp.isfinite(t)
-        times = jnp.where(there, _before(ts, t), jax.lax.stop_gradient(ts[-1])).ravel()
+        times = jnp.where(there, _shortly_before(ts, t), jax.lax.stop_gradient(ts[-1])).ravel()
         order = jnp.argsort(times * jnp.sign(ts[-1] - ts[0]))
         solution = _primitives.run(
             flow, tolerances, jnp.concatenate([ts[:1], times[order], ts[-1:]]), y0, params
@@ -215,7 +215,7 @@ def _varied_crossings(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     return varied
 
 
-def _before(ts, t):
+def _shortly_before(ts, t):
     """A few roundings earlier than t, but not before the first time."""
     first, last = jax.lax.stop_gradient((ts[0], ts[-1]))
     step = _BEFORE * jnp.maximum(abs(first), abs(last))

@@ -78,18 +78,20 @@ class Line:
     @functools.cached_property
     def forward(self) -> "Line":
         """(x, v) ↦ D(x) v, v (count,)."""
-        return self._beside(pushforward(self.line, self._dtypes, range(self.count), range(self.outputs)), self.count)
+        return self._derivative(
+            pushforward(self.line, self._dtypes, range(self.count), range(self.outputs)), self.count
+        )
 
     @functools.cached_property
     def back(self) -> "Line":
         """(x, w) ↦ D(x)ᵀ w, w (outputs,)."""
-        return self._beside(pullback(self.line, self._dtypes, range(self.count), range(self.outputs)), self.outputs)
+        return self._derivative(pullback(self.line, self._dtypes, range(self.count), range(self.outputs)), self.outputs)
 
     @property
     def _dtypes(self) -> list[np.dtype]:
         return [np.dtype(float)] * self.size
 
-    def _beside(self, line: StraightLine, linear: int) -> "Line":
+    def _derivative(self, line: StraightLine, linear: int) -> "Line":
         return Line(line, self.size + linear, self.size)
 
     def __call__(self, x):

@@ -17,7 +17,7 @@ from llvmlite import ir
 from lagjax._native import _adjoint, _integrator, _tangent
 from lagjax._native._constants import DONE
 from lagjax._native._frame import CACHE_LINE
-from lagjax._native._handler import at, call, handler_function, job_of
+from lagjax._native._handler import call, handler_function, job_of, load_at
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module, lanes
 from lagjax._native._output import RECORDED
 
@@ -116,7 +116,7 @@ class _Sweep:
 
     def of_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
         """A field of the plan."""
-        return at(self.plan, getattr(DerivativePlan, name).offset, kind)
+        return load_at(self.plan, getattr(DerivativePlan, name).offset, kind)
 
     def _carve(self) -> None:
         """Give every array of the scratch its place: the memories of both kernels first, on cache lines, of zeros."""

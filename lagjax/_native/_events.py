@@ -116,7 +116,7 @@ class Events:
             frame["guard", i] = guards[i]
         return frame.finish()
 
-    def _at(self, frame: Frame, order: Value, g: Value, s: Value) -> Value:
+    def _guard_value(self, frame: Frame, order: Value, g: Value, s: Value) -> Value:
         """Guard g a time s after the present one."""
         frame.call(self.guard, order, s)
         return frame["guard", g]
@@ -292,7 +292,7 @@ class Events:
         )
         frame["unsure"] = code.intrinsic("fabs", frame["poly", 1]) * frame["instant"] + rounding
         ahead = code.variable(side)
-        self._along(frame, order, g, degree, ahead, moving & sound)
+        self._follow_roots(frame, order, g, degree, ahead, moving & sound)
         self._without_series(frame, order, g, ahead, moving & ~sound)
         with frame.where(moving):
             frame["side", g] = ahead.value
@@ -312,20 +312,20 @@ class Events:
         rate = frame["poly", 1]
         frame["poly", 1] = code.select((rests >= Start.ALONG) & (rate < 0.0), 0.0, rate)
 
-    def _along(self, frame: Frame, order: Value, g: Value, degree: Value, ahead: Variable, where: Value) -> None:
+    def _follow_roots(self, frame: Frame, order: Value, g: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""
         code = frame.code
         looking = code.variable(code.flag(where))
 
-        def on():
+        def searching():
             return looking.value > 0.0
 
-        with code.repeat_while(lambda: code.any_lane(on()), at_most=MOST_CHANGES):
+        with code.repeat_while(lambda: code.any_lane(searching()), at_most=MOST_CHANGES):
             frame.call(self.roots.next_root, degree)
             root, part = frame["root"], frame["part"]
-            is_root = on() & (root < 1.0) & (frame["is_root"] > 0.0)
+            is_root = searching() & (root < 1.0) & (frame["is_root"] > 0.0)
             seen = code.select(root < 1.0, root * part, code.select(part < 1.0, part, 1.0))
-            self._see(frame, on() & ~is_root, seen)
+            self._see(frame, searching() & ~is_root, seen)
             waits = is_root & self._waits(frame, g)
             with frame.where(waits):
                 frame["waits", g] = 1
@@ -339,7 +339,7 @@ class Events:
                     frame["begin"] = root
                 looking.value = code.flag(goes_on)
             looking.value = code.select(changes, looking.value, 0.0)
-        self._see(frame, on(), frame["begin"] * frame["part"])
+        self._see(frame, searching(), frame["begin"] * frame["part"])
 
     def _see(self, frame: Frame, where: Value, seen: Value) -> None:
         """In some lanes a guard is seen only up to a part of the step, the first time it is looked at."""
@@ -371,7 +371,7 @@ class Events:
 
         with code.repeat_while(lambda: code.any_lane(moves()), at_most=MOST_CORRECTIONS):
             here = at.value
-            after = here - side * self._at(frame, order, g, here) / rate
+            after = here - side * self._guard_value(frame, order, g, here) / rate
             near = code.intrinsic("fabs", after - start) <= 0.1 * code.intrinsic("fabs", scale)
             after = code.select(moves() & near, after, here)
             after = code.select(after * frame["forward"] > 0.0, after, 0.0)
@@ -414,11 +414,11 @@ class Events:
         code, side, h = frame.code, ahead.value, frame["h"]
         with code.only_if(code.any_lane(where)):
             self._see(frame, where, frame.constant(WITHOUT_SERIES))
-            changes = where & (side * self._at(frame, order, g, h) < 0.0)
+            changes = where & (side * self._guard_value(frame, order, g, h) < 0.0)
             low, high = code.variable(frame.constant(0.0)), code.variable(h)
             with code.loop(BISECTIONS):
                 middle = 0.5 * (low.value + high.value)
-                same = side * self._at(frame, order, g, middle) > 0.0
+                same = side * self._guard_value(frame, order, g, middle) > 0.0
                 for end, here in ((low, same), (high, ~same)):
                     end.value = code.select(here, middle, end.value)
             self._take(frame, order, g, changes, high.value, ahead)

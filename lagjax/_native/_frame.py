@@ -224,7 +224,7 @@ class Frame:
         """One lane of the memory."""
         return Lane(self, index)
 
-    def beside(self, layout: Memory) -> "Frame":
+    def view(self, layout: Memory) -> "Frame":
         """The same function, which sees the fields of another layout of the same memory."""
         other = copy.copy(self)
         other.layout, other.width = layout, layout.width
@@ -262,7 +262,7 @@ class Frame:
 
     # ---- functions ----
 
-    def at(self, offset: Value) -> Value:
+    def memory_at(self, offset: Value) -> Value:
         """The address that lies this many doubles behind the beginning of the memory."""
         return self.code.element(self._memory, offset)
 

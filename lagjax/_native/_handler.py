@@ -187,22 +187,22 @@ def handler_function(module: ir.Module, work: Code, arguments: int, results: int
     """
     code, null = Code(module, "handler", [POINTER], lanes(), result=POINTER, public=True), ir.Constant(POINTER, None)
     (frame,) = code.arguments
-    extension = at(frame, _EXTENSION, POINTER)
+    extension = load_at(frame, _EXTENSION, POINTER)
     with code.builder.if_then(code.builder.icmp_unsigned("!=", extension.it, null)):
         _tell_version(code, extension)
         code.builder.ret(null)
-    args, rets, attrs = (at(frame, offset, POINTER) for offset in (_ARGS, _RETS, _ATTRS))
-    plan = at(at(element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
+    args, rets, attrs = (load_at(frame, offset, POINTER) for offset in (_ARGS, _RETS, _ATTRS))
+    plan = load_at(load_at(element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
     buffers = [element(args, i) for i in range(arguments)] + [element(rets, i) for i in range(results)]
-    ts, y0, params = (at(buffer, _DIMS, POINTER) for buffer in buffers[:3])
-    sizes = at(y0, 0, INTEGER), at(ts, 8, INTEGER), at(ts, 0, INTEGER), at(params, 0, INTEGER)
-    code.call(work, plan, *(at(buffer, _DATA, POINTER) for buffer in buffers), *sizes)
+    ts, y0, params = (load_at(buffer, _DIMS, POINTER) for buffer in buffers[:3])
+    sizes = load_at(y0, 0, INTEGER), load_at(ts, 8, INTEGER), load_at(ts, 0, INTEGER), load_at(params, 0, INTEGER)
+    code.call(work, plan, *(load_at(buffer, _DATA, POINTER) for buffer in buffers), *sizes)
     code.builder.ret(null)
 
 
 def _tell_version(code: Code, extension: Value) -> None:
     """XLA asks once, when the handler is registered, for which version of the interface it was written."""
-    metadata, short = at(extension, _METADATA, POINTER), ir.IntType(32)
+    metadata, short = load_at(extension, _METADATA, POINTER), ir.IntType(32)
     for offset, number in ((_MAJOR, MAJOR), (_MINOR, MINOR), (_TRAITS, 0)):
         code.builder.store(ir.Constant(short, number), _address(metadata, offset).it)
     code.store(code.as_value(0, INTEGER), _address(metadata, _STATE_TYPE))  # a handler without state
@@ -213,7 +213,7 @@ def _address(base: Value, offset: int) -> Value:
     return base.code.element(base, offset, ir.IntType(8))
 
 
-def at(base: Value, offset: int, kind: ir.Type) -> Value:
+def load_at(base: Value, offset: int, kind: ir.Type) -> Value:
     """The value there."""
     return base.code.load(_address(base, offset), kind)
 
@@ -255,7 +255,7 @@ class _Run:
         code.store(call(code, of_plan("run"), INTEGER, job, memory, integers, idle, of_plan("rounds")), more)
 
     def _of_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
-        return at(self.plan, getattr(Plan, name).offset, kind)
+        return load_at(self.plan, getattr(Plan, name).offset, kind)
 
     def _rest(self, rest: Value) -> tuple[Value, Value]:
         """The memory of the thread, of zeros and on the boundary of a cache line, and the integers, of zeros."""

@@ -190,7 +190,7 @@ class Integrator:
                 frame.call(borders.stop, order)
             self.step.halve_until_sound(frame, order)
             if self.projector is not None:
-                _rank_drops.return_or_remember(frame, self.motion.form, self.motion.states, self.guards)
+                _rank_drops.retry_last_long_step(frame, self.motion.form, self.motion.states, self.guards)
             if self.events is not None:
                 self.events.stop(frame, order)
             if crossings is not None:
@@ -205,10 +205,10 @@ class Integrator:
                 frame.call(crossings.cross)
             if self.projector is not None:
                 _rank_drops.shorten(frame)
-            self._end_or_go_on(frame, idle)
+            self._finish_members(frame, idle)
         frame.finish(self.motion.more(frame))
 
-    def _end_or_go_on(self, frame: Frame, idle) -> None:
+    def _finish_members(self, frame: Frame, idle) -> None:
         """Write down the members that have ended, and take the next ones."""
         code = frame.code
         ending, steps, rejected = (frame[name] for name in ("code", "steps", "rejected"))

@@ -175,13 +175,13 @@ class Packed(Tables):
         """The code of a run; where the next one begins."""
         frame, code, lanes = self._execute, self._execute.code, self.lanes
         shift = frame.arguments[1]
-        results = [frame.at(word(code, words, 2 + k)) for k in range(kind.results)]
+        results = [frame.memory_at(word(code, words, 2 + k)) for k in range(kind.results)]
         if kind.op == "store":
             results = [code.element(result, shift) for result in results]
         at, lists = 2 + kind.results, modes.count(ANYWHERE)
         fixed: list[Value] = []  # addresses, or numbers
         for mode in modes:
-            address = frame.at(word(code, words, at))  # of no use where it lies anywhere
+            address = frame.memory_at(word(code, words, at))  # of no use where it lies anywhere
             at += mode != ANYWHERE
             fixed.append(code.lanes_of(code.load(address, DOUBLE)) if mode == ONE else address)
         tail, vectors = code.element(words, at, WORD), word(code, words, 1)
@@ -192,7 +192,9 @@ class Packed(Tables):
             if modes[k] == SIDE_BY_SIDE:
                 return code.load_packed(code.element(fixed[k], i * lanes))
             place = (i * lists + modes[:k].count(ANYWHERE)) * lanes
-            return code.gather(frame.at(code.as_value(0, INTEGER)), code.offsets(code.element(tail, place, WORD)))
+            return code.gather(
+                frame.memory_at(code.as_value(0, INTEGER)), code.offsets(code.element(tail, place, WORD))
+            )
 
         with code.loop(vectors) as i:
             operands = [operand(k, i) for k in range(len(modes))]

@@ -21,7 +21,7 @@ def fields(n: int, guards: int) -> dict:
 AT_FIRST_ZERO = ("h_before", "returns", "returned")  # for every new member
 
 
-def return_or_remember(frame: Frame, form: Lines | Tables, states: int, guards: int) -> None:
+def retry_last_long_step(frame: Frame, form: Lines | Tables, states: int, guards: int) -> None:
     """Back to where the last long step began, if steps have become too short since; or remember this beginning."""
     code = frame.code
     size, long = (code.intrinsic("fabs", frame[name]) for name in ("h", "h_before"))

@@ -148,7 +148,7 @@ class Roots:
 
         with code.repeat_while(lambda: code.any_lane(active()), at_most=MOST_MOVES):
             here, now = x.value, active()
-            value, slope = self._at(frame, degree, here)
+            value, slope = self._value_and_slope(frame, degree, here)
             noise, left_out = at_start + along * here, frame["doubt"] * self._power(here)
             error = noise + left_out
             # A slope that what is not known, and the bend, cannot undo.
@@ -197,7 +197,7 @@ class Roots:
         square = x * x
         return (square * square) * (square * square)
 
-    def _at(self, frame: Frame, degree: Value, x: Value) -> tuple[Value, Value]:
+    def _value_and_slope(self, frame: Frame, degree: Value, x: Value) -> tuple[Value, Value]:
         """The polynomial and its slope, by Horner's scheme."""
         code = frame.code
         value, slope = code.variable(frame["poly", degree]), code.variable(frame.constant(0.0))

@@ -140,12 +140,12 @@ class SingleMember(TaylorSeries):
 
     def _write_sum(self, frame: Frame, order: int, kind: int, modes: tuple[int, ...], words: Value) -> None:
         code, at, rows = frame.code, 1, []
-        start = frame.at(code.as_value(0, INTEGER))
+        start = frame.memory_at(code.as_value(0, INTEGER))
         for mode in modes:
             if mode == ANYWHERE:
                 rows.append((mode, code.offsets(code.element(words, at, WORD))))
             else:
-                rows.append((mode, frame.at(word(code, words, at))))
+                rows.append((mode, frame.memory_at(word(code, words, at))))
             at += lanes() if mode == ANYWHERE else 1
 
         def read(row: tuple[int, Value], j: int) -> Value:
@@ -156,7 +156,7 @@ class SingleMember(TaylorSeries):
             return code.load_packed(address) if mode == SIDE_BY_SIDE else code.lanes_of(code.load(address, DOUBLE))
 
         total = square_sum(order, read, *rows) if kind else mixed_sum(order, read, *rows)
-        code.store_packed(total, frame.at(word(code, words, 0)))
+        code.store_packed(total, frame.memory_at(word(code, words, 0)))
 
     # ---- the coefficients ----
 
@@ -188,7 +188,7 @@ class SingleMember(TaylorSeries):
         code = frame.code
         table = integers(self.module, places[len(places) - self.series.followed :].astype(np.int64))
         place = code.load(code.element(Value(code, table), j, INTEGER), INTEGER)
-        return code.load(frame.at(place + more), frame.vector)
+        return code.load(frame.memory_at(place + more), frame.vector)
 
     def at_order(self, frame: Frame, k: Value) -> list:
         """The inputs of the order recursion: the coefficients of order k, k, 1/k, the values and the sums."""

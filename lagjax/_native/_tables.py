@@ -184,7 +184,7 @@ class Tables:
             code.builder.position_at_end(block)
             words, size = at.value, kind.operands + kind.results
             for k in range(times):
-                where = [frame.at(word(code, words, 1 + k * size + i)) for i in range(size)]
+                where = [frame.memory_at(word(code, words, 1 + k * size + i)) for i in range(size)]
                 operands = (code.load(address, frame.vector) for address in where[: kind.operands])
                 for result, address in zip(self._results(kind, operands), where[kind.operands :], strict=True):
                     code.store(result, code.element(address, shift) if kind.op == "store" else address)
@@ -216,7 +216,7 @@ class Tables:
             numbers = Value(code, integers(self._module, np.frombuffer(b"".join(self._constants), np.int64)))
             with code.loop(len(self._constants)) as i:
                 number = code.load(code.element(numbers, i), DOUBLE)
-                code.store(code.lanes_of(number), frame.at(code.load(code.element(places, i, INTEGER), INTEGER)))
+                code.store(code.lanes_of(number), frame.memory_at(code.load(code.element(places, i, INTEGER), INTEGER)))
         frame.finish()
 
 

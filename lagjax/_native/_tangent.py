@@ -159,7 +159,7 @@ class Tangent:
 
         Those that are `in_place` lie where `place` says, which does not change.
         """
-        motion, alike = frame.beside(self.motion.layout), self.motion.width == self.lanes
+        motion, alike = frame.view(self.motion.layout), self.motion.width == self.lanes
 
         def read(i):
             address = motion.address(name, *place(i))
@@ -174,11 +174,11 @@ class Tangent:
 
     def lane_of_motion(self, frame: Frame, lane: Value) -> Lane:
         """The lane of the motion that a lane of tangents belongs to."""
-        return frame.beside(self.motion.layout).lane(lane if self.motion.width == self.lanes else lane * 0)
+        return frame.view(self.motion.layout).lane(lane if self.motion.width == self.lanes else lane * 0)
 
     def lanes_of_tangents(self, frame: Frame, lane: Value) -> list[Lane]:
         """The lanes of tangents that belong to a lane of the motion."""
-        tangents, alike = frame.beside(self.layout), self.motion.width == self.lanes
+        tangents, alike = frame.view(self.layout), self.motion.width == self.lanes
         return [tangents.lane(i) for i in ([lane] if alike else [integer(frame.code, j) for j in range(self.lanes)])]
 
     # ---- rounds ----
@@ -406,7 +406,7 @@ class Tangent:
 
     def _product(self, frame: Frame, table: Value, i: Value, order: int, square: bool) -> Value:
         """Σ' (δaⱼ bₖ₋ⱼ + aⱼ δbₖ₋ⱼ) at order k, of one product; twice the first half of it, of a square."""
-        code, motion = frame.code, frame.beside(self.motion.layout)
+        code, motion = frame.code, frame.view(self.motion.layout)
         shared = self.motion.width < self.lanes
 
         def row(which):

@@ -336,13 +336,13 @@ def _fourier(expansion, params, x):
     kind, lengths = params["fft_type"].name, params["fft_lengths"]
     axes, turn = [x.ndim - len(lengths) + k for k in range(len(lengths))], 1 if kind.startswith("I") else -1
     if kind == "RFFT":
-        x = _along(expansion, x, axes[-1], lambda rows: _transformed(rows, turn)[: lengths[-1] // 2 + 1])
+        x = _map_rows(expansion, x, axes[-1], lambda rows: _transformed(rows, turn)[: lengths[-1] // 2 + 1])
         axes = axes[:-1]
     for axis in axes[:-1] if kind == "IRFFT" else axes:
-        x = _along(expansion, x, axis, lambda rows: _transformed(rows, turn))
+        x = _map_rows(expansion, x, axis, lambda rows: _transformed(rows, turn))
     if kind == "IRFFT":
         x = expansion.parts(
-            _along(expansion, x, axes[-1], lambda rows: _transformed(_completed(rows, lengths[-1]), turn))
+            _map_rows(expansion, x, axes[-1], lambda rows: _transformed(_completed(rows, lengths[-1]), turn))
         )[0]
     if turn < 0:
         return x
@@ -351,7 +351,7 @@ def _fourier(expansion, params, x):
     return parts[0] if kind == "IRFFT" else expansion.pair(*parts)
 
 
-def _along(expansion: Expansion, x: np.ndarray, axis: int, transform: Callable) -> np.ndarray:
+def _map_rows(expansion: Expansion, x: np.ndarray, axis: int, transform: Callable) -> np.ndarray:
     rows = transform([_pair_of(expansion, row) for row in np.moveaxis(x, axis, 0)])
     return np.stack([_ids_of(expansion, row) for row in rows], axis)
 

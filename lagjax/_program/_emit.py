@@ -67,11 +67,11 @@ def _emitted(nodes, kinds, outputs, scalars, shape: tuple[Any, ...], entries: Ca
             values[i] = _looked_up(op, attribute, entries, precision, values[operands[0]])
         elif op in ("sin", "cos") and operands[0] in paired:
             if operands[0] not in pairs:
-                pairs[operands[0]] = _apart("sincos")(values[operands[0]])
+                pairs[operands[0]] = _fast_function("sincos")(values[operands[0]])
             values[i] = pairs[operands[0]][op == "cos"]
         else:
             xs = _aligned([values[operand] for operand in operands])
-            values[i] = _apart(op)(*xs) if op in fast else _apply(op, xs, attribute)
+            values[i] = _fast_function(op)(*xs) if op in fast else _apply(op, xs, attribute)
     return tuple(jnp.broadcast_to(jnp.asarray(values[i]), shape) for i in outputs)
 
 
@@ -148,7 +148,7 @@ def in_jax(op: str, *xs, attribute=None) -> jax.Array:
 
 
 @functools.cache
-def _apart(op: str) -> Callable:
+def _fast_function(op: str) -> Callable:
     """A fast elementary function, in the form that suits what it is given.
 
     For lanes: a body of its own. XLA's CPU backend fuses operations into one loop per output and repeats in each what

@@ -223,7 +223,7 @@ def test_tables_are_the_inputs_of_records_with_the_ends_they_have(hold, count):
     at = np.linspace(ts[0], ts[-1], 97)
     expected = lagjax.samples(ts, u, hold)(at)
     np.testing.assert_allclose(lagjax.samples(table.knots[0], table.values[0], hold)(at), expected, atol=1e-10)
-    part = _records.about(ts, 1.31, 1.55, hold)
+    part = _records.samples_between(ts, 1.31, 1.55, hold)
     table, at = _records.table_of([(ts[part], u[part])], hold), np.linspace(1.31, min(1.55, ts[-1]), 5)[None]
     expected = lagjax.samples(ts, u, hold)(at[0])
     np.testing.assert_allclose(_records.inputs_at(table, at, hold)[0][0], expected, atol=1e-10)

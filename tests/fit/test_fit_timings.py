@@ -71,9 +71,7 @@ def test_times_have_the_derivatives_of_differences_forward_and_in_reverse(exact)
     [clock] = question.systems[0].clocks.values()
     times, back = jax.vjp(clock.times, starts[0], fit.parameters.numbers(fit.u))
     weights = np.linspace(-1.0, 2.0, len(times))
-    np.testing.assert_allclose(
-        np.concatenate(back(weights)), weights @ point.slopes[0][0, :, 0], rtol=1e-8, atol=1e-11
-    )
+    np.testing.assert_allclose(np.concatenate(back(weights)), weights @ point.slopes[0][0, :, 0], rtol=1e-8, atol=1e-11)
 
 
 def test_records_and_timings_of_one_motion_are_fitted_together(exact):
