@@ -13,6 +13,7 @@ one Taylor series, of the order that the tolerance asks for.
     _table_reads         entries of tables, read from where the numbers of a member lie
     _constants           every numerical choice, with its reason
     _frame               the memory of a thread, the lanes and the job, as a function of a kernel sees them
+    _parts               the programs that a kernel is made from, and their series
     _taylor              the coefficients of a motion, and what is read off them along a step
     _projection          the way back to the constraints;  _rank_drops: where these become dependent
     _step                step control
@@ -55,15 +56,11 @@ from lagjax._native._kernel import (
     Begun,
     Kernel,
     Outcome,
-    Projection,
     cores,
     floor_of,
-    order_for,
-    pieces_of,
-    recurrences,
-    require_recurrences,
 )
-from lagjax._native._taylor import is_large
+from lagjax._native._parts import Projection, pieces_of, recurrences, require_recurrences
+from lagjax._native._taylor import is_large, order_for
 from lagjax._native._threads import map_in_threads
 from lagjax._program._jump import Nesting
 

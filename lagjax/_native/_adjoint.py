@@ -23,16 +23,16 @@ from lagjax._native._constants import MAX_ORDER, NEAR_ZERO
 from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
+from lagjax._native._parts import MotionParts
 from lagjax._native._replay import Replay
 from lagjax._native._saltation import GuardTable, Saltation, jump_along
 from lagjax._native._table_reads import lane_of
-from lagjax._native._taylor import Chosen, TaylorSeries, double, integer, is_large
+from lagjax._native._taylor import TaylorSeries, double, integer, is_large
 from lagjax._native._time_knots import TimeKnots
 from lagjax._program._borders import Borders
 from lagjax._program._differentiation import pullback, pullback_and_entries
 from lagjax._program._jump import Nesting
 from lagjax._program._look_ups import Table
-from lagjax._program._series import Recurrent, Series
 
 # `y_ct` is the cotangent of the end, and becomes that of the start.
 JOB = job(
@@ -49,18 +49,13 @@ class Adjoint:
 
     def __init__(
         self,
-        program: Recurrent,
-        series: Series,
-        projection=None,
-        borders: "Borders | None" = None,
-        nesting: Nesting | None = None,
-        chosen: Chosen | None = None,
+        parts: MotionParts,
         *,
         width: int,
         number: ir.Type = DOUBLE,
     ):
-        n, states = series.size, 2 * series.size
-        pieces = 0 if borders is None else len(borders.switches)
+        program, series, nesting, projection, borders, _ = parts
+        n, states, pieces = series.size, 2 * series.size, parts.pieces
         fields = {
             "state_ct": states,  # the cotangent of the state
             "y_ct": (states, MAX_ORDER + 1),  # those of its coefficients
@@ -70,7 +65,6 @@ class Adjoint:
             "before": states,
             **dict.fromkeys(("active", "excess"), 1),
         }
-        nesting = nesting or Nesting(n)
         jump = jump_along(borders, nesting)
         if borders is not None:
             fields |= FirstSaltation.fields(pieces, n) if jump is None else Saltation.fields(pieces)
@@ -78,8 +72,7 @@ class Adjoint:
         large = is_large(program, projection, times=2, more=() if jump is None else [jump.line] * 2)
         number = DOUBLE if large else number  # tables do not tell the time from the state
         self.motion = TaylorSeries(
-            "adjoint", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen,
-            number=number,
+            "adjoint", parts, JOB, fields, large, width, keep_sums=True, number=number
         )  # fmt: skip
         self.n, self.states, self.series = n, states, series
         dtypes = program.dtypes

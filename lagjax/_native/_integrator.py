@@ -25,16 +25,15 @@ from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._guards import Guards
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
 from lagjax._native._output import Output
+from lagjax._native._parts import MotionParts
 from lagjax._native._projection import Projector
 from lagjax._native._roots import Roots
 from lagjax._native._saltation import jump_over
 from lagjax._native._single_member import SingleMember, fills_lanes
 from lagjax._native._step import PARTS, StepControl
-from lagjax._native._taylor import Chosen, TaylorSeries, double, integer, is_large
-from lagjax._program import _borders
+from lagjax._native._taylor import TaylorSeries, double, integer, is_large
 from lagjax._program._borders import reads_inputs
-from lagjax._program._jump import Nesting
-from lagjax._program._series import Recurrent, Series
+from lagjax._program._series import Recurrent
 
 JOB = job(
     "Job",
@@ -58,20 +57,15 @@ class Integrator:
 
     def __init__(
         self,
-        program: Recurrent,
-        series: Series,
-        projection=None,
+        parts: MotionParts,
         guards: Guards | None = None,
         error_groups: tuple[int, ...] | None = None,
-        borders: "_borders.Borders | None" = None,
-        nesting: Nesting | None = None,
-        chosen: Chosen | None = None,
         *,
         width: int,
         number: ir.Type = DOUBLE,
     ):
+        program, series, nesting, projection, borders, chosen = parts
         n = series.size
-        nesting = nesting or Nesting(n)
         self.base_size = nesting.base
         self.guards = 0 if guards is None else len(guards.directions)
         self.notes = guards is not None and guards.notes  # in the place of states at output times
@@ -82,14 +76,12 @@ class Integrator:
             fields |= Roots.fields(MAX_ORDER + 2)
         if borders is not None:
             fields |= BorderControl.fields(borders, n)
-        pieces = 0 if borders is None else len(borders.switches)
         jump = None if borders is None or borders.motion is None else jump_over(borders, nesting)
         large = is_large(program, projection, guards, more=() if jump is None else [jump.line])
         alone = large and width == 1 and borders is None and chosen is None
         kind = SingleMember if alone and fills_lanes(series) else TaylorSeries
         self.motion = motion = kind(
-            "motion", program, series, JOB, fields, large, width, pieces=pieces, chosen=chosen, kept=self.guards,
-            number=number,
+            "motion", parts, JOB, fields, large, width, kept=self.guards, number=number
         )  # fmt: skip
         self.projector = projection and Projector(
             motion, projection.state, projection.velocity_scale, self.base_size

@@ -5,7 +5,6 @@ import functools
 import itertools
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,25 +22,23 @@ from lagjax._native._constants import (
 )
 from lagjax._native._derivative_handler import DerivativePlan
 from lagjax._native._frame import LANE, Memory
-from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
+from lagjax._native._guards import Guards
 from lagjax._native._handler import Plan, Rest, aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import DOUBLE, FLOAT, compile_module, lanes
 from lagjax._native._output import RECORDED
 from lagjax._native._packs import forget_stages
+from lagjax._native._parts import MotionParts, Projection, parameters_chosen
 from lagjax._native._schedule import forget_joined
 from lagjax._native._single_member import fills_lanes
 from lagjax._native._table_reads import SET_NUMBERS
 from lagjax._native._tangent import Tangent
-from lagjax._native._taylor import Chosen, TaylorSeries, is_large, order_for, size_of_series
+from lagjax._native._taylor import TaylorSeries, is_large, order_for, size_of_series
 from lagjax._native._threads import SLICE, run_in_slices, run_on_threads
-from lagjax._program._borders import Borders, borders
-from lagjax._program._graph import Unlowerable
-from lagjax._program._jump import Nesting, looks_up, with_borders_of_tangents
-from lagjax._program._look_ups import BESIDE, shifted
+from lagjax._program._borders import Borders
+from lagjax._program._jump import Nesting
 from lagjax._program._memory import without_collections
-from lagjax._program._operations import LOOK_UPS
-from lagjax._program._series import Recurrent, Series, StraightLine, series
+from lagjax._program._series import Recurrent
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
 # It decides the length of the first slice, for which a rough value is enough.
@@ -90,17 +87,6 @@ class Begun(NamedTuple):
     rest: Any
 
 
-class Projection(NamedTuple):
-    """The programs that keep a motion on its constraints: two of (q, q̇, t, parameters).
-
-    `state` gives the projected state (q, q̇), 2n numbers. `velocity_scale` gives n numbers: an error of a velocity
-    counts relative to its scale where that is larger than the velocity itself.
-    """
-
-    state: Recurrent
-    velocity_scale: Recurrent
-
-
 class Kernel:
     """The integration of (q, q̇) with q̈ from a program, whose inputs are q, q̇, t and numbers that stay constant.
 
@@ -126,21 +112,17 @@ class Kernel:
         motion: Recurrent | None = None,
     ):
         self.states, self.numbers = 2 * size, program.size - 2 * size - 1
-        self._nesting = nesting = nesting or Nesting(size)
-        self._given, self.borders = (program, size, projection, guards, error_groups, nesting), None
-        program, projection, guards, self._chosen = parameters_chosen(
+        nesting = nesting or Nesting(size)
+        self._given: dict[str, Any] = dict(
+            program=program, size=size, projection=projection, guards=guards, error_groups=error_groups,
+            nesting=nesting, motion=motion,
+        )  # fmt: skip
+        program, projection, self._guards, chosen = parameters_chosen(
             program, projection, guards, 2 * size + 1, size // nesting.base
         )
-        self._smooth = program, projection
-        self._parts = program, recurrences(program, size), projection
-        self._motion = motion
-        if guards is not None:
-            whole, of_whole, self.borders = watched(program, size, guards.values, not nesting.directions)
-            self._parts = whole, of_whole, projection
-        elif pieces := pieces_of(program, nesting, motion):
-            self.borders, of_pieces = pieces
-            self._parts = self.borders.program, of_pieces, projection
-        self._options = guards, error_groups
+        self._smooth = MotionParts.of_smooth(program, size, projection)._replace(chosen=chosen)
+        self._parts = self._smooth.of_run(nesting, self._guards, motion)
+        self._error_groups = error_groups
         self.width = lanes() if width is None else width
         self._tangents = functools.cache(self._tangents_of)
         self.for_gpus = functools.cache(self._for_gpus)
@@ -156,19 +138,22 @@ class Kernel:
 
     @functools.cached_property
     def _one_by_one(self) -> bool:
-        program, series, _ = self._parts
-        large = is_large(program) and series.rows * MAX_ORDER * self.width * 8 > LARGEST_SHARED
+        series, large = self._parts.series, is_large(self._parts.program)
+        large = large and series.rows * MAX_ORDER * self.width * 8 > LARGEST_SHARED
         return large and fills_lanes(series)
 
     @functools.cached_property
     def _alone(self) -> "Kernel":
-        return Kernel(*self._given, width=1, motion=self._motion)
+        return Kernel(**self._given, width=1)
+
+    @property
+    def borders(self) -> Borders | None:
+        """The borders between the pieces of the motion."""
+        return self._parts.borders
 
     def _integrator(self, number: ir.Type = DOUBLE) -> Integrator:
         with without_collections():
-            integrator = Integrator(
-                *self._parts, *self._options, self.borders, self._nesting, self._chosen, width=self.width, number=number
-            )
+            integrator = Integrator(self._parts, self._guards, self._error_groups, width=self.width, number=number)
         forget_joined()
         forget_stages()
         return integrator
@@ -178,7 +163,7 @@ class Kernel:
         number = FLOAT if single else DOUBLE
 
         def motion() -> TaylorSeries:
-            _gpu.require_room(size_of_series(self._parts[1]))  # before what is larger than that is written down
+            _gpu.require_room(size_of_series(self._parts.series))  # before what is larger than that is written down
             return self.for_members(1)._integrator(number).motion
 
         return _gpu.GpuPrograms(motion, lambda: self._adjoint(width=1, number=number).motion, single)
@@ -189,8 +174,8 @@ class Kernel:
 
         What decides about these is known to the digits of doubles.
         """
-        program, _, projection = self._parts
-        return self.borders is None and self._options[0] is None and not is_large(program, projection)
+        large = is_large(self._parts.program, self._parts.projection)
+        return self.borders is None and self._guards is None and not large
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
@@ -201,7 +186,7 @@ class Kernel:
 
     @property
     def _notes(self) -> bool:
-        return self._options[0] is not None and self._options[0].notes
+        return self._guards is not None and self._guards.notes
 
     @property
     def rest_size(self) -> int:
@@ -235,7 +220,7 @@ class Kernel:
             begun = self._begun(ts, y0, params, self.plan(rtol, atol, max_steps))
         if begun is None:
             shape = (times, self.states)
-            if self._notes and (guards := self._options[0]) is not None:
+            if self._notes and (guards := self._guards) is not None:
                 shape = len(guards.directions) * (room_of_notes + 1), self.states + 1
             path, y_end = np.full((members, *shape), np.nan), np.empty((members, self.states))
             t_end, code, steps, rejected = np.empty((4, members))
@@ -341,7 +326,7 @@ class Kernel:
     def _tangents_of(self, side_by_side: bool) -> "_Compiled":
         """The kernel of tangents, whose directions stand side by side or members do; compiled on first use."""
         with without_collections():
-            tangent = Tangent(*self._derivative_parts, width=1 if side_by_side else self.width, lanes=self.width)
+            tangent = Tangent(self._derivative_parts, width=1 if side_by_side else self.width, lanes=self.width)
         forget_joined()
         forget_stages()
         return _Compiled(tangent.motion, tangent.motion.layout, tangent.job, self._rounds, pointers=3)
@@ -379,15 +364,11 @@ class Kernel:
         )  # fmt: skip
 
     @property
-    def _derivative_parts(self) -> tuple:
+    def _derivative_parts(self) -> MotionParts:
         """The parts of derivatives over steps that have been taken: features do not matter to these."""
-        if self.borders is not None and self.borders.switches:
-            parts = self._parts
-            if self._options[0] is not None:
-                parts = *along_pieces(self.borders, self._given[1]), parts[2]
-            return *parts, self.borders, self._nesting, self._chosen
-        program, projection = self._smooth
-        return program, recurrences(program, self._given[1]), projection, None, None, self._chosen
+        if not self._parts.pieces:
+            return self._smooth
+        return self._parts if self._guards is None else self._parts.without_guards
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
@@ -397,7 +378,7 @@ class Kernel:
 
     def _adjoint(self, width: int, number: ir.Type = DOUBLE) -> Adjoint:
         with without_collections():
-            adjoint = Adjoint(*self._derivative_parts, width=width, number=number)
+            adjoint = Adjoint(self._derivative_parts, width=width, number=number)
         forget_joined()
         forget_stages()
         return adjoint
@@ -487,104 +468,6 @@ def _sort_by_member(table: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, n
 
 def _contiguous(*arrays) -> list[np.ndarray]:
     return [np.ascontiguousarray(x, dtype=np.float64) for x in arrays]
-
-
-@dataclass(frozen=True, eq=False)
-class _Fewer:
-    """A program of those numbers of a member that it computes with (`Recurrent`); others are only looked up."""
-
-    line: StraightLine
-    size: int
-    dtypes: tuple
-    linear: Any
-    budget: int
-
-
-@functools.lru_cache(maxsize=16)
-def parameters_chosen(
-    program: Recurrent, projection: Projection | None, guards: Guards | None, first: int, rows: int
-) -> "tuple[Recurrent, Projection | None, Guards | None, Chosen | None]":
-    """The programs with the parameters that they compute with, where they look up others in tables; and which.
-
-    The numbers of a member begin at input `first`, and are `rows` times as many as those of the motion without its
-    tangents: what is a parameter of one row is one of each.
-    """
-    programs: list = [program]
-    programs += [] if projection is None else [projection.state, projection.velocity_scale]
-    programs += [] if guards is None else [guards.values, guards.program]
-    if not any(op in LOOK_UPS for one in programs for op, _, _ in one.line.nodes):
-        return program, projection, guards, None
-    read = {node[2] - first for one in programs for node in one.line.nodes if node[0] == "input"}
-    of = program.size - first
-    read |= set() if guards is None else set(range(of - guards.inputs, of))
-    own = of // rows
-    columns = sorted({i % own for i in read if i >= 0}) if own else []
-    positions = tuple(row * own + i for row in range(rows) for i in columns)
-    place = {first + i: first + k for k, i in enumerate(positions)}
-
-    def fewer(one):
-        nodes = tuple(
-            (op, xs, place.get(a, a) if op == "input" else shifted(a, BESIDE - first) if op in LOOK_UPS else a)
-            for op, xs, a in one.line.nodes
-        )
-        dtypes = (*one.dtypes[:first], *(one.dtypes[first + i] for i in positions))
-        return _Fewer(one.line._replace(nodes=nodes), first + len(positions), dtypes, one.linear, one.budget)
-
-    done = iter([fewer(one) for one in programs])
-    return (
-        next(done),
-        projection and Projection(next(done), next(done)),
-        guards and guards._replace(values=next(done), program=next(done)),
-        Chosen(positions, of),
-    )
-
-
-# Their rules add nothing but each other, and what is constant between jumps: a program of these alone has a series.
-_ARITHMETIC = frozenset(
-    "input constant add sub mul div neg sqrt abs max min select is_finite eq ne lt le gt ge and or not".split()
-)
-
-
-def require_recurrences(program: Recurrent, size: int) -> None:
-    """Raise `Unlowerable` where the lanes of a kernel cannot run a program, or an operation has no series.
-
-    Of arithmetic that is known from the operations alone, without making the series, which may be as large again.
-    """
-    require_lanes(program.line)
-    if not _ARITHMETIC.issuperset(op for op, _, _ in program.line.nodes):
-        recurrences(program, size)
-
-
-@functools.lru_cache(maxsize=16)  # used where the engine is chosen, and where it is compiled
-def recurrences(program: Recurrent, size: int) -> Series:
-    """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
-    require_lanes(program.line)
-    with without_collections():
-        return series(program, size, moving=2 * size + 1)
-
-
-@functools.lru_cache(maxsize=16)
-def pieces_of(program: Recurrent, nesting: Nesting, motion: Recurrent | None = None) -> "tuple[Borders, Series] | None":
-    """The borders of a piecewise program, and the series of its motion along a piece; None where there are none.
-
-    Of a motion with its tangents they are those of the `motion` alone, moved along.
-    """
-    size = nesting.size
-    if motion is not None and nesting.directions and not looks_up(motion):
-        if (of_motion := pieces_of(motion, Nesting(nesting.base))) is None:
-            return None
-        found = of_motion[0]
-        for inner, directions in nesting.levels:
-            found = with_borders_of_tangents(found, inner, directions)
-        with without_collections():
-            return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
-    try:
-        if (found := borders(program, size, not nesting.directions)) is not None:
-            with without_collections():
-                return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
-    except Unlowerable:  # a switching number without a series, or more operations than that takes
-        pass
-    return None
 
 
 def floor_of(rtol: float, atol: float) -> float:

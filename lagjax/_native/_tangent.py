@@ -26,15 +26,15 @@ from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Lane, Memory, Vectors, integers, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
+from lagjax._native._parts import MotionParts
 from lagjax._native._replay import Replay
 from lagjax._native._saltation import GuardTable, Saltation, jump_along
 from lagjax._native._tables import Tables
-from lagjax._native._taylor import Chosen, TaylorSeries, double, integer, is_large
+from lagjax._native._taylor import TaylorSeries, double, integer, is_large
 from lagjax._native._time_knots import TimeKnots
 from lagjax._program._borders import Borders
 from lagjax._program._differentiation import pushforward
 from lagjax._program._jump import Jump, Nesting
-from lagjax._program._series import Recurrent, Series
 
 # `y_dot` is the tangent of the start, and becomes that of the end.
 JOB = job(
@@ -56,28 +56,22 @@ class Tangent:
 
     def __init__(
         self,
-        program: Recurrent,
-        series: Series,
-        projection=None,
-        borders: "Borders | None" = None,
-        nesting: Nesting | None = None,
-        chosen: Chosen | None = None,
+        parts: MotionParts,
         *,
         width: int,
         lanes: int,
     ):
-        n, states = series.size, 2 * series.size
-        nesting = nesting or Nesting(n)
+        program, series, nesting, projection, borders, _ = parts
+        n, states, pieces = series.size, 2 * series.size, parts.pieces
         jump = jump_along(borders, nesting)
         large = is_large(program, projection, times=2, more=() if jump is None else [jump.line])
         fields = {"active": 1, "next_begin": 1} | ({"moved": states} if projection is not None else {})
-        pieces = 0 if borders is None else len(borders.switches)
         if borders is not None:
             fields |= FirstSaltation.fields(pieces, n) if jump is None else Saltation.fields(pieces)
             fields |= {"crossed": 1, "grazes": 1}
         self.motion = TaylorSeries(
-            "tangent", program, series, JOB, fields, large, width, keep_sums=True, pieces=pieces, chosen=chosen
-        )
+            "tangent", parts, JOB, fields, large, width, keep_sums=True
+        )  # fmt: skip
         self.n, self.states, self.series, self.lanes, self.numbers = n, states, series, lanes, self.motion.parameters
         self.clocks: TimeKnots | None = None
         self.base = nesting.base

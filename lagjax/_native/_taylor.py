@@ -10,7 +10,6 @@ import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -19,19 +18,10 @@ from lagjax._native._constants import LARGEST_LINE, LEAST_ORDER, MAX_ORDER, OPER
 from lagjax._native._frame import Frame, Index, Memory, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
+from lagjax._native._parts import MotionParts
 from lagjax._native._table_reads import LookUps
 from lagjax._native._tables import Tables
 from lagjax._program._series import Recurrent, Series, StraightLine
-
-
-class Chosen(NamedTuple):
-    """The numbers of a member that are parameters of a motion: those at `positions`, `of` this many.
-
-    The others are only looked up (`_table_reads`).
-    """
-
-    positions: tuple[int, ...]
-    of: int
 
 
 def size_of_series(series: Series) -> int:
@@ -53,18 +43,16 @@ class TaylorSeries:
     def __init__(
         self,
         name: str,
-        program: Recurrent,
-        series: Series,
+        parts: MotionParts,
         job: type,
         fields: dict,
         large: bool,
         width: int,
         keep_sums: bool = False,
-        pieces: int = 0,
-        chosen: "Chosen | None" = None,
         kept: int = 0,
         number: ir.Type = DOUBLE,
     ):
+        program, series, pieces, chosen = parts.program, parts.series, parts.pieces, parts.chosen
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
         self.numbers = program.size - self.states - 1  # parameters, and the pieces of a piecewise program
         self.pieces, self.parameters, self.kept = pieces, self.numbers - pieces, kept

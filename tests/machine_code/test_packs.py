@@ -171,10 +171,10 @@ def test_a_scene_in_which_everything_waits_for_what_comes_before_keeps_members_i
 
 def test_the_code_does_not_grow_with_the_scene(monkeypatch):
     from lagjax._native._integrator import Integrator
+    from lagjax._native._parts import MotionParts
 
     def instructions(count):
-        program = cluster(count)
-        module = Integrator(program, _native.recurrences(program, 2 * count), width=1).motion.module
+        module = Integrator(MotionParts.of_smooth(cluster(count), 2 * count), width=1).motion.module
         return sum(len(block.instructions) for function in module.functions for block in function.blocks)
 
     monkeypatch.setattr(_taylor, "LARGEST_LINE", -1)

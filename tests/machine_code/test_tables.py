@@ -11,6 +11,7 @@ from lagjax._derivation import derivation_of, numbers_of
 from lagjax._layout import Layout
 from lagjax._native import _packs, _schedule, _taylor
 from lagjax._native._integrator import Integrator
+from lagjax._native._parts import MotionParts
 from lagjax._program import OPERATIONS, Unlowerable, lower
 
 MEMBERS, RTOL, ROOM = 3, 1e-9, 300
@@ -171,11 +172,10 @@ def instructions(acceleration, size):
     """How many instructions the kernel of q̈ = `acceleration(q, v, t)` has, as tables."""
     states = jax.ShapeDtypeStruct((size,), float)
     program = lower(lambda q, v, t: (acceleration(q, v, t), False), states, states, 1.0)
-    borders, series = _native.pieces_of(program, _native.Nesting(size)) or (None, _native.recurrences(program, size))
-    program = program if borders is None else borders.program
+    parts = MotionParts.of_smooth(program, size).of_run(_native.Nesting(size), None, program)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_taylor, "LARGEST_LINE", -1)
-        functions = Integrator(program, series, borders=borders, width=8).motion.module.functions
+        functions = Integrator(parts, width=8).motion.module.functions
     return sum(len(block.instructions) for function in functions for block in function.blocks)
 
 

@@ -1,0 +1,183 @@
+"""The programs that a kernel is made from: those of a motion, its series, and the borders between its pieces."""
+
+import functools
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
+from lagjax._program._borders import Borders, borders
+from lagjax._program._graph import Unlowerable
+from lagjax._program._jump import Nesting, looks_up, with_borders_of_tangents
+from lagjax._program._look_ups import BESIDE, shifted
+from lagjax._program._memory import without_collections
+from lagjax._program._operations import LOOK_UPS
+from lagjax._program._series import Recurrent, Series, StraightLine, series
+
+
+class Projection(NamedTuple):
+    """The programs that keep a motion on its constraints: two of (q, q̇, t, parameters).
+
+    `state` gives the projected state (q, q̇), 2n numbers. `velocity_scale` gives n numbers: an error of a velocity
+    counts relative to its scale where that is larger than the velocity itself.
+    """
+
+    state: Recurrent
+    velocity_scale: Recurrent
+
+
+class Chosen(NamedTuple):
+    """The numbers of a member that are parameters of a motion: those at `positions`, `of` this many.
+
+    The others are only looked up (`_table_reads`).
+    """
+
+    positions: tuple[int, ...]
+    of: int
+
+
+class MotionParts(NamedTuple):
+    """A motion as its kernels take it: what an integrator, its tangents and its adjoint are built from.
+
+    - `program`: q̈ and whether the mass matrix is singular, then numbers that are followed along a step. Its last inputs
+      are the pieces, where there are `borders` between some.
+    - `series`: the Taylor series of the motion along a piece.
+    - `nesting`: which of the coordinates are tangents of others.
+    - `projection`: the way back to the constraints; `chosen`: the numbers of a member that it computes with. None where
+      there are no constraints, or where these are all numbers.
+    """
+
+    program: Recurrent
+    series: Series
+    nesting: Nesting
+    projection: Projection | None = None
+    borders: Borders | None = None
+    chosen: Chosen | None = None
+
+    @property
+    def pieces(self) -> int:
+        """The number of pieces among the inputs of the program."""
+        return 0 if self.borders is None else len(self.borders.switches)
+
+    @classmethod
+    def of_smooth(cls, program: Recurrent, size: int, projection: Projection | None = None) -> "MotionParts":
+        """Those of a motion over this many coordinates without borders, or whose borders do not matter."""
+        return cls(program, recurrences(program, size), Nesting(size), projection)
+
+    def of_run(self, nesting: Nesting, guards: Guards | None, motion: Recurrent | None) -> "MotionParts":
+        """Those of a run, from those of the same motion without borders: along its pieces, with guards behind q̈.
+
+        `motion` is the program of the motion without its tangents.
+        """
+        size, whole = nesting.size, self._replace(nesting=nesting)
+        if guards is not None:
+            program, series, found = watched(self.program, size, guards.values, not nesting.directions)
+            return whole._replace(program=program, series=series, borders=found)
+        if (pieces := pieces_of(self.program, nesting, motion)) is None:
+            return whole
+        found, series = pieces
+        return whole._replace(program=found.program, series=series, borders=found)
+
+    @property
+    def without_guards(self) -> "MotionParts":
+        """Those of a piecewise motion without the guards behind it."""
+        assert self.borders is not None
+        program, series = along_pieces(self.borders, self.nesting.size)
+        return self._replace(program=program, series=series)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fewer:
+    """A program of those numbers of a member that it computes with (`Recurrent`); others are only looked up."""
+
+    line: StraightLine
+    size: int
+    dtypes: tuple
+    linear: Any
+    budget: int
+
+
+@functools.lru_cache(maxsize=16)
+def parameters_chosen(
+    program: Recurrent, projection: Projection | None, guards: Guards | None, first: int, rows: int
+) -> "tuple[Recurrent, Projection | None, Guards | None, Chosen | None]":
+    """The programs with the parameters that they compute with, where they look up others in tables; and which.
+
+    The numbers of a member begin at input `first`, and are `rows` times as many as those of the motion without its
+    tangents: what is a parameter of one row is one of each.
+    """
+    programs: list = [program]
+    programs += [] if projection is None else [projection.state, projection.velocity_scale]
+    programs += [] if guards is None else [guards.values, guards.program]
+    if not any(op in LOOK_UPS for one in programs for op, _, _ in one.line.nodes):
+        return program, projection, guards, None
+    read = {node[2] - first for one in programs for node in one.line.nodes if node[0] == "input"}
+    of = program.size - first
+    read |= set() if guards is None else set(range(of - guards.inputs, of))
+    own = of // rows
+    columns = sorted({i % own for i in read if i >= 0}) if own else []
+    positions = tuple(row * own + i for row in range(rows) for i in columns)
+    place = {first + i: first + k for k, i in enumerate(positions)}
+
+    def fewer(one):
+        nodes = tuple(
+            (op, xs, place.get(a, a) if op == "input" else shifted(a, BESIDE - first) if op in LOOK_UPS else a)
+            for op, xs, a in one.line.nodes
+        )
+        dtypes = (*one.dtypes[:first], *(one.dtypes[first + i] for i in positions))
+        return _Fewer(one.line._replace(nodes=nodes), first + len(positions), dtypes, one.linear, one.budget)
+
+    done = iter([fewer(one) for one in programs])
+    return (
+        next(done),
+        projection and Projection(next(done), next(done)),
+        guards and guards._replace(values=next(done), program=next(done)),
+        Chosen(positions, of),
+    )
+
+
+# Their rules add nothing but each other, and what is constant between jumps: a program of these alone has a series.
+_ARITHMETIC = frozenset(
+    "input constant add sub mul div neg sqrt abs max min select is_finite eq ne lt le gt ge and or not".split()
+)
+
+
+def require_recurrences(program: Recurrent, size: int) -> None:
+    """Raise `Unlowerable` where the lanes of a kernel cannot run a program, or an operation has no series.
+
+    Of arithmetic that is known from the operations alone, without making the series, which may be as large again.
+    """
+    require_lanes(program.line)
+    if not _ARITHMETIC.issuperset(op for op, _, _ in program.line.nodes):
+        recurrences(program, size)
+
+
+@functools.lru_cache(maxsize=16)  # used where the engine is chosen, and where it is compiled
+def recurrences(program: Recurrent, size: int) -> Series:
+    """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
+    require_lanes(program.line)
+    with without_collections():
+        return series(program, size, moving=2 * size + 1)
+
+
+@functools.lru_cache(maxsize=16)
+def pieces_of(program: Recurrent, nesting: Nesting, motion: Recurrent | None = None) -> "tuple[Borders, Series] | None":
+    """The borders of a piecewise program, and the series of its motion along a piece; None where there are none.
+
+    Of a motion with its tangents they are those of the `motion` alone, moved along.
+    """
+    size = nesting.size
+    if motion is not None and nesting.directions and not looks_up(motion):
+        if (of_motion := pieces_of(motion, Nesting(nesting.base))) is None:
+            return None
+        found = of_motion[0]
+        for inner, directions in nesting.levels:
+            found = with_borders_of_tangents(found, inner, directions)
+        with without_collections():
+            return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
+    try:
+        if (found := borders(program, size, not nesting.directions)) is not None:
+            with without_collections():
+                return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
+    except Unlowerable:  # a switching number without a series, or more operations than that takes
+        pass
+    return None
