@@ -14,7 +14,7 @@ from jax import lax
 from lagjax import scenes
 from lagjax._derivation import derivation_of
 from lagjax._layout import Layout
-from lagjax._native import _kernel
+from lagjax._native import _parts
 from lagjax._program import (
     OPERATIONS,
     Program,
@@ -466,7 +466,7 @@ def test_pullback_is_the_transposed_derivative():
 
 def test_arithmetic_is_known_to_have_a_series_without_making_it():
     # The rules of these operations write no other ones: so a program of them alone need not be tried.
-    closed = _kernel._ARITHMETIC - {"input", "constant"}
+    closed = _parts._ARITHMETIC - {"input", "constant"}
     assert all(OPERATIONS[op].recurrence or OPERATIONS[op].is_step for op in closed)
 
     def each(q, v, t):
@@ -475,4 +475,4 @@ def test_arithmetic_is_known_to_have_a_series_without_making_it():
 
     program, found = recurrences(each, [0.3], [0.4], 0.1)
     for line in (program.line, found.zeroth_order, found.order_recursion):
-        assert {op for op, _, _ in line.nodes} <= _kernel._ARITHMETIC
+        assert {op for op, _, _ in line.nodes} <= _parts._ARITHMETIC
