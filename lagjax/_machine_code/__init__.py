@@ -27,7 +27,7 @@ from lagjax._machine_code._crossing import (
 )
 from lagjax._machine_code._derivatives import jvp, projected_start, vjp
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
-from lagjax._machine_code._gpu_launch import form_for_gpus
+from lagjax._machine_code._gpu_launch import for_device, form_for_gpus
 from lagjax._machine_code._steps import KEPT, StepStore
 from lagjax._machine_code._surfaces import Guarded, Surfaces, crossing_variation, require_one_number, vector_of
 from lagjax._native import Guards, watched
@@ -134,11 +134,15 @@ class MachineCode(AbstractEngine):
         """The outlook for the problem's machine code on a GPU, as the end of a sentence."""
         with jax.enable_x64(True):
             problem = problem.in_doubles if problem.is_single else problem
+            flow = flow_of(problem)
+            tolerances = for_device(flow, tolerances_of(problem))
             try:
-                form = form_for_gpus(flow_of(problem), tolerances_of(problem))
+                form = form_for_gpus(flow, tolerances)
             except Unlowerable as reason:
                 return f"nor can solver=lagjax.MachineCode() go to a GPU: {reason}"
         outlook = "solver=lagjax.MachineCode() is for GPUs too, assembled and checked on a CPU, not yet run on a GPU"
+        if tolerances.allow_singles:
+            outlook += "; its series are in float32 there, since float64 is slow"
         if not form.unrolled:  # `benchmarks.gpu_estimate`: a chain of four, at the bandwidth of the memory
             outlook += (
                 "; its series do not fit into the registers of a thread, and if the memory bounds it, it is no faster "

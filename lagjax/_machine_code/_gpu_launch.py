@@ -47,8 +47,7 @@ def has_slow_doubles() -> bool:
 
 
 def form_for_gpus(flow: Flow, tolerances: Tolerances) -> gpu.GpuForm:
-    """The form of a motion on the GPU at hand. Raises `Unlowerable` where that cannot run it."""
-    tolerances = for_device(flow, tolerances)
+    """The form of a motion, with the tolerances for the device. Raises `Unlowerable` where a GPU cannot run it."""
     return flow.kernel.for_gpus(tolerances.allow_singles).form(gpu.MOTION, tolerances.rtol)
 
 

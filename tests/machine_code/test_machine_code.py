@@ -11,6 +11,7 @@ import pytest
 import lagjax
 import lagjax._engine as engine
 import lagjax._machine_code as machine_code
+from lagjax._machine_code import _gpu_launch
 
 OSCILLATOR = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
 BY_ARRAYS = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, path="array")
@@ -71,6 +72,18 @@ def test_on_a_gpu_the_explanation_follows_the_size_of_the_scene(monkeypatch, sce
     explained = " ".join(str(scene.system.explain(scene.q0, scene.qdot0, params=scene.params)).split())
     assert "diffrax" in explained and outlook in explained
     assert ("16 cores" in explained) == ("16 cores" in outlook)
+
+
+def test_on_a_gpu_with_slow_float64_the_explanation_says_where_float32_is_enough(monkeypatch):
+    for module in (machine_code, engine):
+        monkeypatch.setattr(module, "default_platform", lambda: "gpu")
+    monkeypatch.setattr(_gpu_launch, "has_slow_doubles", lambda: True)
+    scene, words = lagjax.scenes.pendulum(), "its series are in float32 there"
+    for dtype, wedge in ((np.float32, False), (np.float64, False), (np.float32, True)):
+        system = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q)) if wedge else scene.system
+        params = None if wedge else jax.tree.map(dtype, scene.params)
+        explained = " ".join(str(system.explain(dtype(1.0), dtype(0.0), params=params)).split())
+        assert (words in explained) == (dtype == np.float32 and not wedge)
 
 
 def test_where_it_runs_is_asked_anew_for_every_run(monkeypatch):

@@ -401,13 +401,18 @@ def test_every_ready_scene(make, on_the_ptx):
     agree(on_the_ptx(lambda q0: motion(scene, q0, scene.qdot0)[:4], scene.q0), function(scene.q0), 1e-8)
 
 
+ONE_OF_A_KIND = (
+    scenes.chain, scenes.spherical_pendulum, scenes.driven_pendulum, scenes.fermi_pasta_ulam, scenes.kepler,
+    scenes.cartesian_double_pendulum, scenes.rolling_disc, scenes.slider_crank, scenes.swinging_atwood,
+    scenes.relativistic_charge_in_electric_field,
+)  # fmt: skip
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("make", scenes.ALL, ids=lambda make: make.__name__)
-def test_every_ready_scene_in_single_precision(make, on_the_ptx, slow_doubles):
-    """The restricted three bodies, and a pendulum that is driven into chaos, multiply a rounding by a few hundred."""
+@pytest.mark.parametrize("make", ONE_OF_A_KIND, ids=lambda make: make.__name__)
+def test_scenes_in_single_precision(make, on_the_ptx, slow_doubles):
+    """The pendulum that is driven into chaos multiplies a rounding by a hundred."""
     scene = make()
-    if "begin inline asm" in program_of(scene, dtype=np.float32):
-        pytest.skip("libdevice has assembly of its own for a tangent, which is not translated")
 
     def states(q0):
         return in_single(scene, q0)[:3]
@@ -501,16 +506,28 @@ def ptxas():
 STACK, SPILLS = 40_000, 4_000
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(ptxas() is None, reason="there is no ptxas: the extra `ptxas` has it")
-@pytest.mark.parametrize("make", scenes.ALL, ids=lambda make: make.__name__)
-def test_ptxas_assembles_every_ready_scene(make, tmp_path):
-    program, source = program_of(make()), tmp_path / "k.ptx"
+def assembled(program, folder):
+    """The bytes of stack and of spills of a program on each processor."""
+    source = folder / "k.ptx"
     source.write_text(program)
     for processor in ("sm_80", "sm_90", "sm_120"):
-        command = [ptxas(), "-v", "-arch", processor, source, "-o", tmp_path / "k.cubin"]
+        command = [ptxas(), "-v", "-arch", processor, source, "-o", folder / "k.cubin"]
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         report = done.stdout + done.stderr
         stack, *spills = (int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", report))
-        assert stack <= STACK and max(spills) <= SPILLS, report
+        yield stack, max(spills)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(ptxas() is None, reason="there is no ptxas: the extra `ptxas` has it")
+@pytest.mark.parametrize("make", scenes.ALL, ids=lambda make: make.__name__)
+def test_ptxas_assembles_every_ready_scene(make, tmp_path):
+    assert all(stack <= STACK and spills <= SPILLS for stack, spills in assembled(program_of(make()), tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(ptxas() is None, reason="there is no ptxas: the extra `ptxas` has it")
+@pytest.mark.parametrize("make", [scenes.double_pendulum, scenes.spherical_pendulum, scenes.cartesian_pendulum])
+def test_in_single_precision_series_fit_into_registers(make, tmp_path, slow_doubles):
+    assert all(spills == 0 for _, spills in assembled(program_of(make(), dtype=np.float32), tmp_path))
