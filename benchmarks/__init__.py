@@ -15,8 +15,6 @@ error of each run against an independent reference, and compares times *at equal
 - `_comparisons`: right-hand sides, sizes of batches, cores; `_sizes`: many coordinates, first results; `_latency`: one
   call; `_derivation`: the time to the first result beside peers; `_gradient`: derivatives; `_mixed`: batches whose
   members need different numbers of steps; `_constraints`: what they cost;
-- `_goals`: what is to be reached, from the stored numbers;
-- `hard_cases` and `_hard/`: errors against references from elsewhere; `soak`: random scenes for an hour. Both are
-  commands of their own;
+- `hard_cases` and `_hard/`: errors against references from elsewhere, a command of its own;
 - `_report`: tables, and a JSON file that says on what machine and with which versions; `_figures`: a figure of each.
 """

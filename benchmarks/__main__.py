@@ -15,7 +15,6 @@ from benchmarks import (
     _constraints,
     _derivation,
     _figures,
-    _goals,
     _gradient,
     _latency,
     _mixed,
@@ -44,7 +43,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         print(f"\n==== {part} ".ljust(80, "="), flush=True)
         kept = record.get(part, {}).get("rows", []) if part in COMPARISONS else []
         record[part] = _origin(options) | {"rows": kept}
-        for row in _rows_of(part, options, record):
+        for row in _rows_of(part, options):
             others = [
                 other for other in record[part]["rows"] if part not in COMPARISONS or other["case"] != row["case"]
             ]
@@ -58,27 +57,20 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
 
 
 def _origin(options: argparse.Namespace) -> dict[str, Any]:
-    settings = {key: str(value) for key, value in vars(options).items() if key != "output"}
-    return {"circumstances": _report.circumstances(), "options": settings}
+    """Commit, versions and machine, and the options that the rows do not show."""
+    shown = {key: vars(options)[key] for key in ("links", "repeats", "budget", "device")}
+    return {"circumstances": _report.circumstances(), "options": shown}
 
 
-def _commits(record: dict[str, Any]) -> set[str | None]:
-    found = [place for part in record.values() for place in (part, *part["rows"]) if "circumstances" in place]
-    return {place["circumstances"]["commit"] for place in found}
-
-
-def _rows_of(part: str, options: argparse.Namespace, record: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    if part == "goals":
-        if len(_commits(record)) > 1:
-            print("The numbers below are of several commits: run all parts again for one.")
-        yield from _goals.goals(record)
-    elif part in TABLES:
+def _rows_of(part: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    if part in TABLES:
         yield from TABLES[part](options)
     else:
         for comparison in COMPARISONS[part](options):
             _report.print_comparison(comparison)
             sys.stdout.flush()
-            row = comparison.as_dict() | {"equal_error": _report.equal_error(comparison)} | _origin(options)
+            exact = [entry for entry in _report.equal_error(comparison) if not entry["upper_bound"]]
+            row = comparison.as_dict() | {"equal_error": exact} | _origin(options)
             if part == "constraints":
                 print(_constraints.price_line(row), flush=True)
             yield row
@@ -153,7 +145,7 @@ TABLES: dict[str, Callable] = {
     "gradient": _gradient.gradient,
     "gpu": _gpu,
 }
-PARTS = (*COMPARISONS, *TABLES, "goals")  # the last reads what the others wrote
+PARTS = (*COMPARISONS, *TABLES)
 
 
 def _options() -> argparse.ArgumentParser:

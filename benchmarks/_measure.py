@@ -13,7 +13,7 @@ Two programs are compared round by round, and the median of those ratios is kept
 import statistics
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -51,8 +51,9 @@ class Row:
         return self.times[k % len(self.times)] / self.members
 
     def as_dict(self) -> dict[str, Any]:
-        kept = {name: value for name, value in asdict(self).items() if name != "times"}
-        return kept | {"seconds": self.seconds, "least_seconds": self.least_seconds}
+        """The columns that are stored."""
+        names = ("contender", "tol", "median_error", "worst_error", "seconds")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass

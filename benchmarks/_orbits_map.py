@@ -54,7 +54,7 @@ def figure(angles, value, path: Path) -> None:
     ax = lagjax.plot.state_map(angles, angles, value, label="λ₁, T = 100", cmap="inferno")
     ax.set(xlabel="θ1", ylabel="θ2", aspect="equal")
     path.parent.mkdir(exist_ok=True)
-    save(ax.figure, path)
+    save(ax.figure, path, dpi=110)
 
 
 if __name__ == "__main__":

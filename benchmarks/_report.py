@@ -30,12 +30,12 @@ def circumstances() -> dict[str, Any]:
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "commit": _git(root, "rev-parse", "HEAD"),
         "dirty": bool(_git(root, "status", "--porcelain")),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "versions": {name: version for name in PACKAGES if (version := _version(name))},
         "machine": {
             "cpu": _cpu_model(),
             "cores": os.cpu_count(),
             "cores_used": cores(),
-            "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
             "system": platform.system(),
             "python": platform.python_version(),
         },
@@ -107,21 +107,15 @@ def error_against_time(comparison: Comparison) -> list[dict[str, Any]]:
 
 
 def equal_error(comparison: Comparison) -> list[dict[str, Any]]:
-    """For each contender and error: seconds per trajectory, and how many times those of lagjax that is."""
+    """For each contender and error it reaches: seconds per trajectory, and how many times those of lagjax that is."""
     rows = {name: [r for r in comparison.rows if r.contender == name] for name in _contenders(comparison)}
     entries = []
     for name, theirs in rows.items():
         for error in EQUAL_ERRORS:
-            time = at_equal_error(theirs, error)
-            entries.append(
-                {
-                    "contender": name,
-                    "error": error,
-                    "seconds": time and time[0],
-                    "upper_bound": bool(time and time[1]),
-                    "times_lagjax": ratio_at_equal_error(rows.get(OURS, []), theirs, error),
-                }
-            )
+            if time := at_equal_error(theirs, error):
+                ratio = ratio_at_equal_error(rows.get(OURS, []), theirs, error)
+                entry = {"contender": name, "error": error, "seconds": time[0], "upper_bound": time[1]}
+                entries.append(entry | {"times_lagjax": ratio})
     return entries
 
 
@@ -131,16 +125,14 @@ def _contenders(comparison: Comparison) -> list[str]:
 
 def equal_error_table(comparison: Comparison) -> list[dict[str, Any]]:
     """The same for the eye: µs per trajectory, in brackets the multiple of lagjax; "≤" for an upper bound."""
-    lines: dict[str, dict[str, Any]] = {}
+    empty = {f"{error:.0e}": None for error in EQUAL_ERRORS}
+    lines: dict[str, dict[str, Any]] = {name: {"µs at equal error": name} | empty for name in _contenders(comparison)}
     for entry in equal_error(comparison):
-        line = lines.setdefault(entry["contender"], {"µs at equal error": entry["contender"]})
-        line[f"{entry['error']:.0e}"] = _time_and_ratio(entry)
+        lines[entry["contender"]][f"{entry['error']:.0e}"] = _time_and_ratio(entry)
     return list(lines.values())
 
 
-def _time_and_ratio(entry: dict[str, Any]) -> str | None:
-    if entry["seconds"] is None:
-        return None
+def _time_and_ratio(entry: dict[str, Any]) -> str:
     ratio = "" if entry["times_lagjax"] is None else f" ({entry['times_lagjax']:.2g}×)"
     return ("≤ " if entry["upper_bound"] else "") + f"{1e6 * entry['seconds']:.3g}" + ratio
 
@@ -156,20 +148,73 @@ def print_comparison(comparison: Comparison) -> None:
 
 # ---- files -----------------------------------------------------------------------------------------------------------
 
+DIGITS = 3  # of a stored number: times repeat to two, and errors are compared by their powers of ten
+MACHINE = ("versions", "machine")
+
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The parts that were written before."""
+    """The record that `write_json` wrote; an empty one without a file."""
     record = json.loads(path.read_text()) if path.exists() else {}
-    return {part: value for part, value in record.items() if "rows" in value}
+    return _unpacked(record, record.pop("machines", []))
 
 
 def write_json(path: Path, record: dict[str, Any]) -> None:
+    """Write the record as a small file: every machine once, rows with the same columns as tables, and three digits."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(_finite(record), indent=0, ensure_ascii=False, allow_nan=False) + "\n")
+    machines: list[dict] = []
+    packed = _packed(_finite(record), machines)
+    path.write_text(_lines(({"machines": machines} if machines else {}) | packed) + "\n")
+
+
+def _packed(value: Any, machines: list[dict]) -> Any:
+    """Replace versions and machine by their place `on` in `machines`, alike rows by their `columns` and `values`."""
+    if isinstance(value, list):
+        value = [_packed(item, machines) for item in value]
+        return {"columns": list(value[0]), "values": [list(row.values()) for row in value]} if _alike(value) else value
+    if not isinstance(value, dict):
+        return value
+    value = {key: _packed(item, machines) for key, item in value.items()}
+    if circumstances := value.get("circumstances"):
+        machine = {key: circumstances.pop(key) for key in MACHINE}
+        if machine not in machines:
+            machines.append(machine)
+        circumstances["on"] = machines.index(machine)
+    return value
+
+
+def _alike(rows: list) -> bool:
+    """True of two rows or more of numbers and words, with the same columns in the same order."""
+    if len(rows) < 2 or not all(isinstance(row, dict) and list(row) == list(rows[0]) for row in rows):
+        return False
+    return not any(isinstance(item, dict | list) for row in rows for item in row.values())
+
+
+def _unpacked(value: Any, machines: list[dict]) -> Any:
+    """Put versions and machine back where `on` names them, and make rows of `columns` and `values`."""
+    if isinstance(value, list):
+        return [_unpacked(item, machines) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if value.keys() == {"columns", "values"}:
+        return [dict(zip(value["columns"], row, strict=True)) for row in value["values"]]
+    if "on" in value:
+        return {key: item for key, item in value.items() if key != "on"} | machines[value["on"]]
+    return {key: _unpacked(item, machines) for key, item in value.items()}
+
+
+def _lines(value: Any) -> str:
+    """JSON in which a list or an object of numbers and words stands on one line."""
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    if not any(isinstance(part, dict | list) for part in parts):
+        return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    if isinstance(value, list):
+        return "[\n" + ",\n".join(map(_lines, value)) + "\n]"
+    items = (f"{json.dumps(key, ensure_ascii=False)}:{_lines(item)}" for key, item in value.items())
+    return "{\n" + ",\n".join(items) + "\n}"
 
 
 def _finite(value: Any) -> Any:
-    """JSON knows neither NaN nor infinity, nor NumPy's numbers: None, and Python's, to six digits."""
+    """JSON knows neither NaN nor infinity, nor NumPy's numbers: None, and Python's, to three digits."""
     if isinstance(value, dict):
         return {str(key): _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -178,4 +223,4 @@ def _finite(value: Any) -> Any:
         value = value.item()
     if not isinstance(value, float):
         return value
-    return float(f"{value:.6g}") if np.isfinite(value) else None
+    return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None

@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
 def measured(case: Case | Experiment, peers: bool = True) -> dict[str, Any]:
     """One row: all of `COLUMNS`, every peer, and why any is missing."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS) | {"case": case.name, "reference": case.reference}
-    row |= {"good to": case.accuracy, "bound": case.bound, "because": case.because}
+    row |= {"good to": case.accuracy, "bound": case.bound}
     if missing := isinstance(case, Experiment) and case.missing():
         return row | {"remark": f"skipped: {missing}", "peers": {}, "without": []}
     found, others = case.measure(), case.against() if peers else {}

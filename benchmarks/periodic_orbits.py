@@ -202,14 +202,14 @@ SIZES = ("closure", "step", "floor", "arcs", "change")
 
 
 def _store(path: Path, names, table) -> None:
-    """One row an orbit, v1, v2 and T with 20 digits; of the multipliers the four that are not 1 by symmetry."""
+    """One row an orbit, v1, v2 and T with 20 digits, and the four multipliers that are not 1 by symmetry with six."""
     with path.open("w", newline="") as file, localcontext(prec=40):
         write = csv.writer(file, lineterminator="\n").writerow
         write(["name", "v1", "v2", "period", *SIZES, "limit", "stable", "digits", "mu1", "mu2", "mu3", "mu4"])
         for k, name in enumerate(names):
             pairs = zip(table["numbers"][k].tolist(), (3, 3, 1), strict=True)
             digits = [f"{(Decimal(high) + Decimal(low)) / by:.20g}" for (high, low), by in pairs]
-            values = [f"{x.real:.9g}{x.imag:+.6g}i" if abs(x.imag) > 1e-9 * abs(x) else f"{x.real:.9g}"
+            values = [f"{x.real:.6g}{x.imag:+.6g}i" if abs(x.imag) > 1e-9 * abs(x) else f"{x.real:.6g}"
                       for x in table["multipliers"][k, :4]]  # fmt: skip
             sizes = [f"{table[column][k]:.1e}" for column in SIZES]
             write([name, *digits, *sizes, _limit(table, k), _verdicts(table)[k], table["digits"][k], *values])

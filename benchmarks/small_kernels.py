@@ -7,8 +7,6 @@ jax, 615 of diffrax). This file needs nothing but jax, and measures diffrax and 
     python benchmarks/small_kernels.py --beside OLD/bin/python           # and another one, in turns: ratios
     XLA_FLAGS=--xla_cpu_use_thunk_runtime=false python benchmarks/small_kernels.py     # old runtime, jax 0.4.32 to 0.6
 
-`--store` keeps what `--beside` found in `benchmarks/results/small_kernels.json`.
-
 It prints CPU seconds of this process per motion, the least of several: of `lax.scan` over classical Runge–Kutta steps,
 of its gradient by the masses, of `diffrax.diffeqsolve` with Dopri8 and of its gradient, and of `lagjax.simulate`.
 """
@@ -20,12 +18,10 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 
-STORE = Path(__file__).parent / "results" / "small_kernels.json"
 STEPS, DURATION, ROUNDS = 2000, 10.0, 5
 START = jnp.array([1.0, 1.5, 0.0, 0.0], dtype=jnp.float32)  # made float64 below
 PARAMS = (1.0, 0.8)
@@ -126,7 +122,6 @@ def main(argv=None):
     parser.add_argument("--beside", help="another interpreter, whose JAX is measured in turns with this one")
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--json", action="store_true", help="one line for the caller")
-    parser.add_argument("--store", action="store_true", help="keep the turns in benchmarks/results")
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     if options.json:
@@ -137,9 +132,6 @@ def main(argv=None):
             print(f"{name:<20}{value:>10.3g}" + ("" if name == "ends apart" else " ms"))
         return
     pairs = [(elsewhere(sys.executable), elsewhere(options.beside)) for _ in range(options.turns)]
-    if options.store:
-        record = {"load": os.getloadavg()[0], "CPU ms a motion, this environment and the other": pairs}
-        STORE.write_text(json.dumps(record, indent=1) + "\n")
     table(pairs)
 
 

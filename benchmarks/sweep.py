@@ -37,6 +37,7 @@ import numpy as np
 
 import lagjax
 from benchmarks import _report
+from benchmarks._figures import write_picture
 from lagjax._sweep import Progress, Store, run_store, status
 from lagjax._sweep._batch import run_batch
 from lagjax._sweep._description import Sections
@@ -170,11 +171,8 @@ class _Memory:
 
 
 def flip_map(options: argparse.Namespace) -> dict[str, Any]:
-    """The map of first flips, of which at most 1024² members are drawn, a pixel each."""
+    """The map of first flips, of which at most 720² members are drawn, a pixel each."""
     import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
     from PIL import Image
 
     store = Path(options.folder or tempfile.mkdtemp()) / f"flips_{options.side}.zarr"
@@ -182,12 +180,11 @@ def flip_map(options: argparse.Namespace) -> dict[str, Any]:
     swept = run(store, grid(options.side**2), progress=options.progress)
     wall = time.perf_counter() - wall
     picture = options.output / "flip_map.png"
-    flip, stride = swept.open().flip.values, max(1, options.side // 1024)
+    flip, stride = swept.open().flip.values, -(-options.side // 720)
     colors = matplotlib.colormaps["magma_r"](matplotlib.colors.LogNorm(0.5, DURATION, clip=True)(flip))
     colors[np.isnan(flip)] = (1.0, 1.0, 1.0, 1.0)
-    plt.imsave(picture, colors[::-stride, ::stride])
-    exact = Image.open(picture).convert("RGB").quantize(256, dither=Image.Dither.NONE)  # it has fewer
-    exact.save(picture, optimize=True)
+    pixels = (255 * colors[::-stride, ::stride, :3]).round().astype(np.uint8)
+    write_picture(Image.fromarray(pixels), picture)
     print(swept, picture, sep="\n")
     return {"side": options.side, "seconds": wall, "flipped": float(np.isfinite(flip).mean())}
 
@@ -384,7 +381,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     part = {"rate": rate, "map": flip_map, "kills": kills, "workers": workers, "poison": poison, "plan": plan}
     found = part[options.part](options)
     path = options.output / "sweep.json"
-    record = json.loads(path.read_text()) if path.exists() else {}
+    record = _report.read_json(path)
     record[options.part] = {"circumstances": _report.circumstances(), **found}
     _report.write_json(path, record)
     print(json.dumps(found, indent=1, ensure_ascii=False, default=float))

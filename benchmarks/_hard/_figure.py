@@ -85,7 +85,7 @@ def draw(rows: list[dict], folder: File) -> File | None:
         else:
             bottom = figure
         _errors(bottom.add_subplot(), rows)
-        return save(figure, folder / "hard_cases.png", dpi=100)
+        return save(figure, folder / "hard_cases.png", dpi=80)
 
 
 def _portrait(axes, name: str, scene: Callable, time: float, lines: Callable) -> None:

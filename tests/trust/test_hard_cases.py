@@ -5,24 +5,20 @@ are long have a short form, of fewer members, periods or pieces, at the same bou
 """
 
 import importlib.util
-import json
 import math
 import sys
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from sweeps import sweep
-
-import lagjax
 
 mp = pytest.importorskip("mpmath", reason="the references are computed with it")
 pytest.importorskip("scipy", reason="the references are computed with it")
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from benchmarks import hard_cases, hybrid_population, population, soak  # noqa: E402
+from benchmarks import _report, hard_cases, hybrid_population, population  # noqa: E402
 from benchmarks._hard import CASES, Case, Experiment, _constrained, _gravity, _integrable, _rotation  # noqa: E402
 
 # Those that take a second or two, one at least in every file of the table.
@@ -97,7 +93,7 @@ def test_keplers_equation_gives_the_published_digits(e):
 def test_the_table_is_printed_and_kept(tmp_path, capsys):
     pytest.importorskip("matplotlib", reason="the figure is drawn with it")
     hard_cases.main(["--only", "from rest to", "--no-peers", "--output", str(tmp_path)])
-    (row,) = json.loads((tmp_path / "hard_cases.json").read_text())["hard_cases"]["rows"]
+    (row,) = _report.read_json(tmp_path / "hard_cases.json")["hard_cases"]["rows"]
     assert 0 < row["error"] < row["bound"] and row["steps"] > 1 and row["seconds"] > 0
     assert {"commit", "versions", "machine"} <= row["circumstances"].keys()
     assert row["case"] in capsys.readouterr().out
@@ -116,36 +112,7 @@ def test_peers_are_judged_by_the_same_error():
             assert 0 < found[peer].error < 1e-10 and found[peer].drift < 1e-12 and found[peer].steps > 10
 
 
-# ---- soak ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_random_scenes_do_not_fail(tmp_path):
-    record = soak.main(["--minutes", "0", "--seed", "1", "--output", str(tmp_path)])  # one scene
-    assert record["scenes"] == 1 and record["steps"] > record["members"] > 0 and record["growth"] is None
-    assert json.loads((tmp_path / "soak.json").read_text())["failures"] == record["failures"] == []
-    for seed in range(2):
-        (members, steps), failures = soak.run_scene(np.random.default_rng(seed))
-        assert steps > members > 0 and failures == []
-
-
-def test_a_failure_is_found_and_named():
-    def falls(q, qdot, params):  # into the centre
-        return 0.5 * qdot @ qdot + params["k"] / jnp.abs(q[0])
-
-    system, q = lagjax.System(falls), np.array([[1.0], [0.5]])
-    run = lagjax.simulate_batch(
-        system, q, np.zeros_like(q), np.array([0.0, 5.0]), {"k": np.ones(2)}, batch_axes=(0, 0, 0)
-    )
-    (failure,) = soak._faults(system, run, 1e-9, True, 0)
-    assert "member 0 of 2 did not arrive: " in failure
-
-
-def test_a_leak_would_be_seen():
-    steady = [(float(k), 500.0 + k % 7) for k in range(soak.WARM_UP + 100)]
-    leaking = [(k, size + max(0.0, k - soak.WARM_UP)) for k, size in steady]
-    assert abs(soak.growth_of(steady)) < 0.01 < soak.FLAT < soak.growth_of(leaking)
-    assert soak.growth_of(steady[:50]) is None
+# ---- random scenes ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
