@@ -1,7 +1,7 @@
 """`action` and `find_path`: the path between two configurations, what its action is, and whether that is least.
 
-A path of Hamilton's principle joins q_start at one time to q_end at another. It is found by multiple shooting: states
-at equal parts of the time, joined by motions, of which the first and the last have their q given. Whether its action is
+A path of Hamilton's principle joins q_start at one time to q_end at another. It is found by the multiple shooting
+of `_shooting`: states at equal parts of the time, joined by motions, with q given at both ends. Whether its action is
 a minimum is told by conjugate points, where neighbouring paths from the same start meet again: as many as there are on
 the way, as many independent variations lower the action (Morse).
 
@@ -17,8 +17,9 @@ import numpy as np
 
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout, halves
-from lagjax._orbits._arcs import Arc, Arcs, Units
+from lagjax._orbits._arcs import Arcs, Units
 from lagjax._orbits._conjugate import conjugate_times
+from lagjax._orbits._shooting import Chain, Closing, close, equations
 from lagjax._problem import end_to_end
 from lagjax._results import SimulationError
 from lagjax._simulate import simulate
@@ -29,7 +30,7 @@ from lagjax._validate import as_arrays, require_finite, require_flag, require_nu
 PyTree = Any
 
 RTOL = 1e-14
-_ARCS, _TRIALS, _HALVINGS = 8, 60, 10
+_ARCS = 8
 _CLOSED = 1e-10  # the largest defect of a path, of the size of its states
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)  # of each of as many panels as there are outputs, or `_PANELS`
 _PANELS, _RESOLVED = 64, 1e-9
@@ -189,13 +190,15 @@ def find_path(
     ]
     times = np.linspace(float(t_start), float(t_end), _ARCS + 1)
     first = _guessed(layout, guess, ends, times)
-    joined = _joined(arcs, times, first, ends, _units(arcs, first, ends, times))
-    message = _why_not(arcs, joined, times)
+    closing = Closing.plain(arcs)._replace(t_first=times[0], q_end=ends[1])
+    parts = np.linspace(0.0, 1.0, _ARCS + 1)[None]
+    chain = close(closing, first[None], times[-1:] - times[:1], parts, _units(arcs, first, ends, times))
+    message = _why_not(closing, chain, times)
     if message:
         if throw:
             raise SimulationError(message, None)
-        return _nothing(joined, message)
-    return _told(system, arcs, joined, times, params)
+        return _nothing(chain, message)
+    return _told(system, arcs, chain, ends[0], times, params)
 
 
 def _units(arcs: Arcs, y, ends, times) -> Units:
@@ -207,21 +210,6 @@ def _units(arcs: Arcs, y, ends, times) -> Units:
     root = here.length[:, None] / here.state[:, :n]
     length = np.maximum((farther * root).max(axis=1), (velocity * root).max(axis=1) * duration) or 1.0
     return Units(np.concatenate([length / root, length / root / duration], axis=1), duration, np.ravel(length))
-
-
-class _Joined(NamedTuple):
-    """States `y` (K, 2n) at the first times of K arcs, the arcs, and the defects (K, 2n), in the end of q alone.
-
-    The defects are in `units` (1, 2n), the others in those of the user.
-    """
-
-    y: np.ndarray
-    arc: Arc
-    defect: np.ndarray
-    units: Units
-
-    def size(self) -> float:
-        return float(np.abs(self.defect).max()) if self.arc.ok.all() else np.inf
 
 
 def _guessed(layout: Layout, guess, ends, times) -> np.ndarray:
@@ -240,87 +228,44 @@ def _guessed(layout: Layout, guess, ends, times) -> np.ndarray:
     return y
 
 
-def _followed(arcs: Arcs, times, y, ends, units: Units) -> _Joined:
-    arc = arcs.follow(np.stack([times[:-1], times[1:]], axis=1), y)
-    n = arcs.size
-    target = np.concatenate([y[1:], np.concatenate([ends[1], arc.end[-1, n:]])[None]])
-    return _Joined(y, arc, (arc.end - target) / units.state, units)
-
-
-def _joined(arcs: Arcs, times, y, ends, units: Units) -> _Joined:
-    """The arcs that join, as far as they do, by Newton's method with steps that are shortened until defects fall."""
-    joined = _followed(arcs, times, y, ends, units)
-    for _ in range(_TRIALS):
-        size = joined.size()
-        if not np.isfinite(size) or size <= 1e-15:
-            break
-        step = _step(joined, arcs.size)
-        if step is None:
-            break
-        for halving in range(_HALVINGS):
-            trial = _followed(arcs, times, joined.y + 0.5**halving * step, ends, units)
-            if trial.size() < (1 - 0.25 * 0.5**halving) * size:
-                break
-        if not trial.size() < 0.9 * size:
-            return min(joined, trial, key=_Joined.size)
-        joined = trial
-    return joined
-
-
-def _step(joined: _Joined, n: int) -> np.ndarray | None:
-    """The step (K, 2n) of Newton's method, whose first q is zero; None where the equations are singular."""
-    count, states = joined.y.shape
-    matrix = np.zeros((count * states, count * states))
-    for k in range(count):
-        rows = slice(k * states, (k + 1) * states)
-        matrix[rows, rows] = joined.units.growth(joined.arc.by_start[k : k + 1])[0]
-        if k + 1 < count:
-            matrix[rows, (k + 1) * states : (k + 2) * states] = -np.eye(states)
-    # Without the columns of the first q, which is given, and the rows of the last q̇, which is not.
-    matrix, right = matrix[:-n, n:], -joined.defect.ravel()[:-n]
-    values = np.linalg.svd(matrix, compute_uv=False)
-    if not values[-1] > len(values) * np.finfo(float).eps * values[0]:
-        return None
-    step = np.concatenate([np.zeros(n), np.linalg.solve(matrix, right)]).reshape(count, states)
-    return step * joined.units.state
-
-
-def _why_not(arcs: Arcs, joined: _Joined, times) -> str:
+def _why_not(closing: Closing, chain: Chain, times) -> str:
     """Why no path was found; "" where one was."""
     between = f"between t = {times[0]:.6g} and {times[-1]:.6g}"
-    if not joined.arc.ok.all():
-        row = int(np.argmin(joined.arc.ok))
+    if not chain.ok[0]:
         return (
             f"No path was found {between}: from the guess the motion cannot be followed. Give another guess=..., a "
-            f"function of the time. {arcs.why_not(row, joined.arc, joined.y, times[row + 1])}"
+            f"function of the time. {chain.why[0]}"
         )
-    if joined.size() <= _CLOSED:
+    missed = float(chain.closure()[0])
+    if missed <= _CLOSED:
         return ""
-    singular = _step(joined, arcs.size) is None
+    singular = equations(closing, chain).decided.rank[0] < chain.y.shape[2]
     end = " The ends are conjugate to each other: neighbouring paths all meet there, or none does." if singular else ""
     return (
-        f"No path was found {between}: the motions that were tried miss each other by {joined.size():.2g} of their "
+        f"No path was found {between}: the motions that were tried miss each other by {missed:.2g} of their "
         f"size. There may be none, or it may be far from the guess: give another guess=..., a function of time.{end}"
     )
 
 
-def _nothing(joined: _Joined, message: str) -> Path:
+def _nothing(chain: Chain, message: str) -> Path:
     lost = jnp.asarray(np.nan)
-    return Path(None, None, None, lost, jnp.zeros(0), -1, False, jnp.asarray(joined.size()), False, message)
+    return Path(None, None, None, lost, jnp.zeros(0), -1, False, jnp.asarray(chain.closure()[0]), False, message)
 
 
-def _told(system: System, arcs: Arcs, joined: _Joined, times, params) -> Path:
+def _told(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, times, params) -> Path:
     """The path in the user's structure, with its action and its second variation."""
-    restore = arcs.layout.restore
-    conjugate, at_end = conjugate_times(arcs, joined.y, times, joined.units)
-    (q, qdot), qdot_end = map(restore, halves(joined.y[0])), restore(joined.arc.end[-1, arcs.size :])
+    restore, states = arcs.layout.restore, chain.y[0] * chain.of_state
+    states[0, : arcs.size] = q_start  # exactly, not by way of the units
+    conjugate, at_end = conjugate_times(arcs, states, times, chain.units)
+    (q, qdot), end = map(restore, halves(states[0])), arcs.ends(times[-2:][None], states[-1:]).path[0, -1]
+    qdot, qdot_end = jax.tree.map(jnp.asarray, (qdot, restore(end[arcs.size :])))
     ts = np.linspace(times[0], times[-1], 16 * _ARCS + 1)
     trajectory = simulate(system, q, qdot, ts, params, rtol=RTOL, throw=False)
-    total = sum(_arc_action(arcs, y, t0, t1) for y, t0, t1 in zip(joined.y, times[:-1], times[1:], strict=True))
+    total = sum(_arc_action(arcs, y, t0, t1) for y, t0, t1 in zip(states, times[:-1], times[1:], strict=True))
     index = len(conjugate)
     return Path(
-        jax.tree.map(jnp.asarray, qdot), jax.tree.map(jnp.asarray, qdot_end), trajectory, jnp.asarray(total),
-        jnp.asarray(conjugate), index, index == 0 and not at_end, jnp.asarray(joined.size()), True, "",
+        qdot, qdot_end, trajectory, jnp.asarray(total), jnp.asarray(conjugate), index, index == 0 and not at_end,
+        jnp.asarray(chain.closure()[0]), True, "",
     )  # fmt: skip
 
 

@@ -1,9 +1,12 @@
-"""Multiple shooting for closed orbits: Newton's method on states along the orbit and the period, for many at once.
+"""Multiple shooting for orbits and paths: damped Newton on states along the motion and the period, for many at once.
 
-    φ(y_k; a_k T, a_(k+1) T) − y_(k+1) = 0,  k = 0 … K−1,  y_K = S y_0
+    φ(y_k; a_k T, a_(k+1) T) − y_(k+1) = 0,  k = 0 … K−1,  y_K = S y_0,  or q_0 and q_K given
 
 S is the identity, or a symmetry of the scene up to which the motion returns; the parts 0 = a_0 < … < a_K = 1 of the
-period are those in which the guess takes equally many steps, so that violent moments make short arcs.
+period are those in which the guess takes equally many steps, so that violent moments make short arcs. Of a path both
+positions are given and T is its duration. The two differ in how the first and the last state depend on the numbers that
+are free, and in what a deficient rank says: an orbit has neighbours, of which the nearest one is taken; ends of a path
+are then conjugate, and no step is.
 
 Short arcs keep what one error becomes small, so that orbits close whose errors grow a millionfold in a period. Arcs of
 all orbits are rows of one run. Of the alternatives, single shooting loses as many digits as an error grows, and
@@ -18,30 +21,57 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._linear import singular_threshold
 from lagjax._orbits._arcs import Arc, Arcs, Units
-from lagjax._orbits._condense import condense
+from lagjax._orbits._condense import Condensed, condense
 from lagjax._orbits._rank import Decided, decide
 
 # Relative to the largest singular value: below, a direction counts as degenerate. Measured on the 695 planar orbits,
 # true ones are above 1e-6 and degenerate ones of a closed orbit below 1e-11. Twice as much changes no rank there.
 RANK = 1e-8
 _PER_DEFECT, _LARGEST_RANK = 30.0, 1e-3  # before it is closed, an orbit's degenerate directions are so by its defect
-TRIALS, _HALVINGS = 40, 8
+_TRIALS = 60
+# The shares of a step that are tried. Of 64 random paths quarters miss one that halves find.
+_SHARES, _SHARES_OF_PATH = 0.25 ** np.arange(8), 0.5 ** np.arange(10)
 _ENOUGH = 8e-15  # of the size of the state: round-off, below which trials cannot be told from each other
 
 
 class Closing(NamedTuple):
-    """The closing conditions of an orbit: arcs of a scene, S y = `matrix` y + `shift`, and an energy if given."""
+    """The conditions on the ends: those of an orbit are S y = `matrix` y + `shift`, and an energy if given.
+
+    Those of a path are the given positions: `q_end` (n,), and the one it begins with, at the time `t_first`.
+    """
 
     arcs: Arcs
     matrix: np.ndarray
     shift: np.ndarray
     energy: float | None = None
+    t_first: float = 0.0
+    q_end: np.ndarray | None = None
 
     @classmethod
     def plain(cls, arcs: Arcs, energy: float | None = None) -> "Closing":
         """Orbits that return to where they began."""
         return cls(arcs, np.eye(2 * arcs.size), np.zeros(2 * arcs.size), energy)
+
+    @property
+    def lasts(self) -> bool:
+        """True if the duration is given: that of a path, and the period of what is driven."""
+        return self.arcs.driven or self.q_end is not None
+
+    def free(self) -> tuple[np.ndarray, np.ndarray]:
+        """E and F (2n, 2n): the first state changes by E u and the last by F u, u (2n,) being free."""
+        whole, n = np.eye(2 * self.arcs.size), self.arcs.size
+        if self.q_end is None:
+            return whole, whole
+        return np.roll(whole, n, axis=0) * (np.arange(2 * n) < n), whole * (np.arange(2 * n) >= n)
+
+    def target(self, y: np.ndarray, end: np.ndarray, of_state: np.ndarray) -> np.ndarray:
+        """The states (B, K, 2n) where arcs from `y` that end at `end` should end, all in units `of_state` (B, 2n)."""
+        target, n = np.roll(y, -1, axis=1), self.arcs.size
+        if self.q_end is not None:
+            target[:, -1] = np.concatenate([self.q_end / of_state[:, :n], end[:, -1, n:]], axis=1)
+        return target
 
     def images(self, y: np.ndarray) -> np.ndarray:
         """S y for rows (R, 2n)."""
@@ -150,9 +180,9 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
     """The chains through these states, (B, K, 2n), all in these units."""
     arcs, (chains, count, states) = closing.arcs, y.shape
     of_state, spans = units.state[:, None], (period * units.time)[:, None]
-    times = np.stack([spans * parts[:, :-1], spans * parts[:, 1:]], axis=2).reshape(-1, 2)
+    times = closing.t_first + np.stack([spans * parts[:, :-1], spans * parts[:, 1:]], axis=2).reshape(-1, 2)
     rows = (y * of_state).reshape(-1, states)
-    if not arcs.driven:  # each begins at zero, where times have the most digits
+    if not closing.lasts:  # each begins at zero, where times have the most digits
         times = (spans * np.diff(parts)).reshape(-1, 1) * np.array([0.0, 1.0])
     arc = arcs.follow(times, rows)
     rate = arcs.rate(times[:, 1], arc.end).reshape(y.shape)
@@ -161,7 +191,8 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
     inverse = np.linalg.inv(closing.matrix)
     end[:, -1], rate[:, -1] = closing.taken_back(end[:, -1]), rate[:, -1] @ inverse.T
     growth[:, -1] = inverse @ growth[:, -1]
-    defect = end / of_state - np.roll(y, -1, axis=1)
+    end = end / of_state
+    defect = end - closing.target(y, end, units.state)
     off, slope = closing.conditions(y[:, 0] * units.state)
     rate, slope = rate * units.time[:, None, None] / of_state, slope * of_state
     why = _why(arcs, arc, rows, times, ok)
@@ -178,35 +209,57 @@ def _why(arcs: Arcs, arc: Arc, rows, times, ok) -> tuple[str, ...]:
     return tuple(texts)
 
 
-def threshold_of(chain: Chain) -> np.ndarray:
-    """Below which share of the largest a singular value counts as zero, (B,)."""
-    loose = _PER_DEFECT * chain.merit() / np.maximum(chain.size(), 1e-300)
-    return np.clip(loose, RANK, _LARGEST_RANK)
+class NewtonEquations(NamedTuple):
+    """The equations of Newton's method for B chains: condensed to both ends, with the rank decided.
+
+    The unknowns are u (2n,) of `Closing.free`, and the period where it is free; `right` (B, 2n + m).
+    """
+
+    condensed: Condensed
+    decided: Decided
+    right: np.ndarray
 
 
-def correction(chain: Chain, driven: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The step of Newton's method, shortest in the first state and the period: dy (B, K, 2n) and dT (B,)."""
-    chains, _, states = chain.y.shape
+def equations(closing: Closing, chain: Chain) -> NewtonEquations:
+    """The equations at these chains."""
     condensed = condense(chain.growth, np.stack([chain.rate * np.diff(chain.parts)[..., None], chain.defect], axis=3))
-    regular, of_period, right = condensed.first + condensed.last, condensed.more[..., :1], condensed.more[..., 1]
+    of_first, of_last = closing.free()
+    regular, of_period = condensed.first @ of_first + condensed.last @ of_last, condensed.more[..., :1]
     # A condition in units of the state, as the defects are.
     unit = 1 / np.maximum(np.abs(chain.slope).max(axis=2), 1e-300)
     matrix = np.concatenate([regular, unit[:, :, None] * chain.slope], axis=1)
-    right = np.concatenate([right, unit * chain.off], axis=1)
-    if not driven:
-        of_period = np.concatenate([of_period, np.zeros((chains, matrix.shape[1] - states, 1))], axis=1)
-        matrix = np.concatenate([matrix, of_period], axis=2)
-    step = -decide(matrix, threshold_of(chain)).least_norm(right)
-    first, period = step[:, :states, None], np.zeros(chains) if driven else step[:, -1]
-    z = np.stack([period, np.ones(chains)], axis=1)[:, :, None]
-    return condensed.inner(first, first, z)[..., 0], period
+    right = np.concatenate([condensed.more[..., 1], unit * chain.off], axis=1)
+    if not closing.lasts:
+        none = np.zeros((len(matrix), chain.off.shape[1], 1))
+        matrix = np.concatenate([matrix, np.concatenate([of_period, none], axis=1)], axis=2)
+    if closing.q_end is None:
+        threshold = np.clip(_PER_DEFECT * chain.merit() / np.maximum(chain.size(), 1e-300), RANK, _LARGEST_RANK)
+    else:
+        threshold = np.full(len(matrix), singular_threshold(chain.y[0].size, float))
+    return NewtonEquations(condensed, decide(matrix, threshold), right)
+
+
+def correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
+    """The step of Newton's method, shortest in the first state and the period: dy (B, K, 2n) and dT (B,).
+
+    Zero for a path with conjugate ends.
+    """
+    condensed, decided, right = equations(closing, chain)
+    step, states = -decided.least_norm(right), chain.y.shape[2]
+    period = np.zeros(len(step)) if closing.lasts else step[:, -1]
+    first, last = (step[:, :states] @ of.T for of in closing.free())
+    z = np.stack([period, np.ones(len(step))], axis=1)[:, :, None]
+    dy = condensed.inner(first[..., None], last[..., None], z)[..., 0]
+    if closing.q_end is not None:
+        dy[decided.rank < states] = 0.0
+    return dy, period
 
 
 def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
-    """The closed chains near these states, as far as they are found: look at `Chain.closure`."""
+    """The closed chains, or joined paths, near these states, as far as they are found: look at `Chain.closure`."""
     chain = follow(closing, y / units.state[:, None], period / units.time, parts, units)
     active = chain.ok.copy()
-    for _ in range(TRIALS):
+    for _ in range(_TRIALS):
         active &= chain.merit() > _ENOUGH * chain.size()
         if not active.any():
             break
@@ -220,22 +273,20 @@ def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray
 
 
 def _improved(closing: Closing, chain: Chain) -> Chain:
-    """Each chain after one step, halved until its defect falls."""
-    dy, dperiod = correction(chain, closing.arcs.driven)
-    scale = np.minimum(1.0, 0.25 * chain.period / np.maximum(np.abs(dperiod), 1e-300))
+    """Each chain after the largest share of one step by which its defect falls."""
+    dy, dperiod = correction(closing, chain)
+    longest = np.minimum(1.0, 0.25 * chain.period / np.maximum(np.abs(dperiod), 1e-300))
     best, waiting = chain, np.arange(len(chain.period))
-    for _ in range(_HALVINGS):
-        y = chain.y[waiting] + scale[waiting, None, None] * dy[waiting]
-        period = chain.period[waiting] + scale[waiting] * dperiod[waiting]
-        some = Units(*(x[waiting] for x in chain.units))
-        trial = follow(closing, y, period, chain.parts[waiting], some)
-        lower = trial.merit() < (1 - 0.25 * scale[waiting]) * chain.merit()[waiting]
-        near = chain.merit()[waiting] < 1e3 * _ENOUGH * chain.size()[waiting]  # where rounding decides
+    for share in _SHARES if closing.q_end is None else _SHARES_OF_PATH:
+        here, scale = chain.at(waiting), share * longest[waiting]
+        y, period = here.y + scale[:, None, None] * dy[waiting], here.period + scale * dperiod[waiting]
+        trial = follow(closing, y, period, here.parts, here.units)
+        lower = trial.merit() < (1 - 0.25 * scale) * here.merit()
+        near = here.merit() < 1e3 * _ENOUGH * here.size()  # where rounding decides
         best = best.with_rows(waiting[lower], trial.at(lower))
         waiting = waiting[~lower & ~near]
         if not len(waiting):
             break
-        scale[waiting] /= 4
     return best
 
 
