@@ -6,6 +6,7 @@ from lagjax._analysis._hamiltonian import CanonicalTrajectory, Hamiltonian, hami
 from lagjax._analysis._linearize import Linearization, linearize
 from lagjax._analysis._modes import Modes, normal_modes
 from lagjax._analysis._noether import cyclic_coordinates, noether_charge
+from lagjax._analysis._rank import Decided, decide
 from lagjax._analysis._routh import Routhian, routhian
 from lagjax._analysis._same import SameMotion, same_motion
 from lagjax._analysis._symmetries import Conserved, ConservedQuantities, conserved_quantities
@@ -15,6 +16,7 @@ __all__ = [
     "ChangedCoordinates",
     "Conserved",
     "ConservedQuantities",
+    "Decided",
     "Equilibrium",
     "Hamiltonian",
     "Linearization",
@@ -24,6 +26,7 @@ __all__ = [
     "change_coordinates",
     "conserved_quantities",
     "cyclic_coordinates",
+    "decide",
     "equilibrium",
     "hamiltonian",
     "linearize",

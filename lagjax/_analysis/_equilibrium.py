@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._settle import settle
-from lagjax._analysis._solve import levenberg_marquardt, relative_size, shortest_preimage, shortest_solution
+from lagjax._analysis._solve import is_root, levenberg_marquardt, polish, shortest_preimage
 from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
 from lagjax._linear import least_norm
@@ -118,9 +118,6 @@ def require_steady(scene: SceneState) -> None:
 
 # ---- Newton's method -------------------------------------------------------------------------------------------------
 
-# Newton steps at the end, of which two reach rounding.
-_POLISH = 3
-
 # A multiplier that counts as rounding of the others.
 _TINY = 1e-6
 
@@ -141,14 +138,13 @@ def _found(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
     least = jnp.abs(start).at[n:].max(_TINY * unit[n:] * jnp.max(jnp.abs(start / unit)[n:], initial=0.0))
 
     def find(_, start):
-        return _polished(residual, levenberg_marquardt(residual, start, least, unit), start, least, unit)
+        z = polish(residual, levenberg_marquardt(residual, start, least, unit), least, unit)
+        # What converges to zero ends at a tiny number: what is nothing beside the start after three roundings is zero.
+        return jnp.where(jnp.abs(z) < jnp.finfo(z.dtype).eps ** 3 * jnp.abs(start), 0.0, z)
 
-    def shortest(linear, right):
-        return unit * shortest_preimage(lambda x: linear(unit * x), right)
-
-    z = jax.lax.custom_root(residual, start, find, shortest)
+    z = jax.lax.custom_root(residual, start, find, lambda linear, right: shortest_preimage(linear, right, unit))
     q = z[:n]
-    ok = _is_root(residual, jax.lax.stop_gradient(z), least)
+    ok = is_root(residual, jax.lax.stop_gradient(z), least=least, power=0.5)
     multipliers = least_multipliers(scene, q)
     return nan_unless(ok, q), nan_unless(ok, multipliers), ok
 
@@ -179,30 +175,6 @@ def least_multipliers(scene: SceneState, q: Vector) -> Array:
         return jnp.zeros(0, q.dtype)
     jacobian = scene.jacobian(q, scene.qdot)
     return -least_norm(jacobian @ jacobian.T, jacobian @ scene.force(q, scene.qdot))
-
-
-def _polished(residual, z: Unknowns, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
-    """z after Newton steps, as exact as rounding allows; each is taken where it is small.
-
-    What converges to zero ends at any tiny number: zero is what is nothing beside the start even after three roundings.
-    """
-
-    def once(_, z):
-        jacobian = jax.jacfwd(residual)(z)
-        step = unit * shortest_solution(jacobian * unit, residual(z))
-        return jnp.where(relative_size(jacobian, step, z, least) < 1e-3, z - step, z)
-
-    z = jax.lax.fori_loop(0, _POLISH, once, z)
-    return jnp.where(jnp.abs(z) < jnp.finfo(z.dtype).eps ** 3 * jnp.abs(start), 0.0, z)
-
-
-def _is_root(residual, z: Unknowns, least: Unknowns) -> Bool[Array, ""]:
-    """True if r(z) is zero: each number below √eps of what the numbers of z, or the `least` ones, make of it.
-
-    A converged one is at some eps of it; where forces only fade away with the distance it is of order one.
-    """
-    size = jnp.abs(jax.jacfwd(residual)(z)) @ jnp.maximum(least, jnp.abs(z))
-    return jnp.all(jnp.abs(residual(z)) <= jnp.sqrt(jnp.finfo(z.dtype).eps) * size)
 
 
 def _sentence(scene: SceneState) -> str:

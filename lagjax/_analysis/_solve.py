@@ -1,4 +1,10 @@
-"""Linear systems that need not be symmetric, nor regular: for Newton's method and its derivative. No LAPACK in XLA."""
+"""Newton's method, damped where a root is far, of JAX; its linear systems need be neither symmetric nor regular.
+
+`newton` begins near a root, `levenberg_marquardt` far from one, and `polish` ends at rounding what that has found. All
+steps are those of `shortest_solution`, but damped ones, whose matrix is regular. No kernel of LAPACK runs in XLA. The
+iteration of orbits and paths, `lagjax._orbits._shooting`, is in NumPy: a trial there is a run of machine code, of as
+many members as still gain.
+"""
 
 from collections.abc import Callable
 
@@ -12,23 +18,24 @@ Matrix = Float[Array, "n n"]
 Vector = Float[Array, " n"]
 
 
-def shortest_solution(matrix: Matrix, b: Vector) -> Vector:
-    """x with A x = b, the shortest one where A is singular and b in its range.
+def shortest_solution(matrix: Matrix, b: Vector, unit: Vector | float = 1.0) -> Vector:
+    """x with A x = b, the shortest one in these units (n,) where A is singular and b in its range.
 
     Linear in b, with derivatives by both. A singular A is one whose pivots, of rows and columns of unit size, say so.
     """
+    matrix = matrix * unit
     rows, columns = (jax.lax.stop_gradient(scale) for scale in _scales(matrix))
     inverse, singular = _inverse(jax.lax.stop_gradient(rows[:, None] * matrix * columns))
 
     def regular(matrix, b):
         return columns * _regular(rows[:, None] * matrix * columns, rows * b, inverse)
 
-    return jax.lax.cond(singular, _shortest, regular, matrix, b)
+    return unit * jax.lax.cond(singular, _shortest, regular, matrix, b)
 
 
-def shortest_preimage(linear: Callable[[Vector], Vector], right: Vector) -> Vector:
-    """x with linear(x) = right, the shortest one: what the implicit derivative of a root asks for."""
-    return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right)
+def shortest_preimage(linear: Callable[[Vector], Vector], right: Vector, unit: Vector | float = 1.0) -> Vector:
+    """x with linear(x) = right, the shortest one in these units (n,): for the implicit derivative of a root."""
+    return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right, unit)
 
 
 def newton(f: Callable[[Vector], Vector], start: Vector) -> Vector:
@@ -53,13 +60,31 @@ def newton(f: Callable[[Vector], Vector], start: Vector) -> Vector:
     return jax.lax.while_loop(moves, once, (start, jnp.ones((), start.dtype), 0))[0]
 
 
-def is_root(f: Callable[[Vector], Vector], x: Vector, given: Vector) -> Bool[Array, ""]:
-    """True if f(x) = 0: each number of it within eps^0.6 of what x makes of it, or of a term that is `given` (n,).
+def polish(f: Callable[[Vector], Vector], x: Vector, least: Vector, unit: Vector) -> Vector:
+    """x after Newton steps near a root, as exact as rounding allows; each is taken where it is small.
 
-    Newton's method comes to some eps; where it has gone astray it is off by more than half of the digits.
+    `least` (n,) are the sizes below which numbers of x do not count; steps are the shortest ones in `unit`
+    (n,) where the derivatives are singular.
     """
-    size = jnp.abs(jax.jacfwd(f)(x)) @ jnp.abs(x) + jnp.abs(given)
-    return jnp.all(jnp.abs(f(x)) <= jnp.finfo(x.dtype).eps ** 0.6 * size)
+
+    def once(_, x):
+        jacobian = jax.jacfwd(f)(x)
+        step = shortest_solution(jacobian, f(x), unit)
+        return jnp.where(relative_size(jacobian, step, x, least) < 1e-3, x - step, x)
+
+    return jax.lax.fori_loop(0, _POLISH, once, x)
+
+
+def is_root(
+    f: Callable, x: Vector, given: Vector | float = 0.0, *, least: Vector | float = 0.0, power: float = 0.6
+) -> Bool[Array, ""]:
+    """True if f(x) = 0: each number within eps^`power` of what x makes of it, or of a term that is `given` (n,).
+
+    `least` (n,) are the sizes below which numbers of x do not count. Newton's method comes to some eps; where it has
+    gone astray it is off by more than half of the digits, and where f only fades away with x by all of them.
+    """
+    size = jnp.abs(jax.jacfwd(f)(x)) @ jnp.maximum(least, jnp.abs(x)) + jnp.abs(given)
+    return jnp.all(jnp.abs(f(x)) <= jnp.finfo(x.dtype).eps ** power * size)
 
 
 def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector) -> Vector:
@@ -133,6 +158,7 @@ _AT_REST = 1e-14  # of the size of x: some tens of roundings, the square of whic
 # Newton steps: one where f is linear, five to new coordinates of a state, ten to a velocity in relativity. Halvings of
 # one that leads out of where f is defined, as beyond the velocity of light.
 _STEPS, _HALVINGS = 50, 30
+_POLISH = 3  # steps at the end, of which two reach rounding
 
 
 def _scales(matrix: Matrix) -> tuple[Vector, Vector]:

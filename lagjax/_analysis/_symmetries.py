@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from lagjax._analysis._gauge import changes_of, gauge_of, is_right
 from lagjax._analysis._noether import FlatState, euler_lagrange, flat_generator, variation
 from lagjax._analysis._potential import with_potential
+from lagjax._analysis._rank import decide
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._states import moved_by_rounding, random_states
 from lagjax._analysis._transformations import Fields, fields_of, named
@@ -210,9 +211,7 @@ class _Measured(NamedTuple):
     def symmetries(self, *columns: np.ndarray) -> np.ndarray:
         """An orthonormal basis (K, d) of the combinations of columns that are zero."""
         rows = np.concatenate(columns)
-        _, sizes, vectors = np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])
-        rank = int((sizes > self.threshold * np.sqrt(len(rows))).sum())
-        return vectors[rank:].T
+        return decide(rows, absolute=self.threshold * np.sqrt(len(rows))).null
 
 
 def _measured(scene: SceneState, fields: Fields, states: FlatState) -> _Measured:
@@ -400,9 +399,9 @@ def _outside(rows: np.ndarray, row: np.ndarray) -> float:
     if not len(rows) or size == 0:
         return float(size > 0)
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    _, sizes, basis = np.linalg.svd(rows / np.where(lengths > 0, lengths, 1), full_matrices=False)
-    basis = basis[sizes > 1e-9 * sizes.max(initial=1)]
-    return float(np.linalg.norm(row - basis.T @ (basis @ row)) / size)
+    decided = decide(rows / np.where(lengths > 0, lengths, 1), 1e-9)
+    basis = decided.right[:, : int(decided.rank)]
+    return float(np.linalg.norm(row - basis @ (basis.T @ row)) / size)
 
 
 def _charge(scene: SceneState, fields: Fields, weights: np.ndarray, gauge: Callable | None) -> Callable:

@@ -1,9 +1,9 @@
 """Orbits: where motions return, how they depend on energy and parameters, how fast they part, which path is taken.
 
-`_arcs` follows motions with their derivatives, on rows; `_rank` decides about singular values; `_shooting` closes or
-joins chains of arcs, `_floquet` says what their multipliers are, `_orbit` is `periodic_orbit`. `_follow` goes along a
-family, `_family` is `family`, `_branch` goes from one to another. `_lyapunov` is about motions that never return,
-`_path` and `_conjugate` about those from one place to another.
+`_arcs` follows motions with their derivatives, on rows; `_shooting` closes or joins chains of arcs, `_floquet` says
+what their multipliers are, `_orbit` is `periodic_orbit`. `_follow` goes along a family, `_family` is `family`,
+`_branch` goes from one to another. `_lyapunov` is about motions that never return, `_path` and `_conjugate` about those
+from one place to another. `decide` of `lagjax._analysis` decides about singular values.
 """
 
 from lagjax._orbits._branch import branch_off

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._analysis import decide
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout, halves
 from lagjax._orbits._arcs import Arcs
 from lagjax._orbits._family import Family, begun, place_of
 from lagjax._orbits._follow import FamilyPoint, FamilyTangent, Follower, corrected, tangent_at
 from lagjax._orbits._orbit import RTOL, Orbit, told
-from lagjax._orbits._rank import decide
 from lagjax._orbits._starts import starts
 from lagjax._system import System
 from lagjax._validate import require_tolerance
@@ -113,8 +113,8 @@ def _beside(follower: Follower, here: FamilyPoint, before: FamilyTangent, size: 
     branch point singular values do not tell them from the new direction.
     """
     states, count = here.matrix.shape[0], before.symmetries.shape[1]
-    still = decide(here.matrix[None, :, :states], np.zeros(1)).right[0][:, states - count - 1 :]
-    null = decide(here.matrix[None], np.zeros(1)).right[0][:, before.rank - 1 :]
+    still = decide(here.matrix[:, :states]).right[:, states - count - 1 :]
+    null = decide(here.matrix).right[:, before.rank - 1 :]
     known = np.zeros((null.shape[0], count + 1))
     known[:states, :count] = still @ (still.T @ before.symmetries[:states])
     known[:, count] = null @ (null.T @ before.vector)

@@ -13,6 +13,7 @@ import itertools
 
 import numpy as np
 
+from lagjax._analysis import decide
 from lagjax._orbits._arcs import Arcs, Units
 
 _GLANCES = 64  # of each arc: between two of them no phase may turn by half a turn
@@ -98,4 +99,4 @@ def _located(arcs: Arcs, start, t_first, low, high, frame, frame_low, nth: int, 
 
 def _is_singular(frame: np.ndarray, n: int) -> bool:
     """True if B, the first rows of an orthonormal plane (2n, n), is singular to the rounding of tangents."""
-    return bool(np.linalg.svd(frame[:n], compute_uv=False)[-1] < _AT_END)
+    return bool(decide(frame[:n], absolute=_AT_END).rank < n)

@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._analysis import decide
+
 # |multiplier| − 1 above this makes an orbit unstable. Multipliers on the unit circle come out within 1e-9 of it, where
 # two of them meet within the square root of their accuracy, 1e-6.
 UNSTABLE = 1e-5
@@ -47,8 +49,7 @@ def _quotient(null: np.ndarray, of_transpose: np.ndarray) -> np.ndarray:
     """An orthonormal basis (2n, m) of the part of ker ℓ that is orthogonal to W ∩ ker ℓ."""
     w, ell = np.linalg.qr(null)[0], np.linalg.qr(of_transpose)[0]
     # Directions of W that ℓ does not see; those it sees are simple multipliers, outside of ker ℓ.
-    _, seen, right = np.linalg.svd(ell.T @ w)
-    inside = w @ right.T[:, int((seen > _SEEN).sum()) :]
+    inside = w @ decide(ell.T @ w, absolute=_SEEN).null
     away = np.concatenate([ell, inside], axis=1)
     return np.linalg.svd(away, full_matrices=True)[0][:, away.shape[1] :]
 

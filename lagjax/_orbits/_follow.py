@@ -5,7 +5,8 @@
 
 The rank of the closing equations is decided at closed orbits, where degenerate directions are so to rounding, and is
 that of the trials between them. Decided anew at every trial it would have to leave out all that the trial's defect
-may hide, which of an orbit with a multiplier of a thousand is everything but that one direction.
+may hide, which of an orbit with a multiplier of a thousand is everything but that one direction. Nor are these
+corrections damped, as those of `_shooting` are: how they contract is what judges a step.
 
 A step stands if Newton's method contracts, if its first correction is short beside the step, and if the chord lies
 midway between tangents that turned little. An orbit of another family that happens to be near fails one of these, or
@@ -19,11 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._analysis import decide
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
 from lagjax._orbits._condense import Condensed, condense
 from lagjax._orbits._orbit import CLOSED
-from lagjax._orbits._rank import decide
 from lagjax._orbits._shooting import Chain, Closing
 
 _TRIALS = 8  # of Newton's method: beyond, the step along the family was too long
@@ -200,19 +201,17 @@ def tangent_at(
     zero, it is what is nearest to `before` of all directions.
     """
     states = point.matrix.shape[0]
-    whole = decide(point.matrix[None], np.array([_shooting.RANK]))
-    still = decide(point.matrix[None, :, :states], np.array([_shooting.RANK]))
-    slope, count = follower.slope(point), states - int(still.rank[0])
-    rank = int(whole.rank[0])
+    whole, still = decide(point.matrix, _shooting.RANK), decide(point.matrix[:, :states], _shooting.RANK)
+    slope, count, rank = follower.slope(point), states - int(still.rank), int(whole.rank)
     if before is not None:  # a rank that falls short of itself in passing a branch point
-        at_least = whole.values[0, before.rank - 1] > _ROUNDING * whole.values[0, 0]
+        at_least = whole.values[before.rank - 1] > _ROUNDING * whole.values[0]
         rank = max(rank, before.rank) if at_least else rank
         count = min(count, before.symmetries.shape[1]) if at_least else count
     symmetries = np.zeros((point.matrix.shape[1], count))
-    symmetries[:states] = still.right[0][:, states - count :]
+    symmetries[:states] = still.right[:, states - count :]
     if before is None:
         symmetries = _without(symmetries, slope)
-    null = whole.right[0][:, rank - left_out :]
+    null = whole.right[:, rank - left_out :]
     left, sizes, _ = np.linalg.svd(null - symmetries @ (symmetries.T @ null), full_matrices=False)
     left = left[:, sizes > 0.5]
     vector = left @ (left.T @ (slope if before is None else before.vector))
@@ -254,8 +253,7 @@ def corrected(
             return point, np.array(sizes)
         before = closure
         matrix, right = np.concatenate([point.matrix, across.vector[None]]), np.append(point.right, 0.0)
-        system = decide(matrix[None], np.zeros(1))._replace(rank=np.array([across.rank + 1 - left_out]))
-        change = -system.least_norm(right[None])[0]
+        change = -decide(matrix)._replace(rank=np.array(across.rank + 1 - left_out)).least_norm(right)
         sizes.append(np.linalg.norm(change))
         point = follower.moved(point, change, 1.0)
     return (point, np.array(sizes)) if point.closed(CLOSED) else None

@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._analysis import decide
 from lagjax._doubles import accepts_singles
 from lagjax._layout import halves
+from lagjax._linear import singular_threshold
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
 from lagjax._orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, off_pairs, reduce
@@ -172,7 +174,7 @@ def _closing(arcs: Arcs, energy, image) -> Closing:
     terms = np.abs(matrix) @ np.abs(somewhere) + np.abs(shift)
     if not (np.abs(flat(somewhere) - matrix @ somewhere - shift) <= 1e-12 * terms).all():
         raise ValueError("image must be affine in (q, qdot): a linear map and a shift. Use coordinates in which it is.")
-    if np.linalg.matrix_rank(matrix) < states:
+    if decide(matrix, singular_threshold(states, float)).rank < states:
         raise ValueError("image must be invertible: it sends different states to the same one.")
     return plain._replace(matrix=matrix, shift=shift)
 

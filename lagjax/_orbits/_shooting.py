@@ -21,10 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._analysis import Decided, decide
 from lagjax._linear import singular_threshold
 from lagjax._orbits._arcs import Arc, Arcs, Units
 from lagjax._orbits._condense import Condensed, condense
-from lagjax._orbits._rank import Decided, decide
 
 # Relative to the largest singular value: below, a direction counts as degenerate. Measured on the 695 planar orbits,
 # true ones are above 1e-6 and degenerate ones of a closed orbit below 1e-11. Twice as much changes no rank there.
@@ -235,7 +235,7 @@ def equations(closing: Closing, chain: Chain) -> NewtonEquations:
     if closing.q_end is None:
         threshold = np.clip(_PER_DEFECT * chain.merit() / np.maximum(chain.size(), 1e-300), RANK, _LARGEST_RANK)
     else:
-        threshold = np.full(len(matrix), singular_threshold(chain.y[0].size, float))
+        threshold = singular_threshold(chain.y[0].size, float)
     return NewtonEquations(condensed, decide(matrix, threshold), right)
 
 
@@ -318,7 +318,7 @@ def _null(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
     """The decision about A + B of chains that are closed, and the right vectors at all states, (B, K, 2n, 2n)."""
     chains, count, states, _ = growth.shape
     condensed = condense(growth, np.zeros((chains, count, states, 0)))
-    rank = decide(condensed.first + condensed.last, np.full(chains, RANK))
+    rank = decide(condensed.first + condensed.last, RANK)
     return rank, condensed.inner(rank.right, rank.right, np.zeros((chains, 0, states)))
 
 

@@ -1,0 +1,50 @@
+"""Linear systems whose rank is decided openly: which singular values count as zero, and how wide the gap is there.
+
+Symmetries, redundant conditions and closed orbits all make singular equations. A periodic orbit is never alone: it may
+begin anywhere along itself, and where momenta are conserved it may be moved and turned. So the equations that close it
+are singular, exactly so at the orbit, where the conserved quantities also make some of the equations follow from the
+others. What is solved is the part that is regular, by the shortest correction, which moves neither along the orbit nor
+along a symmetry. Which part that is, is a decision about singular values σ: zero are those below a threshold that the
+caller states.
+
+This is NumPy, of any number of matrices at once. What is compiled and differentiated by JAX decides by pivots instead,
+in `_solve` and `lagjax._linear`: a singular value decomposition would be a kernel of LAPACK inside of XLA, without a
+derivative where singular values meet.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Decided(NamedTuple):
+    """The singular values of matrices (…, m, k), largest first, and how many of them count, `rank` (…).
+
+    The singular vectors are the columns of `left` (…, m, min(m, k)) and `right` (…, k, k).
+    """
+
+    left: np.ndarray
+    values: np.ndarray
+    right: np.ndarray
+    rank: np.ndarray
+
+    @property
+    def null(self) -> np.ndarray:
+        """An orthonormal basis (k, k − rank) of what one matrix sends to zero."""
+        return self.right[:, int(self.rank) :]
+
+    def least_norm(self, b: np.ndarray) -> np.ndarray:
+        """The shortest x (…, k) that solves the regular part of A x = b, b (…, m)."""
+        count = self.values.shape[-1]
+        kept = np.arange(count) < self.rank[..., None]
+        inverse = np.where(kept, 1.0 / np.where(kept, self.values, 1.0), 0.0)
+        inner = np.einsum("...mi,...m->...i", self.left, b) * inverse
+        return np.einsum("...ki,...i->...k", self.right[..., :count], inner)
+
+
+def decide(matrices: np.ndarray, relative: np.ndarray | float = 0.0, absolute: float = 0.0) -> Decided:
+    """The rank of matrices (…, m, k): zero are singular values below `absolute`, or `relative` (…) to the largest."""
+    m, k = matrices.shape[-2:]
+    left, values, right = np.linalg.svd(matrices, full_matrices=m < k)
+    bound = np.maximum(absolute, np.asarray(relative)[..., None] * values[..., :1])
+    return Decided(left, values, np.swapaxes(right, -1, -2), np.asarray((values > bound).sum(axis=-1)))
