@@ -181,7 +181,7 @@ class Derivation:
         return int(np.prod(self.shape(name), dtype=int))
 
     def evaluate(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
-        """These quantities at S states, each of shape (S, …), in NumPy; `columns` as `Program.evaluate_many` takes."""
+        """Named quantities at S states, each of shape (S, …), in NumPy; `columns` as `Program.evaluate_many` takes."""
         return self._by_name(names, self.program(*names).evaluate_many(columns))
 
     def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
@@ -329,7 +329,7 @@ class Derivation:
 
     @functools.cached_property
     def scalar_shapes(self) -> list[jax.ShapeDtypeStruct]:
-        """Those of the inputs of every program: q, q̇, t and every number in params, one by one."""
+        """The shapes of the inputs of every program: q, q̇, t and every number in params, one by one."""
         leaves = jax.tree.leaves(self.numbers)
         numbers = [dtype for leaf in leaves for dtype in [leaf.dtype] * leaf.size]
         dtypes = [self.layout.dtype] * (2 * self.layout.size + 1) + numbers

@@ -71,7 +71,7 @@ class Explanation:
     projection_operations: int | None = None
 
     def with_constraints(self, names: list[str], schur_complement: np.ndarray | None) -> "Explanation":
-        """This explanation with the names of constraints; where G M⁻¹ Gᵀ is known, with what depends on what."""
+        """The explanation with the names of constraints; where G M⁻¹ Gᵀ is known, with the dependent ones."""
         dependent = None
         if schur_complement is not None:
             dependent = {

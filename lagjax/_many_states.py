@@ -51,7 +51,7 @@ class Sample(NamedTuple):
         return columns_of(self.q, self.qdot, self.t, self.numbers)
 
     def quantities(self, *names: str) -> dict[str, np.ndarray]:
-        """These of `Motion.quantities`, (S, …) each. Raises `Unlowerable`."""
+        """The quantities of `Motion.quantities` with these names, (S, …) each. Raises `Unlowerable`."""
         try:
             return self.derivation.evaluate(names, self.columns)
         except Unlowerable:

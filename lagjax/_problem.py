@@ -168,7 +168,7 @@ class Batch(eqx.Module):
     def of(
         cls, system, values: dict, axes: dict, size: int, ts, rtol=None, atol=None, max_steps=65_536, event=None
     ) -> "Batch":
-        """From `values` by name, q0, qdot0 and params, and the axes of the members in every leaf (`axes_per_leaf`).
+        """The batch of `values` by name, q0, qdot0, params, with the axis of members of every leaf (`axes_per_leaf`).
 
         Raises `TypeError` or `ValueError` as `Problem.of`; a number of one member alone may be NaN.
         """

@@ -236,7 +236,7 @@ def _derivatives(state: _State, lagrangian: _Taped, rates: dict) -> tuple[Ids, I
 
 
 def _of_constraints(constraints: Constraints, state: _State, rates: dict) -> dict[str, Ids]:
-    """Those of the constraints."""
+    """The quantities of the constraints."""
     f = a = at_rest = state.zeros(0)
     if constraints.on_positions is not None:
         f = state.of(constraints.on_positions, "q", "t", "params")

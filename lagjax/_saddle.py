@@ -230,7 +230,7 @@ class SaddleElimination:
         return z
 
     def _rows_of_lower(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """For every index, in the order of elimination: the columns in which L has an entry in its row, and where."""
+        """The columns in which L has an entry in each row, in the order of elimination, and the entries' places."""
         total, columns = len(self.order), {i: [] for i in self.order}
         for j in self.order:
             for i in self.below[j].tolist():

@@ -46,7 +46,7 @@ class Scales(NamedTuple):
 
     @classmethod
     def of(cls, evaluate: Callable[[str, States, States], np.ndarray], q: Numbers, qdot: Numbers) -> "Scales":
-        """Those at (q, qdot) of a scene.
+        """The scales of a scene at (q, qdot).
 
         `evaluate(name, q, qdot)` gives the "force" and the "momentum" (S, n), and the "mass_matrix" (S, n, n), at S
         states.

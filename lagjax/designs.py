@@ -62,7 +62,7 @@ class Design:
         return columns.T
 
     def _key(self, names: tuple[str, ...]) -> int:
-        """Of 128 bits, from the seed and the names: two axes with one seed are drawn independently."""
+        """A key of 128 bits, from the seed and the names: two axes with one seed are drawn independently."""
         mixed = int.from_bytes(hashlib.sha256("\n".join(names).encode()).digest()[:8], "little")
         return (mixed << 64) | self.seed
 

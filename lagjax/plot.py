@@ -567,7 +567,7 @@ def _pair(projection: Callable) -> Callable:
 
 
 def _some_members(leaf: Any, trajectory: Trajectory, count: int):
-    """At most `count` members of a leaf, evenly chosen, on a first axis that is there for a single trajectory too."""
+    """Evenly chosen members of a leaf, `count` at most, on a first axis that is there for a single trajectory too."""
     batch = np.ndim(trajectory.ok)
     leaf = jnp.reshape(leaf, (-1, *leaf.shape[batch:]))
     return leaf[_some(len(leaf), count)]

@@ -39,7 +39,7 @@ class Changes(NamedTuple):
 
 
 def changes_of(scene: SceneState, fields: Fields, weights: np.ndarray, states: FlatState) -> tuple[Changes, FlatState]:
-    """Those of the transformations with these weights (D, K), at the states where they are finite, and these states.
+    """The changes of L by transformations with weights (D, K), at the states where they are finite, and these states.
 
     Raises `ValueError` where there are none.
     """

@@ -27,7 +27,7 @@ _ROUNDING = 1e4  # units of rounding of the force one size away; below it a jump
 
 
 class _Rough(NamedTuple):
-    """For every coordinate, then velocity: whether the force jumps or has a kink there, and which sides change."""
+    """Jumps and kinks of the force along every coordinate, then velocity, and the sides that change there."""
 
     jumps: Bool[Array, " 2n"]
     kinks: Bool[Array, " 2n"]

@@ -72,7 +72,7 @@ class Conserved(NamedTuple):
         return trajectory.over_members(of_member)
 
     def __repr__(self) -> str:
-        """Its name, and whether it has a gauge term; the functions have nothing to read."""
+        """The name of the charge, and whether it has a gauge term; its functions print nothing."""
         return f"Conserved({self.name!r}{'' if self.gauge is None else ', with a gauge term'})"
 
 
@@ -178,7 +178,7 @@ def _named(chosen: list[tuple[str, np.ndarray]]) -> list[str]:
 
 
 def _verified(chosen: list[tuple[str, np.ndarray]], fresh: "_Measured") -> list[tuple[str, np.ndarray]]:
-    """Those that hold at fresh states as well."""
+    """The symmetries that hold at fresh states as well."""
     rows = np.concatenate([fresh.of_lagrangian, fresh.of_others])
     return [(name, w) for name, w in chosen if np.abs(rows @ w).max() <= _SLACK * fresh.threshold * np.abs(w).max()]
 

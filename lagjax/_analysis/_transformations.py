@@ -41,7 +41,7 @@ class Fields(NamedTuple):
         return len(self.names)
 
     def apart(self, weights):
-        """Weights (K,) of the time (), translations (n,), boosts (n,), maps (M,), the time's scale () and own (U,)."""
+        """The weights (K,) as those of time (), translations (n,), boosts (n,), maps (M,), scale (), own (U,)."""
         n, m = len(self.scale), len(self.maps)
         first, last = 1 + 2 * n, 1 + 2 * n + m
         return (

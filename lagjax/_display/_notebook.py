@@ -94,5 +94,5 @@ def plain(ax) -> None:
 
 
 def _some(count: int, most: int) -> np.ndarray:
-    """At most this many of the places 0 … count − 1, evenly chosen."""
+    """Places among 0 … count − 1, evenly chosen, `most` of them at most."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))

@@ -190,7 +190,7 @@ _STEPS, _STILL = 30, 1e-13  # of Newton's method, which squares the distance; an
 
 
 class Origins:
-    """Of each piece whose start is a function of the parameters: which one it is, and that function, compiled once."""
+    """The pieces whose starts are functions of the parameters, and these functions, compiled once."""
 
     def __init__(self, starts: list, layout: Layout, parameters: Parameters):
         """`starts` is what the record of each piece says of its start; None where the piece begins later."""

@@ -223,7 +223,7 @@ class Positive(AbstractSeparable):
         return u + np.log(10.0) * rng.normal(size=len(u))
 
     def refuses(self, x):
-        """That values must be positive, where one is not."""
+        """The complaint that values must be positive, where one is not."""
         return None if np.all(x > 0) else "must start above zero, because its transform is lagjax.positive"
 
     def __repr__(self) -> str:
@@ -275,7 +275,7 @@ class Between(AbstractSeparable):
         return np.log(share / (1.0 - share))
 
     def refuses(self, x):
-        """That values must lie between the bounds, where one does not."""
+        """The complaint that values must lie between the bounds, where one does not."""
         if np.all((x > self.lower) & (x < self.upper)):
             return None
         return f"must start between {self.lower:g} and {self.upper:g}, because its transform is {self!r}"
@@ -357,7 +357,7 @@ class Simplex(AbstractTransform):
         return count - 1
 
     def refuses(self, x):
-        """That there must be several numbers, all positive."""
+        """The complaint that there must be several numbers, all positive."""
         if len(x) < 2 or not np.all(x > 0):
             return "must start as several numbers above zero in one array, because its transform is lagjax.simplex"
         return None
@@ -425,7 +425,7 @@ class Inertia(AbstractTransform):
         return 10
 
     def refuses(self, x):
-        """That the numbers must be those of a body."""
+        """The complaint that the numbers must be those of a body."""
         if len(x) not in (10, 16):
             return "must have the shape (10,) or (4, 4), because its transform is lagjax.inertia"
         matrix = self._pseudo(x) if len(x) == 10 else x.reshape(4, 4)
@@ -607,7 +607,7 @@ class Parameters:
 
     @functools.cached_property
     def _cuts(self) -> list[tuple[slice, slice, Part]]:
-        """Of every part which u and which free numbers are its own."""
+        """The u and the free numbers that belong to each part."""
         cuts, begin, u_begin = [], 0, 0
         for part in self.parts:
             size = part.transform.unknowns(len(part.places))

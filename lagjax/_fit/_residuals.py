@@ -220,7 +220,7 @@ class SystemResiduals:
         return np.where(self.fitted[:, None, None], np.eye(self.states) - trial.tangents, 0.0)
 
     def _shown(self, batch: Samples, trials: list[_Trial]) -> list[tuple[np.ndarray, np.ndarray] | LostTrial]:
-        """Of each trial what is measured for a batch (N, T, S), and its tangents (N, T, S, D)."""
+        """The signals of each trial for a batch (N, T, S), and their tangents (N, T, S, D)."""
         clock = self.clocks.get(self.pieces[batch.rows[0]].record)
         if clock is not None:
             return [self._timed(clock, batch, trial) for trial in trials]
@@ -599,7 +599,7 @@ class Residuals:
 
     @property
     def firsts(self) -> list[int]:
-        """Of every record the place of its first piece."""
+        """The place of the first piece of every record."""
         places = {piece.record: k for k, piece in reversed(list(enumerate(self.pieces)))}
         return [places[k] for k in range(len(self.records))]
 

@@ -281,7 +281,7 @@ def _unknowns(chart: Chart, z: np.ndarray, log_density: np.ndarray) -> tuple[np.
 
 
 class Agreement(NamedTuple):
-    """Of each unknown (D,): how many independent draws its draws are worth, and r-hat, how far chains disagree.
+    """The effective number of draws of each unknown (D,), and r-hat, the disagreement of chains.
 
     `effective` is the smaller of the numbers for the bulk and for the tails of the density. NaN where draws are too few
     to tell, r-hat also for a single chain.

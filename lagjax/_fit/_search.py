@@ -108,7 +108,7 @@ class Reader(NamedTuple):
         return np.stack([one[k] for k in (0, 1) for one in read], axis=-1)
 
     def read(self, places) -> list[tuple]:
-        """Of every signal what `_read_states` gives at the samples `places`."""
+        """The result of `_read_states` for every signal at the samples `places`."""
         ts = self.record.ts[places]
         return [
             _read_states(ts, *signal, window)
@@ -117,7 +117,7 @@ class Reader(NamedTuple):
 
 
 def some_of(record: Record, count: int) -> np.ndarray:
-    """At most this many places of samples, from the first to the last."""
+    """Places of samples from the first to the last, evenly chosen, `count` of them at most."""
     return np.unique(np.linspace(0, len(record) - 1, count).astype(int))
 
 

@@ -318,7 +318,7 @@ def _ended(run: Trajectory) -> tuple:
 
 
 def _transitions(run: Trajectory) -> Transitions:
-    """Those of a hybrid motion, which has them."""
+    """The transitions of a hybrid motion."""
     assert run.transitions is not None
     return run.transitions
 

@@ -62,7 +62,7 @@ from lagjax._fit._residuals import LostTrial, Residuals, Trial, compressed
 
 
 class Correlation(NamedTuple):
-    """Of one signal: correlations at lags 0, 1, …, tapered to zero; their sum over all lags; how many samples."""
+    """The autocorrelation of a signal at lags 0, 1, …, tapered to zero; its sum over all lags; the samples' number."""
 
     lags: np.ndarray
     time: float
@@ -114,7 +114,7 @@ _CHANCE = 4.0  # standard errors of a correlation: white residuals show it at on
 
 
 def correlated_power(rows: np.ndarray, counted: np.ndarray) -> float:
-    """The mean square of what is no white noise in residuals (N, T), zero where no correlation is beyond chance.
+    """The mean square of the correlated part of residuals (N, T); zero where no correlation is beyond chance.
 
     Motion that changes little from one sample to the next has its whole mean square in the product of neighbours, to
     which white noise adds nothing.
@@ -260,7 +260,7 @@ def _is_lost(question: Residuals, point: Trial) -> bool:
 
 
 def confirmed_null(question: Residuals, point: Trial, null: np.ndarray) -> np.ndarray:
-    """Those of the null directions (F, K) that are no work of rounding, (F, K′)."""
+    """The null directions, of (F, K), that are not the work of rounding, (F, K′)."""
     sizes = row_sizes(question, point)
     if growth(sizes) < _GROWTH:
         return null
@@ -280,7 +280,7 @@ def row_sizes(question: Residuals, point: Trial) -> list[np.ndarray]:
 
 
 def growth(sizes: list[np.ndarray]) -> float:
-    """By how much rows (N, T, S) grow along the record in which they grow most, from the first that is not zero."""
+    """The growth of rows (N, T, S) along the record in which they grow most, from the first that is not zero."""
     found = 1.0
     for row in (row for batch in sizes for row in batch.max(axis=2)):
         (places,) = np.nonzero(row)

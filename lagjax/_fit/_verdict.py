@@ -281,7 +281,7 @@ def _parts(rows: np.ndarray, values: np.ndarray, counts: np.ndarray) -> _Parts:
 
 
 def _rows_of_signal(question: Residuals, point: Trial, widths: NoiseScale, signal: int) -> dict[int, tuple]:
-    """Of every record that has a signal: residuals, values and how much each counts, (M, T) for its M pieces."""
+    """The residuals, values and weights of every record that has a signal, (M, T) for its M pieces."""
     found: dict[int, list] = {}
     columns = zip(question.batches, point.residuals, question.factors(point, widths), strict=True)
     for batch, residuals, factors in columns:
@@ -379,7 +379,7 @@ def _disagreements(
 
 
 def _motion(question: Residuals, point: Trial, widths: NoiseScale) -> dict[int, float]:
-    """Of every record the sum of squares that a trial leaves beyond white noise, in those of the noise."""
+    """The sum of squares that a trial leaves beyond white noise in every record, in units of the noise."""
     found: dict[int, float] = {}
     for signal in range(len(question.names)):
         for k, rows in _rows_of_signal(question, point, widths, signal).items():

@@ -231,7 +231,7 @@ class _Rounds(NamedTuple):
     def _pass_transition(
         self, group: ModeGroup, mode: Mode, place, changes, at_once, t, y, known
     ) -> tuple[Exit, GuardMemory]:
-        """Through the first transition whose bits in `changes` say that its guard falls (1) or rises (2)."""
+        """The state behind the first transition whose bits in `changes` say that its guard falls (1) or rises (2)."""
         no, none = jnp.asarray(False), jnp.asarray(-1)
         exit = Exit(t, y, y, place, none, no, no, jnp.asarray(True))
         if mode.surfaces is None:

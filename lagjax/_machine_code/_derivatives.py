@@ -277,14 +277,14 @@ def _projected(flow: Flow, projection: Projection, ts, path, params, path_dot, d
 
 @functools.lru_cache(maxsize=64)
 def _moved(program: Program, t: int) -> StraightLine:
-    """From the inputs of a projection, and tangents of them but the time, input `t`, to the tangents of its outputs."""
+    """The tangents of the outputs of a projection, from its inputs and tangents of all but the time, input `t`."""
     by = [i for i in range(program.size) if i != t]
     return pushforward(program.line, [np.dtype(float)] * program.size, by, range(t))
 
 
 @functools.lru_cache(maxsize=64)
 def _transposed(program: Program, t: int) -> StraightLine:
-    """From the inputs and output cotangents of a projection to the cotangents of its inputs but the time, input `t`."""
+    """The cotangents of a projection's inputs but the time, input `t`, from its inputs and those of its outputs."""
     by = [i for i in range(program.size) if i != t]
     return pullback(program.line, [np.dtype(float)] * program.size, by, range(t))
 

@@ -56,7 +56,7 @@ class Tolerances(NamedTuple):
 
     @property
     def perturbed(self) -> "Tolerances":
-        """For another try, whose steps end at other places."""
+        """Slightly tighter tolerances for another try, whose steps end at other places."""
         return self._replace(rtol=0.7 * self.rtol, atol=0.7 * self.atol, tries=self.tries - 1)
 
     @property
@@ -66,7 +66,7 @@ class Tolerances(NamedTuple):
 
     @property
     def with_larger_budget(self) -> "Tolerances":
-        """For a motion with its tangents, which takes more steps."""
+        """The tolerances for a motion with its tangents, which takes more steps."""
         return self._replace(max_steps=4 * self.max_steps)
 
 

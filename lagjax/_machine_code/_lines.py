@@ -131,7 +131,7 @@ def _derivative_of_value(primals, tangents, *, line: Line):
 
 
 def _derivative_of_linear(primitive, of):
-    """That of `primitive`, (x, v) ↦ A(x) v, whose line with inputs (x, v) is `of(line)`."""
+    """The derivative rule of `primitive`, (x, v) ↦ A(x) v, whose line with inputs (x, v) is `of(line)`."""
 
     def rule(primals, tangents, *, line: Line):
         (x, v), (dx, dv) = primals, tangents

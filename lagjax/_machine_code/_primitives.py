@@ -152,7 +152,7 @@ def _curvature_shapes(*args, flow, **_):
 
 
 def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, tolerances):
-    """By going back over the steps of the tangent flow, with cotangents of the tangent alone."""
+    """`curvature` by going back over the steps of the tangent flow, with cotangents of the tangent alone."""
     larger, tolerances = flow.tangent(1), tolerances.with_larger_budget
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
     solution = _run(*given, flow=larger, tolerances=tolerances, keep=True)

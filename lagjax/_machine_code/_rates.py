@@ -41,7 +41,7 @@ def _stacked(flow: Flow, y, acceleration):
 
 
 def _from_rows(flow: Flow, t, y, params):
-    """Of a program that looks up tables, whose parameters are too many to be taken apart, or of a large one."""
+    """`rate` of a program that looks up tables, whose parameters are too many to be taken apart, or of a large one."""
     shape = jnp.broadcast_shapes(y.shape[:-1], t.shape)
     y, time = jnp.broadcast_to(y, (*shape, 2 * flow.size)), jnp.broadcast_to(t, shape)[..., None]
     rows = jnp.concatenate([y, time], axis=-1)
@@ -66,7 +66,7 @@ def _pieces(borders, scalars, n: int) -> list[Any]:
     sliding = {guard.piece: guard.slide for guard in borders.guards if guard.slide >= 0 and guard.order < 2}
 
     def rates(side: float):
-        """Of the switching numbers, where all pieces that may slide are on one side of their border."""
+        """The rates of the switching numbers, where all pieces that may slide are on one side of their border."""
         there = [jnp.full_like(zero, side) if j in sliding else piece for j, piece in enumerate(pieces)]
         there = [zero if j in sliding.values() else piece for j, piece in enumerate(there)]
         out, _ = _on_pieces(borders, scalars, there)

@@ -58,7 +58,7 @@ class StepStore:
         return np.where(steps.complete, run * 2**32 + np.arange(len(steps.first)), -1)
 
     def runs(self, tickets: np.ndarray) -> Iterator[tuple[Steps, np.ndarray, np.ndarray]]:
-        """For every run that is here: its steps, which of the tickets are its members, and which members."""
+        """The steps of every run that is here, with the tickets that are its members, and these members."""
         for run in np.unique(tickets[tickets >= 0] >> 32).tolist():
             with self._lock:
                 steps = self._steps.get(run)

@@ -57,7 +57,7 @@ class Surfaces(NamedTuple):
 
     @property
     def only_jump(self) -> np.ndarray:
-        """For every guard, (G,), true if it has no rate anywhere: it changes its sign by jumps."""
+        """True for every guard, (G,), that has no rate anywhere: it changes its sign by jumps."""
         count = len(self.directions)
         return np.array([self.complete.constant(count + k) == 0.0 for k in range(count)])
 

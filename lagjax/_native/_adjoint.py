@@ -209,7 +209,7 @@ class Adjoint:
             lane["output"] = index - 1
 
     def _transpose_orders(self, back_sums: Code, back_recursion: Code) -> Code:
-        """From the last order to the first: the transposes of the Cauchy products, then of the recursion."""
+        """The transposes of the Cauchy products, then of the recursion, from the last order to the first."""
         frame = self.motion.function("back_orders")
         code, order = frame.code, frame.job("order")
         measured = self._last_terms()
@@ -317,7 +317,7 @@ class Adjoint:
         return frame.finish()
 
     def _transpose_start(self) -> Code:
-        """From the cotangents of the first orders, and of what the recursion read, to that of the state."""
+        """The transpose of the zeroth order: from the cotangents of what follows from it to that of the state."""
         frame, form = self.motion.function("back_start"), self.motion.form
         for i in form.each(frame.code, self.n):
             _add(frame, frame["y_ct", i, 1], "y_ct", i + self.n, 0)
@@ -329,7 +329,7 @@ class Adjoint:
         return frame.finish()
 
     def _transpose_projection(self) -> Code:
-        """From the state on the constraints to the end of the series before it was put there."""
+        """The transpose of the projection: to the end of the series, from the state on the constraints."""
         frame = self.motion.function("back_projection")
         h, motion = frame["h"], self.motion
         moved = motion.moved(frame, motion.increments(frame, frame.job("order"), h)[0])
@@ -341,7 +341,7 @@ class Adjoint:
         return frame.finish()
 
     def _transpose_border(self, saltation: Saltation) -> Code:
-        """From behind the border that a step ends at to before it (`_saltation`)."""
+        """The transpose of the jump at the border that a step ends at (`_saltation`)."""
         motion = self.motion
         motion.layout.extend_by(saltation.fields_along())
         frame = motion.function("back_border")
@@ -376,7 +376,7 @@ class Adjoint:
         return frame.finish()
 
     def _transpose_knot(self, clocks: TimeKnots, base: int) -> Code:
-        """To the entry of a table that the time is on, where a step ends at one (`_time_knots`)."""
+        """The cotangent of the entry of a table that a step ends at, where the time is on it (`_time_knots`)."""
         frame = self.motion.function("back_knot")
         code = frame.code
         with code.only_if(code.any_lane(clocks.is_crossed(frame))):

@@ -32,7 +32,7 @@ class Digits(NamedTuple):
 
     @classmethod
     def of(cls, eps: float, largest_unit: float) -> "Digits":
-        """Those of numbers that round by `eps`."""
+        """The rounding of numbers whose unit in the last place is `eps`."""
         return cls(eps, 256 * eps, 16 * eps, largest_unit)
 
 

@@ -342,7 +342,7 @@ class Events:
         self._see(frame, searching(), frame["begin"] * frame["part"])
 
     def _see(self, frame: Frame, where: Value, seen: Value) -> None:
-        """In some lanes a guard is seen only up to a part of the step, the first time it is looked at."""
+        """Note, in some lanes, that a guard is seen only up to a part of the step, the first time it is looked at."""
         less = where & (seen < frame["seen"]) & ~(frame["is_cut"] > 0.0)
         with frame.where(less):
             frame["seen"] = seen
@@ -444,7 +444,7 @@ class Events:
         return frame.finish()
 
     def write_counts(self, frame: Frame, lane: Lane) -> None:
-        """At the end of a member, how often each guard was noted: behind its notes."""
+        """Write, at the end of a member, the number of times each guard was noted behind its notes."""
         with frame.code.loop(self.count) as g:
             row = self._row(frame, lane["member"], g, frame.job("room_of_notes"))
             frame.write("path", row, lane["noted", g])

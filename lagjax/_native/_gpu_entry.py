@@ -43,7 +43,7 @@ class Entry(NamedTuple):
         return {self.arguments.index(name): k for k, name in enumerate(self.results) if name in self.arguments}
 
     def words(self, **numbers: float) -> list[int]:
-        """Its numbers as whole numbers of 64 bits: doubles by their bits."""
+        """The entry's numbers as whole numbers of 64 bits: doubles by their bits."""
         kinds: dict[str, Callable] = dict(_integrator.JOB._fields_)
         return [ctypes.c_int64.from_buffer_copy(kinds[name](numbers[name])).value for name in self.numbers]
 
@@ -87,7 +87,7 @@ class OneLane(NamedTuple):
 
     @classmethod
     def of(cls, motion: TaylorSeries) -> "OneLane":
-        """From the motion of an integrator or of an adjoint, whose module is finished."""
+        """The module of an integrator or of an adjoint, whose motion is finished."""
         states, text = motion.states, str(motion.module)
         row, series = states + RECORDED + motion.recorded_pieces, states + motion.series.rows
         single = motion.layout.number == FLOAT

@@ -104,12 +104,12 @@ class Rest(NamedTuple):
 
     @staticmethod
     def size(layout: Memory) -> int:
-        """Its size in doubles."""
+        """The size of the rest in doubles."""
         return layout.size + CACHE_LINE + _INTEGERS
 
     @classmethod
     def of(cls, array: np.ndarray, layout: Memory) -> "Rest":
-        """From what a handler wrote: a copy."""
+        """A copy of the rest that a handler wrote."""
         integers = array[-_INTEGERS:].view(np.int64).copy()
         lanes, (skipped, *_) = np.split(integers, [-_OTHERS])
         memory = aligned(layout.size)

@@ -38,7 +38,7 @@ _BEHIND_INTRINSICS = ("rint", "round", "floor", "ceil", "trunc", "fma", "fmod")
 
 @functools.cache
 def _target() -> llvm.Target:
-    """This kind of processor, after LLVM is made ready."""
+    """LLVM's target for this kind of processor, after LLVM is made ready."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     for name in _BEHIND_INTRINSICS:
@@ -63,7 +63,7 @@ _LARGE = 2**20
 
 
 def _machine(level: int) -> llvm.TargetMachine:
-    """This processor, anew for each engine: an engine owns its target machine, and frees it in the end."""
+    """A target machine for this processor: an engine owns its own, and frees it in the end."""
     return _target().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=level
     )
@@ -345,7 +345,7 @@ class Code:
         self.builder.store(x.it, address.it, align=self._alignment(x.it.type))
 
     def load_packed(self, address: Value) -> Value:
-        """As many doubles as a vector has lanes, wherever they begin."""
+        """The doubles from an address on, as many as a vector has lanes, wherever they begin."""
         return Value(self, self.builder.load(address.it, typ=self.vector, align=8))
 
     def store_packed(self, x: Value, address: Value) -> None:

@@ -389,7 +389,7 @@ class Kernel:
         )  # fmt: skip
 
     def threads(self, members: int) -> int:
-        """On how many threads this many members are worked on."""
+        """The number of threads for this many members."""
         return min(cores(), max(1, members // (VECTORS_PER_THREAD * self.width)))
 
 

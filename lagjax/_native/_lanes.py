@@ -64,7 +64,7 @@ class Lines:
         return functools.reduce(code.maximum, map(numbers, range(count)))
 
     def largest_by_group(self, frame: Frame, numbers: Callable[[int], Value], groups: Sequence[int]) -> Numbers:
-        """For each of the numbers the largest one of its group: of those with the same number in `groups`."""
+        """The largest number of the group of each: of those with the same number in `groups`."""
         largest: dict[int, Value] = {}
         for i, group in enumerate(groups):
             value = numbers(i)

@@ -87,7 +87,7 @@ class Packed(Tables):
         return frame.vectors(name, staying)
 
     def ranks(self, line: StraightLine, inputs: list[int], stored: int, keep: bool = True) -> np.ndarray:
-        """In which order the last outputs of a program lie beside each other, where its inputs lie there.
+        """The order in which the last outputs of a program lie beside each other, where its inputs lie there.
 
         Those that are other outputs too come first, in the order of these. With `keep` it will be run so.
         """

@@ -60,11 +60,11 @@ class MotionParts(NamedTuple):
 
     @classmethod
     def of_smooth(cls, program: Recurrent, size: int, projection: Projection | None = None) -> "MotionParts":
-        """Those of a motion over this many coordinates without borders, or whose borders do not matter."""
+        """The parts of a motion over this many coordinates without borders, or whose borders do not matter."""
         return cls(program, recurrences(program, size), Nesting(size), projection)
 
     def of_run(self, nesting: Nesting, guards: Guards | None, motion: Recurrent | None) -> "MotionParts":
-        """Those of a run, from those of the same motion without borders: along its pieces, with guards behind q̈.
+        """The parts of a run, from those of the smooth motion: along its pieces, with guards behind q̈.
 
         `motion` is the program of the motion without its tangents.
         """
@@ -79,7 +79,7 @@ class MotionParts(NamedTuple):
 
     @property
     def without_guards(self) -> "MotionParts":
-        """Those of a piecewise motion without the guards behind it."""
+        """The parts of a piecewise motion without the guards behind q̈."""
         assert self.borders is not None
         program, series = along_pieces(self.borders, self.nesting.size)
         return self._replace(program=program, series=series)

@@ -22,7 +22,7 @@ AT_FIRST_ZERO = ("h_before", "returns", "returned")  # for every new member
 
 
 def retry_last_long_step(frame: Frame, form: Lines | Tables, states: int, guards: int) -> None:
-    """Back to where the last long step began, if steps have become too short since; or remember this beginning."""
+    """Return to where the last long step began, if steps have become too short since; or remember this beginning."""
     code = frame.code
     size, long = (code.intrinsic("fabs", frame[name]) for name in ("h", "h_before"))
     returns, steps = frame["returns"], frame["steps"]
@@ -54,7 +54,7 @@ def _beginnings(frame: Frame, form: Lines | Tables, states: int, guards: int) ->
 
 
 def shorten(frame: Frame) -> None:
-    """In the lanes that have just returned: the size of the next step, at most."""
+    """Bound the next step of the lanes that have just returned."""
     code, returned = frame.code, frame["returned"] > 0.0
     size, returns = frame["h_before"], frame["returns"]
     for k in range(1, MOST_RETURNS + 1):

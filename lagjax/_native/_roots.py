@@ -117,7 +117,7 @@ class Roots:
             frame[name] = sum.value
 
     def turn(self, frame: Frame, degree: Value, where: Value) -> None:
-        """In some lanes the polynomial with the other sign."""
+        """Change the sign of the polynomial in some lanes."""
         code = frame.code
         with code.loop(degree + 1) as k:
             c = frame["poly", k]
@@ -136,7 +136,7 @@ class Roots:
         return frame.finish()
 
     def _march(self, frame: Frame, degree: Value, searching: Value) -> None:
-        """From `begin` on, by the bounds `down` of −P″ and `up` of P″."""
+        """March to the first root from `begin` on, by the bounds `down` of −P″ and `up` of P″."""
         code, down = frame.code, frame["down"]
         bend = code.maximum(down, frame["up"])
         at_start = (ROOT_NOISE * EPS) * code.intrinsic("fabs", frame["poly", 0]) + frame["unsure"]

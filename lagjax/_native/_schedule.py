@@ -179,7 +179,7 @@ def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Sche
 
 
 def _angles(line: StraightLine, uses: list[int]) -> dict[int, list[int]]:
-    """For every angle the nodes of its sine and its cosine; -1 where that is not needed."""
+    """The nodes of the sine and the cosine of every angle; -1 where one is not needed."""
     pairs: dict[int, list[int]] = {}
     for i, (op, operands, _) in enumerate(line.nodes):
         if uses[i] and op in ("sin", "cos"):
@@ -355,7 +355,7 @@ def _grouped(operations: list[ScheduledOperation]) -> list[list[ScheduledOperati
 
 
 def _edges(operations: list[ScheduledOperation]) -> tuple[list[list[int]], list[int]]:
-    """For every operation those that read its results, as often as they do, and how many operands it waits for."""
+    """The readers of every operation's results, as often as they read, and the number of operands it waits for."""
     maker = {x: k for k, operation in enumerate(operations) for x in operation.results}
     users: list[list[int]] = [[] for _ in operations]
     waiting = [0] * len(operations)

@@ -124,7 +124,7 @@ class SingleMember(TaylorSeries):
         return by_modes
 
     def _table(self, runs: list[Run]) -> tuple[ir.GlobalVariable, int, int]:
-        """For each vector where its sums lie, and then its rows; how many vectors there are, and words of one."""
+        """The places of the sums, and then of the rows, of each vector; the number of vectors, and of words of one."""
         rows, words = self.layout.place("rows", 0, 0), []
         for run in runs:
             for first in range(0, run.count, lanes()):
@@ -179,7 +179,7 @@ class SingleMember(TaylorSeries):
         return self._followed(frame, first + self._value_ranks, j)
 
     def followed_coefficient(self, frame: Frame, j: Value, k: Index) -> Value:
-        """Its coefficient of order k > 0."""
+        """The coefficient of order k > 0 of followed number j."""
         first = self.layout.place("rows", 0, 0)
         return self._followed(frame, first + self._row_ranks, j, k * self._stride)
 

@@ -266,7 +266,7 @@ def absolute_tolerance(frame: Frame) -> Value:
 
 
 def note_halved(frame: Frame, where: Value) -> None:
-    """In some lanes the step has become shorter: it is not the last one any more, and the next grows less."""
+    """Note that the step of some lanes has become shorter: it is not the last one any more, and the next grows less."""
     with frame.where(where):
         frame["last"] = 0.0
         frame["growth"] = GROWTH_AFTER_REJECTION

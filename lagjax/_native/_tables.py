@@ -98,7 +98,7 @@ class Tables:
         return largest.value
 
     def largest_by_group(self, frame: Frame, numbers: Callable[[Value], Value], groups: Sequence[int]) -> Numbers:
-        """For each of the numbers the largest one of its group: of those with the same number in `groups`."""
+        """The largest number of the group of each: of those with the same number in `groups`."""
         code, count, names = frame.code, len(groups), sorted(set(groups))
         values = self.room(frame, count)
         if len(names) == count:

@@ -189,7 +189,7 @@ class TaylorSeries:
         return frame["values", j + (self.series.values - self.series.followed)]
 
     def followed_coefficient(self, frame: Frame, j: Value, k: Index) -> Value:
-        """Its coefficient of order k > 0."""
+        """The coefficient of order k > 0 of followed number j."""
         return frame["rows", j + (self.series.rows - self.series.followed), k]
 
     def followed_degree(self, code: Code, order: Value) -> Value:

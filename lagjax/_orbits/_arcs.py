@@ -83,7 +83,7 @@ class Arcs:
 
     @classmethod
     def of(cls, system: System, q0, qdot0, params: PyTree, rtol: float, what: str) -> "Arcs":
-        """Those of a scene whose state has the structure of (q0, qdot0).
+        """The arcs of a scene whose state has the structure of (q0, qdot0).
 
         Raises `ValueError`, for `what` was asked, where the scene has constraints or no machine code.
         """
@@ -154,7 +154,7 @@ class Arcs:
         return Arc(end, moved[..., :states], moved[..., states:], run.result, run.t_end, run.accepted)
 
     def units(self, y0: np.ndarray, time: np.ndarray | None = None) -> "Units":
-        """In what states (R, 2n) are measured, from the largest coordinate and velocity there, in the metric of M.
+        """The units of states (R, 2n), from the largest coordinate and velocity there, in the metric of M.
 
         `time` (R,) is that of a change; by default it is read off the velocities and accelerations.
         """
@@ -178,7 +178,7 @@ class Arcs:
         return Units(np.concatenate([of_q, rate[:, None] * of_q], axis=1), 1 / rate, length)
 
     def _scales(self, y: np.ndarray) -> Scales:
-        """Those of one state (2n,), which need some hundred forces."""
+        """The scales at one state (2n,), which need some hundred forces."""
 
         def evaluated(name, q, qdot):
             return self.quantities((name,), 0.0, np.concatenate([q, qdot], axis=1))[name]
@@ -192,7 +192,7 @@ class Arcs:
         return np.concatenate([y[:, self.size :], qddot], axis=1)
 
     def quantities(self, names: tuple[str, ...], t, y: np.ndarray) -> dict[str, np.ndarray]:
-        """These of `Motion.quantities` at states (R, 2n), each (R, …)."""
+        """The quantities of `Motion.quantities` with these names at states (R, 2n), each (R, …)."""
         q, qdot = halves(y)
         t = np.broadcast_to(np.asarray(t, float), (len(y),))
         return self.derivation.evaluate(names, columns_of(q, qdot, t, list(self.numbers)))

@@ -81,7 +81,7 @@ def passing(reduced: Reduced, sign: int) -> float:
 
 
 def off_pairs(multipliers: np.ndarray) -> float:
-    """By how much the pairs of `multipliers_of`, two neighbours each, miss a product of one: the largest miss."""
+    """The largest distance from one of the products of the pairs of `multipliers_of`, two neighbours each."""
     firsts, seconds = multipliers[0::2], multipliers[1::2]
     return float(np.abs(firsts[: len(seconds)] * seconds - 1).max(initial=0.0))
 

@@ -81,7 +81,7 @@ class Whole(NamedTuple):
 
     @classmethod
     def of(cls, point: FamilyPoint) -> "Whole":
-        """Those of a point."""
+        """The equations at a point."""
         return cls(point.chain.y, point.chain.period, point.numbers)
 
     def plus(self, other: "Whole", by: float = 1.0) -> "Whole":

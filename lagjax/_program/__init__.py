@@ -377,7 +377,7 @@ class Program:
 
     @functools.cached_property
     def _dependencies(self) -> list[int]:
-        """For each node the inputs it depends on, as a bit mask."""
+        """The inputs that each node depends on, as a bit mask."""
         masks: list[int] = []
         for op, operands, attribute in self.nodes:
             masks.append(functools.reduce(int.__or__, (masks[i] for i in operands), 0))

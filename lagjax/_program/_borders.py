@@ -445,7 +445,7 @@ class _Rewriting:
         return graph.apply("add", dot(graph, slopes[:n], velocities), slopes[2 * n])
 
     def _decide(self, count: int, slides: Sequence[Slide]) -> StraightLine:
-        """From the inputs, `count` pieces, and a flag for each that is to stay, to the pieces; a slide continues.
+        """The pieces, from the inputs, `count` pieces, and a flag for each that is to stay; a slide continues.
 
         A motion that begins on a border slides along it, and leaves it at once where it may; on one that depends on
         positions it has to be at rest. To begin with all of several borders takes few turns until it is known which
@@ -549,7 +549,7 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int) -> Pieced:
 
 
 def reads_inputs(line: StraightLine, nodes: Sequence[int], first: int) -> tuple[bool, ...]:
-    """For each of these nodes whether it reads an input from number `first` on."""
+    """True for each of these nodes that reads an input from number `first` on."""
     reads: list[bool] = []
     for op, operands, attribute in line.nodes:
         reads.append(attribute >= first if op == "input" else any(reads[i] for i in operands))

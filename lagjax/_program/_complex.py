@@ -139,7 +139,7 @@ def _square_root(z: Pair) -> Pair:
 
 
 def _whole_power(z: Pair, exponent: int) -> Pair:
-    """By repeated squaring; of a negative exponent the inverse."""
+    """A whole power by repeated squaring; of a negative exponent the inverse."""
     result, base, left = None, z, abs(exponent)
     while left:
         if left & 1:
@@ -182,7 +182,7 @@ def _tangent(z: Pair) -> Pair:
 
 
 def _arcsine(z: Pair) -> Pair:
-    """By the roots of 1 ± z, so that nothing cancels (Kahan, *Branch cuts for complex elementary functions* (1987))."""
+    """The arcsine by roots of 1 ± z, without loss (Kahan, *Branch cuts for complex elementary functions* (1987))."""
     less, more = _square_root((-z).shifted(1.0)), _square_root(z.shifted(1.0))
     product = less * more
     return Pair(_f("atan2", z.re, product.re), _f("asinh", (less.conjugate * more).im))

@@ -104,7 +104,7 @@ class Derivatives:
         return [cotangents.get(i, self._number(0.0)) for i in by]
 
     def _varied(self, tape: Tape, nodes: list[int], by: frozenset[int]) -> list[bool]:
-        """For every scalar of a tape, true if it depends on the inputs `by` and has a derivative."""
+        """True for every scalar of a tape that depends on the inputs `by` and has a derivative."""
         varied: list[bool] = []
         for k, (op, operands, attribute) in enumerate(tape.nodes):
             depends = attribute in by if op == "input" else any(varied[x] for x in operands)
@@ -155,7 +155,7 @@ class Derivatives:
     # ---- rules ----
 
     def rules(self, w: int, op: str, operands: Sequence[int]) -> list[_Rule | None]:
-        """For every operand what takes a cotangent, or a tangent, past w = op(operands); None: there is none."""
+        """The rules that take a cotangent, or a tangent, of each operand past w = op(operands); None: there is none."""
 
         def passed(rule):
             return None if rule is None else lambda g: rule(self._apply, self._number, g, w, *operands)
@@ -213,7 +213,7 @@ class Derivatives:
 
 
 def pushforward(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=()) -> StraightLine:
-    """From the inputs and the tangents of the inputs `by` to the tangents of the outputs `of`.
+    """The line from the inputs and the tangents of the inputs `by` to the tangents of the outputs `of`.
 
     `dtypes` has the type of every input of `line`. Its inputs come first, the tangents after them, and after those the
     values of the outputs `known`, which are not computed once more.
@@ -378,7 +378,7 @@ class _PlacedLine(Derivatives):
         return [results[i] if i in results else self._number(0.0) for i in by]
 
     def _varied_by(self, inputs: frozenset[int], tables: bool) -> list[bool]:
-        """For every node, true if it depends on some inputs, or on entries of tables."""
+        """True for every node that depends on some inputs, or on entries of tables."""
         varied: list[bool] = []
         for (op, operands, attribute), kind in zip(self.line.nodes, self.line.kinds, strict=True):
             if op == "take":

@@ -52,7 +52,7 @@ def _parts(groups: Groups, count: int) -> list[slice]:
 
 
 def _cut(x, part: slice):
-    """Those of the numbers of some states; one that is that of all states stays."""
+    """The numbers of some states; one that is shared by all states stays."""
     return x if x is None or np.size(x) == 1 else x[part]
 
 
@@ -83,7 +83,7 @@ def _dtype(kind: str, precision: np.dtype) -> np.dtype:
 
 
 def steps_of(line, precision) -> list[tuple[Callable | None, tuple, object, tuple[int, ...]]]:
-    """For every node its function, its operands, the attribute or constant, and the values that it is the last to use.
+    """The function of every node, its operands, attribute or constant, and the values that it is the last to use.
 
     `outputs` are never dropped.
     """

@@ -364,7 +364,7 @@ class Graph:
         return self.apply("neg", self.node("add", for_a, b))
 
     def _pythagoras(self, terms: dict[int, float]) -> None:
-        """In place, `c*sin(x)**2*y + c*cos(x)**2*y` becomes `c*y`."""
+        """Replace `c*sin(x)**2*y + c*cos(x)**2*y` by `c*y`, in place."""
         for base in list(terms):
             for sine, rest in self._squared_sines(base):
                 cosine = self.find("cos", *self.nodes[sine][1])

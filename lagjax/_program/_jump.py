@@ -57,7 +57,7 @@ class Nesting(NamedTuple):
 
     @property
     def levels(self) -> list[tuple[int, int]]:
-        """For each level of tangents the coordinates that these are of, and the directions that they are along."""
+        """The coordinates whose tangents each level has, and the number of directions of these tangents."""
         return [(Nesting(self.base, self.directions[:k]).size, count) for k, count in enumerate(self.directions)]
 
     def with_tangents(self, directions: int) -> "Nesting":
@@ -82,11 +82,11 @@ class Jump(NamedTuple):
     lower: int
 
     def accelerations(self, size: int) -> StraightLine:
-        """From the same inputs to the accelerations before and behind the border alone."""
+        """The line from the same inputs to the accelerations before and behind the border alone."""
         return StraightLine(*live(self.line.nodes, self.line.kinds, self.line.outputs[-2 * size :]))
 
     def transposed(self, size: int, parameters: int, pieces: int) -> StraightLine:
-        """From all but the upper rows, and cotangents of their jumps, to cotangents of these rows.
+        """The line from all but the upper rows, and cotangents of their jumps, to cotangents of these rows.
 
         The upper rows are as many as the lower ones, for along one direction they are linear. Cotangents come and go
         row after row; those of a row are of q and q̇, and where they go to also of its parameters.
@@ -202,7 +202,7 @@ class _OverBorder:
         self.graph = Graph(_LARGEST * largest + 10_000)
 
     def _leibniz(self) -> list[list[tuple[int, int]]]:
-        """For every row the pairs of rows whose products it is the sum of, of a product of two numbers."""
+        """The pairs of rows whose products sum up to each row of a product of two numbers."""
         place = {index: row for row, index in enumerate(self.indices)}
         terms = []
         for index in self.indices:

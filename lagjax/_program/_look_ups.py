@@ -102,7 +102,7 @@ def look_up(op: str, attribute: Any, columns: Sequence, x) -> np.ndarray:
 
 
 def cotangents(table: Table, index, g) -> dict[int, np.ndarray]:
-    """By input, what the cotangent g of entries `index` at many states is for them, (S,) each."""
+    """The cotangents of the inputs, (S,) each, from the cotangent g of entries `index` at many states."""
     if not len(table.positions):
         return {}
     index = np.clip(np.where(np.isnan(index), 0, index), 0, table.count - 1).astype(int)

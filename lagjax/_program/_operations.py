@@ -73,7 +73,7 @@ class Operation:
     side: Callable | None = None
 
     def transpose(self) -> "tuple[Callable | None, ...]":
-        """For every operand `(f, c, g, w, *operands)` → its cotangent; empty for what is constant in pieces."""
+        """`(f, c, g, w, *operands)` → the cotangent, for every operand; empty where it is constant in pieces."""
         if self.cotangents:
             return self.cotangents
         return tuple(

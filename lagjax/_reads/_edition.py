@@ -54,7 +54,7 @@ class Edition:
         return (_watch_of(function) if is_plain else _Watch(function)).edition()
 
     def with_tracers_as_arguments(self, function: Callable, how: str) -> "Edition":
-        """This edition, of a `function` that is its trace: what was a tracer in it is given `how` it says.
+        """The edition of a `function` that is its trace: what was a tracer in it is given as `how` says.
 
         So it is one edition whatever is being traced.
         """

@@ -192,7 +192,7 @@ class Batches:
         return {name: np.asarray(x) for name, x in _by_name(kept).items()}, None if drift is None else np.asarray(drift)
 
     def _find_raising(self, motions: "_BatchMotions", everyone: np.ndarray) -> dict[int, str]:
-        """The members for which `keep` raises, as from a callback, and what: by halves, in batches of the same size."""
+        """The members for which `keep` raises in a callback, with the errors: by halves, in equal batches."""
         found, waiting = {}, [everyone]
         while waiting and len(found) <= _MOST_RAISE:
             some = waiting.pop()

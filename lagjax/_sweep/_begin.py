@@ -53,7 +53,7 @@ def first_look(description: Description, points: dict[str, np.ndarray]) -> tuple
 
 
 def _thin(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
-    """At most this many of these points, one at least."""
+    """Evenly chosen ones of these points: `most` at most, one at least."""
     count = len(next(iter(points.values())))
     return {name: x[:: -(-count // max(1, most))] for name, x in points.items()}
 
@@ -262,7 +262,7 @@ def copy_members(old: Store, new: Store) -> int:
 
 
 class _MatchingPlaces(NamedTuple):
-    """For places along an axis of the new store those in the old one with the same values; −1 where there is none.
+    """The places in the old store with the values of those along an axis of the new one; −1 where there is none.
 
     `known` (size,) lists them; None where both have one rule, by which the first `common` ones are the same.
     """

@@ -51,7 +51,7 @@ class Sections(NamedTuple):
 
     @classmethod
     def of(cls, crossings: Any, keep: Callable, settings: dict[str, Any]) -> "Sections | None":
-        """From the arguments of `sweep`. Raises `TypeError` or `ValueError` where they cannot be right."""
+        """The description given by the arguments of `sweep`. Raises `TypeError` or `ValueError` if wrong."""
         asked = "crossings" in _parameters(keep)
         if crossings is None:
             if asked:
@@ -161,7 +161,7 @@ class Description:
 
 
 def texts(description: Description, names: list[str]) -> dict[str, dict[str, str]]:
-    """For every function and value: its text, and its program as JAX traces it (the text where it cannot)."""
+    """The text of every function and value, and its program as JAX traces it (the text where it cannot)."""
     point = {name: jnp.zeros(()) for name in names}
     q, qdot, params = description.shapes(names)
     found = {}

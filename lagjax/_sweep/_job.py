@@ -154,7 +154,7 @@ def cpu() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Of what the bits of a store depend on, and of Python, whose code travels."""
+    """The versions that the bits of a store depend on, and that of Python, whose code travels."""
     of_packages = {name: metadata.version(name) for name in ("jax", "jaxlib", "diffrax", "numpy")}
     return {"lagjax": _own_version(), "python": ".".join(platform.python_version_tuple()[:2]), **of_packages}
 

@@ -121,7 +121,7 @@ class Grid:
 
     @classmethod
     def of(cls, shape: tuple[int, ...], members: int) -> "Grid":
-        """With units of about this many members: whole last axes, a part of one, single places of those before it."""
+        """The members in units of about this size: whole last axes, a part of one, single places of those before it."""
         chunk, room = [1] * len(shape), max(1, members)
         for place in reversed(range(len(shape))):
             chunk[place] = min(shape[place], room)

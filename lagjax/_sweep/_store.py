@@ -303,7 +303,7 @@ class Store:
                     pass
 
     def explained(self, what: str) -> "_Explained":
-        """In a `with` statement an error of the disk is raised again as a sentence; `what` it cost."""
+        """A context in which an error of the disk is raised again as a sentence; `what` it cost."""
         return _Explained(self, what)
 
 

@@ -286,7 +286,7 @@ def _collect(running: set[Any]) -> int:
 
 
 def _wait_for_some(running: set[Any]) -> set[Any]:
-    """Those of these tasks that are done, one at least; tasks that are no futures, as those of submitit, are asked."""
+    """The tasks that are done, one at least; tasks that are no futures, as those of submitit, are polled."""
     if all(isinstance(task, Future) for task in running):
         return wait(running, return_when=FIRST_COMPLETED).done
     while not (finished := {task for task in running if task.done()}):
@@ -320,7 +320,7 @@ _MOST = 100  # members of a unit that may end their process: each takes a dozen 
 
 
 class _Died(Exception):
-    """That a child ended, or was ended, over some batch; `.why` in words."""
+    """The end of a child over some batch; `.why` in words."""
 
     def __init__(self, batch: int, why: str):
         super().__init__(why)
