@@ -27,10 +27,10 @@ from lagjax._machine_code._crossing import (
 )
 from lagjax._machine_code._derivatives import jvp, projected_start, vjp
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
-from lagjax._machine_code._gpu_launch import for_device, form_for_gpus
+from lagjax._machine_code._gpu_launch import for_device
 from lagjax._machine_code._steps import KEPT, StepStore
 from lagjax._machine_code._surfaces import Guarded, Surfaces, crossing_variation, require_one_number, vector_of
-from lagjax._native import Guards, watched
+from lagjax._native import Guards, gpu, watched
 from lagjax._platform import default_platform
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
 from lagjax._program import Program, Unlowerable
@@ -137,7 +137,7 @@ class MachineCode(AbstractEngine):
             flow = flow_of(problem)
             tolerances = for_device(flow, tolerances_of(problem))
             try:
-                form = form_for_gpus(flow, tolerances)
+                form = flow.kernel.for_gpus(tolerances.allow_singles).form(gpu.MOTION, tolerances.rtol)
             except Unlowerable as reason:
                 return f"nor can solver=lagjax.MachineCode() go to a GPU: {reason}"
         outlook = "solver=lagjax.MachineCode() is for GPUs too, assembled and checked on a CPU, not yet run on a GPU"

@@ -46,11 +46,6 @@ def has_slow_doubles() -> bool:
     return getattr(devices[0], "compute_capability", None) not in _FAST_DOUBLES
 
 
-def form_for_gpus(flow: Flow, tolerances: Tolerances) -> gpu.GpuForm:
-    """The form of a motion, with the tolerances for the device. Raises `Unlowerable` where a GPU cannot run it."""
-    return flow.kernel.for_gpus(tolerances.allow_singles).form(gpu.MOTION, tolerances.rtol)
-
-
 def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
     """The motions of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P): a `Solution` without `idle`.
 

@@ -59,8 +59,7 @@ class GpuPrograms:
     `Unlowerable`, whose text says why, where a GPU cannot run the program.
     """
 
-    def __init__(self, motion: Callable[[], TaylorSeries], adjoint: Callable[[], TaylorSeries], single: bool):
-        self.single = single
+    def __init__(self, motion: Callable[[], TaylorSeries], adjoint: Callable[[], TaylorSeries]):
         self._lane = functools.cache(lambda: one_lane(motion()))
         self._lane_back = functools.cache(lambda: one_lane(adjoint()))
         self._motion = functools.cache(lambda form: motion_for_gpus(self._lane(), form))

@@ -120,7 +120,7 @@ class Kernel:
         program, projection, self._guards, chosen = parameters_chosen(
             program, projection, guards, 2 * size + 1, size // nesting.base
         )
-        self._smooth = MotionParts.of_smooth(program, size, projection)._replace(chosen=chosen)
+        self._smooth = MotionParts.of_smooth(program, size, projection, chosen)
         self._parts = self._smooth.of_run(nesting, self._guards, motion)
         self._error_groups = error_groups
         self.width = lanes() if width is None else width
@@ -138,9 +138,9 @@ class Kernel:
 
     @functools.cached_property
     def _one_by_one(self) -> bool:
-        series, large = self._parts.series, is_large(self._parts.program)
-        large = large and series.rows * MAX_ORDER * self.width * 8 > LARGEST_SHARED
-        return large and fills_lanes(series)
+        series = self._parts.series
+        shared = series.rows * MAX_ORDER * self.width * 8 <= LARGEST_SHARED
+        return is_large(self._parts.program) and not shared and fills_lanes(series)
 
     @functools.cached_property
     def _alone(self) -> "Kernel":
@@ -166,7 +166,7 @@ class Kernel:
             _gpu.require_room(size_of_series(self._parts.series))  # before what is larger than that is written down
             return self.for_members(1)._integrator(number).motion
 
-        return _gpu.GpuPrograms(motion, lambda: self._adjoint(width=1, number=number).motion, single)
+        return _gpu.GpuPrograms(motion, lambda: self._adjoint(width=1, number=number).motion)
 
     @property
     def allows_singles(self) -> bool:

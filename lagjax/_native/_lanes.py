@@ -88,7 +88,10 @@ def emit(
     """
     values: list[Value] = []
     turns: dict[int, tuple[Value, Value]] = {}
-    exact = _doubles_in(line, inputs) if code.number == FLOAT else frozenset()
+    exact = frozenset()
+    if code.number == FLOAT:
+        inputs = functools.cache(inputs)  # each is read once, for its type and for its value
+        exact = _doubles_in(line, inputs)
     for k, ((op, operands, attribute), kind) in enumerate(zip(line.nodes, line.kinds, strict=True)):
         vector = ir.VectorType(DOUBLE, code.lanes) if k in exact else code.vector
         xs = [values[i] if line.kinds[i] == "bool" else code.as_value(values[i], vector) for i in operands]

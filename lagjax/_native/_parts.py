@@ -59,9 +59,11 @@ class MotionParts(NamedTuple):
         return 0 if self.borders is None else len(self.borders.switches)
 
     @classmethod
-    def of_smooth(cls, program: Recurrent, size: int, projection: Projection | None = None) -> "MotionParts":
+    def of_smooth(
+        cls, program: Recurrent, size: int, projection: Projection | None = None, chosen: Chosen | None = None
+    ) -> "MotionParts":
         """The parts of a motion over this many coordinates without borders, or whose borders do not matter."""
-        return cls(program, recurrences(program, size), Nesting(size), projection)
+        return cls(program, recurrences(program, size), Nesting(size), projection, chosen=chosen)
 
     def of_run(self, nesting: Nesting, guards: Guards | None, motion: Recurrent | None) -> "MotionParts":
         """The parts of a run, from those of the smooth motion: along its pieces, with guards behind q̈.
