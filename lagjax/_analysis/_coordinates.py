@@ -93,15 +93,15 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
         assert system.velocity_constraints is not None
         return system.velocity_constraints(*old_state(Q, Qdot, t, params), t=t, params=params)
 
-    def of_role(function: Function | None, changed: Callable, roles: int = 2) -> Callable | None:
-        return None if function is None else asking(changed, {*function.extras, *place.extras}, roles)
+    def replace_role(function: Function | None, changed: Callable, roles: int = 2) -> Callable | None:
+        return None if function is None else restrict_signature(changed, {*function.extras, *place.extras}, roles)
 
     changed = System(
-        asking(lagrangian, {*system.lagrangian.extras, *place.extras}),
-        forces=of_role(system.forces, forces),
-        dissipation=of_role(system.dissipation, dissipation),
-        constraints=of_role(system.constraints, constraints, 1),
-        velocity_constraints=of_role(system.velocity_constraints, velocity_constraints),
+        restrict_signature(lagrangian, {*system.lagrangian.extras, *place.extras}),
+        forces=replace_role(system.forces, forces),
+        dissipation=replace_role(system.dissipation, dissipation),
+        constraints=replace_role(system.constraints, constraints, 1),
+        velocity_constraints=replace_role(system.velocity_constraints, velocity_constraints),
         path=system.path,  # pyright: ignore[reportArgumentType]
     )
 
@@ -114,10 +114,10 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
     return ChangedCoordinates(changed, to_old, to_new)
 
 
-def asking(function: Callable, extras: set[str], roles: int = 2) -> Callable:
-    """`function(*roles, t, params)` with the signature of one that asks for these extras alone.
+def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> Callable:
+    """`function(*roles, t, params)` with a signature that has `t` and `params` only where `extras` names them.
 
-    A function that does not ask for the time is known not to depend on it.
+    A function without `t` in its signature is known not to depend on the time.
     """
     if roles == 1:
         forms = {
@@ -146,10 +146,12 @@ def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, param
         )
     t, wanted = jnp.asarray(t, old.dtype), old.flatten(q)
 
-    def off(x, t):
+    def residual(x, t):
         return old.flatten(place(new.restore(x), t=t, params=params)) - wanted
 
-    x = jax.lax.custom_root(lambda x: off(x, t), jax.lax.stop_gradient(new.flatten(guess)), newton, shortest_preimage)
-    x = nan_unless(jax.lax.stop_gradient(is_root(lambda x: off(x, t), x, wanted)), x)
-    jacobian, drift = jax.jacfwd(off, argnums=0)(x, t), jax.jacfwd(off, argnums=1)(x, t)
+    x = jax.lax.custom_root(
+        lambda x: residual(x, t), jax.lax.stop_gradient(new.flatten(guess)), newton, shortest_preimage
+    )
+    x = nan_unless(jax.lax.stop_gradient(is_root(lambda x: residual(x, t), x, wanted)), x)
+    jacobian, drift = jax.jacfwd(residual, argnums=0)(x, t), jax.jacfwd(residual, argnums=1)(x, t)
     return new.restore(x), new.restore(shortest_solution(jacobian, old.flatten(qdot) - drift))

@@ -28,21 +28,21 @@ _UNITS = 32
 # ---- the host --------------------------------------------------------------------------------------------------------
 
 
-def _on_host(function: Callable, shapes: tuple, *arrays) -> tuple:
-    """The arrays that a function of NumPy returns for arrays with any batch axes in front."""
+def _call_numpy(function: Callable, shapes: tuple, *arrays) -> tuple:
+    """The arrays of shapes `shapes` that a NumPy function returns on the host for `arrays`, with any batch axes."""
 
-    def in_place(_, places, *buffers):
+    def fill_buffers(_, places, *buffers):
         for place, value in zip(places, function(*map(np.asarray, buffers)), strict=True):
             np.asarray(place)[...] = value
 
-    def by_copies(*x):
+    def return_copies(*x):
         return tuple(function(*map(np.asarray, x)))
 
     def cpu(*x):
-        return buffer_callback(in_place, shapes, vmap_method="broadcast_all")(*x)
+        return buffer_callback(fill_buffers, shapes, vmap_method="broadcast_all")(*x)
 
     def others(*x):
-        return jax.pure_callback(by_copies, shapes, *x, vmap_method="broadcast_all")
+        return jax.pure_callback(return_copies, shapes, *x, vmap_method="broadcast_all")
 
     return tuple(jax.lax.platform_dependent(*arrays, cpu=cpu, default=others))
 
@@ -76,7 +76,7 @@ def symmetric_modes(stiffness: Matrix, mass: Matrix) -> tuple[Float[Array, " n"]
     """
     n = len(mass)
     shapes = jax.ShapeDtypeStruct((n,), mass.dtype), jax.ShapeDtypeStruct((n, n), mass.dtype)
-    return _on_host(lambda *x: _each(_symmetric, *x), shapes, stiffness, mass)  # pyright: ignore[reportReturnType]
+    return _call_numpy(lambda *x: _each(_symmetric, *x), shapes, stiffness, mass)  # pyright: ignore[reportReturnType]
 
 
 def _symmetric(stiffness: np.ndarray, mass: np.ndarray) -> list[np.ndarray]:
@@ -133,7 +133,7 @@ def _eigen(matrix: Array) -> tuple[Array, ...]:
     """Real and imaginary parts of s, X and X⁻¹."""
     n = len(matrix)
     vector, square = (jax.ShapeDtypeStruct(shape, matrix.dtype) for shape in ((n,), (n, n)))
-    return _on_host(lambda a: _each(_general, a), (vector, vector, square, square, square, square), matrix)
+    return _call_numpy(lambda a: _each(_general, a), (vector, vector, square, square, square, square), matrix)
 
 
 # A basis of eigenvectors that has lost half of the digits is none: rounding splits a Jordan block of two by √eps.
@@ -142,7 +142,7 @@ _WORST_BASIS = 1e7
 
 def _general(matrix: np.ndarray) -> list[np.ndarray]:
     values, vectors = np.linalg.eig(matrix)
-    order = _in_pairs(values)
+    order = _eigenvalue_order(values)
     values, vectors = values[order].astype(complex), vectors[:, order].astype(complex)
     if np.linalg.cond(vectors) > _WORST_BASIS:
         inverse = np.full_like(vectors, np.nan)
@@ -151,8 +151,8 @@ def _general(matrix: np.ndarray) -> list[np.ndarray]:
     return [part for x in (values, vectors, inverse) for part in (np.real(x), np.imag(x))]
 
 
-def _in_pairs(values: np.ndarray) -> np.ndarray:
-    """The order of `exponents_and_modes`."""
+def _eigenvalue_order(values: np.ndarray) -> np.ndarray:
+    """The indices (n,) that sort eigenvalues (n,) into the order of `exponents_and_modes`."""
     reals, imaginary = np.real(values), np.imag(values)
     real = np.flatnonzero(imaginary == 0)
     real = real[np.argsort(-reals[real], kind="stable")]
@@ -180,7 +180,7 @@ def null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]
     """An orthonormal basis, a vector a column, of what m rows of this rank send to zero; without derivatives."""
     n = rows.shape[1]
     shape = (jax.ShapeDtypeStruct((n, n - rank), rows.dtype),)
-    return _on_host(lambda g: _each(lambda a: [_null(a, rank)], g), shape, jax.lax.stop_gradient(rows))[0]
+    return _call_numpy(lambda g: _each(lambda a: [_null(a, rank)], g), shape, jax.lax.stop_gradient(rows))[0]
 
 
 def _null(rows: np.ndarray, rank: int) -> np.ndarray:

@@ -77,12 +77,12 @@ def equilibrium(
     """
     require_flag(throw, "throw")
     require_flag(stable, "stable")
-    scene = SceneState.of(system, q, qdot, params)
+    scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("An equilibrium")
     require_steady(scene)
     if stable:
-        scene = _at_rest(scene, qdot)
-    place, multipliers, ok = _found(*scene.arguments)
+        scene = _settled_scene(scene, qdot)
+    place, multipliers, ok = _solve_balance(*scene.arguments)
     if throw and scene.concrete and not ok:
         raise ValueError(_sentence(scene))
     of_user = None
@@ -91,8 +91,8 @@ def equilibrium(
     return Equilibrium(scene.layout.restore(place), of_user, ok)
 
 
-def _at_rest(scene: SceneState, qdot: PyTree) -> SceneState:
-    """The scene where it comes to rest with friction. Raises where that cannot be followed."""
+def _settled_scene(scene: SceneState, qdot: PyTree) -> SceneState:
+    """The scene at the state where friction brings it to rest. Raises `ValueError` where no motion can be followed."""
     if qdot is not None:
         raise ValueError("stable=True finds where a scene comes to rest: leave qdot out, or look at normal_modes.")
     if not scene.concrete:
@@ -100,7 +100,7 @@ def _at_rest(scene: SceneState, qdot: PyTree) -> SceneState:
             "stable=True follows a motion until it rests, and cannot be traced: find q outside of jit, vmap and grad, "
             "and give it to equilibrium(system, q, params) inside; derivatives by params are right there."
         )
-    return SceneState.of(scene.system, settle(scene), None, scene.params)
+    return SceneState.from_state(scene.system, settle(scene), None, scene.params)
 
 
 def require_steady(scene: SceneState) -> None:
@@ -123,9 +123,9 @@ _TINY = 1e-6
 
 
 @eqx.filter_jit
-def _found(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
+def _solve_balance(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
     """q (n,), λ (m,) and whether they are an equilibrium, of a scene made of `SceneState.arguments`."""
-    scene = SceneState.flat(*arguments)
+    scene = SceneState.from_arguments(*arguments)
     n = scene.layout.size
 
     def residual(z: Unknowns) -> Unknowns:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from lagjax._analysis._noether import FlatState, variation
-from lagjax._analysis._potential import along_line
+from lagjax._analysis._potential import line_integral
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._transformations import Fields
 from lagjax._doubles import accepts_singles
@@ -91,7 +91,9 @@ def _function(scene: SceneState, fields: Fields, weights: np.ndarray, constant: 
 
     @accepts_singles(("q",), ("t", "params"))
     def gauge(q, t=0.0, params=None):
-        there = SceneState.flat(system, layout, layout.flatten(q), jnp.zeros(layout.size, layout.dtype), params)
+        there = SceneState.from_arguments(
+            system, layout, layout.flatten(q), jnp.zeros(layout.size, layout.dtype), params
+        )
         transform = fields.transform(jnp.asarray(weights, layout.dtype), params)
         start, t = jnp.asarray(reference, layout.dtype), jnp.asarray(t, layout.dtype)
 
@@ -103,10 +105,10 @@ def _function(scene: SceneState, fields: Fields, weights: np.ndarray, constant: 
 
         if constant:
             return slope(start, jnp.zeros_like(t)) @ there.q
-        in_time = along_line(
+        in_time = line_integral(
             lambda t: change(start, jnp.zeros_like(start), t[0])[None], jnp.zeros_like(t)[None], t[None]
         )
-        return along_line(lambda q: slope(q, t), start, there.q) + in_time
+        return line_integral(lambda q: slope(q, t), start, there.q) + in_time
 
     return gauge
 
@@ -114,12 +116,12 @@ def _function(scene: SceneState, fields: Fields, weights: np.ndarray, constant: 
 @eqx.filter_jit
 def _changes(weights: Array, fields: Fields, states: FlatState, *arguments) -> tuple:
     """The fields of `Changes`."""
-    scene = SceneState.flat(*arguments)
+    scene = SceneState.from_arguments(*arguments)
 
-    def of_state(state):
+    def changes_at(state):
         return jax.lax.map(lambda w: _change(scene, fields, fields.transform(w, scene.params), state), weights)
 
-    return jax.lax.map(of_state, states)
+    return jax.lax.map(changes_at, states)
 
 
 def _change(scene: SceneState, fields: Fields, transform: Callable, state: FlatState) -> tuple:

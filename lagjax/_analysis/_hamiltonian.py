@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lagjax._analysis._coordinates import asking
+from lagjax._analysis._coordinates import restrict_signature
 from lagjax._analysis._solve import is_root, newton, shortest_preimage
 from lagjax._consistent import has_constraints
 from lagjax._failures import nan_unless
@@ -90,17 +90,17 @@ def hamiltonian(system: System) -> Hamiltonian:
         return system.momentum(q, qdot, t, params)
 
     def velocity(q, p, t=0.0, params=None):
-        flat = _Flat.of(system, q, p, params)
+        flat = _FlatScene.from_state(system, q, p, params)
         return flat.layout.restore(flat.velocity(flat.layout.flatten(q), flat.layout.flatten(p), _time(t, flat)))
 
     def energy(q, p, t=0.0, params=None):
-        flat = _Flat.of(system, q, p, params)
+        flat = _FlatScene.from_state(system, q, p, params)
         x, y, t = flat.layout.flatten(q), flat.layout.flatten(p), _time(t, flat)
         v = flat.velocity(x, y, t)
         return y @ v - flat.motion.lagrangian(x, v, t, flat.numbers)
 
     def equations(q, p, t: Any = 0.0, params=None):
-        flat = _Flat.of(system, q, p, params)
+        flat = _FlatScene.from_state(system, q, p, params)
         rate, force = flat.rates(flat.layout.flatten(q), flat.layout.flatten(p), _time(t, flat))
         return flat.layout.restore(rate), flat.layout.restore(force)
 
@@ -115,7 +115,7 @@ def hamiltonian(system: System) -> Hamiltonian:
     return Hamiltonian(system, energy, momentum, velocity, equations, run)
 
 
-def _time(t, flat: "_Flat") -> Array:
+def _time(t, flat: "_FlatScene") -> Array:
     return jnp.asarray(t, flat.layout.dtype)
 
 
@@ -134,29 +134,29 @@ def _phase_space(equations: Callable, system: System) -> System:
         return jax.jvp(rates, (z, t), (zdot, jnp.ones_like(t)))[1]
 
     functions = [f for f in (system.lagrangian, system.forces, system.dissipation) if f is not None]
-    return System(kinetic, forces=asking(force, {extra for f in functions for extra in f.extras}))
+    return System(kinetic, forces=restrict_signature(force, {extra for f in functions for extra in f.extras}))
 
 
-class _Flat(NamedTuple):
-    """A scene on vectors."""
+class _FlatScene(NamedTuple):
+    """The functions of a scene on vectors (n,), for q and p of this layout, and the numbers of its parameters."""
 
     layout: Layout
     motion: Any
     numbers: PyTree
 
     @classmethod
-    def of(cls, system: System, q: PyTree, p: PyTree, params: PyTree) -> "_Flat":
+    def from_state(cls, system: System, q: PyTree, p: PyTree, params: PyTree) -> "_FlatScene":
         layout = Layout.of(q, p)
         return cls(layout, present_system(system).motion(layout, params), eqx.filter(params, eqx.is_array_like))
 
     def velocity(self, q: Vector, p: Vector, t) -> Vector:
         """v with ∂L/∂q̇(q, v, t) = p, by Newton's method from rest."""
 
-        def off(v):
+        def residual(v):
             return self.motion.momentum(q, v, t, self.numbers) - p
 
-        v = jax.lax.custom_root(off, jnp.zeros_like(p), newton, shortest_preimage)
-        return nan_unless(jax.lax.stop_gradient(is_root(off, v, p)), v)
+        v = jax.lax.custom_root(residual, jnp.zeros_like(p), newton, shortest_preimage)
+        return nan_unless(jax.lax.stop_gradient(is_root(residual, v, p)), v)
 
     def rates(self, q: Vector, p: Vector, t) -> tuple[Vector, Vector]:
         """(q̇, ṗ)."""

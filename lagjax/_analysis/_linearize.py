@@ -63,15 +63,15 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
     print(lagjax.linearize(pendulum, 0.0).A)  # [[0, 1], [-9.81, 0]]
     ```
     """
-    scene = SceneState.of(system, q, qdot, params)
+    scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A linearization")
     require_smooth(scene, "A linearization")
-    return Linearization(*_linearized(*scene.arguments), names=scene.layout.names)
+    return Linearization(*_linearize(*scene.arguments), names=scene.layout.names)
 
 
 @eqx.filter_jit
-def _linearized(*arguments) -> tuple:
-    scene = SceneState.flat(*arguments)
+def _linearize(*arguments) -> tuple:
+    scene = SceneState.from_arguments(*arguments)
     n, q, qdot = scene.layout.size, scene.q, scene.qdot
     motion, t, numbers = scene.motion, jnp.zeros((), q.dtype), scene.numbers
     zero, one = jnp.zeros((n, n), q.dtype), jnp.eye(n, dtype=q.dtype)

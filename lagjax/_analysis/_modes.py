@@ -122,7 +122,7 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     print(lagjax.normal_modes(pendulum, 0.0))  # sqrt(9.81)
     ```
     """
-    scene = SceneState.of(system, q, qdot, params)
+    scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A normal mode")
     require_steady(scene)
     require_smooth(scene, "A normal mode")
@@ -172,7 +172,7 @@ def _rank(scene: SceneState) -> int:
 @eqx.filter_jit
 def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> tuple:
     """Exponents (k, 2) and shapes (k, n) of the k degrees of freedom, and how far q is from an equilibrium."""
-    scene = SceneState.flat(*arguments)
+    scene = SceneState.from_arguments(*arguments)
     q = scene.q
     matrices = steady_matrices(scene, q)
     unit = jax.lax.stop_gradient(diagonal_scale(matrices[0]))
@@ -182,10 +182,10 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
     residual = residual + jnp.where(_rank_is(jacobian, rank), 0, jnp.nan)
     keep = np.array([i for i in range(len(q)) if i not in cyclic], int)
     gone = np.array(cyclic, int)
-    reduced, follow = _without_cyclic(mass, rates, stiffness, keep, gone)
+    reduced, follow = _eliminate_cyclic(mass, rates, stiffness, keep, gone)
     basis = _tangent_basis(jacobian[:, keep], rank)
     within = tuple(basis.T @ x @ basis for x in reduced)
-    solve = _of_reversible if reversible else _of_any
+    solve = _reversible_modes if reversible else _general_modes
     exponents, amplitudes = solve(*within) if basis.shape[1] else _none(q.dtype)
     moved = (basis.astype(amplitudes.dtype) @ amplitudes).T  # (k, n without the cyclic ones)
     shapes = jnp.zeros((len(moved), len(q)), moved.dtype).at[:, keep].set(moved)
@@ -195,7 +195,7 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
         exponents = jnp.concatenate([jnp.zeros((len(gone), 2), exponents.dtype), exponents])
         shapes = jnp.concatenate([own, shapes])
     order = jnp.argsort(jax.lax.stop_gradient(exponents[:, 0].imag), stable=True)
-    shapes = _normalised(shapes[order], mass) * unit
+    shapes = _normalise(shapes[order], mass) * unit
     balanced = (residual <= _BALANCED) & is_smooth(scene)
     exponents = jax.lax.complex(*(nan_unless(balanced, x) for x in (exponents.real, exponents.imag)))[order]
     return exponents, jnp.where(balanced, shapes, jnp.nan), residual
@@ -242,8 +242,8 @@ def _distance(
 _FURTHER, _BENT = 1e3, 1e-3
 
 
-def _without_cyclic(mass: Matrix, rates: Matrix, stiffness: Matrix, keep: np.ndarray, gone: np.ndarray):
-    """M, C + G, K of all but the cyclic coordinates, at constant momenta of these; and how those follow a mode."""
+def _eliminate_cyclic(mass: Matrix, rates: Matrix, stiffness: Matrix, keep: np.ndarray, gone: np.ndarray):
+    """M, C + G, K of the coordinates `keep` at constant momenta of the cyclic `gone`; the part of these in modes."""
     if not len(gone):
         return (mass, rates, stiffness), lambda moved, exponents: moved[:, :0]
     within, across = np.ix_(keep, keep), np.ix_(keep, gone)
@@ -281,7 +281,7 @@ def _none(dtype) -> tuple[Array, Array]:
     return jnp.zeros((0, 2), jnp.result_type(dtype, jnp.complex64)), jnp.zeros((0, 0), dtype)
 
 
-def _of_reversible(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
+def _reversible_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
     """Exponents (k, 2) and real amplitudes (k, k), a mode a column, of K x = ω² M x; NaN if velocities do matter."""
     squares, shapes = symmetric_modes(stiffness, mass)
     size = jnp.max(jnp.abs(squares))
@@ -293,7 +293,7 @@ def _of_reversible(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Arra
     return jnp.stack([jax.lax.complex(growth, frequency), jax.lax.complex(-growth, -frequency)], axis=1), shapes
 
 
-def _of_any(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
+def _general_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
     """Exponents (k, 2) and complex amplitudes (k, k), a mode a column.
 
     Velocities are in units of the fastest rate there is: positions and they are then of one size.
@@ -308,7 +308,7 @@ def _of_any(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Arra
     return jnp.stack([values[:k], values[k:]], axis=1), vectors[:k, :k]
 
 
-def _normalised(shapes: Array, mass: Matrix) -> Array:
+def _normalise(shapes: Array, mass: Matrix) -> Array:
     """Shapes (k, n) with xᴴM x = 1 and the largest entry positive."""
     size = jnp.sum(shapes.conj() * (shapes @ mass.T.astype(shapes.dtype)), axis=1).real
     shapes = shapes / jnp.sqrt(size)[:, None].astype(shapes.dtype)

@@ -43,7 +43,7 @@ def cyclic_coordinates(system: System, q: PyTree, qdot: PyTree, params: PyTree =
     lagjax.cyclic_coordinates(kepler, {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 1.0})  # ("q['phi']",)
     ```
     """
-    scene = SceneState.of(system, q, qdot, params)
+    scene = SceneState.from_state(system, q, qdot, params)
     try:
         read = scene.derivation.reads("lagrangian")
     except Unlowerable as reason:

@@ -29,7 +29,7 @@ _BESIDE, _PARTS, _RESOLVED = (0.0, 0.5, -0.5), 4, 1e-10
 _CURL = 1e-12
 
 
-def along_line(slope: Callable, start: Array, end: Array) -> Array:
+def line_integral(slope: Callable, start: Array, end: Array) -> Array:
     """∫ slope(q)·dq from `start` to `end`, (n,) or (), along a straight line."""
     way = end - start
     return _integral(lambda s: jnp.vdot(slope(start + s * way), way), 1, end.dtype)
@@ -52,7 +52,7 @@ def _work(force: Callable, start: Array, end: Array, scale: np.ndarray) -> Array
     across = across - (across @ along) * along
     across = size * length * across / jnp.maximum(jnp.sqrt(jnp.sum(across**2)), 1e-3)
 
-    def along_curve(beside, parts):
+    def curve_work(beside, parts):
         def rate(s):
             place = start + s * way + beside * jnp.sin(jnp.pi * s) * across
             return force(place) @ (way + beside * jnp.pi * jnp.cos(jnp.pi * s) * across)
@@ -60,7 +60,7 @@ def _work(force: Callable, start: Array, end: Array, scale: np.ndarray) -> Array
         return jnp.stack([_integral(rate, parts, end.dtype), _integral(lambda s: jnp.abs(rate(s)), parts, end.dtype)])
 
     curves = jnp.asarray(_BESIDE, end.dtype)
-    coarse, fine = (jax.vmap(lambda x, parts=parts: along_curve(x, parts))(curves) for parts in (_PARTS, 2 * _PARTS))
+    coarse, fine = (jax.vmap(lambda x, parts=parts: curve_work(x, parts))(curves) for parts in (_PARTS, 2 * _PARTS))
     error = jnp.abs(fine[:, 0] - coarse[:, 0]) / jnp.where(fine[:, 1] > 0, fine[:, 1], 1)
     error = jnp.where(jnp.isfinite(error), error, jnp.inf)
     best = jnp.argmin(error)
@@ -69,8 +69,8 @@ def _work(force: Callable, start: Array, end: Array, scale: np.ndarray) -> Array
     return jnp.where(sure, fine[best, 0], jnp.nan)
 
 
-def with_potential(scene: SceneState, scales: Scales, states: FlatState) -> SceneState:
-    """The scene with its forces in L where they have a potential, as far as some states tell; else the scene."""
+def absorb_potential_forces(scene: SceneState, scales: Scales, states: FlatState) -> SceneState:
+    """The scene with its forces as part of L where they have a potential at all of `states`; else the scene itself."""
     if scene.motion.forces is None or not _have_potential(scene, scales, states):
         return scene
     system, layout, reference = scene.system, scene.layout, np.asarray(scene.q)
@@ -85,7 +85,7 @@ def with_potential(scene: SceneState, scales: Scales, states: FlatState) -> Scen
         # The value is that of a long way; by q it changes as along the last, vanishing part of it, to every order.
         here = jax.lax.stop_gradient(place[0])
         start = jnp.asarray(reference, layout.dtype)
-        work = _work(force, start, here, scales.q) + along_line(force, here, place[0])
+        work = _work(force, start, here, scales.q) + line_integral(force, here, place[0])
         return motion.lagrangian(*place) + work
 
     whole = System(
@@ -94,7 +94,7 @@ def with_potential(scene: SceneState, scales: Scales, states: FlatState) -> Scen
         constraints=system.constraints,
         velocity_constraints=system.velocity_constraints,
     )
-    return SceneState.of(whole, layout.restore(scene.q), layout.restore(scene.qdot), scene.params)
+    return SceneState.from_state(whole, layout.restore(scene.q), layout.restore(scene.qdot), scene.params)
 
 
 def _have_potential(scene: SceneState, scales: Scales, states: FlatState) -> bool:
@@ -113,12 +113,12 @@ def _have_potential(scene: SceneState, scales: Scales, states: FlatState) -> boo
 @eqx.filter_jit
 def _derivatives(states: FlatState, *arguments) -> tuple[Array, Array, Array]:
     """Q (S, n), ∂Q/∂q and ∂Q/∂q̇ (S, n, n)."""
-    scene = SceneState.flat(*arguments)
+    scene = SceneState.from_arguments(*arguments)
 
-    def of_state(state):
+    def force_and_derivatives(state):
         def force(q, qdot):
             return scene.motion.forces(q, qdot, state.t, scene.numbers)  # pyright: ignore[reportOptionalCall]
 
         return force(state.q, state.qdot), *jax.jacfwd(force, argnums=(0, 1))(state.q, state.qdot)
 
-    return jax.lax.map(of_state, states)
+    return jax.lax.map(force_and_derivatives, states)

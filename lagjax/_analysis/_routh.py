@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lagjax._analysis._coordinates import asking
+from lagjax._analysis._coordinates import restrict_signature
 from lagjax._analysis._scene_state import SceneState
 from lagjax._arguments import present
 from lagjax._layout import Layout
@@ -68,7 +68,7 @@ def routhian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> 
     print(radial.names)  # ("q['r']",)
     ```
     """
-    scene = SceneState.of(system, q, qdot, params)
+    scene = SceneState.from_state(system, q, qdot, params)
     if scene.constrained or system.forces is not None or system.dissipation is not None:
         raise ValueError("routhian is of systems without constraints, forces and dissipation: R is a Lagrangian alone.")
     gone, layout = np.array(scene.conserved, int), scene.layout
@@ -76,32 +76,32 @@ def routhian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> 
     if not len(gone) or not len(left):
         what = "every coordinate is" if len(gone) else "no coordinate is"
         raise ValueError(f"There is nothing to reduce: {what} cyclic ({', '.join(layout.names)}).")
-    whole = _Whole(scene.system, layout, left, gone)
+    whole = _CyclicSplit(scene.system, layout, left, gone)
     extras = {*system.lagrangian.extras, "params"}
-    reduced = System(asking(whole.routh, extras), path=system.path)  # pyright: ignore[reportArgumentType]
+    reduced = System(restrict_signature(whole.routh, extras), path=system.path)  # pyright: ignore[reportArgumentType]
     names = tuple(layout.names[i] for i in left), tuple(layout.names[i] for i in gone)
     return Routhian(reduced, *names, whole.reduce, whole.restore, lambda *a, **o: _simulate(whole, reduced, *a, **o))
 
 
-class _Whole(NamedTuple):
-    """The scene before it is reduced, and the places of the coordinates that are left and gone."""
+class _CyclicSplit(NamedTuple):
+    """A scene before reduction, and the indices of its coordinates: those `left` and the cyclic ones, `gone`."""
 
     system: System
     layout: Layout
     left: np.ndarray
     gone: np.ndarray
 
-    def joined(self, s, c) -> Array:
+    def join_coordinates(self, s, c) -> Array:
         """The vector (n,) of both kinds."""
         return jnp.zeros(self.layout.size, self.layout.dtype).at[self.left].set(s).at[self.gone].set(c)
 
     def lagrangian(self, s, sdot, cdot, t, params):
         """L, in which the cyclic coordinates may have any value."""
-        q, qdot = self.joined(s, jnp.zeros(len(self.gone))), self.joined(sdot, cdot)
+        q, qdot = self.join_coordinates(s, jnp.zeros(len(self.gone))), self.join_coordinates(sdot, cdot)
         return present(self.system.lagrangian)(self.layout.restore(q), self.layout.restore(qdot), t=t, params=params)
 
-    def turning(self, s, sdot, t, params) -> Array:
-        """ċ (k,) at the momenta in the parameters of the reduced scene."""
+    def cyclic_velocity(self, s, sdot, t, params) -> Array:
+        """The velocity ċ (k,) of the cyclic coordinates at the momenta in `params`, those of the reduced scene."""
         none = jnp.zeros(len(self.gone), self.layout.dtype)
 
         def momenta(cdot):
@@ -114,7 +114,7 @@ class _Whole(NamedTuple):
 
     def routh(self, s, sdot, t, params):
         """R."""
-        cdot = self.turning(s, sdot, t, params)
+        cdot = self.cyclic_velocity(s, sdot, t, params)
         return self.lagrangian(s, sdot, cdot, t, params["params"]) - params["momenta"] @ cdot
 
     def reduce(self, q, qdot, t: Any = 0.0, params=None) -> tuple[Array, Array, dict]:
@@ -125,11 +125,11 @@ class _Whole(NamedTuple):
 
     def restore(self, s, sdot, c, params, t=0.0) -> tuple[PyTree, PyTree]:
         """(q, q̇)."""
-        cdot = self.turning(s, sdot, jnp.asarray(t, self.layout.dtype), params)
-        return self.layout.restore(self.joined(s, c)), self.layout.restore(self.joined(sdot, cdot))
+        cdot = self.cyclic_velocity(s, sdot, jnp.asarray(t, self.layout.dtype), params)
+        return self.layout.restore(self.join_coordinates(s, c)), self.layout.restore(self.join_coordinates(sdot, cdot))
 
 
-def _simulate(whole: _Whole, reduced: System, q0, qdot0, ts, params=None, **options) -> Trajectory:
+def _simulate(whole: _CyclicSplit, reduced: System, q0, qdot0, ts, params=None, **options) -> Trajectory:
     """The motion of the scene: that of the reduced one at the output times and at nodes between them."""
     ts = jnp.asarray(ts, whole.layout.dtype)
     s0, sdot0, momenta = whole.reduce(q0, qdot0, ts[0], params)
@@ -138,7 +138,7 @@ def _simulate(whole: _Whole, reduced: System, q0, qdot0, ts, params=None, **opti
     between = ts[:-1, None] + gaps[:, None] * jnp.asarray(0.5 * (nodes + 1))
     fine = jnp.concatenate([jnp.column_stack([ts[:-1, None], between]).ravel(), ts[-1:]])
     done = simulate(reduced, s0, sdot0, fine, momenta, **options)
-    turning = jax.vmap(lambda s, v, t: whole.turning(s, v, t, momenta))(done.q, done.qdot, fine)
+    turning = jax.vmap(lambda s, v, t: whole.cyclic_velocity(s, v, t, momenta))(done.q, done.qdot, fine)
     inside = turning[:-1].reshape(count, _NODES + 1, -1)[:, 1:]
     turned = 0.5 * gaps[:, None] * jnp.einsum("g,cgk->ck", jnp.asarray(weights), inside)
     start = whole.layout.flatten(q0)[whole.gone]

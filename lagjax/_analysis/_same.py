@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from lagjax._analysis._noether import FlatState, euler_lagrange
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._states import moved_by_rounding, random_states
+from lagjax._analysis._states import perturb_last_digits, random_states
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
 from lagjax._results import as_printed
@@ -83,21 +83,21 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     ```
     """
     a, b = require_system(a), require_system(b)
-    scenes = SceneState.of(a, q, qdot, params), SceneState.of(b, q, qdot, params)
+    scenes = SceneState.from_state(a, q, qdot, params), SceneState.from_state(b, q, qdot, params)
     if any(scene.constrained for scene in scenes):
         raise ValueError("same_motion compares Lagrangians: give systems without constraints.")
     if not all(scene.concrete for scene in scenes):
         raise ValueError("same_motion looks at numbers: call it outside of jit, vmap and grad, on one state.")
     piecewise = any(scene.piecewise for scene in scenes)
     states = random_states(scenes[0], scenes[0].scales, _STATES, seed, piecewise)
-    differences = _compared(scenes, states)
+    differences = _compare_equations(scenes, states)
     if differences is None:
         raise ValueError(
             "A Lagrangian, or a derivative of it, is not finite at most states about (q, qdot): give a state in the "
             "middle of where motions take place."
         )
     factor, relative, well = differences
-    beside = _compared(scenes, moved_by_rounding(states))
+    beside = _compare_equations(scenes, perturb_last_digits(states))
     noise = 0.0 if beside is None else float(np.median(np.abs(relative - beside[1]).max(axis=1)[well & beside[2]]))
     threshold = min(max(_SAME, _CHANCE * noise), _LARGEST)
     state, coordinate = np.unravel_index(int(np.argmax(relative)), relative.shape)
@@ -108,7 +108,7 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     return SameMotion(bool(same), factor, residual, threshold, where)
 
 
-def _compared(scenes, states: FlatState) -> tuple[float, np.ndarray, np.ndarray] | None:
+def _compare_equations(scenes, states: FlatState) -> tuple[float, np.ndarray, np.ndarray] | None:
     """The factor f, |E_a − f E_b| over its terms (S, n), and which states are finite (S,); None where few are."""
     (of_a, size_a), (of_b, size_b) = (map(np.asarray, _equations(states, *scene.arguments)) for scene in scenes)
     well = np.asarray(np.isfinite(of_a).all(axis=1) & np.isfinite(of_b).all(axis=1))
@@ -130,24 +130,24 @@ def _compared(scenes, states: FlatState) -> tuple[float, np.ndarray, np.ndarray]
 @eqx.filter_jit
 def _equations(states: FlatState, *arguments) -> tuple[Array, Array]:
     """E (S, n) and the size of its terms (S, n)."""
-    scene = SceneState.flat(*arguments)
+    scene = SceneState.from_arguments(*arguments)
 
     def lagrangian(q, qdot, t):
         return scene.motion.lagrangian(q, qdot, t, scene.numbers)
 
-    def of_state(state):
+    def equation_and_size(state):
         rate, by_q = euler_lagrange(lagrangian, state)
         force = scene.motion.nonconservative_force(state.q, state.qdot, state.t, scene.numbers)
         return rate - by_q - force, jnp.abs(rate) + jnp.abs(by_q) + jnp.abs(force)
 
-    return jax.lax.map(of_state, states)
+    return jax.lax.map(equation_and_size, states)
 
 
 def _place(layout: Layout, states: FlatState, k: int, coordinate: int) -> str:
-    def shown(x):
+    def format_values(x):
         return ", ".join(f"{value:.4g}" for value in x[k][:8]) + (", …" if x.shape[1] > 8 else "")
 
     return (
-        f"the equation of {layout.names[coordinate]} at q = ({shown(states.q)}), velocities ({shown(states.qdot)}), "
-        f"t = {states.t[k]:.4g}"
+        f"the equation of {layout.names[coordinate]} at q = ({format_values(states.q)}), "
+        f"velocities ({format_values(states.qdot)}), t = {states.t[k]:.4g}"
     )

@@ -34,7 +34,7 @@ class SceneState(NamedTuple):
     numbers: PyTree  # the numbers among them
 
     @classmethod
-    def of(cls, system: System, q: PyTree, qdot: PyTree | None, params: PyTree) -> "SceneState":
+    def from_state(cls, system: System, q: PyTree, qdot: PyTree | None, params: PyTree) -> "SceneState":
         """A scene at the state (q, qdot), at rest where `qdot` is None.
 
         Raises `TypeError` or `ValueError`, with a sentence, for arguments that cannot be right.
@@ -44,17 +44,19 @@ class SceneState(NamedTuple):
         layout = Layout.of(q, rest)
         require_finite(q, "q")
         require_finite(rest, "qdot")
-        return cls.flat(system, layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype))
+        return cls.from_arguments(
+            system, layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype)
+        )
 
     @classmethod
-    def flat(cls, system: System, layout: Layout, q: Vector, qdot: Vector, params: PyTree) -> "SceneState":
-        """A scene at the flat state (q, qdot), with params of arrays: what a compiled function is given."""
+    def from_arguments(cls, system: System, layout: Layout, q: Vector, qdot: Vector, params: PyTree) -> "SceneState":
+        """A scene at the flat state q, q̇ (n,), with params of arrays, inside of a compiled function."""
         motion, derivation = system.motion(layout, params), derivation_of(system, layout, params)
         return cls(system, layout, motion, derivation, q, qdot, params, eqx.filter(params, eqx.is_array_like))
 
     @property
     def arguments(self) -> tuple:
-        """The arguments of `flat`."""
+        """The arguments of `from_arguments`."""
         return self.system, self.layout, self.q, self.qdot, self.params
 
     @property
@@ -169,7 +171,7 @@ class SceneState(NamedTuple):
 @eqx.filter_jit
 def _evaluated(name: str, q, qdot, *arguments) -> Array:
     """Forces, momenta or mass matrices at states (S, n), of a scene without scalar programs."""
-    scene = SceneState.flat(*arguments)
+    scene = SceneState.from_arguments(*arguments)
 
     def momentum(q, qdot):
         return scene.motion.momentum(q, qdot, jnp.zeros((), q.dtype), scene.numbers)

@@ -31,12 +31,12 @@ def settle(scene: SceneState) -> PyTree:
     scales, layout = scene.scales, scene.layout
     aside = np.asarray(scene.q) + _ASIDE * scales.q * np.cos(np.arange(1.0, layout.size + 1))
     q, qdot = layout.restore(jnp.asarray(aside, layout.dtype)), layout.restore(jnp.zeros(layout.size, layout.dtype))
-    system = _with_friction(scene.system)
+    system = _add_friction(scene.system)
     for stage in range(_STAGES):
         rate = 0.5**stage / scales.t
         params = {"of": scene.params, "rate": jnp.asarray(rate, layout.dtype)}
         if scene.constrained:
-            q, qdot = system.project(_near_constraints(scene, q), qdot, 0.0, params)
+            q, qdot = system.project(_approach_constraints(scene, q), qdot, 0.0, params)
         try:
             run = simulate(system, q, qdot, jnp.array([0.0, _TIMES / rate], layout.dtype), params, rtol=_RTOL)
         except SimulationError as error:
@@ -50,34 +50,34 @@ def settle(scene: SceneState) -> PyTree:
     )
 
 
-def _near_constraints(scene: SceneState, q: PyTree) -> PyTree:
-    """q after damped steps to where the constraints hold: the projection needs to begin near."""
+def _approach_constraints(scene: SceneState, q: PyTree) -> PyTree:
+    """q after damped least-squares steps towards the constraints: the projection converges only near them."""
     place = scene.layout.flatten(q)
     unit = jnp.asarray(scene.scales.q, place.dtype)
     return scene.layout.restore(levenberg_marquardt(scene.holds, place, jnp.abs(place), unit))
 
 
-def _with_friction(system: System) -> System:
-    """The scene with the dissipation ½ c q̇ᵀM q̇ besides its own."""
+def _add_friction(system: System) -> System:
+    """The scene at t = 0 with ½ c q̇ᵀM q̇ added to its dissipation; `params` are {"of": its own, "rate": c}."""
 
     def dissipation(q, qdot, params):
-        def along(s):
+        def scale_velocity(s):
             return system.lagrangian(q, jax.tree.map(lambda v: s * v, qdot), t=0.0, params=params["of"])
 
-        kinetic = 0.5 * jax.grad(jax.grad(along))(0.0)
+        kinetic = 0.5 * jax.grad(jax.grad(scale_velocity))(0.0)
         own = 0.0 if system.dissipation is None else system.dissipation(q, qdot, t=0.0, params=params["of"])
         return own + params["rate"] * kinetic
 
-    def of_state(function):
+    def fix_time(function):
         return lambda q, qdot, params: function(q, qdot, t=0.0, params=params["of"])
 
-    def of_place(function):
+    def fix_position_time(function):
         return lambda q, params: function(q, t=0.0, params=params["of"])
 
     return System(
-        of_state(system.lagrangian),
-        forces=None if system.forces is None else of_state(system.forces),
+        fix_time(system.lagrangian),
+        forces=None if system.forces is None else fix_time(system.forces),
         dissipation=dissipation,
-        constraints=None if system.constraints is None else of_place(system.constraints),
-        velocity_constraints=None if system.velocity_constraints is None else of_state(system.velocity_constraints),
+        constraints=None if system.constraints is None else fix_position_time(system.constraints),
+        velocity_constraints=None if system.velocity_constraints is None else fix_time(system.velocity_constraints),
     )

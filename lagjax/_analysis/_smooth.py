@@ -91,15 +91,15 @@ def _rough(scene: SceneState) -> _Rough:
 
     y, units = jnp.concatenate([q, v]), jnp.diag(jnp.concatenate([sizes(q), sizes(v)]))
 
-    def along(function, distance):
+    def evaluate_displaced(function, distance):
         return [jax.vmap(lambda unit, s=s: function(y + s * distance * unit))(units) for s in (1, -1)]
 
     at = max(_AT, 16 * float(eps))
-    ahead, behind = along(sides, at)
+    ahead, behind = evaluate_displaced(sides, at)
     changed, here = ahead != behind, force(y)
 
     def steps(distance):
-        ahead, behind = (moved - here for moved in along(force, distance))
+        ahead, behind = (moved - here for moved in evaluate_displaced(force, distance))
         return ahead, behind, jnp.maximum(jnp.abs(ahead), jnp.abs(behind)).max(axis=1)
 
     def bends(distance):

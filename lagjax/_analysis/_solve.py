@@ -51,7 +51,7 @@ def newton(f: Callable[[Vector], Vector], start: Vector) -> Vector:
     def once(carry):
         x, _, count = carry
         value, jacobian = f(x), jax.jacfwd(f)(x)
-        new = x - _shortened(f, x, value, shortest_solution(jacobian, value))
+        new = x - _shorten_step(f, x, value, shortest_solution(jacobian, value))
         # Each number of x in units of its own, in which all make as much of f.
         unit = 1 / _scales(jacobian)[1]
         size = jnp.max(unit * jnp.maximum(jnp.abs(new), jnp.abs(x)), initial=jnp.finfo(x.dtype).tiny)
@@ -144,7 +144,7 @@ def relative_size(jacobian: Float[Array, "m n"], step: Vector, z: Vector, least:
 _NO_STEP, _DAMPED_STEPS = 1e-10, 200
 
 
-def _shortened(f: Callable, x: Vector, value: Vector, step: Vector) -> Vector:
+def _shorten_step(f: Callable, x: Vector, value: Vector, step: Vector) -> Vector:
     size = jnp.sum(value**2) * (1 + 1e-6)
 
     def fails(carry):
@@ -180,15 +180,15 @@ def _inverse(matrix: Matrix) -> tuple[Matrix, Bool[Array, ""]]:
 
 
 def _regular(matrix: Matrix, b: Vector, inverse: Matrix) -> Vector:
-    def refined(a, inverse, b):
+    def refine(a, inverse, b):
         x = inverse @ b
         return x + inverse @ (b - a @ x)
 
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x,
         b,
-        lambda _, b: refined(matrix, inverse, b),
-        transpose_solve=lambda _, b: refined(matrix.T, inverse.T, b),
+        lambda _, b: refine(matrix, inverse, b),
+        transpose_solve=lambda _, b: refine(matrix.T, inverse.T, b),
     )
 
 

@@ -27,19 +27,19 @@ def random_states(scene: SceneState, scales: Scales, count: int, seed: int, piec
     q = np.asarray(scene.q) + (_FAR if piecewise else 1.0) * _NEAR * beyond * scales.q * draws[0]
     qdot, t = np.asarray(scene.qdot) + _NEAR * scales.qdot * draws[1], scales.t * t
     if scene.constrained:
-        q, qdot = _projected(q, qdot, t, scene.system, scene.layout, scene.params)
+        q, qdot = _project(q, qdot, t, scene.system, scene.layout, scene.params)
     dtype = scene.layout.dtype
     return FlatState(*(jnp.asarray(x, dtype) for x in (q, qdot, scales.qdot / scales.t * draws[2], t)))
 
 
 @eqx.filter_jit
-def _projected(q, qdot, t, system, layout, params):
+def _project(q, qdot, t, system, layout, params):
     motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
     return jax.vmap(lambda *y: motion.nearest_consistent(*y, numbers))(q, qdot, t)
 
 
-def moved_by_rounding(states: FlatState) -> FlatState:
-    """The same states but for a few units in the last place, other ones in every number."""
+def perturb_last_digits(states: FlatState) -> FlatState:
+    """The states with every number moved by a few units in its last place, up or down at random."""
     random = np.random.default_rng(0)
     return FlatState(*(x * (1 + _LAST * np.finfo(float).eps * random.choice([-1.0, 1.0], x.shape)) for x in states))
 

@@ -18,11 +18,11 @@ from jaxtyping import Array, Float
 
 from lagjax._analysis._gauge import changes_of, gauge_of, is_right
 from lagjax._analysis._noether import FlatState, euler_lagrange, flat_generator, variation
-from lagjax._analysis._potential import with_potential
+from lagjax._analysis._potential import absorb_potential_forces
 from lagjax._analysis._rank import decide
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._states import moved_by_rounding, random_states
-from lagjax._analysis._transformations import Fields, fields_of, named
+from lagjax._analysis._states import perturb_last_digits, random_states
+from lagjax._analysis._transformations import Fields, fields_of, textbook_symmetries
 from lagjax._arguments import accept
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
@@ -65,11 +65,11 @@ class Conserved(NamedTuple):
     def drift(self, trajectory: Trajectory) -> Float[Array, "..."]:
         """max |I(t) − I(0)| over a trajectory (), or for each member of a batch, in the units of the charge."""
 
-        def of_member(q, qdot, times, params, mode):
+        def member_drift(q, qdot, times, params, mode):
             values = jax.vmap(self.charge, in_axes=(0, 0, 0, None))(q, qdot, times[0], params)
             return jnp.max(jnp.abs(values - values[0]))
 
-        return trajectory.over_members(of_member)
+        return trajectory.over_members(member_drift)
 
     def __repr__(self) -> str:
         """The name of the charge, and whether it has a gauge term; its functions print nothing."""
@@ -149,42 +149,47 @@ def conserved_quantities(
     print(lagjax.conserved_quantities(kepler, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.2])))  # energy, angular momentum
     ```
     """
-    scene = SceneState.of(system, q, qdot, params)
+    scene = SceneState.from_state(system, q, qdot, params)
     if not scene.concrete:
         raise ValueError("conserved_quantities looks at numbers: call it outside of jit, vmap and grad, on one state.")
     piecewise, scales = scene.piecewise, scene.scales
     fields = fields_of(scene.layout, scales.q, scales.t, _own(generators, scene.layout))
     count = 8 + 4 * fields.count // scene.layout.size
     here, fresh = (random_states(scene, scales, count, seed + k, piecewise) for k in range(2))
-    scene = with_potential(scene, scales, here)
-    measured = _measured(scene, fields, here)
-    known, names = named(scene.layout, fields), scene.layout.names
+    scene = absorb_potential_forces(scene, scales, here)
+    measured = _measure_columns(scene, fields, here)
+    known, names = textbook_symmetries(scene.layout, fields), scene.layout.names
     space = measured.symmetries(measured.of_lagrangian, measured.of_others)
-    chosen = _verified(_chosen(space, known, fields, names), _measured(scene, fields, fresh))
+    chosen = _verify(_choose_basis(space, known, fields, names), _measure_columns(scene, fields, fresh))
     quantities, notes = _quantities(scene, fields, chosen, fresh)
     found = {name for name, _ in chosen}
     if measured.of_others.size:
         of_lagrangian = measured.symmetries(measured.of_lagrangian)
-        broken = [name for name in _named(_chosen(of_lagrangian, known, fields, names)) if name not in found]
+        broken = [
+            name for name in _listed_names(_choose_basis(of_lagrangian, known, fields, names)) if name not in found
+        ]
         notes += [f"not conserved: {name}, by a symmetry of L that a force or a constraint breaks" for name in broken]
-    notes += _near_symmetries(measured, space, known)
+    notes += _approximate_symmetries(measured, space, known)
     if piecewise:
         notes.append("L or a force is piecewise: beyond borders farther off than states were drawn nothing was tested")
     return ConservedQuantities(quantities, tuple(notes), measured.threshold)
 
 
-def _named(chosen: list[tuple[str, np.ndarray]]) -> list[str]:
+def _listed_names(chosen: list[tuple[str, np.ndarray]]) -> list[str]:
+    """The names of symmetries, without those that follow from others."""
     return [name for name, _ in chosen if not name.startswith(_DEPENDENT)]
 
 
-def _verified(chosen: list[tuple[str, np.ndarray]], fresh: "_Measured") -> list[tuple[str, np.ndarray]]:
+def _verify(chosen: list[tuple[str, np.ndarray]], fresh: "_SymmetryColumns") -> list[tuple[str, np.ndarray]]:
     """The symmetries that hold at fresh states as well."""
     rows = np.concatenate([fresh.of_lagrangian, fresh.of_others])
     return [(name, w) for name, w in chosen if np.abs(rows @ w).max() <= _SLACK * fresh.threshold * np.abs(w).max()]
 
 
-def _near_symmetries(measured: "_Measured", space: np.ndarray, known: list[tuple[str, np.ndarray]]) -> list[str]:
-    """Sentences about those with a name that hold but for a small part, which a motion may not show."""
+def _approximate_symmetries(
+    measured: "_SymmetryColumns", space: np.ndarray, known: list[tuple[str, np.ndarray]]
+) -> list[str]:
+    """Sentences about the named transformations in `known` that are broken, but by less than `_NEARLY`."""
     rows, taken, notes = np.concatenate([measured.of_lagrangian, measured.of_others]), space, []
     for name, weights in known:
         unit = weights / np.linalg.norm(weights)
@@ -201,7 +206,7 @@ _COMBINATION = "combination: "
 _DEPENDENT = (_COMBINATION, "dilation")
 
 
-class _Measured(NamedTuple):
+class _SymmetryColumns(NamedTuple):
     """The columns of L and of forces and constraints at states, (rows, K) each, and what rounding may leave of them."""
 
     of_lagrangian: np.ndarray
@@ -214,13 +219,13 @@ class _Measured(NamedTuple):
         return decide(rows, absolute=self.threshold * np.sqrt(len(rows))).null
 
 
-def _measured(scene: SceneState, fields: Fields, states: FlatState) -> _Measured:
+def _measure_columns(scene: SceneState, fields: Fields, states: FlatState) -> _SymmetryColumns:
     """The columns where they are finite, and their noise: how much they differ between states that hardly do."""
     of_lagrangian, of_others = _finite(*map(np.asarray, _columns(fields, states, *scene.arguments)))
-    beside = _finite(*map(np.asarray, _columns(fields, moved_by_rounding(states), *scene.arguments)))
+    beside = _finite(*map(np.asarray, _columns(fields, perturb_last_digits(states), *scene.arguments)))
     pairs = [(a, b) for a, b in zip((of_lagrangian, of_others), beside, strict=True) if a.size and a.shape == b.shape]
     noise = max(float(np.sqrt(np.mean((a - b) ** 2))) for a, b in pairs) if pairs else 0.0
-    return _Measured(of_lagrangian, of_others, min(max(_NULL, _CHANCE * noise), _LARGEST))
+    return _SymmetryColumns(of_lagrangian, of_others, min(max(_NULL, _CHANCE * noise), _LARGEST))
 
 
 def _own(generators, layout: Layout) -> dict[str, Callable]:
@@ -240,12 +245,12 @@ def _columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Arra
 
     Both in units of the terms that would have to cancel, so that entries are of order one unless there is a symmetry.
     """
-    scene = SceneState.flat(*arguments)
+    scene = SceneState.from_arguments(*arguments)
 
     def lagrangian(q, qdot, t):
         return scene.motion.lagrangian(q, qdot, t, scene.numbers)
 
-    def of_state(state):
+    def expressions_at(state):
         def expression(weights):
             transform = fields.transform(weights, scene.params)
             rate, by_q = euler_lagrange(lambda *y: variation(scene, transform, *y), state)
@@ -257,7 +262,7 @@ def _columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Arra
         terms = [jnp.abs(x) for x in euler_lagrange(lagrangian, state)]
         return of_l, of_others, terms[0] + terms[1]
 
-    of_l, of_others, terms = jax.lax.map(of_state, states)
+    of_l, of_others, terms = jax.lax.map(expressions_at, states)
     size = jnp.sqrt(jnp.nanmean(terms**2, axis=0))[:, None]
     others = jnp.nanmax(jnp.abs(of_others), axis=(0, 2), initial=0)[:, None]
     return of_l / jnp.where(size > 0, size, 1), of_others / jnp.where(others > 0, others, 1)
@@ -290,7 +295,7 @@ def _finite(of_lagrangian: np.ndarray, of_others: np.ndarray) -> tuple[np.ndarra
 # ---- the null space --------------------------------------------------------------------------------------------------
 
 
-def _chosen(
+def _choose_basis(
     space: np.ndarray, known: list[tuple[str, np.ndarray]], fields: Fields, names: tuple[str, ...]
 ) -> list[tuple[str, np.ndarray]]:
     """A basis of the space: those of the known vectors that lie in it, then combinations of few parts."""
@@ -305,10 +310,10 @@ def _chosen(
             chosen.append((name, weights))
     rest = space - taken @ (taken.T @ space)
     left = np.linalg.svd(rest, full_matrices=False)[0][:, : space.shape[1] - taken.shape[1]]
-    return chosen + [(_composed(row, fields, names), row) for row in _reduced(left.T)]
+    return chosen + [(_describe_combination(row, fields, names), row) for row in _echelon_form(left.T)]
 
 
-def _reduced(rows: np.ndarray) -> np.ndarray:
+def _echelon_form(rows: np.ndarray) -> np.ndarray:
     """The reduced echelon form of rows (d, K), pivots the largest of each row, each row with a largest entry of 1."""
     rows = rows.copy()
     for k in range(len(rows)):
@@ -323,19 +328,19 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
 
 def _readable(weights: np.ndarray, fields: Fields) -> np.ndarray:
     """The weights in the units of q and t: the largest entry of α, b, c, A, β is 1."""
-    return weights / max(np.abs(x).max(initial=0) for x in _in_units_of_user(weights, fields))
+    return weights / max(np.abs(x).max(initial=0) for x in _restore_units(weights, fields))
 
 
-def _in_units_of_user(weights: np.ndarray, fields: Fields) -> tuple:
-    """α, b (n,), c (n,), A (n, n), β and the user's own of a combination."""
-    alpha, b, c, of_maps, beta, own = fields.apart(weights)
+def _restore_units(weights: np.ndarray, fields: Fields) -> tuple:
+    """A combination (K,) in the user's units: α, b (n,), c (n,), A (n, n), β, and the weights of the user's own."""
+    alpha, b, c, of_maps, beta, own = fields.split_weights(weights)
     shift, drift = b * fields.scale, c * fields.scale / fields.time
     return alpha * fields.time, shift, drift, np.tensordot(of_maps, fields.maps, 1), beta, own
 
 
-def _composed(weights: np.ndarray, fields: Fields, names: tuple[str, ...]) -> str:
+def _describe_combination(weights: np.ndarray, fields: Fields, names: tuple[str, ...]) -> str:
     """A combination in words: its six largest parts, in units of the coordinates, in an order that has no units."""
-    alpha, b, c, a, beta, own = _in_units_of_user(_readable(weights, fields), fields)
+    alpha, b, c, a, beta, own = _restore_units(_readable(weights, fields), fields)
     scale, time = fields.scale, fields.time
     parts = [(alpha, 1 / time, "time translation"), (beta, 1.0, "scaling of the time")]
     parts += [(x, 1 / one, f"translation of {name}") for x, one, name in zip(b, scale, names, strict=True)]
@@ -388,13 +393,13 @@ def _independent(names: list[str], gradients: np.ndarray) -> list[int]:
     """
     kept = [k for k, name in enumerate(names) if not name.startswith(_DEPENDENT)]
     for k in range(len(names)):
-        if k not in kept and any(_outside(of_state[kept], of_state[k]) > 1e-6 for of_state in gradients):
+        if k not in kept and any(_independent_part(of_state[kept], of_state[k]) > 1e-6 for of_state in gradients):
             kept.append(k)
     return kept
 
 
-def _outside(rows: np.ndarray, row: np.ndarray) -> float:
-    """The part of a vector (2n,) outside of the space of some others (k, 2n)."""
+def _independent_part(rows: np.ndarray, row: np.ndarray) -> float:
+    """The share, 0 to 1, of the length of `row` (2n,) that is orthogonal to the span of `rows` (k, 2n)."""
     size = np.linalg.norm(row)
     if not len(rows) or size == 0:
         return float(size > 0)

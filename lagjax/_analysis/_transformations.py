@@ -40,8 +40,8 @@ class Fields(NamedTuple):
         """K, how many there are."""
         return len(self.names)
 
-    def apart(self, weights):
-        """The weights (K,) as those of time (), translations (n,), boosts (n,), maps (M,), scale (), own (U,)."""
+    def split_weights(self, weights):
+        """Split weights (K,) by kind: time (), translations (n,), boosts (n,), maps (M,), time scale (), own (U,)."""
         n, m = len(self.scale), len(self.maps)
         first, last = 1 + 2 * n, 1 + 2 * n + m
         return (
@@ -55,7 +55,7 @@ class Fields(NamedTuple):
 
     def transform(self, weights, params) -> Callable:
         """The combination of all with these weights (K,), a function (q, t) → (ξ, τ)."""
-        alpha, b, c, of_maps, beta, of_own = self.apart(weights)
+        alpha, b, c, of_maps, beta, of_own = self.split_weights(weights)
 
         def combined(q, t):
             shift = (b + c * t / self.time) * jnp.asarray(self.scale, q.dtype)
@@ -132,11 +132,11 @@ def leaf_maps(layout: Layout) -> list[tuple[int, str, np.ndarray]]:
 # ---- those that have a name in textbooks -----------------------------------------------------------------------------
 
 
-def named(layout: Layout, fields: Fields) -> list[tuple[str, np.ndarray]]:
+def textbook_symmetries(layout: Layout, fields: Fields) -> list[tuple[str, np.ndarray]]:
     """Combinations that textbooks name: the name of what they conserve, and their weights (K,)."""
     n, axes = layout.size, _axes(layout)
     one, first_own = np.eye(n), fields.count - len(fields.own)
-    along = [(i, d, _along(n, vectors[:, i])) for d, vectors in axes.items() for i in range(d)]
+    along = [(i, d, _indicator(n, vectors[:, i])) for d, vectors in axes.items() for i in range(d)]
     space = {d: "" if len(axes) == 1 else f" of {d}" for d in axes}
     # The signs are those of what is conserved: h, p, M X − P t.
     known = [("energy", fields.weights(alpha=-1.0))]
@@ -152,7 +152,8 @@ def named(layout: Layout, fields: Fields) -> list[tuple[str, np.ndarray]]:
     return [(name, weights) for name, weights in known if weights is not None]
 
 
-def _along(n: int, places: np.ndarray) -> np.ndarray:
+def _indicator(n: int, places: np.ndarray) -> np.ndarray:
+    """The vector (n,) that is 1 at `places` and 0 elsewhere."""
     vector = np.zeros(n)
     vector[places] = 1.0
     return vector
