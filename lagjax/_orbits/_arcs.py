@@ -82,7 +82,7 @@ class Arcs:
         self.conserves = not self.derivation.works
 
     @classmethod
-    def of(cls, system: System, q0, qdot0, params: PyTree, rtol: float, what: str) -> "Arcs":
+    def from_system(cls, system: System, q0, qdot0, params: PyTree, rtol: float, what: str) -> "Arcs":
         """The arcs of a scene whose state has the structure of (q0, qdot0).
 
         Raises `ValueError`, for `what` was asked, where the scene has constraints or no machine code.
@@ -101,7 +101,7 @@ class Arcs:
         return cls(problem, np.asarray(problem.vector))
 
     def with_numbers(self, numbers: np.ndarray) -> "Arcs":
-        """The same scene with other parameters."""
+        """The arcs of the scene with other parameters (P,)."""
         other = object.__new__(Arcs)
         other.__dict__.update(self.__dict__)
         other.numbers = numbers

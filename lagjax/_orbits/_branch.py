@@ -16,9 +16,9 @@ from lagjax._analysis import decide
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout, halves
 from lagjax._orbits._arcs import Arcs
-from lagjax._orbits._family import Family, begun, place_of
-from lagjax._orbits._follow import FamilyPoint, FamilyTangent, Follower, corrected, tangent_at
-from lagjax._orbits._orbit import RTOL, Orbit, told
+from lagjax._orbits._family import Family, first_point, parameter_index
+from lagjax._orbits._follow import FamilyPoint, FamilyTangent, Follower, correct, tangent_at
+from lagjax._orbits._orbit import RTOL, Orbit, assess_orbits
 from lagjax._orbits._starts import starts
 from lagjax._system import System
 from lagjax._validate import require_tolerance
@@ -64,15 +64,15 @@ def branch_off(
     turns = 2 if bool(family.doubling[index]) else 1
     beside = next(k for k in (index - 1, index + 1, index) if 0 <= k < len(family.value))
     follower = _follower(system, family, index, turns, params, by)
-    here, neighbour = (_orbit_of(follower, family, k, turns) for k in (index, beside))
+    here, neighbour = (_member_point(follower, family, k, turns) for k in (index, beside))
     before = tangent_at(follower, neighbour, None)
-    point = None if before is None else _beside(follower, here, before, float(size))
+    point = None if before is None else _branching_orbit(follower, here, before, float(size))
     if before is None or point is None:
         raise ValueError(
             f"No orbit of another family was found {size:.3g} from orbit {index}: try another size, or follow the "
             "family again with another first step, so that its neighbours lie elsewhere."
         )
-    found = told(follower.closing(point.numbers), point.chain, before.symmetries.shape[1])
+    found = assess_orbits(follower.closing(point.numbers), point.chain, before.symmetries.shape[1])
     q, qdot = map(follower.arcs.layout.restore, halves(found.y[0]))
     arrays = jax.tree.map(jnp.asarray, (q, qdot, *(x[0] for x in found[1:6])))
     return Orbit._make([*arrays, found.message[0]])
@@ -82,15 +82,15 @@ def _follower(system: System, family: Family, k: int, turns: int, params, by: st
     """The follower of orbits of this family, traversed once or twice, in the units of orbit k."""
     period, layout, y0 = _start(family, k, turns)
     q, qdot = map(layout.restore, halves(y0[0]))
-    arcs = Arcs.of(system, q, qdot, params, RTOL, "Families")
-    place = None if by == "energy" else place_of(params, by)
+    arcs = Arcs.from_system(system, q, qdot, params, RTOL, "Families")
+    place = None if by == "energy" else parameter_index(params, by)
     return Follower(arcs.with_numbers(_numbers(arcs, place, family, k)), place, y0, period)
 
 
-def _orbit_of(follower: Follower, family: Family, k: int, turns: int) -> FamilyPoint:
-    """Orbit k of a family, traversed once or twice."""
+def _member_point(follower: Follower, family: Family, k: int, turns: int) -> FamilyPoint:
+    """The point at orbit k of a family, traversed `turns` times."""
     period, _, y0 = _start(family, k, turns)
-    return begun(follower, y0, period, _numbers(follower.arcs, follower.place, family, k))
+    return first_point(follower, y0, period, _numbers(follower.arcs, follower.place, family, k))
 
 
 def _start(family: Family, k: int, turns: int) -> tuple[np.ndarray, Layout, np.ndarray]:
@@ -106,7 +106,7 @@ def _numbers(arcs: Arcs, place: int | None, family: Family, k: int) -> np.ndarra
     return numbers
 
 
-def _beside(follower: Follower, here: FamilyPoint, before: FamilyTangent, size: float) -> FamilyPoint | None:
+def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangent, size: float) -> FamilyPoint | None:
     """The orbit at a distance from a branch point along the null vector that is no symmetry, nor of the old family.
 
     How many symmetries there are, and about which directions, is known from a neighbour on the old family: at the
@@ -123,5 +123,5 @@ def _beside(follower: Follower, here: FamilyPoint, before: FamilyTangent, size: 
     if not sizes[0] > 0.5:
         return None
     across = FamilyTangent(left[:, 0], before.rank, before.symmetries)
-    there = corrected(follower, follower.moved(here, size * across.vector, 0.0), across)
+    there = correct(follower, follower.move(here, size * across.vector, 0.0), across)
     return None if there is None else there[0]

@@ -31,12 +31,12 @@ def conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units) 
     for k, start in enumerate(y):
         ts = np.linspace(times[k], times[k + 1], _GLANCES + 1)
         frames = _frames(arcs, start, ts, frame, units)
-        counts = _crossed(arcs, start, ts, frames, units)
+        counts = _count_conjugate_times(arcs, start, ts, frames, units)
         for j in range(_GLANCES):
             if k == j == 0:
                 continue  # the start itself, where all paths meet
             for nth in range(counts[j]):
-                found.append(_located(arcs, start, ts[0], ts[j], ts[j + 1], frame, frames[j], nth, units))
+                found.append(_locate_conjugate_time(arcs, start, ts[0], ts[j], ts[j + 1], frame, frames[j], nth, units))
         frame = frames[-1]
     found = np.sort(np.array(found))
     at_end = bool((found > times[-1] - _AT_END * duration).any()) or _is_singular(frame, n)
@@ -65,20 +65,20 @@ def _states(arcs: Arcs, start, ts) -> np.ndarray:
     return arcs.ends(ts[None], start[None]).path[0]
 
 
-def _turned(before: np.ndarray, after: np.ndarray) -> int:
+def _count_turns(before: np.ndarray, after: np.ndarray) -> int:
     """The number of phases that passed 2π between two sets of n that lie near each other on the circle."""
     n = len(before)
     shifts = [np.concatenate([after[k:], after[:k] + 2 * np.pi]) - before for k in range(n + 1)]
     return int(np.argmin([np.abs(shift).max() for shift in shifts]))
 
 
-def _crossed(arcs: Arcs, start, ts, frames, units: Units) -> list[int]:
+def _count_conjugate_times(arcs: Arcs, start, ts, frames, units: Units) -> list[int]:
     """The number of conjugate times between neighbouring ones of these times."""
     phases = _phases(arcs, _states(arcs, start, ts), ts, frames, units)
-    return [_turned(a, b) for a, b in itertools.pairwise(phases)]
+    return [_count_turns(a, b) for a, b in itertools.pairwise(phases)]
 
 
-def _located(arcs: Arcs, start, t_first, low, high, frame, frame_low, nth: int, units: Units) -> float:
+def _locate_conjugate_time(arcs: Arcs, start, t_first, low, high, frame, frame_low, nth: int, units: Units) -> float:
     """The time of the nth conjugate time between `low` and `high`, counted from 0, by bisection."""
     ts = np.array([t_first, low]) if low > t_first else np.array([t_first])
     state = _states(arcs, start, ts)[-1:] if len(ts) > 1 else start[None]
@@ -90,7 +90,7 @@ def _located(arcs: Arcs, start, t_first, low, high, frame, frame_low, nth: int, 
         ts = np.array([t_first, middle])
         frames = _frames(arcs, start, ts, frame, units)[1:]
         after = _phases(arcs, _states(arcs, start, ts)[1:], ts[1:], frames, units)[0]
-        if _turned(before, after) > nth:
+        if _count_turns(before, after) > nth:
             high = middle
         else:
             low = middle

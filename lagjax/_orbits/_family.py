@@ -19,18 +19,18 @@ from lagjax._doubles import accepts_singles
 from lagjax._layout import halves, taken_apart
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
-from lagjax._orbits._floquet import passing, reduce
+from lagjax._orbits._floquet import passage_determinant, reduce
 from lagjax._orbits._follow import (
     FamilyPoint,
     FamilyTangent,
+    FamilyUnknowns,
     Follower,
-    Whole,
-    corrected,
+    correct,
     next_step,
     step_along,
     tangent_at,
 )
-from lagjax._orbits._orbit import RTOL, Found, Orbit, arcs_each, told
+from lagjax._orbits._orbit import RTOL, FlatOrbits, Orbit, arc_counts, assess_orbits
 from lagjax._orbits._starts import starts
 from lagjax._system import System
 from lagjax._validate import require_budget, require_tolerance
@@ -119,17 +119,17 @@ def family(
         raise ValueError("orbit must be one periodic orbit that is ok: of a batch take one member, and see why not.")
     period, layout, y0 = starts(orbit.q0, orbit.qdot0, orbit.period, "period")
     q, qdot = map(layout.restore, halves(y0[0]))
-    arcs = Arcs.of(system, q, qdot, params, RTOL, "Families")
-    place = None if by == "energy" else place_of(params, by)
+    arcs = Arcs.from_system(system, q, qdot, params, RTOL, "Families")
+    place = None if by == "energy" else parameter_index(params, by)
     follower = Follower(arcs, place, y0, period.ravel(), until)
     if by == "energy" and not arcs.conserves:
         raise ValueError(
             "The energy of this scene is not conserved, so that there is no family by energy: name a parameter."
         )
-    return _told(follower, *_followed(follower, y0, period.ravel(), float(step), count))
+    return _build_family(follower, *_follow_family(follower, y0, period.ravel(), float(step), count))
 
 
-def place_of(params: PyTree, name: str) -> int:
+def parameter_index(params: PyTree, name: str) -> int:
     """The place of the parameter among all numbers."""
     labels, leaves, _ = taken_apart(params, "params")
     begin = 0
@@ -154,7 +154,7 @@ class _Member(NamedTuple):
     point: FamilyPoint
     tangent: FamilyTangent
     symmetries: int
-    found: Found
+    found: FlatOrbits
     tests: np.ndarray
     events: tuple[bool, bool, bool] = (False, False, False)
 
@@ -163,16 +163,16 @@ def _member(follower: Follower, point: FamilyPoint, tangent: FamilyTangent, most
     """An orbit with its multipliers; at most `most` directions count as symmetries."""
     (symmetries,) = _shooting.symmetries(point.chain, most)
     count = symmetries.null.shape[2]
-    found = told(follower.closing(point.numbers), point.chain, count)
+    found = assess_orbits(follower.closing(point.numbers), point.chain, count)
     reduced = reduce(point.chain.growth[0], *symmetries)
-    through = [passing(reduced, sign) if not found.message[0] else np.nan for sign in (1, -1)]
+    through = [passage_determinant(reduced, sign) if not found.message[0] else np.nan for sign in (1, -1)]
     beyond = np.nan if follower.until is None else (follower.value(point) - follower.until) / follower.of_value
     return _Member(point, tangent, count, found, np.array([follower.slope(point) @ tangent.vector, *through, beyond]))
 
 
-def _followed(follower: Follower, y0, period, step: float, count: int) -> tuple[list[_Member], str]:
+def _follow_family(follower: Follower, y0, period, step: float, count: int) -> tuple[list[_Member], str]:
     """The orbits of a family, and why it ends."""
-    point, shortest, until = begun(follower, y0, period, follower.arcs.numbers), _SHORTEST * step, follower.until
+    point, shortest, until = first_point(follower, y0, period, follower.arcs.numbers), _SHORTEST * step, follower.until
     if until is not None:
         follower.of_value = abs(until - follower.value(point)) or 1.0
     tangent = tangent_at(follower, point, None)
@@ -192,26 +192,26 @@ def _followed(follower: Follower, y0, period, step: float, count: int) -> tuple[
                 return members, _end(follower, last.point, there is not None)
             continue
         following = _member(follower, there.point, there.tangent, last.symmetries)
-        members += _between(follower, last, following, step)
+        members += _locate_events(follower, last, following, step)
         if until is not None and (follower.value(there.point) > until) == wanted:
             return members[:count], f"The family was followed until {until:.6g}."
-        members.append(_in_more_arcs(follower, following))
+        members.append(_refine_member(follower, following))
         step = next_step(step, there)
     return members[:count], f"{count} orbits were found; the family goes on: raise count to follow it further."
 
 
-def begun(follower: Follower, y0: np.ndarray, period: np.ndarray, numbers: np.ndarray) -> FamilyPoint:
-    """The orbit from which a family is followed, in as many arcs as it needs."""
-    count = int(arcs_each(follower.arcs.with_numbers(numbers), y0, period)[0])
-    return follower.within_growth(follower.begun(y0, period, count, numbers))
+def first_point(follower: Follower, y0: np.ndarray, period: np.ndarray, numbers: np.ndarray) -> FamilyPoint:
+    """The orbit at which a family begins, in as many arcs as its steps and its growth need."""
+    count = int(arc_counts(follower.arcs.with_numbers(numbers), y0, period)[0])
+    return follower.refine_arcs(follower.divide_orbit(y0, period, count, numbers))
 
 
-def _in_more_arcs(follower: Follower, member: _Member) -> _Member:
-    """The same orbit, followed in more arcs where errors grow much along one of its."""
-    point = follower.within_growth(member.point)
+def _refine_member(follower: Follower, member: _Member) -> _Member:
+    """The member with its orbit in more arcs where errors grow much along one arc; else the member itself."""
+    point = follower.refine_arcs(member.point)
     if point is member.point:
         return member
-    there = corrected(follower, point, member.tangent)
+    there = correct(follower, point, member.tangent)
     return member if there is None else member._replace(point=there[0])
 
 
@@ -234,10 +234,10 @@ _NOISE = 1e-9  # of tests, which are of order one: what is all degenerate, as an
 _BESIDE, _BRACKET = 0.02, 1e-3
 
 
-def _between(follower: Follower, last: _Member, following: _Member, step: float) -> list[_Member]:
+def _locate_events(follower: Follower, last: _Member, following: _Member, step: float) -> list[_Member]:
     """The folds, branch points and doublings between two orbits, in their order, up to where the family is to end."""
     turned = (last.tests * following.tests < 0) & (np.maximum(abs(last.tests), abs(following.tests)) > _NOISE)
-    located = {k: _located(follower, last, following, step, k) for k in np.flatnonzero(turned).tolist()}
+    located = {k: _locate_event(follower, last, following, step, k) for k in np.flatnonzero(turned).tolist()}
     if 0 in located and 1 in located and abs(located[0][0] - located[1][0]) < _SAME * step:
         del located[1]
     ordered = sorted(located.items(), key=lambda item: item[1][0])
@@ -246,7 +246,7 @@ def _between(follower: Follower, last: _Member, following: _Member, step: float)
     return [member._replace(events=tuple(k == j for j in range(3))) for k, (_, member) in ordered]
 
 
-def _located(follower: Follower, last: _Member, following: _Member, step: float, k: int) -> tuple[float, _Member]:
+def _locate_event(follower: Follower, last: _Member, following: _Member, step: float, k: int) -> tuple[float, _Member]:
     """The zero of test k on the arc between two orbits, and the orbit there.
 
     At a branch point the equations are singular, and about it Newton's method finds orbits of either family. So orbits
@@ -260,7 +260,7 @@ def _located(follower: Follower, last: _Member, following: _Member, step: float,
         for s in (max(zero, a + 2 * _BESIDE * width) - _BESIDE * width, zero + _BESIDE * width):
             if not a < s < b:
                 continue
-            member = _at(follower, asked, a, b, s, across, 0, last.symmetries)
+            member = _orbit_between(follower, asked, a, b, s, across, 0, last.symmetries)
             if member is None or not np.isfinite(member.tests[k]):
                 return a, asked[a]
             asked[s] = member
@@ -268,7 +268,7 @@ def _located(follower: Follower, last: _Member, following: _Member, step: float,
         if b - a > 0.9 * width:
             break
     zero = _zero(asked, a, b, k)
-    member = _at(follower, asked, a, b, zero, across, int(k == 1), last.symmetries)
+    member = _orbit_between(follower, asked, a, b, zero, across, int(k == 1), last.symmetries)
     return zero, asked[a] if member is None else member
 
 
@@ -283,17 +283,17 @@ def _zero(asked: dict[float, _Member], a: float, b: float, k: int) -> float:
     return (a * asked[b].tests[k] - b * asked[a].tests[k]) / (asked[b].tests[k] - asked[a].tests[k])
 
 
-def _at(
+def _orbit_between(
     follower: Follower, asked: dict[float, _Member], a: float, b: float, s: float, across: FamilyTangent, left_out: int,
     most: int,
 ) -> _Member | None:  # fmt: skip
-    """The orbit at an arc s between two of a family that were found at a and b; None where it is none of theirs."""
-    ends = [Whole.of(asked[x].point) for x in (a, b)]
+    """The orbit at arc length s between members of `asked` at a and b; None where it belongs to another family."""
+    ends = [FamilyUnknowns.from_point(asked[x].point) for x in (a, b)]
     slopes = [_rate(follower, asked[x], across) for x in (a, b)]
     u, width = (s - a) / (b - a), b - a
     guess = ends[0].times((1 + 2 * u) * (1 - u) ** 2).plus(ends[1], u**2 * (3 - 2 * u))
     guess = guess.plus(slopes[0], width * u * (1 - u) ** 2).plus(slopes[1], width * u**2 * (u - 1))
-    there = corrected(follower, follower.at(asked[a].point, guess), across, left_out)
+    there = correct(follower, follower.rebuild(asked[a].point, guess), across, left_out)
     tangent = None if there is None else tangent_at(follower, there[0], asked[a].tangent, left_out)
     if there is None or tangent is None or tangent.vector @ across.vector < _ALONG:
         return None
@@ -303,16 +303,16 @@ def _at(
 _ALONG = 0.7  # the cosine of the turn of a tangent between two neighbours, more than which they have by `step_along`
 
 
-def _rate(follower: Follower, member: _Member, across: FamilyTangent) -> Whole:
+def _rate(follower: Follower, member: _Member, across: FamilyTangent) -> FamilyUnknowns:
     """The change of all numbers along the family by the arc across a tangent."""
     vector = member.tangent.vector / (member.tangent.vector @ across.vector)
-    return follower.whole(member.point, vector, 0.0)
+    return follower.complete_change(member.point, vector, 0.0)
 
 
-def _told(follower: Follower, members: list[_Member], message: str) -> Family:
+def _build_family(follower: Follower, members: list[_Member], message: str) -> Family:
     """The family in the user's structure."""
     arrays = zip(*(member.found[:6] for member in members), strict=True)
-    found = Found._make([*map(np.concatenate, arrays), ()])
+    found = FlatOrbits._make([*map(np.concatenate, arrays), ()])
     points, layout = [member.point for member in members], follower.arcs.layout
     value, energy = (np.array([of(point) for point in points]) for of in (follower.value, follower.energy))
     q, qdot = map(layout.restore, halves(found.y))

@@ -60,14 +60,14 @@ _SEEN = 1e-5  # the cosine of W and ℓ that tells a simple multiplier 1 from a 
 def multipliers_of(reduced: Reduced, paired: bool) -> np.ndarray:
     """All 2n multipliers, the largest first; `paired` puts each beside its reciprocal."""
     m = reduced.growth.shape[1]
-    values = _of_product(reduced.growth) if m else np.zeros(0, complex)
+    values = _product_eigenvalues(reduced.growth) if m else np.zeros(0, complex)
     values = values[np.argsort(-np.abs(values), kind="stable")]
     if paired:
-        values = _in_pairs(values)
+        values = _pair_reciprocals(values)
     return np.concatenate([values, np.ones(reduced.known, complex)])
 
 
-def passing(reduced: Reduced, sign: int) -> float:
+def passage_determinant(reduced: Reduced, sign: int) -> float:
     """det(1 − sign·G_(K−1) … G_0): zero where a multiplier passes through 1 (`sign` 1) or −1.
 
     Of the cyclic matrix of the arcs, not of multipliers: two that meet at 1 are known to half the digits only, their
@@ -80,15 +80,15 @@ def passing(reduced: Reduced, sign: int) -> float:
     return float(np.linalg.det(cyclic.reshape(count * m, count * m)))
 
 
-def off_pairs(multipliers: np.ndarray) -> float:
-    """The largest distance from one of the products of the pairs of `multipliers_of`, two neighbours each."""
+def pairing_error(multipliers: np.ndarray) -> float:
+    """max |μᵢ μᵢ₊₁ − 1| over the pairs of neighbours in the result of `multipliers_of`, which are reciprocals."""
     firsts, seconds = multipliers[0::2], multipliers[1::2]
     return float(np.abs(firsts[: len(seconds)] * seconds - 1).max(initial=0.0))
 
 
-def _of_product(growth: np.ndarray) -> np.ndarray:
+def _product_eigenvalues(growth: np.ndarray) -> np.ndarray:
     """The eigenvalues of G_(K−1) … G_0, as K-th powers of those of the cyclic matrix that has them as its blocks."""
-    growth = _merged(growth)
+    growth = _merge_factors(growth)
     count, m, _ = growth.shape
     if count == 1:
         return np.linalg.eigvals(growth[0]).astype(complex)
@@ -98,10 +98,10 @@ def _of_product(growth: np.ndarray) -> np.ndarray:
     roots = np.linalg.eigvals(cyclic.reshape(count * m, count * m)).astype(complex)
     # The roots of one multiplier stand on a circle, a turn divided by K apart: one of each comes of sorting by power.
     powers = np.exp(count * np.log(np.where(roots == 0, 1e-300, roots)))
-    return _one_of_each(powers, count)
+    return _group_means(powers, count)
 
 
-def _merged(growth: np.ndarray) -> np.ndarray:
+def _merge_factors(growth: np.ndarray) -> np.ndarray:
     """Fewer matrices with the same product: neighbours are multiplied as long as that grows little.
 
     The eigenvalues of the cyclic matrix cost the cube of their number.
@@ -122,7 +122,7 @@ def _merged(growth: np.ndarray) -> np.ndarray:
 _LITTLE = 100.0
 
 
-def _one_of_each(powers: np.ndarray, count: int) -> np.ndarray:
+def _group_means(powers: np.ndarray, count: int) -> np.ndarray:
     """Means of the groups of `count` values that belong to one multiplier each."""
     left, chosen = list(range(len(powers))), []
     order = sorted(left, key=lambda i: -abs(powers[i]))
@@ -137,8 +137,8 @@ def _one_of_each(powers: np.ndarray, count: int) -> np.ndarray:
     return np.array(chosen)
 
 
-def _in_pairs(values: np.ndarray) -> np.ndarray:
-    """The values with each one's reciprocal behind it."""
+def _pair_reciprocals(values: np.ndarray) -> np.ndarray:
+    """The values (m,) in an order where each is followed by the one nearest to its reciprocal."""
     left, ordered = list(values), []
     while left:
         first = left.pop(0)

@@ -72,7 +72,7 @@ class FamilyTangent(NamedTuple):
     symmetries: np.ndarray
 
 
-class Whole(NamedTuple):
+class FamilyUnknowns(NamedTuple):
     """All numbers of a point, or a change of them: `y` (1, K, 2n), `period` (1,), `numbers` (P,) of the scene."""
 
     y: np.ndarray
@@ -80,17 +80,17 @@ class Whole(NamedTuple):
     numbers: np.ndarray
 
     @classmethod
-    def of(cls, point: FamilyPoint) -> "Whole":
-        """The equations at a point."""
+    def from_point(cls, point: FamilyPoint) -> "FamilyUnknowns":
+        """The numbers of a point."""
         return cls(point.chain.y, point.chain.period, point.numbers)
 
-    def plus(self, other: "Whole", by: float = 1.0) -> "Whole":
+    def plus(self, other: "FamilyUnknowns", by: float = 1.0) -> "FamilyUnknowns":
         """Each plus a multiple of the other's."""
-        return Whole(*(mine + by * one for mine, one in zip(self, other, strict=True)))
+        return FamilyUnknowns(*(mine + by * one for mine, one in zip(self, other, strict=True)))
 
-    def times(self, by: float) -> "Whole":
+    def times(self, by: float) -> "FamilyUnknowns":
         """Each times a number."""
-        return Whole(*(by * mine for mine in self))
+        return FamilyUnknowns(*(by * mine for mine in self))
 
 
 class Follower:
@@ -117,7 +117,7 @@ class Follower:
         chain = _shooting.follow(closing, y, period, parts, self.units)
         columns = [chain.rate[..., None] * np.diff(chain.parts)[..., None, None]] if self.period_is_free else []
         if self.place is not None:
-            columns.append(self._by_parameter(closing, y, period, parts, self.place))
+            columns.append(self._parameter_derivatives(closing, y, period, parts, self.place))
         if not chain.ok[0]:
             nothing = np.zeros((0, 0))
             return FamilyPoint(chain, numbers, nothing, Condensed(nothing, nothing, nothing, ()), nothing)
@@ -125,7 +125,7 @@ class Follower:
         matrix = np.concatenate([condensed.first + condensed.last, condensed.more[..., :-1]], axis=2)[0]
         return FamilyPoint(chain, numbers, matrix, condensed, condensed.more[0, :, -1])
 
-    def _by_parameter(self, closing: Closing, y, period, parts, place: int) -> np.ndarray:
+    def _parameter_derivatives(self, closing: Closing, y, period, parts, place: int) -> np.ndarray:
         """The derivatives (1, K, 2n, 1) of the ends of the arcs by the parameter at this place."""
         direction = np.eye(len(closing.arcs.numbers))[place][None]
         whole, state = period[0] * self.units.time[0], self.units.state[0]
@@ -136,35 +136,35 @@ class Follower:
         by_params = closing.arcs.follow(times, y[0] * state, direction).by_params
         return by_params[None] * self.of_parameter / state[:, None]
 
-    def whole(self, point: FamilyPoint, first: np.ndarray, right: float) -> "Whole":
-        """The change of all states that goes with one of what is free, (2n + F,), as the linear equations have it."""
+    def complete_change(self, point: FamilyPoint, first: np.ndarray, right: float) -> "FamilyUnknowns":
+        """The change of all numbers that the linear equations make of a change `first` (2n + F,) of the free."""
         states = point.chain.y.shape[2]
         z = np.append(first[states:], right)[None, :, None]
         dy = point.condensed.inner(first[None, :states, None], first[None, :states, None], z)[..., 0]
         by = np.zeros(len(point.numbers))
         if self.place is not None:
             by[self.place] = self.of_parameter * first[-1]
-        return Whole(dy, first[states : states + 1] if self.period_is_free else np.zeros(1), by)
+        return FamilyUnknowns(dy, first[states : states + 1] if self.period_is_free else np.zeros(1), by)
 
-    def moved(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
+    def move(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
         """The point after a change (2n + F,) of what is free, and of the inner states with it."""
-        return self.at(point, Whole.of(point).plus(self.whole(point, first, right)))
+        return self.rebuild(point, FamilyUnknowns.from_point(point).plus(self.complete_change(point, first, right)))
 
-    def at(self, point: FamilyPoint, whole: "Whole") -> FamilyPoint:
-        """The point with these numbers, at the same parts of its period as another."""
+    def rebuild(self, point: FamilyPoint, whole: "FamilyUnknowns") -> FamilyPoint:
+        """The point with the numbers `whole`, its arcs at the same parts of the period as those of `point`."""
         return self.point(whole.y, whole.period, point.chain.parts, whole.numbers)
 
-    def within_growth(self, point: FamilyPoint) -> FamilyPoint:
+    def refine_arcs(self, point: FamilyPoint) -> FamilyPoint:
         """The same orbit in more arcs where errors grow much along one; the same point where they do not."""
         count = point.chain.y.shape[1]
         growth = np.log(max(np.linalg.norm(one, 2) for one in point.chain.growth[0])) / np.log(_LONGEST_GROWTH)
         more = int(2 ** np.ceil(np.log2(max(growth, 1.0))))
         if more == 1 or count * more > _MOST_ARCS:
             return point
-        return self.begun(point.chain.states(), point.chain.periods(), count * more, point.numbers)
+        return self.divide_orbit(point.chain.states(), point.chain.periods(), count * more, point.numbers)
 
-    def begun(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> FamilyPoint:
-        """The orbit from a state (1, 2n) in this many arcs, both in the units of the user."""
+    def divide_orbit(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> FamilyPoint:
+        """The orbit from a state (1, 2n) with a period (1,), both in the user's units, divided into `count` arcs."""
         parts, y = _shooting.guesses(self.closing(numbers), y0, period, count)
         return self.point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
 
@@ -210,7 +210,7 @@ def tangent_at(
     symmetries = np.zeros((point.matrix.shape[1], count))
     symmetries[:states] = still.right[:, states - count :]
     if before is None:
-        symmetries = _without(symmetries, slope)
+        symmetries = _remove_direction(symmetries, slope)
     null = whole.right[:, rank - left_out :]
     left, sizes, _ = np.linalg.svd(null - symmetries @ (symmetries.T @ null), full_matrices=False)
     left = left[:, sizes > 0.5]
@@ -221,8 +221,8 @@ def tangent_at(
     return FamilyTangent(vector / length, rank, symmetries)
 
 
-def _without(basis: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of what is orthogonal to a vector in the span of an orthonormal one (m, k)."""
+def _remove_direction(basis: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of what is orthogonal to `vector` in the span of the orthonormal `basis` (m, k)."""
     along = basis.T @ vector
     if not np.linalg.norm(along) > 1e-6 * np.linalg.norm(vector):
         return basis
@@ -237,7 +237,7 @@ class FamilyStep(NamedTuple):
     share: float
 
 
-def corrected(
+def correct(
     follower: Follower, point: FamilyPoint, across: FamilyTangent, left_out: int = 0
 ) -> tuple[FamilyPoint, np.ndarray] | None:
     """The orbit in the plane across a tangent, and the sizes of Newton's corrections; None where there is none.
@@ -255,13 +255,13 @@ def corrected(
         matrix, right = np.concatenate([point.matrix, across.vector[None]]), np.append(point.right, 0.0)
         change = -decide(matrix)._replace(rank=np.array(across.rank + 1 - left_out)).least_norm(right)
         sizes.append(np.linalg.norm(change))
-        point = follower.moved(point, change, 1.0)
+        point = follower.move(point, change, 1.0)
     return (point, np.array(sizes)) if point.closed(CLOSED) else None
 
 
 def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, step: float) -> FamilyStep | None:
     """The orbit one step on; None where the step was too long for the family."""
-    there = corrected(follower, follower.moved(last, step * tangent.vector, 0.0), tangent)
+    there = correct(follower, follower.move(last, step * tangent.vector, 0.0), tangent)
     if there is None:
         return None
     point, sizes = there

@@ -81,7 +81,7 @@ def lyapunov_spectrum(
     """
     require_flag(throw, "throw")
     durations, layout, y0 = starts(q0, qdot0, duration, "duration")
-    arcs = Arcs.of(system, *_one(layout, y0), params, rtol, "Lyapunov exponents")
+    arcs = Arcs.from_system(system, *_one(layout, y0), params, rtol, "Lyapunov exponents")
     pieces = _pieces(arcs, y0, durations.ravel(), throw and durations.ndim == 0)
     size = max(1, _PORTION // pieces)
     parts = [_spectra(arcs, y0[k : k + size], durations.ravel()[k : k + size], pieces) for k in range(0, len(y0), size)]
@@ -162,7 +162,7 @@ def lyapunov_exponent(
     ```
     """
     durations, layout, y0 = starts(q0, qdot0, duration, "duration")
-    arcs = Arcs.of(system, *_one(layout, y0), params, rtol, "Lyapunov exponents")
+    arcs = Arcs.from_system(system, *_one(layout, y0), params, rtol, "Lyapunov exponents")
     parts = [
         _largest(arcs, y0[k : k + _MEMBERS], durations.ravel()[k : k + _MEMBERS]) for k in range(0, len(y0), _MEMBERS)
     ]

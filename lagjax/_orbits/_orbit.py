@@ -13,7 +13,7 @@ from lagjax._layout import halves
 from lagjax._linear import singular_threshold
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
-from lagjax._orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, off_pairs, reduce
+from lagjax._orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, pairing_error, reduce
 from lagjax._orbits._shooting import Chain, Closing
 from lagjax._orbits._starts import starts
 from lagjax._results import SUCCESSFUL, SimulationError
@@ -75,17 +75,19 @@ def _lines(orbit: Orbit) -> list[str]:
     if not batch:
         verdict = f"closes to {float(orbit.closure):.2g}" if ok[0] else "no orbit"
         stable = "stable" if orbit.stable else "not known to be stable" if orbit.message else "unstable"
-        told = f"{verdict}, {stable}" if ok[0] else verdict
+        verdicts = f"{verdict}, {stable}" if ok[0] else verdict
         text = f": {orbit.message}" if orbit.message else ""
-        return [first, f"period {period[0]:.9g}, largest |multiplier| {sizes[0]:.6g}", told + text]
+        return [first, f"period {period[0]:.9g}, largest |multiplier| {sizes[0]:.6g}", verdicts + text]
     if not ok.any():
         return [first, "periods unknown", f"0 of {len(ok)} close: {orbit.message[0]}"]
     closure, stable = np.asarray(orbit.closure), np.asarray(orbit.stable)
     span = f"periods from {period[ok].min():.6g} to {period[ok].max():.6g}, |multipliers| up to {sizes[ok].max():.6g}"
-    told = f"{ok.sum()} of {len(ok)} close, to {np.median(closure[ok]):.2g} in the median, {stable.sum()} are stable"
+    verdicts = (
+        f"{ok.sum()} of {len(ok)} close, to {np.median(closure[ok]):.2g} in the median, {stable.sum()} are stable"
+    )
     if not ok.all():
-        told += f"; the first that does not is member {int(np.argmin(ok))}"
-    return [first, span, told]
+        verdicts += f"; the first that does not is member {int(np.argmin(ok))}"
+    return [first, span, verdicts]
 
 
 _SHOWN = 6  # leaves of q0, which may have any number of them
@@ -140,12 +142,12 @@ def periodic_orbit(
     require_flag(throw, "throw")
     periods, layout, y0 = starts(q0, qdot0, period, "period")
     q, qdot = map(layout.restore, halves(y0[0]))
-    arcs = Arcs.of(system, q, qdot, params, RTOL, "Periodic orbits")
+    arcs = Arcs.from_system(system, q, qdot, params, RTOL, "Periodic orbits")
     found = find(_closing(arcs, energy, image), y0, periods.ravel())
     if periods.ndim == 0:
         if throw and not found.ok[0]:
             raise SimulationError(found.message[0], None)
-        found = Found._make([*(x[0] for x in found[:6]), str(found.message[0])])
+        found = FlatOrbits._make([*(x[0] for x in found[:6]), str(found.message[0])])
     q, qdot = map(layout.restore, halves(found.y))
     arrays = jax.tree.map(jnp.asarray, (q, qdot, *found[1:6]))
     return Orbit._make([*arrays, found.message])
@@ -179,8 +181,8 @@ def _closing(arcs: Arcs, energy, image) -> Closing:
     return plain._replace(matrix=matrix, shift=shift)
 
 
-class Found(NamedTuple):
-    """`Orbit`s, flat: `y` (B, 2n), and the others with the members as first axis."""
+class FlatOrbits(NamedTuple):
+    """The fields of B `Orbit`s with flat states: `y` (B, 2n), and the others with the members as first axis."""
 
     y: np.ndarray
     period: np.ndarray
@@ -191,10 +193,10 @@ class Found(NamedTuple):
     message: tuple[str, ...]
 
 
-def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> Found:
+def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
     """The orbits near these guesses; what does not close well is tried with more arcs as long as that helps."""
     arcs = closing.arcs
-    counts = arcs_each(arcs, y0, period)
+    counts = arc_counts(arcs, y0, period)
     most = np.minimum(_MOST_ARCS, _MORE * counts)
     found = _nothing(len(y0), y0.shape[1])
     waiting, gained = np.arange(len(y0)), np.ones(len(y0), bool)
@@ -204,17 +206,17 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> Found:
             for some in np.array_split(members, -(-len(members) * count // _PORTION)):
                 parts, y = _shooting.guesses(closing, y0[some], period[some], count)
                 units = closing.arcs.units(y0[some], period[some])
-                trial = told(closing, _shooting.close(closing, y, period[some], parts, units))
+                trial = assess_orbits(closing, _shooting.close(closing, y, period[some], parts, units))
                 better = ~(found.closure[some] <= trial.closure)
                 gained[some] = better | ~found.ok[some]
-                found = _put(found, some[better], Found._make(np.array(x)[better] for x in trial))
+                found = _replace_members(found, some[better], FlatOrbits._make(np.array(x)[better] for x in trial))
         worse = ~(found.closure[waiting] <= WELL_CLOSED) & gained[waiting]
         waiting = waiting[worse & (counts[waiting] < most[waiting])]
         counts[waiting] = np.minimum(_MOST_ARCS, 2 * counts[waiting])
     return found
 
 
-def arcs_each(arcs: Arcs, y0, period) -> np.ndarray:
+def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
     """The number of arcs of each orbit, a power of two: from the steps that its guess takes."""
     run = arcs.ends(np.stack([np.zeros(len(period)), period], axis=1), y0)
     share = np.where(run.result == SUCCESSFUL, 1.0, np.clip(run.t_end / period, 1e-3, 1.0))
@@ -222,30 +224,30 @@ def arcs_each(arcs: Arcs, y0, period) -> np.ndarray:
     return np.minimum(_MOST_ARCS, 2 ** np.ceil(np.log2(count))).astype(int)
 
 
-def _nothing(size: int, states: int) -> Found:
+def _nothing(size: int, states: int) -> FlatOrbits:
     blank = np.full(size, np.nan)
     multipliers = np.full((size, states), np.nan, complex)
-    return Found(
+    return FlatOrbits(
         np.full((size, states), np.nan), blank, multipliers, blank.copy(), np.zeros(size, bool), np.zeros(size, bool),
         ("",) * size,
     )  # fmt: skip
 
 
-def _put(found: Found, places: np.ndarray, others: Found) -> Found:
-    """The same with others in these places."""
+def _replace_members(found: FlatOrbits, places: np.ndarray, others: FlatOrbits) -> FlatOrbits:
+    """The orbits with those at indices `places` replaced by `others`."""
     arrays = [np.array(x) for x in found[:6]]
     for mine, new in zip(arrays, others[:6], strict=True):
         mine[places] = new
     message = list(found.message)
     for place, text in zip(places.tolist(), list(others.message), strict=True):
         message[place] = text
-    return Found._make([*arrays, tuple(message)])
+    return FlatOrbits._make([*arrays, tuple(message)])
 
 
-def told(closing: Closing, chain: Chain, most: int | None = None) -> Found:
-    """The result of the search: multipliers, stability, and a sentence where it is no orbit.
+def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> FlatOrbits:
+    """The orbits that the chains of a search are: multipliers, stability, and a sentence where one is no orbit.
 
-    At most `most` directions count as symmetries; without it all that monodromy − 1 sends to zero.
+    At most `most` directions count as symmetries; None counts all that monodromy − 1 sends to zero.
     """
     closure = chain.closure()
     message = [_sentence(chain, k) for k in range(len(closure))]
@@ -253,26 +255,26 @@ def told(closing: Closing, chain: Chain, most: int | None = None) -> Found:
     multipliers = np.full((len(ok), chain.y.shape[2]), np.nan, complex)
     places = np.flatnonzero(ok)
     if len(places):
-        closed = chain.at(places)
+        closed = chain.select(places)
         known = _shooting.symmetries(closed, most)
         for k, place in enumerate(places.tolist()):
             multipliers[place] = multipliers_of(reduce(closed.growth[k], *known[k]), closing.arcs.conserves)
     stable = np.abs(np.where(np.isnan(multipliers), np.inf, multipliers)).max(axis=1) < 1 + UNSTABLE
-    off = np.array([off_pairs(row) if closing.arcs.conserves else 0.0 for row in multipliers])
+    off = np.array([pairing_error(row) if closing.arcs.conserves else 0.0 for row in multipliers])
     for place in np.flatnonzero(ok & (off > UNCERTAIN)).tolist():
         stable[place] = False
         message[place] = (
             f"The orbit closes, but its multipliers are uncertain: pairs that should multiply to 1 miss it by "
             f"{off[place]:.2g}, so that nothing is known of its stability."
         )
-    return Found(chain.states(), chain.periods(), multipliers, closure, stable & ok, ok, tuple(message))
+    return FlatOrbits(chain.states(), chain.periods(), multipliers, closure, stable & ok, ok, tuple(message))
 
 
 def _sentence(chain: Chain, k: int) -> str:
     """Why a chain is no orbit; "" where it is one."""
     if not chain.ok[k]:
         return f"The motion from the guess cannot be followed for a period of {chain.periods()[k]:.6g}. {chain.why[k]}"
-    if _shooting.stopped(chain.at(np.array([k])))[0]:
+    if _shooting.stopped(chain.select(np.array([k])))[0]:
         return (
             "The search ended at an equilibrium, which closes after any time: begin at a larger amplitude, or with a "
             "period nearer to that of the orbit."

@@ -93,10 +93,10 @@ def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None
     system = require_system(system)
     if isinstance(path, Trajectory):
         params = path.params if params is None else params
-        ts, states = _along_motion(system, path, params)
+        ts, states = _motion_states(system, path, params)
     else:
-        ts, states = _along_function(path, t_start, t_end)
-    coarse, fine = (_integral(system, states, edges, params) for edges in (ts, _halved(ts)))
+        ts, states = _function_states(path, t_start, t_end)
+    coarse, fine = (_integral(system, states, edges, params) for edges in (ts, _halve_panels(ts)))
     if not abs(float(coarse[0] - fine[0])) <= _RESOLVED * abs(float(fine[1])):
         raise ValueError(
             f"The action is not resolved: {float(coarse[0]):.9g} and, on parts half as long, {float(fine[0]):.9g}. The "
@@ -106,7 +106,7 @@ def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None
     return fine[0]
 
 
-def _along_motion(system: System, path: Trajectory, params) -> tuple[np.ndarray, Callable]:
+def _motion_states(system: System, path: Trajectory, params) -> tuple[np.ndarray, Callable]:
     """The times of outputs, and what gives (q, q̇) of a motion at times between."""
     q, qdot = jax.tree.map(lambda x: x[0], (path.q, path.qdot))
 
@@ -117,7 +117,7 @@ def _along_motion(system: System, path: Trajectory, params) -> tuple[np.ndarray,
     return np.asarray(path.ts), states
 
 
-def _along_function(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
+def _function_states(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
     """The edges of equal parts of the time, and what gives (q, q̇) of a function of the time."""
     if not callable(path):
         raise TypeError(f"path must be a Trajectory, or a function of the time; got {type(path).__name__}.")
@@ -130,7 +130,7 @@ def _along_function(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
     return np.linspace(float(t_start), float(t_end), _PANELS + 1), states
 
 
-def _halved(ts: np.ndarray) -> np.ndarray:
+def _halve_panels(ts: np.ndarray) -> np.ndarray:
     return np.sort(np.concatenate([ts, (ts[1:] + ts[:-1]) / 2]))[:: 1 if ts[-1] > ts[0] else -1]
 
 
@@ -184,12 +184,12 @@ def find_path(
     if not t_end > t_start:
         raise ValueError(f"t_end must be later than t_start; got {t_end} and {t_start}.")
     layout = Layout.of(q_start, q_end)
-    arcs = Arcs.of(system, q_start, q_end, params, RTOL, "Paths")
+    arcs = Arcs.from_system(system, q_start, q_end, params, RTOL, "Paths")
     ends = [
         np.asarray(end_to_end(jax.tree.leaves(as_arrays(q, layout.dtype)), np.dtype(float))) for q in (q_start, q_end)
     ]
     times = np.linspace(float(t_start), float(t_end), _ARCS + 1)
-    first = _guessed(layout, guess, ends, times)
+    first = _guess_states(layout, guess, ends, times)
     closing = Closing.plain(arcs)._replace(t_first=times[0], q_end=ends[1])
     parts = np.linspace(0.0, 1.0, _ARCS + 1)[None]
     chain = close(closing, first[None], times[-1:] - times[:1], parts, _units(arcs, first, ends, times))
@@ -198,7 +198,7 @@ def find_path(
         if throw:
             raise SimulationError(message, None)
         return _nothing(chain, message)
-    return _told(system, arcs, chain, ends[0], times, params)
+    return _build_path(system, arcs, chain, ends[0], times, params)
 
 
 def _units(arcs: Arcs, y, ends, times) -> Units:
@@ -212,7 +212,7 @@ def _units(arcs: Arcs, y, ends, times) -> Units:
     return Units(np.concatenate([length / root, length / root / duration], axis=1), duration, np.ravel(length))
 
 
-def _guessed(layout: Layout, guess, ends, times) -> np.ndarray:
+def _guess_states(layout: Layout, guess, ends, times) -> np.ndarray:
     """States (K, 2n) at the first times of the arcs."""
     q_start, q_end = ends
     if guess is None:
@@ -252,7 +252,7 @@ def _nothing(chain: Chain, message: str) -> Path:
     return Path(None, None, None, lost, jnp.zeros(0), -1, False, jnp.asarray(chain.closure()[0]), False, message)
 
 
-def _told(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, times, params) -> Path:
+def _build_path(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, times, params) -> Path:
     """The path in the user's structure, with its action and its second variation."""
     restore, states = arcs.layout.restore, chain.y[0] * chain.of_state
     states[0, : arcs.size] = q_start  # exactly, not by way of the units

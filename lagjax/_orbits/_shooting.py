@@ -77,7 +77,7 @@ class Closing(NamedTuple):
         """S y for rows (R, 2n)."""
         return y @ self.matrix.T + self.shift
 
-    def taken_back(self, y: np.ndarray) -> np.ndarray:
+    def map_back(self, y: np.ndarray) -> np.ndarray:
         """S⁻¹ y for rows (R, 2n)."""
         return np.linalg.solve(self.matrix, (y - self.shift).T).T
 
@@ -138,13 +138,13 @@ class Chain(NamedTuple):
         steep = np.maximum(np.abs(self.slope).max(axis=2, initial=0.0), 1e-300)
         return np.maximum(self.closure(), np.max(np.abs(self.off) / steep, axis=1, initial=0.0))
 
-    def at(self, chosen: np.ndarray) -> "Chain":
-        """Some of them."""
+    def select(self, chosen: np.ndarray) -> "Chain":
+        """The chains at `chosen`: indices, or a mask (B,)."""
         places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
         return Chain._make([*(x[places] for x in self[:_ARRAYS]), tuple(self.why[k] for k in places.tolist())])
 
-    def with_rows(self, places: np.ndarray, others: "Chain") -> "Chain":
-        """The same with others in these places."""
+    def replace_members(self, places: np.ndarray, others: "Chain") -> "Chain":
+        """The chains with those at indices `places` replaced by `others`."""
         arrays = [np.array(x) for x in self[:_ARRAYS]]
         for mine, new in zip(arrays, others[:_ARRAYS], strict=True):
             mine[places] = new
@@ -189,7 +189,7 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
     ok = np.asarray(arc.ok.reshape(chains, count).all(axis=1))
     end, growth = arc.end.reshape(y.shape), arc.by_start.reshape(*y.shape, states)
     inverse = np.linalg.inv(closing.matrix)
-    end[:, -1], rate[:, -1] = closing.taken_back(end[:, -1]), rate[:, -1] @ inverse.T
+    end[:, -1], rate[:, -1] = closing.map_back(end[:, -1]), rate[:, -1] @ inverse.T
     growth[:, -1] = inverse @ growth[:, -1]
     end = end / of_state
     defect = end - closing.target(y, end, units.state)
@@ -264,26 +264,26 @@ def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray
         if not active.any():
             break
         places = np.flatnonzero(active)
-        better = _improved(closing, chain.at(places))
+        better = _improve(closing, chain.select(places))
         gained = better.merit() < 0.9 * chain.merit()[places]
         lower = better.merit() < chain.merit()[places]
-        chain = chain.with_rows(places[lower], better.at(lower))
+        chain = chain.replace_members(places[lower], better.select(lower))
         active[places[~gained]] = False
     return chain
 
 
-def _improved(closing: Closing, chain: Chain) -> Chain:
+def _improve(closing: Closing, chain: Chain) -> Chain:
     """Each chain after the largest share of one step by which its defect falls."""
     dy, dperiod = correction(closing, chain)
     longest = np.minimum(1.0, 0.25 * chain.period / np.maximum(np.abs(dperiod), 1e-300))
     best, waiting = chain, np.arange(len(chain.period))
     for share in _SHARES if closing.q_end is None else _SHARES_OF_PATH:
-        here, scale = chain.at(waiting), share * longest[waiting]
+        here, scale = chain.select(waiting), share * longest[waiting]
         y, period = here.y + scale[:, None, None] * dy[waiting], here.period + scale * dperiod[waiting]
         trial = follow(closing, y, period, here.parts, here.units)
         lower = trial.merit() < (1 - 0.25 * scale) * here.merit()
         near = here.merit() < 1e3 * _ENOUGH * here.size()  # where rounding decides
-        best = best.with_rows(waiting[lower], trial.at(lower))
+        best = best.replace_members(waiting[lower], trial.select(lower))
         waiting = waiting[~lower & ~near]
         if not len(waiting):
             break

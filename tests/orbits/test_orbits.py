@@ -101,7 +101,7 @@ def test_multipliers_of_many_arcs():
     arcs = np.stack([bases[(k + 1) % 64] @ np.diag(stretch) @ bases[k].T for k in range(64)])
     values = np.sort(np.abs(_floquet.multipliers_of(_floquet.Reduced(arcs, 0), True)))
     np.testing.assert_allclose(values, stretch[::-1] ** 64, rtol=1e-10)
-    assert len(_floquet._merged(arcs)) < 8
+    assert len(_floquet._merge_factors(arcs)) < 8
 
 
 def test_multipliers_of_henon_heiles():
