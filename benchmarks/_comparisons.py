@@ -24,7 +24,7 @@ from benchmarks._cases import CASES, Case, double_pendulum
 from benchmarks._contenders import Contender, autodiff_acceleration, named
 from benchmarks._measure import Comparison, compare, seconds
 from lagjax._derivation import derivation_of
-from lagjax._diffrax._equations import Equations, form_of
+from lagjax._diffrax._equations import MotionEquations, form_of
 from lagjax._layout import Layout
 from lagjax._machine_code import MachineCode
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, compile_module, lanes
@@ -131,7 +131,7 @@ def _in_machine_code(case: Case) -> Callable[[], None] | None:
     return lambda held=engine: function(memory.ctypes.data, rows)
 
 
-def derived_equations(case: Case) -> tuple[Equations, Any]:
+def derived_equations(case: Case) -> tuple[MotionEquations, Any]:
     """The right-hand side as `lagjax.simulate` uses it, and the parameters as arrays."""
     params = jax.tree.map(jnp.asarray, case.scene.params)
     layout = Layout.of(case.tree(case.q0[0]), case.tree(case.qdot0[0]))

@@ -36,7 +36,7 @@ def asked_for(solver=None, dt=None, adjoint=None, progress: Any = False, rtol=No
             if given:
                 raise ValueError(_refused(f"{what} was asked for".replace("steps was", "steps were")))
         return solver
-    return Diffrax.of(solver, dt, adjoint, progress) if solver is not None or any(others.values()) else None
+    return Diffrax.from_arguments(solver, dt, adjoint, progress) if solver is not None or any(others.values()) else None
 
 
 _MACHINE_CODE = MachineCode()

@@ -3,7 +3,7 @@
 Everything is computed once, by the programs of the scene: values, derivatives, their finite differences, the mass
 matrix at states nearby, the linearised motion. What follows is NumPy and sentences, each file for one question:
 
-    Scene.of ─► _derivatives ─► _constraints ─► _mass ─► _borders ─► _ahead ─► _stiffness ─► Findings
+    CheckedScene.from_state ─► _derivatives ─► _constraints ─► _mass ─► _borders ─► _ahead ─► _stiffness ─► Findings
     _measure    _differences
 """
 
@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from lagjax._check import _ahead, _constraint_checks, _derivative_checks, _jumps_nearby, _mass, _stiffness
-from lagjax._check._findings import Finding, Findings, listed
+from lagjax._check._findings import Finding, Findings, listed, sort_findings
 from lagjax._check._scene_at_start import CheckedScene
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
@@ -76,13 +76,13 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
         raise ValueError("check needs numbers, not traced values: call it outside of jit, vmap and grad, on one state.")
     reported = _inputs(layout, q, qdot, t, params)
     if any(finding.level == "error" for finding in reported):
-        return Findings.of(reported)
-    return Findings.of([*reported, *_about_scene(system, q, qdot, t, params)])
+        return sort_findings(reported)
+    return sort_findings([*reported, *_scene_findings(system, q, qdot, t, params)])
 
 
 @accepts_singles(("q", "qdot"), ("t", "params"))
-def _about_scene(system, q, qdot, t, params) -> list[Finding]:
-    scene = CheckedScene.of(system, Layout.of(q, qdot), q, qdot, t, params)
+def _scene_findings(system, q, qdot, t, params) -> list[Finding]:
+    scene = CheckedScene.from_state(system, Layout.of(q, qdot), q, qdot, t, params)
     reported = _derivative_checks.findings(scene)
     reported += _dissipation(scene)
     reported += _constraint_checks.findings(scene)

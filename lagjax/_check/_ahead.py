@@ -24,7 +24,7 @@ _UNSEEN = -30.0  # an exponential below this is rounding beside a force of order
 _NAMED = 4  # of many, as of a periodic force, the nearest
 
 
-class _Along(NamedTuple):
+class _VariedInput(NamedTuple):
     """The motion's state with input number `i` varied alone, and what the accelerations decide on there."""
 
     scene: CheckedScene
@@ -44,13 +44,13 @@ class _Along(NamedTuple):
         value = StraightLine(*live(line.nodes, line.kinds, [node]))
         decide = StraightLine(*live(*borders.decide[:2], [borders.decide.outputs[j] for j in read]))
 
-        def at(x):
+        def evaluate_node(x):
             columns, pieces = self._sample(x).columns, np.zeros((count, len(x)))
             if read:
                 pieces[read] = np.nan_to_num(evaluate(decide, [*columns, *np.zeros(2 * count)]))
             return evaluate(value, [*columns, *pieces])[0]
 
-        return at
+        return evaluate_node
 
     def accelerations(self, x: np.ndarray) -> np.ndarray:
         return self._sample(x).acceleration().T
@@ -59,7 +59,7 @@ class _Along(NamedTuple):
         n, here = self.scene.layout.size, self.scene.sample
         y = np.tile([*here.q[0], *here.qdot[0], here.t], (len(x), 1))
         y[:, self.i] = x
-        return self.scene.at(y[:, :n], y[:, n:-1], y[:, -1])
+        return self.scene.sample_at(y[:, :n], y[:, n:-1], y[:, -1])
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
@@ -80,7 +80,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
             if len(read := _moving(borders, node, len(names))) == 1:
                 of_input.setdefault(min(read), []).append(node)
         for i in sorted(of_input):
-            along = _Along(scene, borders, i)
+            along = _VariedInput(scene, borders, i)
             for what, where in report(along, [along.function(node) for node in of_input[i]], names[i]):
                 places.setdefault((what, where), []).append(names[i])
     return [_finding(what, where, tuple(of)) for (what, where), of in places.items()]
@@ -98,7 +98,7 @@ def _moving(borders: Borders, node: int, moving: int) -> set[int]:
     return read
 
 
-def _jumps(along: _Along, switches: list[Callable], name: str) -> Iterator[tuple[str, str]]:
+def _jumps(along: _VariedInput, switches: list[Callable], name: str) -> Iterator[tuple[str, str]]:
     """A kind of finding, and the places where an acceleration jumps along the number."""
     places = _distinct(np.concatenate([_zeros(switch, along.start) for switch in switches]))
     beside = 1e-7 * (1 + np.abs(places))
@@ -110,7 +110,7 @@ def _jumps(along: _Along, switches: list[Callable], name: str) -> Iterator[tuple
         yield "border", nearest
 
 
-def _bumps(along: _Along, exponents: list[Callable], name: str) -> Iterator[tuple[str, str]]:
+def _bumps(along: _VariedInput, exponents: list[Callable], name: str) -> Iterator[tuple[str, str]]:
     """A kind of finding, and where an exponential that cannot be seen from the state has its peak, and how wide."""
     for exponent in exponents:
         tops, bends = _tops(exponent, along.start)
@@ -151,7 +151,7 @@ def _zeros(function: Callable, start: float) -> np.ndarray:
         low, middle, high = (function(x + k * step) for k in (-1, 0, 1))
         with np.errstate(all="ignore"):
             move = middle * 2 * step / (high - low)
-        x, rests = _moved(x, move, _AT_REST)
+        x, rests = _take_step(x, move, _AT_REST)
         if rests.all():
             break
     return x[rests]
@@ -165,15 +165,15 @@ def _tops(function: Callable, start: float) -> tuple[np.ndarray, np.ndarray]:
         with np.errstate(all="ignore"):
             bend = (high - 2 * middle + low) / step**2
             move = (high - low) / (2 * step) / bend
-        x, rests = _moved(x, move, 1e-6)
+        x, rests = _take_step(x, move, 1e-6)
         if rests.all():
             break
     places, first = np.unique(np.round(x[rests], 6), return_index=True)
     return places, bend[rests][first]
 
 
-def _moved(x: np.ndarray, move: np.ndarray, rest: float) -> tuple[np.ndarray, np.ndarray]:
-    """The places one step on, and which of them have come to rest."""
+def _take_step(x: np.ndarray, move: np.ndarray, rest: float) -> tuple[np.ndarray, np.ndarray]:
+    """The places x − move, and which of them moved by no more than `rest` of their size."""
     x = x - np.where(np.isfinite(move), move, 0.0)
     with np.errstate(invalid="ignore"):
         return x, np.abs(move) <= rest * (1 + np.abs(x))

@@ -27,7 +27,9 @@ def findings(scene: CheckedScene) -> list[Finding]:
     if scene.layout.size > _ALL_AT_ONCE and scene.is_lowered and _agree(scene):
         return []
     sides = scene.sides()
-    return [finding for block in _blocks(scene, sides.round_off) for finding in _compared(scene, sides, *block)]
+    return [
+        finding for block in _blocks(scene, sides.round_off) for finding in _compare_derivatives(scene, sides, *block)
+    ]
 
 
 # ---- finite ----------------------------------------------------------------------------------------------------------
@@ -38,7 +40,7 @@ def _values(scene: CheckedScene) -> list[Finding]:
     for role, name, value in (("lagrangian", "L", scene.lagrangian), ("forces", "The force", m.extra),
                               ("dissipation", "D", scene.dissipation)):  # fmt: skip
         if not np.isfinite(value).all():
-            where = () if value.ndim == 0 else _named(scene.layout.names, ~np.isfinite(value))
+            where = () if value.ndim == 0 else _select_names(scene.layout.names, ~np.isfinite(value))
             message = f"{name}{' of ' + listed(where) if where else ''} is {_first_bad(value)} at this state"
             reported.append(Finding("value_not_finite", "error", where, message + _blame(scene, role, "value")))
     return reported
@@ -56,13 +58,13 @@ def _not_finite(scene: CheckedScene) -> list[Finding]:
     reported = []
     if first.any():
         reported.append(
-            _no_derivative(scene, "lagrangian", "The derivative of L by", _named(names[:-1], first), "first")
+            _no_derivative(scene, "lagrangian", "The derivative of L by", _select_names(names[:-1], first), "first")
         )
     elif second.any():
-        where = _named(names[n:-1], second)
+        where = _select_names(names[n:-1], second)
         reported.append(_no_derivative(scene, "lagrangian", "The second derivative of L by", where, "second"))
     if drag.any():
-        where = _named(names[n:-1], drag)
+        where = _select_names(names[n:-1], drag)
         reported.append(_no_derivative(scene, "dissipation", "The derivative of D by", where, "first"))
     return reported
 
@@ -72,7 +74,7 @@ def _no_derivative(scene: CheckedScene, role: str, what: str, where: tuple[str, 
     return Finding("derivative_not_finite", "error", where, message + _blame(scene, role, order))
 
 
-def _named(names, chosen) -> tuple[str, ...]:
+def _select_names(names, chosen) -> tuple[str, ...]:
     return tuple(name for name, yes in zip(names, chosen, strict=True) if yes)
 
 
@@ -161,7 +163,7 @@ def _agree(scene: CheckedScene) -> bool:
     directions[:_RANDOM, :n], directions[_RANDOM:-1, n:-1] = random
     directions[-1, -1] = 1.0
     steps = ladder(np.append(np.ones(2 * _RANDOM), scene.sizes[-1]), dtype)
-    minus, plus = scene.beside(directions, steps)
+    minus, plus = scene.displaced_outputs(directions, steps)
     place = np.abs(directions) @ (_places(scene) / scene.sizes**2)
     exact = tuple(np.zeros_like(x) for x in (m.by_q, m.momentum[0], m.mass[0], m.by_q, m.by_q, m.jacobian[0]))
     for _, _, derivative, axes, outputs in _blocks(scene, exact):
@@ -177,7 +179,9 @@ def _agree(scene: CheckedScene) -> bool:
     return True
 
 
-def _compared(scene: CheckedScene, sides: Sides, name, role, derivative, directions, outputs) -> list[Finding]:
+def _compare_derivatives(
+    scene: CheckedScene, sides: Sides, name, role, derivative, directions, outputs
+) -> list[Finding]:
     m, dtype, names = scene.measured, scene.layout.dtype, scene.names
     chosen = np.ix_(directions, range(sides.plus.shape[1]), outputs)
     place = _places(scene)[list(directions)]

@@ -44,11 +44,6 @@ class Findings:
 
     found: tuple[Finding, ...]
 
-    @classmethod
-    def of(cls, found: list[Finding]) -> "Findings":
-        """Sorted by level, otherwise in the order in which they were found."""
-        return cls(tuple(sorted(found, key=lambda finding: _ORDER[finding.level])))
-
     @property
     def ok(self) -> bool:
         """True if there is no error among them."""
@@ -72,6 +67,11 @@ class Findings:
             return "Nothing found."
         more = len(self.found) - _SHOWN
         return "\n".join([*map(str, self.found[:_SHOWN]), *([f"… and {more} more"] if more > 0 else [])])
+
+
+def sort_findings(found: list[Finding]) -> Findings:
+    """The findings sorted by level, those of one level in the order of `found`."""
+    return Findings(tuple(sorted(found, key=lambda finding: _ORDER[finding.level])))
 
 
 def listed(names: tuple[str, ...] | list[str], longest: int = 8) -> str:

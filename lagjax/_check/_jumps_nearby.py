@@ -89,29 +89,29 @@ def _first_jump(scene: CheckedScene, sides: Callable, start, vector, axis, label
     """The nearest border along `vector`, if something jumps there."""
     eps, vector = float(np.finfo(start.dtype).eps), np.asarray(vector, start.dtype)
 
-    def at(steps):
+    def displaced_states(steps):
         return start + np.asarray(steps, start.dtype)[:, None] * vector
 
     # One step so small that only a border at the state itself lies within it, then longer and longer ones.
     moving = vector != 0
     least = 4 * eps * float(np.max(np.abs(start[moving] / vector[moving]), initial=1.0))
     reach = [min(least, 2.0**-_REACH), *2.0 ** np.arange(1 - _REACH, 1)]
-    here, *ahead = np.asarray(sides(at([0.0, *reach])))
+    here, *ahead = np.asarray(sides(displaced_states([0.0, *reach])))
     past = next((k for k, side in enumerate(ahead) if not np.array_equal(side, here, True)), None)
     if past is None:
         return None
     inside, beyond = (reach[past - 1] if past else 0.0), reach[past]
     for _ in range(12 if past else 0):  # five halvings at once
         between = np.linspace(inside, beyond, 33)[1:]
-        changed = [not np.array_equal(side, here, True) for side in np.asarray(sides(at(between)))]
+        changed = [not np.array_equal(side, here, True) for side in np.asarray(sides(displaced_states(between)))]
         first = changed.index(True) if True in changed else len(between) - 1
         inside, beyond = (between[first - 1] if first else inside), between[first]
-    there = np.asarray(sides(at([beyond])))[0]
+    there = np.asarray(sides(displaced_states([beyond])))[0]
     place = int(np.argmax(there != here))
     # The change is compared with the size at the state, at the border and a little beyond: a force that sets in at zero
     # does not jump.
-    both_sides, n = at([inside if past else -beyond, beyond, 0.0, beyond + 0.1]), scene.layout.size
-    values_of = scene.at(both_sides[:, :n], both_sides[:, n:-1], both_sides[:, -1]).quantities(*_COMPARED)
+    both_sides, n = displaced_states([inside if past else -beyond, beyond, 0.0, beyond + 0.1]), scene.layout.size
+    values_of = scene.sample_at(both_sides[:, :n], both_sides[:, n:-1], both_sides[:, -1]).quantities(*_COMPARED)
     for name, what in _COMPARED.items():
         one, other, *_ = values = values_of[name]
         if np.isfinite(one).all() and np.isfinite(other).all():

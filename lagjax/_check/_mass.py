@@ -66,7 +66,7 @@ def _singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int]) -> 
     where = tuple(names[rest[i]] for i in np.flatnonzero(np.abs(here).max(axis=0) > 1e-6))
     combinations = "; ".join(_combination(u, [names[i] for i in rest]) for u in here)
     what = "The saddle point of M and the constraints" if constrained else "The mass matrix d2L/dqdot2"
-    kind, why = _classified(scene, here, {k: among_rest(k) for k in usable})
+    kind, why = _classify(scene, here, {k: among_rest(k) for k in usable})
     return [*empty_rows, Finding(kind, "error", where, f"{what} is singular along {combinations}, {why}")]
 
 
@@ -83,7 +83,7 @@ def _empty(i: int, momenta: np.ndarray, name: str, constrained: bool) -> Finding
     return Finding(kind, "error", (name,), message)
 
 
-def _classified(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
+def _classify(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
     """The kind of a singularity with these null directions, and the rest of the sentence about it."""
     m = scene.measured
     if any(not len(directions) for k, directions in nearby.items() if not (m.velocity[k] != m.velocity[0]).any()):

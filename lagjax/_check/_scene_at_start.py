@@ -39,8 +39,8 @@ class CheckedScene(NamedTuple):
     measured: "Measured"
 
     @classmethod
-    def of(cls, system: System, layout: Layout, q, qdot, t, params) -> "CheckedScene":
-        """Measure `system` at a state."""
+    def from_state(cls, system: System, layout: Layout, q, qdot, t, params) -> "CheckedScene":
+        """The scene of `system` at a state, with its measurements there."""
         q, qdot, t, params = as_arrays((q, qdot, 1.0 * t, params), layout.dtype)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)
         flat = [np.asarray(x) for x in state[:3]]
@@ -48,7 +48,7 @@ class CheckedScene(NamedTuple):
         scales = _scales(here)
         sizes = _sizes(q, qdot, scales)
         steps, offsets = ladder(sizes, layout.dtype), _offsets(sizes, scales, layout.dtype)
-        return cls(system, layout, (q, qdot, t, params), state, here, sizes, steps, _measured(here, offsets))
+        return cls(system, layout, (q, qdot, t, params), state, here, sizes, steps, _measure(here, offsets))
 
     @property
     def derivation(self) -> Derivation:
@@ -68,7 +68,7 @@ class CheckedScene(NamedTuple):
 
     def sides(self) -> "Sides":
         """The outputs on both sides of the state, along every coordinate and velocity and along the motion."""
-        minus, plus = self.beside(np.eye(2 * self.layout.size + 1), self.steps)
+        minus, plus = self.displaced_outputs(np.eye(2 * self.layout.size + 1), self.steps)
         one, here = self.sample, self.measured
         drift = {
             "lagrangian_by_q": here.by_q, "given_force": here.extra,
@@ -87,7 +87,7 @@ class CheckedScene(NamedTuple):
         )  # fmt: skip
         return Sides(minus, plus, noise, round_off)
 
-    def beside(self, directions: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def displaced_outputs(self, directions: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The outputs of `Measured.here` at steps back and ahead, each (directions, rungs, outputs).
 
         `directions` (D, 2n + 1) are combinations of the coordinates, the velocities and the motion; `steps` (rungs, D).
@@ -97,12 +97,12 @@ class CheckedScene(NamedTuple):
         axes[-1, :n] = v
         moves = np.stack([-steps, steps]).transpose(2, 0, 1)[..., None] * (directions @ axes)[:, None, None]
         along = (np.concatenate([q, v, t[None]]) + moves).reshape(-1, 2 * n + 1).astype(q.dtype)
-        sides = self.at(along[:, :n], along[:, n:-1], along[:, -1]).flat(*_COMPARED)
+        sides = self.sample_at(along[:, :n], along[:, n:-1], along[:, -1]).flat(*_COMPARED)
         sides = sides.reshape(len(directions), 2, len(steps), -1)
         return sides[:, 0], sides[:, 1]
 
-    def at(self, q: np.ndarray, qdot: np.ndarray, t: np.ndarray) -> Sample:
-        """The scene at other states."""
+    def sample_at(self, q: np.ndarray, qdot: np.ndarray, t: np.ndarray) -> Sample:
+        """The scene at S other states: q, q̇ (S, n) and t (S,)."""
         return self.sample._replace(q=q, qdot=qdot, t=t)
 
     @property
@@ -220,13 +220,13 @@ def _sizes(q: PyTree, qdot: PyTree, scales: Scales) -> np.ndarray:
     of the time is what the fastest coordinate takes to move by its size, or its scale if that is shorter.
     """
 
-    def of(tree, scale):
+    def sizes_of(tree, scale):
         leaves = [np.abs(np.ravel(np.asarray(leaf, np.float64))) for leaf in jax.tree.leaves(tree)]
         largest = np.concatenate([np.full(x.size, x.max(initial=0.0)) for x in leaves])
         own = np.concatenate(leaves)
         return np.maximum(np.where(own > 0, own, np.where(largest > 0, largest, scale)), 1e-3 * scale)
 
-    of_q, of_v = of(q, scales.q), of(qdot, scales.qdot)
+    of_q, of_v = sizes_of(q, scales.q), sizes_of(qdot, scales.qdot)
     speed = np.abs(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(qdot)]))
     time = np.min(of_q / np.where(speed > 0, speed, np.inf), where=speed > 0, initial=float(scales.t))
     return np.concatenate([of_q, of_v, [time]])
@@ -253,7 +253,7 @@ _NEARBY_QUANTITIES = (
 _DERIVED = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissipation_by_qdot", "force", "jacobian")
 
 
-def _measured(here: Sample, offsets: np.ndarray) -> Measured:
+def _measure(here: Sample, offsets: np.ndarray) -> Measured:
     """The measurements at the state and at `offsets` (states, 2n) from it."""
     n = here.derivation.layout.size
     velocity = here.qdot + offsets[:, n:]

@@ -15,7 +15,7 @@ import optimistix as optx
 
 from lagjax._constraints import rank_lost
 from lagjax._diffrax._equations import ArrayEquations as ArrayEquations
-from lagjax._diffrax._equations import Equations, form_of
+from lagjax._diffrax._equations import MotionEquations, form_of
 from lagjax._diffrax._integrate import Jumps, Method, WithJumps, integrate
 from lagjax._diffrax._solvers import FineOutput, Projected
 from lagjax._doubles import DOUBLE, SINGLE
@@ -46,7 +46,7 @@ class Diffrax(AbstractEngine, eqx.Module):
     progress: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
 
     @classmethod
-    def of(cls, solver=None, dt=None, adjoint=None, progress: bool | diffrax.AbstractProgressMeter = False):
+    def from_arguments(cls, solver=None, dt=None, adjoint=None, progress: bool | diffrax.AbstractProgressMeter = False):
         """The engine that these arguments of `simulate` ask for. Raises where one of them cannot be right."""
         if solver is not None:
             _require_solver(solver, adaptive=dt is None)
@@ -127,7 +127,7 @@ def _jumps(problem: Problem) -> Jumps | None:
     ends = jnp.asarray(problem.ts)[jnp.array([0, -1])]
     low, high, shift = ends.min(), ends.max(), _AT_END * jnp.finfo(knots.dtype).eps * jnp.abs(knots)
     inside = (knots >= low) & (knots <= high)
-    return Jumps.at(jnp.where(inside, jnp.clip(knots, low + shift, high - shift), jnp.inf))
+    return Jumps.from_times(jnp.where(inside, jnp.clip(knots, low + shift, high - shift), jnp.inf))
 
 
 def _norm_or_inf(error: PyTree) -> jax.Array:
@@ -149,10 +149,10 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
     # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
     start = _state_result(y0, *form.acceleration(given[0], halves(y0), numbers))
     ts = jnp.where(start == RESULTS.successful, given, given[0])
-    event = None if problem.event is None else _in_coordinates(problem.event, problem.layout, problem.params)
+    event = None if problem.event is None else _flatten_event(problem.event, problem.layout, problem.params)
     method = engine.method(problem)
     solution = integrate(form, method, engine.adjoint, event, ts, y0, numbers)
-    result = _explained(solution, form, start, ts, numbers)
+    result = _explain_result(solution, form, start, ts, numbers)
     if derivation.motion.constrained:
         end = halves(solution.y_end)
         schur = derivation.motion.schur_complement
@@ -182,7 +182,7 @@ def _state_result(y, acceleration, singular) -> RESULTS:
     return result_from(jnp.where(finite, SUCCESSFUL, failed))
 
 
-def _explained(solution: Solution, form: Equations, start: RESULTS, ts, numbers) -> RESULTS:
+def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, ts, numbers) -> RESULTS:
     """The most telling of what diffrax reports, of the first and the last state, and of what the motion ran into."""
     last = halves(solution.y_end)
     end = _state_result(last, *form.acceleration(solution.t_end, last, numbers))
@@ -207,8 +207,8 @@ def _explained(solution: Solution, form: Equations, start: RESULTS, ts, numbers)
     return RESULTS.where(not_finite, RESULTS.nonfinite_state, result)
 
 
-def _in_coordinates(event: diffrax.Event, layout: Layout, params: PyTree) -> diffrax.Event:
-    """The user's event functions, made to read the solver's state."""
+def _flatten_event(event: diffrax.Event, layout: Layout, params: PyTree) -> diffrax.Event:
+    """The event whose conditions take the solver's state (2n,) instead of the user's pytrees."""
 
     def flat(function):
         def condition(t, y, args, **_):

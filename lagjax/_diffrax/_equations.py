@@ -28,7 +28,7 @@ State = tuple[Vector, Vector]  # q and q̇
 LARGEST_XLA_PROGRAM = 2_000
 
 
-class Equations(eqx.Module):
+class MotionEquations(eqx.Module):
     """ẏ = f(t, y, params) with y = (q, q̇), two vectors of shape (n,); params holds numbers alone."""
 
     @abc.abstractmethod
@@ -49,7 +49,7 @@ class Equations(eqx.Module):
         """y after one Newton step of positions and of velocities back to the constraints."""
 
 
-class ArrayEquations(Equations):
+class ArrayEquations(MotionEquations):
     """The equations with M, F, G and γ as JAX arrays; `reason` says why the scene has no scalar program in use."""
 
     motion: Motion = eqx.field(static=True)
@@ -74,7 +74,7 @@ class ArrayEquations(Equations):
         return _compiled_once(self.accelerate, *y, t, params)
 
 
-class ScalarEquations(Equations):
+class ScalarEquations(MotionEquations):
     """The equations as scalar programs, whose inputs are q, q̇, t and every number in params.
 
     `program` gives q̈ and whether its matrix is singular, `projection` (q, q̇) after a step back to the constraints.

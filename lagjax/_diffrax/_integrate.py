@@ -18,8 +18,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from lagjax._diffrax._equations import Equations
-from lagjax._diffrax._jumps import AdaptiveWrapper, Noting, may_jump, noting
+from lagjax._diffrax._equations import MotionEquations
+from lagjax._diffrax._jumps import AdaptiveWrapper, Noting, may_jump, note_jumps
 from lagjax._diffrax._solvers import Projected
 from lagjax._failures import differentiable_where
 from lagjax._layout import halves
@@ -44,7 +44,7 @@ class Method(eqx.Module):
 
 
 def integrate(
-    form: Equations,
+    form: MotionEquations,
     method: Method,
     adjoint: diffrax.AbstractAdjoint | None,
     event: diffrax.Event | None,
@@ -60,44 +60,46 @@ def integrate(
     those of the diffrax adjoint.
     """
     # What f closes over (a parameter from outside, the weights of a neural Lagrangian) becomes an argument.
-    field = eqx.filter_closure_convert(_of_arrays(form.vector_field), ts[0], y0, params)
-    project = eqx.filter_closure_convert(_of_arrays(form.projected), ts[0], y0, params) if form.constrained else None
+    field = eqx.filter_closure_convert(_flatten_function(form.vector_field), ts[0], y0, params)
+    project = (
+        eqx.filter_closure_convert(_flatten_function(form.projected), ts[0], y0, params) if form.constrained else None
+    )
     solution = _differentiable((field, project, ts, y0, params), method, adjoint, event)
     if project is not None:
         solution = solution._replace(path=jax.vmap(project, in_axes=(0, 0, None))(ts, solution.path, params))
     return solution
 
 
-def _of_arrays(function):
-    """A function of t, the pair (q, q̇) and params, to such a pair, as one of states (2n,)."""
+def _flatten_function(function):
+    """The function (t, y, params) of states y (2n,) to (2n,) that `function` is of pairs (q, q̇) to such pairs."""
     return lambda t, y, params: jnp.concatenate(function(t, halves(y), params))
 
 
 def _differentiable(moving, method: Method, adjoint, event) -> Solution:
     if adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-        if isinstance(adjoint, diffrax.BacksolveAdjoint) or not may_jump(*_at_start(moving)):
+        if isinstance(adjoint, diffrax.BacksolveAdjoint) or not may_jump(*_initial_arguments(moving)):
             return _solve(moving, method, adjoint, event)
         # It is not known here by what this will be differentiated: parameters count as fixed.
-        solution, _, crossed = _call(moving, _noting(moving, method, None), adjoint, event)
+        solution, _, crossed = _call(moving, _note_jumps(moving, method, None), adjoint, event)
         y_end, path = (differentiable_where(~crossed, x) for x in (solution.y_end, solution.path))
         return solution._replace(path=path, y_end=y_end)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
     frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, method)
-    return _over_recorded_steps(moving, frozen)
+    return _solve_and_record(moving, frozen)
 
 
-def _at_start(moving) -> tuple:
-    """The field, and its arguments where the motion begins."""
+def _initial_arguments(moving) -> tuple:
+    """The field, and its arguments (t, y, params) at the start of the motion."""
     field, _, ts, y0, params = moving
     return field, ts[0], y0, params
 
 
-def _noting(moving, method: Method, varied) -> Method:
-    """The method with a note whether a step crosses a jump of the field that moves with the state or what is varied."""
+def _note_jumps(moving, method: Method, varied) -> Method:
+    """The method whose controller notes steps across a jump of the field that moves with the state or with `varied`."""
     field, _, _, _, params = moving
     varied = jax.tree.map(lambda _: False, (field, params)) if varied is None else varied
-    return eqx.tree_at(lambda m: m.controller, method, noting(method.controller, field, varied))
+    return eqx.tree_at(lambda m: m.controller, method, note_jumps(method.controller, field, varied))
 
 
 def _solve(moving, method: Method, adjoint, event=None) -> Solution:
@@ -113,7 +115,7 @@ def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt)
     notes = isinstance(method.controller, Noting)
     done: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
-        _looping(solver, adjoint),
+        _set_stage_loop(solver, adjoint),
         t0=ts[0],
         t1=ts[-1],
         dt0=method.dt0,
@@ -133,35 +135,35 @@ def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt)
     return Solution(done.ys[0], done.ys[1][0], done.ts[1][0], result, accepted, rejected), done.ys[2:], crossed
 
 
-def _looping(solver, adjoint):
+def _set_stage_loop(solver, adjoint):
     """The solver with a stage loop that the adjoint can differentiate, which diffrax sees to unless it is wrapped."""
     if isinstance(solver, diffrax.AbstractRungeKutta):
         return solver
     kinds = {diffrax.ForwardMode: "lax", diffrax.RecursiveCheckpointAdjoint: "checkpointed"}
     kind = kinds.get(type(adjoint), "bounded")
 
-    def with_scan_kind(part):
+    def set_scan_kind(part):
         if not isinstance(part, diffrax.AbstractRungeKutta) or part.scan_kind is not None:
             return part
         return eqx.tree_at(lambda s: s.scan_kind, part, kind, is_leaf=lambda leaf: leaf is None)
 
-    return jax.tree.map(with_scan_kind, solver, is_leaf=lambda part: isinstance(part, diffrax.AbstractRungeKutta))
+    return jax.tree.map(set_scan_kind, solver, is_leaf=lambda part: isinstance(part, diffrax.AbstractRungeKutta))
 
 
 @eqx.filter_custom_vjp
-def _over_recorded_steps(moving, method):
-    """The plain loop: `diffrax.ForwardMode` is the one that keeps nothing for a backward pass."""
+def _solve_and_record(moving, method):
+    """The solution by the plain loop, `diffrax.ForwardMode`, which keeps nothing; reverse mode replays its steps."""
     return _solve(moving, method, diffrax.ForwardMode())
 
 
-@_over_recorded_steps.def_fwd
+@_solve_and_record.def_fwd
 def _forward(perturbed, moving, method):
     record = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t)
     of_field, _, _, of_start, of_params = perturbed
     varied = of_field, of_params
     moves = any(jax.tree.leaves((varied, of_start)))
-    if moves and may_jump(*_at_start(moving)):
-        method = _noting(moving, method, varied)
+    if moves and may_jump(*_initial_arguments(moving)):
+        method = _note_jumps(moving, method, varied)
     solution, (times,), crossed = _call(moving, method, diffrax.ForwardMode(), None, record)
     if crossed is None:
         crossed = jnp.array(False)
@@ -171,7 +173,7 @@ def _forward(perturbed, moving, method):
     return solution._replace(result=jnp.where(crossed & well, lost, solution.result)), residuals
 
 
-@_over_recorded_steps.def_bwd
+@_solve_and_record.def_bwd
 def _backward(residuals, cotangents, perturbed, moving, method):
     del perturbed
     times, t_end, result, crossed = residuals
@@ -183,7 +185,7 @@ def _backward(residuals, cotangents, perturbed, moving, method):
         reached = jnp.where(ahead, jnp.minimum(ts, t_end), jnp.maximum(ts, t_end))
         ts = jnp.where(result == SUCCESSFUL, ts, reached)
         # The last step ends at ts[-1] itself, which may be differentiated, not at its recorded value.
-        controller = _Replay(jnp.where(times == t_end, jnp.inf, times), method.jumps)
+        controller = _RecordedSteps(jnp.where(times == t_end, jnp.inf, times), method.jumps)
         again = Method(method.solver, controller, None, method.max_steps, diffrax.NoProgressMeter())
         solution = _solve((field, project, ts, y0, params), again, diffrax.RecursiveCheckpointAdjoint())
         return solution[:3]
@@ -194,7 +196,7 @@ def _backward(residuals, cotangents, perturbed, moving, method):
     return pull_back(filled)[0]
 
 
-class _Replay(diffrax.AbstractStepSizeController):
+class _RecordedSteps(diffrax.AbstractStepSizeController):
     """Steps that end at given times, padded with inf (after which the end of the integration is the next)."""
 
     times: jax.Array
@@ -204,9 +206,9 @@ class _Replay(diffrax.AbstractStepSizeController):
         """diffrax integrates backward motion with its time reversed."""
         times = jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction)
         if self.jumps is None:
-            return _Replay(times, None)
+            return _RecordedSteps(times, None)
         jumps = self.jumps.reversed(direction)
-        return _Replay(jumps.ends(times), jumps)  # what is recorded of a step is where the next one begins
+        return _RecordedSteps(jumps.ends(times), jumps)  # what is recorded of a step is where the next one begins
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The first time; the state counts the steps."""
@@ -233,7 +235,8 @@ class Jumps(eqx.Module):
     behind: jax.Array
 
     @classmethod
-    def at(cls, times: jax.Array) -> "Jumps":
+    def from_times(cls, times: jax.Array) -> "Jumps":
+        """The jumps at times (K,), in any order."""
         times = jnp.sort(times)
         gap = 4 * jnp.finfo(times.dtype).eps * jnp.where(jnp.isfinite(times), jnp.abs(times), 0.0)
         return cls(times - gap, times + gap)
@@ -246,12 +249,12 @@ class Jumps(eqx.Module):
 
     def next_start(self, t):
         """The time at which the step after one that ended at t begins, and whether that is behind a jump."""
-        begin = _exchanged(t, self.before, self.behind)
+        begin = _exchange(t, self.before, self.behind)
         return begin, begin != t
 
     def ends(self, times):
         """The ends of the steps behind which others begin at these times."""
-        return _exchanged(times, self.behind, self.before)
+        return _exchange(times, self.behind, self.before)
 
     def first(self, begin, end):
         """`end`, or the first jump on the way from `begin` to it."""
@@ -259,8 +262,8 @@ class Jumps(eqx.Module):
         return jnp.minimum(end, self.before.at[ahead].get(mode="fill", fill_value=jnp.inf))
 
 
-def _exchanged(t, old, new):
-    """Times t; where one is in `old`, which increases, what stands at that place of `new`."""
+def _exchange(t, old, new):
+    """The times t, where those that occur in `old`, in increasing order, are replaced by their partners in `new`."""
     place = jnp.minimum(jnp.searchsorted(old, t), len(old) - 1)
     return jnp.where(jnp.isfinite(t) & (old[place] == t), new[place], t)
 

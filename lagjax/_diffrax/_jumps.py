@@ -61,35 +61,37 @@ def crosses(field, varied, begin, end, params) -> jax.Array:
     (t0, y0), (t1, y1), dtype = begin, end, begin[1].dtype
     n = y0.size // 2
 
-    def at(s, moved: Any = 0.0):
+    def acceleration_at(s, moved: Any = 0.0):
         return field(t0 + s * (t1 - t0), y0 + s * (y1 - y0) + moved, params)[n:]
 
     def halve(_, bracket):
         low, high, of_low, of_high = bracket
         middle = 0.5 * (low + high)
-        of_middle = at(middle)
+        of_middle = acceleration_at(middle)
         first = jnp.abs(of_middle - of_low).max() >= jnp.abs(of_high - of_middle).max()
         earlier, later = (low, middle, of_low, of_middle), (middle, high, of_middle, of_high)
         return jax.tree.map(lambda a, b: jnp.where(first, a, b), earlier, later)
 
     ends = jnp.zeros((), dtype), jnp.ones((), dtype)
-    whole = (*ends, at(ends[0]), at(ends[1]))
+    whole = (*ends, acceleration_at(ends[0]), acceleration_at(ends[1]))
     low, _, of_low, of_high = jax.lax.fori_loop(0, _HALVINGS[dtype], halve, whole)
     change = jnp.abs(of_high - of_low).max()
     jumps = change > _JUMPS[dtype] * jnp.maximum(jnp.abs(whole[2]), jnp.abs(whole[3])).max()
     size = _MOVED[dtype] * (jnp.abs(y0) + jnp.abs(y1 - y0) + 1e-3 * jnp.abs(y0).max())
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, y0.size))
     beside = [
-        at(low, s * size) for signs_of in signs for s in (jnp.asarray(signs_of, dtype), -jnp.asarray(signs_of, dtype))
+        acceleration_at(low, s * size)
+        for signs_of in signs
+        for s in (jnp.asarray(signs_of, dtype), -jnp.asarray(signs_of, dtype))
     ]
     t, y = t0 + low * (t1 - t0), y0 + low * (y1 - y0)
     for s in (1, -1):
-        other, numbers = _moved((field, params), varied, s * _MOVED[dtype])
+        other, numbers = _perturb((field, params), varied, s * _MOVED[dtype])
         beside.append(other(t, y, numbers)[n:])
     return jumps & (jnp.abs(jnp.stack(beside) - of_low).max(axis=1) > 0.5 * change).any()
 
 
-def _moved(tree, varied, by: float):
+def _perturb(tree, varied, by: float):
     """The tree with the floats of its varied leaves a little larger or smaller, by different amounts."""
     draws = np.random.default_rng(1)
 
@@ -156,8 +158,8 @@ class NotingAdaptive(Noting, AdaptiveWrapper):
     """`Noting` of a controller whose steps adapt."""
 
 
-def noting(controller, field, varied) -> Noting:
-    """The same steps, with a note whether one of them crosses a jump of the field; see `crosses`."""
+def note_jumps(controller, field, varied) -> Noting:
+    """A controller with the steps of `controller` that notes whether one of them crosses a jump; see `crosses`."""
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     kind: Any = NotingAdaptive if adaptive else Noting
     return kind(controller, field, varied)

@@ -87,7 +87,7 @@ class FineOutput(_Around):
 
         def increment(place):
             t = t0 + place * (t1 - t0)
-            return _in_dtype_of(y0, terms.vf_prod(t, interpolant.evaluate(t), args, span))
+            return _cast_like(y0, terms.vf_prod(t, interpolant.evaluate(t), args, span))
 
         def correction(y0, y1, k, *inside):
             cubic = (_hermite_slope(place, y1 - y0, k[0], k[-1]) for place in _INSIDE)
@@ -223,5 +223,5 @@ def _nan_where(failed, tree: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
-def _in_dtype_of(y, increment):
+def _cast_like(y, increment):
     return jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), increment, y)

@@ -35,7 +35,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lagjax._batch_members import Members
 from lagjax._diagnosis import diagnosis, ended_of
-from lagjax._health._border_counts import Met, is_piecewise, met
+from lagjax._health._border_counts import Met, count_borders, is_piecewise
 from lagjax._health._compare import global_error
 from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measured
 from lagjax._layout import Layout
@@ -88,10 +88,10 @@ def _diagnosis(trajectory) -> str:
 
 
 def _borders(trajectory) -> tuple[bool, Met[Array] | None]:
-    """`met`, with the batch axes of the trajectory; of a piecewise scene not known where something is traced."""
+    """`count_borders` with the batch axes of the trajectory; None for a piecewise scene where something is traced."""
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         members = Members(trajectory)
-        located, counts = met(members)
+        located, counts = count_borders(members)
         return located, counts and Met(*(jnp.asarray(np.reshape(x, members.batch)) for x in counts))
     system, piecewise = trajectory.system, []
     if not isinstance(system, System):
@@ -260,10 +260,10 @@ class Health(eqx.Module):
         if self.momentum_names is None:
             rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
         rows += [("borders", text) for text in self._met()]
-        rows += _by_name("momenta", self.momentum_names or (), self.momentum, self.momentum_allowed)
+        rows += _worst_row("momenta", self.momentum_names or (), self.momentum, self.momentum_allowed)
         for k, (what, off) in enumerate((("q", self.constraint_distance), ("qdot", self.constraint_rate))):
             allowed = np.broadcast_to(np.asarray(self.constraint_allowed)[..., k, None], off.value.shape)
-            rows += _by_name(f"constraints, {what}", self.constraint_names, off, allowed)
+            rows += _worst_row(f"constraints, {what}", self.constraint_names, off, allowed)
         smallest = Extreme(-np.asarray(self.smallest_eigenvalue.value), self.smallest_eigenvalue.t)
         rows += [
             ("mass matrix", f"smallest eigenvalue {_worst(smallest, sign=-1)}"),
@@ -333,8 +333,8 @@ def _worst(extreme: Extreme, allowed=None, sign: int = 1) -> str:
     return f"{text} ({limit:.1e} allowed)"
 
 
-def _by_name(label: str, names: tuple[str, ...], extreme: Extreme, allowed) -> list[tuple[str, str]]:
-    """A row for the quantity, of several with names, that comes nearest to its limit or exceeds it most."""
+def _worst_row(label: str, names: tuple[str, ...], extreme: Extreme, allowed) -> list[tuple[str, str]]:
+    """A row of the report for the one of several named quantities whose value is largest relative to its limit."""
     if not names:
         return []
     allowed = np.asarray(allowed)

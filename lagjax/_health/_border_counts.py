@@ -36,7 +36,7 @@ class Met(NamedTuple, Generic[Numbers]):
     t: Numbers
 
 
-def met(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
+def count_borders(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
     """A flag that steps ended at the borders of the scene; and how the motion met them; None where not known."""
     trajectory = members.trajectory
     if not isinstance(trajectory.system, System):  # modes have transitions for that

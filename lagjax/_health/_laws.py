@@ -53,8 +53,8 @@ class Law(NamedTuple):
         return self.derivation.motion
 
     @classmethod
-    def of(cls, system: System, layout: Layout, params, mode: str) -> "Law":
-        """The law of a system; `mode` is a prefix for the names."""
+    def from_system(cls, system: System, layout: Layout, params, mode: str) -> "Law":
+        """The law of a system; `mode`, where it is not empty, is a prefix of the names of constraints."""
         derivation = derivation_of(system, layout, params)
         names = system.constraint_names(layout, params) if derivation.motion.constrained else []
         works, conserved = _constants(system, derivation)

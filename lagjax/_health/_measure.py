@@ -90,7 +90,7 @@ def measured(trajectory) -> tuple[dict[str, Any], Names]:
             return _report_of(members, laws), _names(laws, members.layout)
     axes, tree = jax.tree.flatten(trajectory.params_axes, is_leaf=lambda axis: axis is None)  # hashable
     arrays = dataclasses.replace(trajectory, stats={}, params_axes=None)
-    return _measured(arrays, tuple(axes), tree, jnp.asarray(steps))
+    return _measure_traced(arrays, tuple(axes), tree, jnp.asarray(steps))
 
 
 def _precision_of(trajectory, q) -> np.dtype:
@@ -101,7 +101,7 @@ def _laws(trajectory, layout: Layout, params) -> list[Law]:
     modes = {"": trajectory.system}
     if isinstance(trajectory.system, dict):
         modes = {name: trajectory.system[name] for name in trajectory.mode_names}
-    return [Law.of(system, layout, params, name if len(modes) > 1 else "") for name, system in modes.items()]
+    return [Law.from_system(system, layout, params, name if len(modes) > 1 else "") for name, system in modes.items()]
 
 
 def _names(laws: list[Law], layout: Layout) -> Names:
@@ -150,7 +150,7 @@ def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
     path, momenta = path_of(members), _conserved(laws) or ()
     starts = np.cumsum([0, *(len(law.names) for law in laws)])
 
-    def by_mode(function: Callable, q, qdot, t, mode):
+    def evaluate_by_mode(function: Callable, q, qdot, t, mode):
         """`function(law, index, member, sample)` on the states of each mode, in the order of all states, (N, S, …)."""
         shape, total = t.shape, None
         q, qdot = (np.ascontiguousarray(x.reshape(-1, x.shape[-1])) for x in (q, qdot))
@@ -172,21 +172,21 @@ def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
                 all_states[here] = part
         return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), total)
 
-    def measured(law, index, member, sample) -> Measurements:
+    def measure_sample(law, index, member, sample) -> Measurements:
         tolerances = (0.0, 0.0) if path.tolerances is None else (x[member] for x in path.tolerances)
         found = law.measurements(momenta, tuple(tolerances), sample)
         before, after = int(starts[index]), int(starts[-1] - starts[index + 1])
         distances, rates = (np.pad(x, ((0, 0), (before, after))) for x in (found.distances, found.rates))
         return found._replace(distances=distances, rates=rates)
 
-    def along(function: Callable) -> Callable:
-        return partial(by_mode, lambda law, index, member, sample: function(law, sample))
+    def evaluate_law(function: Callable) -> Callable:
+        return partial(evaluate_by_mode, lambda law, index, member, sample: function(law, sample))
 
     with np.errstate(all="ignore"):
         decides = any(borders_of(law.derivation) is not None for law in laws)
-        decided = along(lambda law, sample: sample.pieces()) if decides else None
-        between = Rates(along(Law.powers), along(Law.accelerations), decided)
-        fields = _report(path, laws, momenta, partial(by_mode, measured), between)
+        decided = evaluate_law(lambda law, sample: sample.pieces()) if decides else None
+        between = Rates(evaluate_law(Law.powers), evaluate_law(Law.accelerations), decided)
+        fields = _report(path, laws, momenta, partial(evaluate_by_mode, measure_sample), between)
     return jax.tree.map(lambda x: jnp.asarray(np.reshape(x, members.batch + np.shape(x)[1:])), fields)
 
 
@@ -194,7 +194,7 @@ def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
 
 
 @eqx.filter_jit
-def _measured(trajectory, axes, tree, steps):
+def _measure_traced(trajectory, axes, tree, steps):
     trajectory = dataclasses.replace(trajectory, params_axes=jax.tree.unflatten(tree, axes))
     names, members = {}, max(1, jnp.size(trajectory.result._value))
 
@@ -208,13 +208,13 @@ def _measured(trajectory, axes, tree, steps):
         tolerances = (0.0, 0.0) if path.tolerances is None else path.tolerances
         size = _CHUNK // (members * layout.size**2)
 
-        def chunked(function):
-            return lambda *states: in_chunks(partial(_in_its_mode, laws, function), states, size)
+        def evaluate_in_chunks(function):
+            return lambda *states: in_chunks(partial(_evaluate_mode, laws, function), states, size)
 
-        sample = chunked(lambda law, q, v, t: measurements_at(law, momenta, tolerances, q, v, t, numbers))
+        sample = evaluate_in_chunks(lambda law, q, v, t: measurements_at(law, momenta, tolerances, q, v, t, numbers))
         between = Rates(
-            chunked(lambda law, q, v, t: power_at(law, q, v, t, numbers)),
-            chunked(lambda law, q, v, t: law.motion.acceleration(q, v, t, numbers)),
+            evaluate_in_chunks(lambda law, q, v, t: power_at(law, q, v, t, numbers)),
+            evaluate_in_chunks(lambda law, q, v, t: law.motion.acceleration(q, v, t, numbers)),
         )
         return _report(path, laws, momenta, sample, between)
 
@@ -239,8 +239,8 @@ def _path_of_one(layout: Layout, q, qdot, times_and_tolerances, mode, steps, tra
     return SampledPath(q, v, t, mode, ts, ends, steps.astype(layout.dtype), tolerances, layout.dtype)
 
 
-def _in_its_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
-    """`function(law, q, qdot, t)` by the law of the state's own mode; distances from constraints of others are zero."""
+def _evaluate_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
+    """`function(law, q, qdot, t)` by the law of the state's mode; distances from other modes' constraints are zero."""
     starts = np.cumsum([0, *(len(law.names) for law in laws)])
     total = None
     for index, law in enumerate(laws):
@@ -305,11 +305,12 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
         "scaled_condition": extreme(here.mass[..., 2], on_path),
         "scaled_condition_allowed": none + (math.inf if may_be_singular else finest / np.finfo(path.precision).eps),
         "gradients_finite": all_fine,
-        "gradients_time": xp.where(all_fine, math.nan, _at(xp, path.ts, first)),
+        "gradients_time": xp.where(all_fine, math.nan, _pick(xp, path.ts, first)),
     }
 
 
-def _at(xp, ts, place):
+def _pick(xp, ts, place):
+    """The entry of ts (…, T) at the index `place` (…)."""
     return xp.take_along_axis(ts, place[..., None], axis=-1)[..., 0]
 
 
@@ -332,7 +333,7 @@ def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, be
     """
     xp, axis, ends = path.library, path.time, path.ends
     T = path.ts.shape[-1]
-    until = partial(_at_ends, xp, axis, ends)
+    until = partial(_take_ends, xp, axis, ends)
     values = samples.conserved
     start = values[..., : T - 1, :]
     measurable = until(reached) & reached[..., : T - 1]
@@ -350,7 +351,7 @@ def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, be
     return xp.abs(values[..., :T, :] - values[..., :1, :] - before), work_error
 
 
-def _at_ends(xp, axis: int, ends, x):
+def _take_ends(xp, axis: int, ends, x):
     """x at the end of every piece."""
     return xp.take_along_axis(x, ends.reshape(ends.shape + (1,) * (x.ndim - ends.ndim)), axis=axis)
 
@@ -392,7 +393,7 @@ def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) 
     varies.
     """
     xp, axis, T, n = path.library, path.time, path.ts.shape[-1], path.q.shape[-1]
-    until = partial(_at_ends, xp, axis, path.ends)
+    until = partial(_take_ends, xp, axis, path.ends)
     (q, v, t, a, p), last = (path.q, path.qdot, path.t, samples.acceleration, samples.power), T - 1
     points, weights, more_points, more_weights, checked, corrections = (
         x.astype(q.dtype) for x in (_POINTS, _WEIGHTS, _MORE_POINTS, _MORE_WEIGHTS, _CHECKED, _CORRECTIONS)
@@ -401,14 +402,14 @@ def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) 
     a0, a1 = a[..., :last, :], until(a)
     mode = xp.maximum(until(path.mode), 0)
 
-    def summed(coefficients, powers):
+    def combine(coefficients, powers):
         """Σ cₖ pₖ of coefficients (…, T − 1, n) and powers (S,), (…, T − 1, S, n)."""
         return sum((c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=False)), start=zero)
 
-    def along(coefficients, function, points):
+    def evaluate_on_curve(coefficients, function, points):
         """A function of states over a polynomial in s, with coefficients (…, T − 1, n) of s⁰, s¹, …, at these s."""
-        at = summed(coefficients, [points**k for k in range(len(coefficients))])
-        slope = summed(coefficients, [k * points ** max(k - 1, 0) for k in range(len(coefficients))])
+        at = combine(coefficients, [points**k for k in range(len(coefficients))])
+        slope = combine(coefficients, [k * points ** max(k - 1, 0) for k in range(len(coefficients))])
         shape = at.shape[:-3] + (-1,)
         times = t[..., :last, None] + h[..., None] * points
         velocities = slope / h[..., None, None]
@@ -417,29 +418,29 @@ def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) 
         found = function(*states)
         return found.reshape(times.shape + found.shape[len(shape) :])
 
-    def integrated(coefficients, points, weights):
+    def integrate(coefficients, points, weights):
         """∫ P from s = 0 to 1."""
-        return h * xp.sum(along(coefficients, between.power, points) * weights, axis=-1)
+        return h * xp.sum(evaluate_on_curve(coefficients, between.power, points) * weights, axis=-1)
 
     q0, q1, v0, v1 = q[..., :last, :], until(q), h[..., None] * v[..., :last, :], h[..., None] * until(v)
     cubic, quintic = _interpolants((q0, v0, (h**2)[..., None] * a0), (q1, v1, (h**2)[..., None] * a1))
-    bends = summed(quintic, [k * (k - 1) * checked ** max(k - 2, 0) for k in range(6)])
-    defects = (h**2)[..., None, None] * along(quintic, between.acceleration, checked) - bends
+    bends = combine(quintic, [k * (k - 1) * checked ** max(k - 2, 0) for k in range(6)])
+    defects = (h**2)[..., None, None] * evaluate_on_curve(quintic, between.acceleration, checked) - bends
     septic = [
         (quintic[k] if k < 6 else zero) + sum(defects[..., i, :] * corrections[i, k] for i in range(len(corrections)))
         for k in range(8)
     ]
     second = h / 2 * (p[..., :last] + until(p))
-    fourth, sixth = (integrated(of, points, weights) for of in (cubic, quintic))
-    eighth = integrated(septic, more_points, more_weights)
+    fourth, sixth = (integrate(of, points, weights) for of in (cubic, quintic))
+    eighth = integrate(septic, more_points, more_weights)
     found = xp.stack([second, fourth, sixth, eighth])
     smooth = xp.isfinite(found).all(axis=0)  # elsewhere the error is not known
     error = _error_of_work(xp, found)
     if between.decided is not None:
         inside = np.concatenate([[INSIDE], points, [1 - INSIDE]])
-        pieces = along(quintic, between.decided, inside)
+        pieces = evaluate_on_curve(quintic, between.decided, inside)
         jumps = (pieces != pieces[..., :1]).any(axis=-1)
-        values = along(quintic, between.power, inside)
+        values = evaluate_on_curve(quintic, between.power, inside)
         error = xp.where(jumps, h * (values.max(axis=-1) - values.min(axis=-1)), error)
     error = xp.where(smooth, error, math.inf)
     return xp.where(smooth, eighth, second), xp.sum(xp.where(measurable, error, 0.0), axis=-1)
