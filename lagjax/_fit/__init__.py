@@ -41,25 +41,25 @@ import numpy as np
 from lagjax._consistent import has_constraints
 from lagjax._doubles import DOUBLE, with_doubles
 from lagjax._fit._descent import Descent
-from lagjax._fit._motions import Manifold, motions_of
+from lagjax._fit._motions import Manifold, choose_motions
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
-from lagjax._fit._parameters import Parameters, angle, between, inertia, positive, reading_params, simplex
+from lagjax._fit._parameters import Parameters, angle, between, find_params_expression, inertia, positive, simplex
 from lagjax._fit._prediction import Prediction
 from lagjax._fit._profile import Comparison, Profile
 from lagjax._fit._records import (
     Form,
     Guess,
     Record,
-    asks,
     errors_of_system,
-    in_structure,
+    input_functions,
     known_start,
     require_alike,
     require_held,
     require_untraced,
-    started,
+    restore_structure,
+    start_pair,
     systems_by_name,
-    whole,
+    whole_pieces,
 )
 from lagjax._fit._report import draw_record, record_matrix
 from lagjax._fit._residuals import LostTrial, Residuals, SystemResiduals
@@ -69,16 +69,16 @@ from lagjax._fit._search import (
     TimeScales,
     Unfollowed,
     Waterfall,
-    by_gradient,
+    build_reader,
     pad_states,
-    reader_of,
+    run_multistart,
+    search_by_gradient,
     search_records,
-    searches,
     start_by_weak_form,
     time_scales,
 )
 from lagjax._fit._sensors import UNCLEAR, Delayed, Signals, require_no_jumps, sensors, wrapped
-from lagjax._fit._timings import Timings, clock_of
+from lagjax._fit._timings import Timings, build_clock
 from lagjax._fit._uncertainty import Experiments, Information, information, unseen_sentences
 from lagjax._fit._verdict import (
     SECONDS,
@@ -210,7 +210,7 @@ def fit(
     if not isinstance(noise, AbstractNoise):
         raise TypeError(f"noise must be lagjax.Gaussian() or lagjax.StudentT(); got {noise!r}.")
     scenes = _scenes(system, records, params0, observe, hold)
-    parameters = Parameters.of(params0, free, transforms)
+    parameters = Parameters.from_pytree(params0, free, transforms)
     settings = _Settings(system, observe, noise, int(starts), method, int(seed), progress)
     if len(parameters) > _MANY and method != "gradient":
         warnings.warn(
@@ -245,7 +245,7 @@ def _mistakes(
     if len(scenes) > 1 or settings.method == "gradient":
         return []
     [scene] = scenes
-    once, about = settings._replace(starts=1, progress=False), _residuals_of(scene, parameters)
+    once, about = settings._replace(starts=1, progress=False), _build_residuals(scene, parameters)
     reading = [reader for reader in _readers(scenes, Residuals([about])) or [] if reader is not None]
     if not about.signals.names:
         return []
@@ -279,21 +279,21 @@ def _fit_checked(
     settings: _Settings, scenes: list["_GivenSystem"], params0: PyTree, parameters: Parameters
 ) -> tuple[Fit, Verdict]:
     """The fit of records that were checked. Raises `Unfollowed` where the first trial cannot be followed."""
-    question = Residuals([_residuals_of(scene, parameters) for scene in scenes])
+    question = Residuals([_build_residuals(scene, parameters) for scene in scenes])
     _require_one_beginning(question, settings.starts, settings.method)
     readers = _readers(scenes, question)
     if settings.progress:
         question.watch = _Printer(question.size)
     y0 = _starts(question, readers, params0)
-    readers = _to_cut(scenes, readers, settings.method)
-    first, noise = parameters.moved(parameters.first), settings.noise
+    readers = _cuttable_readers(scenes, readers, settings.method)
+    first, noise = parameters.inverse(parameters.first), settings.noise
     if settings.method == "gradient":
-        return _result_of(settings, by_gradient(question, first, y0, noise, readers), None)
+        return _build_result(settings, search_by_gradient(question, first, y0, noise, readers), None)
     weak = functools.partial(start_by_weak_form, question, readers=readers or [])
     search = functools.partial(
         search_records, question, noise=noise, method=settings.method, readers=readers, weak=weak
     )
-    return _result_of(settings, *searches(question, search, first, y0, settings.starts, settings.seed))
+    return _build_result(settings, *run_multistart(question, search, first, y0, settings.starts, settings.seed))
 
 
 class _GivenSystem(NamedTuple):
@@ -340,7 +340,7 @@ def _require_one_beginning(question: Residuals, starts: int, method: str) -> Non
 
 def _form(system: Scene, records: list[Record], hold: str) -> Form | None:
     """The structure of the inputs. Raises `ValueError` where the scene asks for some, and there are none."""
-    asking = asks(system)
+    asking = input_functions(system)
     if asking and isinstance(system, Hybrid):
         raise ValueError(f"{asking[0]} asks for `inputs`, which hybrid motion has none of: make it a function of `t`.")
     for place, record in enumerate(records):
@@ -361,17 +361,17 @@ def _layout(system: Scene, records: list[Record], params0, form: Form | None) ->
     """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
     place = next((k for k, record in enumerate(records) if record.start is not None), None)
     if place is not None:
-        begun = started(records[place].start, params0)
+        begun = start_pair(records[place].start, params0)
     else:  # no record is of crossing times: those have starts
         begun = 2 * (jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values),)
     q, qdot = jax.tree.map(jnp.asarray, begun)
     scene, params = first_law(system), params0
     if form is not None:
-        scene, params = form.driven(scene), form.params(params0, 2)
+        scene, params = form.drive_scene(scene), form.params(params0, 2)
     try:
         jax.eval_shape(lambda q, qdot: scene.energy(q, qdot, 0.0, params), q, qdot)
     except Exception as reason:
-        if where := reading_params(reason):
+        if where := find_params_expression(reason):
             raise ValueError(
                 f"The scene's functions ask for `{where}`, which params0 does not have ({type(reason).__name__}: "
                 f"{str(reason).splitlines()[0]}): params0 is {jax.tree.structure(params0)}."
@@ -389,7 +389,7 @@ def _layout(system: Scene, records: list[Record], params0, form: Form | None) ->
     return replace(Layout.of(q, qdot), dtype=DOUBLE)
 
 
-def _residuals_of(scene: _GivenSystem, parameters: Parameters) -> SystemResiduals:
+def _build_residuals(scene: _GivenSystem, parameters: Parameters) -> SystemResiduals:
     """The residuals of whole records of one system."""
     with errors_of_system(scene.name):
         return _system_residuals(*scene, parameters)
@@ -397,7 +397,7 @@ def _residuals_of(scene: _GivenSystem, parameters: Parameters) -> SystemResidual
 
 def _system_residuals(name, system, records, observe, form, layout, parameters) -> SystemResiduals:
     rtol = DEFAULT_RTOL
-    motions = motions_of(system, layout, parameters, rtol, None, form)
+    motions = choose_motions(system, layout, parameters, rtol, None, form)
     recordings = [record for record in records if isinstance(record, Record)]
     if isinstance(observe, Delayed):
         _require_longer(recordings, observe.longest)
@@ -406,20 +406,20 @@ def _system_residuals(name, system, records, observe, form, layout, parameters) 
     _require_motion(recordings, signals.names, records)
     size = _sizes(recordings)
     timings = {k: record for k, record in enumerate(records) if isinstance(record, Timings)}
-    clocks = {k: clock_of(system, layout, parameters, record, rtol) for k, record in timings.items()}
+    clocks = {k: build_clock(system, layout, parameters, record, rtol) for k, record in timings.items()}
     if timings:
         size = np.append(size, max(np.ptp(record.ts) for record in timings.values()))
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
     manifold = None
     if isinstance(system, Hybrid):
         _require_plain(system, fitted, observe)
-    elif has_constraints(system) and not asks(system):
+    elif has_constraints(system) and not input_functions(system):
         manifold = Manifold(system, layout, parameters, motions.projection)
     elif has_constraints(system) and fitted.any():
         raise ValueError("A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0).")
     return SystemResiduals(
-        name, system, records, whole(records), fitted, motions, signals, parameters, np.where(size > 0, size, 1.0),
-        rtol, clocks, manifold,
+        name, system, records, whole_pieces(records), fitted, motions, signals, parameters,
+        np.where(size > 0, size, 1.0), rtol, clocks, manifold,
     )  # fmt: skip
 
 
@@ -473,13 +473,15 @@ def _readers(scenes: list[_GivenSystem], question: Residuals) -> list[Reader | N
     for scene, part in zip(scenes, question.parts, strict=True):
         probes = max(8, 256 // len(scene.records))
         readers += [
-            reader_of(record, part.system, numbers, probes) if isinstance(record, Record) else None
+            build_reader(record, part.system, numbers, probes) if isinstance(record, Record) else None
             for record in scene.records
         ]
     return readers if any(reader is not None for reader in readers) else None
 
 
-def _to_cut(scenes: list[_GivenSystem], readers: list[Reader | None] | None, method: str) -> list[Reader | None] | None:
+def _cuttable_readers(
+    scenes: list[_GivenSystem], readers: list[Reader | None] | None, method: str
+) -> list[Reader | None] | None:
     """The readers of records that may be cut into segments: not of hybrid motion, whose mode is known at first only.
 
     Raises `ValueError` where the method needs some, and there are none for that reason.
@@ -539,7 +541,7 @@ class _Printer:
 # ---- what came out ---------------------------------------------------------------------------------------------------
 
 
-def _result_of(settings: _Settings, descent: Descent, waterfall: Waterfall | None) -> tuple[Fit, Verdict]:
+def _build_result(settings: _Settings, descent: Descent, waterfall: Waterfall | None) -> tuple[Fit, Verdict]:
     """The result in the user's structures and in words."""
     point, widths, question = descent.point, descent.widths, descent.question
     parameters, question.watch = question.parameters, None
@@ -548,10 +550,12 @@ def _result_of(settings: _Settings, descent: Descent, waterfall: Waterfall | Non
     found = verdict(descent, unseen, known, question)
     done = Fit(
         params=parameters.restore(parameters.numbers(point.u)),
-        starts=question.by_system([question.restored(k, point.starts[row]) for k, row in enumerate(question.firsts)]),
+        starts=question.group_by_system(
+            [question.restore_state(k, point.starts[row]) for k, row in enumerate(question.firsts)]
+        ),
         covariance=Covariance(parameters.names, parameters.covariance(point.u, known.covariance)),
         noise=_noise_by_name(question, widths, known),
-        residuals=question.by_system(_by_record(question, point)),
+        residuals=question.group_by_system(_record_residuals(question, point)),
         unseen=unseen,
         ok=found.ok,
         message=found.message,
@@ -581,7 +585,7 @@ def _noise_by_name(question: Residuals, widths, known: Information) -> dict[str,
     }
 
 
-def _by_record(question: Residuals, point) -> list[PyTree]:
+def _record_residuals(question: Residuals, point) -> list[PyTree]:
     """The residuals of every record in its structure, NaN where nothing was measured."""
     columns = [question.columns(k) for k in range(len(question.records))]
     found = [
@@ -592,4 +596,4 @@ def _by_record(question: Residuals, point) -> list[PyTree]:
             record, places = question.pieces[row]
             matrix = np.where(weights > 0, left, np.nan)[: len(places), columns[record]]
             found[record][places] = matrix
-    return [in_structure(matrix, record) for matrix, record in zip(found, question.records, strict=True)]
+    return [restore_structure(matrix, record) for matrix, record in zip(found, question.records, strict=True)]

@@ -61,12 +61,12 @@ from scipy.special import polygamma
 from lagjax._doubles import accepts_singles
 from lagjax._fit._noise import AbstractNoise, NoiseScale, StudentT
 from lagjax._fit._parameters import AbstractSeparable
-from lagjax._fit._residuals import LostTrial, Residuals, Trial, compressed
+from lagjax._fit._residuals import LostTrial, Residuals, Trial, compress_rows
 
 _LEAST_DOF, _MOST_DOF = 1.0, 200.0  # ν is between these, with a flat density of its logarithm
 
 
-class Unknowns(NamedTuple):
+class PosteriorUnknowns(NamedTuple):
     """One vector x taken apart: u (F,), the starts of all records (N, 2n), and the noise σ (S,), ν (S,)."""
 
     u: Any
@@ -79,7 +79,8 @@ class Density:
     """log p(x), called with x (D,), for records whose residuals are those of `question` at `point`.
 
     - `first` (D,): the fit; `names` (D,): what the numbers are called.
-    - `of_starts` (N, 2n): which numbers of x the starts are; D for one that is known, or that a system does not have.
+    - `start_places` (N, 2n): the places in x of the starts; D for one that is known, or that a system does not have.
+    - `noise_places`: the places in x of log σ.
     - `shares` (S,): how many independent samples one sample of each signal is worth.
     """
 
@@ -89,7 +90,7 @@ class Density:
     ):  # fmt: skip
         self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths
         for part in question.parts:
-            part.system.require_traced()
+            part.system.require_traceable()
         self.dtype = np.result_type(*(part.system.layout.dtype for part in question.parts))
         self._tails = np.isfinite(widths.dof)
         self.moves_dof = isinstance(noise, StudentT) and noise.dof is None
@@ -101,36 +102,36 @@ class Density:
             moves[part.rows, : part.system.states] = question.fitted[part.rows, None]
         free, starts = len(point.u), point.starts[moves]
         self.first = np.concatenate([point.u, starts, np.log(widths.sigma), dof])
-        self.of_starts = np.full(moves.shape, len(self.first))
-        self.of_starts[moves] = np.arange(free, free + len(starts))
-        self.of_noise = slice(free + len(starts), free + len(starts) + len(widths.sigma))
-        self.names = (*question.parameters.labels, *self._names_of_starts(), *self._names_of_noise())
+        self.start_places = np.full(moves.shape, len(self.first))
+        self.start_places[moves] = np.arange(free, free + len(starts))
+        self.noise_places = slice(free + len(starts), free + len(starts) + len(widths.sigma))
+        self.names = (*question.parameters.labels, *self._start_names(), *self._noise_names())
 
-    def _names_of_starts(self) -> list[str]:
+    def _start_names(self) -> list[str]:
         question = self.question
         layouts = {row: part.system.layout for part in question.parts for row in part.rows.tolist()}
         return [
-            f"starts{question.called(question.pieces[row].record).removeprefix('records')}.{half}{name[1:]}"
+            f"starts{question.label(question.pieces[row].record).removeprefix('records')}.{half}{name[1:]}"
             for row in np.flatnonzero(question.fitted).tolist()
             for half in ("q", "qdot")
             for name in layouts[row].names
         ]
 
-    def _names_of_noise(self) -> list[str]:
+    def _noise_names(self) -> list[str]:
         names = self.question.names
         return [f"log σ of {name}" for name in names] + [f"ν of {name}" for name in names] * self.moves_dof
 
     def __len__(self) -> int:
         return len(self.first)
 
-    def unknowns(self, x) -> Unknowns:
+    def unknowns(self, x) -> PosteriorUnknowns:
         """A vector (D,) taken apart."""
         u, starts = x[: len(self.question.parameters)], jnp.asarray(self.point.starts, x.dtype)
-        starts = jnp.where(self.of_starts < len(self), jnp.append(x, 0.0)[self.of_starts], starts)
+        starts = jnp.where(self.start_places < len(self), jnp.append(x, 0.0)[self.start_places], starts)
         for part in self.question.parts:
-            starts = part.system.traced_starts(starts, part.rows, self.params(u))
-        dof = self._dof(x[self.of_noise.stop :]) if self.moves_dof else jnp.asarray(self.widths.dof, x.dtype)
-        return Unknowns(u, starts, jnp.exp(x[self.of_noise]), dof)
+            starts = part.system.trace_starts(starts, part.rows, self.params(u))
+        dof = self._dof(x[self.noise_places.stop :]) if self.moves_dof else jnp.asarray(self.widths.dof, x.dtype)
+        return PosteriorUnknowns(u, starts, jnp.exp(x[self.noise_places]), dof)
 
     @staticmethod
     def _dof(moved):
@@ -161,18 +162,18 @@ class Density:
         at = self.unknowns(jnp.asarray(x, self.dtype))
         pairs = zip(self.question.batches, self.residuals(at), strict=True)
         weighted = [np.sqrt(batch.weights) * residuals for batch, residuals in pairs]
-        return self.of_weighted(weighted, [batch.weights > 0 for batch in self.question.batches], at)
+        return self.weighted_log_likelihood(weighted, [batch.weights > 0 for batch in self.question.batches], at)
 
-    def residuals(self, at: Unknowns) -> list:
+    def residuals(self, at: PosteriorUnknowns) -> list:
         """The outputs of the sensors less the measurements, (N, T, S), of every batch."""
         found, signals = [], len(self.question.names)
         for part in self.question.parts:
             for batch in part.system.batches:
-                own = part.system.traced(batch, at.u, at.starts[part.rows[batch.rows], : part.system.states])
+                own = part.system.trace_residuals(batch, at.u, at.starts[part.rows[batch.rows], : part.system.states])
                 found.append(jnp.zeros((*own.shape[:2], signals), own.dtype).at[..., part.signals].set(own))
         return found
 
-    def of_weighted(self, weighted: list, counted: list, at: Unknowns):
+    def weighted_log_likelihood(self, weighted: list, counted: list, at: PosteriorUnknowns):
         """Σ_s shares_s log L_s, up to a constant, of √weight · residual (N, T, S) of every batch, where they count.
 
         For a signal whose noise is Gaussian other numbers with the same sum of squares do as well.
@@ -186,7 +187,7 @@ class Density:
             total = total + jnp.sum(jnp.where(counts, each * self.shares, 0.0))
         return total
 
-    def _of_noise(self, samples: np.ndarray) -> np.ndarray:
+    def _noise_covariance(self, samples: np.ndarray) -> np.ndarray:
         """The covariance of log σ, and of the numbers that move ν, from Fisher's information of this many samples (S,).
 
         Per sample of Student's t it is 2ν/(ν+3) for log σ, [ψ′(ν/2) − ψ′((ν+1)/2)]/4 − (ν+5)/(2ν(ν+1)(ν+3)) for ν and
@@ -213,9 +214,9 @@ class Density:
         robust = np.array([(d + 1) / (d + 3) if np.isfinite(d) else 1.0 for d in self.widths.dof])
         weight = np.sqrt(self.shares * robust) / self.widths.sigma
         triangles = question.triangles(point, [np.sqrt(batch.weights) * weight for batch in question.batches])
-        free, size = len(point.u), self.of_noise.start
+        free, size = len(point.u), self.noise_places.start
         precision = np.zeros((len(self) + 1, len(self) + 1))
-        for own, triangle in zip(self.of_starts, triangles, strict=True):
+        for own, triangle in zip(self.start_places, triangles, strict=True):
             own = [*own, *range(free)]
             precision[np.ix_(own, own)] += triangle[:, :-1].T @ triangle[:, :-1]
         precision = precision[:size, :size]
@@ -230,7 +231,7 @@ class Density:
                 "The data do not determine some combination of parameters and starts: fix one parameter with `free`."
             )
         found = np.zeros((len(self), len(self)))
-        found[size:, size:] = self._of_noise((question.weights > 0).sum(axis=0) * self.shares)
+        found[size:, size:] = self._noise_covariance((question.weights > 0).sum(axis=0) * self.shares)
         found[:size, :size] = np.linalg.inv(unit) / np.outer(scale, scale)
         return found
 
@@ -255,7 +256,7 @@ class Chart(NamedTuple):
     middle: np.ndarray
 
     @staticmethod
-    def of(density: Density) -> "Chart":
+    def from_density(density: Density) -> "Chart":
         """The chart about a fit. Raises `ValueError` where something is not seen."""
         parameters, u = density.question.parameters, density.point.u
         ends = np.array([transform.bounds for transform in parameters.maps]).reshape(-1, 2)
@@ -307,7 +308,7 @@ class Chart(NamedTuple):
         total = self.density(x) + volume
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 
-    def at(self, zeta: np.ndarray) -> np.ndarray:
+    def evaluate_unknowns(self, zeta: np.ndarray) -> np.ndarray:
         """The unknowns x (D,) where y = centre + root ζ is inside of its bounds."""
         x = self.centre + self.root @ zeta
         y = x[self.bounded]
@@ -315,7 +316,7 @@ class Chart(NamedTuple):
             x[self.bounded] = np.log(y - self.low) - np.where(np.isfinite(self.high), np.log(self.high - y), 0.0)
         return x
 
-    def columns(self, zeta: np.ndarray) -> np.ndarray:
+    def jacobian(self, zeta: np.ndarray) -> np.ndarray:
         """∂x/∂ζ (D, D)."""
         by_y = np.ones(len(self.centre))
         by_y[self.bounded] = _slope((self.centre + self.root @ zeta)[self.bounded], self.low, self.high)
@@ -366,8 +367,8 @@ class Surrogate(NamedTuple):
         padded = jnp.append(zeta, 0.0)  # where the start of a piece is known its numbers are those of the last place
         weighted = [self._residuals(block, padded) for block in self.blocks]
         density = self.chart.density
-        of_data = density.of_weighted(weighted, [b.counts for b in self.blocks], density.unknowns(x))
-        total = density.posterior(x, of_data) + volume
+        log_likelihood = density.weighted_log_likelihood(weighted, [b.counts for b in self.blocks], density.unknowns(x))
+        total = density.posterior(x, log_likelihood) + volume
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 
     @staticmethod
@@ -378,7 +379,7 @@ class Surrogate(NamedTuple):
         return jnp.einsum("ntsq,nq->nts", jnp.asarray(block.rows, own.dtype), powers)
 
 
-def expanded(chart: Chart) -> Surrogate | str:
+def expand_residuals(chart: Chart) -> Surrogate | str:
     """The expansion about the centre of a chart; or a sentence that says why there is none."""
     density = chart.density
     question, free = density.question, len(density.point.u)
@@ -388,16 +389,16 @@ def expanded(chart: Chart) -> Surrogate | str:
     plain = not np.isfinite(density.widths.dof).any()
     if size > _LARGEST and not plain:
         return f"The expansion of its residuals to second order would hold {size} numbers, more than {_LARGEST}."
-    found = _bent(chart, states)
+    found = _differentiate_twice(chart, states)
     if isinstance(found, LostTrial):
-        return f"One standard deviation from the fit a motion fails. {question.where(found)}"
+        return f"One standard deviation from the fit a motion fails. {question.describe_failure(found)}"
     middle, slopes, bends = found
     blocks = []
     for k, batch in enumerate(question.batches):
         first = np.sqrt(batch.weights) * middle.residuals[k]
         rows, counts = _polynomials(first, slopes[k], bends[k]), batch.weights > 0
         if plain and rows.shape[1] > rows.shape[3]:
-            rows = np.stack([compressed(rows[:, :, s]) for s in range(rows.shape[2])], axis=2)
+            rows = np.stack([compress_rows(rows[:, :, s]) for s in range(rows.shape[2])], axis=2)
             counts = np.ones(rows.shape[:3], bool)
         blocks.append(Block(rows, counts, _places(density, states)[batch.rows]))
     if (size := sum(block.rows.size for block in blocks)) > _LARGEST:
@@ -405,34 +406,34 @@ def expanded(chart: Chart) -> Surrogate | str:
     return Surrogate(chart, blocks)
 
 
-def _bent(chart: Chart, states: int) -> tuple[Trial, list[np.ndarray], list[np.ndarray]] | LostTrial:
+def _differentiate_twice(chart: Chart, states: int) -> tuple[Trial, list[np.ndarray], list[np.ndarray]] | LostTrial:
     """The trial at the centre, and of every batch J (N, T, S, d) and H (N, T, S, d, d); or the motion that failed."""
 
-    def at(zeta: np.ndarray) -> tuple[Trial, list[np.ndarray]] | LostTrial:
+    def evaluate(zeta: np.ndarray) -> tuple[Trial, list[np.ndarray]] | LostTrial:
         trial = _trial(chart, zeta)
         return trial if isinstance(trial, LostTrial) else (trial, _jacobians(chart, trial, zeta, states))
 
-    ways, columns = _ways(chart.density, states), []
-    centre = at(np.zeros(len(chart.centre)))
+    ways, columns = _directions(chart.density, states), []
+    centre = evaluate(np.zeros(len(chart.centre)))
     if isinstance(centre, LostTrial):
         return centre
     for way, step in zip(ways.T, chart.room(ways), strict=True):
-        right, left = at(step * way), at(-step * way)
+        right, left = evaluate(step * way), evaluate(-step * way)
         if isinstance(right, LostTrial):
             return right
         if isinstance(left, LostTrial):
             return left
         columns.append([(more - less) / (2 * step) for more, less in zip(right[1], left[1], strict=True)])
-    return centre[0], centre[1], [np.stack(of_batch, axis=-1) for of_batch in zip(*columns, strict=True)]
+    return centre[0], centre[1], [np.stack(bends, axis=-1) for bends in zip(*columns, strict=True)]
 
 
 def _places(density: Density, states: int) -> np.ndarray:
     """The places in z (N, d) of the numbers that every piece depends on: those of its start, then the parameters'."""
-    of_starts, free = density.of_starts[:, :states], np.arange(len(density.point.u))
-    return np.concatenate([of_starts, np.broadcast_to(free, (len(of_starts), len(free)))], axis=1)
+    starts, free = density.start_places[:, :states], np.arange(len(density.point.u))
+    return np.concatenate([starts, np.broadcast_to(free, (len(starts), len(free)))], axis=1)
 
 
-def _ways(density: Density, states: int) -> np.ndarray:
+def _directions(density: Density, states: int) -> np.ndarray:
     """The directions of ζ (D, d), one for every number of a piece, where the numbers of all starts move together."""
     places = _places(density, states)
     ways = np.zeros((len(density) + 1, places.shape[1]))
@@ -443,8 +444,8 @@ def _ways(density: Density, states: int) -> np.ndarray:
 
 def _trial(chart: Chart, zeta: np.ndarray) -> Trial | LostTrial:
     """The residuals and their derivatives at ζ (D,)."""
-    density, x = chart.density, chart.at(zeta)
-    starts = np.where(density.of_starts < len(x), np.append(x, 0.0)[density.of_starts], density.point.starts)
+    density, x = chart.density, chart.evaluate_unknowns(zeta)
+    starts = np.where(density.start_places < len(x), np.append(x, 0.0)[density.start_places], density.point.starts)
     return density.question.evaluate(x[: len(density.point.u)], starts, notify=False)
 
 
@@ -452,7 +453,7 @@ def _jacobians(chart: Chart, trial: Trial, zeta: np.ndarray, states: int) -> lis
     """The slopes of the weighted residuals of every batch by ζ, (N, T, S, d)."""
     density = chart.density
     question, free, places = density.question, len(density.point.u), _places(density, states)
-    padded = np.pad(chart.columns(zeta), (0, 1))
+    padded = np.pad(chart.jacobian(zeta), (0, 1))
     columns = [padded[np.ix_(row, row)] for row in places]  # of the start and the parameters by ζ
     found = []
     for batch, slopes in zip(question.batches, trial.slopes, strict=True):

@@ -38,7 +38,7 @@ import numpy as np
 
 from lagjax._fit._density import Density
 from lagjax._fit._noise import AbstractNoise, NoiseScale
-from lagjax._fit._residuals import LostTrial, Residuals, Trial, compressed, triangle_of
+from lagjax._fit._residuals import LostTrial, Residuals, Trial, compress_rows, qr_triangle
 from lagjax._fit._uncertainty import independent_share
 
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
@@ -131,7 +131,7 @@ def minimise(
         if trials > _PATIENCE and recent * independent_share(question, point, model.widths) <= enough:
             text = _KINK.format(trials, left, _PATIENCE, recent)
             return Descent(point, model.widths, False, trials, text, question)
-        better, damping, trials = _descended(question, point, model, anchor, damping, trials, limit)
+        better, damping, trials = _find_better_trial(question, point, model, anchor, damping, trials, limit)
         if better is not None:
             falls.append((trials, model.cost - question.cost(better, model.factors) - anchor.cost(better.u)))
         if better is None and trials < limit:
@@ -168,7 +168,7 @@ def _model(question: Residuals, point: Trial, noise: AbstractNoise, anchor: Anch
     return _Model(widths, factors, triangles, question.states, pull, question.parameters.limits(point.u), cost)
 
 
-def _descended(
+def _find_better_trial(
     question: Residuals, point: Trial, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
 ) -> tuple[Trial | None, float, int]:
     """The first trial that is better, the damping to go on with, and the count of trials.
@@ -180,7 +180,7 @@ def _descended(
         step = model.step(damping)
         if step.gain <= _FLAT * model.cost or damping > _MOST:
             break
-        trial = question.evaluate(question.parameters.stepped(point.u, step.u), point.starts + step.starts)
+        trial = question.evaluate(question.parameters.take_step(point.u, step.u), point.starts + step.starts)
         trials += 1
         if not isinstance(trial, LostTrial):
             fall = model.cost - question.cost(trial, model.factors) - anchor.cost(trial.u)
@@ -200,10 +200,10 @@ def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, l
     (pieces, columns, _), free = triangles.shape, len(of_u)
     damped = np.zeros((pieces, states, columns))
     damped[:, np.arange(states), np.arange(states)] = np.sqrt(damping) * of_starts
-    r = triangle_of(np.concatenate([triangles, damped], axis=1))
+    r = qr_triangle(np.concatenate([triangles, damped], axis=1))
     anchored = np.concatenate([np.diag(pull[0]), pull[1][:, None]], axis=1)
-    rest = compressed(np.concatenate([r[:, states:, states:].reshape(-1, free + 1), anchored])[None])[0]
-    du = _within_limits(rest, of_u, damping, limits)
+    rest = compress_rows(np.concatenate([r[:, states:, states:].reshape(-1, free + 1), anchored])[None])[0]
+    du = _limited_step(rest, of_u, damping, limits)
     right = r[:, :states, -1] + r[:, :states, states:-1] @ du
     ds = np.linalg.solve(r[:, :states, :states], -right[..., None])[..., 0]
     whole = np.concatenate([ds, np.broadcast_to(du, (pieces, free)), np.ones((pieces, 1))], axis=1)
@@ -212,12 +212,12 @@ def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, l
     return DescentStep(du, ds, float(0.5 * gain))
 
 
-def _within_limits(rest: np.ndarray, of_u: np.ndarray, damping: float, limits) -> np.ndarray:
+def _limited_step(rest: np.ndarray, of_u: np.ndarray, damping: float, limits) -> np.ndarray:
     """δu (F,) that minimises |rest (δu, 1)|² + Σ damping (scale δu)², with more damping of what is beyond limits."""
     free, each = len(of_u), np.full(len(of_u), damping)
     while True:
         rows = np.concatenate([rest, np.diag(np.append(np.sqrt(each) * of_u, 0.0))[:free]])
-        triangle = triangle_of(rows)
+        triangle = qr_triangle(rows)
         du = np.linalg.solve(triangle[:free, :free], -triangle[:free, free])
         beyond = (du < limits[0]) | (du > limits[1])
         if not beyond.any() or each[beyond].min() > _MOST:
@@ -248,7 +248,7 @@ def descend_gradient(
     optax = _optax()
     whole = NoiseScale(question.size, np.full(len(question.size), np.inf))
     density = Density(question, noise, Trial(u, starts, [], []), whole, np.ones(len(question.size)))
-    first = _with_noise(density, question, noise)
+    first = _initial_unknowns(density, question, noise)
     if isinstance(first, LostTrial):
         return first
     scale = jnp.asarray(_units(density, first), density.dtype)
@@ -279,7 +279,7 @@ def descend_gradient(
     return x[: len(u)], np.asarray(at.starts, float), bool((rest - costs[-1]) * question.measured < _STILL)
 
 
-def _with_noise(density: Density, question: Residuals, noise: AbstractNoise) -> np.ndarray | LostTrial:
+def _initial_unknowns(density: Density, question: Residuals, noise: AbstractNoise) -> np.ndarray | LostTrial:
     """The first x (D,), with the noise that its residuals have."""
     at = density.unknowns(jnp.asarray(density.first, density.dtype))
     left = [np.asarray(residuals, float) for residuals in density.residuals(at)]
@@ -292,7 +292,7 @@ def _with_noise(density: Density, question: Residuals, noise: AbstractNoise) -> 
     flat = np.concatenate([r.reshape(-1, r.shape[-1]) for r in left])
     widths = noise.widths(flat, question.weights, question.least)
     x = density.first.copy()
-    x[density.of_noise] = np.log(widths.sigma)
+    x[density.noise_places] = np.log(widths.sigma)
     return x
 
 
@@ -305,13 +305,13 @@ def _units(density: Density, x: np.ndarray) -> np.ndarray:
     for part in question.parts:
         fitted = part.rows[part.system.fitted]
         if len(fitted):
-            places = density.of_starts[fitted, : part.system.states]
+            places = density.start_places[fitted, : part.system.states]
             size = np.sqrt(np.mean(x[places] ** 2, axis=0))
             scale[places] = np.where(size > 0, size, 1.0)
     return scale
 
 
-def as_descent(
+def build_descent(
     question: Residuals, u: np.ndarray, starts: np.ndarray, noise, steps: int, rest: bool
 ) -> Descent | LostTrial:
     """The result of the descent, with the derivatives that intervals need."""

@@ -27,7 +27,7 @@ import numpy as np
 from lagjax._engine import choose
 from lagjax._failures import sentence
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Driven, Form, SampleTable, asks, started
+from lagjax._fit._records import Driven, Form, SampleTable, input_functions, start_pair
 from lagjax._hybrid import Hybrid, Scene, first_law, follow
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import KEPT, Flow, MachineCode, flow_of, jvp, projected_start, tolerances_of
@@ -54,7 +54,7 @@ class RecordMotion(NamedTuple):
         """True if all reached their last time."""
         return bool(np.isin(self.result, ENDED_WELL).all() and np.isfinite(self.tangents).all())
 
-    def why_not(self, ts: np.ndarray, layout: Layout) -> tuple[int, str]:
+    def describe_failure(self, ts: np.ndarray, layout: Layout) -> tuple[int, str]:
         """The first row that failed, and what became of it."""
         failed = ~np.isin(self.result, ENDED_WELL)
         if not failed.any():
@@ -86,14 +86,14 @@ class AbstractMotions(abc.ABC):
         """q̈ (M, n) at M states `y` (M, 2n) and times `t` (M,), with a table of inputs for each."""
 
 
-def motions_of(
+def choose_motions(
     system: Scene, layout: Layout, parameters: Parameters, rtol, atol, form: Form | None = None
 ) -> AbstractMotions:
     """Followers of the motions of a scene: machine code where it has that, else diffrax. `form` is of its inputs."""
     if isinstance(system, Hybrid):
-        return _ByJAX(system, layout, parameters, {"rtol": rtol, "atol": atol})
-    form = form if asks(system) else None  # inputs that only sensors ask for, or nothing
-    scene = system if form is None else form.driven(system)
+        return _JaxMotions(system, layout, parameters, {"rtol": rtol, "atol": atol})
+    form = form if input_functions(system) else None  # inputs that only sensors ask for, or nothing
+    scene = system if form is None else form.drive_scene(system)
 
     def problem(room: int) -> Problem:
         params = parameters.restore(parameters.first)
@@ -101,12 +101,12 @@ def motions_of(
         return Problem.about(scene, layout, params, rtol=rtol, atol=atol)
 
     if isinstance(choose(problem(2)).engine, MachineCode):
-        return _ByMachineCode(problem, form is not None)
+        return _MachineCodeMotions(problem, form is not None)
     options = {"rtol": rtol, "atol": atol, "adjoint": diffrax.ForwardMode()}
-    return _ByJAX(scene, layout, parameters, options, form is not None)
+    return _JaxMotions(scene, layout, parameters, options, form is not None)
 
 
-class _ByMachineCode(AbstractMotions):
+class _MachineCodeMotions(AbstractMotions):
     def __init__(self, problem: Callable[[int], Problem], is_driven: bool):
         """`problem(room)` is about the scene with tables of inputs of this many instants."""
         self.problem, self.tolerances, self.is_driven = problem, tolerances_of(problem(2)), is_driven
@@ -135,7 +135,7 @@ class _ByMachineCode(AbstractMotions):
         return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
 
 
-class _ByJAX(AbstractMotions):
+class _JaxMotions(AbstractMotions):
     """The tangents of hybrid motion, and of diffrax, by `jax.jvp`."""
 
     def __init__(
@@ -145,30 +145,30 @@ class _ByJAX(AbstractMotions):
         if unfree:
             raise TypeError(f"params0 may only hold numbers where the scene has no machine code; got {unfree[0]!r}.")
 
-        def of(numbers, table):
+        def scene_params(numbers, table):
             params = parameters.restore(numbers)
             return Driven(params, *table) if is_driven else params
 
         def run(state, ts, table):
             y0, numbers = state
             q, qdot = map(layout.restore, halves(y0))
-            trajectory = follow(scene, q, qdot, ts, of(numbers, table), throw=False, **options)
+            trajectory = follow(scene, q, qdot, ts, scene_params(numbers, table), throw=False, **options)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))
             end = jnp.concatenate([layout.flatten(trajectory.end.q), layout.flatten(trajectory.end.qdot)])
             path = rows(trajectory.q, trajectory.qdot)
             return path, (path, trajectory.result._value, trajectory.end.t, end)
 
-        def with_tangents(ts, y0, numbers, y0_dot, numbers_dot, table):
-            def along(*dot):
+        def run_with_tangents(ts, y0, numbers, y0_dot, numbers_dot, table):
+            def tangent(*dot):
                 return jax.jvp(lambda state: run(state, ts, table)[0], ((y0, numbers),), (dot,))[1]
 
-            return run((y0, numbers), ts, table)[1], jax.vmap(along)(y0_dot, numbers_dot)
+            return run((y0, numbers), ts, table)[1], jax.vmap(tangent)(y0_dot, numbers_dot)
 
         def rate(t, y, numbers, table):
             q, qdot = map(layout.restore, halves(y))
-            return layout.flatten(first_law(scene).acceleration(q, qdot, t, of(numbers, table)))
+            return layout.flatten(first_law(scene).acceleration(q, qdot, t, scene_params(numbers, table)))
 
-        self._follow = jax.jit(jax.vmap(with_tangents, in_axes=(0, 0, 0, 0, 0, 0)))
+        self._follow = jax.jit(jax.vmap(run_with_tangents, in_axes=(0, 0, 0, 0, 0, 0)))
         self._rate = jax.jit(jax.vmap(rate, in_axes=(0, 0, None, 0)))
         self.dtype = layout.dtype
 
@@ -195,14 +195,14 @@ class Origins:
     def __init__(self, starts: list, layout: Layout, parameters: Parameters):
         """`starts` is what the record of each piece says of its start; None where the piece begins later."""
 
-        def of(function):
+        def compile_start(function):
             def state(numbers):
-                q, qdot = started(function, parameters.restore(numbers))
+                q, qdot = start_pair(function, parameters.restore(numbers))
                 return jnp.concatenate([layout.flatten(q), layout.flatten(qdot)])
 
             return jax.jit(lambda numbers: (state(numbers), jax.jacfwd(state)(numbers)))
 
-        functions = {start: of(start) for start in starts if callable(start)}
+        functions = {start: compile_start(start) for start in starts if callable(start)}
         self.functions = {k: functions[start] for k, start in enumerate(starts) if callable(start)}
         self.dtype = layout.dtype
 
@@ -219,7 +219,7 @@ class Origins:
         return starts, moved
 
 
-class Placed(NamedTuple):
+class ProjectedStarts(NamedTuple):
     """N starts (N, 2n) on the constraints; how they move with the unknown states, (N, 2n, 2n), and along F directions
     of the parameters, (N, F, 2n)."""
 
@@ -241,23 +241,27 @@ class Manifold:
             q, qdot = system.project(q, qdot, t, parameters.restore(numbers))
             return jnp.concatenate([layout.flatten(q), layout.flatten(qdot)])
 
-        def with_derivatives(y, t, numbers):
+        def project_with_derivatives(y, t, numbers):
             return project(y, t, numbers), *jax.jacfwd(project, argnums=(0, 2))(y, t, numbers)
 
-        self._at = jax.jit(with_derivatives)  # one by one: it takes seconds to compile for a number of rows
+        self._project = jax.jit(
+            project_with_derivatives
+        )  # one by one: it takes seconds to compile for a number of rows
         self.projection, self.dtype = projection, layout.dtype
 
-    def put(self, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions: np.ndarray) -> Placed:
+    def project(self, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions: np.ndarray) -> ProjectedStarts:
         """Consistent states near `y` (N, 2n) at the times `t` (N,); NaN where there is none."""
         if self.projection is not None:
-            return _by_steps(self.projection, y, t, numbers, directions)
+            return _project_by_newton(self.projection, y, t, numbers, directions)
         y, t, numbers = (np.asarray(x, self.dtype) for x in (y, t, numbers))
-        rows = [self._at(y[k], t[k], numbers) for k in range(len(y))]
+        rows = [self._project(y[k], t[k], numbers) for k in range(len(y))]
         starts, by_y, by_numbers = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*rows, strict=True))
-        return Placed(starts, by_y, np.einsum("nip,fp->nfi", by_numbers, directions))
+        return ProjectedStarts(starts, by_y, np.einsum("nip,fp->nfi", by_numbers, directions))
 
 
-def _by_steps(projection: Projection, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions) -> Placed:
+def _project_by_newton(
+    projection: Projection, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions
+) -> ProjectedStarts:
     count, states = y.shape
     rows = np.broadcast_to(numbers, (count, len(numbers)))
     before = np.full_like(y, np.inf)
@@ -272,4 +276,4 @@ def _by_steps(projection: Projection, y: np.ndarray, t: np.ndarray, numbers: np.
     moved = projected_start(
         projection, t[:, None], y, rows, along[0], np.broadcast_to(along[1], (count, *along[1].shape))
     )
-    return Placed(y, moved[:, :states].swapaxes(1, 2), moved[:, states:])
+    return ProjectedStarts(y, moved[:, :states].swapaxes(1, 2), moved[:, states:])

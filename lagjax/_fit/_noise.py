@@ -76,13 +76,13 @@ class StudentT(AbstractNoise):
     def widths(self, residuals, weights, least):
         """σ by its fixed point σ² = mean of c w e² with c = (ν+1)/(ν + z²), ν by search over its logarithm."""
         found = [
-            self._of_one(np.sqrt(weights[keep, s]) * residuals[keep, s], least[s])
+            self._fit_signal(np.sqrt(weights[keep, s]) * residuals[keep, s], least[s])
             for s in range(residuals.shape[1])
             for keep in [weights[:, s] > 0]
         ]
         return NoiseScale(np.array([sigma for sigma, _ in found]), np.array([dof for _, dof in found]))
 
-    def _of_one(self, scaled: np.ndarray, least: float) -> tuple[float, float]:
+    def _fit_signal(self, scaled: np.ndarray, least: float) -> tuple[float, float]:
         if self.dof is not None:
             return _sigma(scaled, self.dof, least), float(self.dof)
         # Golden section over log ν: the profile likelihood has one maximum there, or its end.

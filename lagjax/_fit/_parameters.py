@@ -1,6 +1,6 @@
 """Parameters: the numbers that are fitted, their names, and the transforms that keep them in a set.
 
-It holds `reading_params` (errors of functions that read a parameter which is not there), the transforms and
+It holds `find_params_expression` (errors of functions that read a parameter which is not there), the transforms and
 `Parameters`.
 
 **Transforms.** The search moves numbers u that may be any real, the scene gets x = x(u):
@@ -40,7 +40,7 @@ PyTree = Any
 _OURS = str(Path(__file__).parents[1]), str(Path(jax.__file__).parent)
 
 
-def reading_params(reason: Exception) -> str | None:
+def find_params_expression(reason: Exception) -> str | None:
     """The expression that read `params` where a function of the user failed; None where something else failed."""
     if reason.__traceback__ is None:
         return None
@@ -64,11 +64,11 @@ class AbstractTransform(abc.ABC):
     reach: ClassVar[float] = 2.0
     room: ClassVar[float] = 40.0
 
-    def of(self, x: np.ndarray, shape: tuple[int, ...]) -> "AbstractTransform":
+    def specialize(self, x: np.ndarray, shape: tuple[int, ...]) -> "AbstractTransform":
         """The map for a leaf of this shape that starts at `x` (n,), where the map depends on that."""
         return self
 
-    def unknowns(self, count: int) -> int:
+    def count_unknowns(self, count: int) -> int:
         """m, how many u move a leaf of n = `count` numbers."""
         return count
 
@@ -93,7 +93,7 @@ class AbstractTransform(abc.ABC):
         """The ends of intervals about `x` (n,) whose half width is `spread` where the set does not bend them."""
 
     @abc.abstractmethod
-    def drawn(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def draw(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Another u (m,) to begin a search from, anywhere in the set if that is bounded, else about `u`."""
 
     @abc.abstractmethod
@@ -104,7 +104,7 @@ class AbstractTransform(abc.ABC):
         """(low, high) between which one step of the search may lie, (m,) each."""
         return np.full(len(u), -self.reach), np.full(len(u), self.reach)
 
-    def stepped(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
+    def take_step(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The end of a step (m,) from u (m,)."""
         return u + step
 
@@ -172,7 +172,7 @@ class Unbounded(AbstractSeparable):
         """u(x)."""
         return x
 
-    def drawn(self, u, rng):
+    def draw(self, u, rng):
         """Normal about u, as wide as it is large; as wide as one about zero."""
         return u + np.where(u != 0, np.abs(u), 1.0) * rng.normal(size=len(u))
 
@@ -213,12 +213,12 @@ class Positive(AbstractSeparable):
         """The steps that lower or raise x by the factor e to the power of `reach`."""
         return np.full(len(u), np.expm1(-self.reach)), np.full(len(u), np.expm1(self.reach))
 
-    def stepped(self, u, step):
+    def take_step(self, u, step):
         """u of x + dx/du · step: signals are more nearly linear in a coefficient than in its logarithm."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return u + np.log1p(step)
 
-    def drawn(self, u, rng):
+    def draw(self, u, rng):
         """Normal in the logarithm, with the standard deviation of a decade."""
         return u + np.log(10.0) * rng.normal(size=len(u))
 
@@ -264,12 +264,12 @@ class Between(AbstractSeparable):
             )
         return low, high
 
-    def stepped(self, u, step):
+    def take_step(self, u, step):
         """u of x + dx/du · step, as for `Positive`."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return u + np.log1p(_logistic(-u) * step) - np.log1p(-_logistic(u) * step)
 
-    def drawn(self, u, rng):
+    def draw(self, u, rng):
         """Uniform between the bounds."""
         share = rng.uniform(size=len(u))
         return np.log(share / (1.0 - share))
@@ -313,7 +313,7 @@ class Angle(AbstractSeparable):
         """u(x)."""
         return x
 
-    def drawn(self, u, rng):
+    def draw(self, u, rng):
         """Uniform on the circle."""
         return rng.uniform(-np.pi, np.pi, len(u))
 
@@ -348,11 +348,11 @@ class Simplex(AbstractTransform):
 
     total: float = 1.0
 
-    def of(self, x, shape):
+    def specialize(self, x, shape):
         """The simplex with the sum of `x`."""
         return Simplex(float(np.sum(x)))
 
-    def unknowns(self, count):
+    def count_unknowns(self, count):
         """n − 1."""
         return count - 1
 
@@ -377,7 +377,7 @@ class Simplex(AbstractTransform):
         """u(x) = Hᵀ log x."""
         return _helmert(len(x)).T @ np.log(x)
 
-    def drawn(self, u, rng):
+    def draw(self, u, rng):
         """Uniform on the simplex."""
         return self.inverse(rng.dirichlet(np.ones(len(u) + 1)))
 
@@ -416,11 +416,11 @@ class Inertia(AbstractTransform):
 
     vector: bool = True
 
-    def of(self, x, shape):
+    def specialize(self, x, shape):
         """The form for ten numbers, or for a matrix."""
         return Inertia(vector=shape != (4, 4))
 
-    def unknowns(self, count):
+    def count_unknowns(self, count):
         """Ten."""
         return 10
 
@@ -489,7 +489,7 @@ class Inertia(AbstractTransform):
         off = [factor[place] for place in ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))]
         return np.array([np.log(flipped[0, 0]), *np.log(np.diag(factor)[:3]), *off])
 
-    def drawn(self, u, rng):
+    def draw(self, u, rng):
         """Normal about u with the standard deviation of a factor 1.65 in masses and lengths."""
         return u + 0.5 * rng.normal(size=len(u))
 
@@ -570,7 +570,7 @@ class Parameters:
     parts: tuple[Part, ...]
 
     @classmethod
-    def of(
+    def from_pytree(
         cls, params: PyTree, free: PyTree = None, transforms: PyTree = None, dtype: Any = np.float64
     ) -> "Parameters":
         """The parameters as the user gives them; `free` and `transforms` are prefixes of the same structure.
@@ -579,8 +579,8 @@ class Parameters:
         """
         require_finite(params, "params0")
         labels, leaves, tree = taken_apart(as_arrays(params, dtype, "params0"), "params")
-        is_free = _spread(True if free is None else free, tree, leaves, "free")
-        moved_by = _spread(Unbounded() if transforms is None else transforms, tree, leaves, "transforms")
+        is_free = _broadcast_prefix(True if free is None else free, tree, leaves, "free")
+        moved_by = _broadcast_prefix(Unbounded() if transforms is None else transforms, tree, leaves, "transforms")
         numbers, names, parts = [], [], []
         count = 0
         for label, leaf, may_move, transform in zip(labels, leaves, is_free, moved_by, strict=True):
@@ -588,13 +588,13 @@ class Parameters:
                 continue
             values = np.asarray(leaf, np.float64).ravel()
             numbers.append(values)
-            fitted = _which_are_fitted(label, leaf, may_move, free)
+            fitted = _fitted_mask(label, leaf, may_move, free)
             if fitted.any():
                 shape = np.shape(leaf)
-                for one, some in _pieces(label, transform, fitted, shape):
+                for one, some in _split_by_transform(label, transform, fitted, shape):
                     if isinstance(one, AbstractTransform) and not (len(some) == values.size or one.separable):
                         raise ValueError(f"{label} is free as a whole or not at all: its transform is {one!r}.")
-                    one = _transform_of(label, one, values[some], shape)
+                    one = _specialize_transform(label, one, values[some], shape)
                     parts.append(Part(label, shape, count + some, one))
                 names += [name for name, free_too in zip(_names(label, shape), fitted, strict=True) if free_too]
             count += values.size
@@ -610,7 +610,7 @@ class Parameters:
         """The u and the free numbers that belong to each part."""
         cuts, begin, u_begin = [], 0, 0
         for part in self.parts:
-            size = part.transform.unknowns(len(part.places))
+            size = part.transform.count_unknowns(len(part.places))
             cuts.append((slice(u_begin, u_begin + size), slice(begin, begin + len(part.places)), part))
             begin, u_begin = begin + len(part.places), u_begin + size
         return cuts
@@ -624,7 +624,7 @@ class Parameters:
         """F, the number of unknowns."""
         return self._cuts[-1][0].stop if self.parts else 0
 
-    def moved(self, values: np.ndarray) -> np.ndarray:
+    def inverse(self, values: np.ndarray) -> np.ndarray:
         """u (F,) of the free numbers among all `values` (P,)."""
         return np.concatenate([np.zeros(0), *(part.transform.inverse(values[part.places]) for part in self.parts)])
 
@@ -678,9 +678,9 @@ class Parameters:
         """log of the volume of the free numbers per volume of u, up to a constant."""
         return sum(part.transform.log_volume(u[own], xp) for own, _, part in self._cuts)
 
-    def drawn(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def draw(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Another u (F,) to begin a search from."""
-        return np.concatenate([u[:0], *(part.transform.drawn(u[own], rng) for own, _, part in self._cuts)])
+        return np.concatenate([u[:0], *(part.transform.draw(u[own], rng) for own, _, part in self._cuts)])
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -697,9 +697,9 @@ class Parameters:
         low, high = (np.concatenate([np.zeros(0), *ends]) for ends in zip(*pairs, strict=True)) if pairs else (u, u)
         return low, high
 
-    def stepped(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
+    def take_step(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The end of a step (F,) from u (F,): along the tangent of x(u), where every number moves by itself."""
-        parts = [part.transform.stepped(u[own], step[own]) for own, _, part in self._cuts]
+        parts = [part.transform.take_step(u[own], step[own]) for own, _, part in self._cuts]
         return np.concatenate([np.zeros(0), *parts])
 
     @property
@@ -710,14 +710,14 @@ class Parameters:
     @property
     def reach(self) -> np.ndarray:
         """The largest change of each u (F,) in one step."""
-        return self._of_each("reach")
+        return self._gather_attribute("reach")
 
     @property
     def room(self) -> np.ndarray:
         """The distance from one value of each u (F,) at which others are distinct."""
-        return self._of_each("room")
+        return self._gather_attribute("room")
 
-    def _of_each(self, name: str) -> np.ndarray:
+    def _gather_attribute(self, name: str) -> np.ndarray:
         rows = (np.full(own.stop - own.start, getattr(part.transform, name)) for own, _, part in self._cuts)
         return np.concatenate([np.zeros(0), *rows])
 
@@ -759,7 +759,7 @@ class Parameters:
             )
         return own.start + row - rows.start
 
-    def kept(self, u: np.ndarray, which: int | None = None) -> "Parameters":
+    def fix(self, u: np.ndarray, which: int | None = None) -> "Parameters":
         """The parameters at u (F,), where the unknown `which` of a number of its own is kept there; None: all are."""
         at, parts, names = replace(self, first=self.numbers(u)), [], []
         for own, rows, part in self._cuts:
@@ -785,7 +785,7 @@ class Parameters:
         return jax.tree.unflatten(self.tree, leaves)
 
 
-def _spread(prefix: PyTree, tree, leaves: list, name: str) -> list:
+def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:
     """A prefix of the parameters spread over every leaf. Raises `ValueError` where it is no prefix."""
     whole = jax.tree.unflatten(tree, leaves)
     try:
@@ -798,7 +798,7 @@ def _spread(prefix: PyTree, tree, leaves: list, name: str) -> list:
         ) from None
 
 
-def _which_are_fitted(label: str, leaf, may_move, free) -> np.ndarray:
+def _fitted_mask(label: str, leaf, may_move, free) -> np.ndarray:
     """True for each number of a leaf (n,) that is fitted. Raises where the user asks to fit one that cannot move."""
     wanted = np.asarray(may_move)
     if wanted.dtype != bool:
@@ -815,7 +815,9 @@ def _which_are_fitted(label: str, leaf, may_move, free) -> np.ndarray:
     return np.broadcast_to(wanted, np.shape(leaf)).ravel()
 
 
-def _pieces(label: str, transform, fitted: np.ndarray, shape: tuple[int, ...]) -> list[tuple[Any, np.ndarray]]:
+def _split_by_transform(
+    label: str, transform, fitted: np.ndarray, shape: tuple[int, ...]
+) -> list[tuple[Any, np.ndarray]]:
     """Neighbours among the fitted numbers of a leaf that share a transform, each with their places in it, in order."""
     places = np.flatnonzero(fitted)
     if not isinstance(transform, np.ndarray):
@@ -830,7 +832,7 @@ def _pieces(label: str, transform, fitted: np.ndarray, shape: tuple[int, ...]) -
     return [(each[some[0]], some) for some in np.split(places, edges)]
 
 
-def _transform_of(label: str, transform, values: np.ndarray, shape: tuple[int, ...]) -> AbstractTransform:
+def _specialize_transform(label: str, transform, values: np.ndarray, shape: tuple[int, ...]) -> AbstractTransform:
     """The transform of a free leaf. Raises where it is none, or where the values start outside of its set."""
     transform = Unbounded() if transform is None else transform
     if not isinstance(transform, AbstractTransform):
@@ -840,7 +842,7 @@ def _transform_of(label: str, transform, values: np.ndarray, shape: tuple[int, .
         )
     if reason := transform.refuses(values):
         raise ValueError(f"{label} {reason}; got {values if values.size > 1 else values[0]}.")
-    return transform.of(values, shape)
+    return transform.specialize(values, shape)
 
 
 def _names(label: str, shape: tuple[int, ...]) -> list[str]:

@@ -1,9 +1,9 @@
 """Prediction: the fitted scene over other records, those that were measured and those that are planned.
 
-It holds `Prediction`, `predicted` (the motion of a record with bands) and `planned_rows` (the rows of a planned record,
-for experiment design). Both follow a record once with derivatives by its start and by the
-parameters. The uncertainty of a start that is fitted to the record itself is that for fixed parameters and the way in
-which it follows these.
+It holds `Prediction`, `predict_record` (the motion of a record with bands) and `planned_rows` (the rows of a planned
+record, for experiment design). Both follow a record once with derivatives by its start and by the parameters. The
+uncertainty of a start that is fitted to the record itself is that for fixed parameters and the way in which it follows
+these.
 """
 
 from dataclasses import replace
@@ -16,10 +16,10 @@ from scipy.special import ndtri, stdtrit
 from lagjax._fit._descent import minimise
 from lagjax._fit._noise import Known, NoiseScale
 from lagjax._fit._profile import effective_share
-from lagjax._fit._records import Guess, Record, in_structure, known_start, require_alike, require_held
+from lagjax._fit._records import Guess, Record, known_start, require_alike, require_held, restore_structure
 from lagjax._fit._residuals import LostTrial, Residuals, SystemPart, SystemResiduals, Trial
-from lagjax._fit._search import reader_of
-from lagjax._fit._sensors import UNCLEAR, on_circle
+from lagjax._fit._search import build_reader
+from lagjax._fit._sensors import UNCLEAR, wrap_residuals
 from lagjax._fit._uncertainty import covariance_of_one_start, signal_deviations
 from lagjax._hybrid import follow
 from lagjax._trajectory import Trajectory
@@ -67,9 +67,9 @@ def _half_widths(deviation: np.ndarray, widths: NoiseScale, level: float, column
     return np.sqrt((ndtri(0.5 + 0.5 * level) * flat) ** 2 + noise**2).reshape(deviation.shape)
 
 
-def predicted(fit, record: Record, system: str | None) -> Prediction:
+def predict_record(fit, record: Record, system: str | None) -> Prediction:
     """The motion of the scene of a `Fit` over a record of the system of this name; see `Fit.predict`."""
-    [record], part = require_alike([record]), fit.question.part_called(system)
+    [record], part = require_alike([record]), fit.question.find_part(system)
     about = part.system
     first = next((one for one in about.records if isinstance(one, Record)), None)
     if not isinstance(record, Record) or first is None:
@@ -80,61 +80,61 @@ def predicted(fit, record: Record, system: str | None) -> Prediction:
         raise ValueError("The record has other inputs than those of the fit.")
     if about.signals.form is not None:
         require_held(record, about.signals.form.hold, "the record")
-    layout, fixed = about.layout, fit.parameters.kept(fit.u)
+    layout, fixed = about.layout, fit.parameters.fix(fit.u)
     state = known_start(record, layout, 0, fit.params)
     is_known = state is not None and not isinstance(record.start, Guess)
     if state is None:
-        state = _start_read_off(record, about, fit.parameters.numbers(fit.u))
-    question = Residuals([about.of_records([record], np.array([not is_known]), fixed, about.manifold)])
+        state = _read_start(record, about, fit.parameters.numbers(fit.u))
+    question = Residuals([about.with_records([record], np.array([not is_known]), fixed, about.manifold)])
     if is_known:
         point = question.evaluate(np.zeros(0), state[None])
     else:
-        done = minimise(question, np.zeros(0), state[None], Known(part.of_sensors(fit.widths)), enough=1e-3)
+        done = minimise(question, np.zeros(0), state[None], Known(part.sensor_noise(fit.widths)), enough=1e-3)
         point = done if isinstance(done, LostTrial) else done.point
     if isinstance(point, LostTrial):
-        raise ValueError(question.where(point))
+        raise ValueError(question.describe_failure(point))
     n = layout.size
     start = layout.restore(point.starts[0, :n]), layout.restore(point.starts[0, n:])
     ts = np.asarray(record.ts, layout.dtype)
     q0, qdot0 = (jax.tree.map(lambda x: np.asarray(x, layout.dtype), half) for half in start)
     form, driven = about.signals.form, (record.sampled_at, record.input_samples)
     scene, params = about.scene, fit.params
-    scene, params = (scene, params) if form is None else form.along(scene, params, *driven)
+    scene, params = (scene, params) if form is None else form.bind_samples(scene, params, *driven)
     trajectory = follow(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
-    values, deviation = _shown(fit, part, record, question, point)
-    left = on_circle(values - record.matrix, about.signals.periods)
+    values, deviation = _predict_signals(fit, part, record, question, point)
+    left = wrap_residuals(values - record.matrix, about.signals.periods)
     left = np.where(record.weight_matrix > 0, left, np.nan)
-    noise = part.of_sensors(fit.widths)
+    noise = part.sensor_noise(fit.widths)
     noise = noise._replace(sigma=noise.sigma * np.sqrt(fit.information.lost))
-    shown, missed, uncertain = (in_structure(matrix, record) for matrix in (values, left, deviation))
+    shown, missed, uncertain = (restore_structure(matrix, record) for matrix in (values, left, deviation))
     return Prediction(trajectory, shown, missed, start, uncertain, noise)
 
 
-def _shown(fit, part: SystemPart, record: Record, question: Residuals, point: Trial):
-    """The signals (T, S) of a record that was followed, at all its times, and their standard signal_deviations."""
-    planned, slopes = _followed(fit, part.system, record, point.starts[0])
+def _predict_signals(fit, part: SystemPart, record: Record, question: Residuals, point: Trial):
+    """The signals (T, S) of a record that was followed, at all its times, and their standard deviations."""
+    planned, slopes = _follow_record(fit, part.system, record, point.starts[0])
     known, states = fit.information, question.states
     own, follows = np.zeros((states, states)), np.zeros((states, len(fit.u)))
     if question.fitted[0]:
-        rows = np.sqrt(record.weight_matrix)[..., None] / part.of_sensors(fit.widths).sigma[:, None] * slopes
+        rows = np.sqrt(record.weight_matrix)[..., None] / part.sensor_noise(fit.widths).sigma[:, None] * slopes
         own, follows = covariance_of_one_start(rows, states, known, effective_share(fit))
     return planned.matrix, signal_deviations(slopes, states, own, follows, known)
 
 
-def _followed(fit, of: SystemResiduals, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
+def _follow_record(fit, system: SystemResiduals, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
     """A record with what sensors would show for its values, from a state (2n,), and their derivatives (T, S, D)."""
-    everywhere = replace(record, values=in_structure(np.zeros_like(record.matrix), record), weights=None)
-    about = Residuals([of.of_records([everywhere], np.array([True]), fit.parameters)])
+    everywhere = replace(record, values=restore_structure(np.zeros_like(record.matrix), record), weights=None)
+    about = Residuals([system.with_records([everywhere], np.array([True]), fit.parameters)])
     full = about.evaluate(fit.u, state[None])
     if isinstance(full, LostTrial):
-        raise ValueError(about.where(full))
+        raise ValueError(about.describe_failure(full))
     shown = np.where(about.batches[0].weights[0] > 0, full.residuals[0][0], np.nan)  # NaN before a delay is over
-    return replace(record, values=in_structure(shown, record)), full.slopes[0][0]
+    return replace(record, values=restore_structure(shown, record)), full.slopes[0][0]
 
 
-def _start_read_off(record: Record, about: SystemResiduals, numbers: np.ndarray) -> np.ndarray:
+def _read_start(record: Record, about: SystemResiduals, numbers: np.ndarray) -> np.ndarray:
     """The first state of a record from local polynomials. Raises where its signals are no positions."""
-    reader = reader_of(record, about, numbers)
+    reader = build_reader(record, about, numbers)
     if reader is not None:
         return reader.states(np.array([0]))[0]
     if about.signals.look_like_positions(record):
@@ -150,8 +150,8 @@ def planned_rows(fit, part: SystemPart, name: str, record: Record) -> np.ndarray
         )
     state = known_start(record, part.system.layout, 0, fit.params)
     assert state is not None
-    planned, slopes = _followed(fit, part.system, record, state)
-    sigma = part.of_sensors(fit.widths).sigma[:, None]
+    planned, slopes = _follow_record(fit, part.system, record, state)
+    sigma = part.sensor_noise(fit.widths).sigma[:, None]
     weights = planned.weight_matrix[..., None] * (effective_share(fit) / sigma**2)
     rows, states = np.sqrt(weights) * slopes, part.system.states
     own = rows[..., states:]

@@ -77,19 +77,19 @@ def comparison(fits: dict[str, Any], folds: int) -> Comparison:
     bic = tuple(float(np.log(count) * k - 2 * log) for k, log in zip(free, logs, strict=True))
     names, best, left = tuple(fits), int(np.argmin(bic)), None
     if folds:
-        apart = [left_out(fit.question, fit.u, fit.states, fit.law, fit.widths, folds) for fit in fits.values()]
-        left, best = tuple(rms for rms, _ in apart), _simplest(free, np.array([scores for _, scores in apart]))
+        apart = [cross_validate(fit.question, fit.u, fit.states, fit.law, fit.widths, folds) for fit in fits.values()]
+        left, best = tuple(rms for rms, _ in apart), _choose_simplest(free, np.array([scores for _, scores in apart]))
     rows = _table(names, free, logs, aic, bic, left)
     margin = np.partition(np.array(bic), 1)[1] - min(bic)
     by_bic = names[int(np.argmin(bic))]
-    rows.append(f"The data prefer {_called(by_bic)} fit, by {margin:.1f} in BIC ({count:.0f} effective samples).")
+    rows.append(f"The data prefer {_fit_label(by_bic)} fit, by {margin:.1f} in BIC ({count:.0f} effective samples).")
     if left is not None:
-        simplest = _called(names[best])
+        simplest = _fit_label(names[best])
         rows.append(f"Left out in {folds} groups, no record is followed better than by {simplest} fit, but for chance.")
     return Comparison(names, free, logs, aic, bic, left, names[best], "\n".join(rows))
 
 
-def _simplest(free: tuple[int, ...], scores: np.ndarray) -> int:
+def _choose_simplest(free: tuple[int, ...], scores: np.ndarray) -> int:
     """The fit with the fewest free numbers whose scores (fits, groups) are no worse than those of the best.
 
     Source: Hastie, Tibshirani & Friedman, *The Elements of Statistical Learning* (2009), §7.10: one standard error.
@@ -104,7 +104,7 @@ def _simplest(free: tuple[int, ...], scores: np.ndarray) -> int:
     return int(min(as_good, key=lambda i: (free[i], means[i])))
 
 
-def _called(name: str) -> str:
+def _fit_label(name: str) -> str:
     return name if name in ("this", "the other") else f"the {name!r}"
 
 
@@ -118,7 +118,7 @@ def _table(names, free, logs, aic, bic, left) -> list[str]:
     return rows
 
 
-def left_out(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths: NoiseScale, folds: int):
+def cross_validate(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths: NoiseScale, folds: int):
     """The root mean square residuals by signal of records that were left out, and for each group their mean logarithm.
 
     Infinite where one cannot be followed. A signal that only the records left out have is as noisy as `widths` (S,) of
@@ -129,12 +129,12 @@ def left_out(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths
     groups = np.array([piece.record for piece in question.pieces]) % folds
     squares, weights = dict.fromkeys(question.names, 0.0), dict.fromkeys(question.names, 0.0)
     for group in range(folds):
-        rest = _part(question, groups != group)
+        rest = _select_pieces(question, groups != group)
         done = minimise(rest, u, states[groups != group], law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
         if isinstance(done, LostTrial):
             return failed
-        apart = _part(question, groups == group).with_parameters(question.parameters.kept(done.point.u))
-        known = _of_signals(apart.names, (question.names, widths), (rest.names, done.widths))
+        apart = _select_pieces(question, groups == group).with_parameters(question.parameters.fix(done.point.u))
+        known = _collect_noise(apart.names, (question.names, widths), (rest.names, done.widths))
         end = minimise(apart, np.zeros(0), states[groups == group], Known(known), _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
         if isinstance(end, LostTrial):
             return failed
@@ -147,15 +147,15 @@ def left_out(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths
     return rms, scores
 
 
-def _of_signals(names: tuple[str, ...], *known: tuple[tuple[str, ...], NoiseScale]) -> NoiseScale:
+def _collect_noise(names: tuple[str, ...], *known: tuple[tuple[str, ...], NoiseScale]) -> NoiseScale:
     """The noise of signals by their names, from the last of several that knows it."""
     found = {name: one for own, widths in known for name, one in zip(own, zip(*widths, strict=True), strict=True)}
     return NoiseScale(*(np.array(numbers) for numbers in zip(*(found[name] for name in names), strict=True)))
 
 
-def _part(question: Residuals, keep: np.ndarray) -> Residuals:
+def _select_pieces(question: Residuals, keep: np.ndarray) -> Residuals:
     """The residuals of some of the pieces, without a watch."""
-    part = question.of([p for p, k in zip(question.pieces, keep, strict=True) if k], question.fitted[keep])
+    part = question.with_pieces([p for p, k in zip(question.pieces, keep, strict=True) if k], question.fitted[keep])
     part.watch = None
     return part
 
@@ -214,7 +214,7 @@ class _Place(NamedTuple):
     deviance: float
 
 
-class _Line:
+class _ProfileLine:
     """The values of one unknown, each of which begins from its neighbours."""
 
     def __init__(self, question: Residuals, u, starts, widths: NoiseScale, known: Information, which: int):
@@ -224,7 +224,7 @@ class _Line:
         self.wide = min(float(np.sqrt(reported)), float(question.parameters.reach[which]))
         done = minimise(question, u, starts, Known(widths), _ENOUGH, _TRIALS)
         if isinstance(done, LostTrial):
-            raise ValueError(question.where(done))
+            raise ValueError(question.describe_failure(done))
         self.u, point = done.point.u, done.point
         self.best = log_likelihood(widths, point.flat(), question.weights)
         self.places = [_Place(float(self.u[which]), np.delete(self.u, which), point.starts, 0.0)]
@@ -236,7 +236,7 @@ class _Line:
             return again[0]
         u = self.u.copy()
         u[self.which] = at
-        question = self.question.with_parameters(self.question.parameters.kept(u, self.which))
+        question = self.question.with_parameters(self.question.parameters.fix(u, self.which))
         for others, starts in self._guesses(at):
             done = minimise(question, others, starts, Known(self.widths), _ENOUGH, _TRIALS)
             if not isinstance(done, LostTrial):
@@ -269,10 +269,10 @@ class _Line:
 def profile(question: Residuals, u, starts, widths: NoiseScale, known: Information, name: str, level: float) -> Profile:
     """The profile of the free number called `name`."""
     parameters = question.parameters
-    line = _Line(question, u, starts, widths, known, parameters.unknown(name))
+    line = _ProfileLine(question, u, starts, widths, known, parameters.unknown(name))
     dof = max(float(known.effective.sum()) - len(u), 1.0)
     threshold = float(stdtrit(dof, 0.5 + 0.5 * level) ** 2)
-    ends = [_end(line, side, threshold, parameters.room[line.which]) for side in (-1.0, 1.0)]
+    ends = [_find_end(line, side, threshold, parameters.room[line.which]) for side in (-1.0, 1.0)]
     minima = _minima(line, threshold)
     row = parameters.row(name)
 
@@ -297,7 +297,7 @@ def _end_value(value, end: float) -> float:
     return value(end) if np.isfinite(end) else end
 
 
-def _end(line: _Line, side: float, threshold: float, room: float) -> float:
+def _find_end(line: _ProfileLine, side: float, threshold: float, room: float) -> float:
     """The place where the profile first passes the threshold on one side, ±∞ where it does not within `room`.
 
     Its places go on behind the end, as far as other minima are looked for.
@@ -309,7 +309,7 @@ def _end(line: _Line, side: float, threshold: float, room: float) -> float:
     for _ in range(_MOST):
         deviance = line.deviance(best + side * offset)
         if end is None and deviance > threshold:
-            end = _root(line, best + side * last, best + side * offset, threshold)
+            end = _locate_root(line, best + side * last, best + side * offset, threshold)
         if offset >= room or np.isinf(deviance) or (end is not None and offset >= look_out):
             break
         if end is not None or np.isinf(wide) or deviance < 0.3 * (offset / wide) ** 2:
@@ -320,15 +320,15 @@ def _end(line: _Line, side: float, threshold: float, room: float) -> float:
     return side * np.inf if end is None else end
 
 
-def _root(line: _Line, below: float, above: float, threshold: float) -> float:
+def _locate_root(line: _ProfileLine, below: float, above: float, threshold: float) -> float:
     """The value where the root of D is that of the threshold: a nearly linear function of the value."""
     if np.isinf(line.deviance(above)):
-        return _last_followed(line, below, above, threshold)
+        return _bisect_find_end(line, below, above, threshold)
     miss = lambda at: np.sqrt(max(line.deviance(at), 0.0)) - np.sqrt(threshold)  # noqa: E731
     return float(cast(float, brentq(miss, below, above, xtol=_EXACT * abs(above - below))))
 
 
-def _last_followed(line: _Line, below: float, above: float, threshold: float) -> float:
+def _bisect_find_end(line: _ProfileLine, below: float, above: float, threshold: float) -> float:
     """The end between a value below the threshold and one that no motion follows; the last followed, if there is none.
 
     Bisection: what cannot be followed is as far off as can be.
@@ -342,7 +342,7 @@ def _last_followed(line: _Line, below: float, above: float, threshold: float) ->
     return below
 
 
-def _minima(line: _Line, threshold: float) -> list[tuple[float, float]]:
+def _minima(line: _ProfileLine, threshold: float) -> list[tuple[float, float]]:
     """Minima of the profile: the fit's own, and those that searches find from where it falls again."""
     own, places = line.places[0], sorted(line.places, key=lambda place: place.at)
     middle = places.index(own)
@@ -361,24 +361,26 @@ def _minima(line: _Line, threshold: float) -> list[tuple[float, float]]:
     return sorted(found, key=lambda one: one[1])
 
 
-def _sentence(of: Profile) -> str:
-    low, high = of.interval
-    percent = f"{100 * of.level:g} %"
-    if of.verdict == "flat":
-        text = f"No value from {of.values.min():.6g} to {of.values.max():.6g} is excluded at {percent}."
-    elif of.verdict == "one-sided" and np.isfinite(low):
-        text = f"At {percent} it is above {low:.6g}; no value up to {of.values.max():.6g} is excluded."
-    elif of.verdict == "one-sided":
-        text = f"At {percent} it is below {high:.6g}; no value down to {of.values.min():.6g} is excluded."
+def _sentence(profile: Profile) -> str:
+    low, high = profile.interval
+    percent = f"{100 * profile.level:g} %"
+    if profile.verdict == "flat":
+        text = f"No value from {profile.values.min():.6g} to {profile.values.max():.6g} is excluded at {percent}."
+    elif profile.verdict == "one-sided" and np.isfinite(low):
+        text = f"At {percent} it is above {low:.6g}; no value up to {profile.values.max():.6g} is excluded."
+    elif profile.verdict == "one-sided":
+        text = f"At {percent} it is below {high:.6g}; no value down to {profile.values.min():.6g} is excluded."
     else:
         text = f"The {percent} interval about the best value is {low:.6g} … {high:.6g}."
-    for value, deviance in of.minima:
+    for value, deviance in profile.minima:
         if deviance < -1e-3:
             text += f" The likelihood is larger at {value:.6g}, by {-0.5 * deviance:.3g} in its logarithm: fit again."
-        elif deviance > 1e-3 and deviance <= of.threshold:
+        elif deviance > 1e-3 and deviance <= profile.threshold:
             text += f" Another minimum at {value:.6g} is not excluded: its deviance is {deviance:.3g}."
-        elif deviance > of.threshold:
-            text += f" Another minimum at {value:.6g} has the deviance {deviance:.3g}, {of.threshold:.3g} excludes it."
-        elif value != of.minima[0][0]:
+        elif deviance > profile.threshold:
+            text += (
+                f" Another minimum at {value:.6g} has the deviance {deviance:.3g}, {profile.threshold:.3g} excludes it."
+            )
+        elif value != profile.minima[0][0]:
             text += f" Another minimum at {value:.6g} is as good."
     return text

@@ -5,8 +5,8 @@ It holds `Form` and `SampleTable` (inputs), `Record` (one recording) and `Sample
 **Inputs.** A scene whose functions ask for `inputs` becomes one whose functions ask for `t` and `params` alone: its
 parameters are those of the user and, beside them, one table of samples (`Driven`), in which the input at the time t is
 looked up (`lagjax.samples`). So a step of machine code ends at every sample, each member of a batch has a table of its
-own, and derivatives go along the user's parameters only. Tables are filled up to a few lengths (`room_for`): a program
-is made for a length, and serves all records.
+own, and derivatives go along the user's parameters only. Tables are filled up to a few lengths (`table_length`): a
+program is made for a length, and serves all records.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ class SampleTable(NamedTuple):
     """The inputs of N pieces of records: I numbers at K instants, `knots` (N, K) and `values` (N, K, I).
 
     Some samples about a piece are among them where its input asks for them, and behind the last one instants that still
-    increase (`table_of`).
+    increase (`build_table`).
     """
 
     knots: np.ndarray
@@ -89,25 +89,25 @@ class Form(NamedTuple):
             self.tree, [part.reshape(part.shape[:-1] + shape) for part, shape in zip(parts, self.shapes, strict=True)]
         )
 
-    def driven(self, system: System) -> System:
+    def drive_scene(self, system: System) -> System:
         """The scene whose parameters are `Driven`."""
         present = [name for name in _FUNCTIONS if getattr(system, name) is not None]
-        wrapped = [_wrapped(getattr(system, name), self) for name in present]
+        wrapped = [_wrap_function(getattr(system, name), self) for name in present]
         return eqx.tree_at(lambda s: [getattr(s, name) for name in present], system, wrapped)
 
-    def along(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
+    def bind_samples(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
         """The scene with inputs (K, I) sampled at `ts` (K,), and its parameters, as `simulate` takes them."""
-        if not asks(system) or not isinstance(system, System):
+        if not input_functions(system) or not isinstance(system, System):
             return system, params
-        table = table_of([(ts, inputs)], self.hold)
-        return self.driven(system), Driven(params, table.knots[0], table.values[0])
+        table = build_table([(ts, inputs)], self.hold)
+        return self.drive_scene(system), Driven(params, table.knots[0], table.values[0])
 
     def params(self, params: PyTree, room: int) -> Driven:
         """Parameters of the driven scene, with a table of zeros of this many instants: a structure."""
         return Driven(params, np.arange(float(room)), np.zeros((room, self.size)))
 
 
-class _Looked(eqx.Module):
+class _FunctionOfInputs(eqx.Module):
     """A function of the user, for parameters that are `Driven`."""
 
     function: Function
@@ -124,18 +124,18 @@ class _Looked(eqx.Module):
         return self.function(*roles, **extras)
 
 
-def _wrapped(function: Function, form: Form) -> Function:
-    arrays, code = eqx.partition(_Looked(function, form), eqx.is_array)
+def _wrap_function(function: Function, form: Form) -> Function:
+    arrays, code = eqx.partition(_FunctionOfInputs(function, form), eqx.is_array)
     return Function(arrays, Edition.of(code), ("t", "params"))
 
 
-def asks(scene: Scene) -> list[str]:
+def input_functions(scene: Scene) -> list[str]:
     """The functions of a scene that ask for `inputs`."""
     functions = ((name, getattr(law, name)) for law in laws(scene) for name in _FUNCTIONS)
     return [name for name, function in functions if function is not None and "inputs" in function.extras]
 
 
-def room_for(count: int) -> int:
+def table_length(count: int) -> int:
     """The length of a table that is to hold `count` samples and one more."""
     room = _LEAST_ROOM
     while room <= count:
@@ -143,12 +143,12 @@ def room_for(count: int) -> int:
     return room
 
 
-def table_of(pieces: list[tuple[np.ndarray, np.ndarray]], hold: str) -> SampleTable:
+def build_table(pieces: list[tuple[np.ndarray, np.ndarray]], hold: str) -> SampleTable:
     """The tables of N pieces, each given by its times (k,) and inputs (k, I), side by side.
 
     What they are filled up with changes nothing up to the last sample: functions of time are those of (k,) samples.
     """
-    room, size = room_for(max(len(ts) for ts, _ in pieces) + MARGINS[hold]), pieces[0][1].shape[1]
+    room, size = table_length(max(len(ts) for ts, _ in pieces) + MARGINS[hold]), pieces[0][1].shape[1]
     knots, values = np.zeros((len(pieces), room)), np.zeros((len(pieces), room, size))
     for row, (ts, inputs) in enumerate(pieces):
         count = len(ts)
@@ -158,13 +158,13 @@ def table_of(pieces: list[tuple[np.ndarray, np.ndarray]], hold: str) -> SampleTa
     return SampleTable(knots, values)
 
 
-def at_instants(ts: np.ndarray, inputs: np.ndarray) -> SampleTable:
+def constant_tables(ts: np.ndarray, inputs: np.ndarray) -> SampleTable:
     """Tables that hold one input each, `inputs` (M, I), at and after its time `ts` (M,)."""
     later = np.maximum(1.0, np.abs(ts))
     return SampleTable(np.stack([ts, ts + later], axis=1), np.stack([inputs, inputs], axis=1))
 
 
-def looked_up(ts: np.ndarray, inputs: np.ndarray, at: np.ndarray) -> np.ndarray:
+def interpolate_inputs(ts: np.ndarray, inputs: np.ndarray, at: np.ndarray) -> np.ndarray:
     """The inputs (M, I) at the times `at` (M,), on lines between samples (T, I) at `ts` (T,)."""
     return np.stack([np.interp(at, ts, column) for column in inputs.T], axis=-1)
 
@@ -181,10 +181,10 @@ def samples_between(ts: np.ndarray, begin: float, end: float, hold: str) -> slic
 def inputs_at(table: SampleTable, ts, hold: str) -> tuple[Any, Any]:
     """The inputs (N, T, I) at the times `ts` (N, T) of the pieces of a table, and their rates there."""
 
-    def of(knots, values, ts):
+    def evaluate(knots, values, ts):
         return jax.jvp(samples(knots, values, hold), (ts,), (jnp.ones_like(ts),))
 
-    return jax.vmap(of)(table.knots, table.values, ts)
+    return jax.vmap(evaluate)(table.knots, table.values, ts)
 
 
 class Guess(NamedTuple):
@@ -298,12 +298,12 @@ class Record(MeasuredSignal):
     def input_matrix(self) -> np.ndarray:
         """All inputs at the times of the record, side by side, (T, I): on lines, where they have times of their own.
 
-        That is for where a search begins. What a trial sees is what `hold` makes of them (`_side_by_side`).
+        That is for where a search begins. What a trial sees is what `hold` makes of them (`_stack_pieces`).
         """
         known = self.input_samples
         if self.input_ts is None or not known.shape[1]:
             return np.zeros((len(self), 0)) if not known.shape[1] else known
-        return looked_up(self.input_ts, known, self.ts)
+        return interpolate_inputs(self.input_ts, known, self.ts)
 
     @property
     def input_structure(self) -> tuple | None:
@@ -455,21 +455,21 @@ def _matrix_of_weights(record: Record) -> np.ndarray:
     return np.where(np.isnan(record.matrix), 0.0, matrix)
 
 
-def in_structure(matrix: np.ndarray, record) -> PyTree:
+def restore_structure(matrix: np.ndarray, record) -> PyTree:
     """Signals (T, S) in the structure of a record's values, or times (M, 1) in that of its times."""
     if not isinstance(record, Record):
         return record.restore(matrix)
-    return _taken_apart(matrix, record.structure)
+    return _split_columns(matrix, record.structure)
 
 
 def inputs_between(record: Record, ts: np.ndarray) -> PyTree:
     """The inputs of a record at other times, on lines between the samples; None where it has none."""
     if record.input_structure is None:
         return None
-    return _taken_apart(looked_up(record.sampled_at, record.input_samples, ts), record.input_structure)
+    return _split_columns(interpolate_inputs(record.sampled_at, record.input_samples, ts), record.input_structure)
 
 
-def _taken_apart(matrix: np.ndarray, structure: tuple) -> PyTree:
+def _split_columns(matrix: np.ndarray, structure: tuple) -> PyTree:
     tree, shapes = structure
     sizes = [int(np.prod(shape)) for shape in shapes]
     columns = np.split(matrix, np.cumsum(sizes)[:-1], axis=1)
@@ -488,7 +488,7 @@ class Piece(NamedTuple):
     places: np.ndarray
 
 
-def whole(records: list[Record]) -> list[Piece]:
+def whole_pieces(records: list[Record]) -> list[Piece]:
     """Every record in one piece."""
     return [Piece(k, np.arange(len(record))) for k, record in enumerate(records)]
 
@@ -521,10 +521,10 @@ def batches(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16, hold:
         if not groups or 2 * lengths[row] < lengths[groups[-1][0]]:
             groups.append([])
         groups[-1].append(row)
-    return [_side_by_side(records, pieces, np.sort(rows), eps, hold) for rows in groups]
+    return [_stack_pieces(records, pieces, np.sort(rows), eps, hold) for rows in groups]
 
 
-def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, eps: float, hold: str) -> Samples:
+def _stack_pieces(records: list[Record], pieces: list[Piece], rows: np.ndarray, eps: float, hold: str) -> Samples:
     longest, signals = max(len(pieces[row].places) for row in rows), records[pieces[rows[0]].record].matrix.shape[1]
     ts = np.zeros((len(rows), longest))
     values, weights = np.zeros((2, len(rows), longest, signals))
@@ -545,7 +545,7 @@ def _side_by_side(records: list[Record], pieces: list[Piece], rows: np.ndarray, 
         sampled.append((at[between], samples[between]))
         if records[record].input_ts is None:
             inputs[i, :count], inputs[i, count:] = samples[places], samples[places[-1]]
-    table = table_of(sampled, hold) if driven.shape[1] else None
+    table = build_table(sampled, hold) if driven.shape[1] else None
     if table is not None and any(records[pieces[row].record].input_ts is not None for row in rows):
         inputs = np.asarray(inputs_at(table, ts, hold)[0])
     return Samples(rows, ts, values, weights, inputs, table)
@@ -598,7 +598,7 @@ def known_start(record: MeasuredSignal, layout: Layout, place: int, params: PyTr
     """The state (2n,) that a record says it starts from, known, guessed or of `params`; None where it says nothing."""
     if record.start is None:
         return None
-    q, qdot = started(record.start, params)
+    q, qdot = start_pair(record.start, params)
     own = Layout.of(q, qdot)
     if (own.tree, own.shapes) != (layout.tree, layout.shapes):
         raise ValueError(
@@ -610,15 +610,15 @@ def known_start(record: MeasuredSignal, layout: Layout, place: int, params: PyTr
     return state
 
 
-def started(start, params: PyTree) -> tuple[PyTree, PyTree]:
+def start_pair(start, params: PyTree) -> tuple[PyTree, PyTree]:
     """The pair (q0, qdot0) of a start that is there. Raises `TypeError` where a function returns something else."""
     pair = start(params) if callable(start) else start
     if not (isinstance(pair, tuple) and len(pair) == 2):
         raise TypeError(f"start, as a function of the parameters, must return (q0, qdot0); got {pair!r}.")
-    return jax.tree.map(_as_float, pair[0]), jax.tree.map(_as_float, pair[1])
+    return jax.tree.map(_convert_to_float, pair[0]), jax.tree.map(_convert_to_float, pair[1])
 
 
-def _as_float(number):
+def _convert_to_float(number):
     """A number or an array of a start: whole numbers too mean real ones."""
     if not eqx.is_array_like(number) or jnp.issubdtype(kind := jnp.result_type(number), jnp.complexfloating):
         raise TypeError(f"A start must hold real numbers; got {number!r}.")

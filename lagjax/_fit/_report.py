@@ -43,7 +43,7 @@ def draw_record(axes, record: Record, residuals: np.ndarray, names: tuple[str, .
         above.set_title(name, fontsize="medium")
         below.set_xlabel("t")
         for ax in (above, below):
-            plain(ax)
+            style_axes(ax)
             ax.set_xlim(record.ts[0], record.ts[-1])
         above.tick_params(labelbottom=False)
     axes[0][0].set_ylabel("signal")
@@ -56,7 +56,7 @@ def draw_waterfall(ax, misfits: np.ndarray) -> None:
     known = np.isfinite(misfits)
     ax.plot(np.arange(1, len(misfits) + 1)[known], misfits[known], "o-", color=BLUE, markersize=3, linewidth=1)
     ax.set(yscale="log", xlabel="start, in order", ylabel="misfit / signals")
-    plain(ax)
+    style_axes(ax)
 
 
 def draw_correlations(ax, matrix: np.ndarray, names: tuple[str, ...]) -> None:
@@ -85,10 +85,10 @@ def draw_residuals(ax, residuals: np.ndarray, sigma: np.ndarray, names: tuple[st
     ax.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), color=GREY, linewidth=1, label="normal")
     ax.set(yscale="log", ylim=(1e-4, 2), xlabel="residual / σ", ylabel="density")
     ax.legend(frameon=False, fontsize="small")
-    plain(ax)
+    style_axes(ax)
 
 
-def plain(ax) -> None:
+def style_axes(ax) -> None:
     """A light grid behind the data and no box around it."""
     ax.grid(color="0.9", linewidth=0.8)
     ax.set_axisbelow(True)
@@ -148,12 +148,12 @@ class Drawn(NamedTuple):
     sigma: np.ndarray
 
 
-def pictures_of(systems: list[Drawn], covariance, waterfall) -> dict[str, list[str]]:
+def build_pictures(systems: list[Drawn], covariance, waterfall) -> dict[str, list[str]]:
     """The pictures of a fit by their headings."""
     figures = {}
     for system in systems:
         of_one = "" if system.name is None else f"{system.name}: "
-        figures |= {of_one + heading: pictures for heading, pictures in _of_records(*system[1:]).items()}
+        figures |= {of_one + heading: pictures for heading, pictures in _record_figures(*system[1:]).items()}
     side = min(3.2 + 0.45 * len(covariance.names), 12.0)
     if covariance.names:
         figures["Correlations of the parameters"] = [
@@ -166,7 +166,7 @@ def pictures_of(systems: list[Drawn], covariance, waterfall) -> dict[str, list[s
     return figures
 
 
-def _of_records(records, residuals: list[np.ndarray], names, sigma) -> dict[str, list[str]]:
+def _record_figures(records, residuals: list[np.ndarray], names, sigma) -> dict[str, list[str]]:
     """Data over fit of the records of one system, whose residuals are (T, S), by their headings."""
     count = min(len(names), _SIGNALS)
 
@@ -200,7 +200,7 @@ _LISTED = 8  # numbers of one array that a table lists; of more it says how many
 def lab_book(fit) -> str:
     """The table of parameters, the noise of the signals, what is not seen, and the verdict."""
     lines = [
-        title_of(fit),
+        build_title(fit),
         "",
         *_table_of_parameters(fit),
         "",
@@ -214,7 +214,7 @@ def lab_book(fit) -> str:
     return "\n".join(lines)
 
 
-def title_of(fit) -> str:
+def build_title(fit) -> str:
     samples = sum(noise.samples for noise in fit.noise.values())
     spans = [record.ts[-1] - record.ts[0] for record in fit.records]
     plural = "s" if len(fit.records) > 1 else ""

@@ -27,11 +27,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit._motions import AbstractMotions, Manifold, Origins, Placed, RecordMotion
+from lagjax._fit._motions import AbstractMotions, Manifold, Origins, ProjectedStarts, RecordMotion
 from lagjax._fit._noise import AbstractNoise, NoiseScale, counts
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Driven, Piece, Samples, asks, at_instants, batches, inputs_at, started, whole
-from lagjax._fit._sensors import Signals, on_circle
+from lagjax._fit._records import (
+    Driven,
+    Piece,
+    Samples,
+    batches,
+    constant_tables,
+    input_functions,
+    inputs_at,
+    start_pair,
+    whole_pieces,
+)
+from lagjax._fit._sensors import Signals, wrap_residuals
 from lagjax._fit._timings import Clock
 from lagjax._hybrid import Scene, follow
 from lagjax._layout import Layout, halves
@@ -63,7 +73,7 @@ class LostTrial(NamedTuple):
     text: str
 
 
-class _Trial(NamedTuple):
+class _PendingTrial(NamedTuple):
     """One trial of a system under way: the parameters (P,) and their directions (F, P), the starts, how these move
     with the unknown states, (N, 2n, 2n) or None for the identity, and with u, (N, F, 2n); and what is known so far."""
 
@@ -110,7 +120,7 @@ class SystemResiduals:
         self.motions, self.signals, self.parameters = motions, signals, parameters
         self.layout: Layout = signals.layout
         self.states = 2 * self.layout.size
-        self.batches: list[Samples] = self._in_batches()
+        self.batches: list[Samples] = self._build_batches()
         starts = [records[piece.record].start if piece.places[0] == 0 else None for piece in pieces]
         self.origins = Origins(starts, self.layout, parameters)
 
@@ -120,22 +130,22 @@ class SystemResiduals:
         other.parameters = parameters
         return other
 
-    def of(self, pieces: list[Piece], fitted: np.ndarray) -> "SystemResiduals":
+    def with_pieces(self, pieces: list[Piece], fitted: np.ndarray) -> "SystemResiduals":
         """The residuals of other pieces of the records."""
         return SystemResiduals(
             self.name, self.scene, self.records, pieces, fitted, self.motions, self.signals, self.parameters,
             self.size, self.rtol, self.clocks, self.manifold,
         )  # fmt: skip
 
-    def of_records(
+    def with_records(
         self, records: list[Any], fitted: np.ndarray, parameters: Parameters | None = None,
         manifold: Manifold | None = None,
     ) -> "SystemResiduals":  # fmt: skip
         """The residuals of other records of the system with the same signals, each in one piece."""
         parameters = self.parameters if parameters is None else parameters
         return SystemResiduals(
-            self.name, self.scene, records, whole(records), fitted, self.motions, self.signals, parameters, self.size,
-            self.rtol, None, manifold,
+            self.name, self.scene, records, whole_pieces(records), fitted, self.motions, self.signals, parameters,
+            self.size, self.rtol, None, manifold,
         )  # fmt: skip
 
     def columns(self, record: int) -> slice:
@@ -143,7 +153,7 @@ class SystemResiduals:
         last = len(self.signals.names)
         return slice(last, last + 1) if record in self.clocks else slice(0, last)
 
-    def _in_batches(self) -> list[Samples]:
+    def _build_batches(self) -> list[Samples]:
         """The records in batches, then each of the timings as a batch of its own, all with a column for each signal."""
         sensed = [row for row, piece in enumerate(self.pieces) if piece.record not in self.clocks]
         eps, hold = (
@@ -159,9 +169,9 @@ class SystemResiduals:
                 found.append(
                     Samples(np.array([row]), values[..., 0], values, weights, np.zeros((1, len(record), 0)), None)
                 )
-        return [self._widened(batch) for batch in found]
+        return [self._widen_columns(batch) for batch in found]
 
-    def _widened(self, batch: Samples) -> Samples:
+    def _widen_columns(self, batch: Samples) -> Samples:
         columns = self.columns(self.pieces[batch.rows[0]].record)
         values, weights = np.zeros((2, *batch.ts.shape, len(self.names)))
         values[..., columns], weights[..., columns] = batch.values, batch.weights
@@ -176,60 +186,66 @@ class SystemResiduals:
 
         The motions of all trials are one run for every batch of pieces.
         """
-        found: list[Any] = [self._begin(*one) for one in zip(u, starts, strict=True)]
+        found: list[Any] = [self._begin_trial(*one) for one in zip(u, starts, strict=True)]
         for batch in self.batches:
-            going = [k for k, trial in enumerate(found) if isinstance(trial, _Trial)]
-            for k, shown in zip(going, self._shown(batch, [found[k] for k in going]), strict=True):
+            going = [k for k, trial in enumerate(found) if isinstance(trial, _PendingTrial)]
+            for k, shown in zip(going, self._evaluate_signals(batch, [found[k] for k in going]), strict=True):
                 if isinstance(shown, LostTrial):
                     found[k] = shown
                 else:
-                    self._collect(batch, found[k], *shown)
+                    self._append_residuals(batch, found[k], *shown)
         return [
-            one if isinstance(one, LostTrial) else Trial(at, one.starts, one.residuals, one.slopes, self._across(one))
+            one
+            if isinstance(one, LostTrial)
+            else Trial(at, one.starts, one.residuals, one.slopes, self._normal_projector(one))
             for at, one in zip(u, found, strict=True)
         ]
 
-    def _begin(self, u: np.ndarray, starts: np.ndarray) -> _Trial | LostTrial:
+    def _begin_trial(self, u: np.ndarray, starts: np.ndarray) -> _PendingTrial | LostTrial:
         """The trial u (F,), starts (N, 2n), at the starts of its motions."""
         numbers, directions = self.parameters.numbers(u), self.parameters.directions(u)
         starts, moved = self.origins.move(starts, numbers, directions)
         tangents = None
         if self.manifold is not None and self.fitted.any():
-            starts, tangents, moved = self._placed(starts, moved, numbers, directions)
+            starts, tangents, moved = self._project_starts(starts, moved, numbers, directions)
             if (lost := ~np.isfinite(starts).all(axis=1)).any():
                 return LostTrial(
                     int(np.argmax(lost)), "No start near the one that was tried satisfies the constraints."
                 )
         if not (np.isfinite(numbers).all() and np.isfinite(directions).all() and np.isfinite(starts).all()):
             return LostTrial(0, "A parameter is not finite.")
-        return _Trial(numbers, directions, starts, tangents, moved, [], [])
+        return _PendingTrial(numbers, directions, starts, tangents, moved, [], [])
 
-    def _placed(self, starts, moved, numbers, directions) -> Placed:
+    def _project_starts(self, starts, moved, numbers, directions) -> ProjectedStarts:
         """The starts that are fitted put on the constraints; the others as they are."""
         assert self.manifold is not None
         t = np.array([self.records[piece.record].ts[piece.places[0]] for piece in self.pieces])
-        some, free = self.fitted, Placed(starts, np.tile(np.eye(self.states), (len(starts), 1, 1)), moved)
-        for mine, new in zip(free, self.manifold.put(starts[some], t[some], numbers, directions), strict=True):
+        some, free = self.fitted, ProjectedStarts(starts, np.tile(np.eye(self.states), (len(starts), 1, 1)), moved)
+        for mine, new in zip(free, self.manifold.project(starts[some], t[some], numbers, directions), strict=True):
             mine[some] = new
         return free
 
-    def _across(self, trial: _Trial) -> np.ndarray | None:
+    def _normal_projector(self, trial: _PendingTrial) -> np.ndarray | None:
         """The part of a change of each start across the constraints (N, 2n, 2n), None where there are none."""
         if trial.tangents is None:
             return None
         return np.where(self.fitted[:, None, None], np.eye(self.states) - trial.tangents, 0.0)
 
-    def _shown(self, batch: Samples, trials: list[_Trial]) -> list[tuple[np.ndarray, np.ndarray] | LostTrial]:
+    def _evaluate_signals(
+        self, batch: Samples, trials: list[_PendingTrial]
+    ) -> list[tuple[np.ndarray, np.ndarray] | LostTrial]:
         """The signals of each trial for a batch (N, T, S), and their tangents (N, T, S, D)."""
         clock = self.clocks.get(self.pieces[batch.rows[0]].record)
         if clock is not None:
-            return [self._timed(clock, batch, trial) for trial in trials]
+            return [self._evaluate_times(clock, batch, trial) for trial in trials]
         if self.signals.delays is not None:
-            return [self._checked(batch, self._delayed(batch, trial)) for trial in trials]
+            return [self._check_signals(batch, self._evaluate_delayed(batch, trial)) for trial in trials]
         motions = self._follow(batch, batch.ts, trials)
-        return [self._checked(batch, self._sensed(batch, *one)) for one in zip(trials, motions, strict=True)]
+        return [
+            self._check_signals(batch, self._observe_motion(batch, *one)) for one in zip(trials, motions, strict=True)
+        ]
 
-    def _follow(self, batch: Samples, ts: np.ndarray, trials: list[_Trial]) -> list[RecordMotion | LostTrial]:
+    def _follow(self, batch: Samples, ts: np.ndarray, trials: list[_PendingTrial]) -> list[RecordMotion | LostTrial]:
         """The motions of each trial at the times `ts` (N, T) of the pieces of a batch, in one run of all."""
         if not trials:
             return []
@@ -247,12 +263,12 @@ class SystemResiduals:
         for k in range(count):
             part = RecordMotion(*(x[k * members : (k + 1) * members] for x in motion))
             if not part.ok:
-                row, text = part.why_not(ts, self.layout)
+                row, text = part.describe_failure(ts, self.layout)
                 part = LostTrial(int(batch.rows[row]), text)
             found.append(part)
         return found
 
-    def _directions(self, batch: Samples, trial: _Trial) -> tuple[np.ndarray, np.ndarray]:
+    def _directions(self, batch: Samples, trial: _PendingTrial) -> tuple[np.ndarray, np.ndarray]:
         """Directions of the starts (N, D, 2n) and of the parameters (D, P): D = 2n + F, or F where no start is free."""
         directions, states = trial.directions, self.states if self.fitted[batch.rows].any() else 0
         y0_dot = np.zeros((len(batch.rows), states + len(directions), self.states))
@@ -262,18 +278,18 @@ class SystemResiduals:
         y0_dot[:, states:] = trial.moved[batch.rows]
         return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
 
-    def _sensed(self, batch: Samples, trial: _Trial, motion: RecordMotion | LostTrial):
+    def _observe_motion(self, batch: Samples, trial: _PendingTrial, motion: RecordMotion | LostTrial):
         """The signals of a motion, and their tangents."""
         if isinstance(motion, LostTrial):
             return motion
-        return self.signals.of(motion, batch.ts, batch.inputs, trial.numbers, self._directions(batch, trial)[1])
+        return self.signals.evaluate(motion, batch.ts, batch.inputs, trial.numbers, self._directions(batch, trial)[1])
 
-    def _delayed(self, batch: Samples, trial: _Trial) -> tuple[np.ndarray, np.ndarray] | LostTrial:
+    def _evaluate_delayed(self, batch: Samples, trial: _PendingTrial) -> tuple[np.ndarray, np.ndarray] | LostTrial:
         """The signals of one trial, of each delay those that have it at earlier times, and their tangents."""
         delays, signals, numbers = self.signals.delays, self.signals, trial.numbers
         assert delays is not None
         numbers_dot = self._directions(batch, trial)[1]
-        each = delays.at(numbers)
+        each = delays.evaluate(numbers)
         if text := delays.refuses(each):
             return LostTrial(int(batch.rows[0]), text)
         values = np.zeros((*batch.ts.shape, len(signals.names)))
@@ -286,10 +302,10 @@ class SystemResiduals:
             inputs, rates = self._inputs_at(batch, ts)
             ts_dot = -numbers_dot @ delay.slopes
             y, n = motion.path.reshape(-1, self.states), self.layout.size
-            pulled = self.motions.rate(ts.ravel(), y, numbers, at_instants(ts.ravel(), inputs.reshape(len(y), -1)))
+            pulled = self.motions.rate(ts.ravel(), y, numbers, constant_tables(ts.ravel(), inputs.reshape(len(y), -1)))
             rate = np.concatenate([y[:, n:], pulled], axis=1).reshape(motion.path.shape)
             motion = motion._replace(tangents=motion.tangents + ts_dot[:, None, None] * rate[:, None])
-            some = signals.of(motion, ts, inputs, numbers, numbers_dot, ts_dot, rates)
+            some = signals.evaluate(motion, ts, inputs, numbers, numbers_dot, ts_dot, rates)
             values[..., delay.signals], slopes[..., delay.signals, :] = (x[:, :, delay.signals] for x in some)
         return values, slopes
 
@@ -300,7 +316,7 @@ class SystemResiduals:
         values, rates = inputs_at(batch.table, ts, self.signals.form.hold)
         return np.asarray(values), np.asarray(rates)
 
-    def _checked(self, batch: Samples, shown: tuple[np.ndarray, np.ndarray] | LostTrial):
+    def _check_signals(self, batch: Samples, shown: tuple[np.ndarray, np.ndarray] | LostTrial):
         """The signals and their tangents; a failure where one that counts is not finite."""
         if isinstance(shown, LostTrial):
             return shown
@@ -317,18 +333,20 @@ class SystemResiduals:
             )
         return shown
 
-    def _timed(self, clock: Clock, batch: Samples, trial: _Trial):
+    def _evaluate_times(self, clock: Clock, batch: Samples, trial: _PendingTrial):
         """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D); or a failure."""
         y0, numbers = trial.starts[batch.rows[0]], trial.numbers
         y0_dot, numbers_dot = self._directions(batch, trial)
-        times, slopes = map(np.asarray, clock.along(y0, numbers, y0_dot[0], numbers_dot))
+        times, slopes = map(np.asarray, clock.tangents(y0, numbers, y0_dot[0], numbers_dot))
         if not np.isfinite(times).all():
-            return LostTrial(int(batch.rows[0]), clock.why_not(y0, numbers))
+            return LostTrial(int(batch.rows[0]), clock.describe_failure(y0, numbers))
         if not np.isfinite(slopes).all():
             return LostTrial(int(batch.rows[0]), "The derivatives of its crossing times are not finite.")
         return times[None, :, None], slopes[None, :, None]
 
-    def _collect(self, batch: Samples, trial: _Trial, values: np.ndarray, by_unknowns: np.ndarray) -> None:
+    def _append_residuals(
+        self, batch: Samples, trial: _PendingTrial, values: np.ndarray, by_unknowns: np.ndarray
+    ) -> None:
         """Append the residuals of one batch and their derivatives, with a column for every signal."""
         counted, columns = batch.weights > 0, self.columns(self.pieces[batch.rows[0]].record)
         missing = self.states + len(self.parameters) - by_unknowns.shape[-1]  # of starts, where none is free
@@ -336,12 +354,12 @@ class SystemResiduals:
         by_unknowns[~self.fitted[batch.rows], ..., : self.states] = 0.0
         left, moved = np.zeros(counted.shape), np.zeros(counted.shape + by_unknowns.shape[3:])
         left[..., columns], moved[..., columns, :] = values, by_unknowns
-        trial.residuals.append(np.where(counted, on_circle(left - batch.values, self.periods), 0.0))
+        trial.residuals.append(np.where(counted, wrap_residuals(left - batch.values, self.periods), 0.0))
         trial.slopes.append(np.where(counted[..., None], moved, 0.0))
 
     # ---- the same for JAX ----
 
-    def traced(self, batch: Samples, u, starts):
+    def trace_residuals(self, batch: Samples, u, starts):
         """The residuals of one batch, (N, T, S), at u (F,) and the starts (N, 2n) of its pieces, for JAX: gradients
         come back over the steps of the motions. NaN where one could not be followed."""
         layout, signals = self.layout, self.signals
@@ -352,37 +370,37 @@ class SystemResiduals:
             times = self.clocks[record].times(starts[0], numbers)
             shown = jnp.zeros(batch.values.shape).at[0, :, -1].set(times)
             return jnp.where(batch.weights > 0, shown - batch.values, 0.0)
-        form = signals.form if signals.form is not None and asks(self.scene) else None
+        form = signals.form if signals.form is not None and input_functions(self.scene) else None
         scene = self.scene
         if form is not None and isinstance(scene, System):
-            scene = form.driven(scene)
+            scene = form.drive_scene(scene)
 
         def sense(ts, y0, inputs, table):
             q, qdot = map(layout.restore, halves(y0))
             own = params if form is None else Driven(params, *table)
             motion = follow(scene, q, qdot, ts, own, rtol=self.rtol, throw=False)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))(motion.q, motion.qdot)
-            return jax.vmap(lambda y, t, i: signals.at_one_time(y, t, numbers, i))(rows, ts, inputs)
+            return jax.vmap(lambda y, t, i: signals.evaluate_state(y, t, numbers, i))(rows, ts, inputs)
 
         ts, values, inputs = (jnp.asarray(x, u.dtype) for x in (batch.ts, batch.values, batch.inputs))
         table = None if batch.table is None else tuple(jnp.asarray(x, u.dtype) for x in batch.table)
         shown = jax.vmap(sense)(ts, starts, inputs, table)
         shown = jnp.zeros(values.shape, values.dtype).at[..., : shown.shape[-1]].set(shown)
-        return jnp.where(batch.weights > 0, on_circle(shown - values, self.periods, jnp), 0.0)
+        return jnp.where(batch.weights > 0, wrap_residuals(shown - values, self.periods, jnp), 0.0)
 
-    def traced_starts(self, starts, rows: np.ndarray, params):
+    def trace_starts(self, starts, rows: np.ndarray, params):
         """The starts (M, 2n) of all systems for JAX, of which some of this one, at `rows` (N,), are functions of the
         parameters."""
         for row, piece in zip(rows, self.pieces, strict=True):
             start = self.records[piece.record].start
             if callable(start) and piece.places[0] == 0:
-                pair = started(start, params)
+                pair = start_pair(start, params)
                 flat = jnp.concatenate([self.layout.flatten(half) for half in pair])
                 starts = starts.at[row, : self.states].set(flat)
         return starts
 
-    def require_traced(self) -> None:
-        """Raise `ValueError` for what `traced` cannot do."""
+    def require_traceable(self) -> None:
+        """Raise `ValueError` for what `trace_residuals` cannot do."""
         if self.manifold is not None and self.fitted.any():
             raise ValueError("There is no density for starts on constraints that are fitted: give start=(q0, qdot0).")
         if self.signals.delays is not None:
@@ -403,7 +421,7 @@ class SystemPart(NamedTuple):
         """The name of the system, None where there is no other."""
         return self.system.name
 
-    def of_sensors(self, widths: NoiseScale) -> NoiseScale:
+    def sensor_noise(self, widths: NoiseScale) -> NoiseScale:
         """The noise of the signals of records among that of all signals, without that of crossing times."""
         own = slice(self.signals.start, self.signals.start + len(self.system.signals.names))
         return NoiseScale(widths.sigma[own], widths.dof[own])
@@ -438,7 +456,7 @@ class Residuals:
             fitted = np.concatenate([system.fitted for system in systems])
         self.pieces, self.fitted = pieces, fitted
         self.states = max(system.states for system in systems)
-        self.parts = self._by_system()
+        self.parts = self._split_by_system()
         self.names = tuple(
             signal if part.name is None else f"{part.name}: {signal}"
             for part in self.parts
@@ -446,29 +464,29 @@ class Residuals:
         )
         self.size = np.concatenate([part.system.size for part in self.parts])
         self.least = np.concatenate([part.system.least for part in self.parts])
-        self.batches = [self._among_all(part, batch) for part in self.parts for batch in part.system.batches]
+        self.batches = [self._embed_batch(part, batch) for part in self.parts for batch in part.system.batches]
         self.weights = np.concatenate([b.weights.reshape(-1, len(self.names)) for b in self.batches])
         self.measured = int((self.weights > 0).sum())
 
-    def _by_system(self) -> list[SystemPart]:
+    def _split_by_system(self) -> list[SystemPart]:
         owner, found, signals = np.array([piece.record for piece in self.pieces]), [], 0
         for system, records in zip(self.systems, self._records, strict=True):
             rows = np.flatnonzero((owner >= records.start) & (owner < records.stop))
             if not len(rows):
                 continue
             own = [Piece(self.pieces[row].record - records.start, self.pieces[row].places) for row in rows]
-            part = system.of(own, self.fitted[rows])
+            part = system.with_pieces(own, self.fitted[rows])
             found.append(SystemPart(part, rows, records, slice(signals, signals + len(part.names))))
             signals += len(part.names)
         return found
 
-    def _among_all(self, part: SystemPart, batch: Samples) -> Samples:
+    def _embed_batch(self, part: SystemPart, batch: Samples) -> Samples:
         """A batch of one system with the rows and signals of all."""
         values, weights = np.zeros((2, *batch.ts.shape, len(self.names)))
         values[..., part.signals], weights[..., part.signals] = batch.values, batch.weights
         return batch._replace(rows=part.rows[batch.rows], values=values, weights=weights)
 
-    def of(self, pieces: list[Piece], fitted: np.ndarray) -> "Residuals":
+    def with_pieces(self, pieces: list[Piece], fitted: np.ndarray) -> "Residuals":
         """The residuals of other pieces of the records; the signals are those of systems with a piece."""
         return Residuals(self.systems, pieces, fitted, self.watch)
 
@@ -505,11 +523,11 @@ class Residuals:
                 elif not isinstance(points, LostTrial):
                     points.append(point)
         return [
-            points if isinstance(points, LostTrial) else self._joined(y, points)
+            points if isinstance(points, LostTrial) else self._join_trials(y, points)
             for y, points in zip(starts, found, strict=True)
         ]
 
-    def _joined(self, starts: np.ndarray, points: list[Trial]) -> Trial:
+    def _join_trials(self, starts: np.ndarray, points: list[Trial]) -> Trial:
         """One trial of all systems from those of each."""
         if len(points) == 1 and self.parts[0].system.states == self.states:
             return points[0]
@@ -557,7 +575,7 @@ class Residuals:
                 size = np.abs(rows[..., : self.states]).max() or 1.0
                 more = np.pad(size * point.across[batch.rows], ((0, 0), (0, 0), (0, columns - self.states)))
                 rows = np.concatenate([rows, more], axis=1)
-            found[batch.rows] = compressed(rows)
+            found[batch.rows] = compress_rows(rows)
         return found
 
     # ---- pieces, records and systems ----
@@ -569,17 +587,17 @@ class Residuals:
 
     def columns(self, record: int) -> slice:
         """The signals that a record has."""
-        part = self._part_of(record)
+        part = self._owner(record)
         own = part.system.columns(record - part.records.start)
         return slice(part.signals.start + own.start, part.signals.start + own.stop)
 
-    def called(self, record: int) -> str:
+    def label(self, record: int) -> str:
         """The name by which the user reaches a record: `records[0]`, or `records['name'][0]`."""
         place = next(k for k, own in enumerate(self._records) if record < own.stop)
         name = self.systems[place].name
         return f"records{'' if name is None else f'[{name!r}]'}[{record - self._records[place].start}]"
 
-    def part_called(self, name: str | None) -> SystemPart:
+    def find_part(self, name: str | None) -> SystemPart:
         """One of the systems by its name, or the only one. Raises `ValueError` for a name that there is not."""
         parts = {part.name: part for part in self.parts}
         if name not in parts:
@@ -588,14 +606,14 @@ class Residuals:
             raise ValueError(f"This is a fit of several systems: give system=, one of {', '.join(map(repr, parts))}.")
         return parts[name]
 
-    def _part_of(self, record: int) -> SystemPart:
+    def _owner(self, record: int) -> SystemPart:
         return next(part for part in self.parts if part.records.start <= record < part.records.stop)
 
-    def where(self, failure: LostTrial) -> str:
+    def describe_failure(self, failure: LostTrial) -> str:
         """A sentence for a failure, with the record's number."""
         piece = self.pieces[failure.piece]
         begin = self.records[piece.record].ts[piece.places[0]]
-        return f"The motion of {self.called(piece.record)} from t = {begin:g} failed. {failure.text}"
+        return f"The motion of {self.label(piece.record)} from t = {begin:g} failed. {failure.text}"
 
     @property
     def firsts(self) -> list[int]:
@@ -603,23 +621,23 @@ class Residuals:
         places = {piece.record: k for k, piece in reversed(list(enumerate(self.pieces)))}
         return [places[k] for k in range(len(self.records))]
 
-    def restored(self, record: int, state: np.ndarray) -> tuple:
+    def restore_state(self, record: int, state: np.ndarray) -> tuple:
         """The pair (q, q̇) of a state of a record, of which other systems may leave the last numbers unused."""
-        layout = self._part_of(record).system.layout
+        layout = self._owner(record).system.layout
         return layout.restore(state[: layout.size]), layout.restore(state[layout.size : 2 * layout.size])
 
-    def by_system(self, of_records: Sequence) -> Any:
+    def group_by_system(self, values: Sequence) -> Any:
         """The values of every record as a tuple, or in a dict of tuples by the names of systems."""
         if self.parts[0].name is None:
-            return tuple(of_records)
-        return {part.name: tuple(of_records[part.records]) for part in self.parts}
+            return tuple(values)
+        return {part.name: tuple(values[part.records]) for part in self.parts}
 
-    def end_to_end(self, of_systems: Any) -> list:
-        """The values that `by_system` returned, for all records in order."""
-        return list(of_systems) if self.parts[0].name is None else [x for own in of_systems.values() for x in own]
+    def end_to_end(self, groups: Any) -> list:
+        """The values that `group_by_system` returned, for all records in order."""
+        return list(groups) if self.parts[0].name is None else [x for own in groups.values() for x in own]
 
 
-def triangle_of(rows: np.ndarray) -> np.ndarray:
+def qr_triangle(rows: np.ndarray) -> np.ndarray:
     """R of the factorisation QR of matrices (..., M, D)."""
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
@@ -627,7 +645,7 @@ def triangle_of(rows: np.ndarray) -> np.ndarray:
 _BLOCK = 8  # times as many rows as columns in one factorisation
 
 
-def compressed(rows: np.ndarray) -> np.ndarray:
+def compress_rows(rows: np.ndarray) -> np.ndarray:
     """The triangles (N, D, D) of N tall matrices (N, M, D), block by block.
 
     Blocks stay in the cache, and are too small for a BLAS to start threads that wait for each other.
@@ -638,7 +656,7 @@ def compressed(rows: np.ndarray) -> np.ndarray:
         height = min(_BLOCK * columns, rows.shape[1])
         missing = -rows.shape[1] % height
         rows = np.concatenate([rows, np.zeros((pieces, missing, columns))], axis=1) if missing else rows
-        blocks = triangle_of(rows.reshape(-1, height, columns))
+        blocks = qr_triangle(rows.reshape(-1, height, columns))
         rows = blocks.reshape(pieces, -1, columns)
     found = np.zeros((pieces, columns, columns))
     found[:, : rows.shape[1]] = rows

@@ -17,19 +17,19 @@ from lagjax._doubles import with_doubles
 from lagjax._fit._density import Density
 from lagjax._fit._noise import AbstractNoise, NoiseScale
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._prediction import Prediction, planned_rows, predicted, require_level
+from lagjax._fit._prediction import Prediction, planned_rows, predict_record, require_level
 from lagjax._fit._profile import Comparison, Profile, comparison, profile
 from lagjax._fit._records import Record
 from lagjax._fit._report import (
     Drawn,
+    build_pictures,
+    build_title,
     cells_of_noise,
     cells_of_parameters,
     draw_record,
     lab_book,
     page,
-    pictures_of,
     record_matrix,
-    title_of,
 )
 from lagjax._fit._residuals import Residuals, SystemPart, Trial
 from lagjax._fit._sample import draw, inference_data
@@ -175,7 +175,7 @@ class Fit:
             )
         )
         ends = (enumerate((self.states + s * wide)[self.question.firsts]) for s in (-1, 1))
-        low, high = (self.question.by_system([self.question.restored(k, y) for k, y in end]) for end in ends)
+        low, high = (self.question.group_by_system([self.question.restore_state(k, y) for k, y in end]) for end in ends)
         return low, high
 
     @with_doubles
@@ -262,7 +262,7 @@ class Fit:
 
         Raises `ValueError` where the record has other signals than those of the fit, or its motion fails.
         """
-        return predicted(self, record, system)
+        return predict_record(self, record, system)
 
     @with_doubles
     def next_experiment(
@@ -282,7 +282,7 @@ class Fit:
         named = candidates if isinstance(candidates, dict) else {f"[{k}]": one for k, one in enumerate(candidates)}
         if not named:
             raise ValueError("candidates is empty: give at least one lagjax.Record.")
-        part = self.question.part_called(system)
+        part = self.question.find_part(system)
         rows = [planned_rows(self, part, name, record) for name, record in named.items()]
         return rank_experiments(list(named), rows, self.parameters.labels, self.information)
 
@@ -295,8 +295,8 @@ class Fit:
         """
         tables = {"Parameters": cells_of_parameters(self), "Noise": cells_of_noise(self)}
         texts = {"What to measure next": str(self.next_experiment(experiments))} if experiments else {}
-        pictures = pictures_of([self._drawn(part) for part in self.question.parts], self.covariance, self.waterfall)
-        text = page(title_of(self), self.message, self.ok, self.unseen, tables, pictures, texts)
+        pictures = build_pictures([self._drawn(part) for part in self.question.parts], self.covariance, self.waterfall)
+        text = page(build_title(self), self.message, self.ok, self.unseen, tables, pictures, texts)
         with open(path, "w", encoding="utf-8") as file:
             file.write(text)
 
@@ -305,7 +305,7 @@ class Fit:
         residuals = self.question.end_to_end(self.residuals)[part.records]
         pairs = [pair for pair in zip(residuals, part.system.records, strict=True) if isinstance(pair[1], Record)]
         records, matrices = [record for _, record in pairs], [record_matrix(r, record) for r, record in pairs]
-        return Drawn(part.name, records, matrices, part.system.signals.names, part.of_sensors(self.widths).sigma)
+        return Drawn(part.name, records, matrices, part.system.signals.names, part.sensor_noise(self.widths).sigma)
 
     @with_doubles
     def compare(self, other: "Fit | dict[str, Fit]", *, folds: int = 0) -> Comparison:

@@ -19,13 +19,13 @@ it is small.
 
 Which library: blackjax, whose kernels are plain functions of a log density, so that chains, the loop and what is kept
 are a few lines here; arviz for what draws are worth. numpyro does the same behind a language for models, of which
-nothing is needed. The warming (`_tuned`) is not `blackjax.window_adaptation`: its chains share one step and one metric,
-where a window adaptation has one of each for every chain and does not say how many draws are worth an independent one.
-Measured along the expansions of two posteriors of 7 and 11 unknowns, four chains, two seeds, with compilation: the
-rounds here take 12 to 16 s of a core, and then 4.5 to 5.5 steps of trajectories make an independent draw; windows of
-500 steps a chain take 7 to 8 s, and 4.9 to 5.9; of 150 steps, 7 to 9 s, and 14 to 32. So along the expansion windows
-would warm in half the time; along the exact density, where a step is a batch of motions and 350 of a chain are what is
-spent, they were not measured.
+nothing is needed. The warming (`_tune_sampler`) is not `blackjax.window_adaptation`: its chains share one step and one
+metric, where a window adaptation has one of each for every chain and does not say how many draws are worth an
+independent one. Measured along the expansions of two posteriors of 7 and 11 unknowns, four chains, two seeds, with
+compilation: the rounds here take 12 to 16 s of a core, and then 4.5 to 5.5 steps of trajectories make an independent
+draw; windows of 500 steps a chain take 7 to 8 s, and 4.9 to 5.9; of 150 steps, 7 to 9 s, and 14 to 32. So along the
+expansion windows would warm in half the time; along the exact density, where a step is a batch of motions and 350 of a
+chain are what is spent, they were not measured.
 
 Source: Hoffman & Gelman, *The No-U-Turn sampler*, JMLR 15 (2014) 1593; Christen & Fox, *MCMC using an approximation*,
 J. Comput. Graph. Stat. 14 (2005) 795; Vehtari et al., Bayesian Analysis 16 (2021) 667, for dispersed chains, r-hat and
@@ -42,7 +42,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit._density import Chart, Density, Surrogate, expanded
+from lagjax._fit._density import Chart, Density, Surrogate, expand_residuals
 
 _ACCEPTED = 0.85  # the mean acceptance that steps are tuned for
 _ROUNDS = (400, 800, 3200)  # draws of all chains from π*: each round has the metric of the one before
@@ -81,29 +81,29 @@ class Draws(NamedTuple):
 def draw(density: Density, draws: int, chains: int, seed: int) -> Draws:
     """Draws of the posterior, from starts that are dispersed as the posterior is."""
     _blackjax()
-    chart = Chart.of(density)
-    drawn = _along_expansion(chart, draws, chains, seed)
-    return _along_exact(chart, draws, chains, seed, drawn) if isinstance(drawn, str) else drawn
+    chart = Chart.from_density(density)
+    drawn = _sample_expansion(chart, draws, chains, seed)
+    return _sample_exact(chart, draws, chains, seed, drawn) if isinstance(drawn, str) else drawn
 
 
 # ---- along the expansion, each draw accepted or refused by the exact density -----------------------------------------
 
 
-def _along_expansion(chart: Chart, draws: int, chains: int, seed: int) -> Draws | str:
+def _sample_expansion(chart: Chart, draws: int, chains: int, seed: int) -> Draws | str:
     """Draws that the exact density accepts or refuses; or a sentence that says why the expansion is not good enough."""
-    surrogate = expanded(chart)
+    surrogate = expand_residuals(chart)
     if isinstance(surrogate, str):
         return surrogate
     warming, weighing, going = jax.random.split(jax.random.key(seed), 3)
-    sampler, state, many = _tuned(surrogate, chart, _ROUNDS, chains, warming)
+    sampler, state, many = _tune_sampler(surrogate, chart, _ROUNDS, chains, warming)
     if math.isinf(many):
         return "Along the expansion of its residuals to second order the chains did not move."
     sampler = sampler._replace(inner=min(max(math.ceil(many), 1), _MOST_INNER))
     exact = jax.jit(jax.vmap(chart.log_density))
-    share, start = _weighed(sampler, exact, state, weighing)
+    share, start = _weigh_expansion(sampler, exact, state, weighing)
     if share < _LEAST:
         return f"Of draws of the expansion of its residuals to second order the exact density accepts {share:.2f}."
-    drawn, tail = _corrected(surrogate, sampler, exact, start, draws, going)
+    drawn, tail = _correct_draws(surrogate, sampler, exact, start, draws, going)
     if drawn.acceptance.mean() < _NEARLY_ALL and tail > _HEAVY:
         return f"The expansion of its residuals to second order is too narrow: π/π* has a Pareto tail of {tail:.2f}."
     if (worth := agreement(drawn.x).effective.min()) < _WORTH * draws * chains:
@@ -136,7 +136,9 @@ def _keys(key, k: int, state):
     return jax.random.split(jax.random.fold_in(key, k), len(state.position))
 
 
-def _tuned(of_z: Callable, chart: Chart, rounds: tuple[int, ...], chains: int, key) -> tuple[Sampler, Any, float]:
+def _tune_sampler(
+    log_density: Callable, chart: Chart, rounds: tuple[int, ...], chains: int, key
+) -> tuple[Sampler, Any, float]:
     """The sampler along the logarithm of a density with a step and a metric from its own draws, where its chains are,
     and how many draws of theirs are worth an independent one: infinitely many where a chain does not move."""
     blackjax = _blackjax()
@@ -146,16 +148,16 @@ def _tuned(of_z: Callable, chart: Chart, rounds: tuple[int, ...], chains: int, k
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, 0, None, None))
     def move(key, state, step, metric):
-        return kernel(key, state, of_z, step, metric, _DOUBLINGS)
+        return kernel(key, state, log_density, step, metric, _DOUBLINGS)
 
     start, update, _ = blackjax.adaptation.step_size.dual_averaging_adaptation(_ACCEPTED)
     update = jax.jit(update)
-    z, metric, step = _possible(of_z, (chains, size), dtype, key), jnp.eye(size, dtype=dtype), 0.25
-    state = jax.jit(jax.vmap(lambda z: blackjax.nuts.init(z, of_z)))(z)
+    z, metric, step = _draw_possible_states(log_density, (chains, size), dtype, key), jnp.eye(size, dtype=dtype), 0.25
+    state = jax.jit(jax.vmap(lambda z: blackjax.nuts.init(z, log_density)))(z)
     late = np.zeros((chains, 0, size))
     for part, pooled in enumerate(rounds):
         if part > 0:
-            metric = jnp.asarray(_shrunk(late.reshape(-1, size)), dtype)
+            metric = jnp.asarray(_shrink_covariance(late.reshape(-1, size)), dtype)
         count, own = max(_FEWEST, math.ceil(pooled / chains)), jax.random.fold_in(key, part)
         path, tuning = [], start(step)
         for k in range(count):
@@ -170,9 +172,9 @@ def _tuned(of_z: Callable, chart: Chart, rounds: tuple[int, ...], chains: int, k
     return sampler, state, late.shape[0] * late.shape[1] / max(effective, 1.0)
 
 
-def _possible(of_z: Callable, shape: tuple[int, int], dtype, key):
-    """Draws (C, D) of the fit's normal density where `of_z` is not zero: a chain that begins outside does not move."""
-    density = jax.jit(jax.vmap(of_z))
+def _draw_possible_states(log_density: Callable, shape: tuple[int, int], dtype, key):
+    """Draws (C, D) of the fit's normal density where `log_density` is finite: elsewhere a chain does not move."""
+    density = jax.jit(jax.vmap(log_density))
     z = jax.random.normal(key, shape, dtype)
     for k in range(_TRIED):
         outside = ~jnp.isfinite(density(z))
@@ -185,7 +187,7 @@ def _possible(of_z: Callable, shape: tuple[int, int], dtype, key):
     )
 
 
-def _shrunk(rows: np.ndarray) -> np.ndarray:
+def _shrink_covariance(rows: np.ndarray) -> np.ndarray:
     """The covariance of draws (M, D), drawn towards that of the fit as if D + 5 draws had shown it."""
     count, size = rows.shape
     return (count * np.cov(rows.T).reshape(size, size) + (5 + size) * np.eye(size)) / (count + 5 + size)
@@ -199,14 +201,16 @@ class Chains(NamedTuple):
     ratio: np.ndarray
 
     @staticmethod
-    def at(state, exact: Callable) -> "Chains":
-        """The state weighed by the exact density."""
-        of_z, of_expansion = np.asarray(exact(state.position), float), np.asarray(state.logdensity, float)
-        ratio = np.subtract(of_z, of_expansion, out=np.full(len(of_z), -np.inf), where=np.isfinite(of_z))
-        return Chains(state, of_z, ratio)
+    def from_state(state, exact: Callable) -> "Chains":
+        """The chains at a state of the sampler, with the exact density there."""
+        log_exact, log_expansion = np.asarray(exact(state.position), float), np.asarray(state.logdensity, float)
+        ratio = np.subtract(
+            log_exact, log_expansion, out=np.full(len(log_exact), -np.inf), where=np.isfinite(log_exact)
+        )
+        return Chains(state, log_exact, ratio)
 
 
-def _weighed(sampler: Sampler, exact: Callable, state, key) -> tuple[float, Chains]:
+def _weigh_expansion(sampler: Sampler, exact: Callable, state, key) -> tuple[float, Chains]:
     """The share of independent pairs of draws of π* that is accepted, and the chains then.
 
     Starts chosen by weight would not be better ones: the few largest weights are where π* is too small, and a chain
@@ -215,7 +219,7 @@ def _weighed(sampler: Sampler, exact: Callable, state, key) -> tuple[float, Chai
     pilot = []
     for k in range(max(2, math.ceil(_PILOT / len(state.position)))):
         state, *_ = sampler.draw(jax.random.fold_in(key, k), state)
-        pilot.append(Chains.at(state, exact))
+        pilot.append(Chains.from_state(state, exact))
     ratio = np.concatenate([at.ratio for at in pilot])
     if not np.isfinite(ratio).any():
         return 0.0, pilot[-1]
@@ -229,14 +233,14 @@ def _choices(key) -> np.random.Generator:
     return np.random.default_rng(np.asarray(jax.random.key_data(key)))
 
 
-def _corrected(
+def _correct_draws(
     surrogate: Surrogate, sampler: Sampler, exact: Callable, at: Chains, draws: int, key
 ) -> tuple[Draws, float]:
     """Draws of π, every proposal of π* accepted or refused by the exact density; and the Pareto tail of π/π*."""
     kept, choices, ratios = [], _choices(key), []
     for k in range(_SETTLING + draws):
         state, steps, diverged = sampler.draw(jax.random.fold_in(key, k), at.state)
-        proposed = Chains.at(state, exact)
+        proposed = Chains.from_state(state, exact)
         ratios.append(proposed.ratio)
         with np.errstate(invalid="ignore"):
             change = proposed.ratio - at.ratio  # −∞ where the motion cannot be followed, +∞ where that of x cannot
@@ -257,10 +261,10 @@ def _corrected(
 # ---- along the exact density -----------------------------------------------------------------------------------------
 
 
-def _along_exact(chart: Chart, draws: int, chains: int, seed: int, why: str) -> Draws:
+def _sample_exact(chart: Chart, draws: int, chains: int, seed: int, why: str) -> Draws:
     """Draws by gradients through the motions; `why` says what speaks against the expansion."""
     warming, going = jax.random.split(jax.random.key(seed))
-    sampler, state, _ = _tuned(chart.log_density, chart, _ROUNDS_OF_MOTIONS, chains, warming)
+    sampler, state, _ = _tune_sampler(chart.log_density, chart, _ROUNDS_OF_MOTIONS, chains, warming)
     kept = []
     for k in range(draws):
         state, info = sampler.move(_keys(going, k, state), state, sampler.step, sampler.metric)
@@ -302,7 +306,7 @@ def agreement(x: np.ndarray) -> Agreement:
     return Agreement(np.minimum(bulk, tail), r_hat)
 
 
-def _warned(density: Density, drawn: Draws) -> dict[str, float]:
+def _check_agreement(density: Density, drawn: Draws) -> dict[str, float]:
     """The worst of the agreement of chains, by name; a warning where that is too little to read quantiles off draws."""
     found = agreement(drawn.x)
     worst, apart = int(np.argmin(found.effective)), float(np.max(found.r_hat))
@@ -349,7 +353,7 @@ def inference_data(density: Density, drawn: Draws) -> Any:
         "lp": drawn.log_density, "n_steps": drawn.steps, "diverging": drawn.diverged,
         "acceptance_rate": drawn.acceptance,
     }  # fmt: skip
-    attributes = {"sampler": drawn.sampler, **_warned(density, drawn)}
+    attributes = {"sampler": drawn.sampler, **_check_agreement(density, drawn)}
     return arviz.from_dict(posterior=posterior, sample_stats=stats, dims=dims, coords=coords, attrs=attributes)
 
 

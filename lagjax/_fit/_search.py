@@ -1,6 +1,6 @@
 """Search: where a fit begins, multiple shooting over segments that grow, the weak form, and multistart.
 
-It holds `Reader`, `fit_weak_form`, `Waterfall`, `searches` and `search_records`.
+It holds `Reader`, `fit_weak_form`, `Waterfall`, `run_multistart` and `search_records`.
 
 **Multiple shooting.** Over a long record the sum of squares has many minima: a wrong frequency is out of phase, a
 chaotic motion forgets its start. Over a segment shorter than the motion's own time scale there is one. So the records
@@ -37,9 +37,9 @@ The waterfall is what all of them came to, in order: many that are equally good,
 trusted; a slope without a step is not.
 Source: Raue et al., PLoS ONE 8 (2013) e74335, for many starts and waterfalls.
 
-**The search of whole records.** `search_records` goes from segments to whole records; `searches` does that from many
-starts, `by_gradient` with gradients in reverse mode. `start_by_weak_form` is the first value of the parameters by the
-weak form, where the user's is too far off.
+**The search of whole records.** `search_records` goes from segments to whole records; `run_multistart` does that from
+many starts, `search_by_gradient` with gradients in reverse mode. `start_by_weak_form` is the first value of the
+parameters by the weak form, where the user's is too far off.
 """
 
 import functools
@@ -55,14 +55,22 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from lagjax._consistent import has_constraints
-from lagjax._fit._descent import Anchor, Descent, as_descent, column_norms, descend_gradient, eliminate, minimise
+from lagjax._fit._descent import Anchor, Descent, build_descent, column_norms, descend_gradient, eliminate, minimise
 from lagjax._fit._motions import AbstractMotions
 from lagjax._fit._noise import Gaussian, NoiseScale, log_likelihood
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Driven, Piece, Record, asks, at_instants, in_structure, inputs_between
+from lagjax._fit._records import (
+    Driven,
+    Piece,
+    Record,
+    constant_tables,
+    input_functions,
+    inputs_between,
+    restore_structure,
+)
 from lagjax._fit._residuals import LostTrial, Residuals, SystemResiduals
-from lagjax._fit._sensors import continued
-from lagjax._fit._verdict import unexplained
+from lagjax._fit._sensors import unwrap_record
+from lagjax._fit._verdict import measure_unexplained
 from lagjax._hybrid import Hybrid
 from lagjax._layout import halves
 from lagjax._system import System
@@ -92,12 +100,12 @@ class Reader(NamedTuple):
     periods: tuple[float, ...]
 
     @classmethod
-    def of(cls, record: Record, probes: int = 256, periods: np.ndarray | None = None) -> "Reader":
+    def from_record(cls, record: Record, probes: int = 256, periods: np.ndarray | None = None) -> "Reader":
         """A reader with the longest windows whose cubics leave at most `_WORSE_WINDOW` times what the shortest leave.
 
         Beyond these they no longer follow the motion. They are tried at `probes` places.
         """
-        places = some_of(record, probes)
+        places = choose_places(record, probes)
         windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
         each = np.full(len(windows), np.inf) if periods is None else periods
         return cls(record, windows, scatter, tuple(each.tolist()))
@@ -116,7 +124,7 @@ class Reader(NamedTuple):
         ]
 
 
-def some_of(record: Record, count: int) -> np.ndarray:
+def choose_places(record: Record, count: int) -> np.ndarray:
     """Places of samples from the first to the last, evenly chosen, `count` of them at most."""
     return np.unique(np.linspace(0, len(record) - 1, count).astype(int))
 
@@ -176,14 +184,14 @@ def short_windows(readers: list[Reader], length: float) -> tuple[list[Record], n
     """
     found, states = [], []
     for reader in readers:
-        places = some_of(reader.record, max(4, _WINDOWS_IN_ALL // len(readers)))
+        places = choose_places(reader.record, max(4, _WINDOWS_IN_ALL // len(readers)))
         offsets = np.linspace(0.0, length, 4)
         cubics = [
             _read_states(reader.record.ts[places], *s, w)[3]
             for s, w in zip(_signals(reader.record), reader.windows, strict=True)
         ]
         values = np.stack([np.polynomial.polynomial.polyval(offsets, c.T) for c in cubics], axis=-1)
-        structured = [in_structure(v, reader.record) for v in values]
+        structured = [restore_structure(v, reader.record) for v in values]
         found += [
             Record(t + offsets, v, inputs_between(reader.record, t + offsets))
             for t, v in zip(reader.record.ts[places], structured, strict=True)
@@ -206,13 +214,13 @@ def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.nda
     the spread of the coordinates, in units of each, over the accelerations there. Where nothing moves, they are
     infinite.
     """
-    places = [some_of(reader.record, _PROBES) for reader in readers]
+    places = [choose_places(reader.record, _PROBES) for reader in readers]
     states = [reader.states(some) for reader, some in zip(readers, places, strict=True)]
     t = np.concatenate([reader.record.ts[some] for reader, some in zip(readers, places, strict=True)])
     y, n = np.concatenate(states), states[0].shape[1] // 2
     within = np.concatenate([state[:, :n] - state[:, :n].mean(axis=0) for state in states])
     inputs = np.concatenate([reader.record.input_matrix[some] for reader, some in zip(readers, places, strict=True)])
-    pulled = motions.rate(t, y, numbers, at_instants(t, inputs))
+    pulled = motions.rate(t, y, numbers, constant_tables(t, inputs))
     pulled = np.where(np.isfinite(pulled), pulled, 0.0)
     spread, rate, pulled = (np.sqrt(np.mean(x**2, axis=0)) for x in (within, y[:, n:], pulled))
     spread = np.minimum(spread, _QUARTER * np.array(readers[0].periods))
@@ -235,7 +243,7 @@ def levels(records: list[Record | None], scales: list[float]) -> list[list[Piece
             cut = [*e[:-1:stride].tolist(), len(record)]
             if len(cut) > 2 and 2 * (e[-1] - cut[-2]) < e[min(stride, len(e) - 1)] - e[0]:
                 del cut[-2]  # a rest shorter than half a segment joins the one before
-            pieces += [_thinned(record, k, a, b, scales[k]) for a, b in itertools.pairwise(cut)]
+            pieces += [_thin_segment(record, k, a, b, scales[k]) for a, b in itertools.pairwise(cut)]
         found.append(pieces)
         stride *= 2
     return found
@@ -249,7 +257,7 @@ def _edges(record: Record, length: float) -> np.ndarray:
     return np.unique(np.append(np.searchsorted(ts, np.linspace(ts[0], ts[-1], count + 1)[:-1]), len(ts)))
 
 
-def _thinned(record: Record, which: int, begin: int, end: int, scale: float) -> Piece:
+def _thin_segment(record: Record, which: int, begin: int, end: int, scale: float) -> Piece:
     """The samples from `begin` to `end`, thinned to what the time scale of the motion needs."""
     spacing = (record.ts[end - 1] - record.ts[begin]) / max(end - 1 - begin, 1)
     step = int(scale / (_PER_SCALE * spacing)) if np.isfinite(scale) and spacing > 0 else 1
@@ -257,7 +265,7 @@ def _thinned(record: Record, which: int, begin: int, end: int, scale: float) -> 
     return Piece(which, np.arange(begin, end, step))
 
 
-def complete(pieces: list[Piece], records: list[Record]) -> list[Piece]:
+def complete_pieces(pieces: list[Piece], records: list[Record]) -> list[Piece]:
     """The same pieces of records with all of their samples, up to the first of the next piece."""
     firsts = {(piece.record, int(piece.places[0])) for piece in pieces}
     ends = [
@@ -328,8 +336,8 @@ def weak_form_residuals(system: SystemResiduals, readers: Sequence[Reader | None
     """∫ (φ̇ p + φ F) dt of all windows and coordinates, over the size of ∫ φ̇ p: a function of u (F,) for JAX."""
     layout, parameters, form, scene = system.layout, system.parameters, system.signals.form, system.scene
     assert isinstance(scene, System)
-    form = form if form is not None and asks(scene) else None
-    scene = scene if form is None else form.driven(scene)
+    form = form if form is not None and input_functions(scene) else None
+    scene = scene if form is None else form.drive_scene(scene)
     pieces = _states_and_inputs([reader for reader in readers if reader is not None], _WIDE * scale)
 
     def both(y, t, table, numbers):
@@ -342,7 +350,7 @@ def weak_form_residuals(system: SystemResiduals, readers: Sequence[Reader | None
     at_all = jax.vmap(both, in_axes=(0, 0, 0 if form is not None else None, None))
 
     y, t, inputs = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
-    table = tuple(at_instants(t, inputs)) if form is not None else None
+    table = tuple(constant_tables(t, inputs)) if form is not None else None
     rate, inside = (block_diag(*[getattr(piece[3], name) for piece in pieces]) for name in ("rate", "inside"))
 
     def residuals(u):
@@ -403,12 +411,12 @@ class Trials(NamedTuple):
 def random_starts(parameters: Parameters, u: np.ndarray, count: int, seed: int) -> np.ndarray:
     """u itself and `count` − 1 random ones, (K, F)."""
     rng = np.random.default_rng(seed)
-    return np.stack([u, *(parameters.drawn(u, rng) for _ in range(count - 1))])
+    return np.stack([u, *(parameters.draw(u, rng) for _ in range(count - 1))])
 
 
 def short_search(question: Residuals, u: np.ndarray, starts: np.ndarray) -> Trials:
     """The results of the starts u (K, F) after a few steps, from the records' starts (N, 2n); in order."""
-    part = _sampled(question)
+    part = _subsample(question)
     at = _evaluate_starts(part, u, np.repeat(starts[None], len(u), axis=0))
     damping = np.full(len(u), _FIRST_DAMPING)
     for _ in range(_SHORT_STEPS):
@@ -448,11 +456,11 @@ class _EvaluatedStarts(NamedTuple):
     triangles: np.ndarray
 
 
-def _sampled(question: Residuals) -> Residuals:
+def _subsample(question: Residuals) -> Residuals:
     """The residuals of at most `_SHORT_SAMPLES` samples of each record."""
     chosen = lambda count: np.unique(np.linspace(0, count - 1, _SHORT_SAMPLES).astype(int))  # noqa: E731
     pieces = [Piece(piece.record, piece.places[chosen(len(piece.places))]) for piece in question.pieces]
-    return question.of(pieces, question.fitted)
+    return question.with_pieces(pieces, question.fitted)
 
 
 def _evaluate_starts(question: Residuals, u: np.ndarray, starts: np.ndarray) -> _EvaluatedStarts:
@@ -478,7 +486,7 @@ def _step(question: Residuals, at: _EvaluatedStarts, k: int, damping: float) -> 
     triangles, states, none = at.triangles[k], question.states, np.zeros(at.u.shape[1])
     limits = question.parameters.limits(at.u[k])
     step = eliminate(triangles, states, column_norms(triangles, states), damping, (none, none), limits)
-    return question.parameters.stepped(at.u[k], step.u), at.starts[k] + step.starts
+    return question.parameters.take_step(at.u[k], step.u), at.starts[k] + step.starts
 
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
@@ -501,7 +509,7 @@ class Unfollowed(ValueError):
     """Records whose motion cannot be followed from the first trial."""
 
 
-def searches(question: Residuals, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
+def run_multistart(question: Residuals, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
     """The best of the searches from u and from `starts` − 1 random values, and what all of them came to."""
     if starts == 1:
         return search(u, y0), None
@@ -517,29 +525,29 @@ def searches(question: Residuals, search, u, y0, starts: int, seed: int) -> tupl
             continue
         if place is not None:
             misfits[place] = misfit(done[-1].widths, question)
-    best = max(done, key=lambda one: (one.question is question, _likelihood(one)))
+    best = max(done, key=lambda one: (one.question is question, _log_likelihood(one)))
     misfits = np.sort(misfits)
     misfits[0] = min(misfits[0], misfit(best.widths, question))
     return best, Waterfall(misfits)
 
 
-def _likelihood(done: Descent) -> float:
+def _log_likelihood(done: Descent) -> float:
     return log_likelihood(done.widths, done.point.flat(), done.question.weights)
 
 
-def reader_of(record: Record, about: SystemResiduals, numbers: np.ndarray, probes: int = 256) -> Reader | None:
+def build_reader(record: Record, about: SystemResiduals, numbers: np.ndarray, probes: int = 256) -> Reader | None:
     """A reader of states off a record; None where its signals are no positions, or go round too fast to tell."""
     if not about.signals.look_like_positions(record):
         return None
     periods = about.signals.periods
-    smooth = continued(record, periods)
+    smooth = unwrap_record(record, periods)
     if smooth is None:
         return None
     read = about.signals.positions(smooth, numbers)
     if np.isfinite(periods).any():  # in the units of coordinates
         gain = np.nanstd(read.matrix, axis=0) / np.maximum(np.nanstd(smooth.matrix, axis=0), np.finfo(float).tiny)
         periods = np.where(np.isfinite(periods), gain * periods, np.inf)
-    return Reader.of(read, probes, periods)
+    return Reader.from_record(read, probes, periods)
 
 
 def search_records(question: Residuals, u, starts, noise, method: str, readers, weak) -> Descent:
@@ -551,14 +559,18 @@ def search_records(question: Residuals, u, starts, noise, method: str, readers, 
     u, starts, levels_done = _fit_growing_segments(question, u, starts, noise, readers, weak)
     good = _last_followed_level(levels_done)
     if len(levels_done) - good > _LOST:
-        return _in_pieces(question, levels_done[good], levels_done[-1].widths, noise)
+        return _search_pieces(question, levels_done[good], levels_done[-1].widths, noise)
     done = minimise(question, u, starts, noise, _ENOUGH, _TRIALS)
     if levels_done and (
-        isinstance(done, LostTrial) or not done.converged or unexplained(question, done.point, done.widths).motion
+        isinstance(done, LostTrial)
+        or not done.converged
+        or measure_unexplained(question, done.point, done.widths).motion
     ):
         good = _last_followed_level([*levels_done, *([] if isinstance(done, LostTrial) else [done])])
         if good < len(levels_done) and misfit(levels_done[good].widths, question) < _COARSE:
-            return _in_pieces(question, levels_done[good], None if isinstance(done, LostTrial) else done.widths, noise)
+            return _search_pieces(
+                question, levels_done[good], None if isinstance(done, LostTrial) else done.widths, noise
+            )
     return _require_followed(question, done)
 
 
@@ -593,10 +605,10 @@ def _separation(done: Descent) -> float:
     return float(np.median(rates) * longest) if rates else 0.0
 
 
-def _in_pieces(question: Residuals, level: Descent, joined: NoiseScale | None, noise) -> Descent:
+def _search_pieces(question: Residuals, level: Descent, joined: NoiseScale | None, noise) -> Descent:
     """The search on the pieces of a level, with all samples of these and a start for each."""
-    pieces = complete(level.question.pieces, question.records)
-    part = question.of(pieces, level.question.fitted)
+    pieces = complete_pieces(level.question.pieces, question.records)
+    part = question.with_pieces(pieces, level.question.fitted)
     done = minimise(part, level.point.u, level.point.starts, noise, _ENOUGH, _TRIALS)
     if isinstance(done, LostTrial):
         return _require_followed(part, done)
@@ -612,25 +624,25 @@ def _in_pieces(question: Residuals, level: Descent, joined: NoiseScale | None, n
     return done._replace(message=f"{done.message} {text}", converged=False)
 
 
-def by_gradient(question: Residuals, u, y0, noise, readers: list[Reader | None] | None) -> Descent:
+def search_by_gradient(question: Residuals, u, y0, noise, readers: list[Reader | None] | None) -> Descent:
     """The descent by gradients: over segments of the records that grow, where they can be read, then over all."""
     watch, question.watch = question.watch, None
     tell = None if watch is None else lambda text: print(text, file=sys.stderr, flush=True)
     steps = _GRADIENT_STEPS
     if readers is not None:
         u = start_by_weak_form(question, u, readers)
-        u = _over_segments(question, u, noise, readers, tell)
+        u = _descend_segments(question, u, noise, readers, tell)
         steps = _GRADIENT_STEPS // 3
     done = descend_gradient(question, u, y0, noise, steps, tell)
     if not isinstance(done, LostTrial):
-        done = as_descent(question, done[0], done[1], noise, _GRADIENT_STEPS, done[2])
+        done = build_descent(question, done[0], done[1], noise, _GRADIENT_STEPS, done[2])
     return _require_followed(question, done)
 
 
 def _require_followed(question: Residuals, done: Descent | LostTrial) -> Descent:
     """The result of a search. Raises `Unfollowed` where its motions could not be followed."""
     if isinstance(done, LostTrial):
-        raise Unfollowed(question.where(done) + " Begin nearer: other params0, or starts that are known.")
+        raise Unfollowed(question.describe_failure(done) + " Begin nearer: other params0, or starts that are known.")
     return done
 
 
@@ -703,7 +715,7 @@ def _fit_level(question: Residuals, pieces: list[Piece], u, best, noise, readers
         if new and reader is not None:
             read = pad_states(reader.states(np.array(new)), question.states)
             best |= {(k, place): y for place, y in zip(new, read, strict=True)}
-    part = question.of(pieces, np.array([question.fitted[k] or place > 0 for k, place in firsts]))
+    part = question.with_pieces(pieces, np.array([question.fitted[k] or place > 0 for k, place in firsts]))
     y0 = np.stack([best[first] for first in firsts])
     done = minimise(part, u, y0, noise, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
     if not isinstance(done, LostTrial):
@@ -721,7 +733,7 @@ def _fit_short_windows(question: Residuals, u, noise, readers: list[Reader | Non
             continue
         records, begun = short_windows(reading, 0.25 * scale)
         states.append(pad_states(begun, question.states))
-        short.append(part.system.of_records(records, np.ones(len(records), bool)))
+        short.append(part.system.with_records(records, np.ones(len(records), bool)))
     if not short:
         return u
     part = Residuals(short)
@@ -738,14 +750,14 @@ def start_by_weak_form(question: Residuals, u: np.ndarray, readers: list[Reader 
     return u if found is None else found
 
 
-def _over_segments(question: Residuals, u, noise, readers: list[Reader | None], tell) -> np.ndarray:
+def _descend_segments(question: Residuals, u, noise, readers: list[Reader | None], tell) -> np.ndarray:
     """The u that two thirds of the steps come to over segments that grow, each with a start of its own."""
     recordings = [None if reader is None else reader.record for reader in readers]
     cuts = levels(recordings, _time_scales(question, readers, u))
     for pieces in [] if any(part.system.clocks for part in question.parts) else cuts:
         reading = ((recorder, piece.places[:1]) for piece in pieces if (recorder := readers[piece.record]))
         states = np.stack([pad_states(one.states(place)[0], question.states) for one, place in reading])
-        part = question.of(pieces, np.ones(len(pieces), bool))
+        part = question.with_pieces(pieces, np.ones(len(pieces), bool))
         done = descend_gradient(part, u, states, noise, 2 * _GRADIENT_STEPS // (3 * len(cuts)), tell)
         if not isinstance(done, LostTrial):
             u = done[0]

@@ -34,7 +34,7 @@ import numpy as np
 from lagjax._arguments import accept
 from lagjax._fit._motions import RecordMotion
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Form, Record, in_structure
+from lagjax._fit._records import Form, Record, restore_structure
 from lagjax._layout import Layout, halves
 
 PyTree = Any
@@ -90,7 +90,7 @@ class Delays:
         places = np.split(np.arange(record.matrix.shape[1]), np.cumsum([x[0].size for x in leaves])[:-1])
         self.longest = float(delayed.longest)
 
-        def of(numbers):
+        def evaluate(numbers):
             given = delayed.delay(parameters.restore(numbers))
             try:
                 spread = tree.flatten_up_to(jax.tree.broadcast(given, record.values))
@@ -100,14 +100,14 @@ class Delays:
                 raise ValueError("delay must return numbers, one for all signals or one for each leaf of values.")
             return jnp.stack([jnp.asarray(one, numbers.dtype) for one in spread])
 
-        self._at = jax.jit(lambda numbers: (of(numbers), jax.jacfwd(of)(numbers)))
+        self._value_and_jacobian = jax.jit(lambda numbers: (evaluate(numbers), jax.jacfwd(evaluate)(numbers)))
         self.places = places
         # Leaves that share one number share one motion.
-        jax.eval_shape(of, jax.ShapeDtypeStruct(parameters.first.shape, parameters.first.dtype))
+        jax.eval_shape(evaluate, jax.ShapeDtypeStruct(parameters.first.shape, parameters.first.dtype))
 
-    def at(self, numbers: np.ndarray) -> list[Delay]:
+    def evaluate(self, numbers: np.ndarray) -> list[Delay]:
         """The different delays at the parameters `numbers` (P,)."""
-        values, slopes = (np.asarray(x, float) for x in self._at(numbers))
+        values, slopes = (np.asarray(x, float) for x in self._value_and_jacobian(numbers))
         rows, which = np.unique(np.concatenate([values[:, None], slopes], axis=1), axis=0, return_inverse=True)
         which = which.ravel()
         return [
@@ -207,7 +207,7 @@ def sensors(observe) -> tuple[Any, Wrapped | None]:
     return (inner.observe, inner) if isinstance(inner, Wrapped) else (inner, None)
 
 
-def on_circle(residuals, periods: np.ndarray, xp: Any = np):
+def wrap_residuals(residuals, periods: np.ndarray, xp: Any = np):
     """Residuals (..., S) less whole periods (S,), of which some may be infinite."""
     if not np.isfinite(periods).any():
         return residuals
@@ -215,7 +215,7 @@ def on_circle(residuals, periods: np.ndarray, xp: Any = np):
     return xp.where(np.isfinite(periods), residuals - turn * xp.round(residuals / turn), residuals)
 
 
-def continued(record: Record, periods: np.ndarray) -> Record | None:
+def unwrap_record(record: Record, periods: np.ndarray) -> Record | None:
     """The record with its wrapped signals made continuous; None where samples are too far apart to tell how."""
     if not np.isfinite(periods).any():
         return record
@@ -228,8 +228,8 @@ def continued(record: Record, periods: np.ndarray) -> Record | None:
         if np.mean(np.abs(np.diff(smooth)) > _CLEAR * period) > _UNCLEAR:
             return None
         matrix[there, column] = smooth
-    weights = None if record.weights is None else in_structure(record.weight_matrix, record)
-    return replace(record, values=in_structure(matrix, record), weights=weights)
+    weights = None if record.weights is None else restore_structure(record.weight_matrix, record)
+    return replace(record, values=restore_structure(matrix, record), weights=weights)
 
 
 def require_no_jumps(record: Record, called: str, names: tuple[str, ...], positions: bool) -> None:
@@ -258,7 +258,7 @@ def _jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
     beside = np.sort(beside, axis=-1)[:, -2]
     low, high = y.min(), y.max()
     sharp = steps > _SHARP * np.maximum(beside, 1e-9 * (high - low))
-    sharp &= ~_returns(y, steps)
+    sharp &= ~_isolated_steps(y, steps)
     for period, text in _PERIODS.items():
         fits = sharp & (np.abs(steps - period) <= _NEAR * beside + 1e-6 * period)
         edge = 2 * np.max(beside[fits], initial=0.0)
@@ -273,7 +273,7 @@ def _jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
     return None
 
 
-def _returns(y: np.ndarray, steps: np.ndarray) -> np.ndarray:
+def _isolated_steps(y: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """True for each step that belongs to a sample that is off by itself: the next step leads back."""
     back = np.zeros(len(steps), bool)
     alone = np.abs(y[2:] - y[:-2]) < 0.5 * np.minimum(steps[1:], steps[:-1])
@@ -290,7 +290,7 @@ _SINGULAR = 1e8  # condition from which sensors do not tell positions: that of u
 class Signals:
     """The sensors of a fit: `names` (S,), and the map from motions to signals and their derivatives.
 
-    `periods` (S,) are infinite where a signal is not wrapped; `at_one_time` is the map (y, t, numbers, inputs) →
+    `periods` (S,) are infinite where a signal is not wrapped; `evaluate_state` is the map (y, t, numbers, inputs) →
     signals (S,) of one state, for JAX.
     """
 
@@ -306,14 +306,18 @@ class Signals:
         self.observe = observe
         self.delays: Delays | None = None
         if record is None:
-            self.names, self._at, self.periods = (), None, np.zeros(0)
+            self.names, self._value_and_jacobians, self.periods = (), None, np.zeros(0)
             return
         if isinstance(observe, Delayed):
             self.delays = Delays(observe, parameters, record)
         of_state, wrap = sensors(observe)
         self.periods = np.full(record.matrix.shape[1], np.inf) if wrap is None else wrap.periods(record)
         if of_state is None:
-            self.names, self._at, self.at_one_time = layout.names, None, lambda y, *_: y[: layout.size]
+            self.names, self._value_and_jacobians, self.evaluate_state = (
+                layout.names,
+                None,
+                lambda y, *_: y[: layout.size],
+            )
             if record.structure != (layout.tree, layout.shapes):
                 raise ValueError(
                     f"values must have the structure of q, {layout.tree} of shapes {layout.shapes}, where there is no "
@@ -325,22 +329,22 @@ class Signals:
             raise ValueError("observe asks for `inputs`, which records[0] has none of: give Record(..., inputs=...).")
         self.names = tuple("values" + name for name in record.names)
 
-        def observed(y, t, numbers, inputs):
+        def observe_state(y, t, numbers, inputs):
             q, qdot = map(layout.restore, halves(y))
             extras = {} if form is None else {"inputs": form.restore(inputs)}
             return function(q, qdot, t=t, params=parameters.restore(numbers), **extras)
 
-        _require_signals(observed, layout, parameters, record, 0 if form is None else form.size)
-        flat = lambda *state: jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(observed(*state))])  # noqa: E731
+        _require_signals(observe_state, layout, parameters, record, 0 if form is None else form.size)
+        flat = lambda *state: jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(observe_state(*state))])  # noqa: E731
 
-        def with_derivatives(y, t, inputs, numbers):
+        def value_and_jacobians(y, t, inputs, numbers):
             state = y, t, numbers, inputs
             return flat(*state), *jax.jacfwd(flat, argnums=(0, 2, 1, 3))(*state)
 
-        self.at_one_time = flat
-        self._at = jax.jit(jax.vmap(with_derivatives, in_axes=(0, 0, 0, None)))
+        self.evaluate_state = flat
+        self._value_and_jacobians = jax.jit(jax.vmap(value_and_jacobians, in_axes=(0, 0, 0, None)))
 
-    def of(
+    def evaluate(
         self, motion: RecordMotion, ts: np.ndarray, inputs: np.ndarray, numbers: np.ndarray, numbers_dot: np.ndarray,
         ts_dot: np.ndarray | None = None, rates: np.ndarray | None = None,
     ):  # fmt: skip
@@ -351,12 +355,12 @@ class Signals:
         `motion` moves with the times already.
         """
         tangents = motion.tangents
-        if self._at is None:
+        if self._value_and_jacobians is None:
             n = self.layout.size
             return motion.path[..., :n], np.ascontiguousarray(np.moveaxis(tangents[..., :n], 1, -1))
         rows, times, states = motion.path.shape
         samples = motion.path.reshape(-1, states), ts.ravel(), inputs.reshape(rows * times, -1)
-        values, by_state, by_numbers, by_t, by_inputs = self._in_portions(samples, numbers)
+        values, by_state, by_numbers, by_t, by_inputs = self._evaluate_portions(samples, numbers)
         shape = rows, times, values.shape[1]
         slopes = np.matmul(by_state.reshape(*shape, states), np.moveaxis(tangents, 1, -1))
         slopes += (by_numbers @ numbers_dot.T).reshape(*shape, len(numbers_dot))
@@ -376,7 +380,7 @@ class Signals:
         show a gain, a bias, degrees do with two. Sensors that wrap by themselves, as `atan2` does, never show what was
         made continuous: for these whole periods do not count.
         """
-        if self._at is None:
+        if self._value_and_jacobians is None:
             return record
         there = np.isfinite(record.matrix).all(axis=1)
         instants = record.ts[there], record.input_matrix[there]
@@ -385,15 +389,15 @@ class Signals:
             if q is not None:
                 found = np.full(record.matrix.shape, np.nan)
                 found[there] = q
-                return replace(record, values=in_structure(found, record), weights=None)
+                return replace(record, values=restore_structure(found, record), weights=None)
         return record
 
     def _newton(self, shown: np.ndarray, instants: tuple, numbers: np.ndarray, periods: np.ndarray):
         """q (M, n) for which sensors show `shown` (M, n), up to whole periods; None where the steps do not end."""
         q, rest, n = shown.copy(), np.zeros_like(shown), self.layout.size
         for _ in range(_NEWTON):
-            values, by_state, *_ = self._in_portions((np.concatenate([q, rest], axis=1), *instants), numbers)
-            left, slope = on_circle(values - shown, periods), by_state[..., :n]
+            values, by_state, *_ = self._evaluate_portions((np.concatenate([q, rest], axis=1), *instants), numbers)
+            left, slope = wrap_residuals(values - shown, periods), by_state[..., :n]
             if not (np.isfinite(left).all() and (np.linalg.cond(slope) < _SINGULAR).all()):
                 return None
             step = np.linalg.solve(slope, left[..., None])[..., 0]
@@ -402,21 +406,21 @@ class Signals:
                 return q
         return None
 
-    def _in_portions(self, samples, numbers):
-        assert self._at is not None
+    def _evaluate_portions(self, samples, numbers):
+        assert self._value_and_jacobians is not None
         parts = []
         for begin in range(0, len(samples[0]), _AT_ONCE):
             some = [x[begin : begin + _AT_ONCE] for x in samples]
             filled = [np.resize(x, (_AT_ONCE, *x.shape[1:])) for x in some]
             arrays = (np.asarray(x, self.layout.dtype) for x in (*filled, numbers))
-            parts.append([np.asarray(x, float)[: len(some[0])] for x in self._at(*arrays)])
+            parts.append([np.asarray(x, float)[: len(some[0])] for x in self._value_and_jacobians(*arrays)])
         return [np.concatenate(columns) for columns in zip(*parts, strict=True)]
 
 
-def _require_signals(observed, layout: Layout, parameters: Parameters, record: Record, inputs: int) -> None:
+def _require_signals(observe_state, layout: Layout, parameters: Parameters, record: Record, inputs: int) -> None:
     """Raise `ValueError` where `observe` does not return what the records hold."""
     shapes = (2 * layout.size,), (), parameters.first.shape, (inputs,)
-    out = jax.eval_shape(observed, *(jax.ShapeDtypeStruct(shape, layout.dtype) for shape in shapes))
+    out = jax.eval_shape(observe_state, *(jax.ShapeDtypeStruct(shape, layout.dtype) for shape in shapes))
     leaves, tree = jax.tree.flatten(out)
     got = tree, tuple(getattr(leaf, "shape", ()) for leaf in leaves)
     if any(map(_is_complex, leaves)):

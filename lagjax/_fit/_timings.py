@@ -68,7 +68,7 @@ class Timings(MeasuredSignal):
     direction: int | dict[str, int] = 0
     weights: Any = None
 
-    flat: "Flat" = dataclasses.field(init=False, repr=False)
+    flat: "FlatTimings" = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self):
         keys, functions = _sections(self.section)
@@ -79,20 +79,20 @@ class Timings(MeasuredSignal):
         require_start(self.start)
         if not (np.ndim(self.t0) == 0 and np.isfinite(self.t0)):
             raise ValueError(f"t0 must be a finite number; got {self.t0!r}.")
-        times = _by_section(self.times, keys, "times")
+        times = _section_arrays(self.times, keys, "times")
         counted = [np.arange(len(x)) for x in times] if self.numbers is None else None
-        numbers = _by_section(self.numbers, keys, "numbers") if counted is None else counted
+        numbers = _section_arrays(self.numbers, keys, "numbers") if counted is None else counted
         weights = [np.ones(len(x)) for x in times]
         if self.weights is not None:
             given = self.weights
             weights = [w * given for w in weights] if np.ndim(given) == 0 and not isinstance(given, dict) else (
-                _by_section(given, keys, "weights"))  # fmt: skip
+                _section_arrays(given, keys, "weights"))  # fmt: skip
         for name, few in (("numbers", numbers), ("weights", weights)):
             if [len(x) for x in few] != [len(x) for x in times]:
                 raise ValueError(f"{name} must have the shape of times, {[len(x) for x in times]} by section.")
-        object.__setattr__(self, "times", _in_form(times, keys))
+        object.__setattr__(self, "times", _restore_keys(times, keys))
         which = np.repeat(np.arange(len(times)), [len(x) for x in times])
-        flat = Flat(which, np.concatenate(times), np.concatenate(numbers), np.concatenate(weights))
+        flat = FlatTimings(which, np.concatenate(times), np.concatenate(numbers), np.concatenate(weights))
         _require_possible(flat, float(self.t0))
         object.__setattr__(self, "flat", flat._replace(numbers=flat.numbers.astype(int)))
 
@@ -124,15 +124,15 @@ class Timings(MeasuredSignal):
     def restore(self, matrix: np.ndarray) -> PyTree:
         """Numbers for all times, (M, 1), in the form of `times`."""
         keys, functions = _sections(self.section)
-        return _in_form([matrix[self.flat.which == k, 0] for k in range(len(functions))], keys)
+        return _restore_keys([matrix[self.flat.which == k, 0] for k in range(len(functions))], keys)
 
     def columns(self, values: PyTree) -> np.ndarray:
         """Numbers in the form of `times` as (M, 1)."""
         keys, _ = _sections(self.section)
-        return np.concatenate(_by_section(values, keys, "values"))[:, None]
+        return np.concatenate(_section_arrays(values, keys, "values"))[:, None]
 
 
-class Flat(NamedTuple):
+class FlatTimings(NamedTuple):
     """M times end to end: of which section, when, the number of the crossing, and the weight."""
 
     which: np.ndarray
@@ -152,7 +152,7 @@ def _sections(section) -> tuple[tuple[str, ...] | None, tuple]:
     return tuple(section) if isinstance(section, dict) else None, parts
 
 
-def _by_section(values, keys: tuple[str, ...] | None, name: str) -> list[np.ndarray]:
+def _section_arrays(values, keys: tuple[str, ...] | None, name: str) -> list[np.ndarray]:
     """Arrays (K,) for each section, of floats. Raises where there is not one for each."""
     if keys is not None and (not isinstance(values, dict) or set(values) != set(keys)):
         raise ValueError(f"{name} must be a dict with the names of the sections, {', '.join(map(repr, keys))}.")
@@ -164,11 +164,11 @@ def _by_section(values, keys: tuple[str, ...] | None, name: str) -> list[np.ndar
     return arrays
 
 
-def _in_form(parts: list, keys: tuple[str, ...] | None) -> PyTree:
+def _restore_keys(parts: list, keys: tuple[str, ...] | None) -> PyTree:
     return parts[0] if keys is None else dict(zip(keys, parts, strict=True))
 
 
-def _require_possible(flat: Flat, t0: float) -> None:
+def _require_possible(flat: FlatTimings, t0: float) -> None:
     """Raise `ValueError` for times, numbers or weights that no motion from t0 can have."""
     if not np.isfinite(flat.times).any():
         raise ValueError("times holds no time: all are NaN, or there are none.")
@@ -196,31 +196,33 @@ class Clock:
 
     - `times(y0, numbers)`: the times (M,) of the motion from y0 (2n,) with the parameters `numbers` (P,), a function
       for `jax.jit`, `jax.vmap` and `jax.grad`; NaN where it has not all of them.
-    - `along(y0, numbers, y0_dot, numbers_dot)`: the times, and how they move (M, D) along the directions `y0_dot`
+    - `tangents(y0, numbers, y0_dot, numbers_dot)`: the times, and how they move (M, D) along the directions `y0_dot`
       (D, 2n), `numbers_dot` (D, P).
-    - `why_not(y0, numbers)`: why they are not all there, as a sentence.
+    - `describe_failure(y0, numbers)`: why they are not all there, as a sentence.
     """
 
     times: Callable[..., jax.Array]
-    along: Callable[..., tuple]
-    why_not: Callable[[np.ndarray, np.ndarray], str]
+    tangents: Callable[..., tuple]
+    describe_failure: Callable[[np.ndarray, np.ndarray], str]
 
 
-def clock_of(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
+def build_clock(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
     """The clock of a scene. Raises `ValueError` for functions of a hybrid one, and for transitions of others."""
     is_of_transitions = isinstance(_sections(timings.section)[1][0], Transition)
     if isinstance(scene, Hybrid):
         if not is_of_transitions:
             raise ValueError("Of a lagjax.Hybrid only the times of its transitions are data: Timings(transition, …).")
-        return _clock_of_transitions(scene, layout, parameters, timings, rtol)
+        return _build_transition_clock(scene, layout, parameters, timings, rtol)
     if is_of_transitions:
         raise ValueError("Times of transitions are of a lagjax.Hybrid: give that to `fit` in the place of the System.")
-    return _clock_of_sections(scene, layout, parameters, timings, rtol)
+    return _build_section_clock(scene, layout, parameters, timings, rtol)
 
 
-def _clock_of_sections(system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
+def _build_section_clock(
+    system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float
+) -> Clock:
     """The crossings of the sections, along one motion."""
-    flat, span, (keys, functions) = timings.flat, (float(timings.t0), _end(timings)), sections_of(timings.section)
+    flat, span, (keys, functions) = timings.flat, (float(timings.t0), _last_time(timings)), sections_of(timings.section)
     params = parameters.restore(parameters.first)
     problem = Problem.about(system, layout, params, ts=span, rtol=_SHARPER * rtol, max_steps=_BUDGET)
     directions = directions_of(timings.direction, keys)
@@ -238,12 +240,12 @@ def _clock_of_sections(system: System, layout: Layout, parameters: Parameters, t
     def times(y0, numbers):
         return crossings(y0, numbers)[1].t[flat.which, flat.numbers]
 
-    def along(y0, numbers, y0_dot, numbers_dot):
+    def tangents(y0, numbers, y0_dot, numbers_dot):
         given = motion(y0, numbers), surfaces, room, 1 / _SHARPER
         t, moved = map(np.asarray, MachineCode().crossing_tangents(*given, y0_dot, numbers_dot))
         return t[flat.which, flat.numbers], moved[:, flat.which, flat.numbers].T
 
-    def why_not(y0, numbers) -> str:
+    def describe_failure(y0, numbers) -> str:
         solution, noted = crossings(y0, numbers)
         if text := sentence(solution.result, solution.t_end, span[1], solution.y_end, layout.names):
             return text
@@ -258,16 +260,16 @@ def _clock_of_sections(system: System, layout: Layout, parameters: Parameters, t
             f"{flat.numbers[first]}, counted from 0, was measured."
         )
 
-    return Clock(times, along, why_not)
+    return Clock(times, tangents, describe_failure)
 
 
-def _clock_of_transitions(
+def _build_transition_clock(
     scene: Hybrid, layout: Layout, parameters: Parameters, timings: Timings, rtol: float
 ) -> Clock:
     """The times of transitions of hybrid motion, whose derivatives are those of `simulate_hybrid`."""
-    flat, span = timings.flat, np.array([float(timings.t0), _end(timings)])
+    flat, span = timings.flat, np.array([float(timings.t0), _last_time(timings)])
     _, transitions = _sections(timings.section)
-    ways = np.array([_way(scene, one) for one in transitions])[flat.which]
+    ways = np.array([_mode_places(scene, one) for one in transitions])[flat.which]
     if scene.max_transitions < len(flat.times):
         raise ValueError(
             f"{len(flat.times)} transitions were timed, but Hybrid(max_transitions={scene.max_transitions}) "
@@ -288,13 +290,13 @@ def _clock_of_transitions(
         return jnp.where(mine.any(axis=1), happened.t[place], jnp.nan)
 
     @jax.jit
-    def along(y0, numbers, *directions):
+    def tangents(y0, numbers, *directions):
         t, moved = jax.linearize(times, y0, numbers)
         return t, jax.vmap(moved)(*directions).T
 
-    ended = jax.jit(lambda y0, numbers: _ended(run(y0, numbers)))
+    ended = jax.jit(lambda y0, numbers: _hybrid_end(run(y0, numbers)))
 
-    def why_not(y0, numbers) -> str:
+    def describe_failure(y0, numbers) -> str:
         missing = ~np.isfinite(np.asarray(jax.jit(times)(y0, numbers)))
         result, t_end, y_end, of_transitions = (np.asarray(x) for x in ended(y0, numbers))
         first = int(np.argmax(missing))
@@ -306,10 +308,10 @@ def _clock_of_transitions(
             f"{flat.numbers[first]}, counted from 0, was measured." + (f" {text}" if text else "")
         )
 
-    return Clock(times, along, why_not)
+    return Clock(times, tangents, describe_failure)
 
 
-def _ended(run: Trajectory) -> tuple:
+def _hybrid_end(run: Trajectory) -> tuple:
     """The result, the last time and state of a hybrid motion, and which modes its transitions (K, 2) were between."""
     flat = [jnp.ravel(leaf) for leaf in jax.tree.leaves((run.end.q, run.end.qdot))]
     happened = _transitions(run)
@@ -323,7 +325,7 @@ def _transitions(run: Trajectory) -> Transitions:
     return run.transitions
 
 
-def _way(scene: Hybrid, transition: Transition) -> tuple[int, int]:
+def _mode_places(scene: Hybrid, transition: Transition) -> tuple[int, int]:
     """The places of both modes of a transition. Raises `ValueError` where it is not alone between them."""
     names, ways = list(scene.modes), [(one.source, one.target) for one in scene.transitions]
     way = transition.source, transition.target
@@ -337,7 +339,7 @@ def _way(scene: Hybrid, transition: Transition) -> tuple[int, int]:
     return names.index(way[0]), names.index(way[1])
 
 
-def _end(timings: Timings) -> float:
+def _last_time(timings: Timings) -> float:
     """Until when crossings are looked for."""
     ends = [timings.ts[1]]
     for k in np.unique(timings.flat.which):

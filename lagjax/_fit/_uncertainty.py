@@ -58,7 +58,7 @@ import numpy as np
 
 from lagjax._fit._noise import NoiseScale
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._residuals import LostTrial, Residuals, Trial, compressed
+from lagjax._fit._residuals import LostTrial, Residuals, Trial, compress_rows
 
 
 class Correlation(NamedTuple):
@@ -104,7 +104,7 @@ def _autocorrelation(question: Residuals, point: Trial, widths: NoiseScale, sign
 
 def lag_products(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """Σ zᵢ zᵢ₊ₖ over rows (N, T) for the lags k = 0 … T − 1, of samples that count."""
-    rows = without_gaps(rows, counted)
+    rows = close_gaps(rows, counted)
     spectrum = np.abs(np.fft.rfft(rows, 2 * rows.shape[1])) ** 2
     return np.fft.irfft(spectrum.sum(axis=0), 2 * rows.shape[1])[: rows.shape[1]]
 
@@ -127,7 +127,7 @@ def correlated_power(rows: np.ndarray, counted: np.ndarray) -> float:
     return float(highest / count) if highest > _CHANCE / np.sqrt(count) * sums[0] else 0.0
 
 
-def without_gaps(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
+def close_gaps(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
     """The rows (N, T, ...) with what `counted` (N, T) in front, so that lags count samples that are there.
 
     Where every tenth sample is measured, or some are missing, the neighbour of one is the next that was measured.
@@ -210,14 +210,14 @@ def information(question: Residuals, point: Trial, widths: NoiseScale) -> Inform
     free, unit = len(point.u), _lengths(triangles, question.states)  # of columns: their squares may be no numbers
     middle = np.zeros((free, free))
     for batch, factor, slopes in zip(question.batches, factors, point.slopes, strict=True):
-        own = orthogonal(triangles[batch.rows], factor[..., None] * slopes, question.states) / unit
+        own = eliminate_starts(triangles[batch.rows], factor[..., None] * slopes, question.states) / unit
         for s, law in enumerate(lags):
-            middle += correlated_square(without_gaps(own[:, :, s], batch.weights[..., s] > 0), law)
+            middle += correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), law)
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + question.unknowns
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in widths.dof])
-    rows, basis = _eliminated(triangles, question.states) / unit, basis * unit[:, None]
+    rows, basis = _parameter_rows(triangles, question.states) / unit, basis * unit[:, None]
     half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
     white = robust * half / unit / unit[:, None]
     covariance = lost * robust * half @ middle @ half.T / unit / unit[:, None]
@@ -233,7 +233,7 @@ def information(question: Residuals, point: Trial, widths: NoiseScale) -> Inform
 
 def null_space(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
-    rows = _eliminated(triangles, states)
+    rows = _parameter_rows(triangles, states)
     unit = _lengths(triangles, states)
     if not len(unit):
         return np.zeros((0, 0)), np.zeros((0, 0))
@@ -289,10 +289,10 @@ def growth(sizes: list[np.ndarray]) -> float:
     return found
 
 
-def _eliminated(triangles: np.ndarray, states: int) -> np.ndarray:
+def _parameter_rows(triangles: np.ndarray, states: int) -> np.ndarray:
     """The rows of the parameters, orthogonal to those of the starts: a triangle with F columns."""
-    own = orthogonal(triangles, triangles[..., :-1], states)
-    return compressed(own.reshape(1, own.shape[0] * own.shape[1], own.shape[-1]))[0]
+    own = eliminate_starts(triangles, triangles[..., :-1], states)
+    return compress_rows(own.reshape(1, own.shape[0] * own.shape[1], own.shape[-1]))[0]
 
 
 def _lengths(triangles: np.ndarray, states: int) -> np.ndarray:
@@ -308,7 +308,7 @@ def _norm(x: np.ndarray, axis) -> np.ndarray:
     return np.sqrt(np.sum((x / unit) ** 2, axis=axis)) * unit.squeeze(axis)
 
 
-def orthogonal(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.ndarray:
+def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.ndarray:
     """Columns of parameters less what the starts can do instead: `slopes` (N, ..., D) → (N, ..., F).
 
     Directions of a start that nothing depends on can do nothing: they are left out.
@@ -339,11 +339,11 @@ def start_covariances(question: Residuals, point: Trial, widths: NoiseScale, kno
         for row, piece in zip(batch.rows.tolist(), rows, strict=True):
             if question.fitted[row]:
                 across = np.zeros((states, states)) if point.across is None else point.across[row]
-                found.covariance[row], found.follows[row] = _of_start(piece, states, lags, known, across)
+                found.covariance[row], found.follows[row] = _start_covariance(piece, states, lags, known, across)
     return found
 
 
-def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Information, across: np.ndarray):
+def _start_covariance(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Information, across: np.ndarray):
     """The covariance (2n, 2n) of one start, and A⁺B, from its weighted rows (T, S, 2n + F).
 
     What is `across` (2n, 2n) the constraints is not free, and no less known for not being seen.
@@ -355,11 +355,11 @@ def _of_start(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Info
     follows = into.T @ b.reshape(-1, b.shape[-1])
     own = np.concatenate([into.reshape(a.shape), b - a @ follows], axis=-1)
     square = np.sum([correlated_square(own[None, :, s], lags[s]) for s in range(len(lags))], axis=0)
-    covariance = _covariance_of_seen(known)
+    covariance = _identifiable_covariance(known)
     shared = square[:states, states:] @ known.white @ follows.T
     found = known.lost * (square[:states, :states] - shared - shared.T) + follows @ covariance @ follows.T
     not_seen = v[~sees] - v[~sees] @ across.T
-    lost = (np.abs(not_seen) > 1e-6).any(axis=0) | _moves(follows, known)
+    lost = (np.abs(not_seen) > 1e-6).any(axis=0) | _depends_on_unseen(follows, known)
     found[lost], found[:, lost] = np.nan, np.nan
     found[lost, lost] = np.inf
     return found, follows
@@ -387,17 +387,17 @@ def signal_deviations(slopes: np.ndarray, states: int, start: np.ndarray, follow
     """
     a = slopes[..., :states]
     along = slopes[..., states:] - a @ follows
-    covariance = _covariance_of_seen(known)
+    covariance = _identifiable_covariance(known)
     variance = np.einsum("tsf,fg,tsg->ts", along, covariance, along) + np.einsum("tsi,ij,tsj->ts", a, start, a)
-    return np.where(_moves(along, known), np.inf, np.sqrt(np.maximum(variance, 0.0)))
+    return np.where(_depends_on_unseen(along, known), np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _covariance_of_seen(known: Information) -> np.ndarray:
+def _identifiable_covariance(known: Information) -> np.ndarray:
     """The covariance (F, F) of what is seen, zero along what is not; with white residuals where some is not."""
     return known.covariance if not known.null.size else known.lost * known.white
 
 
-def _moves(rows: np.ndarray, known: Information) -> np.ndarray:
+def _depends_on_unseen(rows: np.ndarray, known: Information) -> np.ndarray:
     """True if rows (..., F) of derivatives depend on a direction that is not seen."""
     if not known.null.size:
         return np.zeros(rows.shape[:-1], bool)
@@ -442,8 +442,8 @@ def _sentence_on_rounding(question: Residuals, point: Trial, known: Information)
         for k, row in enumerate(size)
     )
     return (
-        f"{question.called(record)} is chaotic: motions grow apart within it by a factor of {grown:.0e}, and rounding "
-        f"hides what it says about {_listed(names)}. There are no intervals from records that long: cut it into "
+        f"{question.label(record)} is chaotic: motions grow apart within it by a factor of {grown:.0e}, and rounding "
+        f"hides what it says about {_join_names(names)}. There are no intervals from records that long: cut it into "
         "several shorter ones.",
     )
 
@@ -462,7 +462,7 @@ def _null_elsewhere(question: Residuals, point: Trial, widths: NoiseScale):
 
 def _blocks(null: np.ndarray) -> list[np.ndarray]:
     """The parameters of the null directions in sets, of which each is free by itself: rows that are not zero."""
-    reduced = _reduced(null.T)
+    reduced = _reduce_rows(null.T)
     sets: list[set[int]] = []
     for row in reduced:
         own = set(np.flatnonzero(np.abs(row) > 1e-5 * np.abs(row).max()).tolist())
@@ -473,7 +473,7 @@ def _blocks(null: np.ndarray) -> list[np.ndarray]:
     return [np.array(sorted(s)) for s in sets]
 
 
-def _reduced(rows: np.ndarray) -> np.ndarray:
+def _reduce_rows(rows: np.ndarray) -> np.ndarray:
     """The reduced row echelon form of independent rows, with the largest pivots."""
     rows = np.array(rows, float)
     for i in range(len(rows)):
@@ -498,16 +498,17 @@ def _sentence(parameters: Parameters, block: np.ndarray, spaces) -> str:
     absolute = [_directions_within(direction, block) for direction, _ in spaces]
     if all(np.all(x[block] != 0) for _, x in spaces) and (rows := _whole_numbers(relative)) is not None:
         if relative[0].shape[1] == 1 and np.ptp(relative[0]) < _EXACT * np.abs(relative[0]).max():
-            return f"A common factor of {_listed(names)} is not seen, only their ratios: keep one of them fixed."
-        return f"Of {_listed(names)} only {_listed([_product(row, names) for row in rows])} {_is(rows)} seen."
+            return f"A common factor of {_join_names(names)} is not seen, only their ratios: keep one of them fixed."
+        return f"Of {_join_names(names)} only {_join_names([_product(row, names) for row in rows])} {_verb(rows)} seen."
     if (rows := _whole_numbers(absolute)) is not None:
-        return f"Of {_listed(names)} only {_listed([_sum(row, names) for row in rows])} {_is(rows)} seen."
+        return f"Of {_join_names(names)} only {_join_names([_sum(row, names) for row in rows])} {_verb(rows)} seen."
     if (count := absolute[0].shape[1]) > 1:
-        return f"{count} combinations of {_listed(names)} are not seen: keep {count} of them fixed."
+        return f"{count} combinations of {_join_names(names)} are not seen: keep {count} of them fixed."
     changes = absolute[0][:, 0] / np.abs(absolute[0][:, 0]).max()
     together = ", ".join(f"{name} by {change:+.3g}" for name, change in zip(names, changes, strict=True))
     return (
-        f"A combination of {_listed(names)} is not seen: to change {together}, in proportion, changes nothing measured."
+        f"A combination of {_join_names(names)} is not seen: to change {together}, in proportion, changes nothing "
+        "measured."
     )
 
 
@@ -533,7 +534,7 @@ def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
     if rank == len(first):
         return None
     rows = []
-    for row in _reduced(right[rank:]):
+    for row in _reduce_rows(right[rank:]):
         fractions = [Fraction(float(x)).limit_denominator(_LARGEST_EXPONENT) for x in row]
         common = np.lcm.reduce([f.denominator for f in fractions])
         whole = [int(f * int(common)) for f in fractions]
@@ -586,13 +587,13 @@ def _sum(row: list[int], names: list[str]) -> str:
     return text.removeprefix(" + ")
 
 
-def _listed(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     if len(names) > _MOST_NAMES:  # weights of a network: whole arrays instead of their numbers
         names = list(dict.fromkeys(re.sub(r"\[[\d, ]+\]$", "", name) for name in names))
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _is(rows: list) -> str:
+def _verb(rows: list) -> str:
     return "is" if len(rows) == 1 else "are"
 
 
@@ -614,10 +615,12 @@ class Experiments(NamedTuple):
         width = max(len(name) for name in (*self.names, "experiment"))
         rows = [f"{'experiment':<{width}}  {'gain':>8}  {'volume':>8}  {'newly seen':>10}  most for"]
         for name, gain, new, after in zip(self.names, self.gain, self.newly_seen, self.deviations, strict=True):
-            rows.append(f"{name:<{width}}  {gain:>8.3g}  {np.exp(-gain / 2):>8.3g}  {new:>10}  {self._most(after)}")
+            rows.append(
+                f"{name:<{width}}  {gain:>8.3g}  {np.exp(-gain / 2):>8.3g}  {new:>10}  {self._describe_change(after)}"
+            )
         return "\n".join(rows)
 
-    def _most(self, after: np.ndarray) -> str:
+    def _describe_change(self, after: np.ndarray) -> str:
         known = np.where(np.isfinite(after), after, 1.0)
         place = int(np.argmin(known))
         return f"{self.parameters[place]}, whose interval becomes {known[place]:.2g} of now" if known[place] < 1 else ""

@@ -1,6 +1,6 @@
 """Verdict: the result of a search in words, and the mistakes in records that explain a poor one.
 
-It holds `verdict`, `unexplained`, `shifts_without` (influence of a record) and `find_mistake`.
+It holds `verdict`, `measure_unexplained`, `shifts_without` (influence of a record) and `find_mistake`.
 
 **Mistakes.** Degrees for radians, milliseconds for seconds, two signals in each other's place, a sign, an angle from
 the upright: each leaves data that a scene cannot follow, and each can be undone. If the fit then follows them, that is
@@ -37,9 +37,9 @@ import numpy as np
 from lagjax._fit._descent import Descent, column_norms, eliminate
 from lagjax._fit._noise import NoiseScale
 from lagjax._fit._parameters import Between, Parameters, Positive
-from lagjax._fit._records import Record, in_structure
-from lagjax._fit._residuals import Residuals, Trial, compressed
-from lagjax._fit._uncertainty import Information, correlated_power, orthogonal
+from lagjax._fit._records import Record, restore_structure
+from lagjax._fit._residuals import Residuals, Trial, compress_rows
+from lagjax._fit._uncertainty import Information, correlated_power, eliminate_starts
 
 _WIDE = 3.0  # rad: a signal of a smaller range is not tried as degrees, which would leave it 0.05
 _WIDEST = 20.0  # rad, three turns: of a larger range degrees are tried first
@@ -63,12 +63,12 @@ def possible_mistakes(
     """The mistakes that may be in the records, the likeliest first, where the data move so many times slower than the
     scene does, and `worst` has the places of the records in the order of what is left of them."""
     count, some = len(names), range(min(len(names), _MOST))
-    by_time = [_in_milliseconds(r) if isinstance(r, Record) else r for r in records]
+    by_time = [_convert_milliseconds(r) if isinstance(r, Record) else r for r in records]
     milliseconds = [PossibleMistake("with the times in milliseconds", by_time)]
-    ranges = [max(np.ptp(_there(r, k)) for r in records if isinstance(r, Record)) for k in range(count)]
+    ranges = [max(np.ptp(_present_samples(r, k)) for r in records if isinstance(r, Record)) for k in range(count)]
     wide = [k for k in range(count) if ranges[k] > _WIDE]
     degrees = [
-        PossibleMistake(f"with {_listed(names, turned)} in degrees", _scaled(records, turned, np.pi / 180))
+        PossibleMistake(f"with {_list_names(names, turned)} in degrees", _scale_signals(records, turned, np.pi / 180))
         for turned in ([wide] if wide else []) + [[k] for k in wide[:_MOST] if len(wide) > 1]
     ]
     yield from milliseconds if slower > _SLOW else []
@@ -77,21 +77,21 @@ def possible_mistakes(
     for i, j in itertools.combinations(some, 2):
         order = np.arange(count)
         order[[i, j]] = j, i
-        swaps.append(PossibleMistake(f"with {names[i]} and {names[j]} swapped", _reordered(records, order)))
+        swaps.append(PossibleMistake(f"with {names[i]} and {names[j]} swapped", _reorder_signals(records, order)))
     yield from swaps if len(swaps) == 1 else []  # one try tells
     for place in worst[:_MOST] if len(records) > 2 else []:
         yield PossibleMistake(f"without records[{place}]", [*records[:place], *records[place + 1 :]])
     yield from swaps if len(swaps) > 1 else []
     for k in some:
-        yield PossibleMistake(f"with the other sign of {names[k]}", _scaled(records, [k], -1.0))
+        yield PossibleMistake(f"with the other sign of {names[k]}", _scale_signals(records, [k], -1.0))
     for turned in [list(some)] + [[k] for k in some if count > 1]:
-        text = f"with {_listed(names, turned)} counted from the opposite direction, π further"
-        yield PossibleMistake(text, _changed(records, turned, lambda x: x + np.pi))
+        text = f"with {_list_names(names, turned)} counted from the opposite direction, π further"
+        yield PossibleMistake(text, _change_signals(records, turned, lambda x: x + np.pi))
     yield from degrees if max(ranges) <= _WIDEST else []
     yield from milliseconds if slower <= _SLOW else []
 
 
-def _in_milliseconds(record: Record) -> Record:
+def _convert_milliseconds(record: Record) -> Record:
     """A record whose times were taken for seconds."""
     return replace(record, ts=record.ts / 1e3, input_ts=None if record.input_ts is None else record.input_ts / 1e3)
 
@@ -125,43 +125,43 @@ def constant_signals(records: list[Any], names: tuple[str, ...]) -> list[str]:
         for place, record in enumerate(records)
         if isinstance(record, Record)
         for k, name in enumerate(names)
-        if len(there := _there(record, k)) >= _FEWEST and np.ptp(there) == 0.0
+        if len(there := _present_samples(record, k)) >= _FEWEST and np.ptp(there) == 0.0
     ]
 
 
-def _there(record: Record, signal: int) -> np.ndarray:
+def _present_samples(record: Record, signal: int) -> np.ndarray:
     """The samples of a signal that are not missing; a zero where all are."""
     column = record.matrix[:, signal]
     return column[np.isfinite(column)] if np.isfinite(column).any() else np.zeros(1)
 
 
-def _listed(names: tuple[str, ...], which: list[int]) -> str:
+def _list_names(names: tuple[str, ...], which: list[int]) -> str:
     return " and ".join(names[k] for k in which) if len(which) < len(names) or len(names) == 1 else "all signals"
 
 
-def _scaled(records: list[Any], columns: list[int], factor: float) -> list[Any]:
-    return _changed(records, columns, lambda x: factor * x)
+def _scale_signals(records: list[Any], columns: list[int], factor: float) -> list[Any]:
+    return _change_signals(records, columns, lambda x: factor * x)
 
 
-def _reordered(records: list[Any], order: np.ndarray) -> list[Any]:
+def _reorder_signals(records: list[Any], order: np.ndarray) -> list[Any]:
     """The records with signals in another order, and their weights with them."""
     found = []
     for record in records:
         if isinstance(record, Record):
-            weights = None if record.weights is None else in_structure(record.weight_matrix[:, order], record)
-            record = replace(record, values=in_structure(record.matrix[:, order], record), weights=weights)
+            weights = None if record.weights is None else restore_structure(record.weight_matrix[:, order], record)
+            record = replace(record, values=restore_structure(record.matrix[:, order], record), weights=weights)
         found.append(record)
     return found
 
 
-def _changed(records: list[Any], columns: list[int], change: Callable[[np.ndarray], np.ndarray]) -> list[Any]:
+def _change_signals(records: list[Any], columns: list[int], change: Callable[[np.ndarray], np.ndarray]) -> list[Any]:
     """The records with some signals changed."""
     found = []
     for record in records:
         if isinstance(record, Record):
             matrix = record.matrix
             matrix[:, columns] = change(matrix[:, columns])
-            record = replace(record, values=in_structure(matrix, record))
+            record = replace(record, values=restore_structure(matrix, record))
         found.append(record)
     return found
 
@@ -189,17 +189,19 @@ def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, quest
     parts = [descent.message]
     if known.confirmed.shape[1]:
         parts.append("Not everything that is free is seen: fix it, or measure more.")
-    left = unexplained(question, descent.point, descent.widths)
+    left = measure_unexplained(question, descent.point, descent.widths)
     parts += left.motion + left.noise
     triangles = question.triangles(descent.point, question.factors(descent.point, descent.widths))
-    at_ends, named = _at_ends(question.parameters, descent.point, triangles, question.states, known)
+    at_ends, named = _describe_ends(question.parameters, descent.point, triangles, question.states, known)
     parts += at_ends
     # Half a step of the search is one standard deviation: the interval then spans more than a factor of fifty.
     wide = 2 * _deviations(known) > question.parameters.reach
     labels = dict.fromkeys(question.parameters.labels[i] for i in np.flatnonzero(wide & ~named))
     if labels:
         parts.append(f"Hardly seen, or at the end of what its transform allows: {', '.join(labels)}.")
-    apart, pulls = _disagreements(question, triangles, known, ~named, _motion(question, descent.point, descent.widths))
+    apart, pulls = _disagreements(
+        question, triangles, known, ~named, _unexplained_motion(question, descent.point, descent.widths)
+    )
     parts += apart + pulls
     if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
@@ -224,7 +226,7 @@ class Unexplained(NamedTuple):
     worst: list[int]
 
 
-def unexplained(question: Residuals, point: Trial, widths: NoiseScale) -> Unexplained:
+def measure_unexplained(question: Residuals, point: Trial, widths: NoiseScale) -> Unexplained:
     """The share of the signals that a trial leaves, where that is much."""
     left, noisy, shares, doubted, many = [], [], [0.0], False, len(question.records) > 1
     of_records = np.zeros(len(question.records))
@@ -253,7 +255,7 @@ def unexplained(question: Residuals, point: Trial, widths: NoiseScale) -> Unexpl
         worst = sorted(each, key=lambda k: -each[k])[:_MOST_NAMED] if many and len(each) < len(parts) else []
         left += [
             f"The fit leaves {_percent(np.sqrt(parts[k].left), np.sqrt(parts[k].own))} of {name} in "
-            f"{question.called(k)}, and less in others: is it a record of this scene, with the signs of the others?"
+            f"{question.label(k)}, and less in others: is it a record of this scene, with the signs of the others?"
             for k in worst
         ]
     return Unexplained(left, noisy, float(max(shares)), doubted, np.argsort(-of_records, kind="stable").tolist())
@@ -290,10 +292,10 @@ def _rows_of_signal(question: Residuals, point: Trial, widths: NoiseScale, signa
             if counts[row].any():
                 each = residuals[row, :, signal], batch.values[row, :, signal], counts[row]
                 found.setdefault(question.pieces[place].record, []).append(each)
-    return {k: tuple(_padded([one[i] for one in pieces]) for i in range(3)) for k, pieces in found.items()}
+    return {k: tuple(_pad_rows([one[i] for one in pieces]) for i in range(3)) for k, pieces in found.items()}
 
 
-def _padded(rows: list[np.ndarray]) -> np.ndarray:
+def _pad_rows(rows: list[np.ndarray]) -> np.ndarray:
     """Rows of different lengths as one array, with zeros behind the shorter ones."""
     longest = max(map(len, rows))
     return np.stack([np.pad(row, (0, longest - len(row))) for row in rows])
@@ -304,7 +306,7 @@ def _deviations(known: Information) -> np.ndarray:
     return np.sqrt(np.nan_to_num(np.diag(known.covariance), posinf=0.0))
 
 
-def _at_ends(parameters: Parameters, point: Trial, triangles, states: int, known: Information):
+def _describe_ends(parameters: Parameters, point: Trial, triangles, states: int, known: Information):
     """Sentences for the numbers at the end of their sets, and for each unknown whether there is one (F,)."""
     found, named = [], np.zeros(len(parameters), bool)
     if known.null.shape[1] or not len(parameters):
@@ -317,7 +319,7 @@ def _at_ends(parameters: Parameters, point: Trial, triangles, states: int, known
             continue
         u = point.u[unknown : unknown + 1]
         slope = float(transform.slope(u)[0])
-        text = _at_end(
+        text = _describe_end(
             label, transform, float(transform.value(u)[0]), slope * step[unknown], slope * deviations[unknown]
         )
         if text is not None:
@@ -326,7 +328,7 @@ def _at_ends(parameters: Parameters, point: Trial, triangles, states: int, known
     return found, named
 
 
-def _at_end(name: str, transform: Positive | Between, x: float, step: float, error: float) -> str | None:
+def _describe_end(name: str, transform: Positive | Between, x: float, step: float, error: float) -> str | None:
     """The sentence for one number x whose step on a straight line, and whose standard error there, are given."""
     ends = [(0.0, -1)] if isinstance(transform, Positive) else [(transform.lower, -1), (transform.upper, 1)]
     for end, side in ends:
@@ -368,17 +370,17 @@ def _disagreements(
     else:
         apart, pulls, how = apart[:_MOST_NAMED], pulls[:1], "disagrees with the others"
     return (
-        [f"{question.called(k)} {how}: without it {_moved(labels[i], shifts[k].sizes[i])}." for k, i in apart],
+        [f"{question.label(k)} {how}: without it {_shift_clause(labels[i], shifts[k].sizes[i])}." for k, i in apart],
         [
-            f"Without {question.called(k)} {_moved(labels[i], shifts[k].sizes[i])}, more than its interval allows for. "
-            f"Parameters of its own would explain {100 * shifts[k].explained / motion[k]:.2g} % of the motion that is "
-            "left in it: the scene lacks something that differs from record to record."
+            f"Without {question.label(k)} {_shift_clause(labels[i], shifts[k].sizes[i])}, more than its interval "
+            f"allows for. Parameters of its own would explain {100 * shifts[k].explained / motion[k]:.2g} % of the "
+            "motion that is left in it: the scene lacks something that differs from record to record."
             for k, i in pulls
         ],
     )
 
 
-def _motion(question: Residuals, point: Trial, widths: NoiseScale) -> dict[int, float]:
+def _unexplained_motion(question: Residuals, point: Trial, widths: NoiseScale) -> dict[int, float]:
     """The sum of squares that a trial leaves beyond white noise in every record, in units of the noise."""
     found: dict[int, float] = {}
     for signal in range(len(question.names)):
@@ -388,7 +390,7 @@ def _motion(question: Residuals, point: Trial, widths: NoiseScale) -> dict[int, 
     return found
 
 
-def _moved(label: str, shift: float) -> str:
+def _shift_clause(label: str, shift: float) -> str:
     """The clause on a shift in standard deviations; parameters move up with their unknowns."""
     way = "up" if shift > 0 else "down"
     return f"{label} would move {way} by {abs(shift):.1f} of the standard deviations that chance gives it"
@@ -410,12 +412,12 @@ def shifts_without(states: int, triangles, records: np.ndarray, variances, white
     seen is left out, since there is nothing that it could disagree with.
     """
     # The residual is one more column of the parameters, so that the starts are taken out of it as well.
-    own = orthogonal(np.concatenate([triangles, triangles[..., -1:]], axis=-1), triangles, states)
+    own = eliminate_starts(np.concatenate([triangles, triangles[..., -1:]], axis=-1), triangles, states)
     size, growth = 1.0 / np.sqrt(white), np.sqrt(np.maximum(variances / white, 1.0))
-    whole, found = compressed(own.reshape(1, -1, own.shape[-1]))[0][:, :-1] / size, {}
+    whole, found = compress_rows(own.reshape(1, -1, own.shape[-1]))[0][:, :-1] / size, {}
     for k in np.unique(records):
         rows = own[records != k].reshape(-1, own.shape[-1])
-        rest = compressed(rows[None])[0][:, :-1] / size
+        rest = compress_rows(rows[None])[0][:, :-1] / size
         values = np.linalg.svd(rest, compute_uv=False)
         if values[-1] < 1e-5 * values[0]:
             continue

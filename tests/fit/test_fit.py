@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 import lagjax
 from lagjax._fit import _descent, _parameters, _residuals, _sensors, _uncertainty
-from lagjax._fit._motions import _ByJAX, motions_of
+from lagjax._fit._motions import _JaxMotions, choose_motions
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._search import Reader
 from lagjax._fit._verdict import shifts_without
@@ -433,18 +433,18 @@ def test_the_real_axis_with_dry_friction(capsys):
 
 @pytest.mark.slow
 def test_derivatives_of_motions_and_sensors_are_those_of_differences():
-    parameters = Parameters.of(TRUTH, FREE, lagjax.positive)
+    parameters = Parameters.from_pytree(TRUTH, FREE, lagjax.positive)
     observe = lambda q, v, t, params: jnp.stack([jnp.sin(q) * params["l"], v * t])
     signals = _sensors.Signals(
         observe, Layout.of(0.0, 0.0), parameters, lagjax.Record(TS, np.zeros((len(TS), 2)), start=(0.0, 0.0))
     )
-    motions = motions_of(SCENE, Layout.of(0.0, 0.0), parameters, 1e-12, None)
-    u, ts = parameters.moved(parameters.first), TS[None, ::20]
+    motions = choose_motions(SCENE, Layout.of(0.0, 0.0), parameters, 1e-12, None)
+    u, ts = parameters.inverse(parameters.first), TS[None, ::20]
 
     def values(x):
         numbers, (y0_dot, numbers_dot) = parameters.numbers(x[2:]), along(parameters.directions(x[2:]))
         motion = motions.follow(ts, x[None, :2], numbers, y0_dot, numbers_dot)
-        return signals.of(motion, ts, np.zeros((*ts.shape, 0)), numbers, numbers_dot)
+        return signals.evaluate(motion, ts, np.zeros((*ts.shape, 0)), numbers, numbers_dot)
 
     x = np.concatenate([[1.0, -0.4], u])
     slopes = values(x)[1]
@@ -459,13 +459,13 @@ def test_derivatives_of_motions_and_sensors_are_those_of_differences():
 @pytest.mark.slow
 def test_motions_of_machine_code_and_of_diffrax_agree():
     layout = Layout.of(0.0, 0.0)
-    parameters = Parameters.of(TRUTH, FREE, lagjax.positive)
+    parameters = Parameters.from_pytree(TRUTH, FREE, lagjax.positive)
     ts, y0 = np.stack([TS[:5], TS[3:8]]), np.array([[1.0, 0.0], [0.3, -1.0]])
-    u = parameters.moved(parameters.first)
+    u = parameters.inverse(parameters.first)
     numbers, (y0_dot, numbers_dot) = parameters.numbers(u), along(parameters.directions(u), 2)
-    fast = motions_of(SCENE, layout, parameters, 1e-11, None).follow(ts, y0, numbers, y0_dot, numbers_dot)
+    fast = choose_motions(SCENE, layout, parameters, 1e-11, None).follow(ts, y0, numbers, y0_dot, numbers_dot)
     options = {"rtol": 1e-11, "atol": None, "adjoint": diffrax.ForwardMode()}
-    plain = _ByJAX(SCENE, layout, parameters, options).follow(ts, y0, numbers, y0_dot, numbers_dot)
+    plain = _JaxMotions(SCENE, layout, parameters, options).follow(ts, y0, numbers, y0_dot, numbers_dot)
     np.testing.assert_allclose(fast.path, plain.path, atol=1e-8)
     np.testing.assert_allclose(fast.tangents, plain.tangents, atol=1e-7)
     assert fast.tangents.shape == (2, 4, 5, 2)
@@ -475,7 +475,7 @@ def test_elimination_is_the_solution_of_the_whole_problem():
     rng = np.random.default_rng(0)
     pieces, states, free, damping = 5, 4, 3, 0.3
     rows = rng.normal(size=(pieces, 30, states + free + 1))
-    triangles = _residuals.compressed(rows)
+    triangles = _residuals.compress_rows(rows)
     scale = _descent.column_norms(triangles, states)
     pull = np.array([0.5, 0.0, 2.0]), np.array([0.1, 0.0, -0.3])
     step = _descent.eliminate(triangles, states, scale, damping, pull)
@@ -507,7 +507,7 @@ def test_states_are_read_off_noisy_data():
     ts = np.linspace(0.0, 2.0, 1001)
     values = np.sin(3 * ts) + 1e-2 * np.random.default_rng(0).normal(size=ts.shape)
     values[100:120] = np.nan
-    states = Reader.of(lagjax.Record(ts, values)).states(np.arange(0, 1001, 50))
+    states = Reader.from_record(lagjax.Record(ts, values)).states(np.arange(0, 1001, 50))
     np.testing.assert_allclose(states[1:-1, 0], np.sin(3 * ts[50:-50:50]), atol=1e-2)
     np.testing.assert_allclose(states[1:-1, 1], 3 * np.cos(3 * ts[50:-50:50]), atol=0.3)
 

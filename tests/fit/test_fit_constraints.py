@@ -54,7 +54,7 @@ def test_starts_on_constraints_are_found_and_stay_there():
 def test_the_derivatives_are_those_of_differences_also_by_the_length_of_the_rod():
     record, truth = measured(0.0)
     fit = lagjax.fit(SCENE, record, TRUTH, method="whole")
-    u, states = fit.parameters.moved(np.asarray(fit.parameters.first)), truth[None]
+    u, states = fit.parameters.inverse(np.asarray(fit.parameters.first)), truth[None]
     point = fit.question.evaluate(u, states)
     for k, step in enumerate(1e-5 * np.eye(4 + len(u))):
         ends = [fit.question.evaluate(u + w * step[4:], states + w * step[:4]).residuals[0] for w in (1, -1)]

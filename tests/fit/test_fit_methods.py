@@ -50,10 +50,10 @@ TEN, PSEUDO = body(np.random.default_rng(0))
 )
 def test_transforms_of_leaves_are_inverses_with_the_derivatives_of_differences(transform, start):
     x, rng = start.ravel(), np.random.default_rng(1)
-    own = transform.of(x, start.shape)
+    own = transform.specialize(x, start.shape)
     assert own.refuses(x) is None
     u = own.inverse(x)
-    assert len(u) == own.unknowns(len(x))
+    assert len(u) == own.count_unknowns(len(x))
     np.testing.assert_allclose(own.value(u), x, atol=1e-12)
     other = u + 0.3 * rng.normal(size=len(u))
     central = [(own.value(other + e) - own.value(other - e)) / 2e-6 for e in 1e-6 * np.eye(len(u))]
@@ -94,9 +94,9 @@ def test_numbers_of_an_array_are_free_one_by_one():
     assert fit.intervals()[0]["m"][0] == 1.5
     shares = {"shares": np.array([0.2, 0.3, 0.5])}
     with pytest.raises(ValueError, match=r"array of them of the shape \(3,\) for params\['shares'\]; got one of"):
-        Parameters.of(shares, {"shares": np.array([True, False])})
+        Parameters.from_pytree(shares, {"shares": np.array([True, False])})
     with pytest.raises(ValueError, match=r"free as a whole or not at all: its transform is lagjax\.simplex"):
-        Parameters.of(shares, {"shares": np.array([True, False, True])}, lagjax.simplex)
+        Parameters.from_pytree(shares, {"shares": np.array([True, False, True])}, lagjax.simplex)
 
 
 def test_every_u_is_an_inertia_that_a_body_can_have():
@@ -165,7 +165,7 @@ def test_a_leaf_that_starts_outside_of_its_set_is_refused(start, transform, mess
 
 
 def test_the_sum_of_a_simplex_is_that_of_its_start():
-    own = _parameters.simplex.of(np.array([1.0, 2.0, 4.0]), (3,))
+    own = _parameters.simplex.specialize(np.array([1.0, 2.0, 4.0]), (3,))
     assert np.sum(own.value(np.array([0.3, -2.0]))) == pytest.approx(7.0)
 
 
@@ -355,7 +355,7 @@ def test_a_report_is_one_file_with_everything(tmp_path):
 
 
 def weak(fit, u):
-    readers = [Reader.of(record) for record in fit.records]
+    readers = [Reader.from_record(record) for record in fit.records]
     scale = min(time_scales(readers, fit.question.systems[0].motions, fit.parameters.numbers(fit.u)))
     return _search.weak_form_residuals(fit.question.systems[0], readers, scale), _search.fit_weak_form(
         [(fit.question.systems[0], readers, scale)], u
@@ -423,7 +423,7 @@ def test_inputs_drive_the_density_the_weak_form_and_many_starts():
     value, x = jax.jit(density), density.first + 0.01 * rng.normal(size=len(density))
     central = [(value(x + step) - value(x - step)) / 2e-5 for step in 1e-5 * np.eye(len(x))]
     np.testing.assert_allclose(jax.jit(jax.grad(density))(x), central, rtol=1e-5, atol=1e-4)
-    readers = [Reader.of(one)]
+    readers = [Reader.from_record(one)]
     scale = min(time_scales(readers, fit.question.systems[0].motions, fit.parameters.numbers(fit.u)))
     u = _search.fit_weak_form([(fit.question.systems[0], readers, scale)], fit.u + 2.0)
     np.testing.assert_allclose(fit.parameters.values(u), [0.3, 4.0], rtol=0.1)

@@ -92,7 +92,7 @@ def test_only_single_numbers_that_are_free_have_profiles(done):
 
 def test_the_end_of_a_name_is_enough_where_it_is_the_only_one(done):
     assert done.profile("c").name == "params['c']"
-    parameters = Parameters.of({"a": {"l": np.ones(2), "dry": 1.0}, "b": {"dry": 1.0, "1": 2.0}})
+    parameters = Parameters.from_pytree({"a": {"l": np.ones(2), "dry": 1.0}, "b": {"dry": 1.0, "1": 2.0}})
     assert parameters.names[parameters.row("l[1]")] == "params['a']['l'][1]"
     assert parameters.names[parameters.row("1")] == "params['b']['1']"
     with pytest.raises(ValueError, match=r"'dry' may be params\['a'\]\['dry'\], params\['b'\]\['dry'\]; there are"):

@@ -43,8 +43,8 @@ def test_an_expansion_to_second_order_is_exact_where_signals_are_quadratic(noise
     records[0] = lagjax.Record(SHORT, records[0].values, start=lagjax.Guess(*starts))
     fit = lagjax.fit(scene, records, {"gain": 1.2}, observe=gain, noise=noise)
     density = fit.log_density(prior=lambda params: -params["gain"])
-    chart = Chart.of(density)
-    surrogate = _density.expanded(chart)
+    chart = Chart.from_density(density)
+    surrogate = _density.expand_residuals(chart)
     assert not isinstance(surrogate, str)
     assert [block.rows.shape for block in surrogate.blocks] == [(2, terms, 1, 10)]
     z = 3.0 * rng.normal(size=(20, len(density)))
@@ -112,7 +112,7 @@ def test_chains_that_stand_still_along_the_expansion_are_not_kept(bent, monkeypa
 
 def test_an_expansion_that_would_not_fit_says_so(bent, monkeypatch):
     monkeypatch.setattr(_density, "_LARGEST", 5)
-    assert "more than 5" in str(_density.expanded(Chart.of(bent.log_density())))
+    assert "more than 5" in str(_density.expand_residuals(Chart.from_density(bent.log_density())))
 
 
 @pytest.mark.slow
@@ -142,8 +142,8 @@ class Correlated:
     """Stands in for a density: numbers inside of their sets, beside a bound, and far better known than a bound."""
 
     def __init__(self, y):
-        self.question = SimpleNamespace(parameters=Parameters.of(y, None, BOUNDED))
-        self.first = np.append(self.question.parameters.moved(self.question.parameters.first), -2.0)
+        self.question = SimpleNamespace(parameters=Parameters.from_pytree(y, None, BOUNDED))
+        self.first = np.append(self.question.parameters.inverse(self.question.parameters.first), -2.0)
         self.point, self.dtype = SimpleNamespace(u=self.first[:-1]), np.dtype(float)
 
     def __len__(self):
@@ -157,7 +157,7 @@ class Correlated:
 
 @pytest.mark.parametrize("a, c", [(0.3, 2.99999), (1e-9, -0.999), (50.0, 1.0)])
 def test_the_volume_of_a_chart_is_the_determinant_of_its_derivative(a, c):
-    chart = Chart.of(Correlated({"a": a, "b": 0.5, "c": c, "d": 4e-4}))
+    chart = Chart.from_density(Correlated({"a": a, "b": 0.5, "c": c, "d": 4e-4}))
     z = np.random.default_rng(0).normal(size=(40, 5)) * np.array([3.0, 1.0, 3.0, 3.0, 1.0])
     by_z = jax.vmap(jax.jacfwd(chart.x))(z)
     change = jax.vmap(lambda z: chart(z)[2])(z) - jnp.linalg.slogdet(by_z)[1]
@@ -165,11 +165,11 @@ def test_the_volume_of_a_chart_is_the_determinant_of_its_derivative(a, c):
     # ζ and x belong together, and z = 0 is the centre, inside of all bounds by what the data leave open.
     x, zeta, _ = jax.vmap(chart)(z)
     near = np.abs(z).max(axis=1) < 2.0
-    np.testing.assert_allclose([chart.at(row) for row in np.asarray(zeta)[near]], x[near], rtol=1e-6)
+    np.testing.assert_allclose([chart.evaluate_unknowns(row) for row in np.asarray(zeta)[near]], x[near], rtol=1e-6)
     np.testing.assert_allclose(chart(jnp.zeros(5))[1], 0.0, atol=1e-9)
     step = 1e-4 * np.eye(5)
-    slopes = np.stack([chart.at(h) - chart.at(-h) for h in step], axis=1) / 2e-4
-    np.testing.assert_allclose(chart.columns(np.zeros(5)), slopes, rtol=1e-6, atol=1e-9)
+    slopes = np.stack([chart.evaluate_unknowns(h) - chart.evaluate_unknowns(-h) for h in step], axis=1) / 2e-4
+    np.testing.assert_allclose(chart.jacobian(np.zeros(5)), slopes, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -193,13 +193,13 @@ def test_chains_that_disagree_are_told_of():
     density = SimpleNamespace(names=("params['k']", "params['dry']"))
     drawn = _sample.Draws(x, *np.zeros((4, 4, 300)), "")
     with pytest.warns(UserWarning, match=r"1200 draws of params\['dry'\] are worth .* independent .* r-hat"):
-        worst = _sample._warned(density, drawn)
+        worst = _sample._check_agreement(density, drawn)
     assert worst["effective_draws"] < 50 and worst["r_hat"] > 1.2
     with pytest.warns(UserWarning, match="worth nan independent"):
-        _sample._warned(density, drawn._replace(x=x[:1, :3]))
+        _sample._check_agreement(density, drawn._replace(x=x[:1, :3]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert _sample._warned(density, drawn._replace(x=x[..., :1]))["effective_draws"] > 800
+        assert _sample._check_agreement(density, drawn._replace(x=x[..., :1]))["effective_draws"] > 800
 
 
 COLUMNS = np.stack([np.cos(2 * SHORT), SHORT, np.ones(61), SHORT**2, np.sin(2 * SHORT)], axis=1)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._fit._sensors import on_circle
+from lagjax._fit._sensors import wrap_residuals
 from lagjax._fit._uncertainty import correlated_power
 
 SIGMA = 3e-3
@@ -92,7 +92,7 @@ def test_samples_too_far_apart_to_tell_a_turn_ask_for_a_start():
 def test_periods_by_signal():
     residuals = np.array([[7.0, 7.0, 350.0]])
     np.testing.assert_allclose(
-        on_circle(residuals, np.array([np.inf, 2 * np.pi, 360.0])), [[7.0, 7.0 - 2 * np.pi, -10.0]]
+        wrap_residuals(residuals, np.array([np.inf, 2 * np.pi, 360.0])), [[7.0, 7.0 - 2 * np.pi, -10.0]]
     )
     record = lagjax.Record(TS, {"theta": np.zeros((401, 2)), "x": np.zeros(401)})
     sensors = lagjax.wrapped({"theta": np.array([2.0, 3.0]), "x": None})
