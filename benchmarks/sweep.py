@@ -129,7 +129,7 @@ def _bare(over: dict, flips: dict | None = FLIPS) -> Callable[[int], None]:
     shape = tuple(map(len, over.values()))
     members, places = math.prod(shape), itertools.count()
     settings = dict(rtol=RTOL, atol=None, max_steps=65_536, event=None, solver=None)
-    sections = None if flips is None else Sections.of(flips, keep, settings)
+    sections = None if flips is None else Sections.from_arguments(flips, keep, settings)
 
     def batches(count: int) -> None:
         for _ in range(count):

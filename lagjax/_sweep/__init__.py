@@ -27,9 +27,9 @@ import numpy as np
 from lagjax._hybrid import Hybrid, Scene, require_scene
 from lagjax._sweep._begin import begin, continues, final_states_of, first_look, repair, require_same
 from lagjax._sweep._description import Description, Sections
-from lagjax._sweep._job import Job, compute, in_doubles, precision
+from lagjax._sweep._job import Job, compute, precision, uses_doubles
 from lagjax._sweep._members import axes_of
-from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merged, summary
+from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merge, summary
 from lagjax._sweep._status import Failure, Progress, Status, status
 from lagjax._sweep._store import NOT_DONE, RESULT, Store
 from lagjax._sweep._workers import Child, run_store, submit, work
@@ -95,7 +95,7 @@ class Sweep:
         spec, totals = store.spec(), {}
         for unit in sorted(store.done()) if spec["reduce"] else ():
             for name, part in from_bytes(store.statistics(unit)).items():
-                totals[name] = merged(totals.get(name), part)
+                totals[name] = merge(totals.get(name), part)
         shapes = {q["name"]: tuple(q["shape"]) for q in spec["kept"]}
         return {name: summary(Statistics(**spec["reduce"][name]), x, shapes[name]) for name, x in totals.items()}
 
@@ -215,7 +215,7 @@ def sweep(
     settings = dict(rtol=rtol, atol=atol, max_steps=max_steps, event=event, solver=solver)
     if isinstance(system, Hybrid):
         _require_none(event=event, crossings=crossings, solver=solver)
-    sections = Sections.of(crossings, _callable(keep), settings)
+    sections = Sections.from_arguments(crossings, _callable(keep), settings)
     description = Description(
         system, np.asarray(ts, float), q0, qdot0, params, keep, _reduce(reduce), settings, sections
     )
@@ -224,7 +224,7 @@ def sweep(
     axes, place = axes_of(over), _place(store, "store")
     child = Child(place.path, isolate) if isolate else None
     other = None if extend is None else _place(extend, "extend")
-    with precision(in_doubles()), child or nullcontext():
+    with precision(uses_doubles()), child or nullcontext():
         if place.is_there() and other is not None and not place.spec()["goes_on_from"]:
             other = None  # of which the members were taken: it may be gone
         if other is not None and continues(other, description):
@@ -238,7 +238,7 @@ def sweep(
             begin(place, axes, description, unit, child.look if child else first_look, other)
         spec = place.spec()
         require_same(place, spec, axes, description)
-        job = Job.of(place, spec, description)
+        job = Job.from_store(place, spec, description)
         repair(job)
         show = Progress(place, spec, progress)
         if executor is not None:

@@ -99,32 +99,32 @@ class Batches:
                 "None of q0, qdot0 and params is a function: all members would be the same. Write q0=lambda point: "
                 "point['theta'], with the names of `over`."
             )
-        self._starts = {role: self._mapped(role, f) if callable(f) else None for role, f in roles.items()}
+        self._starts = {role: self._map_start(role, f) if callable(f) else None for role, f in roles.items()}
         of_q0, of_qdot0, of_params = (0 if start else None for start in self._starts.values())
         self._axes = (of_q0, of_qdot0, of_params)
-        self._keep_all, self._tolerances = jax.jit(self._keep_of_all), None
+        self._keep_all, self._tolerances = jax.jit(self._keep_vectorized), None
 
     def __call__(self, points: dict[str, np.ndarray]) -> Kept:
         """The kept values of the members at these points (B,)."""
-        motions, no_start = self._motions_of(points)
-        kept, drift, complaints = self._kept_of(motions)
+        motions, no_start = self._compute_motions(points)
+        kept, drift, complaints = self._keep_results(motions)
         result = np.asarray(motions.run.result._value).astype(RESULT.dtype)
         if complaints:
             result = result.copy()
             result[list(complaints)] = KEEP_FAILED
         return Kept(kept, result, drift, no_start | complaints, motions.run.engine)
 
-    def bytes_of_one(self, points: dict[str, np.ndarray]) -> int:
+    def count_member_bytes(self, points: dict[str, np.ndarray]) -> int:
         """The bytes that are kept of a member, of the first of these; 0 where `keep` fails for that one."""
-        motions, _ = self._motions_of({name: x[:1] for name, x in points.items()})
+        motions, _ = self._compute_motions({name: x[:1] for name, x in points.items()})
         try:
-            kept, _ = jax.eval_shape(self._keep_of_all, motions.arrays, motions.params)
+            kept, _ = jax.eval_shape(self._keep_vectorized, motions.arrays, motions.params)
             return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(kept))
         except NOT_TRACEABLE:
             (row,), _ = self._rows(motions)
             return sum(x.nbytes for x in (row or {}).values())
 
-    def _motions_of(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str]]:
+    def _compute_motions(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str]]:
         """The motions of these members; and of members for which q0, q̇0 or params raised, why."""
         description, ts, complaints = self.description, jnp.asarray(self.description.ts), {}
         values = {
@@ -138,20 +138,22 @@ class Batches:
         for_members = values["params"] if self._axes[2] == 0 else None
         return _BatchMotions(run, crossings, (_arrays(run), crossings), for_members), complaints
 
-    def _kept_of(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
+    def _keep_results(
+        self, motions: "_BatchMotions"
+    ) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
         """The result of `keep` for each member, the change of its energy, and the members for which `keep` raised."""
         if "keep" not in self.slow:
             try:
-                return self._compiled(motions)
+                return self._keep_compiled(motions)
             except NOT_TRACEABLE as why:
                 self.slow["keep"] = _first_line(why)
-        drift = np.asarray(self._drift_alone(motions.arrays, motions.params)) if self.conserves else None
+        drift = np.asarray(self._compute_drifts(motions.arrays, motions.params)) if self.conserves else None
         kept, complaints = self._keep_one_by_one(motions)
         return kept, drift, complaints
 
     # ---- compiled for all members ----
 
-    def _mapped(self, role: str, function: Callable) -> Callable:
+    def _map_start(self, role: str, function: Callable) -> Callable:
         """`function(point)` for points (B,) of all members; why it raised for some is added to `complaints`."""
         compiled = jax.jit(jax.vmap(function))
 
@@ -165,7 +167,9 @@ class Batches:
 
         return start
 
-    def _compiled(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
+    def _keep_compiled(
+        self, motions: "_BatchMotions"
+    ) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
         """The kept values of all members at once; blank, with a complaint, where `keep` raises while it runs."""
         everyone = np.arange(len(motions.run.result._value))
         try:
@@ -179,7 +183,7 @@ class Batches:
         kept, drift = self._keep_members(motions, np.where(bad, well[0], everyone))
         for name, x in kept.items():
             kept[name] = np.where(
-                bad.reshape(-1, *[1] * (x.ndim - 1)), Quantity(name, x.shape[1:], x.dtype).nothing, x
+                bad.reshape(-1, *[1] * (x.ndim - 1)), Quantity(name, x.shape[1:], x.dtype).filling, x
             ).astype(x.dtype)
         return kept, None if drift is None else np.where(bad, np.nan, drift), complaints
 
@@ -189,7 +193,9 @@ class Batches:
         if which is not None:
             arrays = jax.tree.map(lambda x: np.asarray(x)[which], arrays)
         kept, drift = self._keep_all(*arrays)
-        return {name: np.asarray(x) for name, x in _by_name(kept).items()}, None if drift is None else np.asarray(drift)
+        return {name: np.asarray(x) for name, x in _flatten_names(kept).items()}, None if drift is None else np.asarray(
+            drift
+        )
 
     def _find_raising(self, motions: "_BatchMotions", everyone: np.ndarray) -> dict[int, str]:
         """The members for which `keep` raises in a callback, with the errors: by halves, in equal batches."""
@@ -203,26 +209,26 @@ class Batches:
                 if half:
                     waiting += [some[half:], some[:half]]
                 else:
-                    found[int(some[0])] = f"keep raised {_raised(error)}"
+                    found[int(some[0])] = f"keep raised {_callback_error(error)}"
         return found if len(found) <= _MOST_RAISE else {}
 
-    def _keep_of_all(self, arrays: tuple, params: PyTree) -> tuple:
+    def _keep_vectorized(self, arrays: tuple, params: PyTree) -> tuple:
         """The result of `keep` for every member, and the change of the energy."""
 
-        def of_member(arrays, params):
+        def keep_member(arrays, params):
             run, crossings = arrays
             trajectory = self._trajectory(run, params)
-            return self._kept(trajectory, crossings), self._drift(trajectory)
+            return self._keep_member(trajectory, crossings), self._drift(trajectory)
 
-        return jax.vmap(of_member, in_axes=(0, self._axes[2]))(arrays, params)
+        return jax.vmap(keep_member, in_axes=(0, self._axes[2]))(arrays, params)
 
-    def _drift_alone(self, arrays: tuple, params: PyTree):
-        def of_member(arrays, params):
+    def _compute_drifts(self, arrays: tuple, params: PyTree):
+        def member_drift(arrays, params):
             return self._drift(self._trajectory(arrays[0], params))
 
-        return jax.jit(jax.vmap(of_member, in_axes=(0, self._axes[2])))(arrays, params)
+        return jax.jit(jax.vmap(member_drift, in_axes=(0, self._axes[2])))(arrays, params)
 
-    def _kept(self, trajectory: Trajectory, crossings: Any) -> dict:
+    def _keep_member(self, trajectory: Trajectory, crossings: Any) -> dict:
         """The result of `keep` for one member."""
         keep, asked = self.description.keep, {} if self.description.sections is None else {"crossings": crossings}
         kept = keep(trajectory, **asked)
@@ -262,7 +268,7 @@ class Batches:
         for k, row in enumerate(rows):
             if row is not None and (wrong := _misfit(expected, row)):
                 rows[k], complaints[k] = None, wrong
-        return {q.name: _stacked(q, rows) for q in expected}, complaints
+        return {q.name: _stack_rows(q, rows) for q in expected}, complaints
 
     def _rows(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
         """The result of `keep` for each member by name, None where it raised; and the exceptions."""
@@ -270,9 +276,9 @@ class Batches:
         params, rows, errors = jax.tree.map(np.asarray, motions.params), [], {}
         for k in range(len(motions.run.result._value)):
             try:
-                one, crossed, of_member = jax.tree.map(lambda x, k=k: x[k], (*arrays, params))
-                kept = self._kept(self._trajectory(one, of_member), crossed)
-                rows.append({name: np.asarray(x) for name, x in _by_name(kept).items()})
+                one, crossed, own_params = jax.tree.map(lambda x, k=k: x[k], (*arrays, params))
+                kept = self._keep_member(self._trajectory(one, own_params), crossed)
+                rows.append({name: np.asarray(x) for name, x in _flatten_names(kept).items()})
             except Exception as error:  # of the user's function: only this member is lost
                 rows.append(None)
                 errors[k] = error
@@ -346,8 +352,8 @@ def _misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
     return None
 
 
-def _stacked(q: Quantity, rows: list) -> np.ndarray:
-    nothing = np.full(q.shape, q.nothing, q.dtype)
+def _stack_rows(q: Quantity, rows: list) -> np.ndarray:
+    nothing = np.full(q.shape, q.filling, q.dtype)
     return np.stack([nothing if row is None else row[q.name].astype(q.dtype) for row in rows])
 
 
@@ -368,7 +374,7 @@ def _require_dict(kept: Any) -> None:
             raise TypeError(f"keep returns {name!r}, which is of type {what}: numbers can be kept.")
 
 
-def _by_name(kept: dict) -> dict[str, Any]:
+def _flatten_names(kept: dict) -> dict[str, Any]:
     """The leaves of what `keep` returns by names, those of inner trees with points: 'end.theta'."""
     return dict(zip(jax.tree.leaves(names_of(kept)), jax.tree.leaves(kept), strict=True))
 
@@ -380,7 +386,7 @@ def names_of(kept: dict) -> dict:
     )
 
 
-def _raised(error: BaseException) -> str:
+def _callback_error(error: BaseException) -> str:
     """The exception of a callback, out of all that XLA says about it."""
     lines = [line.strip() for line in str(error).split("\n")]
     return next((line for line in reversed(lines) if _RAISED.match(line)), lines[0])[:200]
@@ -399,11 +405,11 @@ _INCONSISTENT = code_of(RESULTS.inconsistent_start)
 def _hybrid_batch(scene: Hybrid, axes: tuple, **tolerances) -> Callable:
     """`follow` for all members at once, compiled."""
 
-    def of_member(q0, qdot0, ts, params):
+    def follow_member(q0, qdot0, ts, params):
         return follow(scene, q0, qdot0, ts, params, throw=False, **tolerances)
 
     of_q0, of_qdot0, of_params = axes
-    return jax.jit(jax.vmap(of_member, in_axes=(of_q0, of_qdot0, None, of_params)))
+    return jax.jit(jax.vmap(follow_member, in_axes=(of_q0, of_qdot0, None, of_params)))
 
 
 def run_batch(
@@ -425,7 +431,7 @@ def run_batch(
     solution, noted = _follow_crossings(batch, sections)
     if len(ts) == 2 and not has_constraints(system):
         params = as_arrays(params, batch.member.layout.dtype)
-        run = trajectory_of(batch.member, MachineCode(), _with_ends_as_path(solution, batch), batch.y0, params, axes[2])
+        run = trajectory_of(batch.member, MachineCode(), _replace_path(solution, batch), batch.y0, params, axes[2])
     else:
         run = simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings)
         noted = _drop_inconsistent(noted, np.asarray(run.result._value) != _INCONSISTENT)
@@ -435,7 +441,7 @@ def run_batch(
 
 def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted]:
     """The motions from the first to the last time, and the crossings of G sections, each with that axis in front."""
-    section = dict(sections.by_name()) if sections.names else sections.functions[0]
+    section = dict(sections.named_functions()) if sections.names else sections.functions[0]
     surfaces = surfaces_in(batch.member, sections_of(section)[1], sections.directions, sections.names)
     problem = dataclasses.replace(batch.member, guards=surfaces.guards(notes=True))
     tolerances = tolerances_of(problem)._replace(notes=sections.count)
@@ -446,7 +452,7 @@ def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted
     return solution, Noted(rows[:, :, :-1, 0], rows[:, :, :-1, 1:], rows[:, :, -1, 0])
 
 
-def _with_ends_as_path(solution: Solution, batch: Batch) -> Solution:
+def _replace_path(solution: Solution, batch: Batch) -> Solution:
     """The solution with the states at the first and the last time, NaN where that was not reached, as its path."""
     reached = (solution.result == SUCCESSFUL)[:, None]
     path = np.stack([np.asarray(batch.y0), np.where(reached, solution.y_end, np.nan)], axis=1)

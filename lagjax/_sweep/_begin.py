@@ -29,9 +29,9 @@ from lagjax._layout import Layout
 from lagjax._results import RESULTS, code_of
 from lagjax._sweep import _batch
 from lagjax._sweep._batch import Kept, batches_of, label, names_of, quantities_of
-from lagjax._sweep._description import MOTION, Description, FinalStates, difference, packed, texts, users_path
-from lagjax._sweep._job import Job, cpu, goes_on_from, in_doubles, record_of, require_versions, states, versions
-from lagjax._sweep._members import RESERVED, Axis, Grid, in_words, points_of
+from lagjax._sweep._description import MOTION, Description, FinalStates, difference, pack_description, texts, users_path
+from lagjax._sweep._job import Job, cpu, record_of, require_versions, source_path, states, uses_doubles, versions
+from lagjax._sweep._members import RESERVED, Axis, Grid, describe_axes, points_of
 from lagjax._sweep._store import FORMAT, KNOWN, NOT_DONE, RESULT, Quantity, Store, arrays_as_bytes
 from lagjax._trajectory import State
 from lagjax.designs import GROWING, Design
@@ -45,14 +45,14 @@ def first_look(description: Description, points: dict[str, np.ndarray]) -> tuple
     """The kept values of a few members, the seconds that one of them takes, and whether the energy is constant."""
     conserves = _conserves(description, points)
     batches = batches_of(description, conserves)
-    points = _thin(points, UNIT_BYTES // max(1, batches.bytes_of_one(points)))
+    points = _thin_points(points, UNIT_BYTES // max(1, batches.count_member_bytes(points)))
     batches(points)  # which compiles
     began = time.perf_counter()
     kept = batches(points)
     return kept, (time.perf_counter() - began) / len(kept.result), conserves
 
 
-def _thin(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
+def _thin_points(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
     """Evenly chosen ones of these points: `most` at most, one at least."""
     count = len(next(iter(points.values())))
     return {name: x[:: -(-count // max(1, most))] for name, x in points.items()}
@@ -70,28 +70,28 @@ def begin(
     extend: Store | None = None,
 ) -> None:
     """Make the store, after a look at what a few members take and keep, with the members that `extend` knows."""
-    scene = packed(description)
+    scene = pack_description(description)
     points, shape = _sample_points(axes, description), tuple(axis.size for axis in axes)
-    points = _thin(points, _members_in_memory(description, points))
+    points = _thin_points(points, _members_in_memory(description, points))
     kept, seconds, conserves = look(description, points)
     quantities = quantities_of(kept)
     _require_names(quantities, axes, description.reduce)
     members = _unit_size(unit, shape, seconds, quantities)
     names = [name for axis in axes for name in axis.names]
     spec = {
-        "format": FORMAT, "versions": versions(), "cpu": cpu(), "x64": in_doubles(), "engine": kept.engine,
-        "axes": [axis.described() for axis in axes], "shape": shape, "chunk": Grid.of(shape, members).chunk,
+        "format": FORMAT, "versions": versions(), "cpu": cpu(), "x64": uses_doubles(), "engine": kept.engine,
+        "axes": [axis.described() for axis in axes], "shape": shape, "chunk": Grid.from_shape(shape, members).chunk,
         "batch": _batch_size(description, points, kept), "seconds_per_member": seconds, "conserves": conserves,
         "kept": [{"name": q.name, "shape": q.shape, "dtype": q.dtype.str} for q in quantities],
         **description.described(),
-        "goes_on_from": goes_on_from(description, store), "scene": texts(description, names), "path": users_path(),
+        "goes_on_from": source_path(description, store), "scene": texts(description, names), "path": users_path(),
     }  # fmt: skip
     codes = sorted({code_of(item) for item in RESULTS._name_to_item.values()} | set(_batch.NAMES))
     title = f"lagjax sweep over {', '.join(names)}"
     extend = None if description.left else extend  # of which no member is taken as it is
     if extend is not None:
         require_extensible(extend, extend.spec(), spec)
-    with store.made_aside() as new:
+    with store.create_aside() as new:
         new.create(spec, scene, axes, title, {NOT_DONE: "not_done"} | {code: label(code) for code in codes})
         if extend is not None:
             copy_members(extend, new)
@@ -142,7 +142,7 @@ def _members_in_memory(description: Description, points: dict[str, np.ndarray]) 
     """The members whose paths, and what is noted on the way, take `PATH_BYTES`; none where one takes more."""
     q, qdot, _ = description.start({name: x[0] for name, x in points.items()})
     states = 2 * Layout.of(q, qdot).size
-    noted = description.sections.bytes_of(states) if description.sections else 0
+    noted = description.sections.count_bytes(states) if description.sections else 0
     return _batch.PATH_BYTES // (8 * states * len(description.ts) + noted)
 
 
@@ -177,10 +177,10 @@ def require_same(store: Store, spec: dict, axes: tuple[Axis, ...], description: 
     """Raise `ValueError`, with the difference, where the store was begun with another description."""
     require_versions(store, spec)
     names = [name for axis in axes for name in axis.names]
-    now = {"axes": [axis.described() for axis in axes], "x64": in_doubles(), **description.described()}
-    now["goes_on_from"] = goes_on_from(description, store)
+    now = {"axes": [axis.described() for axis in axes], "x64": uses_doubles(), **description.described()}
+    now["goes_on_from"] = source_path(description, store)
     now = json.loads(json.dumps(now))
-    words = {"axes": in_words}
+    words = {"axes": describe_axes}
     lines = [
         f"{name}: {words.get(name, str)(spec[name])} in the store, now {words.get(name, str)(x)}"
         for name, x in now.items()
@@ -311,9 +311,11 @@ def final_states_of(other: Store, axes: tuple[Axis, ...], description: Descripti
     spec = other.spec()
     require_versions(other, spec)
     now = json.loads(json.dumps([axis.described() for axis in axes]))
-    lines = [f"axes: {in_words(spec['axes'])} in the store, now {in_words(now)}"] if now != spec["axes"] else []
-    if spec["x64"] != in_doubles():
-        lines.append(f"x64: {spec['x64']} in the store, now {in_doubles()}")
+    lines = (
+        [f"axes: {describe_axes(spec['axes'])} in the store, now {describe_axes(now)}"] if now != spec["axes"] else []
+    )
+    if spec["x64"] != uses_doubles():
+        lines.append(f"x64: {spec['x64']} in the store, now {uses_doubles()}")
     names = [name for axis in axes for name in axis.names]
     scenes = (
         {role: x for role, x in of.items() if role in MOTION} for of in (spec["scene"], texts(description, names))

@@ -50,7 +50,7 @@ class Sections(NamedTuple):
     count: int
 
     @classmethod
-    def of(cls, crossings: Any, keep: Callable, settings: dict[str, Any]) -> "Sections | None":
+    def from_arguments(cls, crossings: Any, keep: Callable, settings: dict[str, Any]) -> "Sections | None":
         """The description given by the arguments of `sweep`. Raises `TypeError` or `ValueError` if wrong."""
         asked = "crossings" in _parameters(keep)
         if crossings is None:
@@ -82,11 +82,11 @@ class Sections(NamedTuple):
         names = None if self.names is None else list(self.names)
         return {"names": names, "directions": list(self.directions), "count": self.count}
 
-    def by_name(self) -> dict[str, Callable]:
+    def named_functions(self) -> dict[str, Callable]:
         """The functions, by what a store calls them."""
         return dict(zip(self.names or ("section",), self.functions, strict=True))
 
-    def bytes_of(self, states: int) -> int:
+    def count_bytes(self, states: int) -> int:
         """The notes on a member whose state has this many numbers."""
         return 8 * len(self.functions) * (self.count + 1) * (states + 1)
 
@@ -167,17 +167,17 @@ def texts(description: Description, names: list[str]) -> dict[str, dict[str, str
     found = {}
     for name, function in _functions(description.system).items():
         arguments = (q,) if name.split()[0] == "constraints" else (q, qdot)
-        found[name] = _entry(function.code.function, _traced(function, arguments, params), function.arrays)
+        found[name] = _entry(function.code.function, _defer_trace(function, arguments, params), function.arrays)
     if isinstance(description.system, Hybrid):
         found["transitions"] = _entry(_plan(description.system), None)
     event = description.settings.get("event")
     if event is not None:
         condition = getattr(event, "cond_fn", event)
-        of_event = _traced(accept(condition, "event"), (q, qdot), params) if callable(condition) else None
+        of_event = _defer_trace(accept(condition, "event"), (q, qdot), params) if callable(condition) else None
         found["event"] = _entry(condition, of_event)
         found["event"]["program"] += "\n" + identity([getattr(event, name, None) for name in _OF_EVENTS])
-    for name, section in description.sections.by_name().items() if description.sections else ():
-        of_section = _traced(accept(section, "section"), (q, qdot), params)
+    for name, section in description.sections.named_functions().items() if description.sections else ():
+        of_section = _defer_trace(accept(section, "section"), (q, qdot), params)
         found[f"crossings of {name}"] = _entry(section, of_section)
     for role in ("q0", "qdot0", "params"):
         value = getattr(description, role)
@@ -203,12 +203,12 @@ def _plan(scene: Hybrid) -> list:
     return [list(scene.modes), scene.start, scene.max_transitions, arrows]
 
 
-def _traced(function, arguments: tuple, params) -> Callable:
+def _defer_trace(function, arguments: tuple, params) -> Callable:
     def program():
-        def of_all(*roles, t, params):
+        def call(*roles, t, params):
             return function(*roles, t=t, params=params)
 
-        return jax.make_jaxpr(of_all)(*arguments, t=jnp.zeros(()), params=params)
+        return jax.make_jaxpr(call)(*arguments, t=jnp.zeros(()), params=params)
 
     return program
 
@@ -254,7 +254,7 @@ def difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]
 # ---- to another process ----------------------------------------------------------------------------------------------
 
 
-def packed(description: Description) -> bytes:
+def pack_description(description: Description) -> bytes:
     """The motions as bytes. Raises `ImportError` without cloudpickle, `TypeError` where a function cannot be packed."""
     try:
         import cloudpickle
@@ -281,7 +281,7 @@ _MOVED = {
 }
 
 
-def unpacked(data: bytes, path: list[str]) -> Description:
+def unpack_description(data: bytes, path: list[str]) -> Description:
     """The description again, modules of the user found along his `path`. Raises `ImportError` where one is not."""
     sys.path += [place for place in path if place not in sys.path]
     try:

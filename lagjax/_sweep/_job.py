@@ -27,7 +27,7 @@ from llvmlite import binding as llvm
 
 from lagjax._results import ENDED_WELL, SUCCESSFUL
 from lagjax._sweep._batch import CRASHED, KEEP_FAILED, Batches, Kept, batches_of, label
-from lagjax._sweep._description import Description, FinalStates, difference, texts, unpacked
+from lagjax._sweep._description import Description, FinalStates, difference, texts, unpack_description
 from lagjax._sweep._members import Grid, points_of
 from lagjax._sweep._statistics import partial_of, to_bytes
 from lagjax._sweep._store import RESULT, Store
@@ -44,7 +44,7 @@ class Job:
     batches: Batches
 
     @classmethod
-    def of(cls, store: Store, spec: dict, description: Description) -> "Job":
+    def from_store(cls, store: Store, spec: dict, description: Description) -> "Job":
         """The job of a store whose functions are at hand."""
         if spec.get("cpu", cpu()) != cpu():
             warnings.warn(
@@ -65,7 +65,7 @@ class Job:
             )
 
 
-def in_doubles() -> bool:
+def uses_doubles() -> bool:
     """True if JAX computes in double precision here."""
     return jax.dtypes.canonicalize_dtype(np.float64) == np.float64
 
@@ -100,7 +100,7 @@ _process_precision: list[bool] = []  # that of the process before the first one 
 def _doubles_in_process() -> bool:
     """True if this process computes in doubles, whatever this thread has chosen: as a thread sees it that has not."""
     seen: list[bool] = []
-    thread = threading.Thread(target=lambda: seen.append(in_doubles()))
+    thread = threading.Thread(target=lambda: seen.append(uses_doubles()))
     thread.start()
     thread.join()
     return seen[0]
@@ -111,12 +111,12 @@ def _set_doubles_in_process(doubles: bool) -> None:
         jax.config.update("jax_enable_x64", doubles)
 
 
-def goes_on_from(description: Description, store: Store) -> str | None:
+def source_path(description: Description, store: Store) -> str | None:
     """The store of the ends of motions, as a path from this one's folder: both may be moved, or seen, elsewhere."""
     return None if description.left is None else os.path.relpath(description.left.path, store.path.parent)
 
 
-def _relocated(description: Description, store: Store, path: str | None) -> Description:
+def _relocate_source(description: Description, store: Store, path: str | None) -> Description:
     """The motions of a store, left where `path` leads from its folder. Raises `FileNotFoundError` if that is gone."""
     if description.left is None or path is None:
         return description
@@ -125,26 +125,26 @@ def _relocated(description: Description, store: Store, path: str | None) -> Desc
     return replace(description, left=description.left._replace(path=str(other.path)))
 
 
-def opened(path: str) -> Job:
+def open_job(path: str) -> Job:
     """The job of a store in a process that knows nothing but its path. Raises where it is not what was begun.
 
     A store that was removed and made anew is another one; each is opened once.
     """
     store = Store(Path(path))
-    return _opened(path, hashlib.sha256(json.dumps(store.spec()).encode() + store.scene()).hexdigest())
+    return _open_job(path, hashlib.sha256(json.dumps(store.spec()).encode() + store.scene()).hexdigest())
 
 
 @lru_cache(maxsize=4)
-def _opened(path: str, content: str) -> Job:
+def _open_job(path: str, content: str) -> Job:
     store = Store(Path(path))
     spec = store.spec()
     require_versions(store, spec)
     with precision(bool(spec["x64"])):
-        description = _relocated(unpacked(store.scene(), spec["path"]), store, spec["goes_on_from"])
+        description = _relocate_source(unpack_description(store.scene(), spec["path"]), store, spec["goes_on_from"])
         names = [name for axis in spec["axes"] for name in axis["names"]]
         if change := difference(spec["scene"], texts(description, names)):
             raise ValueError(f"{store.path}: the scene is not here what it was when the store was begun.\n{change}")
-        return Job.of(store, spec, description)
+        return Job.from_store(store, spec, description)
 
 
 @lru_cache(maxsize=1)
@@ -193,7 +193,7 @@ class Unit(NamedTuple):
 
 def parts(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
     """The batches of a unit: its members in each, all of one length, and how many of them are not copies."""
-    known, _ = job.store.known(unit)
+    known, _ = job.store.copied_members(unit)
     left = np.arange(job.grid.size(unit))
     left = np.setdiff1d(left, known) if known.size else left
     if not left.size:
@@ -221,7 +221,7 @@ def compute(job: Job, unit: int, crashed: Mapping[int, str] = NONE, notify: Call
     began, spent = time.monotonic(), time.process_time()
     size, (points, before) = job.grid.size(unit), starts(job, unit)
     drifts, complaints = np.full(size, np.nan), {}
-    known, of_known = job.store.known(unit)
+    known, of_known = job.store.copied_members(unit)
     values = {q.name: np.empty((size, *q.shape), q.dtype) for q in (*job.batches.quantities, RESULT)}
     for name, x in of_known.items():
         values[name][known] = x
@@ -258,7 +258,7 @@ def _replace_crashed(which: np.ndarray, crashed: Mapping[int, str]) -> np.ndarra
 def _clear_members(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, which, result) -> None:
     """Set members, of which only the results are known, to the filling."""
     for q in job.batches.quantities:
-        values[q.name][which] = q.nothing
+        values[q.name][which] = q.filling
     values[RESULT.name][which], drifts[which] = result, np.nan
 
 

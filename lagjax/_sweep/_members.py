@@ -51,12 +51,12 @@ class Axis:
         return about | {"rule": "values", "ends": ends, "sha256": values}
 
 
-def in_words(axes: list[dict]) -> str:
+def describe_axes(axes: list[dict]) -> str:
     """The axes that a store describes, for a sentence: 'length: 6 values from 0.5 to 1.5 (#53dd0e), …'."""
-    return "; ".join(f"{', '.join(axis['names'])}: {_values_in_words(axis)}" for axis in axes)
+    return "; ".join(f"{', '.join(axis['names'])}: {_describe_values(axis)}" for axis in axes)
 
 
-def _values_in_words(axis: dict) -> str:
+def _describe_values(axis: dict) -> str:
     if axis["rule"] == "values":
         ends = ", ".join(f"{a:g} to {b:g}" for a, b in axis["ends"])
         return f"{axis['size']} values from {ends} (#{axis['sha256'][:6]})"
@@ -120,7 +120,7 @@ class Grid:
     chunk: tuple[int, ...]
 
     @classmethod
-    def of(cls, shape: tuple[int, ...], members: int) -> "Grid":
+    def from_shape(cls, shape: tuple[int, ...], members: int) -> "Grid":
         """The members in units of about this size: whole last axes, a part of one, single places of those before it."""
         chunk, room = [1] * len(shape), max(1, members)
         for place in reversed(range(len(shape))):

@@ -101,12 +101,14 @@ class Summary(NamedTuple):
 def partial_of(how: Statistics, values: np.ndarray, ok: np.ndarray, members: np.ndarray) -> Partial:
     """The statistics of a unit: `values` (m, …) of its members, whether they ended well, and their numbers (m,)."""
     columns = values.reshape(len(values), -1).astype(float).T
-    rows = [_of_column(how, c, x, ok & np.isfinite(x), members) for c, x in enumerate(np.ascontiguousarray(columns))]
+    rows = [
+        _summarize_column(how, c, x, ok & np.isfinite(x), members) for c, x in enumerate(np.ascontiguousarray(columns))
+    ]
     *fields, sketches = zip(*rows, strict=True)
     return Partial._make([*map(np.array, fields), np.concatenate(sketches)])
 
 
-def _of_column(how: Statistics, c: int, x: np.ndarray, use: np.ndarray, members: np.ndarray) -> tuple:
+def _summarize_column(how: Statistics, c: int, x: np.ndarray, use: np.ndarray, members: np.ndarray) -> tuple:
     missing, x, members = int(np.sum(~use)), x[use], members[use]
     bins = 0 if how.edges is None else len(how.edges) - 1
     if not x.size:
@@ -139,7 +141,7 @@ def _middle_of(bins: np.ndarray) -> np.ndarray:
     return np.where(bins == 0, 0.0, np.sign(bins) * size)
 
 
-def merged(one: Partial | None, two: Partial) -> Partial:
+def merge(one: Partial | None, two: Partial) -> Partial:
     """The statistics of two sets of members, those of `one` before those of `two`."""
     if one is None:
         return two

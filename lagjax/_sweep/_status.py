@@ -9,7 +9,7 @@ import numpy as np
 from lagjax._results import as_printed
 from lagjax._sweep._members import text_of
 from lagjax._sweep._store import Store
-from lagjax._sweep._workers import claimed
+from lagjax._sweep._workers import claimed_units
 
 WELL = ("successful", "event_occurred")
 _RECENT = 32  # units whose times give the rate
@@ -106,7 +106,7 @@ def status(store: Store) -> Status:
     slow = {name: why for record in records for name, why in record["slow"].items()}
     return Status(
         store=str(store.path), done=members, members=grid.members, units_done=len(done), units=grid.units,
-        claimed=len(set(claimed(store)) - set(done)), rate=rate,
+        claimed=len(set(claimed_units(store)) - set(done)), rate=rate,
         left=None if rate is None else (grid.members - members) / rate, results=results, failures=failures,
         drift=None if worst is None else (worst[0], worst[1], point(store, spec, worst[1])), slow=slow,
         cpus=tuple(dict.fromkeys(record["cpu"] for record in records if "cpu" in record)), damaged=damaged,

@@ -57,7 +57,7 @@ class Quantity:
         return tuple(f"{self.name}_{k}" for k in range(len(self.shape)))
 
     @property
-    def nothing(self) -> Any:
+    def filling(self) -> Any:
         """The filling where there is no value: NaN; of whole numbers the least, or greatest, of their type."""
         kind = self.dtype.kind
         if kind in "fc":
@@ -124,12 +124,12 @@ class Store:
         return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
     @contextmanager
-    def made_aside(self) -> "Iterator[Store]":
+    def create_aside(self) -> "Iterator[Store]":
         """A store in a folder beside this one's, which takes its place when the `with` statement ends.
 
         So a store is there when it is whole. Of several processes that make it at once the first one's stays.
         """
-        with self.explained("the store was not made"):
+        with self.explain_errors("the store was not made"):
             place = self.path.resolve()
             place.parent.mkdir(parents=True, exist_ok=True)
             begun = f".{place.name}.begun-"
@@ -163,7 +163,7 @@ class Store:
             group.create_array(
                 q.name, shape=grid.shape + q.shape, chunks=grid.chunk + q.shape, dtype=q.dtype,
                 compressors=zarr.codecs.Crc32cCodec(), filters=None,
-                fill_value=NOT_DONE if q == RESULT else q.nothing, dimension_names=dimensions + q.dimensions,
+                fill_value=NOT_DONE if q == RESULT else q.filling, dimension_names=dimensions + q.dimensions,
                 attributes=about,
             )  # fmt: skip
         with warnings.catch_warnings():
@@ -211,7 +211,7 @@ class Store:
         """The statistics of a unit, as bytes."""
         return (self.job / "done" / f"{unit}.npz").read_bytes()
 
-    def known(self, unit: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def copied_members(self, unit: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Members of a unit that were taken from another store: which of it, and what is kept of them by name."""
         file = self.job / KNOWN / f"{unit}.npz"
         if not file.exists():
@@ -222,10 +222,10 @@ class Store:
     def write_unit(self, spec: dict, unit: int, values: dict[str, np.ndarray], record: dict, statistics: bytes) -> None:
         """Write the chunks of a unit (values (members, …) by name), and then that it is done."""
         grid, hashes = self.grid(spec), {}
-        with self.explained(f"unit {unit} was not written"):
+        with self.explain_errors(f"unit {unit} was not written"):
             for q in self.quantities(spec):
                 data = self._chunk(grid, unit, q, values[q.name])
-                data = _with_checksum(data) if spec["format"] >= 3 else data
+                data = _append_checksum(data) if spec["format"] >= 3 else data
                 hashes[q.name] = hashlib.sha256(data.data).hexdigest()
                 self.write(self.chunk_file(grid, unit, q.name, q.shape), data, f"{unit}-{q.name}")
             if statistics:
@@ -238,7 +238,7 @@ class Store:
         shape = grid.box_shape(unit)
         values = np.ascontiguousarray(values, q.dtype).reshape(shape + q.shape)
         if shape != grid.chunk:
-            whole = np.full(grid.chunk + q.shape, NOT_DONE if q == RESULT else q.nothing, q.dtype)
+            whole = np.full(grid.chunk + q.shape, NOT_DONE if q == RESULT else q.filling, q.dtype)
             whole[tuple(map(slice, shape))] = values
             values = whole
         little = values.astype(values.dtype.newbyteorder("<"), copy=False)
@@ -290,7 +290,7 @@ class Store:
 
     def require_writable(self) -> None:
         """Raise `OSError`, with a sentence, where nothing can be written here; remove what dead workers have left."""
-        with self.explained("nothing was computed"):
+        with self.explain_errors("nothing was computed"):
             probe = self.job / "aside" / f"probe-{os.getpid()}-{os.urandom(4).hex()}"
             self.write(probe, b"", "probe")
             now = probe.stat().st_mtime  # by the clock of the disk
@@ -302,12 +302,12 @@ class Store:
                 except FileNotFoundError:  # another one removes it
                     pass
 
-    def explained(self, what: str) -> "_Explained":
+    def explain_errors(self, what: str) -> "_ExplainedErrors":
         """A context in which an error of the disk is raised again as a sentence; `what` it cost."""
-        return _Explained(self, what)
+        return _ExplainedErrors(self, what)
 
 
-class _Explained:
+class _ExplainedErrors:
     """Raises an error of the disk again, as a sentence."""
 
     def __init__(self, store: Store, what: str):
@@ -331,7 +331,7 @@ class _Explained:
         ) from error
 
 
-def _with_checksum(data: np.ndarray) -> np.ndarray:
+def _append_checksum(data: np.ndarray) -> np.ndarray:
     """The bytes of a chunk as the codec crc32c of zarr writes them: the checksum behind the numbers."""
     import google_crc32c  # which zarr's codec takes it from
 

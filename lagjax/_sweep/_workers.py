@@ -42,8 +42,8 @@ import numpy as np
 
 from lagjax._sweep._batch import Kept
 from lagjax._sweep._begin import first_look
-from lagjax._sweep._description import Description, packed, unpacked, users_path
-from lagjax._sweep._job import Job, Unit, compute, in_doubles, opened, parts, precision, starts
+from lagjax._sweep._description import Description, pack_description, unpack_description, users_path
+from lagjax._sweep._job import Job, Unit, compute, open_job, parts, precision, starts, uses_doubles
 from lagjax._sweep._store import Store
 
 # ---- claims ----------------------------------------------------------------------------------------------------------
@@ -65,7 +65,7 @@ class Worker:
         self._identity = {"place": _namespace(), "pid": os.getpid(), "began": _start_ticks(os.getpid())}
 
     def __enter__(self):
-        with self.store.explained("nothing was computed"):
+        with self.store.explain_errors("nothing was computed"):
             self._beat()
         self._thread = threading.Thread(target=self._beat_on, daemon=True)
         self._thread.start()
@@ -102,7 +102,7 @@ class Worker:
         file = self.claims / f"{unit}.{held[-1] + 1 if held else 0}"
         try:
             with (
-                self.store.explained(f"unit {unit} was not claimed"),
+                self.store.explain_errors(f"unit {unit} was not claimed"),
                 open(os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY), "w") as opened,
             ):
                 opened.write(self.name)
@@ -142,7 +142,7 @@ class Worker:
         return time.monotonic() - since > STALE
 
 
-def claimed(store: Store) -> dict[int, str]:
+def claimed_units(store: Store) -> dict[int, str]:
     """The units that are claimed, and by whom; alive or not."""
     found = {}
     for name in sorted(os.listdir(store.job / "claims"), key=lambda name: tuple(map(int, name.split(".")))):
@@ -234,7 +234,7 @@ def _claim_units(job: Job, worker: Worker, notify: Notify) -> Iterator[int]:
 
 def run_unit(path: str, unit: int) -> bool:
     """Compute one unit of a store, in whatever process this is; return False where another worker has it."""
-    job = opened(path)
+    job = open_job(path)
     with Worker(job.store) as worker:
         if unit in job.store.done() or not worker.claim(unit):
             return False
@@ -310,7 +310,7 @@ def _require_no_fork(executor: Any) -> None:
 
 def run_store(store: Store, notify: Notify = lambda: None, most: int | None = None) -> int:
     """Compute units of a store that is known by its path alone; return their number."""
-    return work(opened(str(store.path.resolve())), notify, most=most)
+    return work(open_job(str(store.path.resolve())), notify, most=most)
 
 
 # ---- units in a child process ----------------------------------------------------------------------------------------
@@ -319,7 +319,7 @@ PATIENCE = 600.0  # seconds for a batch, and for the start of a child: a scene o
 _MOST = 100  # members of a unit that may end their process: each takes a dozen children to find
 
 
-class _Died(Exception):
+class _ChildDeath(Exception):
     """The end of a child over some batch; `.why` in words."""
 
     def __init__(self, batch: int, why: str):
@@ -329,43 +329,43 @@ class _Died(Exception):
 
 def _compute_alone(child: "Child", job: Job, unit: int) -> Unit:
     """A unit by a child, without the members that end it."""
-    crashed, again = _known(job, unit), 0
+    crashed, again = _crashed_members(job, unit), 0
     while True:
         try:
             return child.ask(("unit", unit, crashed))
-        except _Died as death:
+        except _ChildDeath as death:
             which, count = parts(job, unit)[death.batch]
             suspects = [j for j in which[:count].tolist() if j not in crashed]
-            found = dict.fromkeys(_search(child, unit, suspects, whole=False), death.why)
+            found = dict.fromkeys(_find_crashing(child, unit, suspects, whole=False), death.why)
             again += not found
             if len(crashed | found) > _MOST or again > 1:
-                raise RuntimeError(_hopeless(job, unit, death, len(crashed | found))) from None
+                raise RuntimeError(_crash_message(job, unit, death, len(crashed | found))) from None
             crashed |= found
             text = json.dumps({str(j): why for j, why in crashed.items()})
             job.store.write(job.store.job / "crashed" / f"{unit}.json", text.encode(), f"{unit}-crashed")
 
 
-def _known(job: Job, unit: int) -> dict[int, str]:
+def _crashed_members(job: Job, unit: int) -> dict[int, str]:
     """The members of a unit that are known to end their process, and how."""
     file = job.store.job / "crashed" / f"{unit}.json"
     return {int(j): why for j, why in json.loads(file.read_text()).items()} if file.exists() else {}
 
 
-def _search(child: "Child", unit: int, suspects: list[int], whole: bool = True) -> list[int]:
+def _find_crashing(child: "Child", unit: int, suspects: list[int], whole: bool = True) -> list[int]:
     """The members among the suspects that end their process; `whole`: where it is not known that there are any."""
     if whole:
         try:
             child.ask(("probe", unit, suspects))
             return []
-        except _Died:
+        except _ChildDeath:
             pass
     if len(suspects) < 2:
         return suspects
     half = len(suspects) // 2
-    return _search(child, unit, suspects[:half]) + _search(child, unit, suspects[half:])
+    return _find_crashing(child, unit, suspects[:half]) + _find_crashing(child, unit, suspects[half:])
 
 
-def _hopeless(job: Job, unit: int, death: _Died, count: int) -> str:
+def _crash_message(job: Job, unit: int, death: _ChildDeath, count: int) -> str:
     more = (
         f"{count} of its members do so: look at one of them with `simulate`"
         if count > _MOST
@@ -399,13 +399,13 @@ class Child:
 
     def look(self, description: Description, points: dict[str, np.ndarray]) -> tuple[Kept, float, bool]:
         """The kept values of a few members (`first_look`), of those at least that do not end the child."""
-        request = packed(description), users_path(), in_doubles()
+        request = pack_description(description), users_path(), uses_doubles()
         waiting = [points]
         while waiting:
             some = waiting.pop(0)
             try:
                 return self.ask(("look", request, some))
-            except _Died as death:
+            except _ChildDeath as death:
                 half, why = len(next(iter(some.values()))) // 2, death.why
             if half:
                 parts = slice(None, half), slice(half, None)
@@ -413,7 +413,7 @@ class Child:
         raise RuntimeError(f"Every member that was tried ends its process ({why}): look at one with `simulate`.")
 
     def ask(self, request: tuple) -> Any:
-        """The answer of the child. Raises `_Died` where it ends first, `RuntimeError` for what it raises."""
+        """The answer of the child. Raises `_ChildDeath` where it ends first, `RuntimeError` for what it raises."""
         process, replies = self._running()
         batch: Any = 0
         try:
@@ -439,7 +439,7 @@ class Child:
                 self.end()
                 code = process.returncode
                 late = f"it took longer than {self.limit:g} s" if kind == "late" else f"it ended with status {code}"
-                raise _Died(int(batch), late)
+                raise _ChildDeath(int(batch), late)
 
     def end(self) -> None:
         """End the child."""
@@ -500,7 +500,7 @@ def serve(path: str) -> None:
             if what == "look":
                 send("answer", _look(unit, members))
                 continue
-            job = opened(path)
+            job = open_job(path)
             _set_precision(bool(job.spec["x64"]))
             if what == "unit":
                 send("answer", compute(job, unit, members, lambda k: send("batch", k)))
@@ -513,7 +513,7 @@ def serve(path: str) -> None:
 def _look(request: tuple[bytes, list[str], bool], points: dict[str, np.ndarray]) -> tuple[Kept, float, bool]:
     data, path, doubles = request
     _set_precision(doubles)
-    return first_look(unpacked(data, path), points)
+    return first_look(unpack_description(data, path), points)
 
 
 def _set_precision(doubles: bool) -> None:

@@ -198,7 +198,7 @@ def test_statistics_leave_out_what_is_not_finite():
     how = lagjax.Statistics(quantiles=(0.5,))
     part = _statistics.partial_of(how, values, ok, np.arange(10, 14))
     nothing = _statistics.partial_of(how, values[1:3], ok[1:3], np.arange(2))
-    for total in (part, _statistics.merged(part, nothing), _statistics.merged(nothing, part)):
+    for total in (part, _statistics.merge(part, nothing), _statistics.merge(nothing, part)):
         got = _statistics.summary(how, total, ())
         assert got.count == 2 and got.mean == -0.5 and got.variance == 4.5 and got.min_member == 13
     assert np.isnan(_statistics.summary(how, nothing, ()).mean)
@@ -210,7 +210,7 @@ def test_statistics_leave_out_what_is_not_finite():
 @pytest.mark.parametrize("shape", [(1,), (1000,), (7, 11, 13), (3, 1, 50), (2, 2, 2, 2)])
 @pytest.mark.parametrize("size", [1, 4, 60, 10**6])
 def test_units_tile_the_members_in_order(shape, size):
-    grid = Grid.of(shape, size)
+    grid = Grid.from_shape(shape, size)
     numbers = [grid.numbers(unit, np.arange(grid.size(unit))) for unit in range(grid.units)]
     np.testing.assert_array_equal(np.concatenate(numbers), np.arange(np.prod(shape)))
     assert max(map(len, numbers)) <= size
@@ -219,7 +219,7 @@ def test_units_tile_the_members_in_order(shape, size):
 def test_a_hundred_million_members_are_no_list(monkeypatch):
     monkeypatch.setattr(designs, "SLICE", 1000)
     over = {"a": np.linspace(0, 1, 10_000), "b": designs.random(10_000)}
-    grid = Grid.of(tuple(axis.size for axis in axes_of(over)), 10**6)
+    grid = Grid.from_shape(tuple(axis.size for axis in axes_of(over)), 10**6)
     assert grid.members == 10**8 and grid.units == 100 and grid.box(99)[0] == slice(9900, 10_000)
     (axis,) = axes_of({("x", "y"): designs.random(10**8, seed=3)})
     start, first = next(axis.pieces())
@@ -269,7 +269,7 @@ def test_goes_on_where_it_stopped(tmp_path, undisturbed):
 
 def test_another_process_goes_on(tmp_path, undisturbed, capsys):
     begun(tmp_path, 1)
-    _job._opened.cache_clear()
+    _job._open_job.cache_clear()
     assert command_line.main(["sweep", "run", str(tmp_path / "store"), "--quiet"]) == 0
     assert digests(tmp_path) == undisturbed and "42 of 42" in capsys.readouterr().out
     assert command_line.main(["sweep", "check", str(tmp_path / "store")]) == 0
@@ -553,7 +553,7 @@ def test_a_process_that_has_ended_is_dead_at_once(store):
 
 def test_functions_in_stores_of_earlier_files_are_found():
     for module, name in (("_scene", "Motions"), ("_scene", "Left"), ("_sections", "Sections")):
-        kind = _description.unpacked(f"clagjax._sweep.{module}\n{name}\n.".encode(), [])
+        kind = _description.unpack_description(f"clagjax._sweep.{module}\n{name}\n.".encode(), [])
         assert kind is getattr(_description, {"Motions": "Description", "Left": "FinalStates"}.get(name, name))
 
 

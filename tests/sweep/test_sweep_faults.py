@@ -154,21 +154,21 @@ def test_of_several_who_make_a_store_the_first_one_stays(tmp_path):
         (aside.job).mkdir(parents=True)
         (aside.job / "spec.json").write_text(text)
 
-    with store.made_aside() as second:
-        with store.made_aside() as first:
+    with store.create_aside() as second:
+        with store.create_aside() as first:
             make(first, "first")
             assert not store.is_there()
         assert store.is_there()
         make(second, "second")
     assert (store.job / "spec.json").read_text() == "first" and os.listdir(tmp_path) == ["store"]
-    with pytest.raises(KeyboardInterrupt), Store(tmp_path / "other").made_aside() as aside:
+    with pytest.raises(KeyboardInterrupt), Store(tmp_path / "other").create_aside() as aside:
         make(aside, "half")
         raise KeyboardInterrupt
     assert os.listdir(tmp_path) == ["store"]
     gone = tmp_path / ".store.begun-1-abc"
     gone.mkdir()
     os.utime(gone, (0, 0))  # of a process that was killed
-    with store.made_aside() as third:
+    with store.create_aside() as third:
         make(third, "third")
     assert (store.job / "spec.json").read_text() == "first" and os.listdir(tmp_path) == ["store"]
 
@@ -236,5 +236,5 @@ def test_a_later_end_of_stores_that_were_moved(tmp_path):
     assert swept(rest, extend=tmp_path / "there" / "first", **rule).status().done == 42
     os.rename(tmp_path / "there" / "first", tmp_path / "there" / "gone")
     (record / "0.json").unlink()
-    _job._opened.cache_clear()
+    _job._open_job.cache_clear()
     assert lagjax.__main__.main(["sweep", "run", str(rest), "--quiet"]) == 1
