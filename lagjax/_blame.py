@@ -50,7 +50,7 @@ def offenders(function: Callable, *arguments, derivatives: bool = True) -> list[
             return
         name = _name(equation)
         if not all(_finite(x) for x in results):
-            collected.append(Offender(name, _operands(_as_written(equation, operands), results), place, "value"))
+            collected.append(Offender(name, _operands(_reorder_operands(equation, operands), results), place, "value"))
         elif derivatives and chosen and all(map(_finite, operands)) and any(_floating(x) for x in results):
             first, second = _derivatives(equation, operands, chosen)
             for fault, values in (("first derivative", first), ("second derivative", second)):
@@ -254,7 +254,7 @@ def _name(equation) -> str:
 _WRITTEN = {"select_n": "where"}  # what users call it
 
 
-def _as_written(equation, operands) -> list:
+def _reorder_operands(equation, operands) -> list:
     """The operands in the order in which users write them: where(condition, if true, if not)."""
     if equation.primitive.name == "select_n" and len(operands) == 3:
         return [operands[0], operands[2], operands[1]]

@@ -54,8 +54,8 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
         raise ValueError(clash)
 
 
-class _Start(NamedTuple):
-    """The conditions on the first state of a motion of n coordinates with m constraints, in NumPy."""
+class _StartConditions(NamedTuple):
+    """The conditions of m constraints on the first state of a motion of n coordinates, in NumPy."""
 
     values: np.ndarray  # f, and zero for constraints on velocities, (m,)
     rates: np.ndarray  # J q̇ + ∂f/∂t, then a, (m,)
@@ -68,7 +68,7 @@ class _Start(NamedTuple):
     size_qdot: np.ndarray  # the largest velocity, ()
 
 
-def _require_gradients(names: list[str], start: _Start) -> None:
+def _require_gradients(names: list[str], start: _StartConditions) -> None:
     for name, value, rate, gamma, length in zip(names, *start[:4], strict=True):
         if not np.isfinite([value, rate, gamma, length]).all():
             raise ValueError(
@@ -82,7 +82,7 @@ def _require_gradients(names: list[str], start: _Start) -> None:
             )
 
 
-def _require_room(names: list[str], start: _Start, coordinates: int, independent: int) -> None:
+def _require_room(names: list[str], start: _StartConditions, coordinates: int, independent: int) -> None:
     """Raise where independent constraints, more than there are coordinates, leave nothing to move."""
     if len(names) > coordinates <= independent and np.isfinite(start.schur).all():
         raise ValueError(
@@ -135,16 +135,16 @@ def _inconsistent(system, t, span, q0: PyTree, qdot0: PyTree, params: PyTree) ->
     return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, span)
 
 
-def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _Start:
+def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _StartConditions:
     """The start of a motion, measured without compiling anything where the scene has programs."""
     q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)]) for x in (q0, qdot0))
     q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, ts[0]))
-    sample = Sample.of(system, layout, q[None], qdot[None], t, params)
+    sample = Sample.from_scene(system, layout, q[None], qdot[None], t, params)
     of = {name: value[0] for name, value in sample.quantities(*_ASKED).items()}
     on_positions = np.arange(len(of["residual"])) < sample.derivation.position_count
     unit = diagonal_scale(of["mass_matrix"])
     size_q, size_qdot = sizes(unit, q, qdot, abs(float(ts[-1]) - float(t)) or np.inf)
-    return _Start(
+    return _StartConditions(
         values=np.where(on_positions, of["residual"], 0),
         rates=of["rates"],
         gamma=of["gamma"],

@@ -243,7 +243,7 @@ def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, param
     matrix = mass_matrix(q0, qdot, t, params)
     unit = jax.lax.stop_gradient(diagonal_scale(matrix))
 
-    def at_rest(q, moved):
+    def is_at_rest(q, moved):
         return jnp.max(jnp.abs(moved / unit)) <= _AT_REST * jnp.finfo(q.dtype).eps * _size(unit, q, q0)
 
     def stationary(place):
@@ -260,8 +260,8 @@ def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, param
         return jax.tree.map(jnp.subtract, place, _solve_symmetric_saddle(linear, value))
 
     def find(_, start):
-        nearby = _until_at_rest(shortest_step, start, at_rest)
-        q, nu = _until_at_rest(newton_step, (nearby[0], start[1]), at_rest)
+        nearby = _iterate_to_rest(shortest_step, start, is_at_rest)
+        q, nu = _iterate_to_rest(newton_step, (nearby[0], start[1]), is_at_rest)
 
         def distance(q):
             return jnp.sqrt((q - q0) @ matrix @ (q - q0))
@@ -285,12 +285,12 @@ def _solve_symmetric_saddle(linear: Callable, right: tuple[Vector, Row]) -> tupl
     return x, -multipliers
 
 
-def _until_at_rest(step: Callable, start: tuple[Vector, Row], at_rest: Callable) -> tuple[Vector, Row]:
+def _iterate_to_rest(step: Callable, start: tuple[Vector, Row], is_at_rest: Callable) -> tuple[Vector, Row]:
     """(q, ν) after as many steps as it takes until q moves no more than rounding; NaN if it always does."""
 
     def moves(carry):
         (q, _), moved, count = carry
-        return ~at_rest(q, moved) & (count < _NEWTON_STEPS)
+        return ~is_at_rest(q, moved) & (count < _NEWTON_STEPS)
 
     def once(carry):
         place, _, count = carry
@@ -298,7 +298,7 @@ def _until_at_rest(step: Callable, start: tuple[Vector, Row], at_rest: Callable)
         return new, new[0] - place[0], count + 1
 
     (q, nu), moved, _ = jax.lax.while_loop(moves, once, (start, jnp.full_like(start[0], jnp.inf), 0))
-    return jnp.where(at_rest(q, moved), q, jnp.nan), nu
+    return jnp.where(is_at_rest(q, moved), q, jnp.nan), nu
 
 
 def _holds(residual: Row, jacobian: Float[Array, "m n"], unit: Vector, *states: Vector) -> Bool[Array, ""]:

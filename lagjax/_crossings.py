@@ -152,13 +152,13 @@ def _raise_unless_ok(problem: Problem, end: tuple, noted: Noted, result) -> Note
 def as_crossings(layout: Layout, names: tuple[str, ...] | None, noted: Noted, ok) -> Crossings | dict[str, Crossings]:
     """The crossings in the pytree of the user, and by the names of the sections."""
 
-    def of_section(k: int) -> Crossings:
+    def section_crossings(k: int) -> Crossings:
         q, qdot = map(layout.restore, halves(jnp.asarray(noted.y[k])))
         return Crossings(jnp.asarray(noted.t[k]), q, qdot, jnp.asarray(noted.count[k]).astype(int), jnp.asarray(ok[k]))
 
     if names is None:
-        return of_section(0)
-    return {name: of_section(k) for k, name in enumerate(names)}
+        return section_crossings(0)
+    return {name: section_crossings(k) for k, name in enumerate(names)}
 
 
 # ---- what can be wrong -----------------------------------------------------------------------------------------------

@@ -30,12 +30,12 @@ def _jvp(primals, tangents, *, function, count):
     arguments, moving = primals[count:], tangents[count:]
     floats = [i for i, x in enumerate(arguments) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-    def of_floats(*some):
+    def call_with_floats(*some):
         given = dict(zip(floats, some, strict=True))
         return function(*(given.get(i, x) for i, x in enumerate(arguments)))
 
     along = [ad.instantiate_zeros(moving[i]) for i in floats]
-    changes = jax.jvp(of_floats, tuple(arguments[i] for i in floats), tuple(along))[1]
+    changes = jax.jvp(call_with_floats, tuple(arguments[i] for i in floats), tuple(along))[1]
     return with_p.bind(*primals, function=function, count=count), list(changes)
 
 

@@ -130,22 +130,22 @@ class Derivation:
         if self.refusal is not None:
             raise Unlowerable(self.refusal)
 
-        def in_order(values):
+        def order_values(values):
             self._shapes = {name: values[name].shape for name in sorted(values)}
             return [values[name] for name in self._shapes]
 
-        def on_arrays(*leaves):
-            return in_order(self._traced_once.quantities(*jax.tree.unflatten(structure, leaves)))
+        def trace_arrays(*leaves):
+            return order_values(self._traced_once.quantities(*jax.tree.unflatten(structure, leaves)))
 
-        def on_scalars(expansion, leaves):
+        def trace_scalars(expansion, leaves):
             values, self._recursion = quantities(self.motion, expansion, self.state_shapes, leaves)
-            return in_order(values)
+            return order_values(values)
 
         leaves, structure = jax.tree.flatten(self.state_shapes)
         try:
-            return lower_scalars(on_scalars, on_arrays, tuple(leaves), OPERATION_BUDGET)
+            return lower_scalars(trace_scalars, trace_arrays, tuple(leaves), OPERATION_BUDGET)
         except OwnRules:
-            return lower(on_arrays, *leaves, budget=OPERATION_BUDGET)
+            return lower(trace_arrays, *leaves, budget=OPERATION_BUDGET)
 
     @property
     def _graph(self) -> Graph | None:
@@ -182,13 +182,13 @@ class Derivation:
 
     def evaluate(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
         """Named quantities at S states, each of shape (S, …), in NumPy; `columns` as `Program.evaluate_many` takes."""
-        return self._by_name(names, self.program(*names).evaluate_many(columns))
+        return self._split_outputs(names, self.program(*names).evaluate_many(columns))
 
     def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
         """The rounding errors of these quantities at S states, each of shape (S, …)."""
-        return self._by_name(names, self.program(*names).round_off_many(columns))
+        return self._split_outputs(names, self.program(*names).round_off_many(columns))
 
-    def _by_name(self, names: Sequence[str], outputs: np.ndarray) -> dict[str, np.ndarray]:
+    def _split_outputs(self, names: Sequence[str], outputs: np.ndarray) -> dict[str, np.ndarray]:
         rows, values, start = outputs.T, {}, 0
         for name in names:
             end = start + self.count(name)
@@ -221,7 +221,7 @@ class Derivation:
         Machine code changes over where that comes about, with the numbers of the run at hand; XLA, which has to write
         the program down before it knows them, takes the one that always holds (`Program.complete`).
         """
-        if (variant := self._by_recursion()) is not None:
+        if (variant := self._recursive_acceleration()) is not None:
             return replace(variant, otherwise=lambda: self._general_acceleration)
         if not self.motion.constrained or self._constant_mass or not self._regular(_ACCELERATION):
             return self._general_acceleration
@@ -269,11 +269,11 @@ class Derivation:
             return None
         n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
 
-        def of_arrays(values, qdot):
+        def scales_from_arrays(values, qdot):
             return velocity_scales(values[: n * n].reshape(n, n), values[n * n :].reshape(-1, n), qdot)
 
         def scales(*scalars):
-            return applied(of_arrays, parts.vector(*scalars), stacked(scalars[n : 2 * n]))
+            return applied(scales_from_arrays, parts.vector(*scalars), stacked(scalars[n : 2 * n]))
 
         return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
 
@@ -381,7 +381,7 @@ class Derivation:
 
         return system, elimination.solve
 
-    def _by_recursion(self) -> Program | None:
+    def _recursive_acceleration(self) -> Program | None:
         """q̈ by the recursion in L; None where there is none, or where it does not hold at a sampled state."""
         self._whole  # noqa: B018  (its trace finds the recursion)
         if self._recursion is None or self._regular(_ACCELERATION) is None:
@@ -389,7 +389,7 @@ class Derivation:
         elimination, n = RecursiveElimination(self._recursion, self.layout.dtype), self.layout.size
         places, count = elimination.entries, len(elimination.entries)
         positions = [*self._positions("recursion"), *self._positions("force")]
-        cut = functools.cache(lambda: self._whole.only(positions, in_jax))  # of which the operations alone are used
+        cut = functools.cache(lambda: self._whole.only(positions, solve_dense))  # its operations alone are used
 
         def system(*scalars):
             whole = self._whole.own_outputs(*scalars)
@@ -397,13 +397,19 @@ class Derivation:
             right = spread(values[count:], np.arange(n), n + 2 * elimination.velocities)
             return places, values[:count], right, *elimination.factors(values[:count])
 
-        def in_jax(*scalars):  # the same function of the state, with arrays: M is eliminated
+        def solve_dense(*scalars):  # the same function of the state, with arrays: M is eliminated
             dense, solve = self._system(_ACCELERATION)
             _, _, right, factors, singular = dense(*scalars)
             return [*solve(factors, right), jnp.asarray(singular)]
 
         program = lower_solution(
-            system, elimination.solve, n, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph, in_jax=in_jax
+            system,
+            elimination.solve,
+            n,
+            *self.scalar_shapes,
+            budget=OPERATION_BUDGET,
+            graph=self._graph,
+            in_jax=solve_dense,
         )
         return program if self._agrees(program) else None
 

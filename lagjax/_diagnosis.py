@@ -81,7 +81,7 @@ class Undefined(NamedTuple):
     by_time: bool  # whether time alone, without the motion, leads there
 
 
-def described(trajectory: Trajectory, layout: Layout) -> str:
+def describe_failure(trajectory: Trajectory, layout: Layout) -> str:
     """The whole message of a single motion that failed: its result, its last state and the diagnosis."""
     end, system = trajectory.end, trajectory.system
     y_end = np.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
@@ -91,18 +91,18 @@ def described(trajectory: Trajectory, layout: Layout) -> str:
     if trajectory.result == RESULTS.mass_matrix_singular:
         mass = np.asarray(system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
         message += f"\n{_describe_null(mass, layout.names)}"
-    return message + diagnosis(system, layout, trajectory.params, ended_of(trajectory, layout))
+    return message + diagnosis(system, layout, trajectory.params, motion_end(trajectory, layout))
 
 
 def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
     """The facts about a failure, as sentences on a line of their own that begins with a line break; or nothing."""
     try:
-        return _diagnosed(system, layout, params, ended) if ended.code in _CODES else ""
+        return _find_cause(system, layout, params, ended) if ended.code in _CODES else ""
     except Exception as error:  # the message of the failure itself must come out
         return f"\n(No more is known about it: {type(error).__name__}.)"
 
 
-def _diagnosed(system: System, layout: Layout, params, ended: Ended) -> str:
+def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
     derivation = derivation_of(system, layout, params)
     state = layout.restore(ended.y[: layout.size]), layout.restore(ended.y[layout.size :])
     first = layout.restore(ended.y_first[: layout.size]), layout.restore(ended.y_first[layout.size :])
@@ -114,7 +114,7 @@ def _diagnosed(system: System, layout: Layout, params, ended: Ended) -> str:
         return f"\n{_reset_to_nothing(layout, ended) if ended.by_resets else _OVERSTEPPED}"
     undefined = _undefined(derivation, ended) or _undefined_by_jax(derivation, params, ended)
     if undefined is not None:
-        return f"\n{_told(undefined)}{_line(derivation, params, undefined)}."
+        return f"\n{_describe_undefined(undefined)}{_line(derivation, params, undefined)}."
     if text := _singular_mass(derivation, ended):
         return f"\n{text}"
     if (at := _running_away(derivation, ended)) is not None:
@@ -157,7 +157,7 @@ def _undefined(derivation: Derivation, ended: Ended) -> Undefined | None:
     try:
         rate = np.concatenate([halves(ended.y)[1], _acceleration(derivation, ended)])
         y, t = _ahead(ended, rate)
-        values = Sample.along(derivation, y, t, ended.numbers).quantities(*(name for name, *_ in _QUANTITIES))
+        values = Sample.from_states(derivation, y, t, ended.numbers).quantities(*(name for name, *_ in _QUANTITIES))
     except Unlowerable:
         return None
     return _first_undefined(derivation.layout, ended, y, t, values)
@@ -187,7 +187,7 @@ def _first_undefined(layout: Layout, ended: Ended, y, t, values: dict[str, np.nd
         for name, what, role in _QUANTITIES:
             if name not in values or not values[name][row].size:
                 continue
-            numbers = _by_coordinate(name, values[name])
+            numbers = _coordinate_values(name, values[name])
             bad = ~np.isfinite(numbers[row])
             if bad.any():
                 by_time = bool(row and not np.isfinite(numbers[row - 1 + along][bad]).any())
@@ -197,14 +197,14 @@ def _first_undefined(layout: Layout, ended: Ended, y, t, values: dict[str, np.nd
     return None
 
 
-def _by_coordinate(name: str, values: np.ndarray) -> np.ndarray:
-    """Values (S, …) with a number for each coordinate, (S, n): of a matrix that of its column that is not finite."""
+def _coordinate_values(name: str, values: np.ndarray) -> np.ndarray:
+    """Values (S, n) as they are; of matrices (S, n, n) one number a column: 0 where the column is finite, else NaN."""
     if values.ndim == 2:
         return values
     return np.where(np.isfinite(values).all(axis=1), 0.0, np.nan)
 
 
-def _told(undefined: Undefined) -> str:
+def _describe_undefined(undefined: Undefined) -> str:
     listed_ = listed([f"{n} ({x})" for n, x in zip(undefined.names, undefined.values, strict=True)])
     since = f", from t = {undefined.t:.9g} on, whatever the state" if undefined.by_time else ""
     return f"Not finite {'just ahead' if undefined.ahead else 'there'}: {undefined.what} {listed_}{since}"
@@ -258,7 +258,7 @@ def _singular_mass(derivation: Derivation, ended: Ended) -> str:
         return ""
     try:
         y, t = np.stack([ended.y_first, ended.y]), np.array([ended.t_first, ended.t])
-        first, last = Sample.along(derivation, y, t, ended.numbers).quantities("mass_matrix")["mass_matrix"]
+        first, last = Sample.from_states(derivation, y, t, ended.numbers).quantities("mass_matrix")["mass_matrix"]
     except Unlowerable:
         return ""
     if not np.isfinite([first, last]).all():
@@ -397,18 +397,18 @@ def _budget(ended: Ended) -> str:
 
 def _acceleration(derivation: Derivation, ended: Ended) -> np.ndarray:
     """q̈ (n,) at the end."""
-    return Sample.along(derivation, ended.y[None], ended.t, ended.numbers).acceleration()[0]
+    return Sample.from_states(derivation, ended.y[None], ended.t, ended.numbers).acceleration()[0]
 
 
 # ---- of a trajectory -------------------------------------------------------------------------------------------------
 
 
-def ended_of(
+def motion_end(
     trajectory: Trajectory, layout: Layout, member: tuple[int, ...] = (), numbers: np.ndarray | None = None
 ) -> Ended:
-    """The beginning and the end of a trajectory, or of one member of a batch; `numbers` (P,) are its parameters."""
+    """The end of a trajectory, or of one member of a batch, and where it began; `numbers` (P,) are its parameters."""
 
-    def of_member(tree, *index):
+    def flatten_member(tree, *index):
         leaves = [numbers_at(leaf, (*member, *index)) for leaf in jax.tree.leaves(tree)]
         return np.concatenate([np.ravel(leaf) for leaf in leaves]).astype(layout.dtype)
 
@@ -417,6 +417,6 @@ def ended_of(
     code, t, steps = (np.asarray(x)[member] for x in (trajectory.result._value, end.t, trajectory.stats["num_steps"]))
     if numbers is None:
         numbers = np.array(numbers_of(eqx.filter(trajectory.params, eqx.is_array_like)), layout.dtype)
-    y, y_first = of_member((end.q, end.qdot)), of_member((trajectory.q, trajectory.qdot), 0)
+    y, y_first = flatten_member((end.q, end.qdot)), flatten_member((trajectory.q, trajectory.qdot), 0)
     by_resets = trajectory.transitions is not None
     return Ended(int(code), float(t), y, float(ts[-1]), float(ts[0]), y_first, int(steps), numbers, by_resets)

@@ -42,9 +42,9 @@ def in_doubles(function: Callable, *arguments: PyTree) -> PyTree:
     """
     leaves, tree = jax.tree.flatten(arguments)
     places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array | np.ndarray | np.generic)]
-    arrays, is_on, made = [_rounded(leaves[i]) for i in places], has_doubles(), {}
+    arrays, is_on, made = [_round_array(leaves[i]) for i in places], has_doubles(), {}
 
-    def of_arrays(*arrays):
+    def call_with_arrays(*arrays):
         filled = list(leaves)
         for i, array in zip(places, arrays, strict=True):
             filled[i] = array
@@ -54,10 +54,10 @@ def in_doubles(function: Callable, *arguments: PyTree) -> PyTree:
 
     if all(map(is_concrete, arrays)):
         with jax.enable_x64(True):
-            results = of_arrays(*map(_on_host, arrays))
-            results = [_narrowed_on_host(x, is_on) for x in results]
+            results = call_with_arrays(*map(_widen, arrays))
+            results = [_narrow_array(x, is_on) for x in results]
     else:
-        results = computed_p.bind(*map(jnp.asarray, arrays), of=_Map(of_arrays), keeps_integers=is_on)
+        results = computed_p.bind(*map(jnp.asarray, arrays), of=_Map(call_with_arrays), keeps_integers=is_on)
     found = iter(results)
     return made["tree"].unflatten([next(found) if other is None else other for other in made["others"]])
 
@@ -111,16 +111,17 @@ def has_doubles() -> bool:
     return jax.dtypes.canonicalize_dtype(DOUBLE) == DOUBLE
 
 
-def _rounded(array):
+def _round_array(array):
     """The array in single precision, if it is of floats."""
     return array if array.dtype not in _NARROW else array.astype(_NARROW[array.dtype])
 
 
-def _on_host(array) -> np.ndarray:
+def _widen(array) -> np.ndarray:
+    """The array in NumPy, floats in double precision."""
     return np.asarray(array, _WIDE.get(array.dtype, array.dtype))
 
 
-def _narrowed_on_host(array, keeps_integers: bool):
+def _narrow_array(array, keeps_integers: bool):
     """The array as float32, by NumPy, which compiles nothing; what NumPy holds stays there."""
     narrow = np.asarray(array).astype(_narrow(array.dtype, keeps_integers), copy=False)
     return narrow if not isinstance(array, jax.Array) else jax.device_put(narrow)
@@ -152,7 +153,7 @@ class _Map:
     def derivative(self, size: int, moving: tuple[int, ...], results: dict[int, ShapedArray]) -> "_Map":
         """(*its `size` arguments, *tangents of those that are `moving`) ↦ the tangents of these `results`."""
 
-        def of_moving(arguments):
+        def restrict_to_moving(arguments):
             def function(*some):
                 given = dict(zip(moving, some, strict=True))
                 found = self.function(*(given.get(i, x) for i, x in enumerate(arguments)))
@@ -161,11 +162,11 @@ class _Map:
             return function, tuple(jnp.asarray(arguments[i]) for i in moving)
 
         def forward(*given):
-            function, at = of_moving(given[:size])
+            function, at = restrict_to_moving(given[:size])
             return jax.jvp(function, at, tuple(map(jnp.asarray, given[size:])))[1]
 
         def back(*given):
-            function, at = of_moving(given[:size])
+            function, at = restrict_to_moving(given[:size])
             return list(jax.vjp(function, *at)[1](list(map(jnp.asarray, given[size:]))))
 
         return _Map(forward, len(moving), back, tuple(results.values()))
@@ -202,10 +203,10 @@ def _shapes(*arrays, of: _Map, keeps_integers: bool):
 
 
 @computed_p.def_impl
-def _at_once(*arrays, of: _Map, keeps_integers: bool):
+def _evaluate(*arrays, of: _Map, keeps_integers: bool):
     with jax.enable_x64(True):
-        results = of.function(*map(_on_host, arrays))
-        return [jax.device_put(_narrowed_on_host(x, keeps_integers)) for x in results]
+        results = of.function(*map(_widen, arrays))
+        return [jax.device_put(_narrow_array(x, keeps_integers)) for x in results]
 
 
 def _compiled(ctx, *arrays, of: _Map, keeps_integers: bool):

@@ -19,8 +19,10 @@ class Choice(NamedTuple):
     refusal: str | None
 
 
-def asked_for(solver=None, dt=None, adjoint=None, progress: Any = False, rtol=None, atol=None) -> AbstractEngine | None:
-    """The engine that these arguments of `simulate` ask for; None where they leave it open.
+def requested_engine(
+    solver=None, dt=None, adjoint=None, progress: Any = False, rtol=None, atol=None
+) -> AbstractEngine | None:
+    """The engine that these arguments of `simulate` determine; None where they leave it open.
 
     Raises `TypeError` or `ValueError` where they cannot be right, or contradict each other.
     """

@@ -76,7 +76,7 @@ check_p.def_abstract_eval(lambda result, t_end, *_, **__: ShapedArray(result.sha
 
 
 @check_p.def_impl
-def _at_once(result, *values, **settings):
+def _check_eagerly(result, *values, **settings):
     _raise(*map(np.asarray, (result, *values)), **settings)
     return jnp.zeros(jnp.shape(result), values[0].dtype)
 
@@ -95,24 +95,24 @@ def _compiled(on_host):
     return mlir.lower_fun(check, multiple_results=False)
 
 
-def _in_place(host, shape):
+def _call_on_buffers(host, shape):
     return buffer_callback(lambda _, place, *arrays: host(*arrays), shape)
 
 
-def _by_copies(host, shape):
+def _call_on_copies(host, shape):
     return lambda *arrays: jax.pure_callback(lambda *x: host(*x), shape, *arrays)
 
 
-mlir.register_lowering(check_p, _compiled(_by_copies))
-mlir.register_lowering(check_p, _compiled(_in_place), platform="cpu")
+mlir.register_lowering(check_p, _compiled(_call_on_copies))
+mlir.register_lowering(check_p, _compiled(_call_on_buffers), platform="cpu")
 
 
-def _without_derivative(primals, tangents, **settings):
+def _zero_derivative(primals, tangents, **settings):
     passed = check_p.bind(*primals, **settings)
     return passed, ad.Zero(jax.typeof(passed).to_tangent_aval())
 
 
-ad.primitive_jvps[check_p] = _without_derivative
+ad.primitive_jvps[check_p] = _zero_derivative
 batching.primitive_batchers[check_p] = lambda args, axes, **settings: (
     check_p.bind(*batch_in_front(args, axes), **settings),
     0,

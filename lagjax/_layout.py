@@ -80,7 +80,7 @@ def halves(y):
     return y[..., :n], y[..., n:]
 
 
-def as_vector(numbers: PyTree, dtype) -> Float[Array, " P"]:
+def flatten_numbers(numbers: PyTree, dtype) -> Float[Array, " P"]:
     """All numbers of a pytree end to end, in the order of its leaves."""
     leaves = [jnp.ravel(jnp.asarray(leaf)).astype(dtype) for leaf in jax.tree.leaves(numbers)]
     return jnp.concatenate(leaves) if leaves else jnp.zeros(0, dtype)

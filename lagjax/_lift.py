@@ -19,7 +19,7 @@ from jax.extend import core
 from lagjax._arguments import Function
 from lagjax._problem import Batch, Problem
 from lagjax._reads import Edition, place_in
-from lagjax._system import ROLES, with_functions
+from lagjax._system import ROLES, replace_functions
 
 PyTree = Any
 
@@ -83,7 +83,7 @@ def lifted(problem: Problem) -> Problem:
     def lift(function: Any, roles: int = 2) -> Any:
         return _lifted(function, roles, problem, values) if isinstance(function, Function) else function
 
-    system = with_functions(
+    system = replace_functions(
         problem.system, {name: lift(f, 1 + (name != "constraints")) for name, f in functions.items()}
     )
     event = problem.event
@@ -115,14 +115,16 @@ def _lifted(function: Function, roles: int, problem: Problem, values: list) -> F
     layout = problem.layout
     state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
 
-    def of_numbers(states, t, numbers):
+    def call_with_numbers(states, t, numbers):
         return function(*states, t=t, params=eqx.combine(numbers, rest))
 
-    closed, shapes = jax.make_jaxpr(of_numbers, return_shape=True)((state,) * roles, t, numbers)
+    closed, shapes = jax.make_jaxpr(call_with_numbers, return_shape=True)((state,) * roles, t, numbers)
     places = tuple(place_in(values, c) if isinstance(c, Tracer) else None for c in closed.consts)
     constants = tuple(None if isinstance(c, Tracer) else c for c in closed.consts)
     structure = jax.tree.structure(shapes)
-    return traced_with(function, open_jaxpr(closed), constants, places, structure, f"{places} {closed.in_avals}")
+    return function_from_trace(
+        function, open_jaxpr(closed), constants, places, structure, f"{places} {closed.in_avals}"
+    )
 
 
 def open_jaxpr(closed: core.ClosedJaxpr, more=(), **changes) -> core.Jaxpr:
@@ -131,7 +133,7 @@ def open_jaxpr(closed: core.ClosedJaxpr, more=(), **changes) -> core.Jaxpr:
     return jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *more, *jaxpr.invars], **changes)
 
 
-def traced_with(function: Function, jaxpr, constants: tuple, places: tuple, structure, how: str) -> Function:
+def function_from_trace(function: Function, jaxpr, constants: tuple, places: tuple, structure, how: str) -> Function:
     """A function as its trace, for parameters that are `Lifted`: the constants that have `places` are values there.
 
     The first arguments of the jaxpr are these constants. `how` says where the values stand in it, so that equal

@@ -47,13 +47,13 @@ class Factorization(eqx.Module):
         def times_matrix(y):
             return _scaled(self.matrix, self.scale) @ y
 
-        def by_inverse(_, scaled):
-            x = self.inverse @ _in_order(scaled, self.order)
+        def solve_by_inverse(_, scaled):
+            x = self.inverse @ _permute_rows(scaled, self.order)
             # One step of refinement: the residual of an inverse is larger than that of LU by the condition of M.
-            return x + self.inverse @ _in_order(scaled - times_matrix(x), self.order)
+            return x + self.inverse @ _permute_rows(scaled - times_matrix(x), self.order)
 
         # `b` scaled, solved, scaled back; M is symmetric, so the transpose solve is the solve.
-        x = self.scale * jax.lax.custom_linear_solve(times_matrix, self.scale * b, by_inverse, symmetric=True)
+        x = self.scale * jax.lax.custom_linear_solve(times_matrix, self.scale * b, solve_by_inverse, symmetric=True)
         return jnp.where(self.singular, jnp.nan, x)
 
     def solve_columns(self, b: Float[Array, "n k"]) -> Float[Array, "n k"]:
@@ -147,21 +147,21 @@ def inverted(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
 
     def one_panel(index, carry):
         a, free, order, pivots = carry
-        panel, left, panel_order, panel_pivots = _eliminated(
+        panel, left, panel_order, panel_pivots = _eliminate(
             jax.lax.dynamic_slice_in_dim(a, index * width, width, 1), free
         )
         if count > 1:
-            a = jnp.where((free & ~left)[:, None], 0, a) + panel @ _in_order(a, panel_order)
+            a = jnp.where((free & ~left)[:, None], 0, a) + panel @ _permute_rows(a, panel_order)
             panel = jax.lax.dynamic_update_slice_in_dim(a, panel, index * width, 1)
         order = jax.lax.dynamic_update_slice_in_dim(order, panel_order, index * width, 0)
         return panel, left, order, jax.lax.dynamic_update_slice_in_dim(pivots, panel_pivots, index * width, 0)
 
     start = a, jnp.ones(size, bool), jnp.zeros(size, np.int32), jnp.zeros(size, a.dtype)
     a, _, order, pivots = jax.lax.fori_loop(0, count, one_panel, start) if count > 1 else one_panel(0, start)
-    return _in_order(a, order[:n])[:, :n], order[:n], pivots[:n]
+    return _permute_rows(a, order[:n])[:, :n], order[:n], pivots[:n]
 
 
-def _eliminated(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
+def _eliminate(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
     """A panel of columns (size, width) after elimination, which rows are still free, the pivots' rows, the pivots."""
 
     def one_column(k, carry):
@@ -170,7 +170,7 @@ def _eliminated(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
         column = jnp.sum(jnp.where(this_column, panel, 0), axis=1)
         row = jnp.argmax(jnp.where(free, jnp.abs(column), -1)).astype(np.int32)  # the first NaN, if there is one
         this_row = np.arange(len(panel)) == row
-        panel, pivot = _exchanged(panel, this_row, this_column)
+        panel, pivot = _exchange(panel, this_row, this_column)
         order, pivots = jnp.where(this_column, row, order), jnp.where(this_column, pivot, pivots)
         return panel, free & ~this_row, order, pivots
 
@@ -179,7 +179,7 @@ def _eliminated(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
     return jax.lax.fori_loop(0, width, one_column, start)
 
 
-def _exchanged(a: Array, this_row: Array, this_column: Array) -> tuple[Array, Array]:
+def _exchange(a: Array, this_row: Array, this_column: Array) -> tuple[Array, Array]:
     """The array A after one column was eliminated by one row, each given as a mask, and the pivot between them.
 
     Masks and not indices, which become gathers and scatters under `vmap`: masks were measured to be faster on the CPU.
@@ -191,7 +191,7 @@ def _exchanged(a: Array, this_row: Array, this_column: Array) -> tuple[Array, Ar
     return jnp.where(this_row[:, None] | this_column, 0, a) - jnp.where(this_row, -1, column)[:, None] * row, pivot
 
 
-def _in_order(a: Array, order: Int[Array, " n"]) -> Array:
+def _permute_rows(a: Array, order: Int[Array, " n"]) -> Array:
     """The rows of `a` in this order."""
     return a.at[order].get(mode="promise_in_bounds")
 
@@ -334,7 +334,7 @@ def _independent(matrix: Matrix, scale: Vector) -> tuple[Matrix, Matrix, Matrix]
         index = jnp.argmax(jnp.where(good, size / (scale[:, None] * scale), -1))
         row, column = np.arange(m) == index // m, np.arange(m) == index % m
         counts = ~(largest <= rank_tolerance(a.dtype))
-        a = jnp.where(counts, _exchanged(a, row, column)[0], a)
+        a = jnp.where(counts, _exchange(a, row, column)[0], a)
         return a, pairs + (row[:, None] & column & counts)
 
     a, pairs = jax.lax.fori_loop(0, m, one_pivot, (matrix, jnp.zeros_like(matrix)))

@@ -35,14 +35,14 @@ class Sample(NamedTuple):
     scene: tuple[Any, PyTree] | None = None  # the system and its parameters, where XLA may evaluate them
 
     @classmethod
-    def of(cls, system: Any, layout: Layout, q, qdot, t, params: PyTree) -> "Sample":
-        """The states of a scene with one set of parameters, which XLA evaluates if the scene has no programs."""
+    def from_scene(cls, system: Any, layout: Layout, q, qdot, t, params: PyTree) -> "Sample":
+        """States q, q̇ (S, n) of a scene with one set of parameters; XLA evaluates them if the scene has no programs."""
         derivation, numbers = derivation_of(system, layout, params), numbers_of(eqx.filter(params, eqx.is_array_like))
         return cls(derivation, q, qdot, t, numbers, (system, params))
 
     @classmethod
-    def along(cls, derivation: Derivation, y: np.ndarray, t, numbers: Sequence | np.ndarray) -> "Sample":
-        """The states y = (q, q̇), (S, 2n)."""
+    def from_states(cls, derivation: Derivation, y: np.ndarray, t, numbers: Sequence | np.ndarray) -> "Sample":
+        """States y = (q, q̇), (S, 2n), of a scene that has programs."""
         return cls(derivation, *halves(y), t, list(numbers))
 
     @property
@@ -62,7 +62,7 @@ class Sample(NamedTuple):
         return jax.tree.map(np.asarray, _compiled(names, system, layout, q, qdot, t, params))
 
     def flat(self, *names: str) -> np.ndarray:
-        """The same end to end, (S, outputs)."""
+        """The `quantities` with these names, flattened and concatenated, (S, outputs)."""
         values = self.quantities(*names)
         return np.concatenate([values[name].reshape(len(self.q), -1) for name in names], axis=1)
 
@@ -86,7 +86,7 @@ class Sample(NamedTuple):
             return np.zeros(shape, self.q.dtype)
         return self.evaluate(self.derivation.momenta_by_q(momenta)).reshape(shape)
 
-    def in_parts(self, function: Callable, size: int, *more):
+    def evaluate_in_parts(self, function: Callable, size: int, *more):
         """`function(sample, *more)` on at most `size` states at a time; `more` are arrays (S,), or numbers for all."""
 
         def cut(x, start):
@@ -140,16 +140,16 @@ def solved(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 def _compiled(names: tuple[str, ...], system: Any, layout: Layout, q, qdot, t, params) -> dict[str, jax.Array]:
     motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
 
-    def at(q, qdot, t):
+    def quantities_at(q, qdot, t):
         values = motion.quantities(q, qdot, t, numbers)
         return {name: values[name] for name in names}
 
     if len(q) == 1:
-        return jax.tree.map(lambda x: x[None], at(q[0], qdot[0], jnp.ravel(t)[0]))
-    return in_chunks(at, (q, qdot, jnp.broadcast_to(t, len(q))), _AT_ONCE // layout.size**2)
+        return jax.tree.map(lambda x: x[None], quantities_at(q[0], qdot[0], jnp.ravel(t)[0]))
+    return map_in_chunks(quantities_at, (q, qdot, jnp.broadcast_to(t, len(q))), _AT_ONCE // layout.size**2)
 
 
-def in_chunks(function, arrays, size: int):
+def map_in_chunks(function, arrays, size: int):
     """`function` of each of the states in `arrays`, at most `size` of them at a time."""
     count = len(arrays[0])
     size = max(1, min(size, count))

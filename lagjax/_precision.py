@@ -168,7 +168,7 @@ def work_precision(
         raise ValueError(f"repeats must be a positive integer; got {repeats!r}.")
 
     if solvers is None:
-        measured = _with_default_named(_problem(system, q0, qdot0, ts, params, batch_axes))
+        measured = _default_solvers(_problem(system, q0, qdot0, ts, params, batch_axes))
     scene = as_arrays((q0, qdot0, jnp.asarray(ts), params), dtype)
     precise = as_arrays(scene, jnp.result_type(float))
 
@@ -195,8 +195,8 @@ def _problem(system: System, q0: PyTree, qdot0: PyTree, ts, params: PyTree, batc
     return Batch.of(system, values, *axes_per_leaf(values, batch_axes), ts).member
 
 
-def _with_default_named(problem: Problem) -> dict[str, diffrax.AbstractSolver | None]:
-    """The solvers that are measured by default, that of `simulate` first and under the name of what integrates."""
+def _default_solvers(problem: Problem) -> dict[str, diffrax.AbstractSolver | None]:
+    """The solvers that are measured by default; the first is that of `simulate`, named after its integrator."""
     if isinstance(choose(problem).engine, MachineCode):
         return {"default: Taylor (machine code)": None, **_SOLVERS}
     others = {name: solver for name, solver in _SOLVERS.items() if name != _FIRST}

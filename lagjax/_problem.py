@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 from lagjax._arguments import accept
 from lagjax._derivation import Derivation, derivation_of
 from lagjax._doubles import DOUBLE, SINGLE
-from lagjax._layout import Layout, as_vector, dtype_of, halves, taken_apart
+from lagjax._layout import Layout, dtype_of, flatten_numbers, halves, taken_apart
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._reads import Edition
 from lagjax._validate import (
@@ -88,7 +88,7 @@ class Problem:
 
         Raises `TypeError` or `ValueError` with the name of the argument that cannot be right.
         """
-        dtype, given = layout.dtype, _checked(layout.dtype, params, ts, rtol, atol, max_steps, event)
+        dtype, given = layout.dtype, _check_fields(layout.dtype, params, ts, rtol, atol, max_steps, event)
         y0 = end_to_end(jax.tree.leaves(as_arrays((q0, qdot0), dtype, "state")), dtype)
         problem = cls(system=system, layout=layout, y0=y0, **given)
         vectors = y0, problem.vector
@@ -102,7 +102,7 @@ class Problem:
         cls, system, layout: Layout, params, ts=(0.0, 1.0), rtol=None, atol=None, max_steps=65_536, event=None
     ) -> "Problem":
         """A problem about this scene from a state of zeros: enough to ask which engine it is for."""
-        given = _checked(layout.dtype, params, ts, rtol, atol, max_steps, event)
+        given = _check_fields(layout.dtype, params, ts, rtol, atol, max_steps, event)
         return cls(system=system, layout=layout, y0=np.zeros(2 * layout.size, layout.dtype), **given)
 
     # What follows from the fields is looked up once: an engine is chosen and then solves the same problem.
@@ -181,7 +181,7 @@ class Batch(eqx.Module):
         state = jax.tree.leaves((arrays["q0"], arrays["qdot0"]))
         params, structure = jax.tree.flatten(arrays["params"])
         of_params = structure.flatten_up_to(axes["params"])
-        in_front = [x if axis is None else _in_front(x, axis) for x, axis in zip(params, of_params, strict=True)]
+        in_front = [x if axis is None else _move_axis_first(x, axis) for x, axis in zip(params, of_params, strict=True)]
         of_state = [
             axis for name in ("q0", "qdot0") for axis in jax.tree.structure(values[name]).flatten_up_to(axes[name])
         ]
@@ -195,9 +195,9 @@ class Batch(eqx.Module):
     def over_members(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
         """`solve` under `jax.vmap` over the members."""
         axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
-        return jax.vmap(lambda *of: solve(self._at(*of)), in_axes=(0, axes))(self.y0, self.params)
+        return jax.vmap(lambda *of: solve(self._member_problem(*of)), in_axes=(0, axes))(self.y0, self.params)
 
-    def _at(self, y0, params) -> Problem:
+    def _member_problem(self, y0, params) -> Problem:
         return replace(self.member, y0=y0, params=params)
 
     @property
@@ -295,7 +295,7 @@ def end_to_end(leaves: list, dtype) -> Float[Numbers, " count"]:
     Of a complex number, which has no place in machine code, that is the real part.
     """
     if not all(map(_is_on_host, leaves)):
-        return as_vector(leaves, dtype)
+        return flatten_numbers(leaves, dtype)
     arrays = (leaf.real if np.iscomplexobj(leaf) else leaf for leaf in leaves)
     return np.concatenate([np.zeros(0, dtype), *(np.asarray(leaf, dtype).ravel() for leaf in arrays)])
 
@@ -313,7 +313,8 @@ def rows(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
     return library.concatenate(columns, axis=1)
 
 
-def _in_front(leaf, axis: int):
+def _move_axis_first(leaf, axis: int):
+    """A leaf with this axis in front; by NumPy where it can read the leaf."""
     library: Any = np if _is_on_host(leaf) else jnp
     return library.moveaxis(library.asarray(leaf), axis, 0)
 
@@ -364,7 +365,7 @@ def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTr
 # ---- what can be wrong -----------------------------------------------------------------------------------------------
 
 
-def _checked(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, Any]:
+def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, Any]:
     """The fields of a problem that depend neither on its scene nor on its state. Raises where they cannot be right."""
     ts = output_times(ts, dtype)
     require_budget(max_steps, "max_steps")
@@ -410,16 +411,16 @@ def _event(event, dtype) -> diffrax.Event | None:
     if event is None:
         return None
     return (
-        _known_event(Edition.of(event), dtype) if isinstance(event, types.FunctionType) else _made_event(event, dtype)
+        _known_event(Edition.of(event), dtype) if isinstance(event, types.FunctionType) else _make_event(event, dtype)
     )
 
 
 @functools.lru_cache(maxsize=64)  # a signature takes as long to read as a short motion
 def _known_event(event: Edition, dtype) -> diffrax.Event:
-    return _made_event(event.function, dtype)
+    return _make_event(event.function, dtype)
 
 
-def _made_event(event, dtype) -> diffrax.Event:
+def _make_event(event, dtype) -> diffrax.Event:
     condition = event.cond_fn if isinstance(event, diffrax.Event) else event
     _, functions, _ = taken_apart(condition, "event", is_leaf=lambda leaf: leaf is None or callable(leaf))
     if not functions or not all(map(callable, functions)):

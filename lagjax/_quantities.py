@@ -39,7 +39,7 @@ class _Taped(NamedTuple):
         return np.array(self.nodes[self.output], dtype=np.int64)
 
 
-class _State:
+class _ScalarState:
     """A state on scalars: q (n,), q̇ (n,), t () and params as ids, by name, and the shapes that functions expect."""
 
     def __init__(self, expansion: Expansion, shapes: tuple, leaves: list[Ids]):
@@ -51,7 +51,7 @@ class _State:
         # Coordinates are differentiated by, one by one: those of a long array are nodes as well.
         self.ids |= {name: expansion.real(self.ids[name]) for name in ("q", "qdot", "t")}
 
-    def of(self, function: Callable, *arguments: str, at_rest: bool = False) -> Ids:
+    def evaluate(self, function: Callable, *arguments: str, at_rest: bool = False) -> Ids:
         """The value of a function of some of q, qdot, t, params; `at_rest` with qdot = 0."""
         values = self.ids | ({"qdot": self.zeros(self.ids["qdot"].shape)} if at_rest else {})
         leaves = jax.tree.leaves([values[name] for name in arguments])
@@ -99,8 +99,8 @@ class _State:
                 result[i, j] = derivative
         return result
 
-    def along(self, values: Ids, q: Ids | None = None, qdot: Ids | None = None, t: bool = False) -> Ids:
-        """The rates of some numbers while q, q̇ and t change at these rates."""
+    def rate(self, values: Ids, q: Ids | None = None, qdot: Ids | None = None, t: bool = False) -> Ids:
+        """The rates of change of `values` while q, q̇ and t change at the rates `q`, `qdot` and 1, where given."""
         rates: dict[int, int] = {}
         for name, rate in (("q", q), ("qdot", qdot)):
             if rate is not None:
@@ -136,12 +136,12 @@ def quantities(
     Where accelerations take fewer operations by the recursion in L, that comes with them, and its `entries` are one
     quantity more: `recursion` (k,). Raises `OwnRules`.
     """
-    state, everything = _State(expansion, shapes, leaves), ("q", "qdot", "t", "params")
+    state, everything = _ScalarState(expansion, shapes, leaves), ("q", "qdot", "t", "params")
     rates = {"q": state.ids["qdot"], "t": True}
     lagrangian = state.taped(motion.lagrangian)
     by_q, momentum, by_t, matrix, inertial = _derivatives(state, lagrangian, rates)
     zero = state.zeros(by_q.shape)
-    forces = zero if motion.forces is None else state.of(motion.forces, *everything)
+    forces = zero if motion.forces is None else state.evaluate(motion.forces, *everything)
     dissipation, damping = state.zeros(0), zero
     if motion.dissipation is not None:
         taped = state.taped(motion.dissipation)
@@ -154,14 +154,14 @@ def quantities(
         "mass_matrix": matrix,
         "lagrangian_by_q": by_q,
         "lagrangian_by_t": by_t,
-        "energy_by_q": state.map("sub", state.along(by_q, qdot=state.ids["qdot"]), by_q),
+        "energy_by_q": state.map("sub", state.rate(by_q, qdot=state.ids["qdot"]), by_q),
         "force": state.map("add", inertial, nonconservative),
         "given_force": forces,
         "dissipation": dissipation.reshape(-1),
         "dissipation_by_qdot": damping,
         "nonconservative_force": nonconservative,
         "generalized_force": generalized,
-        **_of_constraints(motion.constraints, state, rates),
+        **_constraint_quantities(motion.constraints, state, rates),
     }
     # Last of all, so that programs of scenes without one are not touched by the search.
     recursion = _shorter_recursion(motion, state, lagrangian, matrix)
@@ -176,7 +176,7 @@ def quantities(
 _ORDERS = 20
 
 
-def _shorter_recursion(motion: Motion, state: _State, lagrangian: _Taped, matrix: Ids) -> Recursion | None:
+def _shorter_recursion(motion: Motion, state: _ScalarState, lagrangian: _Taped, matrix: Ids) -> Recursion | None:
     """The recursion in L, where that takes fewer operations than to eliminate M; two coordinates have Cramer's rule."""
     if motion.constraints.exist or len(matrix) < 3 or not state.varying(matrix).any():
         return None
@@ -196,14 +196,16 @@ def _shorter_recursion(motion: Motion, state: _State, lagrangian: _Taped, matrix
     return recursion if all(a < b for a, b in zip(*costs, strict=True)) else None
 
 
-def _cost(state: _State, nodes: list[int], places: np.ndarray, operations: int, solution: int) -> tuple[int, float]:
+def _cost(
+    state: _ScalarState, nodes: list[int], places: np.ndarray, operations: int, solution: int
+) -> tuple[int, float]:
     """The operations of an elimination with its matrix, whose `nodes` stand at these places, and those of a step."""
     operations += state.derivatives.size(nodes)
     sums = np.where(places[:, 0] == places[:, 1], 1, 2)[state.varying(np.array(nodes))].sum()
     return operations, operations + _ORDERS * (solution + (2 + _ORDERS / 2) * float(sums))
 
 
-def _entries(state: _State, recursion: Recursion) -> Ids:
+def _entries(state: _ScalarState, recursion: Recursion) -> Ids:
     minus = state.expansion.graph.constant(-1.0, "float")
     return np.array([minus if i is None else i for i in recursion.entries.values()])
 
@@ -215,7 +217,7 @@ _APART = 5000
 _SHORTER = 0.97
 
 
-def _derivatives(state: _State, lagrangian: _Taped, rates: dict) -> tuple[Ids, Ids, Ids, Ids, Ids]:
+def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[Ids, Ids, Ids, Ids, Ids]:
     """∂L/∂q, p, ∂L/∂t, M, and ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t, in the form that takes fewer operations.
 
     In a kinetic energy of rotations the terms of ∂L/∂q cancel with those of (∂p/∂q) q̇. Where the cotangents of equal
@@ -227,7 +229,7 @@ def _derivatives(state: _State, lagrangian: _Taped, rates: dict) -> tuple[Ids, I
         by_q, momentum, by_t = state.gradient(lagrangian, "q", "qdot", "t", together=together)
         matrix = state.jacobian(momentum, "qdot")
         matrix = np.where(np.tri(len(matrix), dtype=bool), matrix, matrix.T)
-        inertial = state.map("sub", by_q, state.along(momentum, **rates))
+        inertial = state.map("sub", by_q, state.rate(momentum, **rates))
         forms.append((by_q, momentum, by_t, matrix, inertial))
     if len(forms) == 1:
         return forms[0]
@@ -235,19 +237,19 @@ def _derivatives(state: _State, lagrangian: _Taped, rates: dict) -> tuple[Ids, I
     return forms[0] if sizes[0] < _SHORTER * sizes[-1] else forms[-1]
 
 
-def _of_constraints(constraints: Constraints, state: _State, rates: dict) -> dict[str, Ids]:
+def _constraint_quantities(constraints: Constraints, state: _ScalarState, rates: dict) -> dict[str, Ids]:
     """The quantities of the constraints."""
     f = a = at_rest = state.zeros(0)
     if constraints.on_positions is not None:
-        f = state.of(constraints.on_positions, "q", "t", "params")
+        f = state.evaluate(constraints.on_positions, "q", "t", "params")
     if constraints.on_velocities is not None:
-        a = state.of(constraints.on_velocities, "q", "qdot", "t", "params")
-        at_rest = state.of(constraints.on_velocities, "q", "qdot", "t", "params", at_rest=True)
-    rate = state.along(f, **rates)
+        a = state.evaluate(constraints.on_velocities, "q", "qdot", "t", "params")
+        at_rest = state.evaluate(constraints.on_velocities, "q", "qdot", "t", "params", at_rest=True)
+    rate = state.rate(f, **rates)
     return {
         "jacobian": np.concatenate([state.jacobian(f, "q"), state.jacobian(a, "qdot")]),
-        "gamma": state.map("neg", np.concatenate([state.along(rate, **rates), state.along(a, **rates)])),
+        "gamma": state.map("neg", np.concatenate([state.rate(rate, **rates), state.rate(a, **rates)])),
         "residual": np.concatenate([f, a]),
         "rates": np.concatenate([rate, a]),
-        "driving": np.concatenate([state.along(f, t=True), at_rest]),
+        "driving": np.concatenate([state.rate(f, t=True), at_rest]),
     }

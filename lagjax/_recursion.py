@@ -65,7 +65,7 @@ def recursion_of(derivatives: Derivatives, value: int, qdot: Sequence[int]) -> R
     if not any(uses[i] > 1 for i in linear):
         return None
     hessian = _hessian(derivatives, value, curved, frontier)
-    unknowns = _Unknowns(graph, qdot, {i for i, j in hessian if i == j}, uses)
+    unknowns = _AffineNodes(graph, qdot, {i for i, j in hessian if i == j}, uses)
     for i, terms in linear.items():
         unknowns.add(i, terms)
     if not unknowns.definitions:
@@ -144,7 +144,7 @@ def _hessian(derivatives: Derivatives, value: int, curved: Iterable[int], fronti
     return {(frontier[a], frontier[b]): places[node] for a, row in enumerate(rows) for b, node in row.items() if b <= a}
 
 
-class _Unknowns:
+class _AffineNodes:
     """Nodes that are affine in q̇ as combinations of unknowns: coordinates, and velocities that are worth one.
 
     That is where a combination of several unknowns is used more than once, or is squared (is `energetic`). What is used

@@ -122,15 +122,15 @@ class SaddleElimination:
         """
         a, weighted, singular = xp.spread(values, self.slots[tuple(self.entries.T)], self.count), None, None
         if self.augmented:
-            a, weighted = self._with_weights(a)
+            a, weighted = self._weight_entries(a)
         if self.regular_only:
             # The constraints would have to hold a light coordinate against forces on heavy ones.
             diagonal = a[: self.size]
             singular = xp.folded("min", diagonal) <= REGULAR * xp.folded("max", diagonal)
-        lower, inverse, lost = self._eliminated(a)
+        lower, inverse, lost = self._eliminate(a)
         return (weighted, lower, inverse), lost if singular is None else singular | lost
 
-    def _eliminated(self, a) -> tuple[Any, Any, Any]:
+    def _eliminate(self, a) -> tuple[Any, Any, Any]:
         """L in the order of the pivots, D⁻¹, and whether a pivot was lost to round-off."""
         n, total = self.size, len(self.order)
         # What coordinates take off the diagonal, and what constraints do: in a constraint the two must stay separate.
@@ -188,8 +188,8 @@ class SaddleElimination:
             return lost, -1.0 / xp.where(lost, np.nan, left)
         return lost, xp.where(lost, 0.0, -1.0 / xp.where(lost, 1.0, left))
 
-    def _with_weights(self, a) -> tuple[Any, Any]:
-        """The entries of M + GᵀW G and of G, and W G, entry by entry in the order of the rows of G.
+    def _weight_entries(self, a) -> tuple[Any, Any]:
+        """The entries of M + GᵀW G and of G, and the entries of W G in the order of the rows of G.
 
         The weights are the trace of M over |Gₖ|², within a factor n of those of `augment`. They are differentiated here
         like everything else, and a trace is smooth where a maximum is not.

@@ -96,12 +96,12 @@ def samples(
     """
     if hold not in HOLDS:
         raise ValueError(f"hold={hold!r} is not known. It is one of 'zero', 'linear', 'cubic' and 'band'.")
-    knots, values = _checked(knots, values, hold)
+    knots, values = _check_samples(knots, values, hold)
     functions = {"zero": _zero, "linear": _linear, "cubic": _cubic, "band": _band}
     return functools.partial(functions[hold], knots, values)
 
 
-def _checked(knots: Any, values: Any, hold: str) -> tuple:
+def _check_samples(knots: Any, values: Any, hold: str) -> tuple:
     """Knots and values as arrays of floats of one precision; what is known is copied."""
     arrays = []
     for name, x in (("knots", knots), ("values", values)):
@@ -256,16 +256,16 @@ def _slopes(knots, values, i, chord):
     steps = [_expand_like(b - a, v[0]) for a, b in itertools.pairwise(x)]
     chords = [(b - a) / step for (a, b), step in zip(itertools.pairwise(v), steps, strict=True)]
 
-    def about(k):  # sample k + 1 of the window
+    def central_slope(k):  # sample k + 1 of the window
         return (steps[k + 1] * chords[k] + steps[k] * chords[k + 1]) / (steps[k] + steps[k + 1])
 
-    def at_end(one, other):  # of the first of two pieces, at its outer end
+    def end_slope(one, other):  # of the first of two pieces, at its outer end
         return chords[one] - steps[one] * (chords[other] - chords[one]) / (steps[one] + steps[other])
 
     first, last = _expand_like(i <= 0, v[0]), _expand_like(i >= count - 2, v[0])
-    left, right = about(0), about(size - 3)
-    m0 = jnp.where(first, at_end(0, 1), jnp.where(last, right, left))
-    m1 = jnp.where(last, at_end(-1, -2), jnp.where(first, left, right))
+    left, right = central_slope(0), central_slope(size - 3)
+    m0 = jnp.where(first, end_slope(0, 1), jnp.where(last, right, left))
+    m1 = jnp.where(last, end_slope(-1, -2), jnp.where(first, left, right))
     return m0, m1
 
 
@@ -294,18 +294,18 @@ def _locate(knots, t, closed: bool):
     return _locate_p.bind(jnp.asarray(knots), t, closed=closed)
 
 
-def _found(knots, t, *, closed):
+def _search(knots, t, *, closed):
     i = jnp.searchsorted(knots, t, side="right").astype(np.int32) - 1
     if closed:
         i = jnp.where(t == knots[-1], len(knots) - 2, i)
     return jnp.where(jnp.isnan(t), -1, i).astype(np.int32)
 
 
-def _of_batch(arguments, axes, *, closed):
+def _batch(arguments, axes, *, closed):
     knots, t = arguments
     if axes[0] is None:  # knots that all share
         return _locate_p.bind(knots, t, closed=closed), axes[1]
-    return jax.vmap(functools.partial(_found, closed=closed), in_axes=tuple(axes))(knots, t), 0
+    return jax.vmap(functools.partial(_search, closed=closed), in_axes=tuple(axes))(knots, t), 0
 
 
 def _derivative(primals, tangents, *, closed):
@@ -314,8 +314,8 @@ def _derivative(primals, tangents, *, closed):
 
 
 _locate_p = Primitive("lagjax_locate")  # `_program._rules` knows it by this name
-_locate_p.def_impl(jax.jit(_found, static_argnames="closed"))
+_locate_p.def_impl(jax.jit(_search, static_argnames="closed"))
 _locate_p.def_abstract_eval(lambda knots, t, *, closed: ShapedArray(t.shape, np.dtype(np.int32)))
-mlir.register_lowering(_locate_p, mlir.lower_fun(_found, multiple_results=False))
+mlir.register_lowering(_locate_p, mlir.lower_fun(_search, multiple_results=False))
 ad.primitive_jvps[_locate_p] = _derivative
-batching.primitive_batchers[_locate_p] = _of_batch
+batching.primitive_batchers[_locate_p] = _batch

@@ -45,7 +45,9 @@ class Scales(NamedTuple):
     reach: float = 1.0
 
     @classmethod
-    def of(cls, evaluate: Callable[[str, States, States], np.ndarray], q: Numbers, qdot: Numbers) -> "Scales":
+    def from_quantities(
+        cls, evaluate: Callable[[str, States, States], np.ndarray], q: Numbers, qdot: Numbers
+    ) -> "Scales":
         """The scales of a scene at (q, qdot).
 
         `evaluate(name, q, qdot)` gives the "force" and the "momentum" (S, n), and the "mass_matrix" (S, n, n), at S
@@ -54,10 +56,10 @@ class Scales(NamedTuple):
         q, qdot = np.asarray(q, float), np.asarray(qdot, float)
         with np.errstate(all="ignore"):
             mass = np.diagonal(evaluate("mass_matrix", q[None], qdot[None])[0])
-            return _measured(evaluate, np.sqrt(np.abs(mass)), q, qdot)
+            return _measure(evaluate, np.sqrt(np.abs(mass)), q, qdot)
 
 
-def _measured(evaluate, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
+def _measure(evaluate, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
     heaviest = root.max(where=np.isfinite(root), initial=0.0) or 1.0
     root = np.where((root > 0) & np.isfinite(root), root, heaviest)
     along = np.cos(np.arange(1.0, len(q) + 1)) / root  # no symmetry moves all coordinates like this

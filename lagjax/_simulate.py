@@ -17,7 +17,7 @@ import numpy as np
 
 from lagjax._consistent import has_constraints, inconsistent_members, require_consistent
 from lagjax._diffrax import Diffrax
-from lagjax._engine import asked_for, choose
+from lagjax._engine import choose, requested_engine
 from lagjax._failures import raise_where_failed
 from lagjax._layout import Layout, halves
 from lagjax._lift import lifted, lifted_batch
@@ -131,7 +131,7 @@ def simulate(
     system = require_system(system)
     require_flag(throw, "throw")
     layout = Layout.of(q0, qdot0)
-    asked = asked_for(solver, dt, adjoint, progress, rtol, atol)
+    asked = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     given = Problem.of(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
     problem = lifted(given)
     if has_constraints(system):
@@ -181,7 +181,7 @@ def simulate_batch(
     ```
     """
     system = require_system(system)
-    asked = asked_for(solver, dt, adjoint, progress, rtol, atol)
+    asked = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
     axes, size = axes_per_leaf(values, batch_axes)
     given = Batch.of(system, values, axes, size, ts, rtol, atol, max_steps, event)
@@ -282,6 +282,6 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
         states = trajectory.q, trajectory.qdot, end
         states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)
         return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
-    from lagjax._diagnosis import described  # a motion that succeeds does not come here
+    from lagjax._diagnosis import describe_failure  # a motion that succeeds does not come here
 
-    raise SimulationError(described(trajectory, layout), trajectory)
+    raise SimulationError(describe_failure(trajectory, layout), trajectory)

@@ -55,15 +55,15 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
     forward = library.where(at.end > at.begin, 1.0, -1.0) * smallest
     rate = library.concatenate([at.y[..., n:], acceleration(at.t, at.y)], axis=-1)
 
-    def along(s):
+    def acceleration_after(s):
         return acceleration(at.t + s, at.y + s[..., None] * rate)
 
     defined = shrank
     for steps in AHEAD:
-        defined = defined & library.isfinite(along(steps * forward)).all(axis=-1)
+        defined = defined & library.isfinite(acceleration_after(steps * forward)).all(axis=-1)
 
     half = _half_width(library, at, smallest, shrank)
-    low, high = along(-half), along(half)
+    low, high = acceleration_after(-half), acceleration_after(half)
     size = library.abs(low) + library.abs(high)
 
     def variation(a, b):
@@ -78,7 +78,7 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
     def halve(bracket):
         count, start, width, low, high = bracket
         width = 0.5 * width
-        middle = along(start + width)
+        middle = acceleration_after(start + width)
         first = variation(low, middle) > variation(middle, high)
         start = library.where(first, start, start + width)
         low = library.where(first[..., None], low, middle)

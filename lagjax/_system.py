@@ -132,32 +132,32 @@ class System(eqx.Module):
         That is so where M is singular, or, with constraints, where M and the constraints together leave some
         acceleration free.
         """
-        return self._at(Motion.acceleration, q, qdot, t, params, restore=True)
+        return self._evaluate_quantity(Motion.acceleration, q, qdot, t, params, restore=True)
 
     def mass_matrix(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Float[Array, "n n"]:
         """M = ∂²L/∂q̇², in the order in which the leaves of `q` lie end to end.
 
         The entry of two coordinates a and b has units energy·time²/({a}{b}).
         """
-        return self._at(Motion.mass_matrix, q, qdot, t, params)
+        return self._evaluate_quantity(Motion.mass_matrix, q, qdot, t, params)
 
     def momentum(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
         """The conjugate momentum p = ∂L/∂q̇, in the structure of `q`, in units energy·time/{q}."""
-        return self._at(Motion.momentum, q, qdot, t, params, restore=True)
+        return self._evaluate_quantity(Motion.momentum, q, qdot, t, params, restore=True)
 
     def generalized_force(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
         """∂L/∂q + Q − ∂D/∂q̇, in the structure of `q`, in units energy/{q}.
 
         Along a motion dp/dt equals this force plus, with constraints, `constraint_force`.
         """
-        return self._at(Motion.generalized_force, q, qdot, t, params, restore=True)
+        return self._evaluate_quantity(Motion.generalized_force, q, qdot, t, params, restore=True)
 
     def energy(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Float[Array, ""]:
         """h = p·q̇ − L, a scalar. It changes by dh/dt = −∂L/∂t + (Q − ∂D/∂q̇)·q̇, and need not equal T + U.
 
         Constraints that depend on the time do work as well: −λ ∂f/∂t.
         """
-        return self._at(Motion.energy, q, qdot, t, params)
+        return self._evaluate_quantity(Motion.energy, q, qdot, t, params)
 
     def multipliers(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
         """λ, in the structure that the constraint functions return: a dict by name if they return dicts.
@@ -167,14 +167,14 @@ class System(eqx.Module):
 
         **Raises** `ValueError` for a system without constraints.
         """
-        return self._of_constraints(Motion.multipliers, q, qdot, t, params)
+        return self._evaluate_constraints(Motion.multipliers, q, qdot, t, params)
 
     def constraint_residual(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
         """f and a, in the structure of `multipliers`: zero where the constraints hold.
 
         **Raises** `ValueError` for a system without constraints.
         """
-        return self._of_constraints(Motion.residual, q, qdot, t, params)
+        return self._evaluate_constraints(Motion.residual, q, qdot, t, params)
 
     def constraint_force(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
         """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ, in the structure of `q`, in units energy/{q}.
@@ -182,7 +182,7 @@ class System(eqx.Module):
         **Raises** `ValueError` for a system without constraints.
         """
         self._require_constraints()
-        return self._at(Motion.constraint_force, q, qdot, t, params, restore=True)
+        return self._evaluate_quantity(Motion.constraint_force, q, qdot, t, params, restore=True)
 
     def project(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> tuple[PyTree, PyTree]:
         """The consistent state (q̂, v̂) nearest to (q, q̇), in the structure of `q`.
@@ -204,7 +204,7 @@ class System(eqx.Module):
         """
         self._require_constraints()
         layout = Layout.of(q, qdot)
-        q, qdot = self._at(Motion.nearest_consistent, q, qdot, t, params)
+        q, qdot = self._evaluate_quantity(Motion.nearest_consistent, q, qdot, t, params)
         return layout.restore(q), layout.restore(qdot)
 
     def explain(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Explanation:
@@ -225,7 +225,7 @@ class System(eqx.Module):
         if self.constraints is None and self.velocity_constraints is None:
             return facts
         names = self.constraint_names(layout, params)
-        schur = self._at(Motion.schur_complement, q, qdot, t, params)
+        schur = self._evaluate_quantity(Motion.schur_complement, q, qdot, t, params)
         return facts.with_constraints(names, np.asarray(schur) if is_concrete(schur) else None)
 
     def motion(self, layout: Layout, params: PyTree = None) -> Motion:
@@ -237,7 +237,7 @@ class System(eqx.Module):
 
         code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
 
-        def of_vectors(function: Function, to_array: Callable) -> Callable:
+        def flatten_function(function: Function, to_array: Callable) -> Callable:
             """The user's function in flat coordinates, the last of which are (t, params); `to_array` flattens it."""
 
             def flat(*arguments):
@@ -248,10 +248,10 @@ class System(eqx.Module):
             return flat
 
         def optional(function: Function | None, to_array: Callable) -> Callable | None:
-            return None if function is None else of_vectors(function, to_array)
+            return None if function is None else flatten_function(function, to_array)
 
         return Motion(
-            lagrangian=of_vectors(self.lagrangian, lambda value: value),
+            lagrangian=flatten_function(self.lagrangian, lambda value: value),
             forces=optional(self.forces, layout.flatten),
             dissipation=optional(self.dissipation, lambda value: value),
             constraints=Constraints(
@@ -263,12 +263,14 @@ class System(eqx.Module):
         if self.constraints is None and self.velocity_constraints is None:
             raise ValueError("This system has no constraints: give constraints=... or velocity_constraints=... to it.")
 
-    def _of_constraints(self, quantity: Callable, q, qdot, t, params) -> PyTree:
+    def _evaluate_constraints(self, quantity: Callable, q, qdot, t, params) -> PyTree:
         self._require_constraints()
         self = present_system(self)
-        return self.by_constraint(self._at(quantity, q, qdot, t, params), Layout.of(q, qdot), params)
+        return self.split_by_constraint(
+            self._evaluate_quantity(quantity, q, qdot, t, params), Layout.of(q, qdot), params
+        )
 
-    def by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
+    def split_by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
         """`flat` (m,), a number for each constraint, in the structure of `multipliers`."""
         structure = self.constraint_structure(layout, params)
         ends = np.cumsum([0, *(math.prod(leaf.shape) for leaf in jax.tree.leaves(structure))]).tolist()
@@ -304,17 +306,17 @@ class System(eqx.Module):
                 names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
         return names
 
-    def _at(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
+    def _evaluate_quantity(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
         """One of `Motion`'s functions at a state in the user's pytree, back in that pytree where `restore` says so."""
         self, layout = present_system(self), Layout.of(q, qdot)
         require_number(t, "t")
         q, qdot, t = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state")
         params = as_arrays(params, layout.dtype)
-        value = self._by_program(quantity, layout, q, qdot, t, params)
+        value = self._evaluate_program(quantity, layout, q, qdot, t, params)
         value = _evaluate(self, quantity, q, qdot, t, params) if value is None else value
         return jax.tree.map(jnp.asarray, layout.restore(value) if restore else value)
 
-    def _by_program(self, quantity: Callable, layout: Layout, q, qdot, t, params) -> np.ndarray | None:
+    def _evaluate_program(self, quantity: Callable, layout: Layout, q, qdot, t, params) -> np.ndarray | None:
         """A quantity at a state of numbers, from the scene's programs in NumPy: nothing is compiled.
 
         None where something is being traced, or the scene has no programs.
@@ -380,11 +382,11 @@ def present_system(system: System) -> System:
     now = [present(f) if isinstance(f, Function) else f for f in functions]
     if all(map(operator.is_, functions, now)):
         return system
-    return with_functions(system, dict(zip(ROLES, now, strict=True)))
+    return replace_functions(system, dict(zip(ROLES, now, strict=True)))
 
 
-def with_functions(system: System, functions: dict[str, Function | None]) -> System:
-    """A scene with other functions, by their roles; the constructor reads signatures, as long as a motion takes."""
+def replace_functions(system: System, functions: dict[str, Function | None]) -> System:
+    """The scene with other functions, by their roles, without the constructor: to read signatures takes long."""
     other = object.__new__(type(system))
     for name, value in (functions | {"path": system.path}).items():
         object.__setattr__(other, name, value)

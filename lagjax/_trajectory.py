@@ -101,9 +101,9 @@ class Trajectory(eqx.Module):
 
     def _repr_html_(self) -> str | None:
         """The three lines and a small figure, for notebooks; None, and they show the lines, where there is none."""
-        from lagjax._display import of_trajectory
+        from lagjax._display import trajectory_html
 
-        return of_trajectory(self)
+        return trajectory_html(self)
 
     @property
     def ok(self) -> jax.Array:
@@ -113,24 +113,24 @@ class Trajectory(eqx.Module):
 
     def energy(self) -> jax.Array:
         """h = p·q̇ − L at every output time, shape (T,) or (batch, T)."""
-        return self._at_every_time("energy")
+        return self._map_outputs("energy")
 
     def momentum(self) -> PyTree:
         """p = ∂L/∂q̇ at every output time, in the structure of `q`."""
-        return self._at_every_time("momentum")
+        return self._map_outputs("momentum")
 
     @property
     def multipliers(self) -> PyTree:
         """λ at every output time, in the structure that the constraint functions return."""
-        return self._at_every_time("multipliers")
+        return self._map_outputs("multipliers")
 
     def constraint_force(self) -> PyTree:
         """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ at every output time, in the structure of `q`."""
-        return self._at_every_time("constraint_force")
+        return self._map_outputs("constraint_force")
 
     def constraint_residual(self) -> PyTree:
         """f and a at every output time, in the structure of `multipliers`: the drift off the constraints."""
-        return self._at_every_time("constraint_residual")
+        return self._map_outputs("constraint_residual")
 
     def health(self, reference: "Trajectory | None" = None) -> "Health":
         """The trust that this motion deserves: conservation laws, constraints, the mass matrix, gradients.
@@ -238,18 +238,18 @@ class Trajectory(eqx.Module):
         for system in (self.system,) if isinstance(self.system, System) else self.system.values():
             system.require_present()
 
-    def _at_every_time(self, name: str) -> PyTree:
+    def _map_outputs(self, name: str) -> PyTree:
         """Map a method (q, qdot, t, params) of the system over the time axis, and over the batch axes before it."""
         self.require_present()
 
-        def of_member(q, qdot, times_and_tolerances, params, mode):
+        def evaluate_member(q, qdot, times_and_tolerances, params, mode):
             ts, _ = times_and_tolerances
-            at_one_time = partial(self._at_one_time, name)
+            at_one_time = partial(self._evaluate_output, name)
             return jax.vmap(at_one_time, in_axes=(0, 0, 0, None, 0))(q, qdot, ts, params, mode)
 
-        return self.over_members(of_member)
+        return self.over_members(evaluate_member)
 
-    def _at_one_time(self, name: str, q, qdot, t, params, mode) -> PyTree:
+    def _evaluate_output(self, name: str, q, qdot, t, params, mode) -> PyTree:
         if isinstance(self.system, System):
             return getattr(self.system, name)(q, qdot, t, params)
         if name not in ("energy", "momentum"):  # which every mode has

@@ -21,7 +21,7 @@ from lagjax._analysis import Modes
 from lagjax._arguments import Function, accept
 from lagjax._check import listed
 from lagjax._crossings import Crossings
-from lagjax._display import COLORS, as_points, course_of, courses_of, times_of_members
+from lagjax._display import COLORS, course_of, courses_of, require_points, times_of_members
 from lagjax._fit import Fit, Record, draw_record, record_matrix
 from lagjax._layout import Layout
 from lagjax._platform import is_known
@@ -159,7 +159,7 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
         _axes(above).plot(course.t, course.q[:, i], color=COLORS[0], linewidth=1.5, label="motion")
         above.plot(ts, values[:, i], style, color=COLORS[1], markersize=3.0, linewidth=1.2, label="other")
         _axes(below).plot(
-            ts, course.at(ts)[:, i] - values[:, i], style[0], color=COLORS[1], markersize=3.0, linewidth=1
+            ts, course.coordinates_at(ts)[:, i] - values[:, i], style[0], color=COLORS[1], markersize=3.0, linewidth=1
         )
         above.set_title(layout.names[i], fontsize="medium")
         below.set_xlabel("t")
@@ -209,7 +209,7 @@ def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: A
         raise ValueError("To draw points give the equilibrium too: lagjax.plot.modes(modes, points, q, params).")
     if points is not None:
         _require_like(q, jax.tree.map(lambda leaf: leaf[0], modes.shapes))
-    shown, shapes = min(_positive(count, "count"), len(frequencies)), _at_largest(modes.shapes)
+    shown, shapes = min(_positive(count, "count"), len(frequencies)), _align_phases(modes.shapes)
     matplotlib = _matplotlib()
     if figure is None:
         figure = matplotlib.pyplot.figure(figsize=(min(2.4 * shown + 1.0, 12.8), 3.2), layout="constrained")
@@ -234,7 +234,7 @@ def _rates(modes: Modes, k: int) -> str:
     return f"ω = {modes.frequencies[k]:.4g}" + (f", ζ = {ratio:.2g}" if ratio > rounding else "")
 
 
-def _at_largest(shapes):
+def _align_phases(shapes):
     """The real parts of shapes, each turned by the phase at which the sum of their squares is largest."""
     total = sum(jnp.sum(jnp.square(leaf).reshape(len(leaf), -1), axis=1) for leaf in jax.tree.leaves(shapes))
     turn = jnp.exp(-0.5j * jnp.angle(total))
@@ -267,7 +267,7 @@ def _swings(ax, points: Function, q, shape, params, largest: float) -> None:
         at = jax.tree.map(lambda x, dx, s=swing: jnp.asarray(x) + s / size * dx, q, shape)
         drawn = points(at, t=jnp.zeros(()), params=params)
         for name, value in (drawn if isinstance(drawn, dict) else {"": drawn}).items():
-            line = as_points(name, np.asarray(value)[None], 1)[0]
+            line = require_points(name, np.asarray(value)[None], 1)[0]
             if line.shape[-1] != 2:
                 raise ValueError("plot.modes draws in the plane: return points of two numbers, a projection of them.")
             ax.plot(*line.T, style, color=color, marker="o", markersize=4, linewidth=1.5)

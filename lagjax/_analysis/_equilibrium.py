@@ -87,7 +87,7 @@ def equilibrium(
         raise ValueError(_sentence(scene))
     of_user = None
     if scene.constrained:
-        of_user = scene.system.by_constraint(multipliers, scene.layout, scene.params)
+        of_user = scene.system.split_by_constraint(multipliers, scene.layout, scene.params)
     return Equilibrium(scene.layout.restore(place), of_user, ok)
 
 

@@ -147,7 +147,7 @@ class SceneState(NamedTuple):
                     pass
             return np.asarray(_evaluated(name, q, qdot, *self.arguments))
 
-        return Scales.of(evaluated, np.asarray(self.q), np.asarray(self.qdot))
+        return Scales.from_quantities(evaluated, np.asarray(self.q), np.asarray(self.qdot))
 
     # ---- quantities at a state (q, q̇) and the time zero ----
 

@@ -44,7 +44,7 @@ class CheckedScene(NamedTuple):
         q, qdot, t, params = as_arrays((q, qdot, 1.0 * t, params), layout.dtype)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)
         flat = [np.asarray(x) for x in state[:3]]
-        here = Sample.of(system, layout, flat[0][None], flat[1][None], flat[2], params)
+        here = Sample.from_scene(system, layout, flat[0][None], flat[1][None], flat[2], params)
         scales = _scales(here)
         sizes = _sizes(q, qdot, scales)
         steps, offsets = ladder(sizes, layout.dtype), _offsets(sizes, scales, layout.dtype)
@@ -206,7 +206,7 @@ def _scales(here: Sample) -> Scales:
         return here._replace(q=q, qdot=v, t=t, scene=None).quantities(name)[name]
 
     try:
-        scales = Scales.of(evaluated, q, v)
+        scales = Scales.from_quantities(evaluated, q, v)
     except Unlowerable:
         scales = Scales(np.abs(q), np.abs(v), 1.0)
     return scales._replace(**{name: np.where(np.isfinite(x) & (x > 0), x, 1.0) for name, x in scales._asdict().items()})

@@ -46,7 +46,7 @@ class Course(NamedTuple):
     before: np.ndarray
     after: np.ndarray
 
-    def at(self, times: np.ndarray) -> np.ndarray:
+    def coordinates_at(self, times: np.ndarray) -> np.ndarray:
         """q (F, n) at some times; NaN beyond the ends, but for what a float32 rounds away."""
         return self.states_at(times)[0]
 
@@ -180,7 +180,7 @@ class Animation:
         positions = self.positions(times)
         figure = matplotlib.figure.Figure(figsize=_size(positions), layout="constrained", dpi=_DPI)
         matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
-        show, moving = _drawn(figure, positions, times, self.traces, max(1, round(TRAIL * fps)))
+        show, moving = _draw_film(figure, positions, times, self.traces, max(1, round(TRAIL * fps)))
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # it is laid out: to do so for every frame takes most of the time
         _keep_the_rest(figure, moving)
@@ -211,13 +211,15 @@ def animated(trajectory, points: Callable, trace, speed: float, fps: float) -> A
         )
 
     def positions(times: np.ndarray) -> dict[str, np.ndarray]:
-        each = [_positions(function, members, k, course.at(times), times) for k, course in enumerate(courses)]
+        each = [
+            _positions(function, members, k, course.coordinates_at(times), times) for k, course in enumerate(courses)
+        ]
         return {name: np.stack([one[name] for one in each]) for name in each[0]}
 
     shapes = {name: array.shape[2:] for name, array in positions(np.array([begin])).items()}
     if not shapes:
         raise ValueError("points returns an empty dict: there is nothing to show.")
-    return Animation(positions, (float(begin), end), float(speed), float(fps), _traced(trace, shapes))
+    return Animation(positions, (float(begin), end), float(speed), float(fps), _parse_trace(trace, shapes))
 
 
 def _require_positive(**numbers) -> None:
@@ -250,22 +252,22 @@ def _course(trajectory, members: Members, k: int) -> Course:
     """The knots of a member: its outputs, and the states just before its transitions."""
     place = np.unravel_index(k, members.batch) if members.batch else ()
 
-    def of_member(tree):
+    def flatten_member(tree):
         leaves = [numbers_at(leaf, place) for leaf in jax.tree.leaves(tree)]
         return np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1).astype(float)
 
     t = times_of_members(trajectory).reshape(members.count, -1)[k].astype(float)
-    q, qdot = of_member(trajectory.q), of_member(trajectory.qdot)
+    q, qdot = flatten_member(trajectory.q), flatten_member(trajectory.qdot)
     changes = trajectory.transitions
     if changes is None:
         return Course(t, q, qdot, qdot)
     when = np.asarray(changes.t).reshape(members.count, -1)[k]
     there = np.isfinite(when)
-    before = of_member(changes.qdot)[there]
+    before = flatten_member(changes.qdot)[there]
     order = np.argsort(np.concatenate([t, when[there]]), kind="stable")
     return Course(
         np.concatenate([t, when[there]])[order],
-        np.concatenate([q, of_member(changes.q)[there]])[order],
+        np.concatenate([q, flatten_member(changes.q)[there]])[order],
         np.concatenate([qdot, before])[order],
         np.concatenate([qdot, np.full_like(before, np.nan)])[order],
     )
@@ -274,13 +276,13 @@ def _course(trajectory, members: Members, k: int) -> Course:
 def _positions(function: Function, members: Members, k: int, q: np.ndarray, times: np.ndarray) -> dict[str, np.ndarray]:
     """The points (frames, number, 2 or 3) of a member at its states q (frames, n), by name."""
     states = members.layout.restore(q.astype(members.layout.dtype))
-    drawn = _at_states(function, states, times.astype(members.layout.dtype), members.params_of(k))
+    drawn = _evaluate_points(function, states, times.astype(members.layout.dtype), members.params_of(k))
     named = drawn if isinstance(drawn, dict) else {"": drawn}
-    return {str(name): as_points(name, np.asarray(value), len(q)) for name, value in named.items()}
+    return {str(name): require_points(name, np.asarray(value), len(q)) for name, value in named.items()}
 
 
 @eqx.filter_jit
-def _at_states(function: Function, states, times, params):
+def _evaluate_points(function: Function, states, times, params):
     def drawn(q, t):
         points = function(q, t=t, params=params)
         if isinstance(points, dict):
@@ -290,8 +292,8 @@ def _at_states(function: Function, states, times, params):
     return jax.vmap(drawn)(states, times)
 
 
-def as_points(name, value: np.ndarray, frames: int) -> np.ndarray:
-    """The positions of one point or line at some frames, (frames, k, 2 or 3)."""
+def require_points(name, value: np.ndarray, frames: int) -> np.ndarray:
+    """The positions of one point or line at F frames, (F, k, 2 or 3). Raises `ValueError` for another shape."""
     if value.ndim == 2:  # one point
         value = value[:, None, :]
     if value.ndim != 3 or value.shape[-1] not in (2, 3):
@@ -303,8 +305,8 @@ def as_points(name, value: np.ndarray, frames: int) -> np.ndarray:
     return value
 
 
-def _traced(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int], ...]:
-    """The points that leave a trace, (name, place) each: a name means the last point of its line."""
+def _parse_trace(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int], ...]:
+    """The points that leave a trace, (name, place) each, from the argument `trace`: a name is its line's last point."""
     if len({shape[-1] for shape in shapes.values()}) > 1:
         raise ValueError("points has some in the plane and some in space: give all of them two numbers, or three.")
     if trace is None:
@@ -325,13 +327,15 @@ def _traced(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int],
 # ---- pictures --------------------------------------------------------------------------------------------------------
 
 
-def _drawn(figure, positions: dict[str, np.ndarray], times: np.ndarray, traces, trail: int) -> tuple[Callable, list]:
+def _draw_film(
+    figure, positions: dict[str, np.ndarray], times: np.ndarray, traces, trail: int
+) -> tuple[Callable, list]:
     """Set the figure up; a function that sets it to frame i, and the artists to draw for it."""
     ax, space = _axes(figure, positions), next(iter(positions.values())).shape[-1] == 3
     count = len(next(iter(positions.values())))
     opacity = max(0.2, count**-0.5)
     lines, faded = [], []
-    for color, (name, array) in zip(_cycled(len(positions)), positions.items(), strict=True):
+    for color, (name, array) in zip(_cycle_colors(len(positions)), positions.items(), strict=True):
         style = dict(color=color, alpha=opacity, linewidth=2, marker="o", markersize=5, solid_capstyle="round")
         for member in array:
             lines.append((ax.plot(*([] for _ in range(member.shape[-1])), **style)[0], member))
@@ -441,7 +445,7 @@ def _trace(ax, color: str, space: bool, opacity: float):
     return ax.add_collection(matplotlib.collections.LineCollection([], linewidths=1.2), autolim=False)
 
 
-def _cycled(count: int) -> list[str]:
+def _cycle_colors(count: int) -> list[str]:
     return [COLORS[k % len(COLORS)] for k in range(count)]
 
 

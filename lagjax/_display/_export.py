@@ -49,7 +49,7 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     columns = {
         name: column
         for which, tree in (("q", trajectory.q), ("qdot", trajectory.qdot))
-        for name, column in zip(_of(which, names), _columns(tree, len(batch) + 1), strict=True)
+        for name, column in zip(_column_names(which, names), _columns(tree, len(batch) + 1), strict=True)
     }
     if trajectory.mode is not None:
         codes = np.asarray(trajectory.mode).ravel()
@@ -61,7 +61,7 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
         index = pandas.Index(each.ravel(), name="t")
     table = pandas.DataFrame(columns, index=index)
     of_q, of_qdot = _units(trajectory.q, units, time_unit)
-    per_leaf = [leaf[0].size for leaf in _of_one(trajectory.q, len(batch))]
+    per_leaf = [leaf[0].size for leaf in _first_member(trajectory.q, len(batch))]
     spread = [unit for of in (of_q, of_qdot) for unit, size in zip(of, per_leaf, strict=True) for _ in range(size)]
     known = {name: unit for name, unit in zip(columns, spread, strict=False) if unit is not None}
     if time_unit is not None:
@@ -102,7 +102,7 @@ def _times(trajectory) -> tuple[np.ndarray, bool]:
     return (rows[0] if shared else times_of_members(trajectory)), shared
 
 
-def _of_one(tree: PyTree, axes: int) -> list[np.ndarray]:
+def _first_member(tree: PyTree, axes: int) -> list[np.ndarray]:
     """The leaves of the first member, with the time axis in front."""
     return [np.asarray(leaf)[(0,) * axes] for leaf in jax.tree.leaves(tree)]
 
@@ -114,7 +114,8 @@ def _names(trajectory) -> tuple[str, ...]:
     return Layout.of(*one).names
 
 
-def _of(which: str, names: tuple[str, ...]) -> list[str]:
+def _column_names(which: str, names: tuple[str, ...]) -> list[str]:
+    """The names of coordinates, which begin with q, with `which` in its place."""
     return [which + name.removeprefix("q") for name in names]
 
 

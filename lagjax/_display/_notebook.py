@@ -41,7 +41,7 @@ def cell(text: str, draw: Callable[[Any], None], size: tuple[float, float] = _SI
     )
 
 
-def of_trajectory(trajectory) -> str | None:
+def trajectory_html(trajectory) -> str | None:
     """HTML of a trajectory: its three lines, and coordinates against time; None where nothing can be drawn."""
     leaves = [*jax.tree.leaves(trajectory.q), trajectory.ts, trajectory.result._value, trajectory.end.t]
     if not all(map(is_known, leaves)) or not leaves[0].size:
@@ -61,7 +61,7 @@ def _draw(figure, trajectory) -> None:
         for place in np.ndindex(inside):
             if drawn == COORDINATES:
                 break
-            values = _of_members(leaf, rank, members, outputs, place)
+            values = _member_values(leaf, rank, members, outputs, place)
             lines = ax.plot(ts.T, values.T, color=COLORS[drawn], alpha=opacity, linewidth=1.2)
             lines[0].set_label("q" + jax.tree_util.keystr(path) + (str(list(place)) if inside else ""))
             drawn += 1
@@ -78,8 +78,8 @@ def _draw(figure, trajectory) -> None:
         handle.set_alpha(1.0)
 
 
-def _of_members(leaf, rank: int, members: np.ndarray, outputs: np.ndarray, place: tuple[int, ...]) -> np.ndarray:
-    """One scalar coordinate of some members at some outputs, (members, outputs), without a copy of the others."""
+def _member_values(leaf, rank: int, members: np.ndarray, outputs: np.ndarray, place: tuple[int, ...]) -> np.ndarray:
+    """One scalar coordinate (M, T) of M members at T outputs, without a copy of other members."""
     for_members = np.unravel_index(members[:, None], leaf.shape[:rank]) if rank else ()
     return np.atleast_2d(numbers_at(leaf, (*for_members, outputs[None, :] if rank else outputs, *place)))
 

@@ -34,7 +34,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax._batch_members import Members
-from lagjax._diagnosis import diagnosis, ended_of
+from lagjax._diagnosis import diagnosis, motion_end
 from lagjax._health._border_counts import Met, count_borders, is_piecewise
 from lagjax._health._compare import global_error
 from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measured
@@ -83,7 +83,7 @@ def _diagnosis(trajectory) -> str:
     members = Members(trajectory)
     which = tuple(failed[0].tolist())
     layout, row = members.layout, int(np.ravel_multi_index(which, members.batch)) if which else 0
-    ended = ended_of(trajectory, layout, which, members.numbers_of(row).astype(layout.dtype))
+    ended = motion_end(trajectory, layout, which, members.numbers_of(row).astype(layout.dtype))
     return diagnosis(trajectory.system, layout, members.params_of(row), ended).strip()
 
 

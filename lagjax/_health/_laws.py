@@ -64,15 +64,15 @@ class Law(NamedTuple):
 
     def measurements(self, momenta: tuple[int, ...], tolerances, sample: Sample) -> Measurements:
         """The `Measurements` at S states; `tolerances` are rtol and atol, () or (S,) each."""
-        return sample.in_parts(partial(self._measurements, momenta), self._portion(_QUANTITIES), *tolerances)
+        return sample.evaluate_in_parts(partial(self._measurements, momenta), self._portion(_QUANTITIES), *tolerances)
 
     def powers(self, sample: Sample) -> np.ndarray:
         """dh/dt at S states, shape (S,)."""
-        return sample.in_parts(self._powers, self._portion(_QUANTITIES))
+        return sample.evaluate_in_parts(self._powers, self._portion(_QUANTITIES))
 
     def accelerations(self, sample: Sample) -> np.ndarray:
         """q̈ at S states, shape (S, n)."""
-        return sample.in_parts(Sample.solved, self._portion(SADDLE))
+        return sample.evaluate_in_parts(Sample.solved, self._portion(SADDLE))
 
     def _portion(self, names: tuple[str, ...]) -> int:
         """The number of states of which programs return these quantities together."""
@@ -123,7 +123,7 @@ class Law(NamedTuple):
             flags = [np.isfinite(np.broadcast_to(bar, len(part.q))) for bar in bars if bar is not None]
             return np.broadcast_to(np.all(flags, axis=0), len(part.q))
 
-        finite = sample.in_parts(finite_at, max(1, _STORED // len(program.nodes)))
+        finite = sample.evaluate_in_parts(finite_at, max(1, _STORED // len(program.nodes)))
         if finite.all():
             return finite
         doubtful = [x if np.ndim(x) == 0 else x[~finite] for x in sample.columns]

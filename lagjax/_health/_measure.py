@@ -20,7 +20,7 @@ from lagjax._batch_members import Members
 from lagjax._doubles import DOUBLE
 from lagjax._health._laws import Law, Measurements, measurements_at, power_at
 from lagjax._layout import Layout
-from lagjax._many_states import Sample, borders_of, in_chunks, is_lowered
+from lagjax._many_states import Sample, borders_of, is_lowered, map_in_chunks
 from lagjax._validate import is_concrete
 
 PyTree = Any
@@ -209,7 +209,7 @@ def _measure_traced(trajectory, axes, tree, steps):
         size = _CHUNK // (members * layout.size**2)
 
         def evaluate_in_chunks(function):
-            return lambda *states: in_chunks(partial(_evaluate_mode, laws, function), states, size)
+            return lambda *states: map_in_chunks(partial(_evaluate_mode, laws, function), states, size)
 
         sample = evaluate_in_chunks(lambda law, q, v, t: measurements_at(law, momenta, tolerances, q, v, t, numbers))
         between = Rates(

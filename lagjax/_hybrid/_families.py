@@ -18,9 +18,9 @@ from jax.extend import core
 from lagjax._arguments import Function
 from lagjax._hybrid._mode import Transition
 from lagjax._layout import Layout
-from lagjax._lift import Unchanged, open_jaxpr, traced_with
+from lagjax._lift import Unchanged, function_from_trace, open_jaxpr
 from lagjax._reads import Edition
-from lagjax._system import ROLES, System, with_functions
+from lagjax._system import ROLES, System, replace_functions
 
 PyTree = Any
 
@@ -86,8 +86,8 @@ def _family(modes, traces, system: System, leaving: tuple[Transition, ...]) -> S
     if len(modes) == 1:
         return SystemFamily(tuple(modes), system, leaving, ())
     rows: list[np.ndarray] = []
-    functions = iter([_shared(column, rows) for column in zip(*traces, strict=True)])
-    system = with_functions(system, {role: next(functions) for role in ROLES})
+    functions = iter([_share_function(column, rows) for column in zip(*traces, strict=True)])
+    system = replace_functions(system, {role: next(functions) for role in ROLES})
     rest = list(functions)
     shared = tuple(
         eqx.tree_at(lambda t: (t.guard, t.reset), transition, (guard, reset), is_leaf=lambda x: x is None)
@@ -96,7 +96,7 @@ def _family(modes, traces, system: System, leaving: tuple[Transition, ...]) -> S
     return SystemFamily(tuple(modes), system, shared, tuple(rows))
 
 
-def _shared(column: tuple, rows: list[np.ndarray]) -> Function | None:
+def _share_function(column: tuple, rows: list[np.ndarray]) -> Function | None:
     """One function for all modes from its traces in each, with the numbers that differ added to the `rows`."""
     first = column[0]
     if first is None:
@@ -109,13 +109,13 @@ def _shared(column: tuple, rows: list[np.ndarray]) -> Function | None:
     for of_modes in _different(column):
         places[of_modes[0].kind, of_modes[0].place] = len(rows)
         rows.append(np.stack([np.asarray(site.value) for site in of_modes]))
-    jaxpr, constants, values = _with_arguments(first.closed, places)
+    jaxpr, constants, values = _promote_numbers(first.closed, places)
     how = f"numbers {places} {first.closed.in_avals}"
-    return traced_with(first.function, jaxpr, constants, values, first.structure, how)
+    return function_from_trace(first.function, jaxpr, constants, values, first.structure, how)
 
 
-def _with_arguments(closed: core.ClosedJaxpr, places: dict) -> tuple[core.Jaxpr, tuple, tuple]:
-    """A trace with arguments for the numbers at these places, its constants, and which of the rows they are."""
+def _promote_numbers(closed: core.ClosedJaxpr, places: dict) -> tuple[core.Jaxpr, tuple, tuple]:
+    """A trace whose numbers at `places` are arguments, its constants, and the row of numbers that each stands for."""
     jaxpr, more, rows = closed.jaxpr, [], []
 
     def argument(kind, place, atom):
@@ -147,21 +147,21 @@ def _traces(system: System, leaving: tuple[Transition, ...], layout: Layout, par
     functions = [(getattr(system, role), 1 + (role != "constraints")) for role in ROLES]
     functions += [(function, 2) for transition in leaving for function in (transition.guard, transition.reset)]
     try:
-        return [None if function is None else _traced(function, roles, layout, params) for function, roles in functions]
+        return [None if function is None else _trace(function, roles, layout, params) for function, roles in functions]
     except Exception:
         return None
 
 
-def _traced(function: Function, roles: int, layout: Layout, params) -> _Traced:
+def _trace(function: Function, roles: int, layout: Layout, params) -> _Traced:
     if function.code.tracers or not set(function.extras) <= {"t", "params"}:
         raise TypeError
     numbers, rest = eqx.partition(params, eqx.is_array_like)
     state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
 
-    def of_numbers(states, t, numbers):
+    def call_with_numbers(states, t, numbers):
         return function(*states, t=t, params=eqx.combine(numbers, rest))
 
-    closed, shapes = jax.make_jaxpr(of_numbers, return_shape=True)((state,) * roles, t, numbers)
+    closed, shapes = jax.make_jaxpr(call_with_numbers, return_shape=True)((state,) * roles, t, numbers)
     if any(isinstance(x, Tracer) for x in closed.consts):
         raise TypeError
     return _Traced(function, closed, jax.tree.structure(shapes))

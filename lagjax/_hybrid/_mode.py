@@ -106,7 +106,7 @@ class Mode(NamedTuple):
     vector: jax.Array  # every number in params, (P,)
 
     @classmethod
-    def of(cls, name: str, problem: Problem, leaving: tuple[Transition, ...], numbers, targets) -> "Mode":
+    def from_problem(cls, name: str, problem: Problem, leaving: tuple[Transition, ...], numbers, targets) -> "Mode":
         """A mode that is ready to run. Raises `ValueError` where it has no machine code."""
         if len(leaving) > MOST_GUARDS:
             raise ValueError(
@@ -118,7 +118,7 @@ class Mode(NamedTuple):
             if refusal := MachineCode().refuses(problem):
                 raise Unlowerable(refusal)
             surfaces = _surfaces(problem.derivation, problem.system, leaving, tuple(code), structure)
-            guarded = dataclasses.replace(problem, guards=_watched(surfaces))
+            guarded = dataclasses.replace(problem, guards=_watched_guards(surfaces))
             if refusal := MachineCode().refuses(guarded):
                 raise Unlowerable(refusal)
         except Unlowerable as why:
@@ -126,7 +126,7 @@ class Mode(NamedTuple):
         return cls(problem, leaving, numbers, targets, surfaces, problem.params, jnp.asarray(problem.vector))
 
     def with_params(self, params: PyTree, numbers, targets) -> "Mode":
-        """Another mode of the same family."""
+        """The mode of the same family that has these parameters, transition numbers and targets."""
         problem = dataclasses.replace(self.problem, params=params)
         return self._replace(
             problem=problem, numbers=numbers, targets=targets, params=params, vector=jnp.asarray(problem.vector)
@@ -153,7 +153,7 @@ class Mode(NamedTuple):
 
         Where it begins on a surface it comes from that one of the `sides` (see `_native.Guards`).
         """
-        guarded = dataclasses.replace(self.problem, ts=ts, y0=y0, guards=_watched(self.surfaces))
+        guarded = dataclasses.replace(self.problem, ts=ts, y0=y0, guards=_watched_guards(self.surfaces))
         return MachineCode().solve_to_event(guarded, sides)
 
     # ---- through a transition ----
@@ -181,7 +181,7 @@ class Mode(NamedTuple):
         return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, jnp.inf)
 
 
-def _watched(surfaces: Surfaces | None) -> Guards | None:
+def _watched_guards(surfaces: Surfaces | None) -> Guards | None:
     """Surfaces as machine code watches them along a mode."""
     return None if surfaces is None else surfaces.guards(remembers=True)
 
@@ -203,7 +203,7 @@ def _surfaces(
         if multipliers is None:
             return {}
         flat = jnp.stack(multipliers.at(y, vector_of(eqx.filter(params, eqx.is_array_like))))
-        return {"multipliers": system.by_constraint(flat, layout, params)}
+        return {"multipliers": system.split_by_constraint(flat, layout, params)}
 
     def value(guard):
         return lambda y, params: _value(

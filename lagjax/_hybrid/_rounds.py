@@ -64,7 +64,9 @@ class RoundPlan(eqx.Module):
             table = np.array([numbers[k] for k in family.modes], int).reshape(len(family.modes), -1)
             targets = np.array([[self.names.index(self.transitions[k].target) for k in row] for row in table], int)
             problem = Problem.about(family.system, layout, own, **limits)
-            mode = Mode.of(self.names[first], problem, family.leaving, table[0], targets.reshape(table.shape)[0])
+            mode = Mode.from_problem(
+                self.names[first], problem, family.leaving, table[0], targets.reshape(table.shape)[0]
+            )
             groups.append(ModeGroup(family, mode, table, targets.reshape(table.shape)))
         return groups
 
@@ -138,7 +140,7 @@ class Exit(NamedTuple):
 def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Ending, TransitionRecord]:
     """The motion from y0 (2n,) at ts[0]: how it ended, and its transitions, with an axis of `max_transitions`."""
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
-    rounds, start = _Rounds.of(plan, plan.groups(layout, params), ts), plan.names.index(plan.start)
+    rounds, start = _Rounds.from_plan(plan, plan.groups(layout, params), ts), plan.names.index(plan.start)
     inconsistent = rounds.is_inconsistent(start, ts[0], y0, [start])
     first = Ending(
         t=ts[0], y=y0, mode=jnp.asarray(start), going=~inconsistent,
@@ -149,7 +151,7 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
     piled_up = (ending.result == TOO_MANY) & _pile_up(record.t, ts[-1])
     ending = ending._replace(result=jnp.where(piled_up, ZENO, ending.result))
-    return _without_silent_zeros(ending, record, (ts, y0, rounds.groups[0].first.vector))
+    return _lose_unreached(ending, record, (ts, y0, rounds.groups[0].first.vector))
 
 
 class _Rounds(NamedTuple):
@@ -159,7 +161,7 @@ class _Rounds(NamedTuple):
     ts: jax.Array
 
     @classmethod
-    def of(cls, plan: RoundPlan, groups: list[ModeGroup], ts) -> "_Rounds":
+    def from_plan(cls, plan: RoundPlan, groups: list[ModeGroup], ts) -> "_Rounds":
         places = np.zeros((len(plan.names), 2), int)
         for index, group in enumerate(groups):
             places[list(group.family.modes)] = [(index, row) for row in range(len(group.family.modes))]
@@ -174,7 +176,7 @@ class _Rounds(NamedTuple):
         place, row = jnp.asarray(self.places)[before.mode]
         for index, group in enumerate(self.groups):
             here = before.going & (place == index)
-            ending, event, recorded = self._in_mode(group, row, before, here)
+            ending, event, recorded = self._run_mode(group, row, before, here)
             after, record = _where(here, ending, after), _where(here & event, recorded, record)
             fired = fired | (here & event)
         spent = fired & (count == self.plan.max_transitions)
@@ -189,8 +191,8 @@ class _Rounds(NamedTuple):
             off = off | (this & self.groups[index].mode(jnp.where(this, row, 0)).is_inconsistent(t, y))
         return off
 
-    def _in_mode(self, group: ModeGroup, row, before: Ending, here) -> tuple[Ending, jax.Array, TransitionRecord]:
-        """The round of the members that are `here`, in this mode of a group, and whether it ended with a transition."""
+    def _run_mode(self, group: ModeGroup, row, before: Ending, here) -> tuple[Ending, jax.Array, TransitionRecord]:
+        """One round in this mode of a group for members that are `here`, and whether it ended with a transition."""
         mode, t_start = group.mode(jnp.where(here, row, 0)), jax.lax.stop_gradient(before.t)
         sides, rounding, lasting = self._sides(mode, before)
         horizon = jnp.where(here, self.ts[-1], t_start)
@@ -332,8 +334,8 @@ def _pile_up(times, end) -> jax.Array:
     return lost | ((ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end))
 
 
-def _without_silent_zeros(ending: Ending, record: TransitionRecord, inputs) -> tuple[Ending, TransitionRecord]:
-    """Outputs (T, 2n) that were not reached and transitions that did not happen get derivatives that are NaN."""
+def _lose_unreached(ending: Ending, record: TransitionRecord, inputs) -> tuple[Ending, TransitionRecord]:
+    """The ending and the record with NaN derivatives of outputs that were not reached and of absent transitions."""
     happened = record.source >= 0
     t, y = (lost_unless(which, x, inputs) for which, x in ((happened, record.t), (happened[:, None], record.y)))
     path = lost_unless((ending.modes >= 0)[:, None], ending.path, inputs)

@@ -183,7 +183,7 @@ class Arcs:
         def evaluated(name, q, qdot):
             return self.quantities((name,), 0.0, np.concatenate([q, qdot], axis=1))[name]
 
-        return Scales.of(evaluated, *halves(y))
+        return Scales.from_quantities(evaluated, *halves(y))
 
     def rate(self, t, y: np.ndarray) -> np.ndarray:
         """ẏ = (q̇, q̈), (R, 2n), at states (R, 2n) and times () or (R,)."""

@@ -162,7 +162,7 @@ class _Watch:
         if latest is not None and latest[0].hold():
             return latest[1]
         with self._lock:
-            walk, text = self._walked()
+            walk, text = self._walk()
             same_as = None
             if latest is not None and all(map(_own.__contains__, _new_places(latest[0], walk))):
                 same_as = latest[1]
@@ -170,7 +170,7 @@ class _Watch:
             self._latest = walk.marks, edition
             return edition
 
-    def _walked(self) -> "tuple[_LiveWalk, str]":
+    def _walk(self) -> "tuple[_LiveWalk, str]":
         names: set[str] | None = set()
         while True:  # ends, as names only become more
             walk = _LiveWalk(names)
@@ -194,7 +194,7 @@ class _Watch:
         with self._lock:
             if self._latest is None or self._latest[0].hold():
                 return
-            walk, _ = self._walked()
+            walk, _ = self._walk()
             _own.update({
                 key: place for key, place in _new_places(self._latest[0], walk).items() if walk.is_own(place, key[1])
             })  # fmt: skip
@@ -284,7 +284,7 @@ class _LiveWalk(Walk):
         count = len(value)
         return CHANGING if self.read(value, None, value) is CHANGING else f"{count} in {self._identity(value)}"
 
-    def of_array(self, array: Any) -> str:
+    def describe_array(self, array: Any) -> str:
         if isinstance(array, Tracer):
             return f"tracer {place_in(self.tracers, array)}: {array.shape} {array.dtype} {array.weak_type}"
         if isinstance(array, np.ndarray):

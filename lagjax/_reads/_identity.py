@@ -76,7 +76,7 @@ class Walk:
         """The words for an object whose inside cannot be seen."""
         return [("shown", without_addresses(repr(thing)))]
 
-    def of_array(self, value: Any) -> str:
+    def describe_array(self, value: Any) -> str:
         """An array in words."""
         return array_text(value)
 
@@ -95,14 +95,14 @@ class Walk:
         if kind in _ATOMS:
             return shortened(repr(value))
         if isinstance(value, np.ndarray | np.generic | jax.Array):
-            return self.of_array(value)
+            return self.describe_array(value)
         if isinstance(value, enum.Enum):
             return f"{self.name(kind)}.{value.name} = {self.name(value.value, deep + 1)}"
         if isinstance(value, _ATOMS):  # of a class of its own
             base: Any = next(base for base in _ATOMS if isinstance(value, base))
             return f"{self.name(kind)} {shortened(base.__repr__(value))}"
         if isinstance(value, bytearray | array.array):
-            return self.name(type(value)) + self.of_array(self.read(value, None, np.array(value)))
+            return self.name(type(value)) + self.describe_array(self.read(value, None, np.array(value)))
         if isinstance(value, self.containers) and deep < _DEEP:
             return shortened(self.container(value, deep + 1))
         if isinstance(value, types.ModuleType):
@@ -132,26 +132,26 @@ class Walk:
     def line(self, thing: Any) -> str:
         """The parts of a function, a class or an object."""
         if isinstance(thing, types.FunctionType):
-            return self._parts("function", self._of_function(thing))
+            return self._parts("function", self._function_parts(thing))
         if isinstance(thing, type):
-            return self._parts(f"class {thing.__name__}", self._of_class(thing))
+            return self._parts(f"class {thing.__name__}", self._class_parts(thing))
         if isinstance(thing, types.MethodType):
             return self._parts("method", [("of", thing.__self__), ("function", thing.__func__)])
         if isinstance(thing, functools.partial):
             return self._parts("partial", [("of", thing.func), ("args", thing.args), ("keywords", thing.keywords)])
         if isinstance(thing, property):
             return self._parts("property", [("get", thing.fget)])
-        if (inner := _wrapped(thing)) is not None:
-            return self._parts("wrapped", [("function", inner), *self._hung_on(thing)])
+        if (inner := _unwrap(thing)) is not None:
+            return self._parts("wrapped", [("function", inner), *self._function_attributes(thing)])
         return self._parts(self.name(type(thing)), self._state(thing))
 
     def _parts(self, kind: str, parts) -> str:
         return "\n".join([kind, *(f"    {name} = {self.name(value)}" for name, value in parts)])
 
-    def _of_function(self, function: types.FunctionType) -> Iterator[tuple[str, Any]]:
-        """The byte code of a function, its defaults, and what it uses from outside; of a library's the last alone."""
+    def _function_parts(self, function: types.FunctionType) -> Iterator[tuple[str, Any]]:
+        """The byte code, the defaults and the outer values of a function; of a library's function its closure alone."""
         cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-        inside = {name: value for name, cell in cells if (value := self._in_cell(cell, name)) is not _NOT_FILLED}
+        inside = {name: value for name, cell in cells if (value := self._read_cell(cell, name)) is not _NOT_FILLED}
         if not _is_users(function.__module__):
             yield "name", f"{function.__module__}.{function.__qualname__}"
             yield "code", code_text(function.__code__)  # functions made by one function have one name
@@ -162,20 +162,23 @@ class Walk:
         for name in names.globals.difference(outer):
             self.misses(outer, name)
         outside = {name: self.read(outer, name, outer[name]) for name in sorted(names.globals) if name in outer}
-        imported = {".".join((".",) * level) + name: _imported(outer, level, name) for level, name, _ in names.imports}
+        imported = {
+            ".".join((".",) * level) + name: _import_module(outer, level, name) for level, name, _ in names.imports
+        }
         used = inside | outside | {name: module for name, module in imported.items() if module is not None}
         yield "code", code_text(function.__code__)
         yield "defaults", [function.__defaults__, function.__kwdefaults__]
-        yield from sorted(self._with_attributes(used, names.attributes | names.globals).items())
-        yield from self._hung_on(function)
+        yield from sorted(self._add_module_attributes(used, names.attributes | names.globals).items())
+        yield from self._function_attributes(function)
 
-    def _in_cell(self, cell: types.CellType, name: str) -> Any:
+    def _read_cell(self, cell: types.CellType, name: str) -> Any:
+        """The value in a closure cell; `_NOT_FILLED` where it is empty."""
         try:
             return self.read(cell, name, cell.cell_contents)
         except ValueError:  # of a name that is assigned later
             return _NOT_FILLED
 
-    def _hung_on(self, function: Any) -> list[tuple[str, Any]]:
+    def _function_attributes(self, function: Any) -> list[tuple[str, Any]]:
         """The attributes that were set on a function."""
         held, is_plain = getattr(function, "__dict__", {}), isinstance(function, types.FunctionType)
         return [
@@ -184,8 +187,8 @@ class Walk:
             if name != "__wrapped__" and (is_plain or not name.startswith("_")) and self.wants(name, x, function)
         ]
 
-    def _with_attributes(self, used: dict[str, Any], names: frozenset[str]) -> dict[str, Any]:
-        """The values that are used by name, those of the user's modules among them: of `helpers.f` the function."""
+    def _add_module_attributes(self, used: dict[str, Any], names: frozenset[str]) -> dict[str, Any]:
+        """The values `used` by name, and the attributes `names` of the user's modules among them, as of `helpers.f`."""
         found, waiting, modules = dict(used), list(used.items()), set()
         for path, value in waiting:  # which grows meanwhile
             if isinstance(value, types.ModuleType) and _is_users(value.__name__) and value.__name__ not in modules:
@@ -196,7 +199,7 @@ class Walk:
                 waiting += more.items()
         return found
 
-    def _of_class(self, kind: type) -> Iterator[tuple[str, Any]]:
+    def _class_parts(self, kind: type) -> Iterator[tuple[str, Any]]:
         """All that a class of the user holds, and the classes that it extends."""
         yield "bases", [*kind.__bases__, *([] if type(kind) is type else [type(kind)])]
         held = kind.__dict__
@@ -221,7 +224,7 @@ class Walk:
         inside, users = getattr(thing, "__dict__", {}), _is_users(type(thing).__module__)
         if not isinstance(inside, dict):
             inside = {}
-        slots = [name for kind in type(thing).__mro__ for name in _as_tuple(kind.__dict__.get("__slots__", ()))]
+        slots = [name for kind in type(thing).__mro__ for name in _slot_names(kind)]
         if dataclasses.is_dataclass(thing):
             fields = [x.name for x in dataclasses.fields(thing)]
             held = {name: inside[name] if name in inside else getattr(thing, name, None) for name in fields}
@@ -254,11 +257,13 @@ def _is_plain(value: Any) -> bool:
     return isinstance(value, int | float | complex | str | np.ndarray | jax.Array)
 
 
-def _as_tuple(slots: Any) -> tuple[str, ...]:
+def _slot_names(kind: type) -> tuple[str, ...]:
+    """The names in the `__slots__` of a class itself, without those of its bases."""
+    slots = kind.__dict__.get("__slots__", ())
     return (slots,) if isinstance(slots, str) else tuple(slots)
 
 
-def _imported(names: dict[str, Any], level: int, name: str) -> types.ModuleType | None:
+def _import_module(names: dict[str, Any], level: int, name: str) -> types.ModuleType | None:
     """A module that a function with these globals imports when it is called; None where there is no such module."""
     try:
         full = name if not level else importlib.util.resolve_name("." * level + name, names.get("__package__"))
@@ -267,7 +272,7 @@ def _imported(names: dict[str, Any], level: int, name: str) -> types.ModuleType 
         return None
 
 
-def _wrapped(thing: Any) -> Any:
+def _unwrap(thing: Any) -> Any:
     """The function within one that `functools.wraps` or `jax.jit` made; None of others.
 
     What jax.jit returns has no `__wrapped__` any more once it came from another process.
@@ -283,7 +288,7 @@ def _library_name(value: Any) -> str | None:
         return None
     if isinstance(value, types.FunctionType) and (value.__closure__ or "<" in name):
         return None
-    compiled = not isinstance(value, type | types.FunctionType | types.MethodType) and _wrapped(value) is None
+    compiled = not isinstance(value, type | types.FunctionType | types.MethodType) and _unwrap(value) is None
     return f"{module}.{name}" if compiled or not _is_users(module) else None
 
 

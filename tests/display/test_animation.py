@@ -120,7 +120,7 @@ def test_mistakes_are_sentences(run):
 
 def test_beyond_the_outputs_nothing_is_known(run):
     _, course = _animation.course_of(run)
-    at = course.at(np.array([-3.0, 0.0, 6.0, 8.0]))
+    at = course.coordinates_at(np.array([-3.0, 0.0, 6.0, 8.0]))
     assert np.isnan(at[[0, 3]]).all()
     np.testing.assert_allclose(at[1:3, 0], np.cos([0.0, 6.0]), atol=1e-8)
 

@@ -115,7 +115,9 @@ def test_a_picture_of_a_large_batch_is_of_a_few_members(fallen, monkeypatch):
 
     places = []
     monkeypatch.setattr(
-        _notebook, "_of_members", lambda leaf, *rest: places.append([len(x) for x in rest[1:3]]) or np.zeros(places[-1])
+        _notebook,
+        "_member_values",
+        lambda leaf, *rest: places.append([len(x) for x in rest[1:3]]) or np.zeros(places[-1]),
     )
     wide = eqx.tree_at(lambda t: t.result._value, fallen, jnp.zeros(100_000, int))
     wide = eqx.tree_at(lambda t: (t.q, t.end.t), wide, (jnp.zeros((100_000, 5)), jnp.zeros(100_000)))

@@ -210,7 +210,7 @@ def test_check_and_health_compile_nothing_where_there_are_programs(monkeypatch):
 
     monkeypatch.setattr(many_states, "_compiled", compiled)
     monkeypatch.setattr(of_check, "_variation", compiled)
-    monkeypatch.setattr(of_health, "_measured", compiled)
+    monkeypatch.setattr(of_health, "_measure_traced", compiled)
     for make in (scenes.rolling_cylinder, scenes.damped_driven_oscillator):
         scene = make()
         assert lagjax.check(scene.system, scene.q0, scene.qdot0, 0.0, scene.params).ok
@@ -389,7 +389,7 @@ def test_a_sample_without_programs_is_the_one_with_them(constraints, monkeypatch
     layout = Layout.of(jnp.ones(3), jnp.ones(3))
     names = "force", "mass_matrix", "dissipation", "residual", "lagrangian"
     lowered, compiled = (
-        many_states.Sample.of(scene, layout, q, qdot, t, None).quantities(*names)
+        many_states.Sample.from_scene(scene, layout, q, qdot, t, None).quantities(*names)
         for scene in (
             lagjax.System(lagrangian, constraints=constraints),
             lagjax.System(Held(lagrangian, jnp.ones(())), constraints=constraints),

@@ -86,7 +86,7 @@ def test_where_diffrax_runs_by_default_it_is_named_so_and_measured_once():
         (OSCILLATOR, ["default: Taylor (machine code)", "Dopri8", "Tsit5"]),
     ):
         problem = _precision._problem(scene, 1.0, 0.0, TS, None, None)
-        assert list(_precision._with_default_named(problem)) == names
+        assert list(_precision._default_solvers(problem)) == names
 
 
 @pytest.mark.slow
