@@ -65,9 +65,9 @@ def samples(
     read where they are needed, and a gradient with respect to all samples costs as much as one with respect to a single
     number. This holds if knots and values are known numbers or unchanged leaves of `params`: compute with u(t) instead
     of with the values. Where u jumps, with "zero", derivatives of the motion with respect to the values are exact, and
-    those with respect to the knots include the effect of a jump that comes later. Second derivatives that do not exist
-    are NaN: those with respect to knots at which the acceleration jumps, and those across other borders at which it
-    jumps. Adaptive steps of diffrax end at the knots of a scalar program, too.
+    those with respect to the knots include the effect of a jump that comes later; so do second and third ones. Where
+    knots of two inputs coincide, and one of them varies, its derivatives do not exist and are NaN. Adaptive steps of
+    diffrax end at the knots of a scalar program, too.
 
     **Raises** `TypeError` or `ValueError` for knots that do not increase, shapes that do not fit, samples that are not
     finite, an unknown `hold`, and knots of "band" that are not evenly spaced. Only the shapes of traced arrays can

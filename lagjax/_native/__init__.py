@@ -23,8 +23,7 @@ one Taylor series, of the order that the tolerance asks for.
     _output              the outputs, and the record of steps
     _integrator          all of these, round by round
     _replay              recorded steps once more, for derivatives;  _tangent, _adjoint: forward and back
-    _saltation           the jump of derivatives at a border;  _first_saltation: of a program that looks up tables
-    _time_knots          derivatives by the instants of a table's entries
+    _saltation           the jump of derivatives at a border, and at a knot of samples
     _kernel              motions and derivatives as functions of arrays;  _threads: on several cores, interruptible
     _handler             the motion as a call of XLA;  _derivative_handler: derivatives of short motions
     _gpu                 the modules of one lane as programs for NVIDIA GPUs;  _gpu_entry: what a thread of these does

@@ -20,18 +20,14 @@ Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3.2, 13.
 from llvmlite import ir
 
 from lagjax._native._constants import MAX_ORDER, NEAR_ZERO
-from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Index, Lane, Numbers, Vectors, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._parts import MotionParts
 from lagjax._native._replay import Replay
-from lagjax._native._saltation import GuardTable, Saltation, jump_along
+from lagjax._native._saltation import GuardTable, Saltation
 from lagjax._native._table_reads import lane_of
 from lagjax._native._taylor import TaylorSeries, double, integer, is_large
-from lagjax._native._time_knots import TimeKnots
-from lagjax._program._borders import Borders
 from lagjax._program._differentiation import pullback, pullback_and_entries
-from lagjax._program._jump import Nesting
 from lagjax._program._look_ups import Table
 
 # `y_ct` is the cotangent of the end, and becomes that of the start.
@@ -65,10 +61,9 @@ class Adjoint:
             "before": states,
             **dict.fromkeys(("active", "excess"), 1),
         }
-        jump = jump_along(borders, nesting)
+        jump = parts.jump_over_steps
         if borders is not None:
-            fields |= FirstSaltation.fields(pieces, n) if jump is None else Saltation.fields(pieces)
-            fields |= {"after": n, "pieces_after": pieces, "has_after": 1, "crossed": 1, "grazes": 1}
+            fields |= Saltation.fields(borders) | {"pieces_after": pieces, "has_after": 1, "crossed": 1, "grazes": 1}
         large = is_large(program, projection, times=2, more=() if jump is None else [jump.line] * 2)
         number = DOUBLE if large else number  # tables do not tell the time from the state
         self.motion = TaylorSeries(
@@ -92,19 +87,12 @@ class Adjoint:
                 projection.state.line, dtypes, self.varied, range(states)
             )
             steps.insert(0, self._transpose_projection())
-        if borders is not None:
-            steps = [*self._transpose_end(borders, nesting, jump), *steps, self._note_after()]
+        if borders is not None and jump is not None:
+            saltation = Saltation(self.motion, GuardTable(self.motion, borders), nesting.base, jump)
+            steps = [self._transpose_border(saltation), *steps, self._note_after()]
         self._run(steps)
         self._begin()
         self.motion.finish()
-
-    def _transpose_end(self, borders: "Borders", nesting: Nesting, jump) -> list[Code]:
-        """Go back over the end of a step: over the border that it met, and over a knot of samples."""
-        clocks = TimeKnots(self.motion, borders)
-        at_knot = [self._transpose_knot(clocks, nesting.base)] if clocks.exist else []
-        if jump is None:
-            return [self._transpose_first_border(borders, nesting), *at_knot]
-        return [self._transpose_border(Saltation(self.motion, borders, nesting.base, jump)), *at_knot]
 
     def _transposed(self, dtypes):
         """The transposes of the zeroth order and of the order recursion."""
@@ -347,60 +335,23 @@ class Adjoint:
         frame = motion.function("back_border")
         code, base, numbers = frame.code, saltation.base, saltation.parameters
         frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], 0.0)
-        with code.only_if(code.any_lane(frame["crossed"] > 0.0)):
+        with code.only_if(code.any_lane(saltation.crosses(frame))):
             saltation.note_edge(frame)
-            gain = saltation.cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))
+            gain, tables, entries = saltation.cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))
             for row in range(saltation.jump.lower):
                 for part in range(2):
                     for i in motion.form.each(code, base):
                         _add(frame, gain(row, i + part * base), "state_ct", i + (part * self.n + row * base))
                 for k in motion.form.each(code, numbers):
                     _add(frame, gain(row, k + 2 * base), "params_ct", k + row * numbers)
-        return frame.finish()
-
-    def _transpose_first_border(self, borders: Borders, nesting: Nesting) -> Code:
-        """`_back_border` of a program that looks up tables (`_first_saltation`)."""
-        motion, saltation = self.motion, FirstSaltation(self.motion, borders, nesting)
-        table, frame = GuardTable(motion, borders), motion.function("back_border")
-        code, base = frame.code, saltation.base
-        frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], 0.0)
-        with code.only_if(code.any_lane(frame["crossed"] > 0.0)):
-            slopes, rate = saltation.at_end(frame, table)
-            gain = saltation.gain(frame, rate)
-            for i in motion.form.each(code, base):
-                _add(frame, slopes[i] * gain, "state_ct", i)
-                _add(frame, slopes[i + base] * gain, "state_ct", i + self.n)
-            for k in motion.form.each(code, saltation.parameters):
-                _add(frame, slopes[k + (2 * base + 1)] * gain, "params_ct", k)
-            self._store_entries(frame, saltation.tables, slopes, len(saltation.by), gain)
-        return frame.finish()
-
-    def _transpose_knot(self, clocks: TimeKnots, base: int) -> Code:
-        """The cotangent of the entry of a table that a step ends at, where the time is on it (`_time_knots`)."""
-        frame = self.motion.function("back_knot")
-        code = frame.code
-        with code.only_if(code.any_lane(clocks.is_crossed(frame))):
-            cotangent, there = clocks.cotangent(frame)
-            without = clocks.moves(frame, base)
-            if without is not None:
-                for i in self.motion.form.each(code, self.states):
-                    x = frame["state_ct", i]
-                    frame["state_ct", i] = code.select(there & without, x * float("nan"), x)
-            for c, j, table in clocks.tables:
-                both = code.compare("==", frame["crossed"], clocks.coincide)
-                hit = there & (code.compare("==", frame["crossed"], float(clocks.first + c)) | both)
-                of_both = code.select(code.compare("!=", cotangent, 0.0), frame.constant(float("nan")), 0.0)
-                entry = code.select(hit, code.select(both, of_both, cotangent), 0.0)
-                self._store_entries(frame, (table,), [clocks.index(frame, j), entry], 0)
+            self._store_entries(frame, tables, entries, 0)
         return frame.finish()
 
     def _note_after(self) -> Code:
-        """The accelerations at the beginning of a step, and its pieces, for the one before it."""
+        """The pieces of a step, for the one before it."""
         frame = self.motion.function("note_after")
         with frame.code.loop(self.motion.pieces) as j:
             frame["pieces_after", j] = frame["params", j + self.motion.parameters]
-        for i in self.motion.form.each(frame.code, self.n):
-            frame["after", i] = frame["y", i + self.n, 1]
         frame["has_after"] = 1.0
         return frame.finish()
 
@@ -417,13 +368,11 @@ class Adjoint:
             for k, i in enumerate(params):
                 _add(frame, cotangents[states + k], "params_ct", i)
 
-    def _store_entries(
-        self, frame: Frame, tables: tuple[Table, ...], out: Numbers, first: int, factor: "Value | None" = None
-    ) -> None:
+    def _store_entries(self, frame: Frame, tables: tuple[Table, ...], out: Numbers, first: int) -> None:
         """Add the cotangents of entries of tables, outputs from the `first` on, to those of the numbers of members."""
         code, motion = frame.code, self.motion
         for k, table in enumerate(tables):
-            cotangent = out[first + 2 * k + 1] if factor is None else out[first + 2 * k + 1] * factor
+            cotangent = out[first + 2 * k + 1]
             places = motion.look_up.places(frame, table, out[first + 2 * k])
             for j, place in enumerate(places):
                 lane = frame.lane(integer(code, j))

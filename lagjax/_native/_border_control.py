@@ -34,17 +34,15 @@ from lagjax._native._constants import (
     SHORT_OF,
     SWITCH_TOLERANCES,
 )
-from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._roots import Roots
 from lagjax._native._saltation import NUMBERS, GuardTable, Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, double, integer
-from lagjax._native._time_knots import TimeKnots
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
-from lagjax._program._jump import Jump, Nesting, looks_up
+from lagjax._program._jump import Jump, Nesting
 
 NOWHERE = 1e300  # a level that no switching number comes to
 
@@ -79,25 +77,17 @@ class BorderControl:
             self.stop = self._stop()
             return
         self.table = GuardTable(motion, borders)
-        self.clocks = TimeKnots(motion, borders)
         self.decide, self.stop = self._decide(), self._stop()
         self.note, self.jump = None, None
         if jump is not None:
-            saltation = Saltation(motion, borders, base, jump)
+            saltation = Saltation(motion, self.table, base, jump)
             motion.layout.extend_by(saltation.fields_along())
             self.note, self.jump = saltation.note(), saltation.apply()
-        elif nesting.directions:
-            first = FirstSaltation(motion, borders, nesting)
-            self.note, self.jump = first.note(self.table), first.apply()
-        self.graze = None if looks_up(borders.program) else self._graze(base)
-        self.jump_at_knot = None
-        if self.clocks.exist and nesting.directions:
-            motion.layout.extend_by(self.clocks.fields())
-            self.jump_at_knot = self.clocks.jump_of_tangents(nesting)
+        self.graze = self._graze(base)
         self.cross = self._cross()
 
     @staticmethod
-    def fields(borders: _borders.Borders, size: int) -> dict:
+    def fields(borders: _borders.Borders) -> dict:
         """The fields of a thread's memory.
 
         `touch` is the `Touch` of every guard where the step begins; `stays` is 1 for a piece that is not decided anew;
@@ -124,8 +114,7 @@ class BorderControl:
         )
         fields = {"touch": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
         fields["level"] = len(borders.guards) if _borders.TABLE in borders.kinds else 0
-        of_tangents = FirstSaltation.fields(len(borders.switches), size) | Saltation.fields(len(borders.switches))
-        return fields | Roots.fields(MAX_ORDER + 2) | of_tangents
+        return fields | Roots.fields(MAX_ORDER + 2) | Saltation.fields(borders)
 
     def begin(self, frame: Frame, lane: Lane) -> None:
         """A lane has taken a member."""
@@ -184,7 +173,7 @@ class BorderControl:
         if self.pieces:
             for c, j in enumerate(self.borders.clocks):
                 self._look_at_clock(frame, c, j, h)
-            if self.clocks.exist and len(self.borders.clocks) > 1:
+            if self.table.knots and len(self.borders.clocks) > 1:
                 self._note_coincidence(frame, h)
             self._note_levels(frame)
             with code.loop(len(self.guards)) as g:
@@ -281,7 +270,7 @@ class BorderControl:
         """Entries of several tables at one instant, one of which may be moved."""
         code, size = frame.code, frame.code.intrinsic("fabs", h)
         count, moves = frame.constant(0.0), frame.constant(0.0)
-        movable = [j for _, j, _ in self.clocks.tables]
+        movable = [j for _, j in self.table.knots]
         for j in self.borders.clocks:
             left, inside = self._until_next_knot(frame, j)
             distance = code.intrinsic("fabs", left - frame["nearest"] * size)
@@ -290,7 +279,7 @@ class BorderControl:
             if j in movable:
                 moves = moves + code.flag(at_once)
         with frame.where((count > 1.0) & (moves > 0.0)):
-            frame["crossed"] = self.clocks.coincide
+            frame["crossed"] = float(self.table.coincide)
 
     def _instant(self, frame: Frame) -> Value:
         """The largest difference of two times that count as the same."""
@@ -472,8 +461,7 @@ class BorderControl:
         for name in ("is_hit", "grazes"):
             with frame.where(frame["stepped"] > 0.0):
                 frame[name] = 0.0
-        if self.graze is not None:
-            frame.call(self.graze)
+        frame.call(self.graze)
 
     def _graze(self, base: int) -> Code:
         """`()`: set `grazes` where the step ends at a border that it only grazes.
@@ -483,8 +471,8 @@ class BorderControl:
         """
         frame, motion, n = self.motion.function("graze"), self.motion, self.motion.n
         code, order, by = frame.code, frame.job("order"), [*range(base), *range(n, n + base)]
-        line, _ = _borders.gradient(self.borders, by)
-        ends = (frame["crossed"] > 0.0) & (frame["stepped"] > 0.0)
+        line = _borders.gradient(self.borders, by)
+        ends = self.table.crosses_guard(frame) & (frame["stepped"] > 0.0)
         with code.only_if(code.any_lane(ends)):
             self.table.note_hit(frame, ends)
             state = motion.moved(frame, motion.increments(frame, order, frame["h"])[0])
@@ -538,8 +526,6 @@ class BorderControl:
                 frame["h"] = frame["planned_h"]
             if self.note is not None:
                 frame.call(self.note)
-            if self.jump_at_knot is not None:
-                self.clocks.note(frame, self.motion.evaluate_now(frame, self.motion.acceleration))
             self._go_on(frame, crossed, crosses)
             with frame.where(crosses):
                 if self.returns:
@@ -550,8 +536,6 @@ class BorderControl:
                 frame.call(self.decide)
             if self.jump is not None:
                 frame.call(self.jump)
-            if self.jump_at_knot is not None:
-                frame.call(self.jump_at_knot)
             idle = code.select(crosses & ~stepped, frame["idle_crossings"] + 1.0, 0.0)
             with frame.where(stepped | crosses):
                 frame["idle_crossings"] = idle

@@ -28,7 +28,6 @@ from lagjax._native._output import Output
 from lagjax._native._parts import MotionParts
 from lagjax._native._projection import Projector
 from lagjax._native._roots import Roots
-from lagjax._native._saltation import jump_over
 from lagjax._native._single_member import SingleMember, fills_lanes
 from lagjax._native._step import PARTS, StepControl
 from lagjax._native._taylor import TaylorSeries, double, integer, is_large
@@ -75,8 +74,8 @@ class Integrator:
         if guards is not None:
             fields |= Roots.fields(MAX_ORDER + 2)
         if borders is not None:
-            fields |= BorderControl.fields(borders, n)
-        jump = None if borders is None or borders.motion is None else jump_over(borders, nesting)
+            fields |= BorderControl.fields(borders)
+        jump = parts.jump
         large = is_large(program, projection, guards, more=() if jump is None else [jump.line])
         alone = large and width == 1 and borders is None and chosen is None
         kind = SingleMember if alone and fills_lanes(series) else TaylorSeries

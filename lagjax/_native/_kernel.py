@@ -117,8 +117,8 @@ class Kernel:
             program=program, size=size, projection=projection, guards=guards, error_groups=error_groups,
             nesting=nesting, motion=motion,
         )  # fmt: skip
-        program, projection, self._guards, chosen = parameters_chosen(
-            program, projection, guards, 2 * size + 1, size // nesting.base
+        program, projection, self._guards, motion, chosen = parameters_chosen(
+            program, projection, guards, motion, nesting
         )
         self._smooth = MotionParts.of_smooth(program, size, projection, chosen)
         self._parts = self._smooth.of_run(nesting, self._guards, motion)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
-from lagjax._program._jump import Nesting, looks_up, with_borders_of_tangents
+from lagjax._program._jump import Jump, Nesting, jump_at_border, with_borders_of_tangents
 from lagjax._program._look_ups import BESIDE, shifted
 from lagjax._program._memory import without_collections
 from lagjax._program._operations import LOOK_UPS
@@ -58,6 +58,26 @@ class MotionParts(NamedTuple):
         """The number of pieces among the inputs of the program."""
         return 0 if self.borders is None else len(self.borders.switches)
 
+    @property
+    def numbers_of_motion(self) -> int:
+        """The count of those numbers of a member that the motion itself has, where tables look up some; else 0."""
+        return 0 if self.chosen is None else self.chosen.of * self.nesting.base // self.nesting.size
+
+    @property
+    def jump(self) -> Jump | None:
+        """The jump of the tangents at a border; None without borders, or without tangents."""
+        return self._jump(self.nesting, over_steps=False)
+
+    @property
+    def jump_over_steps(self) -> Jump | None:
+        """The jump at a border of a derivative of the motion over steps that have been taken; None without borders."""
+        return self._jump(self.nesting.with_tangents(1), over_steps=True)
+
+    def _jump(self, nesting: Nesting, over_steps: bool) -> Jump | None:
+        if not self.pieces or self.borders is None or not nesting.directions:
+            return None
+        return jump_at_border(self.borders.motion or self.borders, *nesting, self.numbers_of_motion, over_steps)
+
     @classmethod
     def of_smooth(
         cls, program: Recurrent, size: int, projection: Projection | None = None, chosen: Chosen | None = None
@@ -68,13 +88,13 @@ class MotionParts(NamedTuple):
     def of_run(self, nesting: Nesting, guards: Guards | None, motion: Recurrent | None) -> "MotionParts":
         """The parts of a run, from those of the smooth motion: along its pieces, with guards behind q̈.
 
-        `motion` is the program of the motion without its tangents.
+        `motion` is the program of the motion without its tangents, of the same numbers of a member.
         """
         size, whole = nesting.size, self._replace(nesting=nesting)
         if guards is not None:
             program, series, found = watched(self.program, size, guards.values, not nesting.directions)
             return whole._replace(program=program, series=series, borders=found)
-        if (pieces := pieces_of(self.program, nesting, motion)) is None:
+        if (pieces := pieces_of(self.program, nesting, motion, whole.numbers_of_motion)) is None:
             return whole
         found, series = pieces
         return whole._replace(program=found.program, series=series, borders=found)
@@ -100,27 +120,33 @@ class _Fewer:
 
 @functools.lru_cache(maxsize=16)
 def parameters_chosen(
-    program: Recurrent, projection: Projection | None, guards: Guards | None, first: int, rows: int
-) -> "tuple[Recurrent, Projection | None, Guards | None, Chosen | None]":
+    program: Recurrent,
+    projection: Projection | None,
+    guards: Guards | None,
+    motion: Recurrent | None,
+    nesting: Nesting,
+) -> "tuple[Recurrent, Projection | None, Guards | None, Recurrent | None, Chosen | None]":
     """The programs with the parameters that they compute with, where they look up others in tables; and which.
 
-    The numbers of a member begin at input `first`, and are `rows` times as many as those of the motion without its
-    tangents: what is a parameter of one row is one of each.
+    What is a parameter of one row of the `nesting` is one of each; `motion` is the program of the first row alone.
     """
+    first, rows = 2 * nesting.size + 1, nesting.size // nesting.base
     programs: list = [program]
     programs += [] if projection is None else [projection.state, projection.velocity_scale]
     programs += [] if guards is None else [guards.values, guards.program]
     if not any(op in LOOK_UPS for one in programs for op, _, _ in one.line.nodes):
-        return program, projection, guards, None
+        return program, projection, guards, motion, None
     read = {node[2] - first for one in programs for node in one.line.nodes if node[0] == "input"}
     of = program.size - first
     read |= set() if guards is None else set(range(of - guards.inputs, of))
+    if motion is not None:
+        read |= {node[2] - 2 * nesting.base - 1 for node in motion.line.nodes if node[0] == "input"}
     own = of // rows
     columns = sorted({i % own for i in read if i >= 0}) if own else []
     positions = tuple(row * own + i for row in range(rows) for i in columns)
-    place = {first + i: first + k for k, i in enumerate(positions)}
 
-    def fewer(one):
+    def fewer(one, first=first, positions=positions):
+        place = {first + i: first + k for k, i in enumerate(positions)}
         nodes = tuple(
             (op, xs, place.get(a, a) if op == "input" else shifted(a, BESIDE - first) if op in LOOK_UPS else a)
             for op, xs, a in one.line.nodes
@@ -133,6 +159,7 @@ def parameters_chosen(
         next(done),
         projection and Projection(next(done), next(done)),
         guards and guards._replace(values=next(done), program=next(done)),
+        None if motion is None else fewer(motion, 2 * nesting.base + 1, columns),
         Chosen(positions, of),
     )
 
@@ -162,22 +189,26 @@ def recurrences(program: Recurrent, size: int) -> Series:
 
 
 @functools.lru_cache(maxsize=16)
-def pieces_of(program: Recurrent, nesting: Nesting, motion: Recurrent | None = None) -> "tuple[Borders, Series] | None":
+def pieces_of(
+    program: Recurrent, nesting: Nesting, motion: Recurrent | None = None, member: int = 0
+) -> "tuple[Borders, Series] | None":
     """The borders of a piecewise program, and the series of its motion along a piece; None where there are none.
 
-    Of a motion with its tangents they are those of the `motion` alone, moved along.
+    Of a motion with its tangents they are those of the `motion` alone, which has this many of the numbers of a
+    `member`, moved along.
     """
     size = nesting.size
-    if motion is not None and nesting.directions and not looks_up(motion):
+    if nesting.directions:
+        assert motion is not None
         if (of_motion := pieces_of(motion, Nesting(nesting.base))) is None:
             return None
         found = of_motion[0]
         for inner, directions in nesting.levels:
-            found = with_borders_of_tangents(found, inner, directions)
+            found = with_borders_of_tangents(found, inner, directions, member * (inner // nesting.base))
         with without_collections():
             return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
     try:
-        if (found := borders(program, size, not nesting.directions)) is not None:
+        if (found := borders(program, size)) is not None:
             with without_collections():
                 return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
     except Unlowerable:  # a switching number without a series, or more operations than that takes

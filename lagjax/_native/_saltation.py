@@ -6,7 +6,9 @@ derivative does. Where the border is grazed, so that a change of the state withi
 crossed, none of this exists: derivatives are NaN there, but for first ones where the acceleration is continuous.
 """
 
+import math
 from collections.abc import Callable
+from enum import IntEnum
 
 import numpy as np
 
@@ -15,17 +17,30 @@ from lagjax._native._frame import Frame, Index, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries
 from lagjax._program._borders import Borders
-from lagjax._program._jump import Jump, Nesting, jump_at_border, looks_up
+from lagjax._program._jump import Jump
+from lagjax._program._look_ups import Table
 
 NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "goes_on")
 PLACES = ("piece", "back", "slide", "on", "order", "of_table")
 
 
+class Hit(IntEnum):
+    """The borders that a step ends at: none whose instant varies, one, or several at one instant."""
+
+    NONE = 0
+    BORDER = 1
+    SEVERAL = 2
+
+
 class GuardTable:
-    """The guards of all pieces (`_program._borders.Guard`) as constants of a kernel, for loops over them."""
+    """The guards of all pieces (`_program._borders.Guard`) as constants of a kernel, for loops over them; and `knots`.
+
+    A knot is an entry of a table of parameters that the time is on; one of a table of numbers does not vary. There are
+    no derivatives by knots of several tables that coincide: the acceleration between them is not known.
+    """
 
     def __init__(self, motion: TaylorSeries, borders: Borders):
-        self.motion = motion
+        self.motion, self.borders = motion, borders
         numbers = np.array([[getattr(guard, name) for name in NUMBERS] for guard in borders.guards] or [[0.0]])
         self._numbers = integers(motion.module, np.frombuffer(numbers.tobytes(), np.int64))
         self._places = integers(
@@ -33,6 +48,10 @@ class GuardTable:
             np.array([[getattr(g, name) for name in PLACES] for g in borders.guards] or [[0]], np.int64),
         )
         self.guards = len(borders.guards)
+        first = self.guards + 1
+        # What is `crossed` at a knot of each piece, and where knots of two do.
+        self.knots = [(first + c, j) for c, j in enumerate(borders.clocks) if borders.moving_table(j) is not None]
+        self.coincide = first + len(borders.clocks)
 
     def number(self, code: Code, g: Value, name: str) -> Value:
         """A number of guard g."""
@@ -44,6 +63,18 @@ class GuardTable:
         place = g * len(PLACES) + PLACES.index(name)
         return code.load(code.element(Value(code, self._places), place, INTEGER), INTEGER)
 
+    def crosses_guard(self, frame: Frame) -> Value:
+        """True if a step ends at a border that the motion comes to, not at an instant."""
+        crosses = frame["crossed"] > 0.0
+        return crosses & (frame["crossed"] <= float(self.guards)) if self.borders.clocks else crosses
+
+    def crosses_knot(self, frame: Frame) -> Value:
+        """True if a step ends at knots that are parameters."""
+        found = frame.code.compare("==", frame["crossed"], float(self.coincide))
+        for crossed, _ in self.knots:
+            found = found | frame.code.compare("==", frame["crossed"], float(crossed))
+        return found
+
     def note_hit(self, frame: Frame, where: Value | None = None) -> None:
         """The pieces, and which switching number the guard `crossed` has; none where a motion begins on the border.
 
@@ -51,11 +82,7 @@ class GuardTable:
         """
         motion, code, crossed = self.motion, frame.code, frame["crossed"]
         where = frame.constant(0.0) <= 0.0 if where is None else where
-        with frame.where(where):
-            frame["is_hit"] = 0.0
-            with code.loop(motion.pieces) as j:
-                frame["hit", j] = 0.0
-                frame["pieces_before", j] = frame["params", j + motion.parameters]
+        self._note_pieces(frame, where)
         with code.loop(self.guards) as g:
             j = self.place(code, g, "piece")
             side = frame["pieces_before", j] * self.number(code, g, "a") + self.number(code, g, "b")
@@ -63,41 +90,57 @@ class GuardTable:
             hit = hit & code.compare("!=", side, 0.0)
             with frame.where(hit):
                 frame["hit", j] = 1
-                frame["is_hit"] = 1
+                frame["is_hit"] = Hit.BORDER
+                if self.borders.levels_move:
+                    frame["entry", j] = frame["params", j + motion.parameters] + self.number(code, g, "e")
 
+    def note_knot(self, frame: Frame, where: Value) -> None:
+        """The same of knots that are parameters."""
+        if not self.knots:
+            return
+        code = frame.code
+        where = where & self.crosses_knot(frame)
+        with code.only_if(code.any_lane(where)):
+            self._note_pieces(frame, where)
+            both = where & code.compare("==", frame["crossed"], float(self.coincide))
+            for k, (crossed, j) in enumerate(self.knots):
+                with frame.where(both | (where & code.compare("==", frame["crossed"], float(crossed)))):
+                    # Where several coincide no rational directions of theirs cancel, to a jump of nothing.
+                    frame["hit", j] = math.exp(k)
+                    frame["entry", j] = frame["params", j + self.motion.parameters] + code.flag(frame["h"] > 0.0)
+                    frame["is_hit"] = Hit.BORDER
+            with frame.where(both):
+                frame["is_hit"] = Hit.SEVERAL
 
-def jump_over(borders: Borders | None, nesting: Nesting) -> Jump | None:
-    """The jump of tangents at a border; None without borders, without tangents, and where tables are looked up.
-
-    The last tangents may be those of a derivative over steps that have been taken.
-    """
-    if borders is None or not borders.switches or not nesting.directions or looks_up(borders.program):
-        return None
-    return jump_at_border(borders.motion or borders, *nesting)
-
-
-def jump_along(borders: Borders | None, nesting: Nesting) -> Jump | None:
-    """`jump_over` for tangents of the motion at hand, whose own `nesting` this is."""
-    if borders is None or (nesting.directions and borders.motion is None):
-        return None
-    return jump_over(borders, nesting.with_tangents(1))
+    def _note_pieces(self, frame: Frame, where: Value) -> None:
+        with frame.where(where):
+            frame["is_hit"] = Hit.NONE
+            with frame.code.loop(self.motion.pieces) as j:
+                frame["hit", j] = 0.0
+                frame["pieces_before", j] = frame["params", j + self.motion.parameters]
+                if self.borders.levels_move:
+                    frame["entry", j] = 0.0
 
 
 class Saltation:
-    """The jumps (`jump_over`) of a motion with tangents, whose first `base` coordinates are the motion alone."""
+    """The jumps of a motion with tangents, whose first `base` coordinates are the motion alone."""
 
-    def __init__(self, motion: TaylorSeries, borders: Borders, base: int, jump: Jump):
+    def __init__(self, motion: TaylorSeries, table: GuardTable, base: int, jump: Jump):
         self.motion, self.base, self.pieces, self.jump = motion, base, motion.pieces, jump
-        self.table = GuardTable(motion, borders)
+        self.table, self.several = table, len(table.knots) > 0 and len(table.borders.clocks) > 1
+        self.chosen = jump.fixed - 2 * self.pieces
         self.parameters = motion.parameters * self.base // motion.n  # of the motion alone
 
     @staticmethod
-    def fields(pieces: int) -> dict:
+    def fields(borders: Borders) -> dict:
         """The fields of a thread's memory: the pieces before the border, and which switching number is zero there.
 
-        `is_hit` is 1 where one is, `grazes` where its rate is zero to the tolerance.
+        `entry` numbers the entries of tables that are levels, behind `hit`. `is_hit` is a `Hit`; `grazes` is 1 where
+        the rate of the switching number is zero to the tolerance.
         """
-        return {"pieces_before": pieces, "hit": pieces, "is_hit": 1, "grazes": 1}
+        pieces = len(borders.switches)
+        entries = {"entry": pieces} if borders.levels_move else {}
+        return {"pieces_before": pieces, "hit": pieces, **entries, "is_hit": 1, "grazes": 1}
 
     # ---- what jumps ----
 
@@ -110,15 +153,15 @@ class Saltation:
 
         return jumps
 
-    def tangent_jumps(self, frame: Frame, out: Numbers, is_hit: Value, grazes: Value) -> Callable:
+    def tangent_jumps(self, frame: Frame, out: Numbers, hit: Value, grazes: Value) -> Callable:
         """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
         code, n = frame.code, self.base
         first = (len(self.jump.orders) - 1) * 2 * n
         jumps = self._jumps(code, *(_some(out, first + k * n, n) for k in range(2)))
+        is_hit, existing = hit > 0.0, self._existing(code, hit, grazes > 0.0)
 
         def added(row: int, i: Index, part: int) -> Value:
-            step = out[i + ((row - 1) * 2 + part) * n]
-            step = code.select(grazes, float("nan"), step)
+            step = existing(out[i + ((row - 1) * 2 + part) * n])
             moves = is_hit & jumps(i) if self.jump.orders[row] == 1 else is_hit
             if self.jump.orders[row] == 1 and not part:
                 return frame.constant(0.0)
@@ -126,12 +169,24 @@ class Saltation:
 
         return added
 
+    def _existing(self, code: Code, hit: Value, grazes: Value) -> Callable[[Value], Value]:
+        """`(jump)`: the jump, or NaN where there is none: at a border that is grazed, and where knots coincide."""
+        several = hit > float(Hit.BORDER) if self.several else None
+
+        def existing(jump: Value) -> Value:
+            if several is not None:
+                jump = code.select(several & code.compare("!=", jump, 0.0), float("nan"), jump)
+            return code.select(grazes, float("nan"), jump)
+
+        return existing
+
     # ---- in a run: the motion with its tangents ----
 
     def note(self) -> Code:
         """`()`: the state at the border that a step ends at. Several may be crossed there, one after the other."""
         frame = self.motion.function("note_before")
         stepped = frame["stepped"] > 0.0
+        self.table.note_knot(frame, stepped)
         for i in self.motion.form.each(frame.code, self.motion.states):
             with frame.where(stepped):
                 frame["edge", i] = frame["y", i]
@@ -147,12 +202,12 @@ class Saltation:
             parts = [
                 _field(frame, "edge", lower), _field(frame, "edge", lower, n), frame.vectors("t", 1),
                 _field(frame, "params", numbers), frame.vectors("pieces_before", self.pieces),
-                _field(frame, "params", self.pieces, motion.parameters), frame.vectors("hit", self.pieces),
+                _field(frame, "params", self.pieces, motion.parameters), *self._choice(frame.vectors),
                 _field(frame, "edge", n - lower, lower), _field(frame, "edge", n - lower, n + lower),
                 _field(frame, "params", motion.parameters - numbers, numbers),
             ]  # fmt: skip
             out = motion.form.run(frame, self.jump.line, *parts)
-            added = self.tangent_jumps(frame, out, is_hit, frame["grazes"] > 0.0)
+            added = self.tangent_jumps(frame, out, frame["is_hit"], frame["grazes"])
             for row in range(1, len(self.jump.orders)):
                 for part in range(2):
                     for i in motion.form.each(code, base):
@@ -172,6 +227,7 @@ class Saltation:
         """The state at the end of a step, and what is to be known of the border there."""
         motion, code = self.motion, frame.code
         self.table.note_hit(frame)
+        self.table.note_knot(frame, frame["crossed"] > 0.0)
         moved = motion.moved(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
         for i in motion.form.each(code, motion.states):
             frame["edge", i] = moved[i]
@@ -180,22 +236,31 @@ class Saltation:
     def note_end(self) -> Code:
         """`()`: note the state at the border that a step ends at."""
         frame = self.motion.function("note_end")
-        frame["is_hit"] = 0.0
-        with frame.code.only_if(frame.code.any_lane(frame["crossed"] > 0.0)):
+        frame["is_hit"] = Hit.NONE
+        with frame.code.only_if(frame.code.any_lane(self.crosses(frame))):
             self.note_edge(frame)
         return frame.finish()
+
+    def crosses(self, frame: Frame) -> Value:
+        """True if a step ends at a border whose instant varies."""
+        crosses = self.table.crosses_guard(frame)
+        return crosses | self.table.crosses_knot(frame) if self.table.knots else crosses
+
+    def _choice(self, numbers: Callable) -> list:
+        """The numbers that choose the switching number, as inputs of the jump."""
+        return [numbers("hit", self.pieces), *([numbers("entry", self.pieces)] if self.chosen > self.pieces else [])]
 
     def at_edge(self, numbers: Callable, behind: Vectors) -> list:
         """The inputs of the jump but for its upper rows; `numbers(name, count)` gives vectors of the motion."""
         return [
             numbers("edge", self.motion.states), numbers("edge_t", 1), numbers("params", self.motion.parameters),
-            numbers("pieces_before", self.pieces), behind, numbers("hit", self.pieces),
+            numbers("pieces_before", self.pieces), behind, *self._choice(numbers),
         ]  # fmt: skip
 
-    def cotangent_jumps(self, frame: Frame, behind: Vectors) -> Callable:
+    def cotangent_jumps(self, frame: Frame, behind: Vectors) -> tuple[Callable, tuple[Table, ...], list[Value]]:
         """`(row, i)`: the gain of the cotangent of number i of a row, q, q̇ and then the parameters, at the `edge`.
 
-        Of `state_ct`, with the pieces `behind` the border.
+        Of `state_ct`, with the pieces `behind` the border. And tables, with the numbers of entries and their gains.
         """
         n, rows, motion, code = self.base, self.jump.lower, self.motion, frame.code
         inputs = self.at_edge(lambda name, count: frame.vectors(name, count), behind)
@@ -210,16 +275,21 @@ class Saltation:
                         ct = code.select(jumps(i), ct, 0.0) if part else frame.constant(0.0)
                     cotangents[i + (2 * row + part) * n] = ct
                     sum.value += code.intrinsic("fabs", ct)
-        line = self.jump.transposed(n, self.parameters, self.pieces)
+        line, tables = self.jump.transposed(n, self.parameters)
         gains = motion.form.run(frame, line, *inputs, cotangents)
         moves = (frame["is_hit"] > 0.0) & ~(sum.value <= 0.0)
-        without = frame["grazes"] > 0.0
+        existing = self._existing(code, frame["is_hit"], frame["grazes"] > 0.0)
+
+        def gain_at(place: Index) -> Value:
+            return code.select(moves, existing(gains[place]), 0.0)
 
         def gain(row: int, i: Index) -> Value:
-            step = gains[i + row * (2 * n + self.parameters)]
-            return code.select(moves, code.select(without, float("nan"), step), 0.0)
+            return gain_at(i + row * (2 * n + self.parameters))
 
-        return gain
+        first, entries = rows * (2 * n + self.parameters), []
+        for k in range(len(tables)):
+            entries += [gains[first + 2 * k], gain_at(first + 2 * k + 1)]
+        return gain, tables, entries
 
 
 def _some(numbers: Numbers, first: int, count: int) -> Numbers:

@@ -14,7 +14,6 @@ A step that suits the motion may be too long for its tangents: about an equilibr
 of a tangent does not. So the last two terms of their series are measured, and `excess` says how large they became.
 """
 
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,19 +21,15 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._constants import MAX_ORDER
-from lagjax._native._first_saltation import FirstSaltation
 from lagjax._native._frame import Frame, Lane, Memory, Vectors, integers, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
 from lagjax._native._parts import MotionParts
 from lagjax._native._replay import Replay
-from lagjax._native._saltation import GuardTable, Saltation, jump_along
+from lagjax._native._saltation import GuardTable, Saltation
 from lagjax._native._tables import Tables
 from lagjax._native._taylor import TaylorSeries, double, integer, is_large
-from lagjax._native._time_knots import TimeKnots
-from lagjax._program._borders import Borders
 from lagjax._program._differentiation import pushforward
-from lagjax._program._jump import Jump, Nesting
 
 # `y_dot` is the tangent of the start, and becomes that of the end.
 JOB = job(
@@ -63,21 +58,20 @@ class Tangent:
     ):
         program, series, nesting, projection, borders, _ = parts
         n, states, pieces = series.size, 2 * series.size, parts.pieces
-        jump = jump_along(borders, nesting)
+        jump = parts.jump_over_steps
         large = is_large(program, projection, times=2, more=() if jump is None else [jump.line])
         fields = {"active": 1, "next_begin": 1} | ({"moved": states} if projection is not None else {})
         if borders is not None:
-            fields |= FirstSaltation.fields(pieces, n) if jump is None else Saltation.fields(pieces)
-            fields |= {"crossed": 1, "grazes": 1}
+            fields |= Saltation.fields(borders) | {"crossed": 1, "grazes": 1}
         self.motion = TaylorSeries(
             "tangent", parts, JOB, fields, large, width, keep_sums=True
         )  # fmt: skip
         self.n, self.states, self.series, self.lanes, self.numbers = n, states, series, lanes, self.motion.parameters
-        self.clocks: TimeKnots | None = None
-        self.base = nesting.base
-        self.saltation: Saltation | FirstSaltation | None = None
-        if borders is not None:
-            self._note_borders(borders, nesting, jump)
+        self.saltation: Saltation | None = None
+        if borders is not None and jump is not None:
+            self.saltation = Saltation(self.motion, GuardTable(self.motion, borders), nesting.base, jump)
+            self.motion.layout.extend_by(self.saltation.fields_along())
+            self.note_border = self.saltation.note_end()
         self.layout = Memory(lanes, self._fields(), beside=self.motion.layout)
         sincos = sincos_function(self.motion.module, lanes, "sincos_of_tangents")
         look_up = self.motion.look_up
@@ -98,22 +92,6 @@ class Tangent:
         if self.form is not self.motion.form:
             self.form.finish()
         self.motion.finish()
-
-    def _note_borders(self, borders: Borders, nesting: Nesting, jump: Jump | None) -> None:
-        """Build the functions that note a border at the end of a step, and jump over it."""
-        if jump is not None:
-            self.saltation = Saltation(self.motion, borders, nesting.base, jump)
-            self.motion.layout.extend_by(self.saltation.fields_along())
-            self.note_border = self.saltation.note_end()
-        else:
-            self.saltation = FirstSaltation(self.motion, borders, nesting)
-            self.motion.layout.extend_by(self.saltation.fields_along())
-            self.begin_behind = self.saltation.note_begin()
-            self.note_border = self.saltation.note_end(GuardTable(self.motion, borders))
-        clocks = TimeKnots(self.motion, borders)
-        if clocks.exist:
-            self.motion.layout.extend_by(clocks.fields())
-            self.clocks, self.note_knot = clocks, clocks.note_end()
 
     def _fields(self) -> dict:
         """The fields of the direction at hand, in every lane: the tangents of the motion's fields."""
@@ -195,8 +173,6 @@ class Tangent:
         directions, per_group = frame.job("directions"), self.lanes // self.motion.width
         with self.replay.rounds(frame, rounds, self._leave_step):
             self._await_end(frame)
-            if isinstance(self.saltation, FirstSaltation):
-                frame.call(self.begin_behind)
             if self.projection is not None:
                 self._move(frame)
             with code.loop((directions + (per_group - 1)) / per_group) as group:
@@ -204,8 +180,6 @@ class Tangent:
                     frame.call(step, group)
             if self.saltation is not None:
                 frame.call(self.note_border)
-            if self.clocks is not None:
-                frame.call(self.note_knot)
         frame.finish(self.motion.more(frame))
 
     def _move(self, frame: Frame) -> None:
@@ -224,8 +198,6 @@ class Tangent:
             tangents["excess"] = 0.0
         if self.saltation is not None:
             lane["is_hit"] = 0.0
-        if self.clocks is not None:
-            lane["knot_of"] = 0.0
 
     def _await_end(self, frame: Frame) -> None:
         """Set the beginning of the next step of every lane, up to which outputs belong to this one."""
@@ -282,28 +254,8 @@ class Tangent:
         if self.saltation is not None:
             is_hit = self.number_of(frame, "is_hit") > 0.0
             with code.only_if(code.any_lane(is_hit)):
-                if isinstance(self.saltation, FirstSaltation):
-                    self._jump_first(frame, self.saltation, is_hit)
-                else:
-                    self._jump(frame, self.saltation, is_hit)
-        if self.clocks is not None:
-            with code.only_if(code.any_lane(self.number_of(frame, "knot_of") > 0.0)):
-                self._jump_at_knot(frame, self.clocks)
+                self._jump(frame, self.saltation, is_hit)
         return frame.finish()
-
-    def _jump_at_knot(self, frame: Frame, clocks: TimeKnots) -> None:
-        """The tangents behind an entry of a table that the time is on, at the beginning of the step from there."""
-        code, n = frame.code, self.n
-        knot_of, knot = self.number_of(frame, "knot_of"), self.number_of(frame, "knot")
-        change = clocks.moved(frame, knot_of, knot, lambda table: table._replace(tangents=True))
-        before = self.numbers_of(frame, "before_knot", n)
-        jump = clocks.jump(code, before, self.numbers_of(frame, "y", n, lambda i: (i + n, 1)))
-        moves = (knot_of > 0.0) & code.compare("!=", change, 0.0)
-        if self.base < n:
-            change = code.select(moves, float("nan"), change)
-        for i in self.form.each(code, n):
-            moved = code.select(moves & code.compare("!=", jump(i), 0.0), jump(i) * change, 0.0)
-            frame["dy", i + n, 0] = frame["dy", i + n, 0] + moved
 
     def _jump(self, frame: Frame, saltation: Saltation, is_hit: Value) -> None:
         """The tangents behind a border, at the beginning of the step from there."""
@@ -316,37 +268,12 @@ class Tangent:
         tangents = [frame.vectors("dy", n, lambda i: (i, 0)), frame.vectors("dy", n, lambda i: (i + n, 0))]
         inputs = saltation.at_edge(numbers, numbers("params", self.motion.pieces, behind))
         out = form.run(frame, jump.line, *inputs, *tangents, frame.vectors("dparams", self.numbers))
-        added = saltation.tangent_jumps(frame, out, is_hit, self.number_of(frame, "grazes") > 0.0)
+        added = saltation.tangent_jumps(frame, out, self.number_of(frame, "is_hit"), self.number_of(frame, "grazes"))
         for row in range(jump.lower):
             for part in range(2):
                 for i in form.each(frame.code, base):
                     place = i + (part * n + row * base)
                     frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
-
-    def _jump_first(self, frame: Frame, saltation: FirstSaltation, is_hit: Value) -> None:
-        """The tangents behind a border of a program that looks up tables."""
-        code, form, n = frame.code, self.form, self.n
-        base = saltation.base
-        slopes = self.numbers_of(frame, "slopes", saltation.slopes)
-        jump = self.numbers_of(frame, "jump", n)
-        by_state = (
-            slopes[i] * frame["dy", i, 0] + slopes[i + base] * frame["dy", i + n, 0] for i in form.each(code, base)
-        )
-        by_parameters = (
-            slopes[k + (2 * base + 1)] * frame["dparams", k] for k in form.each(code, saltation.parameters)
-        )
-        entries = saltation.by_entries(frame, slopes, lambda table: table._replace(tangents=True))
-        change = code.total(itertools.chain(by_state, by_parameters, entries))
-        delay = 0.0 - change / self.number_of(frame, "rate")
-        always = is_hit & (self.number_of(frame, "jumps") > 0.0)  # where the tangents of the motion jump themselves
-        for first, count in ((0, base), (base, n - base)):
-            if first:
-                delay = code.select(always, float("nan"), delay)
-            for i in form.each(code, count):
-                moves = is_hit & code.compare("!=", jump[i + first], 0.0)
-                moves = moves | always if first else moves
-                moved = code.select(moves, jump[i + first] * delay, 0.0)
-                frame["dy", i + (n + first), 0] = frame["dy", i + (n + first), 0] + moved
 
     def _now(self, frame: Frame, state: Vectors, t: Value, tangents: Vectors) -> list:
         """The inputs of a program at a state, and their tangents: those of the state, and of the parameters."""

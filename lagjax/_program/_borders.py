@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._program._differentiation import copied, gradient_in, pullback_and_entries
+from lagjax._program._differentiation import copied, gradient_in, pullback
 from lagjax._program._graph import Graph
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS
@@ -124,7 +124,7 @@ class Borders(NamedTuple):
 
     def moving_table(self, j: int) -> Table | None:
         """The table of parameters whose entries are the levels of piece j; None where it has none."""
-        located = self.tables[j] if self.kinds[j] == TABLE else None
+        located = self.tables[j] if self.kinds[j] in (TABLE, CLOCK) else None
         return None if located is None or located.table.numbers is not None else located.table
 
     @property
@@ -617,20 +617,8 @@ def _floor_divisions(line: StraightLine) -> dict[int, tuple[int, int]]:
     return found
 
 
-def gradient(borders: Borders, by: Sequence[int]) -> tuple[StraightLine, tuple[Table, ...]]:
-    """The derivatives by the inputs `by` of Σ hⱼ (uⱼ − levelⱼ), with numbers hⱼ after the inputs of the program.
-
-    Where levels are parameters (`levels_move`), the m numbers of the entries that they are stand before the numbers hⱼ.
-    Behind the derivatives come those by entries of tables (`_transpose.pullback_and_entries`).
-    """
-    program, dtypes = borders.program, borders.program.dtypes
-    graph, switches = Graph.of(program.line, program.budget + _LARGEST * len(borders.switches) + 1000), []
-    for j, node in enumerate(borders.switches):
-        if (table := borders.moving_table(j)) is not None:
-            entry = graph.input(program.size + j, "float")
-            node = graph.apply("sub", node, graph.apply("take", entry, attribute=table))
-        switches.append(node)
-    if borders.levels_move:
-        dtypes = (*dtypes, *[np.dtype(float)] * len(switches))
-    line = StraightLine(*live(tuple(graph.nodes), tuple(graph.kinds), switches))
-    return pullback_and_entries(line, dtypes, by, range(len(switches)))
+def gradient(borders: Borders, by: Sequence[int]) -> StraightLine:
+    """The derivatives by the inputs `by` of Σ hⱼ uⱼ, with m numbers hⱼ after the inputs of the program."""
+    program = borders.program
+    line = StraightLine(*live(program.line.nodes, program.line.kinds, borders.switches))
+    return pullback(line, program.dtypes, by, range(len(borders.switches)))

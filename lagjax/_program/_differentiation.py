@@ -27,6 +27,7 @@ from lagjax._program._series import StraightLine
 
 _Rule = Callable[[int], int]
 Tangents = dict[int, int]  # by the number of the direction; a direction that is not there has none
+TangentTable = Callable[[Table], Table]  # the table of the tangents of the entries of a table
 
 _LARGEST = 100  # operations of a derivative for one of a line: a bound for errors, three are usual
 
@@ -222,7 +223,7 @@ def pushforward(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Seq
     placed = _PlacedLine.in_new_graph(line, dtypes, len(by))
     with np.errstate(all="ignore"):
         tangents = {i: placed.graph.input(place, "float") for i, place in places.items()}
-        moved = placed.tangents(tangents, places, beside=True)
+        moved = placed.tangents(tangents, places, lambda table: table._replace(tangents=True))
         zero = placed.graph.constant(0.0, "float")
         return placed.finished([moved.get(line.outputs[i], zero) for i in of], known, len(dtypes) + len(by))
 
@@ -238,31 +239,42 @@ def pullback(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequen
 
 
 def pullback_and_entries(
-    line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=()
+    line: StraightLine,
+    dtypes: Sequence,
+    by: Sequence[int],
+    of: Sequence[int],
+    known=(),
+    varies: Callable[[Table], bool] = lambda table: True,
 ) -> tuple[StraightLine, tuple[Table, ...]]:
     """`pullback`, and the cotangents of the entries of tables that are not among the inputs `by`.
 
-    For each of the tables two outputs come behind those of the inputs: the index of an entry, and its cotangent.
+    For each of the tables two outputs come behind those of the inputs: the index of an entry, and its cotangent. Only
+    entries of tables for which `varies` is true have cotangents.
     """
     placed, tables = _PlacedLine.in_new_graph(line, dtypes), []
     with np.errstate(all="ignore"):
         cotangents: dict[int, int] = {}
         for k, output in enumerate(of):
             placed._add(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
-        results = placed.cotangents(cotangents, by, tables)
+        results = placed.cotangents(cotangents, by, tables, varies)
         results += [i for _, *entry in tables for i in entry]
         done = placed.finished(results, known, len(dtypes) + len(of))
     return done, tuple(table for table, *_ in tables)
 
 
 def with_tangents(
-    line: StraightLine, dtypes: Sequence, places: Sequence[int], directions: Sequence[dict[int, int]], of: Sequence
+    line: StraightLine,
+    dtypes: Sequence,
+    places: Sequence[int],
+    directions: Sequence[dict[int, int]],
+    of: Sequence,
+    tables: "Sequence[TangentTable | None] | None" = None,
 ) -> StraightLine:
     """A straight line and its tangents along some directions, in one.
 
     Input i of `line` is input `places[i]` of the result, its tangent along a direction d input `directions[d][i]`; an
-    input that is not there does not move. The outputs are `of`, pairs of an output and a direction, or None for the
-    output itself.
+    input that is not there does not move. Of numbers of a member that are only looked up, `tables[d]` gives the table
+    of tangents. The outputs are `of`, pairs of an output and a direction, or None for the output itself.
     """
     graph, kinds = Graph(_LARGEST * len(line.nodes) * (1 + len(directions)) + 1000), [*map(_kind, dtypes)]
     with np.errstate(all="ignore"):
@@ -272,9 +284,9 @@ def with_tangents(
         ]
         placed = _PlacedLine(graph, line, copied(graph, line, ids, places))
         moved = []
-        for direction in directions:
+        for direction, table in zip(directions, tables or [None] * len(directions), strict=True):
             tangents = {i: place + INPUTS for i, place in direction.items() if kinds[i] == "float"}
-            moved.append(placed.tangents(tangents, direction))
+            moved.append(placed.tangents(tangents, direction, table))
         zero = graph.constant(0.0, "float")
         results = []
         for output, direction in of:
@@ -323,10 +335,13 @@ class _PlacedLine(Derivatives):
         positions = {node: first + k for k, node in enumerate(values) if done.nodes[node][1]}
         return StraightLine(*replace_by_inputs(done.nodes, done.kinds, done.outputs[:count], positions))
 
-    def tangents(self, of_inputs: dict[int, int], places: dict[int, int], beside: bool = False) -> dict[int, int]:
+    def tangents(
+        self, of_inputs: dict[int, int], places: dict[int, int], beside: "TangentTable | None" = None
+    ) -> dict[int, int]:
         """The tangents of the nodes that have some, from those of the inputs.
 
-        The tangent of input i is input `places[i]`. Tables that are not among these have theirs `beside` the inputs.
+        The tangent of input i is input `places[i]`. Of a table that is not among these, `beside` gives that of the
+        tangents of its entries; None: they have none.
         """
         graph, line, nodes, tangents = self.graph, self.line, self.nodes, {}
         for k, (op, operands, attribute) in enumerate(line.nodes):
@@ -349,14 +364,20 @@ class _PlacedLine(Derivatives):
                 tangents[k] = parts[k]
         return tangents
 
-    def cotangents(self, cotangents: dict[int, int], by: Sequence[int], tables: list | None = None) -> list[int]:
+    def cotangents(
+        self,
+        cotangents: dict[int, int],
+        by: Sequence[int],
+        tables: list | None = None,
+        varies: Callable[[Table], bool] = lambda table: False,
+    ) -> list[int]:
         """The cotangents of the inputs `by`, from those of some nodes.
 
-        Those of entries of a table are added to `tables`: the table, the index, and the cotangent; or, where the table
-        consists of inputs `by`, to each of these.
+        Those of entries of a table that `varies` are added to `tables`: the table, the index, and the cotangent; or,
+        where the table consists of inputs `by`, to each of these.
         """
         line, nodes, inputs, results = self.line, self.nodes, frozenset(by), {}
-        varied = self._varied_by(inputs, tables is not None)
+        varied = self._varied_by(inputs, varies)
         for k in range(len(line.nodes) - 1, -1, -1):
             (op, operands, attribute), g = line.nodes[k], cotangents.get(k)
             if g is None or not varied[k]:
@@ -377,12 +398,12 @@ class _PlacedLine(Derivatives):
                         self._add(cotangents, i, self._zero_where_zero(k, g, rule(g)))
         return [results[i] if i in results else self._number(0.0) for i in by]
 
-    def _varied_by(self, inputs: frozenset[int], tables: bool) -> list[bool]:
-        """True for every node that depends on some inputs, or on entries of tables."""
+    def _varied_by(self, inputs: frozenset[int], varies: Callable[[Table], bool]) -> list[bool]:
+        """True for every node that depends on some inputs, or on entries of a table that `varies`."""
         varied: list[bool] = []
         for (op, operands, attribute), kind in zip(self.line.nodes, self.line.kinds, strict=True):
             if op == "take":
-                varied.append(attribute.numbers is None and (tables or attribute.first in inputs))
+                varied.append(attribute.numbers is None and (attribute.first in inputs or varies(attribute)))
             else:
                 depends = attribute in inputs if op == "input" else any(varied[i] for i in operands)
                 varied.append(kind == "float" and depends)
@@ -401,12 +422,12 @@ class _PlacedLine(Derivatives):
         return self.graph.apply("select", self.graph.apply("eq", g, zero), part, zero)
 
 
-def _tangents_of(table: Table, places: dict[int, int], beside: bool) -> Table | None:
+def _tangents_of(table: Table, places: dict[int, int], beside: "TangentTable | None") -> Table | None:
     """The table of the tangents of the entries of another one; None where they have none."""
     if table.numbers is not None:
         return None
     if table.first not in places:
-        return table._replace(tangents=True) if beside else None
+        return None if beside is None else beside(table)
     first = places[table.first]
     stride = places[table.first + table.stride] - first if table.count > 1 else 1
     return table._replace(first=first, stride=stride)

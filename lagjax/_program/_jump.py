@@ -25,10 +25,11 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._program._borders import Borders, Pieced
-from lagjax._program._differentiation import copied, pullback, tangents_in, with_tangents
+from lagjax._program._differentiation import TangentTable, copied, pullback_and_entries, tangents_in, with_tangents
 from lagjax._program._graph import Graph, Unlowerable
+from lagjax._program._look_ups import Table, shifted
 from lagjax._program._passes import eliminate_dead_code, live
-from lagjax._program._series import Recurrent, StraightLine
+from lagjax._program._series import StraightLine
 
 # Explicit Runge–Kutta methods of order s with s stages: what of the stages before goes into each, and into the step.
 # Source: Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.1.
@@ -73,26 +74,30 @@ class Jump(NamedTuple):
 
     `line` takes the lower rows of q, of q̇, t, the lower rows of the parameters, the m pieces before and behind the
     border, m numbers that choose the switching number Σ hⱼ uⱼ, then the upper rows of q, of q̇ and of the parameters:
-    those that move along the last directions. It gives the jumps of q and q̇, row after row from row 1 on, then the
-    accelerations before and behind the border. `orders` says how many derivatives each row is.
+    those that move along the last directions. Where levels are entries of tables of parameters, the numbers of the m
+    entries stand behind the hⱼ, and uⱼ is less its level. It gives the jumps of q and q̇, row after row from row 1 on,
+    then the accelerations before and behind the border. `orders` says how many derivatives each row is, `fixed` how
+    many of the inputs belong to no row.
     """
 
     line: StraightLine
     orders: tuple[int, ...]
     lower: int
+    fixed: int
 
     def accelerations(self, size: int) -> StraightLine:
         """The line from the same inputs to the accelerations before and behind the border alone."""
         return StraightLine(*live(self.line.nodes, self.line.kinds, self.line.outputs[-2 * size :]))
 
-    def transposed(self, size: int, parameters: int, pieces: int) -> StraightLine:
+    def transposed(self, size: int, parameters: int) -> tuple[StraightLine, tuple[Table, ...]]:
         """The line from all but the upper rows, and cotangents of their jumps, to cotangents of these rows.
 
         The upper rows are as many as the lower ones, for along one direction they are linear. Cotangents come and go
-        row after row; those of a row are of q and q̇, and where they go to also of its parameters.
+        row after row; those of a row are of q and q̇, and where they go to also of its parameters. Behind them come the
+        cotangents of entries of tables, as `pullback_and_entries` gives them.
         """
         n, rows = size, self.lower
-        first = rows * (2 * n + parameters) + 1 + 3 * pieces
+        first = rows * (2 * n + parameters) + 1 + self.fixed
         upper = rows * (2 * n + parameters)
         by = [
             place
@@ -104,25 +109,21 @@ class Jump(NamedTuple):
             )
         ]
         of = range((rows - 1) * 2 * n, (2 * rows - 1) * 2 * n)
-        line = pullback(self.line, [np.dtype(float)] * (first + upper), by, of)
+        dtypes = [np.dtype(float)] * (first + upper)
+        line, tables = pullback_and_entries(self.line, dtypes, by, of, varies=lambda table: table.tangents)
         nodes = []
         for op, operands, attribute in line.nodes:
             if op == "input" and attribute >= first + upper:
                 attribute -= upper
             nodes.append((op, operands, attribute))
-        return line._replace(nodes=tuple(nodes))
+        return line._replace(nodes=tuple(nodes)), tables
 
 
-def looks_up(program: Recurrent) -> bool:
-    """True if a program reads tables, of which the jumps here know nothing."""
-    return any(op in ("take", "locate") for op, *_ in program.line.nodes)
-
-
-def with_borders_of_tangents(borders: Borders, size: int, directions: int) -> Borders:
+def with_borders_of_tangents(borders: Borders, size: int, directions: int, member: int) -> Borders:
     """The borders of a motion together with its tangents along this many directions; along a piece these are smooth.
 
     The inputs q, q̇ and the parameters have 1 + D rows, those of the motion and then one for each direction, and so have
-    the accelerations.
+    the accelerations. The motion has this many of the numbers of a `member`, of which tables look up some.
     """
     program, pieces, n, rows = borders.program, len(borders.switches), size, 1 + directions
     numbers = program.size - 2 * n - 1 - pieces
@@ -134,7 +135,8 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int) -> Bo
     line = program.line._replace(outputs=(*program.line.outputs[: n + 1], *followed))
     every = [None, *range(directions)]
     of = [(i, row) for row in every for i in range(n)] + [(n + k, None) for k in range(1 + len(followed))]
-    line = with_tangents(line, program.dtypes, places, moving, of)
+    tables = [_table_of_row(row * member) for row in range(1, rows)]
+    line = with_tangents(line, program.dtypes, places, moving, of, tables)
     switches = line.outputs[rows * n + 1 :]
     dtypes = (np.dtype(float),) * (first_piece + pieces)
     decided = {i: place for i, place in enumerate(places)}
@@ -156,6 +158,11 @@ def _places(n: int, numbers: int, rows: int, row: int) -> list[int]:
     ]  # fmt: skip
 
 
+def _table_of_row(shift: int) -> TangentTable:
+    """The table of a row of tangents, which stands this many numbers of a member behind that of the motion."""
+    return lambda table: shifted(table, shift)
+
+
 def _renumbered(line: StraightLine, places: dict[int, int]) -> StraightLine:
     """The line with other numbers of its inputs."""
     return line._replace(nodes=tuple((op, of, places[x]) if op == "input" else (op, of, x) for op, of, x in line.nodes))
@@ -164,17 +171,20 @@ def _renumbered(line: StraightLine, places: dict[int, int]) -> StraightLine:
 # ---- the jump --------------------------------------------------------------------------------------------------------
 
 
-def jump_at_border(borders: Borders, size: int, directions: tuple[int, ...]) -> Jump:
+def jump_at_border(
+    borders: Borders, size: int, directions: tuple[int, ...], member: int, over_steps: bool = False
+) -> Jump:
     """The jump of the tangents of a motion, of tangents of these and so on, along this many `directions` each.
 
-    `borders` are those of the motion alone. Raises `Unlowerable` where directions are of too many kinds.
+    `borders` are those of the motion alone, which has this many of the numbers of a `member`. The last tangents may be
+    those of a derivative `over_steps` that have been taken. Raises `Unlowerable` for more than four kinds of them.
     """
     if len(directions) > len(_STAGES):
         raise Unlowerable(
             f"derivatives of order {len(directions)} over a border are not known, of {len(_STAGES)} they are"
         )
     with np.errstate(all="ignore"):
-        return _OverBorder(borders, size, directions).finished()
+        return _OverBorder(borders, size, directions, member, over_steps).finished()
 
 
 class _OverBorder:
@@ -183,9 +193,11 @@ class _OverBorder:
     A direction 0 is none. Rows are numbered with i₁ as the first to change.
     """
 
-    def __init__(self, borders: Borders, size: int, directions: tuple[int, ...]):
+    def __init__(self, borders: Borders, size: int, directions: tuple[int, ...], member: int, over_steps: bool):
         program = borders.program
         self.n, self.pieces, self.directions = size, len(borders.switches), directions
+        self.member, self.over_steps = member, over_steps
+        self.chosen = self.pieces * (2 if borders.levels_move else 1)  # numbers that choose what is zero at the border
         self.numbers = program.size - 2 * size - 1 - self.pieces
         self.moving = 2 * size + 1 + self.numbers  # inputs of a row
         self.indices = [index[::-1] for index in itertools.product(*(range(1 + d) for d in directions[::-1]))]
@@ -194,7 +206,7 @@ class _OverBorder:
         self.lower = self.rows // (1 + directions[-1])
         self.terms = self._leibniz()
         self.stages = _STAGES[len(directions) - 1]
-        dtypes = [*program.dtypes[: self.moving], *[np.dtype(float)] * (2 * self.pieces)]
+        dtypes = [*program.dtypes[: self.moving], *[np.dtype(float)] * (self.pieces + self.chosen)]
         line = StraightLine(*live(program.line.nodes, program.line.kinds, program.line.outputs[:size]))
         self.switch = _chosen(borders, program.size)
         self.field, self.switches = (self._with_rows(line, dtypes) for line in (line, self.switch))
@@ -212,19 +224,22 @@ class _OverBorder:
         return terms
 
     def _with_rows(self, line: StraightLine, dtypes: Sequence) -> StraightLine:
-        """A line of inputs that move, and of 2m that do not, with all rows of its outputs; rows of inputs alike."""
+        """A line of inputs that move, and of some that do not, with all rows of its outputs; rows of inputs alike."""
         outputs, rows, first = len(line.outputs), 1, self.rows * self.moving
-        kinds = [np.dtype(float)] * (first + 2 * self.pieces)
+        kinds = [np.dtype(float)] * (first + self.pieces + self.chosen)
         kinds[: self.moving] = dtypes[: self.moving]
         line = _renumbered(line, {i: i if i < self.moving else i - self.moving + first for i in range(len(dtypes))})
-        for count in self.directions:
+        for level, count in enumerate(self.directions):
+            tables = [_table_of_row(row * rows * self.member) for row in range(1, 1 + count)]
+            if self.over_steps and level == len(self.directions) - 1:
+                tables = [lambda table: table._replace(tangents=True)]
             moving = [
                 {row * self.moving + i: (row + d * rows) * self.moving + i
                  for row in range(rows) for i in range(self.moving)}
                 for d in range(1, 1 + count)
             ]  # fmt: skip
             of = [(i, d) for d in (None, *range(count)) for i in range(rows * outputs)]
-            line = with_tangents(line, kinds, range(len(kinds)), moving, of)
+            line = with_tangents(line, kinds, range(len(kinds)), moving, of, tables)
             rows *= 1 + count
         return line
 
@@ -262,7 +277,7 @@ class _OverBorder:
 
     def _rates(self, place: list[Jet], pieces: Sequence[int]) -> list[Jet]:
         """The rates of all that moves: q̇, q̈, 1 of the time, 0 of parameters."""
-        unused = [self.graph.constant(0.0, "float")] * self.pieces
+        unused = [self.graph.constant(0.0, "float")] * self.chosen
         none: Jet = [None] * self.rows
         one: Jet = [self.graph.constant(1.0, "float"), *none[1:]]
         acceleration = self._values(self.field, place, [*pieces, *unused])
@@ -310,7 +325,7 @@ class _OverBorder:
             for x, y in zip(place[: 2 * n], back[: 2 * n], strict=True):
                 results.append(zero if y[row] is None else graph.apply("sub", y[row], x[row]))
         line = StraightLine(*eliminate_dead_code(graph, [*results, *a_before, *a_behind]))
-        return Jump(line, self.orders, self.lower)
+        return Jump(line, self.orders, self.lower, 2 * self.pieces + self.chosen)
 
     def _inputs(self) -> tuple[list[Jet], list[int], list[int], list[int]]:
         """The inputs of the result, in the order of `Jump`: the jets of all that moves, and pieces."""
@@ -321,7 +336,7 @@ class _OverBorder:
             return [self.graph.input(next(count), "float") for _ in range(size)]
 
         q, v, (t,), p = some(lower * n), some(lower * n), some(1), some(lower * numbers)
-        before, behind, hit = some(m), some(m), some(m)
+        before, behind, hit = some(m), some(m), some(self.chosen)
         q, v, p = q + some(upper * n), v + some(upper * n), p + some(upper * numbers)
         time: Jet = [t, *[None] * (self.rows - 1)]
         jets: list[Jet] = [[q[row * n + i] for row in range(self.rows)] for i in range(n)]
@@ -332,14 +347,20 @@ class _OverBorder:
 
 
 def _chosen(borders: Borders, size: int) -> StraightLine:
-    """Σ hⱼ uⱼ, with the numbers hⱼ behind the inputs of the program."""
-    program = borders.program
+    """Σ hⱼ (uⱼ − levelⱼ), with the numbers hⱼ behind the inputs of the program.
+
+    Levels that are parameters are entries of tables, whose numbers are inputs behind these. Others do not matter.
+    """
+    program, m = borders.program, len(borders.switches)
     line = StraightLine(*live(program.line.nodes, program.line.kinds, borders.switches))
     graph = Graph(10 * len(line.nodes) + 1000)
     kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
     nodes = copied(graph, line, [graph.input(i, kinds.get(i, "float")) for i in range(size)])
     total = graph.constant(0.0, "float")
     for j, node in enumerate(line.outputs):
-        weight = graph.input(size + j, "float")
-        total = graph.apply("add", total, graph.apply("mul", weight, nodes[node]))
+        weight, number = graph.input(size + j, "float"), nodes[node]
+        if (table := borders.moving_table(j)) is not None:
+            entry = graph.apply("take", graph.input(size + m + j, "float"), attribute=table)
+            number = graph.apply("sub", number, entry)
+        total = graph.apply("add", total, graph.apply("mul", weight, number))
     return StraightLine(*eliminate_dead_code(graph, [total]))

@@ -72,9 +72,9 @@ def shifted(attribute: "Table | Located", by: int) -> "Table | Located":
 
 
 def moved(attribute: "Table | Located", places: Sequence[int]) -> "Table | Located":
-    """A look-up in a program whose input `places[i]` is what input i was."""
+    """A look-up in a program whose input `places[i]` is what input i was; numbers of a member stay what they are."""
     table = table_of(attribute)
-    if table.numbers is not None:
+    if table.numbers is not None or table.first >= BESIDE:
         return attribute
     first = places[table.first]
     stride = places[table.first + table.stride] - first if table.count > 1 else 1

@@ -111,6 +111,45 @@ def test_second_derivatives_by_knots_of_a_force():
         np.testing.assert_allclose(curved[name], (ahead[name] - behind[name]) / 2e-6, atol=2e-6)
 
 
+@pytest.mark.slow
+def test_second_and_third_derivatives_by_knots_of_a_potential():
+    """The force jumps at every knot, which the motion passes at another time: derivatives are those of the closed form.
+
+    Compiles the tangent flows along one and two directions, and the transposes of the motion and of these.
+    """
+    scene, params = lagjax.System(valley), table(8)
+    end = lambda p: end_of(scene, p, solver=MACHINE)
+    along = {"x": jnp.cos(jnp.arange(8.0)), "u": jnp.sin(jnp.arange(8.0))}
+
+    def moved(transform):
+        return lambda p: jax.jvp(transform, (p,), (along,))[1]
+
+    # Local errors are of rtol = 1e-9 or below rounding, here of constant accelerations, and derivatives of these up to
+    # a hundred times as large: of each order as of the others.
+    for transform in (
+        lambda f: moved(jax.grad(f)), lambda f: moved(moved(f)), lambda f: moved(moved(jax.grad(f))),
+        lambda f: jax.grad(lambda p: sum(jnp.vdot(along[name], jax.grad(f)(p)[name]) for name in "xu")),
+        lambda f: lambda p: jax.jit(jax.vmap(moved(jax.grad(f))))(jax.tree.map(lambda x: jnp.stack([x, 1.01 * x]), p)),
+    ):  # fmt: skip
+        found, closed = transform(end)(params), transform(exact_end)(params)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), found, closed)
+
+
+@pytest.mark.slow
+def test_where_a_knot_is_grazed_there_are_no_derivatives():
+    """A motion that turns where its force changes: whether it comes there, a change within the tolerance decides."""
+    force = lambda q, qdot, params: jnp.where(jnp.searchsorted(params["x"], q, side="right") > 1, -2.0, -1.0)
+    scene, ts = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=force), jnp.array([0.0, 3.0])
+    end = lambda x: lagjax.simulate(scene, 0.0, 1.0, ts, {"x": x}, solver=MACHINE).q[-1]
+    touched, passed = (jnp.array([-10.0, x, 10.0]) for x in (0.5 - 1e-12, 0.4))
+    # It passes x after 1 − v with v = √(1 − 2x), comes back after v more, and has two seconds left.
+    closed = lambda x: x - 2 * jnp.sqrt(1 - 2 * x) - 2
+    for order in (jax.grad, lambda f: lambda x: jax.jvp(jax.grad(f), (x,), (jnp.array([0.0, 1.0, 0.0]),))[1]):
+        of_closed = jax.grad(closed) if order is jax.grad else jax.grad(jax.grad(closed))
+        np.testing.assert_allclose(order(end)(passed)[1], of_closed(0.4), atol=1e-8)
+        assert np.isnan(order(end)(touched)[1])
+
+
 STEEP = np.array([0.5, -0.3, 0.0, 1.0, 0.6, 0.2, 0.7, 0.3])
 # The knots and the values that a scene computes of its parameters.
 COMPUTED = {

@@ -265,12 +265,23 @@ def test_derivatives_of_every_mode(hold):
 
 
 @pytest.mark.slow
-def test_second_derivatives_by_instants_are_none():
-    f = lambda x: end_of("zero", x, VALUES)[0]
-    assert np.isnan(jax.hessian(f)(jnp.asarray(KNOTS))[3]).any()
-    mixed = jax.jacfwd(jax.grad(lambda x, u: end_of("zero", x, u)[0]), argnums=1)
-    closed = jax.jacfwd(jax.grad(lambda x, u: exact("zero", x, u)[0]), argnums=1)
-    np.testing.assert_allclose(mixed(KNOTS, VALUES)[1:-1], closed(KNOTS, VALUES)[1:-1], atol=1e-11)
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_second_derivatives_by_instants(hold):
+    """Of an input that jumps, and of one that bends: by knots, by values and by both, in every mode.
+
+    Compiles the tangent flows along 11 and 11 and along 11 and 1 directions, and the transposes of the first.
+    """
+
+    def in_motion(f):
+        # The ends are no knots that the motion passes.
+        return lambda x, u: f(hold, jnp.concatenate([KNOTS[:1], x, KNOTS[-1:]]), u)[0]
+
+    inner, values = jnp.asarray(KNOTS[1:-1]), jnp.asarray(VALUES)
+    for outer, by in ((jax.jacfwd, jax.grad), (jax.jacfwd, jax.jacfwd), (jax.jacrev, jax.jacfwd)):
+        found, closed = (
+            outer(by(in_motion(f), argnums=(0, 1)), argnums=(0, 1))(inner, values) for f in (end_of, exact)
+        )
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), found, closed)
 
 
 @pytest.mark.slow
@@ -290,6 +301,10 @@ def test_instants_of_two_inputs_that_coincide_have_no_derivatives():
     by_knots, by_values = jax.grad(end, argnums=(0, 1))(knots, values)
     one = jax.grad(lambda x: exact("zero", x, values[0])[0])(jnp.asarray(KNOTS))
     assert np.isnan(by_knots[:, 5]).all() and np.isfinite(by_values).all()
+    forward = jax.jvp(lambda u: end(knots, u), (values,), (jnp.cos(values),))[1]
+    np.testing.assert_allclose(forward, jnp.vdot(by_values, jnp.cos(values)), atol=1e-10)
+    for along in np.eye(24).reshape(24, 2, 12)[[5, 17]]:
+        assert np.isnan(jax.jvp(lambda x: end(x, values), (knots,), (jnp.asarray(along),))[1])
     np.testing.assert_allclose(np.delete(by_knots[0], 5)[1:-1], np.delete(one, 5)[1:-1], atol=1e-11)
 
 
