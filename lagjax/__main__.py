@@ -34,10 +34,10 @@ def _status(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> int:
     store = Store(options.store.absolute())
-    damaged = store.damaged(store.spec(), store.done(), whole=True)
+    damaged = store.find_damage(store.spec(), store.finished_units(), whole=True)
     for text in damaged.values():
         print(text)
-    print(f"{len(store.done())} units are done, {len(damaged)} of them damaged.")
+    print(f"{len(store.finished_units())} units are done, {len(damaged)} of them damaged.")
     return 1 if damaged else 0
 
 

@@ -53,8 +53,8 @@ from lagjax._fit._records import (
     errors_of_system,
     input_functions,
     known_start,
-    require_alike,
-    require_held,
+    require_interpolation,
+    require_records,
     require_untraced,
     restore_structure,
     start_pair,
@@ -314,7 +314,7 @@ def _scenes(system, records, params0, observe, hold: str) -> list[_GivenSystem]:
     for name, one, own, shown in systems_by_name(system, records, observe):
         with errors_of_system(name):
             one = require_scene(one)
-            own = require_alike(own)
+            own = require_records(own)
             form = _form(one, own, hold)
             scenes.append(_GivenSystem(name, one, own, shown, form, _layout(one, own, params0, form)))
     return scenes
@@ -352,7 +352,7 @@ def _form(system: Scene, records: list[Record], hold: str) -> Form | None:
     if not structures or structures[0] is None:
         return None
     for place, record in enumerate(records):
-        require_held(record, hold, f"records[{place}]")
+        require_interpolation(record, hold, f"records[{place}]")
     tree, shapes = structures[0]
     return Form(tree, shapes, hold)
 
@@ -400,7 +400,7 @@ def _system_residuals(name, system, records, observe, form, layout, parameters) 
     motions = choose_motions(system, layout, parameters, rtol, None, form)
     recordings = [record for record in records if isinstance(record, Record)]
     if isinstance(observe, Delayed):
-        _require_longer(recordings, observe.longest)
+        _require_length(recordings, observe.longest)
     signals = Signals(observe, layout, parameters, recordings[0] if recordings else None, form)
     _require_no_jumps(system, records, observe, signals)
     _require_motion(recordings, signals.names, records)
@@ -412,7 +412,7 @@ def _system_residuals(name, system, records, observe, form, layout, parameters) 
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
     manifold = None
     if isinstance(system, Hybrid):
-        _require_plain(system, fitted, observe)
+        _require_supported(system, fitted, observe)
     elif has_constraints(system) and not input_functions(system):
         manifold = Manifold(system, layout, parameters, motions.projection)
     elif has_constraints(system) and fitted.any():
@@ -439,7 +439,7 @@ def _require_motion(recordings: list[Record], names: tuple[str, ...], records: l
         raise ValueError(f"{still[0]} So it is with all signals of all records: nothing moves that could be fitted.")
 
 
-def _require_plain(scene: Hybrid, fitted: np.ndarray, observe) -> None:
+def _require_supported(scene: Hybrid, fitted: np.ndarray, observe) -> None:
     """Raise `ValueError` for what a fit of hybrid motion cannot do."""
     if fitted.any() and has_constraints(first_law(scene)):
         raise ValueError("A start on constraints of hybrid motion cannot be fitted: give start=(q0, qdot0).")
@@ -447,7 +447,7 @@ def _require_plain(scene: Hybrid, fitted: np.ndarray, observe) -> None:
         raise ValueError("Sensors of hybrid motion cannot be lagjax.Delayed: keep the delay, and shift the times.")
 
 
-def _require_longer(recordings: list[Record], longest: float) -> None:
+def _require_length(recordings: list[Record], longest: float) -> None:
     """Raise `ValueError` for a record of which the delay of its sensors leaves nothing."""
     for place, record in enumerate(recordings):
         if (length := record.ts[-1] - record.ts[0]) < longest:

@@ -161,7 +161,7 @@ class _Model(NamedTuple):
 
 
 def _model(question: Residuals, point: Trial, noise: AbstractNoise, anchor: Anchor) -> _Model:
-    widths = question.widths(point, noise)
+    widths = question.noise_scale(point, noise)
     factors = question.factors(point, widths)
     triangles, cost = question.triangles(point, factors), question.cost(point, factors) + anchor.cost(point.u)
     pull = anchor.weight, anchor.pull(point.u)
@@ -321,7 +321,7 @@ def build_descent(
     text = f"The descent by gradients came to rest within {steps} steps."
     if not rest:
         text = f"The descent by gradients was stopped after {steps} steps, and the likelihood still grew."
-    return Descent(point, question.widths(point, noise), rest, steps, text, question)
+    return Descent(point, question.noise_scale(point, noise), rest, steps, text, question)
 
 
 def _optax() -> Any:

@@ -105,7 +105,7 @@ class StudentT(AbstractNoise):
 
 
 @dataclass(frozen=True)
-class Known(AbstractNoise):
+class KnownNoise(AbstractNoise):
     """Noise that is known already, for one more record."""
 
     known: NoiseScale

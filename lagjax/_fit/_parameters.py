@@ -56,9 +56,9 @@ def find_params_expression(reason: Exception) -> str | None:
 class AbstractTransform(abc.ABC):
     """A smooth map x(u) from real numbers (m,) onto the values (n,) that the numbers of one leaf may have.
 
-    `reach` is how far a step of the search may change u: beyond it x(u) is nothing like its tangent. `room` is how far
-    from one u another can be told from a bound of the set, or from itself. Functions that take `xp` compute with NumPy,
-    or with `jax.numpy` inside of a program of JAX.
+    `reach` is how far a step of the search may change u: beyond it x(u) is nothing like its tangent. `room` is the
+    distance from one u within which another one is neither at a bound of the set nor the same value again. Functions
+    that take `xp` compute with NumPy, or with `jax.numpy` inside of a program of JAX.
     """
 
     reach: ClassVar[float] = 2.0

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from lagjax._fit._descent import minimise
-from lagjax._fit._noise import Known, NoiseScale
+from lagjax._fit._noise import KnownNoise, NoiseScale
 from lagjax._fit._profile import effective_share
-from lagjax._fit._records import Guess, Record, known_start, require_alike, require_held, restore_structure
+from lagjax._fit._records import Guess, Record, known_start, require_interpolation, require_records, restore_structure
 from lagjax._fit._residuals import LostTrial, Residuals, SystemPart, SystemResiduals, Trial
 from lagjax._fit._search import build_reader
 from lagjax._fit._sensors import UNCLEAR, wrap_residuals
@@ -69,7 +69,7 @@ def _half_widths(deviation: np.ndarray, widths: NoiseScale, level: float, column
 
 def predict_record(fit, record: Record, system: str | None) -> Prediction:
     """The motion of the scene of a `Fit` over a record of the system of this name; see `Fit.predict`."""
-    [record], part = require_alike([record]), fit.question.find_part(system)
+    [record], part = require_records([record]), fit.question.find_part(system)
     about = part.system
     first = next((one for one in about.records if isinstance(one, Record)), None)
     if not isinstance(record, Record) or first is None:
@@ -79,7 +79,7 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     if record.input_structure != first.input_structure:
         raise ValueError("The record has other inputs than those of the fit.")
     if about.signals.form is not None:
-        require_held(record, about.signals.form.hold, "the record")
+        require_interpolation(record, about.signals.form.hold, "the record")
     layout, fixed = about.layout, fit.parameters.fix(fit.u)
     state = known_start(record, layout, 0, fit.params)
     is_known = state is not None and not isinstance(record.start, Guess)
@@ -89,7 +89,7 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     if is_known:
         point = question.evaluate(np.zeros(0), state[None])
     else:
-        done = minimise(question, np.zeros(0), state[None], Known(part.sensor_noise(fit.widths)), enough=1e-3)
+        done = minimise(question, np.zeros(0), state[None], KnownNoise(part.sensor_noise(fit.widths)), enough=1e-3)
         point = done if isinstance(done, LostTrial) else done.point
     if isinstance(point, LostTrial):
         raise ValueError(question.describe_failure(point))

@@ -33,7 +33,7 @@ from scipy.optimize import brentq
 from scipy.special import stdtrit
 
 from lagjax._fit._descent import minimise
-from lagjax._fit._noise import Known, NoiseScale, log_likelihood
+from lagjax._fit._noise import KnownNoise, NoiseScale, log_likelihood
 from lagjax._fit._residuals import LostTrial, Residuals
 from lagjax._fit._uncertainty import Information
 
@@ -135,7 +135,9 @@ def cross_validate(question: Residuals, u: np.ndarray, states: np.ndarray, law, 
             return failed
         apart = _select_pieces(question, groups == group).with_parameters(question.parameters.fix(done.point.u))
         known = _collect_noise(apart.names, (question.names, widths), (rest.names, done.widths))
-        end = minimise(apart, np.zeros(0), states[groups == group], Known(known), _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
+        end = minimise(
+            apart, np.zeros(0), states[groups == group], KnownNoise(known), _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT
+        )
         if isinstance(end, LostTrial):
             return failed
         square, weight = (apart.weights * end.point.flat() ** 2).sum(axis=0), apart.weights.sum(axis=0)
@@ -222,7 +224,7 @@ class _ProfileLine:
         reported, white = known.covariance[which, which], known.white[which, which]
         self.scale = white / reported if np.isfinite(reported) and reported > 0 else 1.0 / known.lost
         self.wide = min(float(np.sqrt(reported)), float(question.parameters.reach[which]))
-        done = minimise(question, u, starts, Known(widths), _ENOUGH, _TRIALS)
+        done = minimise(question, u, starts, KnownNoise(widths), _ENOUGH, _TRIALS)
         if isinstance(done, LostTrial):
             raise ValueError(question.describe_failure(done))
         self.u, point = done.point.u, done.point
@@ -238,7 +240,7 @@ class _ProfileLine:
         u[self.which] = at
         question = self.question.with_parameters(self.question.parameters.fix(u, self.which))
         for others, starts in self._guesses(at):
-            done = minimise(question, others, starts, Known(self.widths), _ENOUGH, _TRIALS)
+            done = minimise(question, others, starts, KnownNoise(self.widths), _ENOUGH, _TRIALS)
             if not isinstance(done, LostTrial):
                 lost = self.best - log_likelihood(self.widths, done.point.flat(), question.weights)
                 self.places.append(_Place(at, done.point.u, done.point.starts, 2.0 * self.scale * lost))
@@ -259,7 +261,7 @@ class _ProfileLine:
     def minimum(self, place: _Place) -> tuple[float, float] | None:
         """The minimum that a search from one place ends in: the unknown and D there."""
         u = np.insert(place.others, self.which, place.at)
-        done = minimise(self.question, u, place.starts, Known(self.widths), _ENOUGH, 2 * _TRIALS)
+        done = minimise(self.question, u, place.starts, KnownNoise(self.widths), _ENOUGH, 2 * _TRIALS)
         if isinstance(done, LostTrial):
             return None
         lost = self.best - log_likelihood(self.widths, done.point.flat(), self.question.weights)
@@ -323,12 +325,12 @@ def _find_end(line: _ProfileLine, side: float, threshold: float, room: float) ->
 def _locate_root(line: _ProfileLine, below: float, above: float, threshold: float) -> float:
     """The value where the root of D is that of the threshold: a nearly linear function of the value."""
     if np.isinf(line.deviance(above)):
-        return _bisect_find_end(line, below, above, threshold)
+        return _bisect_end(line, below, above, threshold)
     miss = lambda at: np.sqrt(max(line.deviance(at), 0.0)) - np.sqrt(threshold)  # noqa: E731
     return float(cast(float, brentq(miss, below, above, xtol=_EXACT * abs(above - below))))
 
 
-def _bisect_find_end(line: _ProfileLine, below: float, above: float, threshold: float) -> float:
+def _bisect_end(line: _ProfileLine, below: float, above: float, threshold: float) -> float:
     """The end between a value below the threshold and one that no motion follows; the last followed, if there is none.
 
     Bisection: what cannot be followed is as far off as can be.

@@ -261,7 +261,7 @@ class Record(MeasuredSignal):
         object.__setattr__(self, "values", tree.unflatten(leaves))
         if self.input_ts is not None:
             object.__setattr__(self, "input_ts", _times(self.input_ts, "input_ts"))
-            _require_covered(self)
+            _require_input_times(self)
         if self.inputs is not None:
             labels, leaves, tree = taken_apart(one_signal(self.inputs), "inputs")
             leaves = [_input(leaf, label, len(self.sampled_at)) for label, leaf in zip(labels, leaves, strict=True)]
@@ -392,7 +392,7 @@ def _signal(leaf, label: str, times: int) -> np.ndarray:
     return values
 
 
-def _require_covered(record: Record) -> None:
+def _require_input_times(record: Record) -> None:
     """Raise `ValueError` for times of inputs without inputs, or that begin after the record."""
     times, begin = record.sampled_at, record.ts[0]
     if record.inputs is None:
@@ -404,7 +404,7 @@ def _require_covered(record: Record) -> None:
         )
 
 
-def require_held(record: MeasuredSignal, hold: str, name: str) -> None:
+def require_interpolation(record: MeasuredSignal, hold: str, name: str) -> None:
     """Raise `ValueError` where the inputs of a record cannot go on between samples as `hold` says."""
     if not isinstance(record, Record) or record.inputs is None or hold == "zero":
         return
@@ -551,7 +551,7 @@ def _stack_pieces(records: list[Record], pieces: list[Piece], rows: np.ndarray, 
     return Samples(rows, ts, values, weights, inputs, table)
 
 
-def require_alike(records) -> list[Any]:
+def require_records(records) -> list[Any]:
     """The records and timings as a list. Raises where there is none, or where records differ in their signals."""
     if not isinstance(records, MeasuredSignal | Iterable):
         raise TypeError(f"records must be a lagjax.Record, or a list of them; got {type(records).__name__}.")
@@ -563,14 +563,14 @@ def require_alike(records) -> list[Any]:
             raise TypeError(
                 f"records[{place}] must be a lagjax.Record, or lagjax.Timings; got {type(record).__name__}."
             )
-    _require_alike([(place, record) for place, record in enumerate(listed) if isinstance(record, Record)])
+    _require_same_signals([(place, record) for place, record in enumerate(listed) if isinstance(record, Record)])
     for place, record in enumerate(listed):
         if not (record.weight_matrix > 0).any():
             raise ValueError(f"records[{place}] holds no sample: all its values are NaN or have no weight.")
     return listed
 
 
-def _require_alike(placed: list[tuple[int, Record]]) -> None:
+def _require_same_signals(placed: list[tuple[int, Record]]) -> None:
     """Raise `ValueError` where records, with their places, differ in structure, or a signal is in none of them."""
     if not placed:
         return

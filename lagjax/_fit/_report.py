@@ -1,6 +1,6 @@
 """Report: a fit in words, in figures drawn with matplotlib, and as a page of HTML with these inside.
 
-It holds `lab_book` (what `print(fit)` shows), the functions that draw, `Drawn` and `page`.
+It holds `lab_book` (what `print(fit)` shows), the functions that draw, `SystemDrawing` and `render_page`.
 
 The figures do without the state machine of matplotlib, and `lagjax.plot` draws them too.
 """
@@ -107,7 +107,7 @@ img { max-width: 100% } pre { background: #f4f4f4; padding: .7rem; overflow-x: a
 """
 
 
-def page(
+def render_page(
     title: str, message: str, ok: bool, unseen: Sequence[str], tables: dict[str, list[list[str]]],
     figures: dict[str, list[str]], texts: dict[str, str],
 ) -> str:  # fmt: skip
@@ -128,7 +128,7 @@ def page(
     return f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(parts)}</body></html>\n"
 
 
-def _picture(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
+def _render_picture(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
     """A figure of a size in inches as PNG in base64."""
     matplotlib = matplotlib_or_refuse("Fit.report")
     figure = matplotlib.figure.Figure(figsize=size, layout="constrained", dpi=110)
@@ -138,7 +138,7 @@ def _picture(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
     return base64.b64encode(file.getvalue()).decode()
 
 
-class Drawn(NamedTuple):
+class SystemDrawing(NamedTuple):
     """Records of one system, their residuals (T, S), and its signals with their noise (S,); `name` None: the only."""
 
     name: str | None
@@ -148,7 +148,7 @@ class Drawn(NamedTuple):
     sigma: np.ndarray
 
 
-def build_pictures(systems: list[Drawn], covariance, waterfall) -> dict[str, list[str]]:
+def build_pictures(systems: list[SystemDrawing], covariance, waterfall) -> dict[str, list[str]]:
     """The pictures of a fit by their headings."""
     figures = {}
     for system in systems:
@@ -157,11 +157,13 @@ def build_pictures(systems: list[Drawn], covariance, waterfall) -> dict[str, lis
     side = min(3.2 + 0.45 * len(covariance.names), 12.0)
     if covariance.names:
         figures["Correlations of the parameters"] = [
-            _picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), covariance.matrix, covariance.names))
+            _render_picture(
+                (side + 1.0, side), lambda f: draw_correlations(f.subplots(), covariance.matrix, covariance.names)
+            )
         ]
     if waterfall is not None:
         figures["Waterfall of the starts"] = [
-            _picture((6.4, 3.2), lambda figure: draw_waterfall(figure.subplots(), waterfall.misfits))
+            _render_picture((6.4, 3.2), lambda figure: draw_waterfall(figure.subplots(), waterfall.misfits))
         ]
     return figures
 
@@ -170,13 +172,13 @@ def _record_figures(records, residuals: list[np.ndarray], names, sigma) -> dict[
     """Data over fit of the records of one system, whose residuals are (T, S), by their headings."""
     count = min(len(names), _SIGNALS)
 
-    def one(k):
+    def draw_one(k):
         def draw(figure):
             axes = figure.subplots(2, count, squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
             draw_record(axes, records[k], residuals[k], names[:count], sigma)
             figure.suptitle(f"records[{k}]", fontsize="medium")
 
-        return _picture((max(6.4, 3.6 * count), 4.2), draw)
+        return _render_picture((max(6.4, 3.6 * count), 4.2), draw)
 
     figures = {}
     if len(records):
@@ -184,10 +186,10 @@ def _record_figures(records, residuals: list[np.ndarray], names, sigma) -> dict[
         heading = "Data over fit, and residuals"
         if len(shown) < len(records) or count < len(names):
             heading += f" (records {', '.join(map(str, shown))} of {len(records)}; {count} of {len(names)} signals)"
-        figures[heading] = [one(k) for k in shown]
+        figures[heading] = [draw_one(k) for k in shown]
         every = np.concatenate(residuals)
         figures["Residuals against the normal distribution"] = [
-            _picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))
+            _render_picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))
         ]
     return figures
 

@@ -548,7 +548,7 @@ class Residuals:
                 slopes.append(by_unknowns)
         return Trial(u, placed, residuals, slopes, across if across.any() else None)
 
-    def widths(self, point: Trial, noise: AbstractNoise) -> NoiseScale:
+    def noise_scale(self, point: Trial, noise: AbstractNoise) -> NoiseScale:
         """The noise of the signals that makes the residuals of a trial likeliest."""
         return noise.widths(point.flat(), self.weights, self.least)
 

@@ -21,15 +21,15 @@ from lagjax._fit._prediction import Prediction, planned_rows, predict_record, re
 from lagjax._fit._profile import Comparison, Profile, comparison, profile
 from lagjax._fit._records import Record
 from lagjax._fit._report import (
-    Drawn,
+    SystemDrawing,
     build_pictures,
     build_title,
     cells_of_noise,
     cells_of_parameters,
     draw_record,
     lab_book,
-    page,
     record_matrix,
+    render_page,
 )
 from lagjax._fit._residuals import Residuals, SystemPart, Trial
 from lagjax._fit._sample import draw, inference_data
@@ -116,7 +116,7 @@ class Fit:
         return cell(repr(self), self._draw_first, (5.2, 2.8))
 
     def _draw_first(self, figure) -> None:
-        drawn = next(one for one in map(self._drawn, self.question.parts) if one.records)
+        drawn = next(one for one in map(self._system_drawing, self.question.parts) if one.records)
         axes = figure.subplots(2, min(2, len(drawn.names)), squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
         draw_record(axes, drawn.records[0], drawn.residuals[0], drawn.names[:2], drawn.sigma)
 
@@ -295,17 +295,21 @@ class Fit:
         """
         tables = {"Parameters": cells_of_parameters(self), "Noise": cells_of_noise(self)}
         texts = {"What to measure next": str(self.next_experiment(experiments))} if experiments else {}
-        pictures = build_pictures([self._drawn(part) for part in self.question.parts], self.covariance, self.waterfall)
-        text = page(build_title(self), self.message, self.ok, self.unseen, tables, pictures, texts)
+        pictures = build_pictures(
+            [self._system_drawing(part) for part in self.question.parts], self.covariance, self.waterfall
+        )
+        text = render_page(build_title(self), self.message, self.ok, self.unseen, tables, pictures, texts)
         with open(path, "w", encoding="utf-8") as file:
             file.write(text)
 
-    def _drawn(self, part: SystemPart) -> Drawn:
+    def _system_drawing(self, part: SystemPart) -> SystemDrawing:
         """The records of one system with their residuals."""
         residuals = self.question.end_to_end(self.residuals)[part.records]
         pairs = [pair for pair in zip(residuals, part.system.records, strict=True) if isinstance(pair[1], Record)]
         records, matrices = [record for _, record in pairs], [record_matrix(r, record) for r, record in pairs]
-        return Drawn(part.name, records, matrices, part.system.signals.names, part.sensor_noise(self.widths).sigma)
+        return SystemDrawing(
+            part.name, records, matrices, part.system.signals.names, part.sensor_noise(self.widths).sigma
+        )
 
     @with_doubles
     def compare(self, other: "Fit | dict[str, Fit]", *, folds: int = 0) -> Comparison:

@@ -229,15 +229,11 @@ def _weigh_expansion(sampler: Sampler, exact: Callable, state, key) -> tuple[flo
     return float(share), pilot[-1]
 
 
-def _choices(key) -> np.random.Generator:
-    return np.random.default_rng(np.asarray(jax.random.key_data(key)))
-
-
 def _correct_draws(
     surrogate: Surrogate, sampler: Sampler, exact: Callable, at: Chains, draws: int, key
 ) -> tuple[Draws, float]:
     """Draws of π, every proposal of π* accepted or refused by the exact density; and the Pareto tail of π/π*."""
-    kept, choices, ratios = [], _choices(key), []
+    kept, choices, ratios = [], np.random.default_rng(np.asarray(jax.random.key_data(key))), []
     for k in range(_SETTLING + draws):
         state, steps, diverged = sampler.draw(jax.random.fold_in(key, k), at.state)
         proposed = Chains.from_state(state, exact)

@@ -340,14 +340,14 @@ def weak_form_residuals(system: SystemResiduals, readers: Sequence[Reader | None
     scene = scene if form is None else form.drive_scene(scene)
     pieces = _states_and_inputs([reader for reader in readers if reader is not None], _WIDE * scale)
 
-    def both(y, t, table, numbers):
+    def momentum_and_force(y, t, table, numbers):
         params = parameters.restore(numbers)
         params = params if form is None else Driven(params, *table)
         motion = scene.motion(layout, params)
         state = (*halves(y), t, params)
         return jnp.stack([motion.momentum(*state), motion.generalized_force(*state)])
 
-    at_all = jax.vmap(both, in_axes=(0, 0, 0 if form is not None else None, None))
+    at_all = jax.vmap(momentum_and_force, in_axes=(0, 0, 0 if form is not None else None, None))
 
     y, t, inputs = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
     table = tuple(constant_tables(t, inputs)) if form is not None else None
@@ -475,7 +475,7 @@ def _evaluate_starts(question: Residuals, u: np.ndarray, starts: np.ndarray) -> 
         some = slice(begin, begin + portion)
         for k, trial in enumerate(question.evaluate_trials(u[some], starts[some]), begin):
             if not isinstance(trial, LostTrial):
-                noise = question.widths(trial, Gaussian())
+                noise = question.noise_scale(trial, Gaussian())
                 found.starts[k], found.misfits[k] = trial.starts, misfit(noise, question)
                 found.triangles[k] = question.triangles(trial, question.factors(trial, noise))
     return found
@@ -555,7 +555,7 @@ def search_records(question: Residuals, u, starts, noise, method: str, readers, 
     if method == "segments" and readers is None:
         raise ValueError('method="segments" reads starts off the data: for that values must have the structure of q.')
     if method == "whole" or readers is None:
-        return _require_followed(question, minimise(question, u, starts, noise, _ENOUGH, _TRIALS))
+        return _require_success(question, minimise(question, u, starts, noise, _ENOUGH, _TRIALS))
     u, starts, levels_done = _fit_growing_segments(question, u, starts, noise, readers, weak)
     good = _last_followed_level(levels_done)
     if len(levels_done) - good > _LOST:
@@ -571,7 +571,7 @@ def search_records(question: Residuals, u, starts, noise, method: str, readers, 
             return _search_pieces(
                 question, levels_done[good], None if isinstance(done, LostTrial) else done.widths, noise
             )
-    return _require_followed(question, done)
+    return _require_success(question, done)
 
 
 def _last_followed_level(levels_done: list[Descent]) -> int:
@@ -611,7 +611,7 @@ def _search_pieces(question: Residuals, level: Descent, joined: NoiseScale | Non
     part = question.with_pieces(pieces, level.question.fitted)
     done = minimise(part, level.point.u, level.point.starts, noise, _ENOUGH, _TRIALS)
     if isinstance(done, LostTrial):
-        return _require_followed(part, done)
+        return _require_success(part, done)
     worse = (
         "fails" if joined is None else f"leaves {misfit(joined, question) / misfit(done.widths, part):.2g} times more"
     )
@@ -636,10 +636,10 @@ def search_by_gradient(question: Residuals, u, y0, noise, readers: list[Reader |
     done = descend_gradient(question, u, y0, noise, steps, tell)
     if not isinstance(done, LostTrial):
         done = build_descent(question, done[0], done[1], noise, _GRADIENT_STEPS, done[2])
-    return _require_followed(question, done)
+    return _require_success(question, done)
 
 
-def _require_followed(question: Residuals, done: Descent | LostTrial) -> Descent:
+def _require_success(question: Residuals, done: Descent | LostTrial) -> Descent:
     """The result of a search. Raises `Unfollowed` where its motions could not be followed."""
     if isinstance(done, LostTrial):
         raise Unfollowed(question.describe_failure(done) + " Begin nearer: other params0, or starts that are known.")

@@ -93,7 +93,7 @@ class Timings(MeasuredSignal):
         object.__setattr__(self, "times", _restore_keys(times, keys))
         which = np.repeat(np.arange(len(times)), [len(x) for x in times])
         flat = FlatTimings(which, np.concatenate(times), np.concatenate(numbers), np.concatenate(weights))
-        _require_possible(flat, float(self.t0))
+        _require_valid_times(flat, float(self.t0))
         object.__setattr__(self, "flat", flat._replace(numbers=flat.numbers.astype(int)))
 
     def __len__(self) -> int:
@@ -168,7 +168,7 @@ def _restore_keys(parts: list, keys: tuple[str, ...] | None) -> PyTree:
     return parts[0] if keys is None else dict(zip(keys, parts, strict=True))
 
 
-def _require_possible(flat: FlatTimings, t0: float) -> None:
+def _require_valid_times(flat: FlatTimings, t0: float) -> None:
     """Raise `ValueError` for times, numbers or weights that no motion from t0 can have."""
     if not np.isfinite(flat.times).any():
         raise ValueError("times holds no time: all are NaN, or there are none.")

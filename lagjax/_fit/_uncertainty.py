@@ -20,11 +20,10 @@ intervals many times too small. Source: Newey & West, Econometrica 55 (1987) 703
 Directions that nothing depends on have no variance: they are found as null directions of G (`null_space`), their
 parameters have infinite variance, and nothing is inverted there.
 
-Over a chaotic record sensitivities grow by so many powers of ten that all columns point along the one direction that
-grows fastest, and rounding hides the rest: G seems to have null directions where it has none. Null directions are the
-same whatever the rows are multiplied by, so they are looked for a second time where every row has length one
-(`confirmed`): what is null there is not seen, and what is not was drowned. Where rows grow by more than there are
-digits, all are.
+Over a chaotic record sensitivities grow until all columns point along the one direction that grows fastest, and
+rounding hides the rest: G seems to have null directions where it has none. Null directions are the same whatever the
+rows are multiplied by, so they are looked for a second time where every row has length one (`confirmed`): what is null
+there is not seen, and what is not was drowned. Where rows grow by more than there are digits, all are.
 
 **Covariance of the starts**, which were eliminated. A piece with rows A of its start and B of the parameters, in units
 of the noise ε, has the start
@@ -541,7 +540,7 @@ def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
         if max(map(abs, whole)) > _LARGEST_EXPONENT or np.abs(np.array(whole) / common - row).max() > _EXACT:
             return None
         rows.append(whole)
-    rows = _plain(rows)
+    rows = _simplify_rows(rows)
     for space in spaces[1:]:
         left = np.array(rows, float) @ space
         if np.abs(left).max() > _EXACT * np.abs(space).max():
@@ -549,21 +548,21 @@ def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
     return rows
 
 
-def _plain(rows: list[list[int]]) -> list[list[int]]:
+def _simplify_rows(rows: list[list[int]]) -> list[list[int]]:
     """Whole rows of the same span with fewer minus signs, and then smaller numbers: a·m and b·m, not a/b and a·m."""
 
     def weight(row):
         return sum(x < 0 for x in row), sum(map(abs, row)), [-x for x in row]  # the last so that a/b is not b/a
 
-    def upright(row):
+    def positive_sign(row):
         return min(row, [-x for x in row], key=weight)
 
-    rows = [upright(row) for row in rows]
+    rows = [positive_sign(row) for row in rows]
     while True:  # the weights fall at every turn, and are whole
         better = []
         for i, row in enumerate(rows):
             for other in rows[:i] + rows[i + 1 :]:
-                sums = [upright([a + sign * b for a, b in zip(row, other, strict=True)]) for sign in (1, -1)]
+                sums = [positive_sign([a + sign * b for a, b in zip(row, other, strict=True)]) for sign in (1, -1)]
                 better += [(weight(new), i, new) for new in sums if weight(new)[:2] < weight(row)[:2]]
         if not better:
             return sorted(rows, reverse=True)

@@ -60,7 +60,7 @@ class PossibleMistake(NamedTuple):
 def possible_mistakes(
     records: list[Any], names: tuple[str, ...], worst: list[int], slower: float
 ) -> Iterator[PossibleMistake]:
-    """The mistakes that may be in the records, the likeliest first, where the data move so many times slower than the
+    """The mistakes that may be in the records, the likeliest first, where the data move `slower` times slower than the
     scene does, and `worst` has the places of the records in the order of what is left of them."""
     count, some = len(names), range(min(len(names), _MOST))
     by_time = [_convert_milliseconds(r) if isinstance(r, Record) else r for r in records]

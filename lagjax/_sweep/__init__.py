@@ -75,7 +75,7 @@ class Sweep:
             raise ImportError("Sweep.open() needs the package xarray: pip install xarray.") from None
         data, store = xarray.open_zarr(self.store), Store(self.store)
         spec = store.spec()
-        damaged = store.damaged(spec, store.done())
+        damaged = store.find_damage(spec, store.finished_units())
         if not damaged:
             return data
         for text in damaged.values():
@@ -93,7 +93,7 @@ class Sweep:
         """The statistics named in `reduce` over all finished units, by the names of the quantities."""
         store = Store(self.store)
         spec, totals = store.spec(), {}
-        for unit in sorted(store.done()) if spec["reduce"] else ():
+        for unit in sorted(store.finished_units()) if spec["reduce"] else ():
             for name, part in from_bytes(store.statistics(unit)).items():
                 totals[name] = merge(totals.get(name), part)
         shapes = {q["name"]: tuple(q["shape"]) for q in spec["kept"]}
@@ -102,7 +102,7 @@ class Sweep:
     def damaged(self) -> dict[int, str]:
         """The damage of chunks of finished units, in words, by units; all of them are read."""
         store = Store(self.store)
-        return store.damaged(store.spec(), store.done(), whole=True)
+        return store.find_damage(store.spec(), store.finished_units(), whole=True)
 
 
 def sweep(
@@ -214,7 +214,7 @@ def sweep(
     require_flag(progress, "progress")
     settings = dict(rtol=rtol, atol=atol, max_steps=max_steps, event=event, solver=solver)
     if isinstance(system, Hybrid):
-        _require_none(event=event, crossings=crossings, solver=solver)
+        _require_no_arguments(event=event, crossings=crossings, solver=solver)
     sections = Sections.from_arguments(crossings, _callable(keep), settings)
     description = Description(
         system, np.asarray(ts, float), q0, qdot0, params, keep, _reduce(reduce), settings, sections
@@ -225,7 +225,7 @@ def sweep(
     child = Child(place.path, isolate) if isolate else None
     other = None if extend is None else _place(extend, "extend")
     with precision(uses_doubles()), child or nullcontext():
-        if place.is_there() and other is not None and not place.spec()["goes_on_from"]:
+        if place.exists() and other is not None and not place.spec()["goes_on_from"]:
             other = None  # of which the members were taken: it may be gone
         if other is not None and continues(other, description):
             if isinstance(system, Hybrid):
@@ -234,7 +234,7 @@ def sweep(
                     f"ts[0], with another store than {str(extend)!r}."
                 )
             description = replace(description, left=final_states_of(other, axes, description))
-        if not place.is_there():
+        if not place.exists():
             begin(place, axes, description, unit, child.look if child else first_look, other)
         spec = place.spec()
         require_same(place, spec, axes, description)
@@ -261,7 +261,7 @@ def _callable(keep: Any) -> Callable:
     return keep
 
 
-def _require_none(**arguments: Any) -> None:
+def _require_no_arguments(**arguments: Any) -> None:
     """Raise `ValueError` for arguments that a hybrid motion does not have."""
     if given := [name for name, value in arguments.items() if value is not None]:
         raise ValueError(

@@ -43,7 +43,7 @@ def label(code: int) -> str:
     return NAMES.get(code) or name_of(code)
 
 
-class Kept(NamedTuple):
+class KeptResults(NamedTuple):
     """The results of the members of a batch: values (B, …) by name, results (B,), |h − h₀| (B,), and complaints."""
 
     values: dict[str, np.ndarray]
@@ -104,7 +104,7 @@ class Batches:
         self._axes = (of_q0, of_qdot0, of_params)
         self._keep_all, self._tolerances = jax.jit(self._keep_vectorized), None
 
-    def __call__(self, points: dict[str, np.ndarray]) -> Kept:
+    def __call__(self, points: dict[str, np.ndarray]) -> KeptResults:
         """The kept values of the members at these points (B,)."""
         motions, no_start = self._compute_motions(points)
         kept, drift, complaints = self._keep_results(motions)
@@ -112,7 +112,7 @@ class Batches:
         if complaints:
             result = result.copy()
             result[list(complaints)] = KEEP_FAILED
-        return Kept(kept, result, drift, no_start | complaints, motions.run.engine)
+        return KeptResults(kept, result, drift, no_start | complaints, motions.run.engine)
 
     def count_member_bytes(self, points: dict[str, np.ndarray]) -> int:
         """The bytes that are kept of a member, of the first of these; 0 where `keep` fails for that one."""
@@ -230,8 +230,8 @@ class Batches:
 
     def _keep_member(self, trajectory: Trajectory, crossings: Any) -> dict:
         """The result of `keep` for one member."""
-        keep, asked = self.description.keep, {} if self.description.sections is None else {"crossings": crossings}
-        kept = keep(trajectory, **asked)
+        keep, extras = self.description.keep, {} if self.description.sections is None else {"crossings": crossings}
+        kept = keep(trajectory, **extras)
         _require_dict(kept)
         return kept
 
@@ -312,7 +312,7 @@ def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarra
     return jax.tree.map(lambda *leaves: np.stack(leaves), *(nothing if row is None else row for row in rows))
 
 
-def quantities_of(kept: Kept) -> list[Quantity]:
+def quantities_of(kept: KeptResults) -> list[Quantity]:
     """The quantities that are kept, from those of a batch."""
     return [Quantity(name, x.shape[1:], x.dtype) for name, x in kept.values.items()]
 

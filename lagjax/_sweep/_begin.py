@@ -28,7 +28,7 @@ from lagjax._hybrid import Hybrid
 from lagjax._layout import Layout
 from lagjax._results import RESULTS, code_of
 from lagjax._sweep import _batch
-from lagjax._sweep._batch import Kept, batches_of, label, names_of, quantities_of
+from lagjax._sweep._batch import KeptResults, batches_of, label, names_of, quantities_of
 from lagjax._sweep._description import MOTION, Description, FinalStates, difference, pack_description, texts, users_path
 from lagjax._sweep._job import Job, cpu, record_of, require_versions, source_path, states, uses_doubles, versions
 from lagjax._sweep._members import RESERVED, Axis, Grid, describe_axes, points_of
@@ -41,7 +41,7 @@ UNIT_BYTES = 64 * 2**20  # of what is kept of a unit, by default; two of them ar
 _PROBED = 4096  # members by which the time of a member is estimated
 
 
-def first_look(description: Description, points: dict[str, np.ndarray]) -> tuple[Kept, float, bool]:
+def first_look(description: Description, points: dict[str, np.ndarray]) -> tuple[KeptResults, float, bool]:
     """The kept values of a few members, the seconds that one of them takes, and whether the energy is constant."""
     conserves = _conserves(description, points)
     batches = batches_of(description, conserves)
@@ -58,7 +58,7 @@ def _thin_points(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarr
     return {name: x[:: -(-count // max(1, most))] for name, x in points.items()}
 
 
-Look = Callable[[Description, dict[str, np.ndarray]], tuple[Kept, float, bool]]
+Look = Callable[[Description, dict[str, np.ndarray]], tuple[KeptResults, float, bool]]
 
 
 def begin(
@@ -132,7 +132,7 @@ def _unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantit
     return max(1, min(int(SECONDS / seconds), UNIT_BYTES // each, several))
 
 
-def _batch_size(description: Description, points: dict[str, np.ndarray], kept: Kept) -> int:
+def _batch_size(description: Description, points: dict[str, np.ndarray], kept: KeptResults) -> int:
     """The most members of a batch: their paths take at most `PATH_BYTES`."""
     most = _batch.MOST if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
     return max(1, min(most, _members_in_memory(description, points)))
@@ -197,7 +197,7 @@ def require_same(store: Store, spec: dict, axes: tuple[Axis, ...], description: 
 
 def repair(job: Job) -> None:
     """Have units computed again whose chunks are not whole, as after a crash of the disk."""
-    for unit, text in job.store.damaged(job.spec, job.store.done()).items():
+    for unit, text in job.store.find_damage(job.spec, job.store.finished_units()).items():
         warnings.warn(f"{job.store.path}: {text}. It is computed again.", stacklevel=3)
         job.store.undo(job.spec, unit)
 
@@ -327,7 +327,7 @@ def final_states_of(other: Store, axes: tuple[Axis, ...], description: Descripti
             f"{other.path} has motions of another description, which cannot continue. What differs:\n"
             + "\n".join(lines)
         )
-    if left := other.grid(spec).units - len(other.done()):
+    if left := other.grid(spec).units - len(other.finished_units()):
         raise ValueError(f"{other.path}: {left} units are not done; motions can continue when they are.")
     q, qdot, _ = description.shapes(names)
     shapes = {x.name: x.shape for x in other.quantities(spec)}

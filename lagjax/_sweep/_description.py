@@ -52,9 +52,9 @@ class Sections(NamedTuple):
     @classmethod
     def from_arguments(cls, crossings: Any, keep: Callable, settings: dict[str, Any]) -> "Sections | None":
         """The description given by the arguments of `sweep`. Raises `TypeError` or `ValueError` if wrong."""
-        asked = "crossings" in _parameters(keep)
+        takes_crossings = "crossings" in _parameters(keep)
         if crossings is None:
-            if asked:
+            if takes_crossings:
                 raise ValueError("keep asks for `crossings`: say which, by crossings={'section': a function}.")
             return None
         if not isinstance(crossings, dict) or "section" not in crossings or not set(crossings) <= set(_ARGUMENTS):
@@ -62,7 +62,7 @@ class Sections(NamedTuple):
                 "crossings must be a dict with arguments of lagjax.crossings: section, perhaps direction and count; "
                 f"got {list(crossings) if isinstance(crossings, dict) else crossings!r}."
             )
-        if not asked:
+        if not takes_crossings:
             raise ValueError(
                 "crossings are found for keep, which does not ask for them: write keep(trajectory, crossings)."
             )

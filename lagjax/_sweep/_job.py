@@ -26,7 +26,7 @@ import numpy as np
 from llvmlite import binding as llvm
 
 from lagjax._results import ENDED_WELL, SUCCESSFUL
-from lagjax._sweep._batch import CRASHED, KEEP_FAILED, Batches, Kept, batches_of, label
+from lagjax._sweep._batch import CRASHED, KEEP_FAILED, Batches, KeptResults, batches_of, label
 from lagjax._sweep._description import Description, FinalStates, difference, texts, unpack_description
 from lagjax._sweep._members import Grid, points_of
 from lagjax._sweep._statistics import partial_of, to_bytes
@@ -56,7 +56,7 @@ class Job:
         batches.quantities = [q for q in store.quantities({**spec, "reduce": {}}) if q != RESULT]
         return cls(store, spec, store.grid(spec), description, batches)
 
-    def require_engine(self, kept: Kept) -> None:
+    def require_engine(self, kept: KeptResults) -> None:
         """Raise `ValueError` where another engine integrates here than where the store was begun."""
         if kept.engine != self.spec["engine"]:
             raise ValueError(
@@ -75,7 +75,7 @@ def precision(doubles: bool) -> Iterator[None]:
     """Compute in the precision of the store, in this thread and in those of XLA.
 
     XLA calls callbacks of `keep` from threads of its own, which see the setting of the process alone: that is changed
-    for so long, where it is another one. Of several stores in one process the first to come decides on it.
+    within this context, where it is another one. Of several stores in one process the first to come decides on it.
     """
     with _precision_lock:
         if not _active_precisions:
@@ -94,7 +94,7 @@ def precision(doubles: bool) -> Iterator[None]:
 
 _precision_lock = threading.Lock()
 _active_precisions: list[bool] = []  # the precisions of all who are inside
-_process_precision: list[bool] = []  # that of the process before the first one came, while somebody is inside
+_process_precision: list[bool] = []  # that of the process before the first one came, as long as a thread is inside
 
 
 def _doubles_in_process() -> bool:
@@ -212,12 +212,10 @@ def starts(job: Job, unit: int) -> tuple[Callable[[np.ndarray], dict[str, np.nda
     return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in more.items()}, before
 
 
-def _ignore(batch: int) -> None:
-    pass
-
-
-def compute(job: Job, unit: int, crashed: Mapping[int, str] = NONE, notify: Callable[[int], None] = _ignore) -> Unit:
-    """Compute a unit without members that are known to end their process, and how; `tell(k)` before the k-th batch."""
+def compute(
+    job: Job, unit: int, crashed: Mapping[int, str] = NONE, notify: Callable[[int], None] = lambda _: None
+) -> Unit:
+    """Compute a unit without members that are known to end their process; `notify(k)` precedes the k-th batch."""
     began, spent = time.monotonic(), time.process_time()
     size, (points, before) = job.grid.size(unit), starts(job, unit)
     drifts, complaints = np.full(size, np.nan), {}

@@ -122,20 +122,20 @@ def _summarize_column(how: Statistics, c: int, x: np.ndarray, use: np.ndarray, m
         outside = np.array([np.sum(x < how.edges[0]), np.sum(x > how.edges[-1])])
     sketch = np.zeros((0, 3), int)
     if how.quantiles:
-        keys, counts = np.unique(_bin_of(x), return_counts=True)
+        keys, counts = np.unique(_bin_indices(x), return_counts=True)
         sketch = np.stack([np.full(len(keys), c), keys, counts], axis=1)
     ends = x[least], members[least], x[greatest], members[greatest]
     return len(x), missing, mean, np.sum((x - mean) ** 2), *ends, histogram, outside, sketch
 
 
-def _bin_of(x: np.ndarray) -> np.ndarray:
+def _bin_indices(x: np.ndarray) -> np.ndarray:
     """The bins of numbers, in increasing order of these; 0 is zero's."""
     with np.errstate(divide="ignore"):
         size = np.ceil(np.log(np.abs(x)) / _LOG_GAMMA)
     return np.where(x == 0, 0, np.sign(x) * (np.where(x == 0, 0.0, size) + _OFFSET)).astype(np.int64)
 
 
-def _middle_of(bins: np.ndarray) -> np.ndarray:
+def _bin_centres(bins: np.ndarray) -> np.ndarray:
     """The numbers at most `RELATIVE` from all that are in these bins."""
     size = np.exp((np.abs(bins) - _OFFSET) * _LOG_GAMMA) * 2 / (1 + np.exp(_LOG_GAMMA))
     return np.where(bins == 0, 0.0, np.sign(bins) * size)
@@ -197,7 +197,7 @@ def _quantiles(how: Statistics, sketch: np.ndarray) -> list[float]:
         return [np.nan] * len(how.quantiles)
     below = np.cumsum(sketch[:, 1])
     ranks = [level * (below[-1] - 1) for level in how.quantiles]
-    return [float(_middle_of(sketch[np.searchsorted(below, rank, side="right"), 0])) for rank in ranks]
+    return [float(_bin_centres(sketch[np.searchsorted(below, rank, side="right"), 0])) for rank in ranks]
 
 
 # ---- as bytes --------------------------------------------------------------------------------------------------------

@@ -90,8 +90,8 @@ class Status(NamedTuple):
 def status(store: Store) -> Status:
     """The progress of a store."""
     spec = store.spec()
-    grid, finished = store.grid(spec), store.done()
-    damaged = store.damaged(spec, finished)
+    grid, finished = store.grid(spec), store.finished_units()
+    damaged = store.find_damage(spec, finished)
     done = sorted(finished - set(damaged))
     records = [store.record(unit) for unit in done]
     results: dict[str, int] = {}
@@ -157,7 +157,7 @@ class Progress:
         if not self.shown or now - self._last < 0.2:
             return
         self._last = now
-        for unit in self.store.done() - set(self._known):
+        for unit in self.store.finished_units() - set(self._known):
             record = self.store.record(unit)
             self._known[unit] = record["members"], record["results"]
         done = sum(members for members, _ in self._known.values())

@@ -119,7 +119,7 @@ class Store:
         kept = [Quantity(x["name"], tuple(x["shape"]), np.dtype(x["dtype"])) for x in spec["kept"]]
         return [*(q for q in kept if q.name not in spec["reduce"]), RESULT]
 
-    def is_there(self) -> bool:
+    def exists(self) -> bool:
         """True if there is something by this name; an empty folder is nothing."""
         return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
@@ -141,7 +141,7 @@ class Store:
                 yield aside
                 os.rename(aside.path, place)
             except OSError:
-                if not (aside.job / "spec.json").exists() or not self.is_there():
+                if not (aside.job / "spec.json").exists() or not self.exists():
                     raise  # else another process was first
             finally:
                 shutil.rmtree(aside.path, ignore_errors=True)
@@ -199,7 +199,7 @@ class Store:
 
     # ---- units ----
 
-    def done(self) -> set[int]:
+    def finished_units(self) -> set[int]:
         """The units that are finished."""
         return {int(name.split(".")[0]) for name in os.listdir(self.job / "done") if name.endswith(".json")}
 
@@ -253,7 +253,7 @@ class Store:
         (self.job / "done" / f"{unit}.json").unlink(missing_ok=True)
         self.chunk_file(self.grid(spec), unit, RESULT.name, RESULT.shape).unlink(missing_ok=True)
 
-    def damaged(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
+    def find_damage(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
         """The damage of finished units, in words: chunks that lack or have another size or, `whole`, hash."""
         grid, found, tail = self.grid(spec), {}, _CHECKSUM if spec["format"] >= 3 else 0
         for unit in sorted(units):

@@ -14,8 +14,8 @@ is known to be dead at once.
 filelock 4.2 has this protocol as `SoftFileLease`, which was measured instead: 0.41 ms for a claim and its release, 0.04
 here, which no unit notices. But an empty claim, as a worker leaves that is killed between making and writing it, or a
 machine whose power fails, counts there as held for ever (a lease of 0.5 s was not taken in 6 s): the sweep would not
-end. Its `FileLock` needs a disk with flock, and falls back to locks without heartbeats where there is none: nobody
-takes a unit from a machine that has died.
+end. Its `FileLock` needs a disk with flock, and falls back to locks without heartbeats where there is none: no
+worker takes a unit from a machine that has died.
 
 **A child** is started afresh, never forked, and reads from the store what it computes. When it dies, or takes
 too long over a batch, the members of that batch are halved in further children until those are known that end them; the
@@ -40,7 +40,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._sweep._batch import Kept
+from lagjax._sweep._batch import KeptResults
 from lagjax._sweep._begin import first_look
 from lagjax._sweep._description import Description, pack_description, unpack_description, users_path
 from lagjax._sweep._job import Job, Unit, compute, open_job, parts, precision, starts, uses_doubles
@@ -186,7 +186,7 @@ def work(job: Job, notify: Notify = lambda: None, compute_unit: Compute = comput
     Nothing is written where all are done: a finished store may lie on a disk that is read-only.
     """
     count, writing = 0, None
-    if len(job.store.done()) == job.grid.units:
+    if len(job.store.finished_units()) == job.grid.units:
         return count
     job.store.require_writable()
     with Worker(job.store) as worker, ThreadPoolExecutor(1) as writer, precision(bool(job.spec["x64"])):
@@ -213,12 +213,12 @@ def _write(job: Job, worker: Worker, notify: Notify, unit: int, done: Unit) -> N
 def _claim_units(job: Job, worker: Worker, notify: Notify) -> Iterator[int]:
     """The units that this worker has claimed, one after the other, until all are done."""
     units, own = set(range(job.grid.units)), set()  # of its own the last one may still be in the writer
-    while left := sorted(units - job.store.done() - own):
+    while left := sorted(units - job.store.finished_units() - own):
         taken = False
         for unit in left:
             if not worker.claim(unit):
                 continue
-            if unit in job.store.done():  # it was finished after the look at what is left
+            if unit in job.store.finished_units():  # it was finished after the look at what is left
                 worker.release(unit)
                 continue
             own.add(unit)
@@ -236,7 +236,7 @@ def run_unit(path: str, unit: int) -> bool:
     """Compute one unit of a store, in whatever process this is; return False where another worker has it."""
     job = open_job(path)
     with Worker(job.store) as worker:
-        if unit in job.store.done() or not worker.claim(unit):
+        if unit in job.store.finished_units() or not worker.claim(unit):
             return False
         with precision(bool(job.spec["x64"])):
             _write(job, worker, lambda: None, unit, compute(job, unit))
@@ -246,7 +246,7 @@ def run_unit(path: str, unit: int) -> bool:
 def submit(job: Job, executor: Any, notify: Notify) -> None:
     """Compute the units by an executor, some at a time, until all are done, by whichever worker."""
     _require_no_fork(executor)
-    if len(job.store.done()) == job.grid.units:
+    if len(job.store.finished_units()) == job.grid.units:
         return
     job.store.require_writable()
     running: set[Any] = set()
@@ -262,7 +262,7 @@ def _submit_all(job: Job, executor: Any, notify: Notify, running: set[Any]) -> N
     """Have all units done, with the tasks that are on their way in `running`."""
     path = str(Path(job.store.path).resolve())
     while True:
-        left = sorted(set(range(job.grid.units)) - job.store.done())
+        left = sorted(set(range(job.grid.units)) - job.store.finished_units())
         if not left:
             return
         free = 0
@@ -397,7 +397,7 @@ class Child:
         """Compute a unit, without the members that end the child."""
         return _compute_alone(self, job, unit)
 
-    def look(self, description: Description, points: dict[str, np.ndarray]) -> tuple[Kept, float, bool]:
+    def look(self, description: Description, points: dict[str, np.ndarray]) -> tuple[KeptResults, float, bool]:
         """The kept values of a few members (`first_look`), of those at least that do not end the child."""
         request = pack_description(description), users_path(), uses_doubles()
         waiting = [points]
@@ -510,7 +510,7 @@ def serve(path: str) -> None:
             send("error", traceback.format_exc())
 
 
-def _look(request: tuple[bytes, list[str], bool], points: dict[str, np.ndarray]) -> tuple[Kept, float, bool]:
+def _look(request: tuple[bytes, list[str], bool], points: dict[str, np.ndarray]) -> tuple[KeptResults, float, bool]:
     data, path, doubles = request
     _set_precision(doubles)
     return first_look(unpack_description(data, path), points)

@@ -260,8 +260,8 @@ def begun(folder, units=0, **changes):
 
 def test_goes_on_where_it_stopped(tmp_path, undisturbed):
     store = begun(tmp_path, 2)
-    assert len(store.done()) == 2
-    times = {unit: (store.job / "done" / f"{unit}.json").stat().st_mtime_ns for unit in store.done()}
+    assert len(store.finished_units()) == 2
+    times = {unit: (store.job / "done" / f"{unit}.json").stat().st_mtime_ns for unit in store.finished_units()}
     swept(tmp_path)
     assert all((store.job / "done" / f"{unit}.json").stat().st_mtime_ns == t for unit, t in times.items())
     assert digests(tmp_path) == undisturbed and not os.listdir(store.job / "claims")
@@ -375,8 +375,8 @@ def test_disks_that_refuse(tmp_path, undisturbed, monkeypatch, number, words):
     store = Store(tmp_path / "store")
     with pytest.raises(OSError, match=f"nothing was computed: .*{words}"), _workers.Worker(store):
         pass
-    done = store.done()
-    assert 0 < len(done) < 6 and not store.damaged(store.spec(), done, whole=True)
+    done = store.finished_units()
+    assert 0 < len(done) < 6 and not store.find_damage(store.spec(), done, whole=True)
     monkeypatch.undo()
     swept(tmp_path)
     assert digests(tmp_path) == undisturbed
@@ -674,10 +674,12 @@ def test_kills_lose_nothing_but_the_unit_in_work(tmp_path, undisturbed):
         while not os.listdir(store.job / "claims") and shell.poll() is None:
             time.sleep(0.001)
         time.sleep(rng.uniform(0.0, 0.3))
-        before = store.done()
+        before = store.finished_units()
         shell.kill()
         shell.communicate()
-        assert before <= store.done() and not store.damaged(store.spec(), store.done(), whole=True)
+        assert before <= store.finished_units() and not store.find_damage(
+            store.spec(), store.finished_units(), whole=True
+        )
     swept(tmp_path)
     assert digests(tmp_path) == undisturbed
 

@@ -157,8 +157,8 @@ def test_of_several_who_make_a_store_the_first_one_stays(tmp_path):
     with store.create_aside() as second:
         with store.create_aside() as first:
             make(first, "first")
-            assert not store.is_there()
-        assert store.is_there()
+            assert not store.exists()
+        assert store.exists()
         make(second, "second")
     assert (store.job / "spec.json").read_text() == "first" and os.listdir(tmp_path) == ["store"]
     with pytest.raises(KeyboardInterrupt), Store(tmp_path / "other").create_aside() as aside:
