@@ -51,7 +51,12 @@ def makers(name: str) -> list[str]:
             thing = inspect.getattr_static(owner, member)
             returned = getattr(thing, "__annotations__", {}).get("return", "")
             text = returned if isinstance(returned, str) else getattr(returned, "__name__", "") + str(returned)
-            if member != "of" and member[0] != "_" and not inspect.isclass(thing) and re.search(rf"\b{name}\b", text):
+            if (
+                member != "from_fields"
+                and member[0] != "_"
+                and not inspect.isclass(thing)
+                and re.search(rf"\b{name}\b", text)
+            ):
                 found.append(prefix + member)
     return found
 

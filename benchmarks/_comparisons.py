@@ -99,8 +99,8 @@ def _nanoseconds(forms: dict[str, tuple[Callable, Any]], case: Case, repeats: in
 
 def _in_machine_code(case: Case) -> Callable[[], None] | None:
     """The same chain in the lanes of vectors, as the integrator evaluates them; None without machine code."""
-    layout = Layout.of(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
-    problem = Problem.about(case.scene.system, layout, case.scene.params)
+    layout = Layout.from_state(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
+    problem = Problem.from_system(case.scene.system, layout, case.scene.params)
     if MachineCode().refuses(problem) is not None:
         return None
     acceleration = problem.derivation.acceleration
@@ -134,7 +134,7 @@ def _in_machine_code(case: Case) -> Callable[[], None] | None:
 def derived_equations(case: Case) -> tuple[MotionEquations, Any]:
     """The right-hand side as `lagjax.simulate` uses it, and the parameters as arrays."""
     params = jax.tree.map(jnp.asarray, case.scene.params)
-    layout = Layout.of(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
+    layout = Layout.from_state(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
     return form_of(derivation_of(case.scene.system, layout, params)), params
 
 

@@ -195,13 +195,13 @@ def __dir__() -> list[str]:
 @functools.cache
 def _places() -> dict[str, str]:
     """The module of every public name and result: what a type checker reads, so that it is said once."""
-    (block,) = (node for node in _parsed(__name__).body if isinstance(node, ast.If))
-    imports = [*block.body, *_parsed(f"{__name__}.results").body]
+    (block,) = (node for node in _parse_module(__name__).body if isinstance(node, ast.If))
+    imports = [*block.body, *_parse_module(f"{__name__}.results").body]
     imports = [node for node in imports if isinstance(node, ast.ImportFrom)]
     return {alias.name: str(node.module) for node in imports for alias in node.names if alias.name != "*"}
 
 
-def _parsed(module: str) -> ast.Module:
+def _parse_module(module: str) -> ast.Module:
     """The syntax of a module of this package, which is not imported for it."""
     loader = __spec__.loader if module == __name__ else importlib.util.find_spec(module).loader  # type: ignore
     return ast.parse(loader.get_source(module))  # type: ignore[attr-defined]

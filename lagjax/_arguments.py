@@ -147,7 +147,7 @@ def accept(
     bound = function.keywords if isinstance(function, functools.partial) else {}
     wanted = [p for p in rest if p.name not in bound]
     given = [p for p in wanted if p.name in extras and p.kind in _BY_NAME]
-    needed = {p.name for p in signature.parameters.values() if p.default is p.empty or _meant(p.name, extras)}
+    needed = {p.name for p in signature.parameters.values() if p.default is p.empty or _resembles_extra(p.name, extras)}
     unknown = [str(p) for p in wanted if p not in given and p.name in needed]
     if unknown:
         raise TypeError(
@@ -155,11 +155,11 @@ def accept(
             f"have the form {expected}. Put constants into `params`, or bind them with functools.partial."
         )
     arrays, code = eqx.partition(function, eqx.is_array)
-    return Function(arrays, Edition.of(code), tuple(p.name for p in given))
+    return Function(arrays, Edition.from_function(code), tuple(p.name for p in given))
 
 
-def _meant(name: str, extras: tuple[str, ...]) -> bool:
-    """True if a name may stand for one of the extras, whose default would then be a silent mistake."""
+def _resembles_extra(name: str, extras: tuple[str, ...]) -> bool:
+    """True if a name is a likely misspelling of one of the extras, whose default would then be a silent mistake."""
     known = [*extras, *(["time"] if "t" in extras else [])]
     return bool(difflib.get_close_matches(name.lower(), known, cutoff=0.7))
 

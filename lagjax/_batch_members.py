@@ -24,8 +24,8 @@ class Members:
         self.batch = np.shape(trajectory.result._value)
         self.count, rank = math.prod(self.batch), len(self.batch)
         first = jax.tree.map(lambda leaf: numbers_at(leaf, (0,) * (rank + 1)), (trajectory.q, trajectory.qdot))
-        self.layout, self.trajectory = Layout.of(*first), trajectory
-        # Of the axes of a batch, the innermost shares times and some parameters (`Trajectory.over_members`).
+        self.layout, self.trajectory = Layout.from_state(*first), trajectory
+        # Of the axes of a batch, the innermost shares times and some parameters (`Trajectory.map_members`).
         self._outer = rank - (rank > 0 and np.ndim(trajectory.ts) < 1 + rank)
         self.numbers, self.params = self._parameters()
 

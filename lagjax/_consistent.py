@@ -129,7 +129,7 @@ def inconsistent_members(system, ts, values: dict, axes: dict) -> jax.Array | No
 
 @eqx.filter_jit
 def _inconsistent(system, t, span, q0: PyTree, qdot0: PyTree, params: PyTree) -> jax.Array:
-    layout = Layout.of(q0, qdot0)
+    layout = Layout.from_state(q0, qdot0)
     state = layout.flatten(q0), layout.flatten(qdot0), t, eqx.filter(params, eqx.is_array_like)
     motion = system.motion(layout, params)
     return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, span)

@@ -18,7 +18,7 @@ from lagjax._layout import Layout, halves
 from lagjax._machine_code import MOST_GUARDS, MachineCode, Noted, Surfaces, surfaces_of
 from lagjax._platform import is_known
 from lagjax._problem import Problem, Solution
-from lagjax._results import RESULTS, SUCCESSFUL, SimulationError, as_printed, code_of
+from lagjax._results import RESULTS, SUCCESSFUL, SimulationError, code_of, show_str
 from lagjax._system import System, require_system
 from lagjax._validate import as_arrays, is_concrete, require_budget, require_flag
 
@@ -40,7 +40,7 @@ class Crossings(NamedTuple):
     count: jax.Array
     ok: jax.Array
 
-    _repr_pretty_ = as_printed
+    _repr_pretty_ = show_str
 
     def __str__(self) -> str:
         if not all(map(is_known, (self.t, self.count, self.ok))):
@@ -107,8 +107,8 @@ def crossings(
     require_budget(count, "count")
     names, functions = sections_of(section)
     directions = directions_of(direction, names)
-    layout = Layout.of(q0, qdot0)
-    problem = Problem.of(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
+    layout = Layout.from_state(q0, qdot0)
+    problem = Problem.from_arguments(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
     if has_constraints(system):
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
         require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
@@ -118,7 +118,7 @@ def crossings(
     result, end, ok = how(noted, solution, count)
     if throw:
         noted = _raise_unless_ok(problem, end, noted, result)
-    return as_crossings(problem.layout, names, noted, ok)
+    return restore_crossings(problem.layout, names, noted, ok)
 
 
 def _how_it_ended(noted: Noted, solution: Solution, count: int, library: Any = np) -> tuple:
@@ -149,7 +149,9 @@ def _raise_unless_ok(problem: Problem, end: tuple, noted: Noted, result) -> Note
     return noted
 
 
-def as_crossings(layout: Layout, names: tuple[str, ...] | None, noted: Noted, ok) -> Crossings | dict[str, Crossings]:
+def restore_crossings(
+    layout: Layout, names: tuple[str, ...] | None, noted: Noted, ok
+) -> Crossings | dict[str, Crossings]:
     """The crossings in the pytree of the user, and by the names of the sections."""
 
     def section_crossings(k: int) -> Crossings:

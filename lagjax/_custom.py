@@ -13,7 +13,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 
-def differentiated_as(function: Callable, values: tuple, *arguments) -> tuple:
+def attach_derivative(function: Callable, values: tuple, *arguments) -> tuple:
     """`values`, a tuple of arrays, with the derivatives of `function(*arguments)`, a tuple like it; of every order.
 
     `function` may only vary with its arguments, which are arrays.
@@ -48,7 +48,7 @@ def batch_in_front(arrays, axes) -> list:
     ]
 
 
-def _batched(arrays, axes, *, function, count):
+def _batch(arrays, axes, *, function, count):
     arrays = batch_in_front(arrays, axes)
     return with_p.bind(*arrays, function=jax.vmap(function), count=count), [0] * count
 
@@ -59,4 +59,4 @@ with_p.def_impl(_values)
 with_p.def_abstract_eval(lambda *avals, function, count: list(avals[:count]))
 mlir.register_lowering(with_p, mlir.lower_fun(_values, multiple_results=True))
 ad.primitive_jvps[with_p] = _jvp
-batching.primitive_batchers[with_p] = _batched
+batching.primitive_batchers[with_p] = _batch

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._blame import Offender, offenders, pieces_of, poles
-from lagjax._check import check, listed
+from lagjax._check import check, join_names
 from lagjax._derivation import Derivation, derivation_of, numbers_of
 from lagjax._failures import sentence
 from lagjax._layout import Layout, halves
@@ -119,13 +119,13 @@ def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
         return f"\n{text}"
     if (at := _running_away(derivation, ended)) is not None:
         return f"\n{_escape(derivation, ended, at, _pole(derivation, params, ended))}"
-    return _checked(system, derivation, state, params, ended) or _budget(ended)
+    return _run_check(system, derivation, state, params, ended) or _budget(ended)
 
 
 def _reset_to_nothing(layout: Layout, ended: Ended) -> str:
     names = [*layout.names, *(f"the velocity of {name}" for name in layout.names)]
     bad = [f"{name} ({value})" for name, value in zip(names, ended.y, strict=True) if not np.isfinite(value)]
-    return f"The reset of the transition at t = {ended.t:.9g} returned {listed(bad)}: every number must be finite."
+    return f"The reset of the transition at t = {ended.t:.9g} returned {join_names(bad)}: every number must be finite."
 
 
 # ---- what is not finite ----------------------------------------------------------------------------------------------
@@ -205,9 +205,9 @@ def _coordinate_values(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def _describe_undefined(undefined: Undefined) -> str:
-    listed_ = listed([f"{n} ({x})" for n, x in zip(undefined.names, undefined.values, strict=True)])
+    quantities = join_names([f"{n} ({x})" for n, x in zip(undefined.names, undefined.values, strict=True)])
     since = f", from t = {undefined.t:.9g} on, whatever the state" if undefined.by_time else ""
-    return f"Not finite {'just ahead' if undefined.ahead else 'there'}: {undefined.what} {listed_}{since}"
+    return f"Not finite {'just ahead' if undefined.ahead else 'there'}: {undefined.what} {quantities}{since}"
 
 
 def _line(derivation: Derivation, params, undefined: Undefined) -> str:
@@ -272,7 +272,7 @@ def _singular_mass(derivation: Derivation, ended: Ended) -> str:
     names = derivation.layout.names
     along = [f"d{name}" for name, c in zip(names, vectors[:, place], strict=True) if abs(c) > 0.1]
     return (
-        f"The mass matrix is nearly singular there: along {listed(along)} it has come down from {usual:.1e} to "
+        f"The mass matrix is nearly singular there: along {join_names(along)} it has come down from {usual:.1e} to "
         f"{left:.1e}. The coordinates are singular where the motion went (polar ones at r = 0, spherical ones and "
         "Euler angles at a pole), or the kinetic energy vanishes: use coordinates that are regular there."
     )
@@ -360,7 +360,7 @@ _EXPLAIN = (
 )  # fmt: skip
 
 
-def _checked(system: System, derivation: Derivation, state, params, ended: Ended) -> str:
+def _run_check(system: System, derivation: Derivation, state, params, ended: Ended) -> str:
     """The first finding of `check` at the end that explains the failure."""
     if derivation.layout.size > (LARGEST if is_lowered(derivation) else 16):
         return ""
@@ -380,7 +380,7 @@ def _borders(derivation: Derivation, params, ended: Ended) -> str:
     functions = [f for f in (derivation.motion.forces, derivation.motion.lagrangian) if f is not None]
     functions = [f for f in functions if _is_short(f, arguments)]
     places = list(dict.fromkeys(f"{name}{place}" for f in functions for name, place, _ in pieces_of(f, *arguments)))
-    return f" The scene is pieced together by {listed(places, 3)}." if places else ""
+    return f" The scene is pieced together by {join_names(places, 3)}." if places else ""
 
 
 def _budget(ended: Ended) -> str:

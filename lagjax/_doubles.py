@@ -172,7 +172,7 @@ class _Map:
         return _Map(forward, len(moving), back, tuple(results.values()))
 
     def batched(self, axes: tuple, size: int) -> "_Map":
-        """The same for batches of this size along these axes of the arguments; that of the results is their first."""
+        """The map for batches of this size along these axes of its arguments, and along the first of its results."""
         first, back = len(axes) - self.linear, self.transposed
 
         def transposed(*given):
@@ -209,7 +209,7 @@ def _evaluate(*arrays, of: _Map, keeps_integers: bool):
         return [jax.device_put(_narrow_array(x, keeps_integers)) for x in results]
 
 
-def _compiled(ctx, *arrays, of: _Map, keeps_integers: bool):
+def _lower(ctx, *arrays, of: _Map, keeps_integers: bool):
     def rounded(*arrays):
         results = of.function(*(x.astype(_WIDE.get(x.dtype, x.dtype)) for x in arrays))
         return [jnp.asarray(x).astype(_narrow(x.dtype, keeps_integers)) for x in results]
@@ -250,7 +250,7 @@ def _transpose(cotangents, *arguments, of: _Map, **settings):
     return [None] * first + [new if ad.is_undefined_primal(x) else None for x, new in linear]
 
 
-def _batched(arrays, axes, *, of: _Map, **settings):
+def _batch(arrays, axes, *, of: _Map, **settings):
     first = len(arrays) - of.linear
     size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
     # What it is linear in has one row a member, so that a cotangent of it has, too.
@@ -263,7 +263,7 @@ def _batched(arrays, axes, *, of: _Map, **settings):
     return results, [0] * len(results)
 
 
-mlir.register_lowering(computed_p, _compiled)
+mlir.register_lowering(computed_p, _lower)
 ad.primitive_jvps[computed_p] = _jvp
 ad.primitive_transposes[computed_p] = _transpose
-batching.primitive_batchers[computed_p] = _batched
+batching.primitive_batchers[computed_p] = _batch

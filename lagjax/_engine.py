@@ -36,7 +36,7 @@ def requested_engine(
     if isinstance(solver, MachineCode):
         for what, given in others.items():
             if given:
-                raise ValueError(_refused(f"{what} was asked for".replace("steps was", "steps were")))
+                raise ValueError(_refusal(f"{what} was asked for".replace("steps was", "steps were")))
         return solver
     return Diffrax.from_arguments(solver, dt, adjoint, progress) if solver is not None or any(others.values()) else None
 
@@ -54,7 +54,7 @@ def choose(problem: Problem, asked: AbstractEngine | None = None) -> Choice:
         if refusal is None:
             return Choice(_MACHINE_CODE, None)
         if asked is not None:
-            raise ValueError(_refused(refusal))
+            raise ValueError(_refusal(refusal))
         choice = Choice(Diffrax(), refusal)
     if refusal := choice.engine.refuses(problem):
         raise ValueError(f"{refusal}.")
@@ -72,7 +72,7 @@ def explain_refusal(problem: Problem) -> str | None:
     return refusal
 
 
-def _refused(reason: str) -> str:
+def _refusal(reason: str) -> str:
     return (
         f"solver=lagjax.MachineCode() cannot integrate this: {reason}. Leave solver at None, and diffrax integrates "
         "what machine code cannot."

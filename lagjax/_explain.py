@@ -17,7 +17,7 @@ from lagjax._linear import dependent_rows
 from lagjax._native import Nesting, is_large, pieces_of
 from lagjax._problem import Problem
 from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Program, Unlowerable
-from lagjax._results import as_printed
+from lagjax._results import show_str
 
 _PIECES = {
     SIGN: "the sign of", FLOOR: "the whole part of", TRUNC: "the whole part of", CLOCK: "samples by",
@@ -80,14 +80,14 @@ class Explanation:
             }
         return replace(self, constraints=tuple(names), dependent_constraints=dependent)
 
-    _repr_pretty_ = as_printed
+    _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        rows = [("coordinates", f"{len(self.coordinates)}: {_listed(self.coordinates)}")]
+        rows = [("coordinates", f"{len(self.coordinates)}: {_join_names(self.coordinates)}")]
         if self.cyclic is not None:
-            reads = _listed(self.mass_matrix_depends_on or ())
+            reads = _join_names(self.mass_matrix_depends_on or ())
             rows += [
-                ("cyclic", _listed(self.cyclic)),
+                ("cyclic", _join_names(self.cyclic)),
                 ("mass matrix", f"{self.mass_matrix}; depends on {reads}"),
                 ("velocity terms", "yes" if self.velocity_terms else "no"),
                 ("explicit time", "yes" if self.explicit_time else "no"),
@@ -95,13 +95,13 @@ class Explanation:
             ]
         if self.borders:
             how = "steps end there" if self.borders_located else "not located: steps of diffrax go across"
-            rows.append(("borders", f"{_counted(self.borders)}; {how}"))
+            rows.append(("borders", f"{_count_names(self.borders)}; {how}"))
         if self.narrow:
-            rows.append(("narrow features", _counted(self.narrow)))
+            rows.append(("narrow features", _count_names(self.narrow)))
         if self.constraints:
-            rows.append(("constraints", f"{len(self.constraints)}: {_listed(self.constraints)}"))
+            rows.append(("constraints", f"{len(self.constraints)}: {_join_names(self.constraints)}"))
         for name, others in (self.dependent_constraints or {}).items():
-            rows.append(("dependent", f"{name} on {_listed(others)}"))
+            rows.append(("dependent", f"{name} on {_join_names(others)}"))
         if self.operations is not None:
             rows.append(("operations", f"{self.operations} per acceleration, {self.traced_operations} as derived"))
         if self.projection_operations is not None:
@@ -169,7 +169,7 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
         return {"borders": (), "narrow": (), "borders_located": True}
 
     def read_by(node: int) -> str:
-        return _listed(tuple(inputs[i] for i in sorted(borders.read_by(node)) if i < len(inputs)))
+        return _join_names(tuple(inputs[i] for i in sorted(borders.read_by(node)) if i < len(inputs)))
 
     kinds = zip(borders.switches, borders.kinds, strict=True)
     in_machine_code = choose(problem).refusal is None and pieces_of(derivation.acceleration, Nesting(n)) is not None
@@ -189,9 +189,9 @@ def _borders_in_lines(problem: Problem) -> dict[str, Any]:
     return {"borders": names, "borders_located": not names}
 
 
-def _counted(names: tuple[str, ...]) -> str:
+def _count_names(names: tuple[str, ...]) -> str:
     """The count of names, and each of them once."""
-    return f"{len(names)}: {_listed(tuple(dict.fromkeys(names)))}"
+    return f"{len(names)}: {_join_names(tuple(dict.fromkeys(names)))}"
 
 
 def _pattern(parts: Program, n: int) -> str:
@@ -203,6 +203,6 @@ def _pattern(parts: Program, n: int) -> str:
     return "dense" if connected.all() else "block-diagonal"
 
 
-def _listed(names: tuple[str, ...], longest: int = 12) -> str:
+def _join_names(names: tuple[str, ...], longest: int = 12) -> str:
     shown = ", ".join(names[:longest]) or "none"
     return shown + (f", … ({len(names) - longest} more)" if len(names) > longest else "")

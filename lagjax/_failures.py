@@ -16,7 +16,7 @@ from jax.experimental.buffer_callback import buffer_callback
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from lagjax._custom import batch_in_front, differentiated_as
+from lagjax._custom import attach_derivative, batch_in_front
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, advice, code_of, result_from
 
 
@@ -81,7 +81,7 @@ def _check_eagerly(result, *values, **settings):
     return jnp.zeros(jnp.shape(result), values[0].dtype)
 
 
-def _compiled(on_host):
+def _lower_with(on_host):
     """One comparison where all is well; the host is called only where something failed."""
 
     def check(result, *values, **settings):
@@ -103,8 +103,8 @@ def _call_on_copies(host, shape):
     return lambda *arrays: jax.pure_callback(lambda *x: host(*x), shape, *arrays)
 
 
-mlir.register_lowering(check_p, _compiled(_call_on_copies))
-mlir.register_lowering(check_p, _compiled(_call_on_buffers), platform="cpu")
+mlir.register_lowering(check_p, _lower_with(_call_on_copies))
+mlir.register_lowering(check_p, _lower_with(_call_on_buffers), platform="cpu")
 
 
 def _zero_derivative(primals, tangents, **settings):
@@ -139,7 +139,7 @@ def lost_unless(reached, x, inputs):
 
 def differentiable_where(well, x, *inputs):
     """`x` itself, whose derivatives by it and by `inputs` are NaN unless `well` holds."""
-    return differentiated_as(lambda well, x, *more: (lost_unless(well, x, (x, *more)),), (x,), well, x, *inputs)[0]
+    return attach_derivative(lambda well, x, *more: (lost_unless(well, x, (x, *more)),), (x,), well, x, *inputs)[0]
 
 
 def _nan_unless(reached, x):

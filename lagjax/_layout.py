@@ -28,7 +28,7 @@ class Layout:
     dtype: np.dtype
 
     @classmethod
-    def of(cls, q: PyTree, qdot: PyTree) -> "Layout":
+    def from_state(cls, q: PyTree, qdot: PyTree) -> "Layout":
         """Read the layout of a state; raise `TypeError` or `ValueError`, with a sentence, where (q, qdot) is none."""
         paths, tree, shapes, dtypes = _structure(q, "q")
         _, qdot_tree, qdot_shapes, qdot_dtypes = _structure(qdot, "qdot")
@@ -88,7 +88,7 @@ def flatten_numbers(numbers: PyTree, dtype) -> Float[Array, " P"]:
 
 def _structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tuple[int, ...], ...], list]:
     """The paths, the tree, the shapes and the dtypes of a pytree, whose leaves are checked to hold real floats."""
-    paths, leaves, structure = taken_apart(tree, name)
+    paths, leaves, structure = labelled_leaves(tree, name)
     dtypes = []
     for path, leaf in zip(paths, leaves, strict=True):
         try:
@@ -121,7 +121,7 @@ def dtype_of(x):
     return jnp.result_type(x)
 
 
-def taken_apart(tree: PyTree, name: str, is_leaf=None) -> tuple[tuple[str, ...], list, Any]:
+def labelled_leaves(tree: PyTree, name: str, is_leaf=None) -> tuple[tuple[str, ...], list, Any]:
     """The leaves of a pytree with their names, such as `params['m']`, and its structure."""
     try:
         leaves, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf)

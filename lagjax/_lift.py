@@ -1,4 +1,4 @@
-"""`lifted`: a problem whose functions close over numbers that are being traced, with these as parameters.
+"""`lift_problem`: a problem whose functions close over numbers that are being traced, with these as parameters.
 
 `jax.grad(lambda k: simulate(System(lambda q, v: … k …), …))` gives a Lagrangian that reads a tracer. No program can be
 made of that, nor kept. So each function is traced once, as `jax.closure_convert` does, what it took from outside goes
@@ -67,8 +67,8 @@ class Unchanged:
         return self.function(*roles, t=t, params=params.params)
 
 
-def lifted(problem: Problem) -> Problem:
-    """The problem with the tracers that its functions close over as parameters; the same where there are none."""
+def lift_problem(problem: Problem) -> Problem:
+    """The problem with the tracers that its functions close over as parameters; itself where they close over none."""
     fields = object.__getattribute__(problem.system, "__dict__")  # an attribute of an equinox.Module takes 2 µs
     present = [f for role in ROLES if isinstance(f := fields[role], Function)]
     if problem.event is not None:
@@ -81,7 +81,7 @@ def lifted(problem: Problem) -> Problem:
     values: list[Tracer] = []
 
     def lift(function: Any, roles: int = 2) -> Any:
-        return _lifted(function, roles, problem, values) if isinstance(function, Function) else function
+        return _lift_function(function, roles, problem, values) if isinstance(function, Function) else function
 
     system = replace_functions(
         problem.system, {name: lift(f, 1 + (name != "constraints")) for name, f in functions.items()}
@@ -93,9 +93,9 @@ def lifted(problem: Problem) -> Problem:
     return dataclasses.replace(problem, system=system, event=event, params=Lifted(problem.params, tuple(values)))
 
 
-def lifted_batch(batch: Batch) -> Batch:
+def lift_batch(batch: Batch) -> Batch:
     """A batch with the tracers that its functions close over as parameters of all members."""
-    member = lifted(batch.member)
+    member = lift_problem(batch.member)
     if member is batch.member:
         return batch
     values = member.params.values
@@ -106,11 +106,11 @@ def _is_function(x: Any) -> bool:
     return isinstance(x, Function)
 
 
-def _lifted(function: Function, roles: int, problem: Problem, values: list) -> Function:
+def _lift_function(function: Function, roles: int, problem: Problem, values: list) -> Function:
     extras = tuple(dict.fromkeys((*function.extras, "params")))
     if not function.code.tracers or "inputs" in function.extras:
         unchanged = Unchanged(function)
-        return Function(None, Edition.of(unchanged), extras)
+        return Function(None, Edition.from_function(unchanged), extras)
     numbers, rest = eqx.partition(problem.params, eqx.is_array_like)
     layout = problem.layout
     state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
@@ -141,4 +141,4 @@ def function_from_trace(function: Function, jaxpr, constants: tuple, places: tup
     """
     trace = _Trace(function.name, jaxpr, constants, places, structure)
     extras = tuple(dict.fromkeys((*function.extras, "params")))
-    return Function(None, function.code.with_tracers_as_arguments(trace, how), extras)
+    return Function(None, function.code.trace_edition(trace, how), extras)

@@ -65,7 +65,7 @@ def factorize(matrix: Matrix) -> Factorization:
     """Scale and invert a symmetric matrix."""
     matrix = 0.5 * (matrix + matrix.T)
     scale = jax.lax.stop_gradient(diagonal_scale(matrix))
-    inverse, order, pivots = inverted(jax.lax.stop_gradient(_scaled(matrix, scale)))
+    inverse, order, pivots = invert(jax.lax.stop_gradient(_scaled(matrix, scale)))
     pivots, threshold = jnp.abs(pivots), singular_threshold(matrix.shape[0], matrix.dtype)
     return Factorization(matrix, scale, inverse, order, jnp.min(pivots) <= threshold * jnp.max(pivots))
 
@@ -132,7 +132,7 @@ def null_directions(matrix: np.ndarray, threshold: float | None = None) -> np.nd
 _PANEL = 16
 
 
-def inverted(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
+def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
     """B, `order` and the pivots of A with A⁻¹ b = B b[order], by Gauss-Jordan elimination with partial pivoting.
 
     A need not be symmetric.

@@ -59,7 +59,7 @@ class Sample(NamedTuple):
                 raise
         (system, params), layout = self.scene, self.derivation.layout
         q, qdot, t = (jnp.asarray(x, layout.dtype) for x in (self.q, self.qdot, self.t))
-        return jax.tree.map(np.asarray, _compiled(names, system, layout, q, qdot, t, params))
+        return jax.tree.map(np.asarray, _evaluate_compiled(names, system, layout, q, qdot, t, params))
 
     def flat(self, *names: str) -> np.ndarray:
         """The `quantities` with these names, flattened and concatenated, (S, outputs)."""
@@ -99,10 +99,10 @@ class Sample(NamedTuple):
             parts.append(function(part, *others))
         return parts[0] if len(parts) == 1 else jax.tree.map(lambda *some: np.concatenate(some), *parts)
 
-    def solved(self) -> np.ndarray:
+    def solve_acceleration(self) -> np.ndarray:
         """q̈ (S, n) from the quantities `SADDLE`. Raises `Unlowerable`."""
         with np.errstate(all="ignore"):
-            return solved(self.quantities(*SADDLE))[0]
+            return solve_saddle(self.quantities(*SADDLE))[0]
 
     def pieces(self) -> np.ndarray:
         """A number (S,) that is another one where the accelerations decide on other pieces."""
@@ -131,13 +131,13 @@ def borders_of(derivation: Derivation):
     return borders if borders is not None and borders.switches else None
 
 
-def solved(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def solve_saddle(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """q̈ (S, n) and λ (S, m) from the quantities `SADDLE`."""
     return saddle_many(of["mass_matrix"], of["force"], of["jacobian"], of["gamma"])
 
 
 @eqx.filter_jit
-def _compiled(names: tuple[str, ...], system: Any, layout: Layout, q, qdot, t, params) -> dict[str, jax.Array]:
+def _evaluate_compiled(names: tuple[str, ...], system: Any, layout: Layout, q, qdot, t, params) -> dict[str, jax.Array]:
     motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
 
     def quantities_at(q, qdot, t):

@@ -22,7 +22,7 @@ from lagjax._engine import choose
 from lagjax._layout import Layout
 from lagjax._machine_code import MachineCode
 from lagjax._problem import LEAST_RTOL, Batch, Problem, axes_per_leaf
-from lagjax._results import as_printed
+from lagjax._results import show_str
 from lagjax._simulate import simulate, simulate_batch
 from lagjax._system import System, require_system
 from lagjax._trajectory import Trajectory
@@ -78,7 +78,7 @@ class WorkPrecision(eqx.Module):
     def __len__(self) -> int:
         return len(self.rows)
 
-    _repr_pretty_ = as_printed
+    _repr_pretty_ = show_str
 
     def __str__(self) -> str:
         table = [_HEADER, *map(_cells, self.rows)]
@@ -190,9 +190,9 @@ def _problem(system: System, q0: PyTree, qdot0: PyTree, ts, params: PyTree, batc
     """The problem to be integrated, or that of one member."""
     system = require_system(system)
     if batch_axes is None:
-        return Problem.of(system, Layout.of(q0, qdot0), q0, qdot0, ts, params)
+        return Problem.from_arguments(system, Layout.from_state(q0, qdot0), q0, qdot0, ts, params)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
-    return Batch.of(system, values, *axes_per_leaf(values, batch_axes), ts).member
+    return Batch.from_values(system, values, *axes_per_leaf(values, batch_axes), ts).member
 
 
 def _default_solvers(problem: Problem) -> dict[str, diffrax.AbstractSolver | None]:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 from lagjax._arguments import accept
 from lagjax._derivation import Derivation, derivation_of
 from lagjax._doubles import DOUBLE, SINGLE
-from lagjax._layout import Layout, dtype_of, flatten_numbers, halves, taken_apart
+from lagjax._layout import Layout, dtype_of, flatten_numbers, halves, labelled_leaves
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._reads import Edition
 from lagjax._validate import (
@@ -81,15 +81,15 @@ class Problem:
     is_rounded: bool = field(metadata={"static": True}, default=False)
 
     @classmethod
-    def of(
+    def from_arguments(
         cls, system, layout: Layout, q0, qdot0, ts, params=None, rtol=None, atol=None, max_steps=65_536, event=None
     ) -> "Problem":
-        """The problem that a user states, after checking all that does not depend on an engine.
+        """The problem of the arguments of `simulate`, after checks of all that does not depend on an engine.
 
         Raises `TypeError` or `ValueError` with the name of the argument that cannot be right.
         """
         dtype, given = layout.dtype, _check_fields(layout.dtype, params, ts, rtol, atol, max_steps, event)
-        y0 = end_to_end(jax.tree.leaves(as_arrays((q0, qdot0), dtype, "state")), dtype)
+        y0 = concatenate_leaves(jax.tree.leaves(as_arrays((q0, qdot0), dtype, "state")), dtype)
         problem = cls(system=system, layout=layout, y0=y0, **given)
         vectors = y0, problem.vector
         if not all(isinstance(x, np.ndarray) and all_finite(x) for x in vectors):  # leaf by leaf, with their names
@@ -98,10 +98,10 @@ class Problem:
         return problem
 
     @classmethod
-    def about(
+    def from_system(
         cls, system, layout: Layout, params, ts=(0.0, 1.0), rtol=None, atol=None, max_steps=65_536, event=None
     ) -> "Problem":
-        """A problem about this scene from a state of zeros: enough to ask which engine it is for."""
+        """A problem of this scene that starts at q = q̇ = 0: enough to choose an engine and to make its program."""
         given = _check_fields(layout.dtype, params, ts, rtol, atol, max_steps, event)
         return cls(system=system, layout=layout, y0=np.zeros(2 * layout.size, layout.dtype), **given)
 
@@ -125,7 +125,7 @@ class Problem:
     @functools.cached_property
     def vector(self) -> Float[Numbers, " P"]:
         """Every number in the parameters, shape (P,), in the dtype of the state."""
-        return end_to_end(list(filter(eqx.is_array_like, jax.tree.leaves(self.params))), self.layout.dtype)
+        return concatenate_leaves(list(filter(eqx.is_array_like, jax.tree.leaves(self.params))), self.layout.dtype)
 
     @property
     def is_known(self) -> bool:
@@ -165,16 +165,16 @@ class Batch(eqx.Module):
     axes: tuple[int | None, ...] = eqx.field(static=True)
 
     @classmethod
-    def of(
+    def from_values(
         cls, system, values: dict, axes: dict, size: int, ts, rtol=None, atol=None, max_steps=65_536, event=None
     ) -> "Batch":
         """The batch of `values` by name, q0, qdot0, params, with the axis of members of every leaf (`axes_per_leaf`).
 
-        Raises `TypeError` or `ValueError` as `Problem.of`; a number of one member alone may be NaN.
+        Raises `TypeError` or `ValueError` as `Problem.from_arguments`; a number of one member alone may be NaN.
         """
         member = {name: jax.tree.map(_shape_of_one, value, axes[name]) for name, value in values.items()}
-        layout = Layout.of(member["q0"], member["qdot0"])
-        one = Problem.about(system, layout, member["params"], ts, rtol, atol, max_steps, event)
+        layout = Layout.from_state(member["q0"], member["qdot0"])
+        one = Problem.from_system(system, layout, member["params"], ts, rtol, atol, max_steps, event)
         arrays = {name: as_arrays(value, layout.dtype, name) for name, value in values.items()}
         for name, value in arrays.items():
             require_finite(jax.tree.map(lambda leaf, axis: leaf if axis is None else None, value, axes[name]), name)
@@ -192,7 +192,7 @@ class Batch(eqx.Module):
     def __len__(self) -> int:
         return len(self.y0)
 
-    def over_members(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
+    def map_members(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
         """`solve` under `jax.vmap` over the members."""
         axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
         return jax.vmap(lambda *of: solve(self._member_problem(*of)), in_axes=(0, axes))(self.y0, self.params)
@@ -212,7 +212,7 @@ class Batch(eqx.Module):
         leaves = jax.tree.leaves(self.params)
         numbers = [(leaf, axis) for leaf, axis in zip(leaves, self.axes, strict=True) if eqx.is_array_like(leaf)]
         if all(axis is None for _, axis in numbers):
-            return end_to_end([leaf for leaf, _ in numbers], self.member.layout.dtype)[None]
+            return concatenate_leaves([leaf for leaf, _ in numbers], self.member.layout.dtype)[None]
         return rows([leaf for leaf, _ in numbers], [axis for _, axis in numbers], len(self), self.member.layout.dtype)
 
 
@@ -289,7 +289,7 @@ def _is_on_host(leaf) -> bool:
     return is_concrete(leaf) and [device.platform for device in leaf.devices()] == ["cpu"]
 
 
-def end_to_end(leaves: list, dtype) -> Float[Numbers, " count"]:
+def concatenate_leaves(leaves: list, dtype) -> Float[Numbers, " count"]:
     """All numbers of the leaves as one vector; by NumPy where it can read them, at a tenth of the cost of JAX.
 
     Of a complex number, which has no place in machine code, that is the real part.
@@ -411,7 +411,9 @@ def _event(event, dtype) -> diffrax.Event | None:
     if event is None:
         return None
     return (
-        _known_event(Edition.of(event), dtype) if isinstance(event, types.FunctionType) else _make_event(event, dtype)
+        _known_event(Edition.from_function(event), dtype)
+        if isinstance(event, types.FunctionType)
+        else _make_event(event, dtype)
     )
 
 
@@ -422,7 +424,7 @@ def _known_event(event: Edition, dtype) -> diffrax.Event:
 
 def _make_event(event, dtype) -> diffrax.Event:
     condition = event.cond_fn if isinstance(event, diffrax.Event) else event
-    _, functions, _ = taken_apart(condition, "event", is_leaf=lambda leaf: leaf is None or callable(leaf))
+    _, functions, _ = labelled_leaves(condition, "event", is_leaf=lambda leaf: leaf is None or callable(leaf))
     if not functions or not all(map(callable, functions)):
         raise TypeError(f"event must be a function event(q, qdot), or a pytree of such; got {condition!r}.")
     if not isinstance(event, diffrax.Event):

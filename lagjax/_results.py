@@ -110,7 +110,7 @@ class SimulationError(RuntimeError):
         self.trajectory = trajectory
 
 
-def as_printed(result, printer, cycle: bool) -> None:
+def show_str(result, printer, cycle: bool) -> None:
     """Let IPython show the `str` of a result, which is meant for reading, and not its fields.
 
     A class takes it as its `_repr_pretty_`. Where `str` has no values to show, inside `jax.jit`, it is the fields.

@@ -20,7 +20,7 @@ from lagjax._diffrax import Diffrax
 from lagjax._engine import choose, requested_engine
 from lagjax._failures import raise_where_failed
 from lagjax._layout import Layout, halves
-from lagjax._lift import lifted, lifted_batch
+from lagjax._lift import lift_batch, lift_problem
 from lagjax._machine_code import MachineCode
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution, axes_per_leaf
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, result_from
@@ -130,10 +130,10 @@ def simulate(
     """
     system = require_system(system)
     require_flag(throw, "throw")
-    layout = Layout.of(q0, qdot0)
+    layout = Layout.from_state(q0, qdot0)
     asked = requested_engine(solver, dt, adjoint, progress, rtol, atol)
-    given = Problem.of(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
-    problem = lifted(given)
+    given = Problem.from_arguments(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
+    problem = lift_problem(given)
     if has_constraints(system):
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
         require_consistent(problem.system, layout, problem.ts, q0, qdot0, problem.params)
@@ -184,14 +184,14 @@ def simulate_batch(
     asked = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
     axes, size = axes_per_leaf(values, batch_axes)
-    given = Batch.of(system, values, axes, size, ts, rtol, atol, max_steps, event)
-    batch = lifted_batch(given)
+    given = Batch.from_values(system, values, axes, size, ts, rtol, atol, max_steps, event)
+    batch = lift_batch(given)
     values = {name: as_arrays(value, batch.member.layout.dtype) for name, value in values.items()}
     inconsistent = inconsistent_members(system, batch.member.ts, values, axes)
     engine = choose(batch.member, asked).engine
     solution = engine.solve_batch(batch)
     trajectory = trajectory_of(given.member, engine, solution, given.y0, values["params"], batch_axes[2])
-    return trajectory if inconsistent is None else _refused(trajectory, inconsistent)
+    return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)
 
 
 def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, y0, params: PyTree, params_axes=None):
@@ -204,7 +204,7 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
     if not isinstance(solution.y_end, np.ndarray):
         ts, q, qdot, result = jax.tree.map(jnp.asarray, arrays)
     else:
-        ts, q, qdot, result = _sent(arrays)
+        ts, q, qdot, result = _device_arrays(arrays)
     stats = {
         "num_steps": solution.accepted + solution.rejected,
         "num_accepted_steps": solution.accepted,
@@ -213,7 +213,7 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
     if solution.idle is not None:
         stats["num_wasted_lane_steps"] = solution.idle
     fixed_steps = isinstance(engine, Diffrax) and engine.dt is not None
-    return Trajectory.of(
+    return Trajectory.from_fields(
         ts=ts,
         q=q,
         qdot=qdot,
@@ -231,7 +231,7 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
     )
 
 
-def _sent(arrays: tuple) -> tuple:
+def _device_arrays(arrays: tuple) -> tuple:
     """NumPy arrays as arrays of JAX.
 
     `jax.device_put` takes as long as a short motion, a compiled function of arrays of these shapes a tenth of that: it
@@ -260,8 +260,8 @@ _PROCESS = os.getpid()
 _as_they_are = jax.jit(lambda *arrays: arrays)
 
 
-def _refused(trajectory: Trajectory, inconsistent: jax.Array) -> Trajectory:
-    """The same without the members that did not start on their constraints: they are NaN, and say so."""
+def _mask_inconsistent(trajectory: Trajectory, inconsistent: jax.Array) -> Trajectory:
+    """The trajectory in which members that did not start on their constraints are NaN, with a result that says so."""
 
     def masked(leaf):
         return jnp.where(inconsistent.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.nan, leaf)

@@ -49,7 +49,7 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
     `acceleration(t, y)` gives q̈, with a last axis of n. `shrank` are the members whose step became too small, `spent`
     those whose budget of steps is spent; others are not looked at.
     """
-    library, loop = (np, _while) if isinstance(at.y, np.ndarray) else (jnp, jax.lax.while_loop)
+    library, loop = (np, _loop) if isinstance(at.y, np.ndarray) else (jnp, jax.lax.while_loop)
     n = at.y.shape[-1] // 2
     smallest = 4 * np.finfo(at.y.dtype).eps * library.maximum(abs(at.begin), abs(at.end))
     forward = library.where(at.end > at.begin, 1.0, -1.0) * smallest
@@ -98,7 +98,7 @@ def _half_width(library, at: End, smallest, shrank):
     return library.where(shrank, NARROW * smallest, library.maximum(wide, NARROW * smallest))
 
 
-def _while(goes_on: Callable, body: Callable, carry):
+def _loop(goes_on: Callable, body: Callable, carry):
     while goes_on(carry):
         carry = body(carry)
     return carry

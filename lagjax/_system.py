@@ -22,8 +22,8 @@ from lagjax._derivation import derivation_of, numbers_of
 from lagjax._diffrax import form_of
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
-from lagjax._linear import saddle_many, schur_complements
-from lagjax._many_states import Sample
+from lagjax._linear import schur_complements
+from lagjax._many_states import SADDLE, Sample, solve_saddle
 from lagjax._motion import Motion
 from lagjax._problem import Problem
 from lagjax._program import Unlowerable
@@ -203,7 +203,7 @@ class System(eqx.Module):
         ```
         """
         self._require_constraints()
-        layout = Layout.of(q, qdot)
+        layout = Layout.from_state(q, qdot)
         q, qdot = self._evaluate_quantity(Motion.nearest_consistent, q, qdot, t, params)
         return layout.restore(q), layout.restore(qdot)
 
@@ -220,8 +220,8 @@ class System(eqx.Module):
         print(scene.system.explain(scene.q0, scene.qdot0, params=scene.params))
         ```
         """
-        self, layout = present_system(self), Layout.of(q, qdot)
-        facts = explain(Problem.about(self, layout, params))
+        self, layout = present_system(self), Layout.from_state(q, qdot)
+        facts = explain(Problem.from_system(self, layout, params))
         if self.constraints is None and self.velocity_constraints is None:
             return facts
         names = self.constraint_names(layout, params)
@@ -255,7 +255,8 @@ class System(eqx.Module):
             forces=optional(self.forces, layout.flatten),
             dissipation=optional(self.dissipation, lambda value: value),
             constraints=Constraints(
-                optional(self.constraints, _end_to_end), optional(self.velocity_constraints, _end_to_end)
+                optional(self.constraints, _concatenate),
+                optional(self.velocity_constraints, _concatenate),
             ),
         )
 
@@ -267,7 +268,7 @@ class System(eqx.Module):
         self._require_constraints()
         self = present_system(self)
         return self.split_by_constraint(
-            self._evaluate_quantity(quantity, q, qdot, t, params), Layout.of(q, qdot), params
+            self._evaluate_quantity(quantity, q, qdot, t, params), Layout.from_state(q, qdot), params
         )
 
     def split_by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
@@ -287,14 +288,14 @@ class System(eqx.Module):
         """The shapes that the constraint functions return, a tuple of one or two pytrees."""
         numbers, code = eqx.partition(params, eqx.is_array_like)
 
-        def returned(q, t, p):
+        def output_shapes(q, t, p):
             extras = {"t": t, "params": eqx.combine(p, code)}
             positions = () if self.constraints is None else (self.constraints(q, **extras),)
             velocities = () if self.velocity_constraints is None else (self.velocity_constraints(q, q, **extras),)
             return positions + velocities
 
         state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
-        return jax.eval_shape(returned, state, t, numbers)
+        return jax.eval_shape(output_shapes, state, t, numbers)
 
     def constraint_names(self, layout: Layout, params: PyTree) -> list[str]:
         """A name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
@@ -308,7 +309,7 @@ class System(eqx.Module):
 
     def _evaluate_quantity(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
         """One of `Motion`'s functions at a state in the user's pytree, back in that pytree where `restore` says so."""
-        self, layout = present_system(self), Layout.of(q, qdot)
+        self, layout = present_system(self), Layout.from_state(q, qdot)
         require_number(t, "t")
         q, qdot, t = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state")
         params = as_arrays(params, layout.dtype)
@@ -338,7 +339,7 @@ class System(eqx.Module):
     def _check_outputs(self, layout: Layout, params: PyTree) -> None:
         """Trace each function once, on shapes alone, and say what is wrong with what it returns."""
 
-        def returned(function, role):
+        def output_shapes(function, role):
             state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
             numbers, code = eqx.partition(params, eqx.is_array_like)
             try:
@@ -351,9 +352,9 @@ class System(eqx.Module):
 
         for function, role in ((self.lagrangian, "lagrangian"), (self.dissipation, "dissipation")):
             if function is not None:
-                _require_scalar(returned(function, role), role)
+                _require_scalar(output_shapes(function, role), role)
         if self.forces is not None:
-            _require_structure(returned(self.forces, "forces"), layout)
+            _require_structure(output_shapes(self.forces, "forces"), layout)
         if self.constraints is not None or self.velocity_constraints is not None:
             _require_constraints(self.constraint_structure(layout, params))
 
@@ -398,18 +399,11 @@ def _accept(function: Callable, role: str, roles: tuple[str, ...] = ("q", "qdot"
     return accept(function, role, roles, ("t", "params", "inputs"))
 
 
-_SADDLE = ("mass_matrix", "force", "jacobian", "gamma")
-
-
-def _solved(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    return saddle_many(*(of[name] for name in _SADDLE))
-
-
 # The functions of `Motion` in terms of `Motion.quantities` and q̇ (S, n) at S states: which of them, and the formula.
 _OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
-    Motion.acceleration: (_SADDLE, lambda of, v: _solved(of)[0]),
-    Motion.multipliers: (_SADDLE, lambda of, v: _solved(of)[1]),
-    Motion.constraint_force: (_SADDLE, lambda of, v: np.einsum("skn,sk->sn", of["jacobian"], _solved(of)[1])),
+    Motion.acceleration: (SADDLE, lambda of, v: solve_saddle(of)[0]),
+    Motion.multipliers: (SADDLE, lambda of, v: solve_saddle(of)[1]),
+    Motion.constraint_force: (SADDLE, lambda of, v: np.einsum("skn,sk->sn", of["jacobian"], solve_saddle(of)[1])),
     Motion.schur_complement: (
         ("mass_matrix", "jacobian"),
         lambda of, v: schur_complements(of["mass_matrix"], of["jacobian"]),
@@ -428,7 +422,7 @@ _OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
 @eqx.filter_jit
 def _evaluate(system: System, quantity: Callable, q, qdot, t, params):
     """One of `Motion`'s functions, compiled whole: XLA would take seconds to prepare its operations one by one."""
-    layout = Layout.of(q, qdot)
+    layout = Layout.from_state(q, qdot)
     numbers, state = eqx.filter(params, eqx.is_array), (layout.flatten(q), layout.flatten(qdot))
     if quantity is Motion.acceleration:  # in the form in which diffrax integrates it
         form = form_of(derivation_of(system, layout, params), "array" if system.path == "array" else "auto")
@@ -445,7 +439,7 @@ def _require_scalar(value: PyTree, role: str) -> None:
         raise TypeError(f"{role} must return a real floating-point number; got {value.dtype}.")
 
 
-def _end_to_end(tree: PyTree) -> jax.Array:
+def _concatenate(tree: PyTree) -> jax.Array:
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)])
 
 

@@ -82,10 +82,10 @@ class Trajectory(eqx.Module):
     engine: str = eqx.field(static=True, default="")
 
     @classmethod
-    def of(cls, **fields) -> "Trajectory":
-        """A trajectory with all of these fields, as equinox makes one again from its leaves.
+    def from_fields(cls, **fields) -> "Trajectory":
+        """A trajectory with all of these fields, made as equinox makes one from its leaves.
 
-        The constructor asks of every field whether it is a mistake, which takes a tenth of a short motion.
+        The constructor checks every field for mistakes, which takes a tenth of the time of a short motion.
         """
         trajectory = object.__new__(cls)
         for name in cls.__dataclass_fields__:
@@ -218,11 +218,11 @@ class Trajectory(eqx.Module):
         film.save("pendulum.gif")
         ```
         """
-        from lagjax._display import animated
+        from lagjax._display import make_animation
 
-        return animated(self, points, trace, speed, fps)
+        return make_animation(self, points, trace, speed, fps)
 
-    def over_members(self, function, *more) -> PyTree:
+    def map_members(self, function, *more) -> PyTree:
         """Map `function(q, qdot, (ts, tolerances), params, mode, *more)` over the batch axes, those of `more` too."""
         mapped, rank = function, jnp.ndim(self.result._value)
         for outer in range(rank):
@@ -247,7 +247,7 @@ class Trajectory(eqx.Module):
             at_one_time = partial(self._evaluate_output, name)
             return jax.vmap(at_one_time, in_axes=(0, 0, 0, None, 0))(q, qdot, ts, params, mode)
 
-        return self.over_members(evaluate_member)
+        return self.map_members(evaluate_member)
 
     def _evaluate_output(self, name: str, q, qdot, t, params, mode) -> PyTree:
         if isinstance(self.system, System):
@@ -269,7 +269,7 @@ def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, para
     constrained = [
         which for which, s in modes.items() if s.constraints is not None or s.velocity_constraints is not None
     ]
-    structures = [modes[which].constraint_structure(Layout.of(q, qdot), params) for which in constrained]
+    structures = [modes[which].constraint_structure(Layout.from_state(q, qdot), params) for which in constrained]
     if len(constrained) < len(modes) or any(structure != structures[0] for structure in structures):
         one = constrained[0] if constrained else next(iter(modes))
         raise ValueError(

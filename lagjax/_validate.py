@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from lagjax._layout import dtype_of, taken_apart
+from lagjax._layout import dtype_of, labelled_leaves
 
 PyTree = Any
 
@@ -23,19 +23,19 @@ def as_arrays(tree: PyTree, dtype, name: str = "params") -> PyTree:
     Raises `TypeError` or `ValueError`, with the name of the leaf, for what is neither a number nor can be a part of the
     program.
     """
-    leaves, structure = _flattened(tree, name)
+    leaves, structure = _flatten(tree, name)
     if not all(_is_plain(leaf, dtype) for leaf in leaves):
-        labels, leaves, structure = taken_apart(tree, name)
+        labels, leaves, structure = labelled_leaves(tree, name)
         return structure.unflatten(_leaf_as_array(*of, dtype) for of in zip(leaves, labels, strict=True))
     return structure.unflatten([np.asarray(leaf, dtype) if type(leaf) is float else leaf for leaf in leaves])
 
 
-def _flattened(tree: PyTree, name: str) -> tuple[list, Any]:
+def _flatten(tree: PyTree, name: str) -> tuple[list, Any]:
     """The leaves of a pytree, whose names cost more than all else, and its structure."""
     try:
         return jax.tree.flatten(tree)
     except ValueError:
-        _, leaves, structure = taken_apart(tree, name)  # which raises a sentence
+        _, leaves, structure = labelled_leaves(tree, name)  # which raises a sentence
         return leaves, structure
 
 

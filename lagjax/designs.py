@@ -47,8 +47,8 @@ class Design:
         return {"rule": self.kind, "seed": self.seed, "low": list(self.low), "high": list(self.high)}
 
     @classmethod
-    def of(cls, axis: dict) -> "Design":
-        """The rule of an axis that a store describes."""
+    def from_axis(cls, axis: dict) -> "Design":
+        """The design from the description of an axis in a sweep's store."""
         return cls(axis["rule"], axis["size"], axis["seed"], tuple(axis["low"]), tuple(axis["high"]))
 
     def piece(self, names: tuple[str, ...], start: int) -> np.ndarray:
@@ -104,7 +104,7 @@ def random(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
     over = {"length": [0.5, 1.0], ("angle", "speed"): lagjax.designs.random(10_000, seed=1, low=-3.0, high=3.0)}
     ```
     """
-    return _made("random", count, seed, low, high, None)
+    return _make_design("random", count, seed, low, high, None)
 
 
 def sobol(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
@@ -121,7 +121,7 @@ def sobol(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
     over = {("angle", "speed"): lagjax.designs.sobol(1024, seed=1, low=(-3.0, 0.0), high=(3.0, 1.0))}
     ```
     """
-    return _made("sobol", count, seed, low, high, _LONGEST_SOBOL)
+    return _make_design("sobol", count, seed, low, high, _LONGEST_SOBOL)
 
 
 def latin_hypercube(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
@@ -138,10 +138,10 @@ def latin_hypercube(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:
     over = {("angle", "speed"): lagjax.designs.latin_hypercube(1000, seed=1, low=(-3.0, 0.0), high=(3.0, 1.0))}
     ```
     """
-    return _made("latin_hypercube", count, seed, low, high, _LONGEST_HYPERCUBE)
+    return _make_design("latin_hypercube", count, seed, low, high, _LONGEST_HYPERCUBE)
 
 
-def _made(kind: str, count, seed, low, high, most: int | None) -> Design:
+def _make_design(kind: str, count, seed, low, high, most: int | None) -> Design:
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise ValueError(f"The count of a {kind} design must be a positive whole number; got {count!r}.")
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:

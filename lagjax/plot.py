@@ -19,7 +19,7 @@ import numpy as np
 
 from lagjax._analysis import Modes
 from lagjax._arguments import Function, accept
-from lagjax._check import listed
+from lagjax._check import join_names
 from lagjax._crossings import Crossings
 from lagjax._display import COLORS, course_of, courses_of, require_points, times_of_members
 from lagjax._fit import Fit, Record, draw_record, record_matrix
@@ -53,7 +53,7 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
         ax.plot(x.T, y.T, color=COLORS[0], alpha=opacity, linewidth=1.2)
         return ax
 
-    layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0, 0], (q, qdot)))
+    layout = Layout.from_state(*jax.tree.map(lambda leaf: leaf[0, 0], (q, qdot)))
     paths = np.asarray(jax.vmap(jax.vmap(layout.flatten))(q))
     ts = times_of_members(trajectory).reshape(-1, paths.shape[1])
     ts = ts[_some(len(ts), members)]
@@ -130,7 +130,7 @@ def _places(layout: Layout, coordinates: tuple[str, ...], most: int = len(COLORS
     if not coordinates:
         return list(range(min(layout.size, most)))
     if unknown := [name for name in coordinates if name not in layout.names]:
-        raise ValueError(f"There is no coordinate {unknown[0]!r}; there are {listed(layout.names)}.")
+        raise ValueError(f"There is no coordinate {unknown[0]!r}; there are {join_names(layout.names)}.")
     if len(coordinates) > most:
         raise ValueError(f"At most {most} coordinates are drawn at once; got {len(coordinates)}.")
     return [layout.names.index(name) for name in coordinates]
@@ -252,7 +252,7 @@ def _require_like(q, shape) -> None:
 
 def _bars(ax, shape) -> None:
     """The deviation of every coordinate as a bar, the largest one of length one."""
-    layout = Layout.of(shape, shape)
+    layout = Layout.from_state(shape, shape)
     deviation = np.asarray(layout.flatten(shape))
     ax.bar(np.arange(layout.size), deviation / np.abs(deviation).max(), color=COLORS[0], width=0.7)
     ax.axhline(0.0, color=GREY, linewidth=0.8)

@@ -138,7 +138,7 @@ def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> 
 
 def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, params: PyTree) -> tuple[PyTree, PyTree]:
     """(Q, Q̇) with q(Q, t) = q and (∂q/∂Q) Q̇ + ∂q/∂t = q̇."""
-    old, new = Layout.of(q, qdot), Layout.of(guess, guess)
+    old, new = Layout.from_state(q, qdot), Layout.from_state(guess, guess)
     if old.size != new.size:
         raise ValueError(
             f"There are {new.size} new coordinates for {old.size} old ones: a state has new coordinates where both are "

@@ -25,7 +25,7 @@ from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
 from lagjax._linear import dependent_rows, diagonal_scale, factorize, least_norm, schur_complement
 from lagjax._linear import rank as rank_of
-from lagjax._results import as_printed
+from lagjax._results import show_str
 from lagjax._system import System
 from lagjax._validate import is_concrete
 
@@ -55,7 +55,7 @@ class Modes(eqx.Module):
     exponents: Complex[Array, "n 2"]
     damping_ratios: Float[Array, " n"]
 
-    _repr_pretty_ = as_printed
+    _repr_pretty_ = show_str
 
     def __str__(self) -> str:
         if self.frequencies.ndim != 1 or not is_concrete(self.frequencies):

@@ -82,7 +82,7 @@ def noether_charge(system: System, generator: Callable, gauge: Callable | None =
     gauge = None if gauge is None else accept(gauge, "gauge", ("q",))
 
     def charge(q: PyTree, qdot: PyTree, t=0.0, params: PyTree = None) -> Float[Array, ""]:
-        layout = Layout.of(q, qdot)
+        layout = Layout.from_state(q, qdot)
         scene_q, scene_qdot = layout.flatten(q), layout.flatten(qdot)
         t = jnp.asarray(t, layout.dtype)
         motion, by = present_system(system).motion(layout, params), present(generator)

@@ -148,7 +148,7 @@ def _simulate(whole: _CyclicSplit, reduced: System, q0, qdot0, ts, params=None, 
     q, qdot = jax.vmap(lambda s, v, c, t: whole.restore(s, v, c, momenta, t))(s, v, c, ts)
     end = State(ts[-1], jax.tree.map(lambda x: x[-1], q), jax.tree.map(lambda x: x[-1], qdot))
     fields = {name: getattr(done, name) for name in Trajectory.__dataclass_fields__}
-    return Trajectory.of(
+    return Trajectory.from_fields(
         **{
             **fields,
             "ts": ts,

@@ -13,7 +13,7 @@ from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._states import perturb_last_digits, random_states
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
-from lagjax._results import as_printed
+from lagjax._results import show_str
 from lagjax._system import System, require_system
 
 PyTree = Any
@@ -46,7 +46,7 @@ class SameMotion(NamedTuple):
     def __bool__(self) -> bool:
         return self.same
 
-    _repr_pretty_ = as_printed
+    _repr_pretty_ = show_str
 
     def __str__(self) -> str:
         """The verdict, the factor and what is left, in a sentence."""

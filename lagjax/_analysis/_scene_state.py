@@ -41,7 +41,7 @@ class SceneState(NamedTuple):
         """
         system = require_system(system)
         rest = jax.tree.map(lambda x: jnp.zeros_like(jnp.asarray(x, float)), q) if qdot is None else qdot
-        layout = Layout.of(q, rest)
+        layout = Layout.from_state(q, rest)
         require_finite(q, "q")
         require_finite(rest, "qdot")
         return cls.from_arguments(
@@ -145,7 +145,7 @@ class SceneState(NamedTuple):
                     return derivation.evaluate((name,), columns_of(q, qdot, 0.0, numbers))[name]
                 except Unlowerable:
                     pass
-            return np.asarray(_evaluated(name, q, qdot, *self.arguments))
+            return np.asarray(_evaluate_quantity(name, q, qdot, *self.arguments))
 
         return Scales.from_quantities(evaluated, np.asarray(self.q), np.asarray(self.qdot))
 
@@ -169,7 +169,7 @@ class SceneState(NamedTuple):
 
 
 @eqx.filter_jit
-def _evaluated(name: str, q, qdot, *arguments) -> Array:
+def _evaluate_quantity(name: str, q, qdot, *arguments) -> Array:
     """Forces, momenta or mass matrices at states (S, n), of a scene without scalar programs."""
     scene = SceneState.from_arguments(*arguments)
 

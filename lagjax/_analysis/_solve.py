@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lagjax._linear import factorize, inverted, least_norm, singular_threshold
+from lagjax._linear import factorize, invert, least_norm, singular_threshold
 
 Matrix = Float[Array, "n n"]
 Vector = Float[Array, " n"]
@@ -173,7 +173,7 @@ def _reciprocal(size: Vector) -> Vector:
 
 def _inverse(matrix: Matrix) -> tuple[Matrix, Bool[Array, ""]]:
     """The inverse, and whether there is none to working precision."""
-    inverse, order, pivots = inverted(matrix)
+    inverse, order, pivots = invert(matrix)
     sizes, n = jnp.abs(pivots), len(matrix)
     singular = jnp.min(sizes) <= singular_threshold(n, matrix.dtype) * jnp.max(sizes)
     return jnp.zeros_like(matrix).at[:, order].set(inverse), singular

@@ -26,7 +26,7 @@ from lagjax._analysis._transformations import Fields, fields_of, textbook_symmet
 from lagjax._arguments import accept
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
-from lagjax._results import as_printed
+from lagjax._results import show_str
 from lagjax._system import System
 from lagjax._trajectory import Trajectory
 
@@ -69,7 +69,7 @@ class Conserved(NamedTuple):
             values = jax.vmap(self.charge, in_axes=(0, 0, 0, None))(q, qdot, times[0], params)
             return jnp.max(jnp.abs(values - values[0]))
 
-        return trajectory.over_members(member_drift)
+        return trajectory.map_members(member_drift)
 
     def __repr__(self) -> str:
         """The name of the charge, and whether it has a gauge term; its functions print nothing."""
@@ -87,7 +87,7 @@ class ConservedQuantities(list[Conserved]):
         super().__init__(quantities)
         self.notes, self.threshold = notes, threshold
 
-    _repr_pretty_ = as_printed
+    _repr_pretty_ = show_str
 
     def __str__(self) -> str:
         rows = [f"{c.name}{'' if c.gauge is None else ' (with a gauge term)'}" for c in self]
@@ -153,7 +153,7 @@ def conserved_quantities(
     if not scene.concrete:
         raise ValueError("conserved_quantities looks at numbers: call it outside of jit, vmap and grad, on one state.")
     piecewise, scales = scene.piecewise, scene.scales
-    fields = fields_of(scene.layout, scales.q, scales.t, _own(generators, scene.layout))
+    fields = fields_of(scene.layout, scales.q, scales.t, _flatten_generators(generators, scene.layout))
     count = 8 + 4 * fields.count // scene.layout.size
     here, fresh = (random_states(scene, scales, count, seed + k, piecewise) for k in range(2))
     scene = absorb_potential_forces(scene, scales, here)
@@ -228,7 +228,7 @@ def _measure_columns(scene: SceneState, fields: Fields, states: FlatState) -> _S
     return _SymmetryColumns(of_lagrangian, of_others, min(max(_NULL, _CHANCE * noise), _LARGEST))
 
 
-def _own(generators, layout: Layout) -> dict[str, Callable]:
+def _flatten_generators(generators, layout: Layout) -> dict[str, Callable]:
     if generators is None:
         return {}
     if not isinstance(generators, dict):

@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from lagjax._check import _ahead, _constraint_checks, _derivative_checks, _jumps_nearby, _mass, _stiffness
-from lagjax._check._findings import Finding, Findings, listed, sort_findings
+from lagjax._check._findings import Finding, Findings, join_names, sort_findings
 from lagjax._check._scene_at_start import CheckedScene
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
@@ -26,7 +26,7 @@ from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
 from lagjax._validate import is_concrete, not_finite
 
-__all__ = ["Finding", "Findings", "check", "listed"]
+__all__ = ["Finding", "Findings", "check", "join_names"]
 
 PyTree = Any
 
@@ -69,7 +69,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     ```
     """
     system = require_system(system)
-    layout = Layout.of(q, qdot)
+    layout = Layout.from_state(q, qdot)
     if jnp.ndim(t) != 0:
         raise ValueError(f"t must be one number; got shape {jnp.shape(t)}.")
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((q, qdot, t, params))):
@@ -82,7 +82,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
 
 @accepts_singles(("q", "qdot"), ("t", "params"))
 def _scene_findings(system, q, qdot, t, params) -> list[Finding]:
-    scene = CheckedScene.from_state(system, Layout.of(q, qdot), q, qdot, t, params)
+    scene = CheckedScene.from_state(system, Layout.from_state(q, qdot), q, qdot, t, params)
     reported = _derivative_checks.findings(scene)
     reported += _dissipation(scene)
     reported += _constraint_checks.findings(scene)
@@ -122,9 +122,9 @@ def _small(layout: Layout, q) -> list[Finding]:
         return []
     size = max(leaves[name] for name in small)
     message = (
-        f"{listed(small)}: {size:.1e} at most beside coordinates as large as {largest:.1e}, near the default atol of "
-        f"{atol:.0e}, which is for all of them: errors of that size are allowed in every step. Use units in which all "
-        f"coordinates are of one size, or pass atol={ATOL_OVER_RTOL * rtol * size:.0e}."
+        f"{join_names(small)}: {size:.1e} at most beside coordinates as large as {largest:.1e}, near the default atol "
+        f"of {atol:.0e}, which is for all of them: errors of that size are allowed in every step. Use units in which "
+        f"all coordinates are of one size, or pass atol={ATOL_OVER_RTOL * rtol * size:.0e}."
     )
     return [Finding("small_state", "advice", small, message)]
 
@@ -148,7 +148,7 @@ def _precision(layout: Layout, q, qdot, params) -> list[Finding]:
     ]
     if integers:
         message = (
-            f"{listed(integers)}: integers. Their products wrap around when they overflow, and nothing can be "
+            f"{join_names(integers)}: integers. Their products wrap around when they overflow, and nothing can be "
             "differentiated by them. Write 1.0 for 1 unless it counts something."
         )
         reported.append(Finding("integer_parameter", "advice", tuple(integers), message))
@@ -175,13 +175,13 @@ def _dissipation(scene: CheckedScene) -> list[Finding]:
 
 
 def _acceleration(scene: CheckedScene) -> list[Finding]:
-    bad = ~np.isfinite(scene.solved()[0])
+    bad = ~np.isfinite(scene.solve_saddle()[0])
     if not bad.any():
         return []
     where = tuple(name for name, b in zip(scene.layout.names, bad, strict=True) if b)
     message = (
-        f"The acceleration of {listed(where)} is not finite, although M and the forces are: numbers overflow, or M is "
-        "singular to working precision. Use units in which the motion is of order one."
+        f"The acceleration of {join_names(where)} is not finite, although M and the forces are: numbers overflow, or M "
+        "is singular to working precision. Use units in which the motion is of order one."
     )
     return [Finding("acceleration_not_finite", "error", where, message)]
 
@@ -192,8 +192,8 @@ def _time(scene: CheckedScene) -> list[Finding]:
     if not timed:
         return []
     message = (
-        f"{listed(timed)}: may depend on the time, so that the energy h need not be conserved and a run must start at "
-        "the right ts[0]."
+        f"{join_names(timed)}: may depend on the time, so that the energy h need not be conserved and a run must start "
+        "at the right ts[0]."
     )
     return [Finding("explicit_time", "advice", timed, message)]
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._check._findings import Finding, listed
+from lagjax._check._findings import Finding, join_names
 from lagjax._check._jumps_nearby import OF_FORCE
 from lagjax._check._scene_at_start import CheckedScene
 from lagjax._many_states import Sample
@@ -129,7 +129,7 @@ def _nearest(places: np.ndarray, start: float, name: str) -> str:
 
 
 def _finding(kind: str, places: str, names: tuple[str, ...]) -> Finding:
-    where = f"{listed(names)} = {places}"
+    where = f"{join_names(names)} = {places}"
     message = {
         "border": f"The accelerations jump at {where}. {OF_FORCE}",
         "narrow_feature": (

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lagjax._check._derivative_checks import position_count
-from lagjax._check._findings import Finding, listed
+from lagjax._check._findings import Finding, join_names
 from lagjax._check._mass import null_velocities
 from lagjax._check._scene_at_start import CheckedScene
 from lagjax._consistent import require_consistent
@@ -88,8 +88,8 @@ def _dependent(schur: np.ndarray, names: list[str]) -> list[Finding]:
     for row, factors in dependent_rows(schur).items():
         others = tuple(name for name, factor in zip(names, factors, strict=True) if factor)
         message = (
-            f"{names[row]} follows from {listed(others)} here. The motion is right, but how their forces are shared "
-            "is not determined; the shortest multipliers are given. Drop it if its force is wanted."
+            f"{names[row]} follows from {join_names(others)} here. The motion is right, but how their forces are "
+            "shared is not determined; the shortest multipliers are given. Drop it if its force is wanted."
         )
         reported.append(Finding("dependent_constraints", "advice", (names[row], *others), message))
     return reported

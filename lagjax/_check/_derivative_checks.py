@@ -4,7 +4,7 @@ import numpy as np
 
 from lagjax._blame import Offender, offenders, pieces_of
 from lagjax._check._differences import Slopes, differ, ladder, slopes
-from lagjax._check._findings import Finding, listed
+from lagjax._check._findings import Finding, join_names
 from lagjax._check._jumps_nearby import OF_FORCE
 from lagjax._check._scene_at_start import CheckedScene, Sides
 
@@ -41,7 +41,7 @@ def _values(scene: CheckedScene) -> list[Finding]:
                               ("dissipation", "D", scene.dissipation)):  # fmt: skip
         if not np.isfinite(value).all():
             where = () if value.ndim == 0 else _select_names(scene.layout.names, ~np.isfinite(value))
-            message = f"{name}{' of ' + listed(where) if where else ''} is {_first_bad(value)} at this state"
+            message = f"{name}{' of ' + join_names(where) if where else ''} is {_first_bad(value)} at this state"
             reported.append(Finding("value_not_finite", "error", where, message + _blame(scene, role, "value")))
     return reported
 
@@ -70,7 +70,7 @@ def _not_finite(scene: CheckedScene) -> list[Finding]:
 
 
 def _no_derivative(scene: CheckedScene, role: str, what: str, where: tuple[str, ...], order: str) -> Finding:
-    message = f"{what} {listed(where)} is not finite at this state, although the function is"
+    message = f"{what} {join_names(where)} is not finite at this state, although the function is"
     return Finding("derivative_not_finite", "error", where, message + _blame(scene, role, order))
 
 
@@ -112,7 +112,7 @@ def _remedy(offender: Offender) -> str:
 def _blame_for_kink(scene: CheckedScene, role: str) -> str:
     function = getattr(scene.motion, role)
     places = list(dict.fromkeys(f"{name}{place}" for name, place, _ in pieces_of(function, *scene.state)))
-    return f" (the function is pieced together by {listed(places, 3)})" if places else ""
+    return f" (the function is pieced together by {join_names(places, 3)})" if places else ""
 
 
 # ---- against finite differences --------------------------------------------------------------------------------------

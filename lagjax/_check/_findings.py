@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from lagjax._results import as_printed
+from lagjax._results import show_str
 
 Level = Literal["error", "warning", "advice"]
 _ORDER = {"error": 0, "warning": 1, "advice": 2}
@@ -28,7 +28,7 @@ class Finding:
     where: tuple[str, ...]
     message: str
 
-    _repr_pretty_ = as_printed
+    _repr_pretty_ = show_str
 
     def __str__(self) -> str:
         text = f"{self.level:8s} {self.kind}: {self.message}"
@@ -60,7 +60,7 @@ class Findings:
     def __len__(self) -> int:
         return len(self.found)
 
-    _repr_pretty_ = as_printed
+    _repr_pretty_ = show_str
 
     def __str__(self) -> str:
         if not self.found:
@@ -74,6 +74,6 @@ def sort_findings(found: list[Finding]) -> Findings:
     return Findings(tuple(sorted(found, key=lambda finding: _ORDER[finding.level])))
 
 
-def listed(names: tuple[str, ...] | list[str], longest: int = 8) -> str:
+def join_names(names: tuple[str, ...] | list[str], longest: int = 8) -> str:
     """Names separated by commas, the `longest` first of them and how many more."""
     return ", ".join(names[:longest]) + (f" and {len(names) - longest} more" if len(names) > longest else "")

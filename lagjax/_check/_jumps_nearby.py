@@ -81,7 +81,7 @@ def _directions(scene: CheckedScene) -> list[tuple[str, float, np.ndarray]]:
     """(name, size, vector (2n + 1,)) of every direction: a coordinate or a velocity by its size, or the motion."""
     m, n = scene.measured, scene.layout.size
     axes = np.diag(scene.sizes)
-    axes[-1, :n], axes[-1, n:-1] = scene.sizes[-1] * m.velocity[0], scene.sizes[-1] * scene.solved()[0]
+    axes[-1, :n], axes[-1, n:-1] = scene.sizes[-1] * m.velocity[0], scene.sizes[-1] * scene.solve_saddle()[0]
     return list(zip(scene.names, scene.sizes, axes, strict=True))
 
 

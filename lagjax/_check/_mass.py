@@ -14,7 +14,7 @@ examined, which is regular when the saddle point is (`_linear`). States nearby t
 
 import numpy as np
 
-from lagjax._check._findings import Finding, listed
+from lagjax._check._findings import Finding, join_names
 from lagjax._check._scene_at_start import CheckedScene
 from lagjax._linear import diagonal_scale, eigen, null_directions, singular_threshold
 from lagjax._problem import DEFAULT_RTOL
@@ -167,10 +167,10 @@ def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[
         return []
     where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 0.1)
     message = (
-        f"The mass matrix is {lowest:.1g} of its usual size along {listed([f'd{name}' for name in where])}: the state "
-        "is next to a singularity of the coordinates (r = 0, a pole, a gimbal), where accelerations and steps become "
-        "extreme (or a length is in units far too large for it). Use coordinates that are regular there, such as "
-        "Cartesian ones with a constraint."
+        f"The mass matrix is {lowest:.1g} of its usual size along {join_names([f'd{name}' for name in where])}: the "
+        "state is next to a singularity of the coordinates (r = 0, a pole, a gimbal), where accelerations and steps "
+        "become extreme (or a length is in units far too large for it). Use coordinates that are regular there, such "
+        "as Cartesian ones with a constraint."
     )
     return [Finding("near_coordinate_singularity", "warning", where, message)]
 
@@ -222,7 +222,7 @@ def _condition(matrix: np.ndarray, names, default_rtol: float) -> list[Finding]:
     where = tuple(name for name, c in zip(names, vectors[:, 0], strict=True) if abs(c) > 0.1)
     message = (
         f"The mass matrix has the condition {condition:.1e} after scaling each coordinate ({raw:.1e} before): "
-        f"accelerations are good to {lost:.0e} only, through {listed(where)}. Use coordinates that are less coupled "
-        "(absolute angles instead of joint angles), masses less far apart, or do not ask for a tighter rtol."
+        f"accelerations are good to {lost:.0e} only, through {join_names(where)}. Use coordinates that are less "
+        "coupled (absolute angles instead of joint angles), masses less far apart, or do not ask for a tighter rtol."
     )
     return [Finding("ill_conditioned", "advice", where, message)]

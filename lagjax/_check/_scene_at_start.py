@@ -137,7 +137,7 @@ class CheckedScene(NamedTuple):
         """The augmented matrix K = M + GᵀW G (see `_linear`) of every state, (states, n, n); M without constraints."""
         return augment(self.measured.mass, self.measured.jacobian)[0]
 
-    def solved(self) -> tuple[np.ndarray, np.ndarray]:
+    def solve_saddle(self) -> tuple[np.ndarray, np.ndarray]:
         """q̈ (n,) and λ (m,) at the state."""
         m, n = self.measured, self.layout.size
         x = self._solve(np.concatenate([m.force, m.gamma])[:, None])[:, 0]
@@ -145,7 +145,7 @@ class CheckedScene(NamedTuple):
 
     def jacobian(self) -> np.ndarray:
         """∂q̈/∂(q, q̇) at the state, (n, 2n), by the implicit function theorem."""
-        acceleration, multipliers = self.solved()
+        acceleration, multipliers = self.solve_saddle()
         try:
             varied = _program_variation(self.derivation, self.state, acceleration, multipliers)
         except Unlowerable:
@@ -313,7 +313,7 @@ def _rounding(*terms):
 @eqx.filter_jit
 def _variation(system: System, q, qdot, t, params, acceleration, multipliers):
     """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: compiled by XLA."""
-    layout = Layout.of(q, qdot)
+    layout = Layout.from_state(q, qdot)
     motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
 
     def balance(y):

@@ -21,7 +21,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
         return []
     f, eps = len(by_q), float(np.finfo(scene.layout.dtype).eps)
     if by_v.any():
-        values = _trusted(np.block([[np.zeros((f, f)), np.eye(f)], [by_q, by_v]]), eps)
+        values = _trusted_eigenvalues(np.block([[np.zeros((f, f)), np.eye(f)], [by_q, by_v]]), eps)
     else:
         values = _trusted_roots(_symmetric(by_q, free.T @ m.mass[0] @ free), eps)
     speeds = np.abs(values)
@@ -54,7 +54,7 @@ def _symmetric(matrix: np.ndarray, mass: np.ndarray) -> np.ndarray:
 
 
 def _trusted_roots(matrix: np.ndarray, eps: float) -> np.ndarray:
-    """`_trusted` for ẍ = K x, of which the eigenvalues are ±√ of those of K: an eighth of the work."""
+    """`_trusted_eigenvalues` for ẍ = K x, of which the eigenvalues are ±√ of those of K: an eighth of the work."""
 
     symmetric = np.array_equal(matrix, matrix.T)
     noise = 64 * eps * np.abs(matrix).max() * np.random.default_rng(0).standard_normal(matrix.shape)
@@ -70,7 +70,7 @@ def _trusted_roots(matrix: np.ndarray, eps: float) -> np.ndarray:
     return np.concatenate([trusted, -trusted])
 
 
-def _trusted(linear: np.ndarray, eps: float) -> np.ndarray:
+def _trusted_eigenvalues(linear: np.ndarray, eps: float) -> np.ndarray:
     """The eigenvalues of ẏ = A y that a perturbation of the size of rounding moves by less than a tenth.
 
     A defective zero, as of a free coordinate, is not one of them: rounding makes eigenvalues of √eps of it.

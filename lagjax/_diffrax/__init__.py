@@ -138,7 +138,7 @@ def _norm_or_inf(error: PyTree) -> jax.Array:
 
 @eqx.filter_jit
 def _solve_batch(engine: Diffrax, batch: Batch) -> Solution:
-    return batch.over_members(lambda problem: _solve(engine, problem))
+    return batch.map_members(lambda problem: _solve(engine, problem))
 
 
 @eqx.filter_jit

@@ -6,23 +6,12 @@ _animation   a motion as a film; states between outputs
 _export      a trajectory as an xarray.Dataset or a pandas.DataFrame, intervals as a table
 """
 
-from lagjax._display._animation import Animation, animated, course_of, courses_of, require_points
+from lagjax._display._animation import Animation, course_of, courses_of, make_animation, require_points
 from lagjax._display._export import dataset, frame, intervals
 from lagjax._display._notebook import COLORS, cell, trajectory_html
 from lagjax._display._summary import summary, times_of_members
 
 __all__ = [
-    "COLORS",
-    "Animation",
-    "animated",
-    "cell",
-    "course_of",
-    "courses_of",
-    "dataset",
-    "frame",
-    "intervals",
-    "require_points",
-    "summary",
-    "times_of_members",
-    "trajectory_html",
+    "COLORS", "Animation", "cell", "course_of", "courses_of", "dataset", "frame", "intervals", "make_animation",
+    "require_points", "summary", "times_of_members", "trajectory_html",
 ]  # fmt: skip

@@ -187,7 +187,7 @@ class Animation:
         return figure, show, len(times)
 
 
-def animated(trajectory, points: Callable, trace, speed: float, fps: float) -> Animation:
+def make_animation(trajectory, points: Callable, trace, speed: float, fps: float) -> Animation:
     """The `Animation` of a trajectory; see `Trajectory.animate`."""
     _require_positive(speed=speed, fps=fps)
     if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):

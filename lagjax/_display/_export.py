@@ -111,7 +111,7 @@ def _names(trajectory) -> tuple[str, ...]:
     """The names of the coordinates, as messages have them."""
     axes = np.ndim(trajectory.result._value) + 1
     one = jax.tree.map(lambda leaf: np.asarray(leaf)[(0,) * axes], (trajectory.q, trajectory.qdot))
-    return Layout.of(*one).names
+    return Layout.from_state(*one).names
 
 
 def _column_names(which: str, names: tuple[str, ...]) -> list[str]:

@@ -386,7 +386,7 @@ def _layout(system: Scene, records: list[Record], params0, form: Form | None) ->
             f"have where no record has a start ({type(reason).__name__}: {str(reason).splitlines()[0]}). If the values "
             "are something else, give every record start=(q0, qdot0), or lagjax.Guess(q0, qdot0) to fit it."
         ) from reason
-    return replace(Layout.of(q, qdot), dtype=DOUBLE)
+    return replace(Layout.from_state(q, qdot), dtype=DOUBLE)
 
 
 def _build_residuals(scene: _GivenSystem, parameters: Parameters) -> SystemResiduals:

@@ -98,7 +98,7 @@ def choose_motions(
     def problem(room: int) -> Problem:
         params = parameters.restore(parameters.first)
         params = params if form is None else form.params(params, room)
-        return Problem.about(scene, layout, params, rtol=rtol, atol=atol)
+        return Problem.from_system(scene, layout, params, rtol=rtol, atol=atol)
 
     if isinstance(choose(problem(2)).engine, MachineCode):
         return _MachineCodeMotions(problem, form is not None)

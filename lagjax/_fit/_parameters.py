@@ -31,7 +31,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from lagjax._layout import taken_apart
+from lagjax._layout import labelled_leaves
 from lagjax._validate import as_arrays, require_finite
 
 PyTree = Any
@@ -578,7 +578,7 @@ class Parameters:
         Raises `TypeError` or `ValueError` with the name of the parameter that cannot be right.
         """
         require_finite(params, "params0")
-        labels, leaves, tree = taken_apart(as_arrays(params, dtype, "params0"), "params")
+        labels, leaves, tree = labelled_leaves(as_arrays(params, dtype, "params0"), "params")
         is_free = _broadcast_prefix(True if free is None else free, tree, leaves, "free")
         moved_by = _broadcast_prefix(Unbounded() if transforms is None else transforms, tree, leaves, "transforms")
         numbers, names, parts = [], [], []

@@ -22,7 +22,7 @@ import numpy as np
 
 from lagjax._arguments import Function
 from lagjax._hybrid import Scene, laws
-from lagjax._layout import Layout, taken_apart
+from lagjax._layout import Layout, labelled_leaves
 from lagjax._reads import Edition
 from lagjax._samples import MARGINS, continued, samples, unevenly_spaced
 from lagjax._system import System
@@ -126,7 +126,7 @@ class _FunctionOfInputs(eqx.Module):
 
 def _wrap_function(function: Function, form: Form) -> Function:
     arrays, code = eqx.partition(_FunctionOfInputs(function, form), eqx.is_array)
-    return Function(arrays, Edition.of(code), ("t", "params"))
+    return Function(arrays, Edition.from_function(code), ("t", "params"))
 
 
 def input_functions(scene: Scene) -> list[str]:
@@ -254,7 +254,7 @@ class Record(MeasuredSignal):
 
     def __post_init__(self):
         object.__setattr__(self, "ts", _times(self.ts))
-        labels, leaves, tree = taken_apart(one_signal(self.values), "values")
+        labels, leaves, tree = labelled_leaves(one_signal(self.values), "values")
         leaves = [_signal(leaf, label, len(self.ts)) for label, leaf in zip(labels, leaves, strict=True)]
         if not any(leaf.size for leaf in leaves):
             raise ValueError("values holds no signal: give an array with the times as first axis.")
@@ -263,7 +263,7 @@ class Record(MeasuredSignal):
             object.__setattr__(self, "input_ts", _times(self.input_ts, "input_ts"))
             _require_input_times(self)
         if self.inputs is not None:
-            labels, leaves, tree = taken_apart(one_signal(self.inputs), "inputs")
+            labels, leaves, tree = labelled_leaves(one_signal(self.inputs), "inputs")
             leaves = [_input(leaf, label, len(self.sampled_at)) for label, leaf in zip(labels, leaves, strict=True)]
             object.__setattr__(self, "inputs", tree.unflatten(leaves))
         require_start(self.start)
@@ -314,7 +314,7 @@ class Record(MeasuredSignal):
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the signals, (S,): `['x'][0]` or empty for the only one."""
-        labels, leaves, _ = taken_apart(self.values, "")
+        labels, leaves, _ = labelled_leaves(self.values, "")
         return tuple(
             label + (f"[{', '.join(map(str, index))}]" if leaf.ndim > 1 else "")
             for label, leaf in zip(labels, leaves, strict=True)
@@ -599,7 +599,7 @@ def known_start(record: MeasuredSignal, layout: Layout, place: int, params: PyTr
     if record.start is None:
         return None
     q, qdot = start_pair(record.start, params)
-    own = Layout.of(q, qdot)
+    own = Layout.from_state(q, qdot)
     if (own.tree, own.shapes) != (layout.tree, layout.shapes):
         raise ValueError(
             f"The start of records[{place}] has coordinates {list(own.names)}, not {list(layout.names)} as the others."

@@ -224,7 +224,7 @@ def _build_section_clock(
     """The crossings of the sections, along one motion."""
     flat, span, (keys, functions) = timings.flat, (float(timings.t0), _last_time(timings)), sections_of(timings.section)
     params = parameters.restore(parameters.first)
-    problem = Problem.about(system, layout, params, ts=span, rtol=_SHARPER * rtol, max_steps=_BUDGET)
+    problem = Problem.from_system(system, layout, params, ts=span, rtol=_SHARPER * rtol, max_steps=_BUDGET)
     directions = directions_of(timings.direction, keys)
     surfaces = MachineCode().refuses(problem) or surfaces_of(problem, functions, directions, "A section")
     if isinstance(surfaces, str):

@@ -37,9 +37,9 @@ from lagjax._batch_members import Members
 from lagjax._diagnosis import diagnosis, motion_end
 from lagjax._health._border_counts import Met, count_borders, is_piecewise
 from lagjax._health._compare import global_error
-from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measured
+from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measure_trajectory
 from lagjax._layout import Layout
-from lagjax._results import RESULTS, advice, as_printed
+from lagjax._results import RESULTS, advice, show_str
 from lagjax._system import System
 from lagjax._validate import is_concrete
 
@@ -51,7 +51,7 @@ UNSTEADY = 0.5
 
 def examine(trajectory, reference=None) -> "Health":
     """The `Health` of a trajectory, with its global error if there is a reference; see `Trajectory.health`."""
-    fields, names = measured(trajectory)
+    fields, names = measure_trajectory(trajectory)
     located, counts = _borders(trajectory)
     return Health(
         result=trajectory.result,
@@ -98,11 +98,11 @@ def _borders(trajectory) -> tuple[bool, Met[Array] | None]:
         return True, None
 
     def none(q, qdot, times_and_tolerances, params, mode):
-        layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
+        layout = Layout.from_state(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
         piecewise.append(is_piecewise(system, layout, params))
         return jnp.zeros((), int)
 
-    zero = trajectory.over_members(none)
+    zero = trajectory.map_members(none)
     located = trajectory.engine == "MachineCode" or not piecewise[0]
     return located, None if piecewise[0] else Met(zero, zero, zero, jnp.full(zero.shape, jnp.nan))
 
@@ -221,7 +221,7 @@ class Health(eqx.Module):
         flags = self._flags()[0]
         raised = {name: np.asarray(flags[name]) for name in _SENTENCES if name in flags and np.any(flags[name])}
         sides = "" if self.borders_located else "make it an event or a mode, or "
-        sentences = {name: _SENTENCES[name].format(_who(members), sides) for name, members in raised.items()}
+        sentences = {name: _SENTENCES[name].format(_member_share(members), sides) for name, members in raised.items()}
         if "result" in raised:
             sentences["result"] += " " + self._advice()
             if self.diagnosis:
@@ -246,11 +246,11 @@ class Health(eqx.Module):
             else "The power is not finite or not smooth somewhere: give it in modes of simulate_hybrid."
         )
         return (
-            f"Power balance: cannot be told{_who(undecided)} from {outputs} outputs, between which the work is not "
-            f"known to a hundredth of the energy. {advice}",
+            f"Power balance: cannot be told{_member_share(undecided)} from {outputs} outputs, between which the "
+            f"work is not known to a hundredth of the energy. {advice}",
         )
 
-    _repr_pretty_ = as_printed
+    _repr_pretty_ = show_str
 
     def __str__(self) -> str:
         rows = [("result", self._results()), ("steps", self._steps())]
@@ -259,7 +259,7 @@ class Health(eqx.Module):
         rows.append((law, f"off by {_worst(self.energy, self.energy_allowed)}{known}"))
         if self.momentum_names is None:
             rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
-        rows += [("borders", text) for text in self._met()]
+        rows += [("borders", text) for text in self._border_contacts()]
         rows += _worst_row("momenta", self.momentum_names or (), self.momentum, self.momentum_allowed)
         for k, (what, off) in enumerate((("q", self.constraint_distance), ("qdot", self.constraint_rate))):
             allowed = np.broadcast_to(np.asarray(self.constraint_allowed)[..., k, None], off.value.shape)
@@ -278,8 +278,8 @@ class Health(eqx.Module):
         rows += [("" if k else "verdict", line) for k, line in enumerate(lines)]
         return "\n".join(f"{name:17s} {text}" for name, text in rows)
 
-    def _met(self) -> list[str]:
-        """The borders that the motion met, and how."""
+    def _border_contacts(self) -> list[str]:
+        """A row of the report about the borders that the motion crossed, slid along or grazed, where it did."""
         if self.borders is None:
             return [] if self.borders_located else ["not located"]
         crossed, slid, grazed = (np.asarray(x) for x in self.borders[:3])
@@ -347,7 +347,7 @@ def _worst_row(label: str, names: tuple[str, ...], extreme: Extreme, allowed) ->
     return [(label, f"{of} off by {_worst(picked, allowed[..., which])}")]
 
 
-def _who(flags: np.ndarray) -> str:
+def _member_share(flags: np.ndarray) -> str:
     if flags.ndim == 0:
         return ""
     return f" in {np.sum(flags)} of {flags.size} members, the first {_member(np.argwhere(flags)[0])}"

@@ -53,7 +53,9 @@ def count_borders(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
     accepted, rejected = (members.shared(trajectory.stats[f"num_{kind}_steps"], 0) for kind in ("accepted", "rejected"))
     steps = accepted + rejected
     rtol, atol = (float(np.max(x)) for x in trajectory.tolerances)
-    flow = flow_of(Problem.about(trajectory.system, members.layout, members.params, ts=ts[0], rtol=rtol, atol=atol))
+    flow = flow_of(
+        Problem.from_system(trajectory.system, members.layout, members.params, ts=ts[0], rtol=rtol, atol=atol)
+    )
     if flow.borders is None:  # one without a series
         return False, None
     columns = [np.broadcast_to(x, members.count) for x in members.numbers]

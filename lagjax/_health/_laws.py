@@ -15,7 +15,7 @@ import numpy as np
 from lagjax._constraints import distances
 from lagjax._derivation import Derivation, derivation_of
 from lagjax._layout import Layout
-from lagjax._many_states import SADDLE, Sample, solved
+from lagjax._many_states import SADDLE, Sample, solve_saddle
 from lagjax._motion import Motion
 from lagjax._program import Program, Unlowerable, lower
 from lagjax._system import System
@@ -72,7 +72,7 @@ class Law(NamedTuple):
 
     def accelerations(self, sample: Sample) -> np.ndarray:
         """q̈ at S states, shape (S, n)."""
-        return sample.evaluate_in_parts(Sample.solved, self._portion(SADDLE))
+        return sample.evaluate_in_parts(Sample.solve_acceleration, self._portion(SADDLE))
 
     def _portion(self, names: tuple[str, ...]) -> int:
         """The number of states of which programs return these quantities together."""
@@ -94,7 +94,7 @@ class Law(NamedTuple):
             off_q, off_qdot = distances(of["residual"], of["rates"], of["jacobian"], self.derivation.position_count)
             power, acceleration = np.zeros(len(q), q.dtype), np.zeros_like(q)
             if self.works:
-                acceleration, multipliers = solved(of)
+                acceleration, multipliers = solve_saddle(of)
                 power = _power_of(of, qdot, multipliers)
             return Measurements(
                 conserved, slopes, sizes, power, acceleration, off_q, off_qdot,
@@ -107,7 +107,7 @@ class Law(NamedTuple):
         driven = not self.derivation.absent("driving").all()
         of = sample.quantities(*_SOURCES, *(SADDLE if driven else ()))
         with np.errstate(all="ignore"):
-            return _power_of(of, sample.qdot, solved(of)[1] if driven else np.zeros_like(of["driving"]))
+            return _power_of(of, sample.qdot, solve_saddle(of)[1] if driven else np.zeros_like(of["driving"]))
 
     def _finite(self, sample: Sample) -> np.ndarray:
         """True if M, F, G and γ have finite derivatives by all inputs at S states, (S,).

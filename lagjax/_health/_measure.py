@@ -80,7 +80,7 @@ class SampledPath(NamedTuple):
         return self.q.ndim - 2
 
 
-def measured(trajectory) -> tuple[dict[str, Any], Names]:
+def measure_trajectory(trajectory) -> tuple[dict[str, Any], Names]:
     """The fields of `Health` that are measured along the path, and names for them."""
     steps = trajectory.stats["num_accepted_steps"]
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
@@ -199,7 +199,7 @@ def _measure_traced(trajectory, axes, tree, steps):
     names, members = {}, max(1, jnp.size(trajectory.result._value))
 
     def one(q, qdot, times_and_tolerances, params, mode, steps, transitions):
-        layout = Layout.of(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
+        layout = Layout.from_state(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
         laws = _laws(trajectory, layout, params)
         names["all"] = _names(laws, layout)
         path = _path_of_one(layout, q, qdot, times_and_tolerances, mode, steps, transitions)
@@ -218,7 +218,7 @@ def _measure_traced(trajectory, axes, tree, steps):
         )
         return _report(path, laws, momenta, sample, between)
 
-    fields = trajectory.over_members(one, steps, trajectory.transitions)
+    fields = trajectory.map_members(one, steps, trajectory.transitions)
     return fields, names["all"]
 
 
@@ -251,11 +251,11 @@ def _evaluate_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
                 for of_law in (value.distances, value.rates)
             )
             value = value._replace(distances=distances, rates=rates)
-        total = value if total is None else _where(mode == index, value, total)
+        total = value if total is None else _select(mode == index, value, total)
     return total
 
 
-def _where(which, new, old):
+def _select(which, new, old):
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
 
 

@@ -128,10 +128,10 @@ def simulate_hybrid(
     ```
     """
     require_flag(throw, "throw")
-    layout = Layout.of(q0, qdot0)
+    layout = Layout.from_state(q0, qdot0)
     _require_modes(modes, transitions, start, max_transitions)
     modes, transitions = _present(modes, transitions)
-    problem = Problem.of(modes[start], layout, q0, qdot0, ts, params, rtol, atol, max_steps)
+    problem = Problem.from_arguments(modes[start], layout, q0, qdot0, ts, params, rtol, atol, max_steps)
     if not all(map(is_concrete, problem.tolerances)):
         raise ValueError("rtol and atol of simulate_hybrid must be numbers: they decide the order of the method.")
     if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:

@@ -104,7 +104,7 @@ def _share_function(column: tuple, rows: list[np.ndarray]) -> Function | None:
     if all(traced.function == first.function for traced in column):
         unchanged = Unchanged(first.function)
         extras = tuple(dict.fromkeys((*first.function.extras, "params")))
-        return Function(None, Edition.of(unchanged), extras)
+        return Function(None, Edition.from_function(unchanged), extras)
     places = {}
     for of_modes in _different(column):
         places[of_modes[0].kind, of_modes[0].place] = len(rows)

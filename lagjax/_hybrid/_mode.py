@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function, accept, present
-from lagjax._custom import differentiated_as
+from lagjax._custom import attach_derivative
 from lagjax._derivation import Derivation
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import (
@@ -168,7 +168,7 @@ class Mode(NamedTuple):
         See `_machine_code.crossing_variation`.
         """
         moved = functools.partial(crossing_variation(self._surfaces, flow_of(self.problem).anywhere), k)
-        return lambda taken, t, y, numbers: differentiated_as(moved, (t, y), taken, t, y, numbers)
+        return lambda taken, t, y, numbers: attach_derivative(moved, (t, y), taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):
         """True if a state is off the constraints of this mode."""
@@ -231,7 +231,7 @@ def state_after(transition: Transition, layout: Layout, t, y, params) -> jax.Arr
     if not isinstance(result, tuple) or len(result) != 2:
         raise TypeError(f"{where} must return the pair (q, qdot); got {type(result).__name__}.")
     try:
-        same = Layout.of(*result) == layout
+        same = Layout.from_state(*result) == layout
     except (TypeError, ValueError) as why:
         raise TypeError(f"{where} must return (q, qdot) like the initial state: {why}") from None
     if not same:

@@ -63,7 +63,7 @@ class RoundPlan(eqx.Module):
                 own = Lifted(params, tuple(row[0] for row in family.rows))
             table = np.array([numbers[k] for k in family.modes], int).reshape(len(family.modes), -1)
             targets = np.array([[self.names.index(self.transitions[k].target) for k in row] for row in table], int)
-            problem = Problem.about(family.system, layout, own, **limits)
+            problem = Problem.from_system(family.system, layout, own, **limits)
             mode = Mode.from_problem(
                 self.names[first], problem, family.leaving, table[0], targets.reshape(table.shape)[0]
             )
@@ -147,7 +147,7 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
         result=jnp.where(inconsistent, INCONSISTENT, SUCCESSFUL), path=jnp.full((ts.size, y0.size), jnp.nan),
         modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), memory=rounds.no_memory(0.0),
     )  # fmt: skip
-    ending, record = jax.lax.scan(rounds.one, first, jnp.arange(plan.max_transitions + 1))
+    ending, record = jax.lax.scan(rounds.run_round, first, jnp.arange(plan.max_transitions + 1))
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
     piled_up = (ending.result == TOO_MANY) & _pile_up(record.t, ts[-1])
     ending = ending._replace(result=jnp.where(piled_up, ZENO, ending.result))
@@ -167,7 +167,7 @@ class _Rounds(NamedTuple):
             places[list(group.family.modes)] = [(index, row) for row in range(len(group.family.modes))]
         return cls(plan, groups, places, ts)
 
-    def one(self, before: Ending, count) -> tuple[Ending, TransitionRecord]:
+    def run_round(self, before: Ending, count) -> tuple[Ending, TransitionRecord]:
         """One round: every group runs the members that are in its modes; the others are given no time."""
         after, fired = before, jnp.asarray(False)
         record = TransitionRecord(
@@ -177,7 +177,7 @@ class _Rounds(NamedTuple):
         for index, group in enumerate(self.groups):
             here = before.going & (place == index)
             ending, event, recorded = self._run_mode(group, row, before, here)
-            after, record = _where(here, ending, after), _where(here & event, recorded, record)
+            after, record = _select(here, ending, after), _select(here & event, recorded, record)
             fired = fired | (here & event)
         spent = fired & (count == self.plan.max_transitions)
         after = after._replace(going=after.going & ~spent, result=jnp.where(spent, TOO_MANY, after.result))
@@ -252,7 +252,7 @@ class _Rounds(NamedTuple):
             target, number = jnp.asarray(mode.targets[k]), jnp.asarray(mode.numbers[k])
             inconsistent = self.is_inconsistent(target, t_zero, y_next, group.targets[:, k].tolist())
             this = Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, no)
-            exit = _where(taken, this, exit)
+            exit = _select(taken, this, exit)
         exit = exit._replace(guards_defined=~jnp.isnan(guarded.values).any())
         return exit, self._memory(mode, guarded, kinds, *known)
 
@@ -303,7 +303,7 @@ class _Rounds(NamedTuple):
         return sides, memory.rounding.at[numbers].set(rounding), jax.lax.stop_gradient(stays)
 
 
-def _where(condition, new: PyTree, old: PyTree) -> PyTree:
+def _select(condition, new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 

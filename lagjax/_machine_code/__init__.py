@@ -204,7 +204,7 @@ class MachineCode(AbstractEngine):
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, in the lanes of vectors and on all cores."""
         if not batch.is_known or default_platform() != "cpu":
-            return batch.over_members(self.solve)
+            return batch.map_members(self.solve)
         member = batch.member
         given = np.asarray(member.ts)[None], np.asarray(batch.y0), np.asarray(batch.vectors)
         if member.is_single:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._custom import differentiated_as
+from lagjax._custom import attach_derivative
 from lagjax._derivation import Derivation
 from lagjax._failures import differentiable_where, lost_unless
 from lagjax._layout import halves
@@ -121,7 +121,7 @@ def _to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Toleran
     reached = jnp.isfinite(solution.path).all(axis=1)
     values, where = (solution.path, solution.y_end, solution.t_end), (solution.result, solution.event)
     varied = _varied_to_event(flow, surfaces, tolerances)
-    path, y_end, t_end = differentiated_as(varied, values, ts, y0, params, solution.t_end, *where)
+    path, y_end, t_end = attach_derivative(varied, values, ts, y0, params, solution.t_end, *where)
     well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL))
     return solution._replace(
         path=lost_unless(reached[:, None], path, (ts, y0, params)),
@@ -187,7 +187,7 @@ def _along_crossings(
     solution = jax.tree.map(still, _primitives.run(noting, tolerances, still(ts), still(y0), still(params)))
     noted = Noted.read(solution.path, len(surfaces.directions))
     varied = _varied_crossings(flow, surfaces, tolerances._replace(notes=0))
-    t, y = differentiated_as(varied, (noted.t, noted.y), ts, y0, params, noted.t)
+    t, y = attach_derivative(varied, (noted.t, noted.y), ts, y0, params, noted.t)
     there, inputs = jnp.isfinite(noted.t), (ts, y0, params)
     return solution, Noted(
         lost_unless(there, t, inputs), lost_unless(there[..., None], y, inputs), noted.count

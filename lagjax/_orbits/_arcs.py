@@ -55,8 +55,8 @@ class Units(NamedTuple):
     time: np.ndarray
     length: np.ndarray
 
-    def repeated(self, count: int) -> "Units":
-        """Each this many times, (R count, 2n)."""
+    def repeat(self, count: int) -> "Units":
+        """The units with each row `count` times, (R count, 2n)."""
         return Units(*(np.repeat(x, count, axis=0) for x in self))
 
     def growth(self, growth: np.ndarray) -> np.ndarray:
@@ -89,13 +89,13 @@ class Arcs:
         """
         system = require_system(system)
         require_untraced((system, params), "A parameter")
-        layout = Layout.of(q0, qdot0)
+        layout = Layout.from_state(q0, qdot0)
         if has_constraints(system):
             raise ValueError(
                 f"{what} cannot be found with constraints yet: give the scene coordinates that need none, angles of "
                 "links instead of positions of their ends."
             )
-        problem = Problem.about(system, layout, params, rtol=rtol, max_steps=_BUDGET)
+        problem = Problem.from_system(system, layout, params, rtol=rtol, max_steps=_BUDGET)
         if refusal := MachineCode().refuses(problem):
             raise ValueError(f"{what} are found with machine code, and there is none for this scene: {refusal}.")
         return cls(problem, np.asarray(problem.vector))

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._doubles import accepts_singles
-from lagjax._layout import halves, taken_apart
+from lagjax._layout import halves, labelled_leaves
 from lagjax._orbits import _shooting
 from lagjax._orbits._arcs import Arcs
 from lagjax._orbits._floquet import passage_determinant, reduce
@@ -131,7 +131,7 @@ def family(
 
 def parameter_index(params: PyTree, name: str) -> int:
     """The place of the parameter among all numbers."""
-    labels, leaves, _ = taken_apart(params, "params")
+    labels, leaves, _ = labelled_leaves(params, "params")
     begin = 0
     for label, leaf in zip(labels, leaves, strict=True):
         if name in (label, label.removeprefix("params").strip("[]'."), label.rsplit(".", 1)[-1]):
@@ -186,7 +186,7 @@ def _follow_family(follower: Follower, y0, period, step: float, count: int) -> t
     while len(members) < count:
         last = members[-1]
         there = step_along(follower, last.point, last.tangent, step)
-        if there is None or _shooting.stopped(there.point.chain)[0]:
+        if there is None or _shooting.is_equilibrium(there.point.chain)[0]:
             step /= 2
             if step < shortest:
                 return members, _end(follower, last.point, there is not None)

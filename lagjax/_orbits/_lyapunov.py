@@ -81,7 +81,7 @@ def lyapunov_spectrum(
     """
     require_flag(throw, "throw")
     durations, layout, y0 = starts(q0, qdot0, duration, "duration")
-    arcs = Arcs.from_system(system, *_one(layout, y0), params, rtol, "Lyapunov exponents")
+    arcs = Arcs.from_system(system, *_first_state(layout, y0), params, rtol, "Lyapunov exponents")
     pieces = _pieces(arcs, y0, durations.ravel(), throw and durations.ndim == 0)
     size = max(1, _PORTION // pieces)
     parts = [_spectra(arcs, y0[k : k + size], durations.ravel()[k : k + size], pieces) for k in range(0, len(y0), size)]
@@ -89,7 +89,8 @@ def lyapunov_spectrum(
     return jnp.asarray(exponents if durations.ndim else exponents[0])
 
 
-def _one(layout, y0) -> tuple[PyTree, PyTree]:
+def _first_state(layout, y0) -> tuple[PyTree, PyTree]:
+    """The first of states y0 (B, 2n) in the user's structure, (q, q̇)."""
     q, qdot = map(layout.restore, halves(y0[0]))
     return q, qdot
 
@@ -115,8 +116,8 @@ def _spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: int) -> n
     if well.any():
         moved[rows] = arcs.follow(spans[rows], path[:, :-1].reshape(-1, states)[rows]).by_start
     units = arcs.units(y0)
-    moved = units.repeated(pieces).growth(moved)
-    chart = arcs.canonical(times.ravel(), path.reshape(-1, states), units.repeated(pieces + 1))
+    moved = units.repeat(pieces).growth(moved)
+    chart = arcs.canonical(times.ravel(), path.reshape(-1, states), units.repeat(pieces + 1))
     chart = chart.reshape(members, pieces + 1, states, states)
     order = np.append(np.arange(states // 2), np.arange(states - 1, states // 2 - 1, -1))
     growth, frame = np.zeros((members, states)), np.tile(np.eye(states), (members, 1, 1))
@@ -162,7 +163,7 @@ def lyapunov_exponent(
     ```
     """
     durations, layout, y0 = starts(q0, qdot0, duration, "duration")
-    arcs = Arcs.from_system(system, *_one(layout, y0), params, rtol, "Lyapunov exponents")
+    arcs = Arcs.from_system(system, *_first_state(layout, y0), params, rtol, "Lyapunov exponents")
     parts = [
         _largest(arcs, y0[k : k + _MEMBERS], durations.ravel()[k : k + _MEMBERS]) for k in range(0, len(y0), _MEMBERS)
     ]

@@ -274,7 +274,7 @@ def _sentence(chain: Chain, k: int) -> str:
     """Why a chain is no orbit; "" where it is one."""
     if not chain.ok[k]:
         return f"The motion from the guess cannot be followed for a period of {chain.periods()[k]:.6g}. {chain.why[k]}"
-    if _shooting.stopped(chain.select(np.array([k])))[0]:
+    if _shooting.is_equilibrium(chain.select(np.array([k])))[0]:
         return (
             "The search ended at an equilibrium, which closes after any time: begin at a larger amplitude, or with a "
             "period nearer to that of the orbit."

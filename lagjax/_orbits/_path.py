@@ -20,7 +20,7 @@ from lagjax._layout import Layout, halves
 from lagjax._orbits._arcs import Arcs, Units
 from lagjax._orbits._conjugate import conjugate_times
 from lagjax._orbits._shooting import Chain, Closing, close, equations
-from lagjax._problem import end_to_end
+from lagjax._problem import concatenate_leaves
 from lagjax._results import SimulationError
 from lagjax._simulate import simulate
 from lagjax._system import System, require_system
@@ -183,10 +183,11 @@ def find_path(
         require_number(value, name)
     if not t_end > t_start:
         raise ValueError(f"t_end must be later than t_start; got {t_end} and {t_start}.")
-    layout = Layout.of(q_start, q_end)
+    layout = Layout.from_state(q_start, q_end)
     arcs = Arcs.from_system(system, q_start, q_end, params, RTOL, "Paths")
     ends = [
-        np.asarray(end_to_end(jax.tree.leaves(as_arrays(q, layout.dtype)), np.dtype(float))) for q in (q_start, q_end)
+        np.asarray(concatenate_leaves(jax.tree.leaves(as_arrays(q, layout.dtype)), np.dtype(float)))
+        for q in (q_start, q_end)
     ]
     times = np.linspace(float(t_start), float(t_end), _ARCS + 1)
     first = _guess_states(layout, guess, ends, times)

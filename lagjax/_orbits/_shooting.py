@@ -322,6 +322,6 @@ def _null(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
     return rank, condensed.inner(rank.right, rank.right, np.zeros((chains, 0, states)))
 
 
-def stopped(chain: Chain) -> np.ndarray:
+def is_equilibrium(chain: Chain) -> np.ndarray:
     """True if nothing moves along a chain, beside its states and the guess: an equilibrium closes after any time."""
     return np.abs(chain.rate).max(axis=(1, 2)) * chain.period <= 1e-6 * np.maximum(chain.size(), 1.0)

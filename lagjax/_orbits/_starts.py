@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._layout import Layout
-from lagjax._problem import end_to_end, rows
+from lagjax._problem import concatenate_leaves, rows
 from lagjax._validate import as_arrays, require_concrete, require_finite
 
 PyTree = Any
@@ -29,16 +29,16 @@ def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layo
         raise ValueError(f"{name} must be positive; got {times.min()}.")
     leaves, dtype = jax.tree.leaves((q0, qdot0)), np.dtype(float)
     if times.ndim == 0:
-        layout = Layout.of(q0, qdot0)
+        layout = Layout.from_state(q0, qdot0)
         arrays = jax.tree.leaves(as_arrays((q0, qdot0), layout.dtype, "state"))
-        return times, layout, np.asarray(end_to_end(arrays, dtype))[None]
+        return times, layout, np.asarray(concatenate_leaves(arrays, dtype))[None]
     if any(np.shape(leaf)[:1] != times.shape for leaf in leaves):
         shapes = sorted({np.shape(leaf) for leaf in leaves})
         raise ValueError(
             f"{name} has shape {times.shape}, a batch: every leaf of q0 and qdot0 must have that many members as its "
             f"first axis; got shapes {shapes}."
         )
-    layout = Layout.of(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], (q0, qdot0)))
+    layout = Layout.from_state(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], (q0, qdot0)))
     arrays = jax.tree.leaves(as_arrays((q0, qdot0), layout.dtype, "state"))
     return times, layout, np.asarray(rows(arrays, [0] * len(arrays), len(times), dtype))
 

@@ -14,6 +14,6 @@ names that it makes up, the inside of objects written in C (a generator, a rando
 """
 
 from lagjax._reads._edition import Edition, place_in
-from lagjax._reads._identity import array_text, hash_of, identity, source, without_addresses
+from lagjax._reads._identity import array_text, hash_of, identity, source, strip_addresses
 
-__all__ = ["Edition", "array_text", "hash_of", "identity", "place_in", "source", "without_addresses"]
+__all__ = ["Edition", "array_text", "hash_of", "identity", "place_in", "source", "strip_addresses"]

@@ -48,15 +48,15 @@ class Edition:
         self._hash = hash(text)
 
     @classmethod
-    def of(cls, function: Callable) -> "Edition":
+    def from_function(cls, function: Callable) -> "Edition":
         """The present edition of a function."""
         is_plain = isinstance(function, types.FunctionType)
         return (_watch_of(function) if is_plain else _Watch(function)).edition()
 
-    def with_tracers_as_arguments(self, function: Callable, how: str) -> "Edition":
-        """The edition of a `function` that is its trace: what was a tracer in it is given as `how` says.
+    def trace_edition(self, function: Callable, how: str) -> "Edition":
+        """The edition of `function`, a trace of this one whose tracers are arguments; `how` says which is which.
 
-        So it is one edition whatever is being traced.
+        It is one and the same edition whatever is being traced.
         """
         still = _Still(function)
         still.latest = Edition(still, f"{how}: {self.text}", list(self._held), [], False)
@@ -119,7 +119,7 @@ class Edition:
 
 def _edition_of(function: Callable) -> Edition:
     """The function that a pickle calls: cloudpickle would take the class with all that it reads for a method of it."""
-    return Edition.of(function)
+    return Edition.from_function(function)
 
 
 def _same(one: tuple, other: tuple) -> bool:

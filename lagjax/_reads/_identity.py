@@ -74,7 +74,7 @@ class Walk:
 
     def opaque(self, thing: Any) -> list[tuple[str, Any]]:
         """The words for an object whose inside cannot be seen."""
-        return [("shown", without_addresses(repr(thing)))]
+        return [("shown", strip_addresses(repr(thing)))]
 
     def describe_array(self, value: Any) -> str:
         """An array in words."""
@@ -93,18 +93,18 @@ class Walk:
         """A value in words; of functions, classes and objects a number, by which their line is found."""
         kind = type(value)
         if kind in _ATOMS:
-            return shortened(repr(value))
+            return shorten(repr(value))
         if isinstance(value, np.ndarray | np.generic | jax.Array):
             return self.describe_array(value)
         if isinstance(value, enum.Enum):
             return f"{self.name(kind)}.{value.name} = {self.name(value.value, deep + 1)}"
         if isinstance(value, _ATOMS):  # of a class of its own
             base: Any = next(base for base in _ATOMS if isinstance(value, base))
-            return f"{self.name(kind)} {shortened(base.__repr__(value))}"
+            return f"{self.name(kind)} {shorten(base.__repr__(value))}"
         if isinstance(value, bytearray | array.array):
             return self.name(type(value)) + self.describe_array(self.read(value, None, np.array(value)))
         if isinstance(value, self.containers) and deep < _DEEP:
-            return shortened(self.container(value, deep + 1))
+            return shorten(self.container(value, deep + 1))
         if isinstance(value, types.ModuleType):
             return value.__name__
         if (name := _library_name(value)) is not None:
@@ -242,7 +242,7 @@ class Walk:
 
 
 def _key(key: Any) -> str:
-    return without_addresses(repr(key))
+    return strip_addresses(repr(key))
 
 
 # Attributes of every class, which say nothing that its code does not: methods of that kind enter, values do not.
@@ -325,7 +325,7 @@ def array_text(value: Any) -> str:
     except TypeError:  # keys of jax.random
         array = np.asarray(jax.random.key_data(value))
     if array.dtype == object:
-        return without_addresses(shortened(repr(array.tolist())))
+        return strip_addresses(shorten(repr(array.tolist())))
     return f"{array.dtype} {array.tolist()}" if array.size <= 16 else f"{array.dtype}{array.shape} {hash_of(array)}"
 
 
@@ -334,12 +334,12 @@ def hash_of(array: np.ndarray) -> str:
     return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
 
 
-def without_addresses(text: str) -> str:
+def strip_addresses(text: str) -> str:
     """A text without the places of objects in memory."""
     return re.sub(r"0x[0-9a-f]+", "0x", text)
 
 
-def shortened(text: str) -> str:
+def shorten(text: str) -> str:
     """A text, of a long one its beginning and its hash."""
     return text if len(text) <= _LONG else f"{text[:40]}… {hashlib.sha256(text.encode()).hexdigest()[:16]}"
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._consistent import has_constraints
-from lagjax._crossings import as_crossings, sections_of, surfaces_in
+from lagjax._crossings import restore_crossings, sections_of, surfaces_in
 from lagjax._hybrid import Hybrid, Scene, follow
 from lagjax._machine_code import MachineCode, Noted, flow_of, tolerances_of
 from lagjax._problem import Batch, Solution, axes_per_leaf
@@ -241,7 +241,7 @@ class Batches:
         scene, hybrid = self.description.system, {"mode": None, "transitions": None, "mode_names": ()}
         if isinstance(scene, Hybrid):
             hybrid = {"mode": mode, "transitions": Transitions(*transitions), "mode_names": tuple(scene.modes)}
-        return Trajectory.of(
+        return Trajectory.from_fields(
             ts=jnp.asarray(self.description.ts), q=q, qdot=qdot, result=result_from(code), end=State(*end), stats=stats,
             system=dict(scene.modes) if isinstance(scene, Hybrid) else scene, params_axes=None, engine="",
             params=self.description.params if self._axes[2] is None else params, tolerances=self._tolerances, **hybrid,
@@ -427,7 +427,9 @@ def run_batch(
     if sections is None:
         return simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings), None
     of_leaves, size = axes_per_leaf(values, axes)
-    batch = Batch.of(system, values, of_leaves, size, ts, settings["rtol"], settings["atol"], settings["max_steps"])
+    batch = Batch.from_values(
+        system, values, of_leaves, size, ts, settings["rtol"], settings["atol"], settings["max_steps"]
+    )
     solution, noted = _follow_crossings(batch, sections)
     if len(ts) == 2 and not has_constraints(system):
         params = as_arrays(params, batch.member.layout.dtype)
@@ -436,7 +438,7 @@ def run_batch(
         run = simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings)
         noted = _drop_inconsistent(noted, np.asarray(run.result._value) != _INCONSISTENT)
     ok = (solution.result == SUCCESSFUL) & (noted.count <= sections.count)
-    return run, as_crossings(batch.member.layout, sections.names, noted, ok)
+    return run, restore_crossings(batch.member.layout, sections.names, noted, ok)
 
 
 def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted]:

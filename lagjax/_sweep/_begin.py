@@ -141,7 +141,7 @@ def _batch_size(description: Description, points: dict[str, np.ndarray], kept: K
 def _members_in_memory(description: Description, points: dict[str, np.ndarray]) -> int:
     """The members whose paths, and what is noted on the way, take `PATH_BYTES`; none where one takes more."""
     q, qdot, _ = description.start({name: x[0] for name, x in points.items()})
-    states = 2 * Layout.of(q, qdot).size
+    states = 2 * Layout.from_state(q, qdot).size
     noted = description.sections.count_bytes(states) if description.sections else 0
     return _batch.PATH_BYTES // (8 * states * len(description.ts) + noted)
 

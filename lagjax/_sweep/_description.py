@@ -24,7 +24,7 @@ from lagjax._arguments import accept
 from lagjax._crossings import directions_of, sections_of
 from lagjax._hybrid import Hybrid, Scene
 from lagjax._machine_code import MachineCode
-from lagjax._reads import array_text, hash_of, identity, source, without_addresses
+from lagjax._reads import array_text, hash_of, identity, source, strip_addresses
 from lagjax._sweep._statistics import Statistics
 from lagjax._validate import require_budget
 
@@ -222,7 +222,7 @@ def _entry(value: Any, program: Callable | None, *more: Any) -> dict[str, str]:
         closed = program()
     except Exception:  # not written in jax.numpy, or it needs leaves that are no numbers: its code stands for it
         return {"text": text, "program": identity(value)}
-    shown = without_addresses(str(closed))
+    shown = strip_addresses(str(closed))
     constants = [_value_text(x) for x in [*closed.consts, *jax.tree.leaves(more)]]
     called = [identity(value)] if "callback" in shown else []  # functions that a program names, and does not hold
     return {"text": text, "program": "\n".join([shown, *constants, *called])}
@@ -232,7 +232,7 @@ def _value_text(value: PyTree) -> str:
     """A pytree of numbers in words, large arrays by their hash."""
     lines = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(value):
-        text = array_text(leaf) if isinstance(leaf, jax.Array | np.ndarray) else without_addresses(repr(leaf))
+        text = array_text(leaf) if isinstance(leaf, jax.Array | np.ndarray) else strip_addresses(repr(leaf))
         lines.append(f"{jax.tree_util.keystr(path)} {text}".strip())
     return "\n".join(lines) or "None"
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._results import as_printed
+from lagjax._results import show_str
 from lagjax._sweep._members import text_of
 from lagjax._sweep._store import Store
 from lagjax._sweep._workers import claimed_units
@@ -57,7 +57,7 @@ class Status(NamedTuple):
     cpus: tuple[str, ...] = ()
     damaged: dict[int, str] = {}  # noqa: RUF012  (a field of a NamedTuple, never written to)
 
-    _repr_pretty_ = as_printed
+    _repr_pretty_ = show_str
 
     def __str__(self) -> str:
         lines = [f"{self.store}", f"done       {self.done:,} of {self.members:,} members, {self.units_done} of "

@@ -187,7 +187,7 @@ class Store:
         files = [self.path / name / "c" / str(k) for name in axis["names"]]
         if all(file.exists() for file in files):
             return
-        values = Design.of(axis).piece(tuple(axis["names"]), k * designs.SLICE)
+        values = Design.from_axis(axis).piece(tuple(axis["names"]), k * designs.SLICE)
         for file, column in zip(files, values.T, strict=True):
             chunk = np.full(designs.SLICE, np.nan)
             chunk[: len(column)] = column

@@ -297,7 +297,7 @@ def test_sympy_agrees():
 @pytest.mark.slow
 def test_more_coordinates_in_one_array_than_are_unfolded():
     """Scenes of more than 256 coordinates in one array had no equations: an IndexError."""
-    derivation = derivation_of(CHAIN, Layout.of(jnp.zeros(300), jnp.zeros(300)), np.ones(()))
+    derivation = derivation_of(CHAIN, Layout.from_state(jnp.zeros(300), jnp.zeros(300)), np.ones(()))
     assert derivation.shape("mass_matrix") == (300, 300)
 
 

@@ -299,7 +299,7 @@ def test_masses_in_params_are_taken_for_what_they_are():
     # Where they are regular the program is the lean one; where they are not, or hardly, the one for any mass matrix
     # takes over, also where JAX does not know them while it traces, and in derivatives.
     rods = scenes.cartesian_double_pendulum()
-    layout = Layout.of(rods.q0, rods.qdot0)
+    layout = Layout.from_state(rods.q0, rods.qdot0)
     lean = derivation_of(rods.system, layout, rods.params).acceleration
     assert 2 * lean.operations < lean.complete.operations
     scene = scenes.rolling_cylinder()
@@ -526,7 +526,7 @@ def test_accelerations_where_a_parallelogram_is_flat():
     minimal = lagjax.System(parallelogram)
     away = np.array([0.0, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 1e-4, 1e-2])
     expected = jax.vmap(lambda angle: minimal.acceleration(angle, 3.0))(GROUND[1] + away)
-    layout = Layout.of(jnp.zeros(3), jnp.zeros(3))
+    layout = Layout.from_state(jnp.zeros(3), jnp.zeros(3))
     motion = lagjax.System(linkage, constraints=closed_linkage).motion(layout)
     for path in ("scalar", "array"):
         form = form_of(Derivation(motion, layout, None), path)

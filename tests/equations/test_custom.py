@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax._custom import differentiated_as
+from lagjax._custom import attach_derivative
 
 
 def moved(t, y):
@@ -29,7 +29,7 @@ def repeated(x, scan: bool, step):
 
 
 def step(t, y):
-    return differentiated_as(moved, (t, y), t, y)
+    return attach_derivative(moved, (t, y), t, y)
 
 
 @pytest.mark.slow
@@ -47,4 +47,4 @@ def test_derivatives_are_those_of_the_expression_in_every_order_of_modes(scan):
 
 
 def test_the_value_is_what_is_given():
-    assert differentiated_as(lambda x: (2 * x,), (jnp.float64(5.0),), 3.0)[0] == 5.0
+    assert attach_derivative(lambda x: (2 * x,), (jnp.float64(5.0),), 3.0)[0] == 5.0

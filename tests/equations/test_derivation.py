@@ -79,7 +79,7 @@ def test_round_off_is_bounded_and_seen_where_terms_cancel():
 
 
 def of(system, q, qdot, params=None):
-    return derivation_of(system, Layout.of(q, qdot), params)
+    return derivation_of(system, Layout.from_state(q, qdot), params)
 
 
 def pendulum(q, qdot, params):
@@ -208,7 +208,7 @@ def test_check_and_health_compile_nothing_where_there_are_programs(monkeypatch):
     def compiled(*_):
         raise AssertionError("compiled by XLA")
 
-    monkeypatch.setattr(many_states, "_compiled", compiled)
+    monkeypatch.setattr(many_states, "_evaluate_compiled", compiled)
     monkeypatch.setattr(of_check, "_variation", compiled)
     monkeypatch.setattr(of_health, "_measure_traced", compiled)
     for make in (scenes.rolling_cylinder, scenes.damped_driven_oscillator):
@@ -386,7 +386,7 @@ def test_a_sample_without_programs_is_the_one_with_them(constraints, monkeypatch
     lagrangian = lambda q, v: 0.5 * v @ v * (1.0 + q[0] ** 2) - jnp.cos(q).sum()
     random = np.random.default_rng(0)
     q, qdot, t = random.standard_normal((7, 3)), random.standard_normal((7, 3)), np.linspace(0.0, 1.0, 7)
-    layout = Layout.of(jnp.ones(3), jnp.ones(3))
+    layout = Layout.from_state(jnp.ones(3), jnp.ones(3))
     names = "force", "mass_matrix", "dissipation", "residual", "lagrangian"
     lowered, compiled = (
         many_states.Sample.from_scene(scene, layout, q, qdot, t, None).quantities(*names)

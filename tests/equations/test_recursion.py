@@ -12,7 +12,7 @@ from lagjax._layout import Layout
 
 
 def of(system, q, qdot, params=None):
-    return derivation_of(system, Layout.of(q, qdot), params)
+    return derivation_of(system, Layout.from_state(q, qdot), params)
 
 
 def chain(n):

@@ -436,9 +436,9 @@ def test_derivatives_of_motions_and_sensors_are_those_of_differences():
     parameters = Parameters.from_pytree(TRUTH, FREE, lagjax.positive)
     observe = lambda q, v, t, params: jnp.stack([jnp.sin(q) * params["l"], v * t])
     signals = _sensors.Signals(
-        observe, Layout.of(0.0, 0.0), parameters, lagjax.Record(TS, np.zeros((len(TS), 2)), start=(0.0, 0.0))
+        observe, Layout.from_state(0.0, 0.0), parameters, lagjax.Record(TS, np.zeros((len(TS), 2)), start=(0.0, 0.0))
     )
-    motions = choose_motions(SCENE, Layout.of(0.0, 0.0), parameters, 1e-12, None)
+    motions = choose_motions(SCENE, Layout.from_state(0.0, 0.0), parameters, 1e-12, None)
     u, ts = parameters.inverse(parameters.first), TS[None, ::20]
 
     def values(x):
@@ -458,7 +458,7 @@ def test_derivatives_of_motions_and_sensors_are_those_of_differences():
 
 @pytest.mark.slow
 def test_motions_of_machine_code_and_of_diffrax_agree():
-    layout = Layout.of(0.0, 0.0)
+    layout = Layout.from_state(0.0, 0.0)
     parameters = Parameters.from_pytree(TRUTH, FREE, lagjax.positive)
     ts, y0 = np.stack([TS[:5], TS[3:8]]), np.array([[1.0, 0.0], [0.3, -1.0]])
     u = parameters.inverse(parameters.first)

@@ -424,7 +424,7 @@ def test_attributes_that_no_code_names_do_not_matter(derived):
 
 
 def test_functions_that_differ_in_what_cannot_be_seen_are_two():
-    one, two = (Edition.of(reading(x for x in range(3))) for _ in range(2))
+    one, two = (Edition.from_function(reading(x for x in range(3))) for _ in range(2))
     assert one.text == two.text and one != two and one == one.now()
 
 

@@ -130,7 +130,7 @@ def test_bad_input_gets_a_sentence(changes, sentence):
 
 
 def test_a_batch_that_comes_again_and_again_stays_what_it_is():
-    """After some calls its arrays are sent to JAX by a compiled function (`_simulate._sent`)."""
+    """After some calls its arrays are sent to JAX by a compiled function (`_simulate._device_arrays`)."""
     scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
     q0, ts = np.linspace(0.1, 0.4, 3), np.linspace(0.0, 1.0, 5)
     first, *_, last = (lagjax.simulate_batch(scene, q0 + k, np.zeros(3), ts) for k in (*[0.0] * 60, 1.0))

@@ -888,7 +888,7 @@ def down_the_stairs(g, modes, v=0.2):
 def test_modes_that_differ_by_numbers_are_one_program():
     modes, edges = {f"{n}": stair(n) for n in range(STAIRS)}, [edge(n) for n in range(STAIRS - 1)]
     leaving = [tuple(e for e in edges if e.source == name) for name in modes]
-    found = families(list(modes.values()), leaving, Layout.of(0.0, 0.2), 1.0)
+    found = families(list(modes.values()), leaving, Layout.from_state(0.0, 0.2), 1.0)
     assert [family.modes for family in found] == [(0, 1, 2, 3), (4,)]  # nothing leaves the last one
 
     run = hybrid(modes, edges, v0=0.2, ts=(0.0, 4.0), params=1.3, rtol=1e-12)
@@ -934,6 +934,6 @@ def test_modes_of_a_family_keep_their_targets_and_constraints():
 )
 def test_modes_that_differ_otherwise_are_programs_of_their_own(other):
     systems = [lagjax.System(lambda q, v: 0.5 * v**2 - q**2 - jnp.abs(q) ** 2.5), OSCILLATOR, lagjax.System(other)]
-    found = families(systems, [(), (), ()], Layout.of(0.0, 0.0), None)
+    found = families(systems, [(), (), ()], Layout.from_state(0.0, 0.0), None)
     assert [family.modes for family in found] == [(0,), (1,), (2,)]
     assert found[2].system is systems[2]

@@ -38,7 +38,7 @@ def ellipse(q, params):
 @pytest.fixture(scope="module")
 def double():
     params = {"m": jnp.ones(2), "l": jnp.ones(2), "g": 9.81}
-    return flow_of(Problem.about(lagjax.System(chain), Layout.of(jnp.zeros(2), jnp.zeros(2)), params))
+    return flow_of(Problem.from_system(lagjax.System(chain), Layout.from_state(jnp.zeros(2), jnp.zeros(2)), params))
 
 
 def batch(members: int, seed: int = 0):

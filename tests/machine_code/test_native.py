@@ -676,7 +676,9 @@ def test_a_member_alone_is_bit_for_bit_the_member_of_a_batch(make):
     scene = make()
     y0 = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(z)]) for z in (scene.q0, scene.qdot0)]
     kernel = flow_of(
-        Problem.of(scene.system, Layout.of(scene.q0, scene.qdot0), scene.q0, scene.qdot0, TWO_TIMES, scene.params)
+        Problem.from_arguments(
+            scene.system, Layout.from_state(scene.q0, scene.qdot0), scene.q0, scene.qdot0, TWO_TIMES, scene.params
+        )
     ).kernel
     numbers = np.concatenate([np.zeros(0), *(np.ravel(x) for x in jax.tree.leaves(scene.params))])[None]
     states, ts = np.tile(np.concatenate(y0), (3, 1)), TWO_TIMES[None]

@@ -22,7 +22,9 @@ TS = np.linspace(0.0, 1.0, 5)
 
 def run() -> np.ndarray:
     """The path of a motion by a kernel of its own."""
-    problem = Problem.of(SCENE.system, Layout.of(SCENE.q0, SCENE.qdot0), SCENE.q0, SCENE.qdot0, TS, SCENE.params)
+    problem = Problem.from_arguments(
+        SCENE.system, Layout.from_state(SCENE.q0, SCENE.qdot0), SCENE.q0, SCENE.qdot0, TS, SCENE.params
+    )
     flow = flow_of(problem)
     kernel = _native.Kernel(flow.program, flow.size, flow.projection, flow.guards, flow.groups, flow.nesting)
     return kernel(TS[None], np.asarray(problem.y0)[None], np.asarray(problem.vector)[None], 1e-9, 1e-12, 1000).path

@@ -71,7 +71,7 @@ QUICK = ("double_pendulum", "driven_pendulum")
 )  # fmt: skip
 def test_ready_scenes(scene):
     made = scene()
-    layout = Layout.of(made.q0, made.qdot0)
+    layout = Layout.from_state(made.q0, made.qdot0)
     derivation = derivation_of(made.system, layout, made.params)
     try:
         parts = derivation.acceleration, layout.size, derivation.projection

@@ -26,7 +26,7 @@ def swing(q, v, params):
 @pytest.fixture(scope="module")
 def flow():
     params = {"m": jnp.ones(2), "k": 1.0}
-    return flow_of(Problem.about(lagjax.System(swing), Layout.of(jnp.zeros(2), jnp.zeros(2)), params))
+    return flow_of(Problem.from_system(lagjax.System(swing), Layout.from_state(jnp.zeros(2), jnp.zeros(2)), params))
 
 
 def starts(members):

@@ -254,7 +254,7 @@ def test_derivatives_of_each_family(family):
 
     q = [jnp.asarray(leaves[k]) for k in moving]
     v = [0.1 * jnp.ones_like(x) for x in q]
-    derivation = derivation_of(lagjax.System(lagrangian), Layout.of(q, v), None)
+    derivation = derivation_of(lagjax.System(lagrangian), Layout.from_state(q, v), None)
     values = derivation.evaluate(["momentum", "lagrangian_by_q", "mass_matrix"], [*scalars(*q, *v), 0.0])
     y, unravel = jax.flatten_util.ravel_pytree((q, v))
     flat_lagrangian, n = lambda y: lagrangian(*unravel(y)), y.size // 2
@@ -267,7 +267,7 @@ def test_derivatives_of_each_family(family):
 def test_derivatives_of_the_sign_of_a_complex_number():
     """z/|z| = e^(iθ): for L = v²/2 + Re z/|z| of z = e^(x + iq) the force is −sin q, whatever x is."""
     scene = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.real(jnp.sign(jnp.exp(0.7 + 1j * q))))
-    derivation = derivation_of(scene, Layout.of(1.0, 0.0), None)
+    derivation = derivation_of(scene, Layout.from_state(1.0, 0.0), None)
     slope = derivation.evaluate(["lagrangian_by_q"], [jnp.array(1.0), jnp.array(0.0), 0.0])["lagrangian_by_q"]
     np.testing.assert_allclose(np.ravel(slope), -np.sin(1.0), rtol=1e-15)
 
@@ -287,7 +287,7 @@ AT_EDGES = {
 def test_derivatives_at_edges_are_those_of_jax(name):
     """Where a function has a kink, or ends, a derivative is a convention: also there both forms have the same."""
     function, points = AT_EDGES[name], np.array([0.0, 1.0, -1.0, 0.5])
-    derivation = derivation_of(lagjax.System(lambda q, v: 0.5 * v**2 + function(q)), Layout.of(0.0, 0.0), None)
+    derivation = derivation_of(lagjax.System(lambda q, v: 0.5 * v**2 + function(q)), Layout.from_state(0.0, 0.0), None)
     columns = [points, np.zeros(4), np.zeros(4)]
     derived = derivation.evaluate(["lagrangian_by_q"], columns)["lagrangian_by_q"][:, 0]
     np.testing.assert_allclose(derived, jax.vmap(jax.grad(function))(points), rtol=1e-15)

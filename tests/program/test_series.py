@@ -325,7 +325,7 @@ SYSTEMS = {  # a scene, and the products that its series takes, with the recurre
 def test_the_solution_of_a_linear_system_without_its_elimination(name):
     make, by_elimination, by_system = SYSTEMS[name]
     scene = make()
-    layout = Layout.of(scene.q0, scene.qdot0)
+    layout = Layout.from_state(scene.q0, scene.qdot0)
     program = derivation_of(scene.system, layout, scene.params).acceleration
     rng, n = np.random.default_rng(3), layout.size
     states = np.concatenate([layout.flatten(scene.q0), layout.flatten(scene.qdot0)]) + rng.uniform(-0.1, 0.1, 2 * n)
