@@ -95,7 +95,7 @@ def _contradiction(names, values, what, lengths, dependent, tolerance, size) -> 
     """A sentence where a constraint is a combination of others, but does not ask for the same combination.
 
     `values` (m,) are what the constraints ask for in the quantity called `what`, of which errors count by `size` or
-    by the largest of what is asked for; `dependent` is from `dependent_rows`.
+    by the largest of `values`; `dependent` is from `dependent_rows`.
     """
     size = max(size, np.max(np.abs(values) / lengths))
     for row, factors in dependent.items():

@@ -196,7 +196,7 @@ def surfaces_in(problem: Problem, functions, directions, names) -> Surfaces:
     """The sections as programs. Raises `ValueError` where there is no machine code, or a section never changes."""
     if problem.is_single:
         with jax.enable_x64(True):
-            return surfaces_in(problem.in_doubles, functions, directions, names)
+            return surfaces_in(problem.double_precision, functions, directions, names)
     refusal = MachineCode().refuses(problem)
     surfaces = refusal or surfaces_of(problem, functions, directions, "A section")
     if not isinstance(surfaces, str):

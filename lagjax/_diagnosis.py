@@ -164,7 +164,7 @@ def _undefined(derivation: Derivation, ended: Ended) -> Undefined | None:
 
 
 def _undefined_by_jax(derivation: Derivation, params, ended: Ended) -> Undefined | None:
-    """The same for a scene without programs, of which only forces and the gradient of L are looked at."""
+    """The first quantity that is not finite in a scene without programs, among its forces and the gradient of L."""
     if is_lowered(derivation) or derivation.layout.size > LARGEST:
         return None
     motion, numbers = derivation.motion, jax.tree.map(jnp.asarray, eqx.filter(params, eqx.is_array_like))

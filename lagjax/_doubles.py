@@ -34,7 +34,7 @@ _NARROW = {DOUBLE: SINGLE, np.dtype("complex128"): np.dtype("complex64")}
 _WIDE = {narrow: wide for wide, narrow in _NARROW.items()}
 
 
-def in_doubles(function: Callable, *arguments: PyTree) -> PyTree:
+def compute_in_doubles(function: Callable, *arguments: PyTree) -> PyTree:
     """`function(*arguments)` in float64: of arrays that are rounded to float32 first, with arrays of float32.
 
     Integers of the result are those that JAX has at present. What is not an array stays what it is. It works under
@@ -63,9 +63,9 @@ def in_doubles(function: Callable, *arguments: PyTree) -> PyTree:
 
 
 def accepts_singles(state: tuple[str, ...], others: tuple[str, ...] = ()) -> Callable:
-    """A decorator: where the arguments called `state` are float32, the function is called in float64 by `in_doubles`.
+    """A decorator: `compute_in_doubles` calls the function in float64 where the arguments named in `state` are float32.
 
-    So are the `others`, which are numbers too.
+    The arguments named in `others`, which are numbers too, are converted with them.
     """
 
     def decorate(function: Callable) -> Callable:
@@ -78,7 +78,7 @@ def accepts_singles(state: tuple[str, ...], others: tuple[str, ...] = ()) -> Cal
                 return function(*args, **kwargs)
             numbers = {name: given[name] for name in (*state, *others) if name in given}
             numbers = jax.tree.map(lambda leaf: SINGLE.type(leaf) if type(leaf) is float else leaf, numbers)
-            return in_doubles(lambda numbers: function(**{**given, **numbers}), numbers)
+            return compute_in_doubles(lambda numbers: function(**{**given, **numbers}), numbers)
 
         return decorated
 
@@ -92,7 +92,7 @@ def with_doubles(function: Callable) -> Callable:
     def decorated(*args, **kwargs):
         if has_doubles():
             return function(*args, **kwargs)
-        return in_doubles(lambda: function(*args, **kwargs))
+        return compute_in_doubles(lambda: function(*args, **kwargs))
 
     return decorated
 

@@ -44,16 +44,16 @@ def requested_engine(
 _MACHINE_CODE = MachineCode()
 
 
-def choose(problem: Problem, asked: AbstractEngine | None = None) -> Choice:
-    """The engine for a problem. Raises `ValueError` where the one that was asked for, or else every one, refuses it."""
-    if isinstance(asked, Diffrax):
-        choice = Choice(asked, "diffrax was asked for")
+def choose(problem: Problem, requested: AbstractEngine | None = None) -> Choice:
+    """The engine for a problem. Raises `ValueError` where the `requested` one, or without it every one, refuses it."""
+    if isinstance(requested, Diffrax):
+        choice = Choice(requested, "diffrax was asked for")
     else:
         # On a GPU it is not the default: its results there have not been verified on one.
-        refusal = _MACHINE_CODE.refuses(problem) if asked is None else _MACHINE_CODE.lacks(problem)
+        refusal = _MACHINE_CODE.refuses(problem) if requested is None else _MACHINE_CODE.lacks(problem)
         if refusal is None:
             return Choice(_MACHINE_CODE, None)
-        if asked is not None:
+        if requested is not None:
             raise ValueError(_refusal(refusal))
         choice = Choice(Diffrax(), refusal)
     if refusal := choice.engine.refuses(problem):

@@ -138,8 +138,8 @@ class Problem:
         return self.layout.dtype == SINGLE
 
     @functools.cached_property
-    def in_doubles(self) -> "Problem":
-        """The same problem in float64; where numbers are being traced, with zeros in their places."""
+    def double_precision(self) -> "Problem":
+        """The problem in float64; numbers that are being traced become zeros."""
 
         def wide(leaf):
             if not eqx.is_array_like(leaf) or dtype_of(leaf) != SINGLE:

@@ -131,13 +131,13 @@ def simulate(
     system = require_system(system)
     require_flag(throw, "throw")
     layout = Layout.from_state(q0, qdot0)
-    asked = requested_engine(solver, dt, adjoint, progress, rtol, atol)
+    requested = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     given = Problem.from_arguments(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
     problem = lift_problem(given)
     if has_constraints(system):
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
         require_consistent(problem.system, layout, problem.ts, q0, qdot0, problem.params)
-    engine = choose(problem, asked).engine
+    engine = choose(problem, requested).engine
     solution = engine.solve(problem)
     trajectory = trajectory_of(given, engine, solution, given.y0, given.params)
     if not throw or (isinstance(solution.result, np.integer) and solution.result in ENDED_WELL):
@@ -181,14 +181,14 @@ def simulate_batch(
     ```
     """
     system = require_system(system)
-    asked = requested_engine(solver, dt, adjoint, progress, rtol, atol)
+    requested = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
     axes, size = axes_per_leaf(values, batch_axes)
     given = Batch.from_values(system, values, axes, size, ts, rtol, atol, max_steps, event)
     batch = lift_batch(given)
     values = {name: as_arrays(value, batch.member.layout.dtype) for name, value in values.items()}
     inconsistent = inconsistent_members(system, batch.member.ts, values, axes)
-    engine = choose(batch.member, asked).engine
+    engine = choose(batch.member, requested).engine
     solution = engine.solve_batch(batch)
     trajectory = trajectory_of(given.member, engine, solution, given.y0, values["params"], batch_axes[2])
     return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 Matrix = Float[Array, "n n"]
 
-# Eigenvalues that differ by less than so many units of round-off of the largest count as equal. LAPACK's errors are a
+# Eigenvalues that differ by less than this many units of round-off of the largest count as equal. LAPACK's errors are a
 # few units times √n or so; with a closer bound a pair that rounding has split would have derivatives of 1/eps.
 _UNITS = 32
 

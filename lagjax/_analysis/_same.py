@@ -19,7 +19,7 @@ from lagjax._system import System, require_system
 PyTree = Any
 
 # What may be left of the difference, beside the terms that cancel in it: rounding leaves some 1e-15 of them, and as
-# much of what the numbers of two scenes are made of. Where terms cancel within L it leaves more: so many times what it
+# much of what the numbers of two scenes are made of. Where terms cancel within L more is left: this many times what it
 # is seen to change between states a few units in the last place apart, but never more than the last.
 _SAME, _CHANCE, _LARGEST = 1e-13, 100.0, 1e-8
 

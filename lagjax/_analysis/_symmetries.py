@@ -36,10 +36,10 @@ PyTree = Any
 # 1e-15 of the terms, and as much of what numbers of a scene are made of (a mass that is 0.1 · 3). What breaks a
 # symmetry by less than this part is not seen. Halved, it would come within ten of what the ready scenes leave.
 _NULL = 1e-13
-# Where terms cancel inside of L rounding leaves more: so many times what it is seen to leave. A symmetry that is broken
-# is off by the same at a state and a few units in its last place beside it; one that holds is off by chance.
+# Where terms cancel inside of L rounding leaves more: this many times what it is seen to leave. A broken symmetry is
+# off by the same at a state and a few units in its last place beside it; one that holds is off by chance.
 _CHANCE = 30.0
-# The largest part of L that may be left at all. Beyond, nothing is told from rounding, and no symmetry is reported.
+# The largest part of L that may be left. Beyond, nothing is distinguished from rounding, and no symmetry is reported.
 _LARGEST = 1e-8
 
 # At fresh states as much may be left of a symmetry, times this: the largest of many, not their mean.
@@ -92,8 +92,8 @@ class ConservedQuantities(list[Conserved]):
     def __str__(self) -> str:
         rows = [f"{c.name}{'' if c.gauge is None else ' (with a gauge term)'}" for c in self]
         rows = rows or ["no symmetry among the transformations that were tried"]
-        told = f"(what breaks a symmetry by less than {self.threshold:.0e} of L's terms would not be seen)"
-        return "\n".join([*rows, *self.notes, told])
+        resolution = f"(what breaks a symmetry by less than {self.threshold:.0e} of L's terms would not be seen)"
+        return "\n".join([*rows, *self.notes, resolution])
 
     def report(self, trajectory: Trajectory) -> str:
         """The drift of each quantity along a trajectory, a line each; the worst member of a batch."""

@@ -242,7 +242,7 @@ class Jumps(eqx.Module):
         return cls(times - gap, times + gap)
 
     def reversed(self, direction) -> "Jumps":
-        """The same in time that runs in this direction, 1 or −1; none at infinity then."""
+        """The jumps in a time that is multiplied by `direction`, 1 or −1; those at infinity stay at +∞."""
         one, other = self.before * direction, self.behind * direction
         low, high = jnp.minimum(one, other), jnp.maximum(one, other)
         return Jumps(*(jnp.sort(jnp.where(jnp.isfinite(x), x, jnp.inf)) for x in (low, high)))

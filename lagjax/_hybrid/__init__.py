@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._consistent import require_consistent
-from lagjax._doubles import DOUBLE, in_doubles
+from lagjax._doubles import DOUBLE, compute_in_doubles
 from lagjax._hybrid._mode import Transition
 from lagjax._hybrid._rounds import Ending, RoundPlan, TransitionRecord, hybrid_motion
 from lagjax._layout import Layout, halves
@@ -138,7 +138,7 @@ def simulate_hybrid(
         raise ValueError("simulate_hybrid goes forward in time: a reset cannot be undone; ts must increase.")
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
     require_consistent(modes[start], layout, problem.ts, q0, qdot0, problem.params)
-    rtol, atol = float(MachineCode().rtol(problem.in_doubles)), None if atol is None else float(atol)
+    rtol, atol = float(MachineCode().rtol(problem.double_precision)), None if atol is None else float(atol)
     plan = RoundPlan(modes, tuple(transitions), start, max_transitions, rtol, atol, max_steps)
     ending, record = _motion(plan, problem)
     trajectory = _trajectory(modes, problem, ending, record)
@@ -151,7 +151,7 @@ def _motion(plan: RoundPlan, problem: Problem) -> tuple[Ending, TransitionRecord
     if not problem.is_single:
         return hybrid_motion(plan, problem.layout, *given)
     layout = dataclasses.replace(problem.layout, dtype=DOUBLE)
-    return in_doubles(lambda *given: hybrid_motion(plan, layout, *given), *given)
+    return compute_in_doubles(lambda *given: hybrid_motion(plan, layout, *given), *given)
 
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:

@@ -308,7 +308,7 @@ def _select(condition, new: PyTree, old: PyTree) -> PyTree:
 
 
 def _constant_unless(varies, tree: PyTree) -> PyTree:
-    """The same numbers, without derivatives unless `varies` holds."""
+    """The numbers of a pytree, without derivatives unless `varies` holds."""
 
     def constant(x):
         return jnp.where(varies, x, jax.lax.stop_gradient(x)) if eqx.is_array_like(x) else x

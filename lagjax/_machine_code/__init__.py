@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._derivation import Derivation
-from lagjax._doubles import in_doubles
+from lagjax._doubles import compute_in_doubles
 from lagjax._machine_code import _primitives
 from lagjax._machine_code._crossing import (
     MOST_GUARDS,
@@ -122,7 +122,7 @@ class MachineCode(AbstractEngine):
         """
         if problem.is_single:
             with jax.enable_x64(True):
-                return self.lacks(problem.in_doubles)
+                return self.lacks(problem.double_precision)
         if not all(map(is_concrete, problem.tolerances)):
             return "the tolerances are being traced"
         if problem.event is not None and isinstance(surfaces := surfaces_of_event(problem), str):
@@ -133,7 +133,7 @@ class MachineCode(AbstractEngine):
     def outlook_on_gpus(self, problem: Problem) -> str:
         """The outlook for the problem's machine code on a GPU, as the end of a sentence."""
         with jax.enable_x64(True):
-            problem = problem.in_doubles if problem.is_single else problem
+            problem = problem.double_precision if problem.is_single else problem
             flow = flow_of(problem)
             tolerances = for_device(flow, tolerances_of(problem))
             try:
@@ -208,7 +208,7 @@ class MachineCode(AbstractEngine):
         member = batch.member
         given = np.asarray(member.ts)[None], np.asarray(batch.y0), np.asarray(batch.vectors)
         if member.is_single:
-            return in_doubles(lambda *given: _run(member.in_doubles, given), *given)
+            return compute_in_doubles(lambda *given: _run(member.double_precision, given), *given)
         return _run(member, given)
 
 
@@ -221,16 +221,16 @@ def _in_doubles(solve: Callable, problem: Problem):
     """The solution by `solve` in float64, in the precision of the problem."""
 
     def of_numbers(ts, y0, params):
-        return solve(dataclasses.replace(problem.in_doubles, ts=ts, y0=y0, params=params))
+        return solve(dataclasses.replace(problem.double_precision, ts=ts, y0=y0, params=params))
 
-    return in_doubles(of_numbers, problem.ts, problem.y0, problem.params)
+    return compute_in_doubles(of_numbers, problem.ts, problem.y0, problem.params)
 
 
 def flow_of(problem: Problem) -> Flow:
     """The flow of a problem's scene. Raises `ValueError` where it has none, saying why."""
     if problem.is_single:
         with jax.enable_x64(True):
-            return flow_of(problem.in_doubles)
+            return flow_of(problem.double_precision)
     flow = _flow_of(problem)
     if isinstance(flow, str):
         raise ValueError(f"There is no machine code for this scene: {flow}.")

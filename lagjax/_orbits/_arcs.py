@@ -85,7 +85,7 @@ class Arcs:
     def from_system(cls, system: System, q0, qdot0, params: PyTree, rtol: float, what: str) -> "Arcs":
         """The arcs of a scene whose state has the structure of (q0, qdot0).
 
-        Raises `ValueError`, for `what` was asked, where the scene has constraints or no machine code.
+        Raises `ValueError`, a sentence about `what` they are for, where the scene has constraints or no machine code.
         """
         system = require_system(system)
         require_untraced((system, params), "A parameter")

@@ -229,7 +229,7 @@ def _end(follower: Follower, last: FamilyPoint, stopped: bool) -> str:
 
 _SAME = 1e-3  # of a step: within, a fold and a branch point are one, where both tests change sign
 _NOISE = 1e-9  # of tests, which are of order one: what is all degenerate, as an isotropic oscillator, passes nothing
-# How far from a branch point orbits are asked for, in parts of the bracket, and the bracket that ends that, in parts of
+# How far from a branch point orbits are computed, in parts of the bracket, and the bracket that ends that, in parts of
 # the step: the inverse polynomial through four orbits is then right to its fourth power.
 _BESIDE, _BRACKET = 0.02, 1e-3
 
@@ -250,51 +250,51 @@ def _locate_event(follower: Follower, last: _Member, following: _Member, step: f
     """The zero of test k on the arc between two orbits, and the orbit there.
 
     At a branch point the equations are singular, and about it Newton's method finds orbits of either family. So orbits
-    are asked for beside it, nearer and nearer, from cubic guesses that are much nearer than the other family; the one
+    are computed beside it, nearer and nearer, from cubic guesses that are much nearer than the other family; the one
     at the zero is then interpolated, and corrected in all directions but the singular one.
     """
-    across, asked = last.tangent, {0.0: last, step: following}
+    across, found = last.tangent, {0.0: last, step: following}
     a, b = 0.0, step
     while b - a > _BRACKET * step:
-        zero, width = _zero(asked, a, b, k), b - a
+        zero, width = _zero(found, a, b, k), b - a
         for s in (max(zero, a + 2 * _BESIDE * width) - _BESIDE * width, zero + _BESIDE * width):
             if not a < s < b:
                 continue
-            member = _orbit_between(follower, asked, a, b, s, across, 0, last.symmetries)
+            member = _orbit_between(follower, found, a, b, s, across, 0, last.symmetries)
             if member is None or not np.isfinite(member.tests[k]):
-                return a, asked[a]
-            asked[s] = member
-            a, b = (s, b) if member.tests[k] * asked[a].tests[k] > 0 else (a, s)
+                return a, found[a]
+            found[s] = member
+            a, b = (s, b) if member.tests[k] * found[a].tests[k] > 0 else (a, s)
         if b - a > 0.9 * width:
             break
-    zero = _zero(asked, a, b, k)
-    member = _orbit_between(follower, asked, a, b, zero, across, int(k == 1), last.symmetries)
-    return zero, asked[a] if member is None else member
+    zero = _zero(found, a, b, k)
+    member = _orbit_between(follower, found, a, b, zero, across, int(k == 1), last.symmetries)
+    return zero, found[a] if member is None else member
 
 
-def _zero(asked: dict[float, _Member], a: float, b: float, k: int) -> float:
+def _zero(found: dict[float, _Member], a: float, b: float, k: int) -> float:
     """The zero of the inverse polynomial through the four orbits nearest to a bracket; within it in any case."""
-    near = sorted(asked, key=lambda s: abs(s - (a + b) / 2))[:4]
-    values = [asked[s].tests[k] for s in near]
+    near = sorted(found, key=lambda s: abs(s - (a + b) / 2))[:4]
+    values = [found[s].tests[k] for s in near]
     shares = [np.prod([w / (w - v) for w in values[:j] + values[j + 1 :]]) for j, v in enumerate(values)]
     zero = float(np.dot(near, shares))
     if a < zero < b:
         return zero
-    return (a * asked[b].tests[k] - b * asked[a].tests[k]) / (asked[b].tests[k] - asked[a].tests[k])
+    return (a * found[b].tests[k] - b * found[a].tests[k]) / (found[b].tests[k] - found[a].tests[k])
 
 
 def _orbit_between(
-    follower: Follower, asked: dict[float, _Member], a: float, b: float, s: float, across: FamilyTangent, left_out: int,
+    follower: Follower, found: dict[float, _Member], a: float, b: float, s: float, across: FamilyTangent, left_out: int,
     most: int,
 ) -> _Member | None:  # fmt: skip
-    """The orbit at arc length s between members of `asked` at a and b; None where it belongs to another family."""
-    ends = [FamilyUnknowns.from_point(asked[x].point) for x in (a, b)]
-    slopes = [_rate(follower, asked[x], across) for x in (a, b)]
+    """The orbit at arc length s between members of `found` at a and b; None where it belongs to another family."""
+    ends = [FamilyUnknowns.from_point(found[x].point) for x in (a, b)]
+    slopes = [_rate(follower, found[x], across) for x in (a, b)]
     u, width = (s - a) / (b - a), b - a
     guess = ends[0].times((1 + 2 * u) * (1 - u) ** 2).plus(ends[1], u**2 * (3 - 2 * u))
     guess = guess.plus(slopes[0], width * u * (1 - u) ** 2).plus(slopes[1], width * u**2 * (u - 1))
-    there = correct(follower, follower.rebuild(asked[a].point, guess), across, left_out)
-    tangent = None if there is None else tangent_at(follower, there[0], asked[a].tangent, left_out)
+    there = correct(follower, follower.rebuild(found[a].point, guess), across, left_out)
+    tangent = None if there is None else tangent_at(follower, there[0], found[a].tangent, left_out)
     if there is None or tangent is None or tangent.vector @ across.vector < _ALONG:
         return None
     return _member(follower, there[0], tangent, most)

@@ -155,7 +155,7 @@ class Follower:
         return self.point(whole.y, whole.period, point.chain.parts, whole.numbers)
 
     def refine_arcs(self, point: FamilyPoint) -> FamilyPoint:
-        """The same orbit in more arcs where errors grow much along one; the same point where they do not."""
+        """The point with its orbit in more arcs where errors grow much along one arc; else the point itself."""
         count = point.chain.y.shape[1]
         growth = np.log(max(np.linalg.norm(one, 2) for one in point.chain.growth[0])) / np.log(_LONGEST_GROWTH)
         more = int(2 ** np.ceil(np.log2(max(growth, 1.0))))

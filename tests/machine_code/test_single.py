@@ -17,7 +17,7 @@ import pytest
 from sweeps import sweep
 
 import lagjax
-from lagjax._doubles import in_doubles
+from lagjax._doubles import compute_in_doubles
 
 EPS = float(np.finfo(np.float32).eps)
 TS = np.linspace(0, 10, 11, dtype=np.float32)
@@ -205,7 +205,7 @@ def test_what_is_computed_in_doubles_is_differentiated_and_batched(off):
         return {"sum": (x + 1e8) - 1e8 + x**3, "twice": 2 * k, "name": "kept"}
 
     def of(x, k=3):
-        return in_doubles(lost, x, jnp.asarray(k))
+        return compute_in_doubles(lost, x, jnp.asarray(k))
 
     found = of(np.float32(0.3))
     assert found["sum"] == np.float32(float(np.float32(0.3)) + float(np.float32(0.3)) ** 3) and found["name"] == "kept"
@@ -215,7 +215,7 @@ def test_what_is_computed_in_doubles_is_differentiated_and_batched(off):
         assert jax.grad(function)(2.0) == 13 and jax.jacfwd(jax.grad(function))(2.0) == 12
         assert jax.grad(jax.grad(jax.grad(function)))(2.0) == 6
         np.testing.assert_array_equal(jax.vmap(jax.grad(function))(jnp.arange(3.0)), [1, 4, 13])
-    both = jax.grad(lambda x, y: in_doubles(lambda x, y: x * y, x, y), (0, 1))
+    both = jax.grad(lambda x, y: compute_in_doubles(lambda x, y: x * y, x, y), (0, 1))
     np.testing.assert_array_equal(jax.vmap(both, (0, None))(jnp.arange(2.0), 5.0), [[5, 5], [0, 1]])
 
 
