@@ -111,6 +111,7 @@ class BorderControl:
             "part",
             "approach",
             "next_approach",
+            "slides",
         )
         fields = {"touch": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
         fields["level"] = len(borders.guards) if _borders.TABLE in borders.kinds else 0
@@ -176,6 +177,7 @@ class BorderControl:
             if self.table.knots and len(self.borders.clocks) > 1:
                 self._note_coincidence(frame, h)
             self._note_levels(frame)
+            self._note_slides(frame)
             with code.loop(len(self.guards)) as g:
                 self._look(frame, g, degree, h)
         frame["next_approach"] = 0.0
@@ -218,7 +220,10 @@ class BorderControl:
         self._divide(frame, g, degree)
         # A move of less than a part of atol does not count as leaving a border that the motion touches.
         nothing = self.roots.size(frame, degree) <= NEGLIGIBLE * code.lanes_of(absolute_tolerance(frame))
-        idle = idle | (nothing & (frame["touch", g] > Touch.NONE) & ~undecided)
+        touches = frame["touch", g] > Touch.NONE
+        if self.slides:  # along u = 0 another border of |u| is there by rounding
+            touches = touches | (frame["slides"] > 0.0)
+        idle = idle | (nothing & touches & ~undecided)
         self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame))
         frame.call(self.roots.first_root, degree)
         self._look_closer(frame, degree)
@@ -293,6 +298,21 @@ class BorderControl:
                 index = self._piece(frame, integer(code, guard.piece)) + guard.e
                 knot, inside = self._knot(frame, guard.piece, index)
                 frame["level", g] = code.select(inside, knot, NOWHERE if guard.e else -NOWHERE)
+
+    @property
+    def slides(self) -> bool:
+        """True if the motion may slide along a border that other switching numbers depend on."""
+        return self.borders.nested and _borders.SLIDE in self.borders.kinds
+
+    def _note_slides(self, frame: Frame) -> None:
+        """Set `slides` to 1 in the lanes whose motion slides along any border."""
+        if not self.slides:
+            return
+        code = frame.code
+        frame["slides"] = 0.0
+        with code.loop(len(self.guards)) as g:
+            with frame.where(frame["touch", g] >= Touch.SLIDING):
+                frame["slides"] = 1
 
     def _go_on(self, frame: Frame, crossed: Value, going: Value) -> None:
         """Past borders, and entries of tables.
@@ -536,8 +556,9 @@ class BorderControl:
                 frame.call(self.decide)
             if self.jump is not None:
                 frame.call(self.jump)
-            idle = code.select(crosses & ~stepped, frame["idle_crossings"] + 1.0, 0.0)
-            with frame.where(stepped | crosses):
+            # A border at which a step of no length ends, too, whether it is crossed or only met.
+            idle = code.select(stepped, 0.0, frame["idle_crossings"] + 1.0)
+            with frame.where(stepped | crosses | was_cut):
                 frame["idle_crossings"] = idle
             many = frame["idle_crossings"] > float(MOST_CROSSINGS * (len(self.guards) + len(self.borders.clocks)))
             with frame.where(many):

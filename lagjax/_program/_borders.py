@@ -343,10 +343,25 @@ class _Rewriting:
         return self._known.get((SIGN, self.graph.term(f("sub", a, b))[1]))
 
     def _sign(self, u: int) -> int | None:
-        """The sign of a number, by the piece of what it is a multiple of."""
+        """The sign of a number, by the piece of what it is a multiple of.
+
+        That of |x| is 1 but at the border of x, where it is 0: the square of the piece of x, and no border of its own.
+        """
         coefficient, base = self.graph.term(u)
-        piece = self._piece(SIGN, base)
+        piece = self._sign_of_size(base) or self._piece(SIGN, base)
         return piece if piece is None or coefficient > 0 else self.graph.apply("neg", piece)
+
+    def _sign_of_size(self, x: int) -> int | None:
+        """The sign of what is |y|, the product of a number and the piece of its sign; None of another number."""
+        op, operands, _ = self.graph.nodes[x]
+        if op != "mul":
+            return None
+        for piece, y in (operands, operands[::-1]):
+            coefficient, base = self.graph.term(y)
+            if self._known.get((SIGN, base)) == piece:
+                square = self.graph.apply("mul", piece, piece)
+                return square if coefficient > 0 else self.graph.apply("neg", square)
+        return None
 
     def _piece(self, kind: int, x: int, table: Located | None = None) -> int | None:
         """The input that says which piece a number is on; None where the number stays as it is along the motion."""

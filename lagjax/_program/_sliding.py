@@ -24,7 +24,7 @@ MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for each of which a program is c
 # Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
 # mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
 SOFT, MENDED = 1e-9, 2
-FAR = 1e200  # of a rate: a share that is beyond 0 and 1, and finite
+FAR = 1e100  # of a rate: a share that is beyond 0 and 1; the search for its roots squares it
 _LARGEST = 10_000_000  # operations: a bound for errors
 
 
@@ -313,24 +313,28 @@ def _with_copies(
         [f("sub", places[i], x) for i, x in zip(line.outputs[:n], a, strict=False)]
         for places in map(copy, range(count))
     ]
-    rows, right = [], []
-    for k, (j, _) in enumerate(slides):
+    rates, effects = [], []
+    for j, _ in slides:
         slopes = gradient_in(graph, line, base, switches[j], range(2 * n + 1))
         velocity = [graph.input(n + i, "float") for i in range(n)]
         rate = dot(graph, [*slopes[:n], *slopes[n : 2 * n]], [*velocity, *a[:n]])
-        rate = f("add", rate, slopes[2 * n])
-        right.append(f("select", flags[k], zero, f("neg", rate)))
-        row = []
-        for m in range(count):
-            both = f("and", flags[k], flags[m])
-            row.append(f("select", both, one if k == m else zero, dot(graph, slopes[n : 2 * n], more[m])))
-        rows.append(row)
+        rates.append(f("add", rate, slopes[2 * n]))
+        effects.append([dot(graph, slopes[n : 2 * n], of_one) for of_one in more])
+    # Borders that are not pushed onto are left.
+    held = [f("and", flags[k], f("lt", effects[k][k], zero)) for k in range(count)]
+    rows = [
+        [f("select", f("and", held[k], held[m]), one if k == m else zero, effects[k][m]) for m in range(count)]
+        for k in range(count)
+    ]
     lower = eliminate(graph, rows)
-    shares = substitute(graph, rows, lower, right)
+    shares = substitute(graph, rows, lower, [f("select", held[k], zero, f("neg", rates[k])) for k in range(count)])
     for i in range(n):
         for k in range(count):
-            a[i] = f("add", a[i], f("select", flags[k], zero, f("mul", shares[k], more[k][i])))
-    return Sliding(StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(a)), base, shares, None)
+            a[i] = f("add", a[i], f("select", held[k], zero, f("mul", shares[k], more[k][i])))
+    moves = [f("add", rates[k], dot(graph, shares, effects[k])) for k in range(count)]
+    left = [f("add", number(0.5), f("mul", number(FAR), x)) for x in moves]
+    ends = [f("select", held[k], f("select", flags[k], zero, left[k]), shares[k]) for k in range(count)]
+    return Sliding(StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(a)), base, ends, None)
 
 
 # ---- a few linear equations ------------------------------------------------------------------------------------------

@@ -142,6 +142,36 @@ def test_static_friction_is_larger_than_kinetic():
     np.testing.assert_allclose(run.qdot[1:], [0.0, 0.05 * (49 - 25) - 0.3 * 2], atol=1e-4)
 
 
+TABLE = {"speed": jnp.array([0.0, 0.5, 1.0, 9.0]), "mu": jnp.array([0.4, 0.4, 0.4, 0.4])}
+# Coulomb's law with 0.4 in other words, all of which decide on |v| where v itself is decided on.
+COULOMB = {
+    "where": lambda v, params: jnp.where(jnp.abs(v) > 0.0, *params["mu"][:2]) * jnp.sign(v),
+    "twice": lambda v, params: jnp.where(2 * jnp.abs(v) <= 0.0, 0.0, 0.4) * jnp.sign(v),
+    "threshold": lambda v, params: jnp.where(jnp.abs(v) > params["speed"][0], *params["mu"][:2]) * jnp.sign(v),
+    "table": lambda v, params: jnp.interp(jnp.abs(v), *map(np.asarray, TABLE.values())) * jnp.sign(v),
+    "table of parameters": lambda v, params: jnp.interp(jnp.abs(v), params["speed"], params["mu"]) * jnp.sign(v),
+}
+
+
+@pytest.mark.parametrize("law", COULOMB)
+def test_friction_by_a_law_of_speed_that_begins_at_zero(law):
+    """Two borders at one place, of which one has no lower side. Compiles a motion."""
+    friction = lambda q, v, params: -COULOMB[law](v - params["belt"], params)
+    scene = lagjax.System(lambda q, v: 0.5 * (v * v - q * q), forces=friction)
+
+    def state(q0, belt, t):
+        run = lagjax.simulate(scene, q0, 0.0, jnp.array([0.0, t]), TABLE | {"belt": belt}, solver=lagjax.MachineCode())
+        return jnp.stack([run.q[-1], run.qdot[-1]])
+
+    for q0, t in ((1.5, 2.0), (1.5, 9.0), (0.3, 9.0)):  # it sets out, comes to rest, and has never moved
+        np.testing.assert_allclose(state(q0, 0.0, t), swings(q0, 0.4, t), atol=1e-8)
+
+    # A belt drags it at its own speed for a second, until the spring pulls 0.4; from there it swings about q = 0.4.
+    params = TABLE | {"belt": 0.3}
+    dragged = lagjax.simulate(scene, 0.1, 0.3, jnp.array([0.0, 4.0]), params, solver=lagjax.MachineCode())
+    np.testing.assert_allclose(dragged.q[-1], 0.4 + 0.3 * np.sin(3.0), atol=1e-8)
+
+
 def test_a_belt_that_changes_its_speed():
     # With friction 1: it goes along with 0.5, from t = 1 on it brakes to −0.25, from t = 2 on to rest.
     def force(q, v, t):
