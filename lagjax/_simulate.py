@@ -95,14 +95,14 @@ def simulate(
     **Borders.** Forces and potentials may have kinks and jumps (`where`, `abs`, `sign`, `clip`, `floor`, …), also in
     time. Machine code ends a step at every border and begins the next one beyond it; where both sides push towards the
     border, as dry friction at rest does, the motion stays on it. First and second derivatives, in every mode, include
-    the jumps at borders. Where they do not exist they are NaN: where a border is grazed, and second ones by the knots
-    of samples at which a force jumps (see `samples`). With diffrax, steps shrink at borders and go across, and a
-    derivative over them lacks what a jump of the acceleration adds. So they are searched for a jump where a derivative
-    is asked for: a motion that crosses one, at a place that moves with the state or with parameters that are
-    differentiated, raises `SimulationError` in `jax.grad`; its derivatives are NaN with `throw=False`. With an event or
-    an `adjoint` they are NaN in either case, but by the time of a switch that is a parameter, where they lack its jump;
-    with `diffrax.BacksolveAdjoint` nothing is searched. Corners, where the acceleration is continuous, and jumps at
-    known times add nothing to first derivatives.
+    the jumps at borders. Where they do not exist they are NaN: where a border is grazed, and by knots of two inputs
+    that coincide (see `samples`). With diffrax, steps shrink at borders and go across, and a derivative over them lacks
+    what a jump of the acceleration adds. So the steps are searched for a jump before a derivative is computed: a motion
+    that crosses one, at a place that moves with the state or with parameters that are differentiated, raises
+    `SimulationError` in `jax.grad`; its derivatives are NaN with `throw=False`. With an event or an `adjoint` they are
+    NaN in either case, but by the time of a switch that is a parameter, where they lack its jump; with
+    `diffrax.BacksolveAdjoint` nothing is searched. Corners, where the acceleration is continuous, and jumps at known
+    times add nothing to first derivatives.
 
     **Values that functions read.** What the event and the functions inside `system` read besides their arguments
     (globals, closures, attributes, helpers) is compared at every call: after `K = 1.0` the motion is that of the new

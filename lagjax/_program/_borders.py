@@ -231,7 +231,17 @@ class _Rewriting:
             op, operands, _ = nodes[i]
             if op in (*_COMPARISONS, "abs", "max", "min", "sign") and {self._base(x) for x in operands} & singular:
                 out.add(i)
-        return out
+        # What else is decided at the same border is decided beside it: no step may end where the root has no series.
+        abrupt = {self._compared(i) for i in out} - {None}
+        return out | {i for i in needed if self._compared(i) in abrupt}
+
+    def _compared(self, i: int) -> frozenset[int] | None:
+        """The numbers that are equal at the border of a node, but for factors and zero; None of other nodes."""
+        op, operands, _ = self.program.line.nodes[i]
+        if op not in (*_COMPARISONS, "abs", "max", "min", "sign"):
+            return None
+        nodes = self.program.line.nodes
+        return frozenset(self._base(x) for x in operands if nodes[x][0] != "constant" or nodes[x][2] != 0)
 
     def _base(self, i: int) -> int:
         """The node that this one is a multiple of."""
@@ -272,7 +282,30 @@ class _Rewriting:
             self._note_border(op, of)
         if op in _FEATURES and i in self.decisive and self._is_moving(of[0]):
             self.features.setdefault(of[0], Feature(*_FEATURES[op]))
+        if op == "div" and (quotient := self._direction(*of)) is not None:
+            return quotient
         return self.graph.node(op, *of, attribute=attribute)
+
+    def _direction(self, x: int, size: int) -> int | None:
+        """x / |x| as the piece of x, which has both sides at x = 0, too; None of other quotients.
+
+        The size may be replaced by a number where it is zero, by `where`.
+        """
+        op, operands, _ = self.graph.nodes[size]
+        if op == "select":
+            branches = [self._direction(x, y) for y in operands[1:]]
+            if branches == [None, None]:
+                return None
+            quotients = [b or self.graph.apply("div", x, y) for b, y in zip(branches, operands[1:], strict=True)]
+            return self.graph.apply("select", operands[0], *quotients)
+        (a, x), (b, size) = self.graph.term(x), self.graph.term(size)
+        operands = self.graph.nodes[size][1]
+        for piece, y in (operands, operands[::-1]) if self.graph.nodes[size][0] == "mul" else ():
+            c, y = self.graph.term(y)
+            if x == y and self._known.get((SIGN, x)) == piece:
+                self._jumping.add(piece)
+                return self.graph.apply("mul", self.graph.constant(a / (b * c), "float"), piece)
+        return None
 
     def _of_piece(self, i: int, op: str, of: list[int], attribute) -> int | None:
         """The result of a node by its piece; None where it has none."""
@@ -354,9 +387,7 @@ class _Rewriting:
     def _sign_of_size(self, x: int) -> int | None:
         """The sign of what is |y|, the product of a number and the piece of its sign; None of another number."""
         op, operands, _ = self.graph.nodes[x]
-        if op != "mul":
-            return None
-        for piece, y in (operands, operands[::-1]):
+        for piece, y in (operands, operands[::-1]) if op == "mul" else ():
             coefficient, base = self.graph.term(y)
             if self._known.get((SIGN, base)) == piece:
                 square = self.graph.apply("mul", piece, piece)

@@ -146,6 +146,8 @@ TABLE = {"speed": jnp.array([0.0, 0.5, 1.0, 9.0]), "mu": jnp.array([0.4, 0.4, 0.
 # Coulomb's law with 0.4 in other words, all of which decide on |v| where v itself is decided on.
 COULOMB = {
     "where": lambda v, params: jnp.where(jnp.abs(v) > 0.0, *params["mu"][:2]) * jnp.sign(v),
+    "direction": lambda v, params: 0.4 * v / jnp.where(jnp.abs(v) > 0.0, jnp.abs(v), 1.0),
+    "quotient": lambda v, params: 0.4 * v / jnp.abs(v),
     "twice": lambda v, params: jnp.where(2 * jnp.abs(v) <= 0.0, 0.0, 0.4) * jnp.sign(v),
     "threshold": lambda v, params: jnp.where(jnp.abs(v) > params["speed"][0], *params["mu"][:2]) * jnp.sign(v),
     "table": lambda v, params: jnp.interp(jnp.abs(v), *map(np.asarray, TABLE.values())) * jnp.sign(v),
@@ -192,3 +194,37 @@ def test_three_contacts_of_two_blocks_share_what_they_hold():
     scene = lagjax.System(lambda q, v: 0.5 * v @ v, forces=force)
     run = lagjax.simulate(scene, jnp.zeros(2), jnp.zeros(2), np.array([0.0, 5.9, 7.0, 12.0]))
     np.testing.assert_allclose(run.qdot[1:], [[0.0, 0.0], [0.05, 0.0], [1.8, 0.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_contacts_that_hold_to_rounding_are_settled_at_one_instant(size):
+    """Of the contacts of two blocks one yields at once; what the others hold is exact to the rounding of the forces.
+
+    Whether that moves a block within a step, by its own tolerance, depends on the size of the forces and of the step.
+    Compiles one motion.
+    """
+
+    def force(q, v, params):
+        between = -0.1 * jnp.sign(v[0] - v[1]) * jnp.array([1.0, -1.0])
+        return params * (between - 0.2 * jnp.sign(v) + jnp.array([1.2, 0.0]) - q)
+
+    scene = lagjax.System(lambda q, v: 0.5 * jnp.sum(v * v), forces=force)
+    for duration in (0.1, 1.0, 3.0):
+        for second in (0.1, 0.11, 0.099999):  # held back by its own friction, up to 0.3
+            ts = jnp.array([0.0, duration / np.sqrt(size)])
+            run = lagjax.simulate(scene, jnp.array([0.0, second]), jnp.zeros(2), ts, size)
+            np.testing.assert_allclose(run.q[-1], [0.9 * (1 - np.cos(duration)), second], atol=1e-8)
+
+
+@pytest.mark.parametrize("power", [0.5, 1.5, 1.75, 2.5])
+def test_an_oscillator_of_a_broken_power(power):
+    """The root and the sign change at one place, where the power has no series. Compiles two batches."""
+    q0, ts = jnp.linspace(0.1, 1.0, 10), jnp.array([0.0, 8.0])
+    for force in (
+        lambda q, v: -jnp.sign(q) * jnp.abs(q) ** power,
+        lambda q, v: -(jnp.where(q > 0, q, -q) ** power) * jnp.where(q < 0, -1.0, 1.0),
+    ):
+        scene = lagjax.System(lambda q, v: 0.5 * v * v, forces=force)
+        run = lagjax.simulate_batch(scene, q0, jnp.zeros(10), ts, solver=lagjax.MachineCode())
+        energy = 0.5 * run.qdot[:, -1] ** 2 + jnp.abs(run.q[:, -1]) ** (power + 1) / (power + 1)
+        np.testing.assert_allclose(energy, q0 ** (power + 1) / (power + 1), atol=1e-8)
