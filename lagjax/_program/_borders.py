@@ -193,6 +193,8 @@ class _Rewriting:
         self.abrupt: set[int] = set()
         self.moduli, self.quotients = _moduli(program.line), _floor_divisions(program.line)
         self.decisive = self._decisive()
+        comparisons = [i for i in self.decisive if program.line.nodes[i][0] not in ("eq", "ne")]
+        self.borders_of_decisions = {self._compared(i) for i in comparisons} - {None}
         self.places: list[int] = []
         relevant = self.decisive | self.abrupt
         if any(
@@ -238,7 +240,7 @@ class _Rewriting:
     def _compared(self, i: int) -> frozenset[int] | None:
         """The numbers that are equal at the border of a node, but for factors and zero; None of other nodes."""
         op, operands, _ = self.program.line.nodes[i]
-        if op not in (*_COMPARISONS, "abs", "max", "min", "sign"):
+        if op not in (*_COMPARISONS, "abs", "max", "min", "sign", "eq", "ne"):
             return None
         nodes = self.program.line.nodes
         return frozenset(self._base(x) for x in operands if nodes[x][0] != "constant" or nodes[x][2] != 0)
@@ -276,7 +278,7 @@ class _Rewriting:
         of = [self.places[x] for x in operands]
         if i in self.decisive and (decided := self._of_piece(i, op, of, attribute)) is not None:
             return decided
-        if op in ("eq", "ne") and (sign := self._known_sign(*of)) is not None:
+        if op in ("eq", "ne") and (sign := self._known_sign(i, *of)) is not None:
             return self.graph.apply(op, sign, self.graph.constant(0.0, "float"))
         if i in self.abrupt and self._decides(i):
             self._note_border(op, of)
@@ -358,8 +360,8 @@ class _Rewriting:
     def _base_of(self, piece: int) -> int:
         return self.graph.term(piece)[1]
 
-    def _known_sign(self, a: int, b: int) -> int | None:
-        """The piece that decides whether two numbers are equal.
+    def _known_sign(self, i: int, a: int, b: int) -> int | None:
+        """The piece that decides whether two numbers are equal, which is node i of the program.
 
         Of x and max(x, y), say, which are equal where x is larger: 0 there, and else 1.
         """
@@ -373,6 +375,8 @@ class _Rewriting:
                 return f("select", f("ge" if op == "max" else "le", larger, zero), self._one, zero)
         if self.graph.kinds[a] != "float" or self.graph.kinds[b] != "float":
             return None
+        if self._compared(i) in self.borders_of_decisions:  # which may come later in the program
+            return self._sign(f("sub", a, b))
         return self._known.get((SIGN, self.graph.term(f("sub", a, b))[1]))
 
     def _sign(self, u: int) -> int | None:

@@ -146,6 +146,7 @@ TABLE = {"speed": jnp.array([0.0, 0.5, 1.0, 9.0]), "mu": jnp.array([0.4, 0.4, 0.
 # Coulomb's law with 0.4 in other words, all of which decide on |v| where v itself is decided on.
 COULOMB = {
     "where": lambda v, params: jnp.where(jnp.abs(v) > 0.0, *params["mu"][:2]) * jnp.sign(v),
+    "equal": lambda v, params: jnp.where(v == 0.0, 0.0, 0.4 * jnp.sign(v)),
     "direction": lambda v, params: 0.4 * v / jnp.where(jnp.abs(v) > 0.0, jnp.abs(v), 1.0),
     "quotient": lambda v, params: 0.4 * v / jnp.abs(v),
     "twice": lambda v, params: jnp.where(2 * jnp.abs(v) <= 0.0, 0.0, 0.4) * jnp.sign(v),
@@ -157,7 +158,7 @@ COULOMB = {
 
 @pytest.mark.parametrize("law", COULOMB)
 def test_friction_by_a_law_of_speed_that_begins_at_zero(law):
-    """Two borders at one place, of which one has no lower side. Compiles a motion."""
+    """Two borders at one place, of which one has no lower side. Compiles a motion, and its transpose."""
     friction = lambda q, v, params: -COULOMB[law](v - params["belt"], params)
     scene = lagjax.System(lambda q, v: 0.5 * (v * v - q * q), forces=friction)
 
@@ -167,6 +168,10 @@ def test_friction_by_a_law_of_speed_that_begins_at_zero(law):
 
     for q0, t in ((1.5, 2.0), (1.5, 9.0), (0.3, 9.0)):  # it sets out, comes to rest, and has never moved
         np.testing.assert_allclose(state(q0, 0.0, t), swings(q0, 0.4, t), atol=1e-8)
+
+    slope = jax.grad(lambda q0: state(q0, 0.0, 5.0)[0])(1.5)  # after one half swing
+    near = [swings(1.5 + h, 0.4, 5.0)[0] for h in (1e-6, -1e-6)]
+    np.testing.assert_allclose(slope, (near[0] - near[1]) / 2e-6, atol=1e-8)
 
     # A belt drags it at its own speed for a second, until the spring pulls 0.4; from there it swings about q = 0.4.
     params = TABLE | {"belt": 0.3}
