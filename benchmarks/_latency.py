@@ -96,7 +96,7 @@ def _machine_code(case: Case) -> Callable:
     problem = Problem.from_arguments(
         case.scene.system, Layout.from_state(*start), *start, ts[0], case.scene.params, rtol=TOLERANCE
     )
-    kernel, y0, numbers = flow_of(problem).kernel.for_members(1), problem.y0, problem.vector
+    kernel, y0, numbers = flow_of(problem).kernel.select_width(1), problem.y0, problem.vector
     rtol, atol = map(float, MachineCode().tolerances(problem, y0))
     return functools.partial(kernel, ts, y0[None], numbers[None], rtol, atol, problem.max_steps)
 

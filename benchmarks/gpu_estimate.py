@@ -150,7 +150,7 @@ def counted(run: Run, form=as_chosen, result=end_of, members=MEMBERS) -> Counted
         lower_by(mlir.lower_fun(rule, multiple_results=True) for rule in of_gpus)
         jax.block_until_ready(jax.jit(lambda given: result(run, *given))(run.given(members)))
     finally:
-        lower_by(map(_primitives._for_cpus, (_primitives._run_compiled, _primitives._vjp_compiled)))
+        lower_by(map(_primitives._lowering_rule, (_primitives._run_compiled, _primitives._vjp_compiled)))
         _gpu_launch.launch, _gpu_launch.has_slow_doubles, gpu.form_for = kept
         jax.clear_caches()
     assert len(launched) <= 2, "a gradient that needs tangents, too, is not counted"

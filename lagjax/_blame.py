@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend import core, source_info_util
 
 from lagjax._motion import Motion
-from lagjax._program import OPERATIONS, in_jax, written_out
+from lagjax._program import OPERATIONS, apply_in_jax, expand_primitive
 
 _PACKAGE = os.path.dirname(os.path.abspath(__file__))
 
@@ -156,7 +156,7 @@ def _side_of(name: str) -> Callable | None:
     if row is None or row.side is None:
         return _SIDES.get(name)
     side = row.side
-    return lambda result, *operands: side(in_jax, float, result, *operands)
+    return lambda result, *operands: side(apply_in_jax, float, result, *operands)
 
 
 # ---- following a jaxpr -----------------------------------------------------------------------------------------------
@@ -209,7 +209,7 @@ def _run(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside
 def _body(equation) -> tuple | None:
     """The jaxpr that an equation calls, and its constants."""
     if equation.primitive.name == "call_hi_primitive":
-        closed = written_out(equation.params["_prim"])
+        closed = expand_primitive(equation.params["_prim"])
         return closed.jaxpr, closed.consts
     body = next((equation.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in equation.params), None)
     if body is None:

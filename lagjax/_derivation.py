@@ -31,17 +31,17 @@ from lagjax._program import (
     Graph,
     Program,
     Unlowerable,
-    applied,
+    apply_function,
     borders,
-    joined,
+    concatenate,
     lower,
     lower_formula,
     lower_scalars,
     lower_solution,
     operations_that_fit,
-    spread,
-    stacked,
-    without_collections,
+    pause_collections,
+    scatter,
+    stack,
 )
 from lagjax._quantities import OwnRules, quantities
 from lagjax._recursion import Recursion, RecursiveElimination
@@ -84,7 +84,7 @@ def _lowered_once(make: Callable) -> property:
             with self._lock:  # programs of a large scene share one graph
                 if name not in self._made:
                     try:
-                        with without_collections():
+                        with pause_collections():
                             self._made[name] = make(self)
                     except Unlowerable as reason:
                         self._made[name] = reason
@@ -163,7 +163,7 @@ class Derivation:
                 values = self._traced_once.quantities(*jax.tree.unflatten(structure, leaves))
                 return [values[name] for name in names]
 
-            self._programs[names] = self._whole.only(positions, chosen)
+            self._programs[names] = self._whole.select_outputs(positions, chosen)
         return self._programs[names]
 
     @functools.cached_property
@@ -255,10 +255,10 @@ class Derivation:
         position = None if self.motion.constraints.on_positions is None else self._solution(_POSITION_STEP)
 
         def projected(*scalars):
-            q, v, rest = stacked(scalars[:n]), stacked(scalars[n : 2 * n]), scalars[n:]
+            q, v, rest = stack(scalars[:n]), stack(scalars[n : 2 * n]), scalars[n:]
             if position is not None:
                 q = q + position.vector(*scalars)[:n]
-            return joined([q, v + velocity.vector(*(q[i] for i in range(n)), *rest)[:n]])
+            return concatenate([q, v + velocity.vector(*(q[i] for i in range(n)), *rest)[:n]])
 
         return lower_formula(projected, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
 
@@ -273,7 +273,7 @@ class Derivation:
             return velocity_scales(values[: n * n].reshape(n, n), values[n * n :].reshape(-1, n), qdot)
 
         def scales(*scalars):
-            return applied(scales_from_arrays, parts.vector(*scalars), stacked(scalars[n : 2 * n]))
+            return apply_function(scales_from_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
 
         return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
 
@@ -286,7 +286,7 @@ class Derivation:
 
     def reads(self, name: str) -> frozenset[int]:
         """The positions of the inputs that any number of this quantity depends on."""
-        return self._whole.read_by(self._positions(name))
+        return self._whole.find_inputs(self._positions(name))
 
     def absent(self, name: str) -> np.ndarray:
         """True for each number of this quantity that is zero whatever the state, in its shape."""
@@ -376,8 +376,8 @@ class Derivation:
             entries, c, b = values[:count], values[count : count + m], values[count + m :]
             factors, singular = elimination.factors(entries)
             c = c if saddle.sign > 0 else -c
-            b = spread(c[:0], np.zeros(0, int), n) if saddle.b is None else b
-            return places, entries, joined([b, c]), factors, singular
+            b = scatter(c[:0], np.zeros(0, int), n) if saddle.b is None else b
+            return places, entries, concatenate([b, c]), factors, singular
 
         return system, elimination.solve
 
@@ -389,12 +389,13 @@ class Derivation:
         elimination, n = RecursiveElimination(self._recursion, self.layout.dtype), self.layout.size
         places, count = elimination.entries, len(elimination.entries)
         positions = [*self._positions("recursion"), *self._positions("force")]
-        cut = functools.cache(lambda: self._whole.only(positions, solve_dense))  # its operations alone are used
+        # The operations of the program alone are used, not its function.
+        cut = functools.cache(lambda: self._whole.select_outputs(positions, solve_dense))
 
         def system(*scalars):
             whole = self._whole.own_outputs(*scalars)
             values = cut().vector(*scalars) if whole is None else whole[positions]
-            right = spread(values[count:], np.arange(n), n + 2 * elimination.velocities)
+            right = scatter(values[count:], np.arange(n), n + 2 * elimination.velocities)
             return places, values[:count], right, *elimination.factors(values[:count])
 
         def solve_dense(*scalars):  # the same function of the state, with arrays: M is eliminated
@@ -440,7 +441,7 @@ class Derivation:
             right = [] if saddle.b is None else [values[saddle.b]]
             return [table[row, column], values[saddle.c][:constraints], *right]
 
-        cut = functools.cache(lambda: self._whole.only(positions, chosen))
+        cut = functools.cache(lambda: self._whole.select_outputs(positions, chosen))
 
         def parts(*scalars):
             whole = self._whole.own_outputs(*scalars)

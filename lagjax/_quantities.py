@@ -13,7 +13,7 @@ import numpy as np
 
 from lagjax._constraints import Constraints
 from lagjax._motion import Motion
-from lagjax._program import Derivatives, Expansion, Tape, copied, has_own_rules, inputs_of, traced
+from lagjax._program import Derivatives, Expansion, Tape, copied, has_own_rules, inputs_of, trace_jaxpr
 from lagjax._recursion import Recursion, RecursiveElimination, recursion_of
 from lagjax._saddle import SaddleElimination
 
@@ -80,7 +80,7 @@ class _ScalarState:
         return [part.reshape(ids.shape) for part, ids in zip(np.split(flat, ends), inputs, strict=True)]
 
     def _traced(self, function: Callable, *arguments: str):
-        jaxpr = traced(function, *(self.shapes[name] for name in arguments))
+        jaxpr = trace_jaxpr(function, *(self.shapes[name] for name in arguments))
         if has_own_rules(jaxpr.jaxpr):
             raise OwnRules
         return jaxpr
@@ -93,7 +93,10 @@ class _ScalarState:
         """∂valueᵢ/∂xⱼ for x = q or qdot, shape (values, n)."""
         one = self.expansion.graph.constant(1.0, "float")
         directions = [{i: one} for i in self.ids[by].tolist()]
-        rows, result = self.derivatives.along(values.tolist(), directions), self.zeros((values.size, len(directions)))
+        rows, result = (
+            self.derivatives.directional_derivatives(values.tolist(), directions),
+            self.zeros((values.size, len(directions))),
+        )
         for i, row in enumerate(rows):
             for j, derivative in row.items():
                 result[i, j] = derivative
@@ -107,7 +110,7 @@ class _ScalarState:
                 rates |= zip(self.ids[name].tolist(), rate.tolist(), strict=True)
         if t:
             rates[int(self.ids["t"])] = self.expansion.graph.constant(1.0, "float")
-        return np.array(self.derivatives.along_one(values.tolist(), rates), dtype=np.int64)
+        return np.array(self.derivatives.directional_derivative(values.tolist(), rates), dtype=np.int64)
 
     def zero(self, values: Ids) -> np.ndarray:
         """True for each number that is zero whatever the state."""
@@ -118,7 +121,7 @@ class _ScalarState:
         """True for each number that depends on q, q̇ or t."""
         graph = self.expansion.graph
         moving = {i for name in ("q", "qdot", "t") for i in self.ids[name].ravel().tolist()}
-        for i in self.derivatives.below(values.ravel().tolist()):
+        for i in self.derivatives.find_ancestors(values.ravel().tolist()):
             if not moving.isdisjoint(graph.nodes[i][1]):
                 moving.add(i)
         return np.array([i in moving for i in values.ravel().tolist()], bool).reshape(values.shape)

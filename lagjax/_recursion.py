@@ -60,8 +60,8 @@ class Recursion(NamedTuple):
 def recursion_of(derivatives: Derivatives, value: int, qdot: Sequence[int]) -> Recursion | None:
     """The recursion in a Lagrangian, whose node is `value`; None where no velocity is used twice."""
     graph = derivatives.graph
-    linear, curved, uses = _linear_nodes(derivatives, derivatives.below([value]), qdot)
-    frontier = sorted({x for i in curved for x in derivatives.as_derived(i)[1] if x in linear})
+    linear, curved, uses = _linear_nodes(derivatives, derivatives.find_ancestors([value]), qdot)
+    frontier = sorted({x for i in curved for x in derivatives.node_to_differentiate(i)[1] if x in linear})
     if not any(uses[i] > 1 for i in linear):
         return None
     hessian = _hessian(derivatives, value, curved, frontier)
@@ -79,7 +79,7 @@ def _linear_nodes(derivatives: Derivatives, below: Iterable[int], qdot: Sequence
     curved: dict[int, None] = {}
     uses = dict.fromkeys(qdot, 0)
     for i in below:
-        op, operands, _ = derivatives.as_derived(i)
+        op, operands, _ = derivatives.node_to_differentiate(i)
         moving = [x for x in operands if x in linear or x in curved]
         if not moving or i in linear:
             continue
@@ -131,15 +131,15 @@ def _hessian(derivatives: Derivatives, value: int, curved: Iterable[int], fronti
 
     varied = [known(i) for i in frontier]
     for i in curved:
-        op, operands, attribute = derivatives.as_derived(i)
+        op, operands, attribute = derivatives.node_to_differentiate(i)
         xs = [known(x) for x in operands]
         if op == "integer_pow":
             nodes[i] = apart.apply("pow", *xs, apart.constant(attribute, "float"))
         else:
             nodes[i] = apart.apply(op, *xs, attribute=attribute)
     second, one = Derivatives(apart), apart.constant(1.0, "float")
-    slopes = second.slopes(nodes[value], second.below([nodes[value]]), varied)
-    rows = second.along(slopes, [{i: one} for i in varied])
+    slopes = second.slopes(nodes[value], second.find_ancestors([nodes[value]]), varied)
+    rows = second.directional_derivatives(slopes, [{i: one} for i in varied])
     places = copied(derivatives.graph, apart, inputs)
     return {(frontier[a], frontier[b]): places[node] for a, row in enumerate(rows) for b, node in row.items() if b <= a}
 

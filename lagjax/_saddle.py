@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._linear import rank_tolerance, singular_threshold
-from lagjax._program import orthogonalized, row_weights, solve_orthogonalized
+from lagjax._program import orthogonalize, row_weights, solve_orthogonalized
 from lagjax._program import scalars as xp
 
 # The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
@@ -120,13 +120,13 @@ class SaddleElimination:
 
         `values` holds what stands at `entries`.
         """
-        a, weighted, singular = xp.spread(values, self.slots[tuple(self.entries.T)], self.count), None, None
+        a, weighted, singular = xp.scatter(values, self.slots[tuple(self.entries.T)], self.count), None, None
         if self.augmented:
             a, weighted = self._weight_entries(a)
         if self.regular_only:
             # The constraints would have to hold a light coordinate against forces on heavy ones.
             diagonal = a[: self.size]
-            singular = xp.folded("min", diagonal) <= REGULAR * xp.folded("max", diagonal)
+            singular = xp.fold("min", diagonal) <= REGULAR * xp.fold("max", diagonal)
         lower, inverse, lost = self._eliminate(a)
         return (weighted, lower, inverse), lost if singular is None else singular | lost
 
@@ -150,9 +150,9 @@ class SaddleElimination:
             for k, i in enumerate(rows.tolist()):
                 taken[i][j >= n].append(squares[k])
             if len(updated):
-                a = xp.replaced(a, updated, a[updated] - lower[first] * scaled[second])
-        lost = xp.folded("or", xp.stacked(losses)) if losses else False
-        return xp.joined(columns) if columns else a[:0], xp.stacked(inverse), lost
+                a = xp.replace_entries(a, updated, a[updated] - lower[first] * scaled[second])
+        lost = xp.fold("or", xp.stack(losses)) if losses else False
+        return xp.concatenate(columns) if columns else a[:0], xp.stack(inverse), lost
 
     def _pivot(self, j: int, diagonal, of_coordinates: list, of_constraints: list) -> tuple[Any, Any]:
         """A flag that a pivot was lost, None where that does not count, and its inverse."""
@@ -194,17 +194,17 @@ class SaddleElimination:
         The weights are the trace of M over |Gₖ|², within a factor n of those of `augment`. They are differentiated here
         like everything else, and a trace is smooth where a maximum is not.
         """
-        trace, weighted, added = xp.folded("add", a[: self.size]), [], xp.spread(a[:0], np.zeros(0, int), self.count)
+        trace, weighted, added = xp.fold("add", a[: self.size]), [], xp.scatter(a[:0], np.zeros(0, int), self.count)
         for k, touching in enumerate(self.rows):
             if not len(touching):
                 continue
             row = a[self.slots[self.size + k, touching]]
-            size = xp.folded("add", row * row)
+            size = xp.fold("add", row * row)
             weighted.append(trace / xp.where(size > 0.0, size, 1.0) * row)
             first, second = np.tril_indices(len(touching))
             places = self.slots[touching[first], touching[second]]
-            added = xp.replaced(added, places, added[places] + weighted[-1][first] * row[second])
-        return a + added, xp.joined(weighted) if weighted else a[:0]
+            added = xp.replace_entries(added, places, added[places] + weighted[-1][first] * row[second])
+        return a + added, xp.concatenate(weighted) if weighted else a[:0]
 
     # ---- solution ----
 
@@ -215,18 +215,18 @@ class SaddleElimination:
         start = 0
         for k, touching in enumerate(self.rows if self.augmented else ()):
             row = weighted[start : start + len(touching)]
-            z = xp.replaced(z, touching, z[touching] + row * z[n + k]) if len(touching) else z
+            z = xp.replace_entries(z, touching, z[touching] + row * z[n + k]) if len(touching) else z
             start += len(touching)
         start = 0
         for j in self.order:
             rows = self.below[j]
             if len(rows):
-                z = xp.replaced(z, rows, z[rows] - lower[start : start + len(rows)] * z[j])
+                z = xp.replace_entries(z, rows, z[rows] - lower[start : start + len(rows)] * z[j])
             start += len(rows)
         z = z * inverse
         for i, (columns, places) in reversed(list(zip(self.order, self._rows_of_lower(), strict=True))):
             if len(columns):
-                z = xp.replaced(z, columns, z[columns] - lower[places] * z[i])
+                z = xp.replace_entries(z, columns, z[columns] - lower[places] * z[i])
         return z
 
     def _rows_of_lower(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -258,14 +258,14 @@ class TwoCoordinates:
         product, square = a * d, c * c
         determinant = product - square
         singular = xp.absolute(determinant) <= self.threshold * xp.maximum(xp.absolute(product), square)
-        return xp.stacked([a, c, d, 1.0 / xp.where(singular, np.nan, determinant)]), singular
+        return xp.stack([a, c, d, 1.0 / xp.where(singular, np.nan, determinant)]), singular
 
     def solve(self, factors, right):
         """x, two numbers, linear in `right`."""
         if self.diagonal:
             return right / factors
         a, c, d, inverse = (factors[k] for k in range(4))
-        return xp.stacked([(d * right[0] - c * right[1]) * inverse, (a * right[1] - c * right[0]) * inverse])
+        return xp.stack([(d * right[0] - c * right[1]) * inverse, (a * right[1] - c * right[0]) * inverse])
 
 
 class IndefiniteElimination:
@@ -285,12 +285,12 @@ class IndefiniteElimination:
         n, (row, column) = self.size, self.entries.T
         places = np.full((n, n), len(self.entries))
         places[row, column] = places[column, row] = np.arange(len(self.entries))
-        matrix = xp.joined([values, np.zeros(1)])[places]
-        factors, weights = orthogonalized(matrix), row_weights(matrix)
-        sizes = [xp.folded("add", weights * matrix[:, j] * matrix[:, j]) for j in range(n)]
-        lost = factors.squares <= self.threshold * xp.stacked(sizes)
+        matrix = xp.concatenate([values, np.zeros(1)])[places]
+        factors, weights = orthogonalize(matrix), row_weights(matrix)
+        sizes = [xp.fold("add", weights * matrix[:, j] * matrix[:, j]) for j in range(n)]
+        lost = factors.squares <= self.threshold * xp.stack(sizes)
         duals = xp.where(lost[:, None], np.nan, factors.duals)
-        return factors._replace(duals=duals), xp.folded("or", lost)
+        return factors._replace(duals=duals), xp.fold("or", lost)
 
     def solve(self, factors, right):
         """x, linear in `right`."""

@@ -120,7 +120,7 @@ def _jumps(problem: Problem) -> Jumps | None:
     numbers, first = jnp.asarray(problem.vector), 2 * problem.layout.size + 1
     located = (table for kind, table in zip(borders.kinds, borders.tables, strict=True) if kind == CLOCK)
     knots = jnp.concatenate([
-        jnp.asarray(table.known, numbers.dtype) if table.numbers is not None
+        jnp.asarray(table.entries, numbers.dtype) if table.numbers is not None
         else numbers[table.first - first :: table.stride][: table.count]
         for table in dict.fromkeys(table_of(of) for of in located if of is not None)
     ])  # fmt: skip

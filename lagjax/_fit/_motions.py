@@ -30,7 +30,7 @@ from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Form, SampleTable, input_functions, start_pair
 from lagjax._hybrid import Hybrid, Scene, first_law, follow
 from lagjax._layout import Layout, halves
-from lagjax._machine_code import KEPT, Flow, MachineCode, flow_of, jvp, projected_start, tolerances_of
+from lagjax._machine_code import KEPT, Flow, MachineCode, flow_of, jvp, project_start_tangents, tolerances_of
 from lagjax._native import Projection
 from lagjax._problem import Problem
 from lagjax._program import evaluate
@@ -131,7 +131,7 @@ class _MachineCodeMotions(AbstractMotions):
 
     def rate(self, t, y, numbers, table=None):
         flow, params = self._flow(numbers, table)
-        values = flow.anywhere.evaluate(*y.T, t, *params.T)[: flow.size]
+        values = flow.general_program.evaluate(*y.T, t, *params.T)[: flow.size]
         return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
 
 
@@ -273,7 +273,7 @@ def _project_by_newton(
     y = np.where(still[:, None], y, np.nan)
     along = np.zeros((count, states + len(directions), states)), np.zeros((states + len(directions), len(numbers)))
     along[0][:, :states], along[1][states:] = np.eye(states), directions
-    moved = projected_start(
+    moved = project_start_tangents(
         projection, t[:, None], y, rows, along[0], np.broadcast_to(along[1], (count, *along[1].shape))
     )
     return ProjectedStarts(y, moved[:, :states].swapaxes(1, 2), moved[:, states:])

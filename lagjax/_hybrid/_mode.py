@@ -160,14 +160,14 @@ class Mode(NamedTuple):
 
     def guards_at(self, t, y, latest) -> Guarded:
         """The guards at a state, without derivatives, of a run that ends at `latest`."""
-        return self._surfaces.at(t, y, self.vector, latest)
+        return self._surfaces.evaluate_guards(t, y, self.vector, latest)
 
     def crossing(self, k: int) -> Callable:
         """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero and stays so as what went in varies.
 
         See `_machine_code.crossing_variation`.
         """
-        moved = functools.partial(crossing_variation(self._surfaces, flow_of(self.problem).anywhere), k)
+        moved = functools.partial(crossing_variation(self._surfaces, flow_of(self.problem).general_program), k)
         return lambda taken, t, y, numbers: attach_derivative(moved, (t, y), taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):
@@ -202,7 +202,7 @@ def _surfaces(
     def extras(y, params):
         if multipliers is None:
             return {}
-        flat = jnp.stack(multipliers.at(y, vector_of(eqx.filter(params, eqx.is_array_like))))
+        flat = jnp.stack(multipliers.compute_outputs(y, vector_of(eqx.filter(params, eqx.is_array_like))))
         return {"multipliers": system.split_by_constraint(flat, layout, params)}
 
     def value(guard):
@@ -212,7 +212,7 @@ def _surfaces(
 
     functions = [value(transition.guard) for transition in leaving]
     directions = tuple(transition.direction for transition in leaving)
-    return Surfaces.of(derivation, functions, directions, code, structure)
+    return Surfaces.from_functions(derivation, functions, directions, code, structure)
 
 
 def _value(guard: Function, q, qdot, extras) -> jax.Array:

@@ -294,7 +294,7 @@ class _Rounds(NamedTuple):
         unmoved, followed = jnp.abs(guarded.values - values) <= rounding, numbers == before.latest
         noise, goes = rounding + guarded.of_time, jnp.sign(guarded.rates)
         unknown = np.array([-float(transition.direction) for transition in mode.leaving])
-        crossed = np.array([transition.reset is None for transition in mode.leaving]) | mode.surfaces.only_jump
+        crossed = np.array([transition.reset is None for transition in mode.leaving]) | mode.surfaces.have_no_rate
         beyond = jnp.where(goes != 0, goes, jnp.where(crossed, -was, unknown))
         sides = jnp.where(jnp.abs(guarded.values) > noise, jnp.sign(guarded.values), unknown)
         sides = jnp.where(unmoved & (was != 0), jnp.where(followed, beyond, was), sides)

@@ -19,43 +19,27 @@ from lagjax._machine_code import _primitives
 from lagjax._machine_code._crossing import (
     MOST_GUARDS,
     Noted,
-    along_crossings,
     crossing_tangents,
+    motion_to_event,
+    motion_with_crossings,
     surfaces_of,
     surfaces_of_event,
-    to_event,
 )
-from lagjax._machine_code._derivatives import jvp, projected_start, vjp
+from lagjax._machine_code._derivatives import jvp, project_start_tangents, vjp
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
-from lagjax._machine_code._gpu_launch import for_device
+from lagjax._machine_code._gpu_launch import adapt_tolerances
 from lagjax._machine_code._steps import KEPT, StepStore
 from lagjax._machine_code._surfaces import Guarded, Surfaces, crossing_variation, require_one_number, vector_of
-from lagjax._native import Guards, gpu, watched
+from lagjax._native import Guards, append_guards, gpu
 from lagjax._platform import default_platform
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
 from lagjax._program import Program, Unlowerable
 from lagjax._validate import is_concrete
 
 __all__ = [
-    "KEPT",
-    "MOST_GUARDS",
-    "Flow",
-    "Guarded",
-    "Guards",
-    "MachineCode",
-    "Noted",
-    "StepStore",
-    "Surfaces",
-    "Tolerances",
-    "crossing_variation",
-    "flow_of",
-    "jvp",
-    "projected_start",
-    "require_one_number",
-    "surfaces_of",
-    "tolerances_of",
-    "vector_of",
-    "vjp",
+    "KEPT", "MOST_GUARDS", "Flow", "Guarded", "Guards", "MachineCode", "Noted", "StepStore", "Surfaces", "Tolerances",
+    "crossing_variation", "flow_of", "jvp", "project_start_tangents", "require_one_number", "surfaces_of",
+    "tolerances_of", "vector_of", "vjp",
 ]  # fmt: skip
 
 
@@ -135,7 +119,7 @@ class MachineCode(AbstractEngine):
         with jax.enable_x64(True):
             problem = problem.double_precision if problem.is_single else problem
             flow = flow_of(problem)
-            tolerances = for_device(flow, tolerances_of(problem))
+            tolerances = adapt_tolerances(flow, tolerances_of(problem))
             try:
                 form = flow.kernel.for_gpus(tolerances.allow_singles).form(gpu.MOTION, tolerances.rtol)
             except Unlowerable as reason:
@@ -153,7 +137,7 @@ class MachineCode(AbstractEngine):
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
         if problem.is_single:
-            return _in_doubles(self.solve, problem)
+            return _solve_in_doubles(self.solve, problem)
         flow, tolerances = flow_of(problem), tolerances_of(problem)
         if problem.is_known and default_platform() == "cpu":
             _require_increasing(flow.program, problem.vector)
@@ -162,7 +146,7 @@ class MachineCode(AbstractEngine):
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
         if problem.event is None:
             return _primitives.run(flow, tolerances, ts, y0, params)
-        return to_event(flow, _without_guards(problem), _surfaces_of(problem), tolerances)(ts, y0, params)
+        return motion_to_event(flow, _unguarded_flow(problem), _surfaces_of(problem), tolerances)(ts, y0, params)
 
     def solve_to_event(self, problem: Problem, sides) -> Solution:
         """The motion of one member to the first change of its guards; it remembers `sides` (see `Guards`).
@@ -183,22 +167,22 @@ class MachineCode(AbstractEngine):
         Derivatives are those of a tolerance that is `slack` times as large.
         """
         if problem.is_single:
-            return _in_doubles(lambda problem: self.crossings(problem, surfaces, room, slack), problem)
-        noting, flow, surfaces, tolerances = _noting(problem, surfaces, room, slack)
+            return _solve_in_doubles(lambda problem: self.crossings(problem, surfaces, room, slack), problem)
+        noting, flow, surfaces, tolerances = _flows_to_crossings(problem, surfaces, room, slack)
         if problem.is_known:
             ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
             solution = noting.run(ts, y0, params, tolerances)
             solution = Solution._make([*(x[0] for x in solution[:-1]), None])
             return solution, Noted.read(solution.path, len(surfaces.directions))
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
-        return along_crossings(noting, flow, surfaces, tolerances)(ts, y0, params)
+        return motion_with_crossings(noting, flow, surfaces, tolerances)(ts, y0, params)
 
     def crossing_tangents(self, problem: Problem, surfaces: Surfaces, room: int, slack: float, dy0, dparams):
         """The times of the crossings (G, room), and their tangents (D, G, room), of a problem in float64.
 
         They are along the directions `dy0` (D, 2n) of the start and `dparams` (D, P) of the parameters.
         """
-        tangents = crossing_tangents(*_noting(problem, surfaces, room, slack))
+        tangents = crossing_tangents(*_flows_to_crossings(problem, surfaces, room, slack))
         return tangents(problem.ts, problem.y0, problem.vector, dy0, dparams)
 
     def solve_batch(self, batch: Batch) -> Solution:
@@ -217,13 +201,13 @@ def _run(problem: Problem, given: tuple) -> Solution:
     return flow_of(problem).run(ts, y0, params, tolerances_of(problem))
 
 
-def _in_doubles(solve: Callable, problem: Problem):
+def _solve_in_doubles(solve: Callable, problem: Problem):
     """The solution by `solve` in float64, in the precision of the problem."""
 
-    def of_numbers(ts, y0, params):
+    def solve_numbers(ts, y0, params):
         return solve(dataclasses.replace(problem.double_precision, ts=ts, y0=y0, params=params))
 
-    return compute_in_doubles(of_numbers, problem.ts, problem.y0, problem.params)
+    return compute_in_doubles(solve_numbers, problem.ts, problem.y0, problem.params)
 
 
 def flow_of(problem: Problem) -> Flow:
@@ -237,14 +221,16 @@ def flow_of(problem: Problem) -> Flow:
     return flow
 
 
-def _noting(problem: Problem, surfaces: Surfaces, room: int, slack: float) -> tuple[Flow, Flow, Surfaces, Tolerances]:
+def _flows_to_crossings(
+    problem: Problem, surfaces: Surfaces, room: int, slack: float
+) -> tuple[Flow, Flow, Surfaces, Tolerances]:
     """The flow that notes the crossings of surfaces, that without any, the surfaces, and the tolerances of both."""
     noting = dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True))
     tolerances = tolerances_of(problem)._replace(notes=room, slack=slack)
-    return flow_of(noting), _without_guards(problem), surfaces, tolerances
+    return flow_of(noting), _unguarded_flow(problem), surfaces, tolerances
 
 
-def _without_guards(problem: Problem) -> Flow:
+def _unguarded_flow(problem: Problem) -> Flow:
     return flow_of(dataclasses.replace(problem, event=None, guards=None))
 
 
@@ -256,11 +242,11 @@ def _surfaces_of(problem: Problem) -> Surfaces:
 
 def _flow_of(problem: Problem) -> Flow | str:
     guards = problem.guards if problem.event is None else _surfaces_of(problem).guards()
-    return _made(problem.derivation, problem.system.path, guards)
+    return _make_flow(problem.derivation, problem.system.path, guards)
 
 
 @functools.lru_cache(maxsize=64)
-def _made(derivation: Derivation, path: str, guards: Guards | None) -> Flow | str:
+def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow | str:
     """The flow of a scene, or a sentence that says why it has none. Made once."""
     if path == "array":
         return "the array path was asked for"
@@ -272,15 +258,15 @@ def _made(derivation: Derivation, path: str, guards: Guards | None) -> Flow | st
         return str(reason)
     n = derivation.layout.size
     if guards is not None and guards.remembers:
-        program = program.with_inputs(guards.inputs)
+        program = program.append_inputs(guards.inputs)
     if reason := unfit(program, n):
         return reason
     try:
         if guards is not None:
-            watched(program, n, guards.values, True)
+            append_guards(program, n, guards.values, True)
     except Unlowerable as reason:
         return f"of a guard, {reason}"
-    return Flow.of(program, n, projection, guards)
+    return Flow.from_program(program, n, projection, guards)
 
 
 def _require_increasing(program: Program, vector) -> None:

@@ -29,7 +29,7 @@ _SWEEPS = ("jvp", "vjp")
 _lock = threading.Lock()
 
 
-def on_host(host: Callable, shapes, *arrays) -> tuple:
+def call_host(host: Callable, shapes, *arrays) -> tuple:
     """Call `host` on NumPy arrays, in a callback of what XLA compiles; `shapes` are those of its results."""
 
     # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
@@ -46,7 +46,7 @@ def on_host(host: Callable, shapes, *arrays) -> tuple:
 def has_handler(flow: Flow, members: int) -> bool:
     """True if a run of this many members begins in the handler."""
     notes = flow.guards is not None and flow.guards.notes
-    return NO_HANDLER is None and not notes and flow.kernel.to_run(members).threads(members) == 1
+    return NO_HANDLER is None and not notes and flow.kernel.select_kernel(members).threads(members) == 1
 
 
 def has_sweep(flow: Flow, members: int) -> bool:
@@ -65,7 +65,7 @@ def run_by_handler(
     """
     _register()
     members, states = y0.shape
-    kernel = flow.kernel.to_run(members)
+    kernel = flow.kernel.select_kernel(members)
     plan = kernel.plan(tolerances.rtol, tolerances.atol, tolerances.max_steps)
     plan.rounds = plan.rounds if rounds is None else rounds
     rows, size = (members,), (kernel.rest_size,)
@@ -73,19 +73,19 @@ def run_by_handler(
     call = jax.ffi.ffi_call(_TARGET, [jax.ShapeDtypeStruct(shape, np.float64) for shape in of_handler])
     begun = _native.Begun(*call(ts, y0, params, plan=np.int64(ctypes.addressof(plan))))
 
-    def finished(ts, y0, params, path, y_end, t_end, code, steps, rejected, rest):
+    def convert_results(ts, y0, params, path, y_end, t_end, code, steps, rejected, rest):
         happened = code >= _native.EVENT
         result = jnp.where(happened, EVENT_OCCURRED, SUCCESSFUL)
         event = jnp.where(happened, code - _native.EVENT, 0.0)
         counts = result, steps, rejected, event, jnp.full(rows, -1)
         return path, y_end, t_end, *(x.astype(int) for x in counts)
 
-    def unfinished(*arrays):
+    def continue_on_host(*arrays):
         # The callback lives as long as the compiled program, and with it what the handler needs.
-        return on_host(functools.partial(host, needed=(plan, kernel)), shapes, *arrays)
+        return call_host(functools.partial(host, needed=(plan, kernel)), shapes, *arrays)
 
-    well = _ended_well(begun)
-    return tuple(jax.lax.cond(well, finished, unfinished, ts, y0, params, *begun))
+    well = _has_ended_well(begun)
+    return tuple(jax.lax.cond(well, convert_results, continue_on_host, ts, y0, params, *begun))
 
 
 def sweep_by_handler(kind: str, flow: Flow, tolerances: Tolerances, ts, y0, params, argument, start) -> tuple:
@@ -104,7 +104,7 @@ def sweep_by_handler(kind: str, flow: Flow, tolerances: Tolerances, ts, y0, para
     return *results, done[0] > 0, (plan, flow.kernel)
 
 
-def _ended_well(begun: _native.Begun):
+def _has_ended_well(begun: _native.Begun):
     """True if nothing is left to do, and no member failed."""
     more = jax.lax.bitcast_convert_type(begun.rest[-1], np.int64)
     codes = (begun.code == _native.DONE) | (begun.code >= _native.EVENT)
@@ -114,11 +114,11 @@ def _ended_well(begun: _native.Begun):
 def _register() -> None:
     """Tell XLA about the handler; once."""
     with _lock:
-        _registered()
+        _register_once()
 
 
 @functools.cache
-def _registered() -> None:
+def _register_once() -> None:
     addresses = {_TARGET: _native.handler().address}
     addresses |= {f"lagjax_{kind}": _native.derivative_handler(kind).address for kind in _SWEEPS}
     for target, address in addresses.items():

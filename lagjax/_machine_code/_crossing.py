@@ -82,46 +82,46 @@ def surfaces_of(problem: Problem, functions: tuple, directions: tuple[int, ...],
     """
     code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
     try:
-        return _lowered(problem.derivation, functions, directions, tuple(code), structure, what)
+        return _lower_surfaces(problem.derivation, functions, directions, tuple(code), structure, what)
     except Unlowerable as reason:
         return str(reason)
 
 
 @functools.lru_cache(maxsize=64)
-def _lowered(derivation: Derivation, functions, directions, code, structure, what: str) -> Surfaces:
+def _lower_surfaces(derivation: Derivation, functions, directions, code, structure, what: str) -> Surfaces:
     restore = derivation.layout.restore
 
     def value(function):
-        def of(y, params):
+        def evaluate_guard(y, params):
             given = function(*map(restore, halves(y[:-1])), t=y[-1], params=params)
             if what == "An event" and jnp.result_type(given) == np.dtype(bool):
                 raise Unlowerable("the event is true or false")
             return require_one_number(given, what)
 
-        return of
+        return evaluate_guard
 
-    return Surfaces.of(derivation, [value(function) for function in functions], directions, code, structure)
+    return Surfaces.from_functions(derivation, [value(function) for function in functions], directions, code, structure)
 
 
 # ---- to the first event ----------------------------------------------------------------------------------------------
 
 
 @functools.lru_cache(maxsize=64)
-def to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances) -> Callable[..., Solution]:
+def motion_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances) -> Callable[..., Solution]:
     """`(ts, y0, params)` → the motion to its event, or to the last of `ts` (T,), with first and second derivatives.
 
     As one program of XLA: a derivative outside of `jit` then compiles as one, not operation by operation.
     """
-    return jax.jit(functools.partial(_to_event, guarded, flow, surfaces, tolerances))
+    return jax.jit(functools.partial(_run_to_event, guarded, flow, surfaces, tolerances))
 
 
-def _to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params) -> Solution:
+def _run_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params) -> Solution:
     still = jax.lax.stop_gradient
     solution = jax.tree.map(still, _primitives.run(guarded, tolerances, still(ts), still(y0), still(params)))
     reached = jnp.isfinite(solution.path).all(axis=1)
     values, where = (solution.path, solution.y_end, solution.t_end), (solution.result, solution.event)
-    varied = _varied_to_event(flow, surfaces, tolerances)
-    path, y_end, t_end = attach_derivative(varied, values, ts, y0, params, solution.t_end, *where)
+    run_again = _event_variation(flow, surfaces, tolerances)
+    path, y_end, t_end = attach_derivative(run_again, values, ts, y0, params, solution.t_end, *where)
     well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL))
     return solution._replace(
         path=lost_unless(reached[:, None], path, (ts, y0, params)),
@@ -131,33 +131,33 @@ def _to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Toleran
 
 
 @functools.lru_cache(maxsize=64)
-def _varied_to_event(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
+def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     """`(ts, y0, params, t_end, result, event)` → path, y_end, t_end, for the sake of their derivatives."""
-    moved, each = crossing_variation(surfaces, flow.anywhere), np.arange(len(surfaces.directions))
+    move_to_zero, each = crossing_variation(surfaces, flow.general_program), np.arange(len(surfaces.directions))
 
     @jax.jit
-    def varied(ts, y0, params, t_stop, result, event):
+    def run_unguarded(ts, y0, params, t_stop, result, event):
         fired, stop = result == EVENT_OCCURRED, _shortly_before(ts, t_stop)
         end = jnp.where(fired, stop, ts[-1])
         times = jnp.where((end - ts) * (ts[-1] - ts[0]) >= 0, ts, end)
         times = jnp.concatenate([ts[:1], times[1:-1], end[None]])
         solution = _primitives.run(flow, tolerances, times, y0, params)
         first = jnp.argmax(((event >> (2 * each)) & 3) > 0)
-        t_end, y_end = moved(first, fired, end, solution.y_end, params)
+        t_end, y_end = move_to_zero(first, fired, end, solution.y_end, params)
         return solution.path, y_end, t_end
 
-    return varied
+    return run_unguarded
 
 
 # ---- all crossings ---------------------------------------------------------------------------------------------------
 
 
 @functools.lru_cache(maxsize=64)
-def along_crossings(
+def motion_with_crossings(
     noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances
 ) -> Callable[..., tuple[Solution, Noted]]:
     """`(ts, y0, params)` → the motion to the last of `ts`, and its crossings, with first and second derivatives."""
-    return jax.jit(functools.partial(_along_crossings, noting, flow, surfaces, tolerances))
+    return jax.jit(functools.partial(_run_with_crossings, noting, flow, surfaces, tolerances))
 
 
 @functools.lru_cache(maxsize=64)
@@ -170,24 +170,24 @@ def crossing_tangents(noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: 
     @jax.jit
     def tangents(ts, y0, params, dy0, dparams):
         def times(y0, params):
-            return _along_crossings(noting, flow, surfaces, tolerances, ts, y0, params)[1].t
+            return _run_with_crossings(noting, flow, surfaces, tolerances, ts, y0, params)[1].t
 
-        def along(*direction):
+        def differentiate_times(*direction):
             return jax.jvp(times, (y0, params), direction)
 
-        return jax.vmap(along, out_axes=(None, 0))(dy0, dparams)
+        return jax.vmap(differentiate_times, out_axes=(None, 0))(dy0, dparams)
 
     return tangents
 
 
-def _along_crossings(
+def _run_with_crossings(
     noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params
 ) -> tuple[Solution, Noted]:
     still = jax.lax.stop_gradient
     solution = jax.tree.map(still, _primitives.run(noting, tolerances, still(ts), still(y0), still(params)))
     noted = Noted.read(solution.path, len(surfaces.directions))
-    varied = _varied_crossings(flow, surfaces, tolerances._replace(notes=0))
-    t, y = attach_derivative(varied, (noted.t, noted.y), ts, y0, params, noted.t)
+    run_again = _crossings_variation(flow, surfaces, tolerances._replace(notes=0))
+    t, y = attach_derivative(run_again, (noted.t, noted.y), ts, y0, params, noted.t)
     there, inputs = jnp.isfinite(noted.t), (ts, y0, params)
     return solution, Noted(
         lost_unless(there, t, inputs), lost_unless(there[..., None], y, inputs), noted.count
@@ -195,12 +195,12 @@ def _along_crossings(
 
 
 @functools.lru_cache(maxsize=64)
-def _varied_crossings(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
+def _crossings_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     """`(ts, y0, params, t)` → t (G, room) and y (G, room, 2n), for the sake of their derivatives."""
-    moved, each = crossing_variation(surfaces, flow.anywhere), np.arange(len(surfaces.directions))
+    move_to_zero, each = crossing_variation(surfaces, flow.general_program), np.arange(len(surfaces.directions))
 
     @jax.jit
-    def varied(ts, y0, params, t):
+    def run_unguarded(ts, y0, params, t):
         there = jnp.isfinite(t)
         times = jnp.where(there, _shortly_before(ts, t), jax.lax.stop_gradient(ts[-1])).ravel()
         order = jnp.argsort(times * jnp.sign(ts[-1] - ts[0]))
@@ -209,10 +209,10 @@ def _varied_crossings(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
         )  # fmt: skip
         path = jnp.zeros_like(solution.path[1:-1]).at[order].set(solution.path[1:-1])
         y, times = path.reshape(*t.shape, -1), times.reshape(t.shape)
-        of_section = jax.vmap(moved, (None, 0, 0, 0, None))
+        of_section = jax.vmap(move_to_zero, (None, 0, 0, 0, None))
         return jax.vmap(of_section, (0, 0, 0, 0, None))(each, there, times, y, params)
 
-    return varied
+    return run_unguarded
 
 
 def _shortly_before(ts, t):

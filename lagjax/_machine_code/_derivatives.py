@@ -2,8 +2,8 @@
 
 Both go over the steps of the motion itself: forward along each direction (`_native._tangent`), back with each step
 transposed (`_native._adjoint`). They are transposes of each other to round-off, and as accurate as the motion as long
-as its steps suit its tangents: where they do not, they are divided (`_divided`). What `vjp` costs does not grow with
-the number of parameters. A name that ends in `_ct` is a cotangent, one that ends in `_dot` a tangent.
+as its steps suit its tangents: where they do not, they are divided (`_divide_steps`). The cost of `vjp` does not grow
+with the number of parameters. A name that ends in `_ct` is a cotangent, one that ends in `_dot` a tangent.
 """
 
 import functools
@@ -34,7 +34,7 @@ def jvp(flow: Flow, ts, y0, params, solution, dy0, dparams, tolerances: Toleranc
     path, result, accepted, ticket = solution
     members, m = dy0.shape[:2]
     if flow.projection is not None:
-        dy0 = projected_start(flow.projection, ts[:, :1], y0, params, dy0, dparams)
+        dy0 = project_start_tangents(flow.projection, ts[:, :1], y0, params, dy0, dparams)
     groups = _groups_of_directions(members, m)
     directions = math.ceil(m / groups)
     padding = ((0, 0), (0, groups * directions - m), (0, 0))
@@ -44,7 +44,7 @@ def jvp(flow: Flow, ts, y0, params, solution, dy0, dparams, tolerances: Toleranc
     unit = np.where(length > 0, length, 1.0)
     dy0, dparams = dy0 / unit, dparams / unit
     rows = np.repeat(np.arange(members), groups)
-    params = _for_all(params, members)
+    params = _repeat_rows(params, members)
     some = ts if len(ts) == 1 else ts[rows], y0[rows], params[rows], accepted[rows], ticket[rows]
     path_dot, y_dot = _jvp_over_steps(flow, *some, dy0, dparams, tolerances)
     path_dot, y_dot = path_dot * unit[..., None], y_dot * unit
@@ -52,7 +52,7 @@ def jvp(flow: Flow, ts, y0, params, solution, dy0, dparams, tolerances: Toleranc
     y_dot = y_dot.reshape(members, groups * directions, -1)[:, :m]
     if flow.projection is not None and path.shape[1] > 2:
         dparams = (dparams * unit).reshape(members, groups * directions, -1)[:, :m]
-        _projected(flow, flow.projection, ts, path, params, path_dot, dparams)
+        _project_tangents(flow, flow.projection, ts, path, params, path_dot, dparams)
     path_dot[:, :, -1] = y_dot
     path_dot[~np.broadcast_to(np.isfinite(path)[:, None], path_dot.shape)] = np.nan
     y_dot[result != SUCCESSFUL] = np.nan
@@ -82,7 +82,7 @@ def _jvp_over_steps(
     y_dot = np.array(dy0, np.float64)
     path_dot = np.full((*dy0.shape[:2], ts.shape[1], flow.states), np.nan)
 
-    def along(steps: Steps, rows, members):
+    def advance_tangents(steps: Steps, rows, members):
         times = ts if len(ts) == 1 else ts[rows]
         path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(
             times, params[rows], steps.table, steps.first[members], steps.counts[members], dy0[rows], dparams[rows],
@@ -91,12 +91,15 @@ def _jvp_over_steps(
         return excess / tolerances.largest_excess
 
     for steps, rows, members in _steps_of(flow, ts, y0, params, accepted, ticket, tolerances):
-        excess = along(steps, rows, members)
+        excess = advance_tangents(steps, rows, members)
 
         def divide(k: int, steps=steps, rows=rows, members=members, excess=excess):
             row = rows[k : k + 1]
-            again = functools.partial(along, rows=row, members=np.zeros(1, int))
-            if _over_divided(flow, steps, members[k], params[row[0]], tolerances, excess[k : k + 1], again) is None:
+            again = functools.partial(advance_tangents, rows=row, members=np.zeros(1, int))
+            if (
+                _sweep_divided_steps(flow, steps, members[k], params[row[0]], tolerances, excess[k : k + 1], again)
+                is None
+            ):
                 path_dot[row], y_dot[row] = np.nan, np.nan
 
         _native.map_in_threads(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
@@ -118,11 +121,11 @@ def vjp(flow: Flow, ts, y0, params, solution, path_ct, end_ct, tolerances: Toler
     members, m = end_ct.shape[:2]
     if m > flow.states + flow.numbers:
         return _vjp_by_jacobian(flow, ts, y0, params, solution, path_ct, end_ct, tolerances)
-    path_ct, lost = reached_cotangents(path, result, path_ct, end_ct)
-    params = _for_all(params, members)
+    path_ct, lost = mask_cotangents(path, result, path_ct, end_ct)
+    params = _repeat_rows(params, members)
     params_ct = np.zeros((members, m, flow.numbers))
     if flow.projection is not None and path.shape[1] > 2:
-        _through_projection(flow, flow.projection, ts, path, params, path_ct, params_ct)
+        _transpose_projection(flow, flow.projection, ts, path, params, path_ct, params_ct)
     done = (result == SUCCESSFUL)[:, None, None]
     end_ct = end_ct + np.where(done, path_ct[:, :, -1], 0.0)
     path_ct[:, :, -1] = 0.0
@@ -135,13 +138,13 @@ def vjp(flow: Flow, ts, y0, params, solution, path_ct, end_ct, tolerances: Toler
     )  # fmt: skip
     y_ct, more = y_ct.reshape(members, m, -1), more.reshape(members, m, -1) + params_ct
     if flow.projection is not None:
-        y_ct, of_projection = _through_projected_start(flow.projection, first, y0, params, y_ct)
+        y_ct, of_projection = _transpose_start_projection(flow.projection, first, y0, params, y_ct)
         more = more + of_projection
     y_ct[lost], more[lost] = np.nan, np.nan
     return y_ct, more
 
 
-def reached_cotangents(path, result, path_ct, end_ct, library: Any = np) -> tuple:
+def mask_cotangents(path, result, path_ct, end_ct, library: Any = np) -> tuple:
     """Cotangents (N, m, T, 2n), zero where an output was not reached; and whether one is lost there, (N, m)."""
     reached = library.isfinite(path)[:, None]
     lost = ((path_ct != 0) & ~reached).any(axis=(2, 3))
@@ -155,7 +158,7 @@ def _vjp_over_steps(
     """`vjp` of one cotangent a row, over the steps that were taken."""
     y_ct, params_ct = np.full(end_ct.shape, np.nan), np.full((len(y0), flow.numbers), np.nan)
 
-    def back(steps: Steps, rows, members):
+    def transpose_steps(steps: Steps, rows, members):
         times = ts if len(ts) == 1 else ts[rows]
         y_ct[rows], params_ct[rows], excess = steps.kernel.vjp(
             times, params[rows], steps.table, steps.first[members], steps.counts[members], path_ct[rows],
@@ -164,28 +167,30 @@ def _vjp_over_steps(
         return excess > tolerances.largest_excess
 
     for steps, rows, members in _steps_of(flow, ts, y0, params, accepted, ticket, tolerances):
-        long = np.flatnonzero(back(steps, rows, members))
+        long = np.flatnonzero(transpose_steps(steps, rows, members))
         if not long.size:
             continue
-        probe = functools.partial(_probed, flow, ts, params, tolerances)
+        probe = functools.partial(_probe_series, flow, ts, params, tolerances)
         excess = probe(steps, rows[long], members[long])
 
         def divide(k: int, steps=steps, rows=rows, members=members, long=long, excess=excess, probe=probe):
             row = rows[long[k : k + 1]]
             again = functools.partial(probe, rows=row, members=np.zeros(1, int))
             number = params[row[0]]
-            better = _over_divided(flow, steps, int(members[long[k]]), number, tolerances, excess[k : k + 1], again)
+            better = _sweep_divided_steps(
+                flow, steps, int(members[long[k]]), number, tolerances, excess[k : k + 1], again
+            )
             if better is None:
                 y_ct[row], params_ct[row] = np.nan, np.nan
             else:
-                back(better, row, np.zeros(1, int))  # here, so that no more than one table a thread is kept
+                transpose_steps(better, row, np.zeros(1, int))  # here, so that no more than one table a thread is kept
 
         _native.map_in_threads(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
     at_start = (ts == ts[:, :1])[:, :, None]  # outputs that are the initial state; steps begin after them
     return y_ct + np.sum(path_ct * at_start, axis=1), params_ct
 
 
-def _probed(flow: Flow, ts, params, tolerances, steps: Steps, rows, members) -> np.ndarray:
+def _probe_series(flow: Flow, ts, params, tolerances, steps: Steps, rows, members) -> np.ndarray:
     """The size of the last terms of the series of a tangent, in units of the limit, along any direction at all."""
     direction = np.random.default_rng(0).normal(size=flow.states + flow.numbers)
     y_dot, params_dot = (np.tile(x, (len(rows), 1, 1)) for x in np.split(direction, [flow.states]))
@@ -216,20 +221,20 @@ def _vjp_by_jacobian(
 # differentiated as if it began at the projection of its start, which is that start.
 
 
-def projected_start(projection: Projection, t, y0, params, dy0, dparams) -> np.ndarray:
+def project_start_tangents(projection: Projection, t, y0, params, dy0, dparams) -> np.ndarray:
     """The tangents (N, m, 2n) of the projection of the starts."""
-    inputs = _at_start(t, y0, params, dy0, dparams)
-    return evaluate(_moved(projection.state, y0.shape[1]), inputs).T.reshape(dy0.shape)
+    inputs = _start_columns(t, y0, params, dy0, dparams)
+    return evaluate(_projection_pushforward(projection.state, y0.shape[1]), inputs).T.reshape(dy0.shape)
 
 
-def _through_projected_start(projection: Projection, t, y0, params, y_ct) -> tuple[np.ndarray, np.ndarray]:
-    """The transpose of `projected_start`: cotangents (N, m, 2n) of the starts, and (N, m, P) of the parameters."""
-    back = evaluate(_transposed(projection.state, y0.shape[1]), _at_start(t, y0, params, y_ct)).T
+def _transpose_start_projection(projection: Projection, t, y0, params, y_ct) -> tuple[np.ndarray, np.ndarray]:
+    """The transpose of `project_start_tangents`: cotangents (N, m, 2n) of starts, and (N, m, P) of parameters."""
+    back = evaluate(_projection_pullback(projection.state, y0.shape[1]), _start_columns(t, y0, params, y_ct)).T
     back = back.reshape(*y_ct.shape[:2], -1)
     return back[..., : y0.shape[1]], back[..., y0.shape[1] :]
 
 
-def _at_start(t, y0, params, *moving) -> list:
+def _start_columns(t, y0, params, *moving) -> list:
     """The inputs of a projection's derivatives at N starts, in m directions each: columns of N m numbers."""
     members, m = moving[0].shape[:2]
     parts = y0, t, params, *moving
@@ -237,7 +242,7 @@ def _at_start(t, y0, params, *moving) -> list:
     return list(np.concatenate([x.reshape(members * m, x.shape[-1]).T for x in parts]))
 
 
-def _through_projection(flow: Flow, projection: Projection, ts, path, params, path_ct, params_ct) -> None:
+def _transpose_projection(flow: Flow, projection: Projection, ts, path, params, path_ct, params_ct) -> None:
     """Take cotangents back through the projection that put the outputs on the constraints, all but the first and last.
 
     Changes `path_ct` and `params_ct` in place. The projection squares the distance to the constraints: its derivative
@@ -250,16 +255,16 @@ def _through_projection(flow: Flow, projection: Projection, ts, path, params, pa
     numbers = np.broadcast_to(params[:, None, None], (*place.shape[:-1], flow.numbers))
     parts = place, t[..., None], numbers, path_ct[:, :, 1:-1]
     columns = [x.reshape(place[..., 0].size, x.shape[-1]).T for x in parts]  # a scene may have no numbers
-    back = evaluate(_transposed(projection.state, flow.states), list(np.concatenate(columns))).T
+    back = evaluate(_projection_pullback(projection.state, flow.states), list(np.concatenate(columns))).T
     back = back.reshape(*place.shape[:-1], -1)
     path_ct[:, :, 1:-1] = back[..., : flow.states]
     params_ct += back[..., flow.states :].sum(axis=2)
 
 
-def _projected(flow: Flow, projection: Projection, ts, path, params, path_dot, dparams) -> None:
+def _project_tangents(flow: Flow, projection: Projection, ts, path, params, path_dot, dparams) -> None:
     """Take tangents through the projection that put the outputs on the constraints, all but the first and last.
 
-    Changes `path_dot` in place; `_through_projection` is its transpose.
+    Changes `path_dot` in place; `_transpose_projection` is its transpose.
     """
     members, m, times, _ = path_dot.shape
     shape = members, m, times - 2, flow.states
@@ -270,20 +275,20 @@ def _projected(flow: Flow, projection: Projection, ts, path, params, path_dot, d
     )
     parts = place, t, numbers, path_dot[:, :, 1:-1], moving
     columns = [x.reshape(place[..., 0].size, x.shape[-1]).T for x in parts]  # a scene may have no numbers
-    path_dot[:, :, 1:-1] = evaluate(_moved(projection.state, flow.states), list(np.concatenate(columns))).T.reshape(
-        shape
-    )
+    path_dot[:, :, 1:-1] = evaluate(
+        _projection_pushforward(projection.state, flow.states), list(np.concatenate(columns))
+    ).T.reshape(shape)
 
 
 @functools.lru_cache(maxsize=64)
-def _moved(program: Program, t: int) -> StraightLine:
+def _projection_pushforward(program: Program, t: int) -> StraightLine:
     """The tangents of the outputs of a projection, from its inputs and tangents of all but the time, input `t`."""
     by = [i for i in range(program.size) if i != t]
     return pushforward(program.line, [np.dtype(float)] * program.size, by, range(t))
 
 
 @functools.lru_cache(maxsize=64)
-def _transposed(program: Program, t: int) -> StraightLine:
+def _projection_pullback(program: Program, t: int) -> StraightLine:
     """The cotangents of a projection's inputs but the time, input `t`, from its inputs and those of its outputs."""
     by = [i for i in range(program.size) if i != t]
     return pullback(program.line, [np.dtype(float)] * program.size, by, range(t))
@@ -311,7 +316,9 @@ def _steps_of(
             yield steps, places[rows], members
 
 
-def _over_divided(flow: Flow, steps: Steps, member: int, params, tolerances, excess, sweep: Callable) -> Steps | None:
+def _sweep_divided_steps(
+    flow: Flow, steps: Steps, member: int, params, tolerances, excess, sweep: Callable
+) -> Steps | None:
     """`sweep(steps)` over the steps of a member in ever smaller parts: the steps that suit its tangents, or None.
 
     `excess` (1,), and what `sweep` returns, is how large the last terms of the series are, in units of the limit. Those
@@ -322,7 +329,7 @@ def _over_divided(flow: Flow, steps: Steps, member: int, params, tolerances, exc
     for _ in range(TRIES):
         before = float(excess[0])
         parts *= math.ceil(min(MOST_PARTS, 1.1 * float(excess[0]) ** (1 / (steps.order - 1))))
-        divided = _divided(flow, steps, member, params, tolerances, parts)
+        divided = _divide_steps(flow, steps, member, params, tolerances, parts)
         excess = sweep(divided)
         if not excess > 1.0:
             return divided
@@ -334,7 +341,7 @@ def _over_divided(flow: Flow, steps: Steps, member: int, params, tolerances, exc
     return None
 
 
-def _divided(flow: Flow, steps: Steps, member: int, params, tolerances: Tolerances, parts: int) -> Steps:
+def _divide_steps(flow: Flow, steps: Steps, member: int, params, tolerances: Tolerances, parts: int) -> Steps:
     """The steps of one member, each in this many parts: the states between are outputs of the motion."""
     first = steps.first[member]
     rows = steps.table[first : first + steps.counts[member]]
@@ -352,7 +359,7 @@ def _divided(flow: Flow, steps: Steps, member: int, params, tolerances: Toleranc
 # ---- rows ------------------------------------------------------------------------------------------------------------
 
 
-def _for_all(x: np.ndarray, rows: int) -> np.ndarray:
+def _repeat_rows(x: np.ndarray, rows: int) -> np.ndarray:
     """An array (1, …) that all members share as one with a row for each; any other array as it is."""
     return np.broadcast_to(x, (rows, *x.shape[1:])) if len(x) == 1 else x
 

@@ -55,7 +55,7 @@ class Tolerances(NamedTuple):
         return EXCESS * self.slack * self.rtol
 
     @property
-    def perturbed(self) -> "Tolerances":
+    def tighter(self) -> "Tolerances":
         """Slightly tighter tolerances for another try, whose steps end at other places."""
         return self._replace(rtol=0.7 * self.rtol, atol=0.7 * self.atol, tries=self.tries - 1)
 
@@ -109,7 +109,7 @@ class Flow:
         general: "Callable[[], Flow | None]" = lambda: None,
         motion: "Callable[[], Program] | None" = None,
     ):
-        self._of_motion: Callable = (lambda: self.program) if motion is None else motion
+        self._motion_program: Callable = (lambda: self.program) if motion is None else motion
         self._parts, self.size, self.numbers, self.guards = functools.cache(parts), size, numbers, guards
         self.groups = tuple(range(size)) if groups is None else groups
         self.nesting = nesting or _native.Nesting(size)
@@ -117,7 +117,7 @@ class Flow:
         self.tangent = functools.lru_cache(maxsize=8)(self._tangent)
 
     @classmethod
-    def of(cls, program: Program, size: int, projection=None, guards=None) -> "Flow":
+    def from_program(cls, program: Program, size: int, projection=None, guards=None) -> "Flow":
         """The flow of a scene's program, with that of its general variant behind it."""
 
         def general():
@@ -126,7 +126,7 @@ class Flow:
             except Unlowerable:
                 return None
             fits = other is not program and other.operations <= LARGEST_PROGRAM
-            return cls.of(other, size, projection, guards) if fits else None
+            return cls.from_program(other, size, projection, guards) if fits else None
 
         return cls(lambda: (program, projection), size, program.size - 2 * size - 1, guards, general=general)
 
@@ -141,7 +141,7 @@ class Flow:
         return self._parts()[1]
 
     @functools.cached_property
-    def anywhere(self) -> Program:
+    def general_program(self) -> Program:
         """The program that holds for any mass matrix, if there is one, else the flow's own.
 
         That is enough where there are no constraints: all pivots are positive if and only if the mass matrix is.
@@ -168,7 +168,7 @@ class Flow:
     def kernel(self) -> _native.Kernel:
         """The machine code."""
         parts = self.program, self.size, self.projection, self.guards, self.groups, self.nesting
-        return _native.Kernel(*parts, motion=self._of_motion())
+        return _native.Kernel(*parts, motion=self._motion_program())
 
     @property
     def borders(self):
@@ -195,7 +195,7 @@ class Flow:
         """
         solution = self.follow(ts, y0, params, tolerances, store, room, begun)
         if (solution.result != SUCCESSFUL).any():
-            solution = self._explained(solution, ts, params)
+            solution = self._explain_stops(solution, ts, params)
         finite = np.isfinite(solution.y_end)
         if not finite.all():  # even where it came to the last time
             solution.result[~finite.all(axis=1)] = _NOT_FINITE
@@ -206,7 +206,7 @@ class Flow:
         rtol, atol, max_steps, notes = *tolerances[:3], tolerances.notes
         if store is not None and room is None:
             room = min(max_steps * len(y0), LARGEST_KEPT // (self.states + 4))
-        done = self.kernel.to_run(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes)
+        done = self.kernel.select_kernel(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes)
         result, event = RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:
@@ -226,7 +226,7 @@ class Flow:
             values[again] = new
         return solution._replace(idle=done.idle + better.idle)
 
-    def _explained(self, solution: Solution, ts, params) -> Solution:
+    def _explain_stops(self, solution: Solution, ts, params) -> Solution:
         """The solution with what stopped the members whose steps became too small, or too many."""
         shrank, spent = solution.result == _SHRANK, solution.result == _SPENT
         some = np.flatnonzero(shrank | spent)
@@ -235,7 +235,7 @@ class Flow:
         times, numbers = (x[some] if len(x) > 1 else x for x in (ts, params))
 
         def acceleration(t, y):
-            values = self.anywhere.evaluate(*y.T, t, *numbers.T)[: self.size]
+            values = self.general_program.evaluate(*y.T, t, *numbers.T)[: self.size]
             return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
 
         y_end, t_end, _, accepted, rejected = (x[some] for x in solution[1:6])
@@ -259,7 +259,7 @@ class Flow:
         stuck = result == _NOT_PROJECTED
         if self.projection is not None:
             stuck |= result == _SHRANK
-        return stuck & (tolerances.tries > 1), self, tolerances.perturbed
+        return stuck & (tolerances.tries > 1), self, tolerances.tighter
 
     def _tangent(self, directions: int) -> "Flow":
         """The flow of q and of its derivatives along this many directions, whose δparams are numbers of it.
@@ -278,7 +278,7 @@ class Flow:
             return tangent_programs(self.program, self.projection, n, directions)
 
         nesting = self.nesting.with_tangents(directions)
-        return Flow(parts, rows * n, rows * self.numbers, None, groups, nesting, general, self._of_motion)
+        return Flow(parts, rows * n, rows * self.numbers, None, groups, nesting, general, self._motion_program)
 
 
 def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:

@@ -26,7 +26,7 @@ _FAST_DOUBLES = frozenset(("6.0", "7.0", "8.0", "9.0", "10.0"))
 _LEAST_RTOL = 2.0**-20
 
 
-def for_device(flow: Flow, tolerances: Tolerances) -> Tolerances:
+def adapt_tolerances(flow: Flow, tolerances: Tolerances) -> Tolerances:
     """The tolerances on the GPU at hand: they allow single precision where it computes in that.
 
     That is where the caller's numbers are of float32, float64 is slow, and single precision decides about nothing
@@ -49,7 +49,7 @@ def has_slow_doubles() -> bool:
 def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
     """The motions of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P): a `Solution` without `idle`.
 
-    The tolerances are those for the device (`for_device`).
+    The tolerances are those for the device (`adapt_tolerances`).
 
     Raises `ValueError` where the scene cannot go to a GPU, saying why.
     """

@@ -26,7 +26,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from lagjax._custom import batch_in_front
-from lagjax._machine_code._call import on_host
+from lagjax._machine_code._call import call_host
 from lagjax._program import Program, StraightLine, evaluate, pullback, pushforward, steps_of
 
 # Operations of a program that XLA compiles; NumPy evaluates a larger one. The second derivative of a motion by its
@@ -38,7 +38,7 @@ LARGEST_COMPILED = 100
 def outputs(program: Program, count: int, first, numbers):
     """The first `count` outputs (…, count) for the first inputs (…, m) and the others (…, P), by XLA or by NumPy."""
     if not is_large(program):
-        return jnp.stack(program.at(first, numbers)[:count], axis=-1)
+        return jnp.stack(program.compute_outputs(first, numbers)[:count], axis=-1)
     shape = jnp.broadcast_shapes(first.shape[:-1], numbers.shape[:-1])
     parts = [jnp.broadcast_to(x, (*shape, x.shape[-1])) for x in (first, numbers)]
     return _line_of(program, count)(jnp.concatenate(parts, axis=-1))
@@ -144,11 +144,11 @@ def _derivative_of_linear(primitive, of):
     return rule
 
 
-def _transposed(primitive):
+def _transpose_rule(primitive):
     return lambda cotangent, x, v, *, line: [None, primitive.bind(x, ad.instantiate_zeros(cotangent), line=line)]
 
 
-def _batched(primitive):
+def _batch_rule(primitive):
     return lambda arrays, axes, *, line: (primitive.bind(*batch_in_front(arrays, axes), line=line), 0)
 
 
@@ -158,17 +158,17 @@ def _register(primitive, host, width) -> None:
     def shape(x, *_, line: Line):
         return ShapedArray((*x.shape[:-1], width(line)), np.dtype(float))
 
-    def at_once(*arrays, line: Line):
+    def evaluate(*arrays, line: Line):
         with jax.enable_x64(True):
             return jax.device_put(host(*map(np.asarray, arrays), line=line)[0])
 
-    def compiled(*arrays, line: Line):
-        return on_host(functools.partial(host, line=line), [shape(*arrays, line=line)], *arrays)[0]
+    def call_back(*arrays, line: Line):
+        return call_host(functools.partial(host, line=line), [shape(*arrays, line=line)], *arrays)[0]
 
     primitive.def_abstract_eval(shape)
-    primitive.def_impl(at_once)
-    mlir.register_lowering(primitive, mlir.lower_fun(compiled, multiple_results=False), platform="cpu")
-    batching.primitive_batchers[primitive] = _batched(primitive)
+    primitive.def_impl(evaluate)
+    mlir.register_lowering(primitive, mlir.lower_fun(call_back, multiple_results=False), platform="cpu")
+    batching.primitive_batchers[primitive] = _batch_rule(primitive)
 
 
 _register(value_p, _value, lambda line: line.outputs)
@@ -177,5 +177,5 @@ _register(back_p, _back, lambda line: line.count)
 ad.primitive_jvps[value_p] = _derivative_of_value
 ad.primitive_jvps[forward_p] = _derivative_of_linear(forward_p, lambda line: line.forward)
 ad.primitive_jvps[back_p] = _derivative_of_linear(back_p, lambda line: line.back)
-ad.primitive_transposes[forward_p] = _transposed(back_p)
-ad.primitive_transposes[back_p] = _transposed(forward_p)
+ad.primitive_transposes[forward_p] = _transpose_rule(back_p)
+ad.primitive_transposes[back_p] = _transpose_rule(forward_p)

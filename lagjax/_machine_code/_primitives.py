@@ -33,9 +33,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from lagjax._machine_code import _derivatives
-from lagjax._machine_code._call import has_handler, has_sweep, on_host, run_by_handler, sweep_by_handler
+from lagjax._machine_code._call import call_host, has_handler, has_sweep, run_by_handler, sweep_by_handler
 from lagjax._machine_code._flow import Flow, Tolerances
-from lagjax._machine_code._gpu_launch import for_device, run_on_gpu, transpose_on_gpu
+from lagjax._machine_code._gpu_launch import adapt_tolerances, run_on_gpu, transpose_on_gpu
 from lagjax._machine_code._lines import outputs
 from lagjax._machine_code._rates import rate
 from lagjax._machine_code._steps import KEPT
@@ -51,11 +51,11 @@ def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:
 
     A flow with guards has no derivatives: they would have to say how its end moves.
     """
-    return _compiled(flow, tolerances)(ts, y0, params)
+    return _compile_run(flow, tolerances)(ts, y0, params)
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled(flow: Flow, tolerances: Tolerances):
+def _compile_run(flow: Flow, tolerances: Tolerances):
     """`run` as one program of XLA: a derivative outside of `jit` then compiles as one, not operation by operation."""
     return jax.jit(lambda *given: _run(*given, flow=flow, tolerances=tolerances, keep=False))
 
@@ -77,13 +77,13 @@ def _rows(arrays, inner, shared=(), library: Any = np):
     return [rows(place, x, k) for place, (x, k) in enumerate(zip(arrays, inner, strict=True))], batch
 
 
-def _in_batch(results, batch):
+def _restore_batch(results, batch):
     return [x.reshape(batch + x.shape[1:]) for x in results]
 
 
 def _run_on_host(ts, y0, params, *, flow, tolerances, keep):
     rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2))
-    return _in_batch(flow.run(*rows, tolerances, KEPT if keep else None)[:_OUTPUTS], batch)
+    return _restore_batch(flow.run(*rows, tolerances, KEPT if keep else None)[:_OUTPUTS], batch)
 
 
 def _continue_run(ts, y0, params, *begun, flow, tolerances, **_):
@@ -99,13 +99,13 @@ def _run_again(ts, y0, params, *_, flow, tolerances, **__):
 def _jvp_on_host(ts, y0, params, path, result, accepted, ticket, dy0, dparams, *, flow, tolerances, **_):
     arrays = ts, y0, params, path, result, accepted, ticket, dy0, dparams
     (ts, y0, params, *rest), batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 2, 2), shared=(0, 2))
-    return _in_batch(_derivatives.jvp(flow, ts, y0, params, rest[:4], *rest[4:], tolerances=tolerances), batch)
+    return _restore_batch(_derivatives.jvp(flow, ts, y0, params, rest[:4], *rest[4:], tolerances=tolerances), batch)
 
 
 def _vjp_on_host(ts, y0, params, path, result, accepted, ticket, path_ct, end_ct, *, flow, tolerances, **_):
     arrays = ts, y0, params, path, result, accepted, ticket, path_ct, end_ct
     (ts, y0, params, *rest), batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2))
-    return _in_batch(_derivatives.vjp(flow, ts, y0, params, rest[:4], *rest[4:], tolerances=tolerances), batch)
+    return _restore_batch(_derivatives.vjp(flow, ts, y0, params, rest[:4], *rest[4:], tolerances=tolerances), batch)
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
 def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
     """The start of the tangent flow, for a direction of length one; and the length."""
     if flow.projection is not None:
-        dy0 = _projected_direction(flow, flow.projection, ts[..., 0], y0, params, dy0, dparams)
+        dy0 = _project_direction(flow, flow.projection, ts[..., 0], y0, params, dy0, dparams)
     length = jnp.max(jnp.abs(dy0), axis=-1, keepdims=True)
     if flow.numbers:
         length = jnp.maximum(*jnp.broadcast_arrays(length, jnp.max(jnp.abs(dparams), axis=-1, keepdims=True)))
@@ -185,16 +185,16 @@ def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
     return (ts, start, numbers), length
 
 
-def _projected_direction(flow: Flow, projection: Projection, t, y0, params, dy0, dparams):
+def _project_direction(flow: Flow, projection: Projection, t, y0, params, dy0, dparams):
     """The tangent of the projection of a start, at which a motion with constraints begins (see `_derivatives`)."""
 
-    def along(t, y, p, dy, dp):
+    def differentiate_start(t, y, p, dy, dp):
         def start(y, p):
             return outputs(cast(Program, projection.state), flow.states, jnp.append(y, t), p)
 
         return jax.jvp(start, (y, p), (dy, dp))[1]
 
-    return jnp.vectorize(along, signature="(),(s),(p),(s),(p)->(s)")(t, y0, params, dy0, dparams)
+    return jnp.vectorize(differentiate_start, signature="(),(s),(p),(s),(p)->(s)")(t, y0, params, dy0, dparams)
 
 
 def _residuals(solution: Solution):
@@ -256,16 +256,16 @@ def _derivative_of_jvp(primals, tangents, **settings):
     if not all(map(_zero, tangents[:3])):
         dy0, dparams = primals[_GIVEN:]
 
-        def along(*moving):
+        def compose_jvp(*moving):
             ts, y0, params = (x[..., None, :] for x in moving)
             return _jvp_composed(ts, y0, params, dy0, dparams, **settings)
 
-        more = list(jax.jvp(along, primals[:3], tuple(map(_value, tangents[:3])))[1])
+        more = list(jax.jvp(compose_jvp, primals[:3], tuple(map(_value, tangents[:3])))[1])
         total = more if total is None else _add(total, more)
-    return outs, _or_zeros(total, outs)
+    return outs, _fill_zeros(total, outs)
 
 
-def _or_zeros(total, outs):
+def _fill_zeros(total, outs):
     return [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs] if total is None else total
 
 
@@ -273,18 +273,18 @@ def _derivative_of_vjp(primals, tangents, **settings):
     outs = vjp_p.bind(*primals, **settings)
     total = _linear_part(vjp_p, primals, tangents, 2, settings)
     if not all(map(_zero, tangents[:3])):
-        more = _vjp_moved(primals, tangents[:3], outs, settings)
+        more = _vjp_variation(primals, tangents[:3], outs, settings)
         total = more if total is None else _add(total, more)
-    return outs, _or_zeros(total, outs)
+    return outs, _fill_zeros(total, outs)
 
 
-def _vjp_moved(primals, tangents, outs, settings):
+def _vjp_variation(primals, tangents, outs, settings):
     """The change of `vjp` with ts, y0 and params, for each of its m cotangents."""
     dts, dy0, dparams = tangents
     (ts, y0, params), cts, total = primals[:3], primals[_GIVEN:], None
     dy0, dparams = _value(dy0), _value(dparams)
     if not _zero(dts):
-        total = _vjp_moved_in_time(primals, dts, outs, settings)
+        total = _vjp_variation_in_time(primals, dts, outs, settings)
         dy0 = dy0 - rate(settings["flow"], ts[..., 0], y0, params) * dts[..., :1]
     given = [x[..., None, :] for x in (ts, y0, params)]
     direction = [x[..., None, :] for x in (dy0, dparams)]
@@ -292,7 +292,7 @@ def _vjp_moved(primals, tangents, outs, settings):
     return list(more) if total is None else _add(total, more)
 
 
-def _vjp_moved_in_time(primals, dts, outs, settings):
+def _vjp_variation_in_time(primals, dts, outs, settings):
     """The change of `vjp` with the output times, but for the curvature along the start's −f₀ δt₀.
 
     Output i moves by f δtᵢ, so that its derivative by (y0, params) gains the part (∂f/∂y Dᵢ + ∂f/∂p) δtᵢ; and the start
@@ -310,15 +310,15 @@ def _vjp_moved_in_time(primals, dts, outs, settings):
     def first_rate(y, numbers):
         return -rate(flow, ts[..., None, 0], y, numbers) * dts[..., None, :1]
 
-    def transposed(function, place, cotangent, numbers_shape):
+    def transpose_rate(function, place, cotangent, numbers_shape):
         place = jnp.broadcast_to(place, cotangent.shape)
         return jax.vjp(function, place, jnp.broadcast_to(params[..., None, :], numbers_shape))[1](cotangent)
 
     places = jnp.where(reached, path, y0[..., None, :])[..., None, :, :]
-    moved_ct, params_ct = transposed(rates, places, weights, (*weights.shape[:-2], flow.numbers))
+    moved_ct, params_ct = transpose_rate(rates, places, weights, (*weights.shape[:-2], flow.numbers))
     still = jnp.zeros_like(end_ct)
     y0_ct, more = vjp_p.bind(*primals[:_GIVEN], moved_ct, still, **settings)
-    start = transposed(first_rate, y0[..., None, :], outs[0], outs[1].shape)
+    start = transpose_rate(first_rate, y0[..., None, :], outs[0], outs[1].shape)
     return _add([y0_ct, more + params_ct], start)
 
 
@@ -336,27 +336,29 @@ def _derivative_of_curvature(primals, tangents, **settings):
         if not all(map(_zero, moving)):
             more = part([_value(x) for x in moving])
             total = list(more) if total is None else _add(total, more)
-    return outs, _or_zeros(total, outs)
+    return outs, _fill_zeros(total, outs)
 
 
 # ---- transposes: of what is linear -----------------------------------------------------------------------------------
 
 
-def _summed(cotangent, aval):
+def _sum_shared(cotangent, aval):
     """A cotangent with the batch axes of an argument that was shared: the sum over those that shared it."""
     axes = tuple(i for i, (a, b) in enumerate(zip(cotangent.shape, aval.shape, strict=True)) if a != b)
     return jnp.sum(cotangent, axis=axes, keepdims=True) if axes else cotangent
 
 
-def _to_linear(args, cotangents):
+def _linear_cotangents(args, cotangents):
     """The cotangents of the arguments that are linear here, None for the others."""
-    return [_summed(c, x.aval) if ad.is_undefined_primal(x) else None for x, c in zip(args, cotangents, strict=True)]
+    return [
+        _sum_shared(c, x.aval) if ad.is_undefined_primal(x) else None for x, c in zip(args, cotangents, strict=True)
+    ]
 
 
-def _transposed(primitive):
+def _transpose_rule(primitive):
     def rule(cotangents, *args, **settings):
         found = primitive.bind(*args[:_GIVEN], *map(_value, cotangents), **settings)
-        return [None] * _GIVEN + _to_linear(args[_GIVEN:], found)
+        return [None] * _GIVEN + _linear_cotangents(args[_GIVEN:], found)
 
     return rule
 
@@ -365,20 +367,20 @@ def _curvature_transpose(cotangents, *args, **settings):
     moving, given, cts, direction = [_value(c) for c in cotangents], args[:3], args[3:5], args[5:]
     if any(map(ad.is_undefined_primal, direction)):
         found = curvature_p.bind(*given, *cts, *moving, **settings)
-        return [None] * 5 + _to_linear(direction, found)
+        return [None] * 5 + _linear_cotangents(direction, found)
     ts, *state = given
     state = tuple(
         jnp.broadcast_to(x, jnp.broadcast_shapes(x.shape, m.shape)) for x, m in zip(state, moving, strict=True)
     )
     moving = tuple(jnp.broadcast_to(m, x.shape) for m, x in zip(moving, state, strict=True))
     second = jax.jvp(lambda *state: _jvp_composed(ts, *state, *direction, **settings), state, moving)[1]
-    return [None] * 3 + _to_linear(cts, second) + [None] * 2
+    return [None] * 3 + _linear_cotangents(cts, second) + [None] * 2
 
 
 # ---- batches ---------------------------------------------------------------------------------------------------------
 
 
-def _batched(primitive):
+def _batch_rule(primitive):
     def rule(args, axes, **settings):
         given = [
             jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(x, axis, 0)
@@ -395,7 +397,7 @@ def _batch_of_batches(primitive, outputs_after):
 
     def rule(args, axes, **settings):
         if any(axis is not None for axis in axes[:_GIVEN]):
-            return _batched(primitive)(args, axes, **settings)
+            return _batch_rule(primitive)(args, axes, **settings)
         size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
         place, linear = args[1].ndim - 1, []  # the axis after those of the batch
         for x, axis in zip(args[_GIVEN:], axes[_GIVEN:], strict=True):
@@ -415,23 +417,23 @@ def _batch_of_batches(primitive, outputs_after):
 # ---- registration ----------------------------------------------------------------------------------------------------
 
 
-def _on_host(primitive, host, shapes) -> None:
+def _register_on_host(primitive, host, shapes) -> None:
     """A primitive that `host` computes from NumPy arrays, outside of `jit`."""
     primitive.multiple_results = True
     primitive.def_abstract_eval(shapes)
 
-    def at_once(*args, **settings):
+    def evaluate(*args, **settings):
         with jax.enable_x64(True):
             return jax.device_put([np.asarray(x) for x in host(*map(np.asarray, args), **settings)])
 
-    primitive.def_impl(at_once)
+    primitive.def_impl(evaluate)
 
 
-def _for_cpus(form):
+def _lowering_rule(form):
     """The rule by which a primitive is lowered for CPUs: as `form`, which calls code that lies in this process."""
     rule = mlir.lower_fun(form, multiple_results=True)
 
-    def lowered(context, *args, **settings):
+    def lower_form(context, *args, **settings):
         if context.module_context.lowering_parameters.for_export:
             raise ValueError(
                 "jax.export cannot take a motion along that runs in a CPU's machine code, which lies in this process: "
@@ -440,7 +442,7 @@ def _for_cpus(form):
             )
         return rule(context, *args, **settings)
 
-    return lowered
+    return lower_form
 
 
 def _run_compiled(ts, y0, params, *, flow, tolerances, keep):
@@ -451,38 +453,38 @@ def _run_compiled(ts, y0, params, *, flow, tolerances, keep):
     with jax.enable_x64(True):  # where the kernel is made, and whatever was set where this is lowered
         short = keep and has_sweep(flow, math.prod(batch))  # whose derivatives need no steps that are kept
         if not (short or (not keep and has_handler(flow, math.prod(batch)))):
-            return on_host(functools.partial(_run_on_host, **settings), shapes, ts, y0, params)
+            return call_host(functools.partial(_run_on_host, **settings), shapes, ts, y0, params)
         of_rows = [jax.ShapeDtypeStruct((len(rows[1]), *x.shape[len(batch) :]), x.dtype) for x in shapes]
         host = functools.partial(_run_again if keep else _continue_run, **settings)
         rounds = flow.kernel.rounds_of_sweep if keep else None
-        return _in_batch(run_by_handler(flow, tolerances, host, of_rows, *rows, rounds=rounds), batch)
+        return _restore_batch(run_by_handler(flow, tolerances, host, of_rows, *rows, rounds=rounds), batch)
 
 
-def _swept_compiled(on_rows, on_host_, shapes_of, inner, args, settings):
+def _compile_sweep(sweep_rows, run_on_host, shapes_of, inner, args, settings):
     """A derivative in what XLA compiles: by a handler where the motion was a short one, else on the host.
 
-    `on_rows(*rows)` gives the results for rows of members, whether these are done, and what they need to live.
+    `sweep_rows(*rows)` gives the results for rows of members, whether these are done, and what they need to live.
     """
-    shapes, function = shapes_of(*args, **settings), functools.partial(on_host_, **settings)
+    shapes, function = shapes_of(*args, **settings), functools.partial(run_on_host, **settings)
     (ts, y0, params, *_, a, b), batch = _rows(args, (1, 1, 1, 2, 0, 0, 0, *inner), shared=(0, 2), library=jnp)
 
-    def by_handler(*args):
-        *results, done, needed = on_rows(ts, y0, params, a, b)
-        host = functools.partial(on_host, functools.partial(function, needed=needed), shapes)
-        return jax.lax.cond(done, lambda *_: tuple(_in_batch(results, batch)), host, *args)
+    def call_handler(*args):
+        *results, done, needed = sweep_rows(ts, y0, params, a, b)
+        host = functools.partial(call_host, functools.partial(function, needed=needed), shapes)
+        return jax.lax.cond(done, lambda *_: tuple(_restore_batch(results, batch)), host, *args)
 
     with jax.enable_x64(True):  # where kernels are made, and whatever was set where this is lowered
-        host = functools.partial(on_host, function, shapes)
+        host = functools.partial(call_host, function, shapes)
         if not has_sweep(settings["flow"], math.prod(batch)):
             return host(*args)
-        return jax.lax.cond(jnp.all(args[6] < 0), by_handler, host, *args)  # there are no steps that were kept
+        return jax.lax.cond(jnp.all(args[6] < 0), call_handler, host, *args)  # there are no steps that were kept
 
 
 def _jvp_compiled(*args, **settings):
     """`jvp` of what XLA compiles."""
     flow, tolerances = settings["flow"], settings["tolerances"]
 
-    def on_rows(ts, y0, params, dy0, dparams):
+    def sweep_rows(ts, y0, params, dy0, dparams):
         length = jnp.max(jnp.abs(jnp.concatenate([dy0, dparams], axis=2)), axis=2, keepdims=True)
         unit = jnp.where(length > 0, length, 1.0)
         end, path, excess, done, needed = sweep_by_handler(
@@ -493,14 +495,14 @@ def _jvp_compiled(*args, **settings):
         done &= jnp.all(excess <= tolerances.largest_excess)
         return path * unit[..., None], end * unit, done, needed
 
-    return _swept_compiled(on_rows, _jvp_on_host, _jvp_shapes, (2, 2), args, settings)
+    return _compile_sweep(sweep_rows, _jvp_on_host, _jvp_shapes, (2, 2), args, settings)
 
 
 def _vjp_compiled(*args, **settings):
     """`vjp` of what XLA compiles, of one cotangent."""
     flow, tolerances = settings["flow"], settings["tolerances"]
 
-    def on_rows(ts, y0, params, path_ct, end_ct):
+    def sweep_rows(ts, y0, params, path_ct, end_ct):
         path_ct, end_ct = path_ct[:, 0], end_ct[:, 0]
         y_ct, params_ct, excess, done, needed = sweep_by_handler(
             "vjp", flow, tolerances, ts, y0, params, path_ct, end_ct + path_ct[:, -1]
@@ -511,8 +513,8 @@ def _vjp_compiled(*args, **settings):
         return y_ct[:, None], params_ct[:, None], done, needed
 
     if args[-1].shape[-2] != 1:
-        return on_host(functools.partial(_vjp_on_host, **settings), _vjp_shapes(*args, **settings), *args)
-    return _swept_compiled(on_rows, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
+        return call_host(functools.partial(_vjp_on_host, **settings), _vjp_shapes(*args, **settings), *args)
+    return _compile_sweep(sweep_rows, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
 
 
 # ---- on a GPU --------------------------------------------------------------------------------------------------------
@@ -521,7 +523,7 @@ def _vjp_compiled(*args, **settings):
 def _run_for_gpus(ts, y0, params, *, flow, tolerances, **_):
     rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2), library=jnp)
     with jax.enable_x64(True):  # whatever was set where this is lowered
-        return _in_batch(run_on_gpu(flow, for_device(flow, tolerances), *rows), batch)
+        return _restore_batch(run_on_gpu(flow, adapt_tolerances(flow, tolerances), *rows), batch)
 
 
 def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
@@ -538,29 +540,29 @@ def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
 
 def _vjp_for_gpus(*args, flow, tolerances):
     """`vjp`: back over the steps of the motion; of constraints, and where the steps do not do, by tangents."""
-    settings = dict(flow=flow, tolerances=for_device(flow, tolerances))
+    settings = dict(flow=flow, tolerances=adapt_tolerances(flow, tolerances))
     with jax.enable_x64(True):
         rows, batch = _rows(args, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2), library=jnp)
         ts, y0, params, path, result, *_, path_ct, end_ct = rows
         members, m = end_ct.shape[:2]
         few = m <= flow.states + flow.numbers and flow.projection is None
-        reached_ct, lost = _derivatives.reached_cotangents(path, result, path_ct, end_ct, library=jnp)
-        swept = few and _swept_on_gpu(ts, y0, params, reached_ct, result, end_ct, **settings)
+        reached_ct, lost = _derivatives.mask_cotangents(path, result, path_ct, end_ct, library=jnp)
+        swept = few and _sweep_on_gpu(ts, y0, params, reached_ct, result, end_ct, **settings)
         if not swept:
             return _vjp_by_tangents(*args, **settings)
         *found, done = (x.reshape(members, m, *x.shape[1:]) for x in swept)
         done = (done | lost).all(axis=1)
 
-        def with_tangents(*found):
+        def replace_unfinished(*found):
             times = jnp.where(done[:, None], ts[:, :1], ts)  # members that are done stay where they are
             others = _vjp_by_tangents(times, y0, params, *rows[3:], **settings)
             return tuple(jnp.where(done[:, None, None], a, b) for a, b in zip(found, others, strict=True))
 
-        found = jax.lax.cond(jnp.all(done), lambda *found: found, with_tangents, *found)
-        return _in_batch([jnp.where(lost[..., None], jnp.nan, x) for x in found], batch)
+        found = jax.lax.cond(jnp.all(done), lambda *found: found, replace_unfinished, *found)
+        return _restore_batch([jnp.where(lost[..., None], jnp.nan, x) for x in found], batch)
 
 
-def _swept_on_gpu(ts, y0, params, path_ct, result, end_ct, *, flow, tolerances):
+def _sweep_on_gpu(ts, y0, params, path_ct, result, end_ct, *, flow, tolerances):
     """The cotangents that m ones of each member lead to, a row each, and whether these are right; None: it cannot."""
     members, m = end_ct.shape[:2]
     ts, params = (x if len(x) == 1 else jnp.repeat(x, m, axis=0) for x in (ts, params))
@@ -583,19 +585,19 @@ def _vjp_by_tangents(ts, y0, params, *given, flow, tolerances):
     along = basis[..., : flow.states], basis[..., flow.states :]
     path, end = _jvp_for_gpus(ts, y0, params, *run, *along, flow=flow, tolerances=tolerances)
 
-    def weighted(cotangent, values):  # values without a cotangent do not matter, even where they are not finite
+    def weigh(cotangent, values):  # values without a cotangent do not matter, even where they are not finite
         return jnp.where(cotangent != 0, cotangent * values, 0.0)
 
-    total = jnp.sum(weighted(path_ct[..., :, None, :, :], path[..., None, :, :, :]), axis=(-1, -2))
-    total += jnp.sum(weighted(end_ct[..., :, None, :], end[..., None, :, :]), axis=-1)
+    total = jnp.sum(weigh(path_ct[..., :, None, :, :], path[..., None, :, :, :]), axis=(-1, -2))
+    total += jnp.sum(weigh(end_ct[..., :, None, :], end[..., None, :, :]), axis=-1)
     return [total[..., : flow.states], total[..., flow.states :]]
 
 
-_on_host(run_p, _run_on_host, _run_shapes)
-_on_host(jvp_p, _jvp_on_host, _jvp_shapes)
-_on_host(vjp_p, _vjp_on_host, _vjp_shapes)
+_register_on_host(run_p, _run_on_host, _run_shapes)
+_register_on_host(jvp_p, _jvp_on_host, _jvp_shapes)
+_register_on_host(vjp_p, _vjp_on_host, _vjp_shapes)
 for _primitive, _compiled_form in ((run_p, _run_compiled), (jvp_p, _jvp_compiled), (vjp_p, _vjp_compiled)):
-    mlir.register_lowering(_primitive, _for_cpus(_compiled_form), platform="cpu")
+    mlir.register_lowering(_primitive, _lowering_rule(_compiled_form), platform="cpu")
 curvature_p.multiple_results = True
 curvature_p.def_abstract_eval(_curvature_shapes)
 curvature_p.def_impl(_curvature_composed)
@@ -606,10 +608,10 @@ for _primitive, _form in ((run_p, _run_for_gpus), (jvp_p, _jvp_for_gpus), (vjp_p
     mlir.register_lowering(_primitive, mlir.lower_fun(_form, multiple_results=True), platform="cuda")
 
 for _primitive, _jvp, _transpose, _batching in (
-    (run_p, _derivative_of_run, None, _batched(run_p)),
-    (jvp_p, _derivative_of_jvp, _transposed(vjp_p), _batch_of_batches(jvp_p, (2, 1))),
-    (vjp_p, _derivative_of_vjp, _transposed(jvp_p), _batch_of_batches(vjp_p, (1, 1))),
-    (curvature_p, _derivative_of_curvature, _curvature_transpose, _batched(curvature_p)),
+    (run_p, _derivative_of_run, None, _batch_rule(run_p)),
+    (jvp_p, _derivative_of_jvp, _transpose_rule(vjp_p), _batch_of_batches(jvp_p, (2, 1))),
+    (vjp_p, _derivative_of_vjp, _transpose_rule(jvp_p), _batch_of_batches(vjp_p, (1, 1))),
+    (curvature_p, _derivative_of_curvature, _curvature_transpose, _batch_rule(curvature_p)),
 ):
     ad.primitive_jvps[_primitive] = _jvp
     if _transpose is not None:

@@ -23,34 +23,34 @@ def rate(flow: Flow, t, y, params):
     n = flow.size
     borders = flow.borders
     slides = borders is not None and any(guard.slide >= 0 for guard in borders.guards)
-    if flow.anywhere.looks_up or (is_large(flow.anywhere) and not slides):
-        return _from_rows(flow, t, y, params)
+    if flow.general_program.looks_up or (is_large(flow.general_program) and not slides):
+        return _rate_from_rows(flow, t, y, params)
     scalars = (*(y[..., i] for i in range(2 * n)), t, *(params[..., i] for i in range(flow.numbers)))
     scalars = jnp.broadcast_arrays(*scalars)
     if slides:
-        acceleration = _on_pieces(borders, scalars, _pieces(borders, scalars, n))[0][:n]
+        acceleration = _evaluate_pieces(borders, scalars, _pieces(borders, scalars, n))[0][:n]
     else:
-        acceleration = flow.anywhere(*scalars)[:n]
-    return _stacked(flow, y, acceleration)
+        acceleration = flow.general_program(*scalars)[:n]
+    return _stack_rate(flow, y, acceleration)
 
 
-def _stacked(flow: Flow, y, acceleration):
+def _stack_rate(flow: Flow, y, acceleration):
     velocity = (y[..., flow.size + i] for i in range(flow.size))
     slope = jnp.stack(jnp.broadcast_arrays(*velocity, *acceleration), axis=-1)
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
-def _from_rows(flow: Flow, t, y, params):
+def _rate_from_rows(flow: Flow, t, y, params):
     """`rate` of a program that looks up tables, whose parameters are too many to be taken apart, or of a large one."""
     shape = jnp.broadcast_shapes(y.shape[:-1], t.shape)
     y, time = jnp.broadcast_to(y, (*shape, 2 * flow.size)), jnp.broadcast_to(t, shape)[..., None]
     rows = jnp.concatenate([y, time], axis=-1)
-    if flow.anywhere.looks_up:
-        return _stacked(flow, y, flow.anywhere.of_rows(rows, params)[: flow.size])
-    return _stacked(flow, y, jnp.moveaxis(outputs(flow.anywhere, flow.size, rows, params), -1, 0))
+    if flow.general_program.looks_up:
+        return _stack_rate(flow, y, flow.general_program.compute_rows(rows, params)[: flow.size])
+    return _stack_rate(flow, y, jnp.moveaxis(outputs(flow.general_program, flow.size, rows, params), -1, 0))
 
 
-def _on_pieces(borders, scalars, pieces) -> tuple[tuple, tuple]:
+def _evaluate_pieces(borders, scalars, pieces) -> tuple[tuple, tuple]:
     """The outputs of the program on these pieces, and the switching numbers."""
     line = borders.program.line
     outputs = (*line.outputs, *borders.switches)
@@ -69,10 +69,10 @@ def _pieces(borders, scalars, n: int) -> list[Any]:
         """The rates of the switching numbers, where all pieces that may slide are on one side of their border."""
         there = [jnp.full_like(zero, side) if j in sliding else piece for j, piece in enumerate(pieces)]
         there = [zero if j in sliding.values() else piece for j, piece in enumerate(there)]
-        out, _ = _on_pieces(borders, scalars, there)
+        out, _ = _evaluate_pieces(borders, scalars, there)
         moving = [*scalars[n : 2 * n], *out[:n], jnp.ones_like(zero)]
         moving += [jnp.zeros_like(zero)] * (len(scalars) - 2 * n - 1)
-        return jax.jvp(lambda *at: _on_pieces(borders, at, there)[1], tuple(scalars), tuple(moving))
+        return jax.jvp(lambda *at: _evaluate_pieces(borders, at, there)[1], tuple(scalars), tuple(moving))
 
     (switches, below), (_, above) = rates(-1.0), rates(1.0)
     for j, slide in sliding.items():

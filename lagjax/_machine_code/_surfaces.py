@@ -56,12 +56,12 @@ class Surfaces(NamedTuple):
         return Guards(self.values, self.complete, self.directions, notes, remembers)
 
     @property
-    def only_jump(self) -> np.ndarray:
+    def have_no_rate(self) -> np.ndarray:
         """True for every guard, (G,), that has no rate anywhere: it changes its sign by jumps."""
         count = len(self.directions)
         return np.array([self.complete.constant(count + k) == 0.0 for k in range(count)])
 
-    def at(self, t, y, numbers, latest) -> Guarded:
+    def evaluate_guards(self, t, y, numbers, latest) -> Guarded:
         """The guards at a state (2n,), as machine code takes a start there in a run that ends at `latest`."""
         count, still = len(self.directions), jax.lax.stop_gradient
         t, y, numbers, latest = still((t, y, numbers, latest))
@@ -72,7 +72,7 @@ class Surfaces(NamedTuple):
         return Guarded(values, clear, GUARD_NOISE * sizes, jnp.abs(rates) * instant)
 
     @classmethod
-    def of(
+    def from_functions(
         cls, derivation: Derivation, functions: Sequence[Callable], directions: tuple[int, ...], code: tuple, structure
     ) -> "Surfaces":
         """The surfaces of functions of y = (q, q̇, t), (2n + 1,), and params; each gives one number.
@@ -86,7 +86,7 @@ class Surfaces(NamedTuple):
             return jnp.stack([function(y, params) for function in functions])
 
         def complete(y, numbers):
-            acceleration = jnp.stack(program.complete.at(y, vector_of(numbers))[:n])
+            acceleration = jnp.stack(program.complete.compute_outputs(y, vector_of(numbers))[:n])
             rate = jnp.concatenate([y[n:-1], acceleration, jnp.ones(1)])
             by_y = jax.jacfwd(values)(y, numbers)
             terms, moving = by_y * y, by_y * rate
@@ -126,7 +126,7 @@ def crossing_variation(surfaces: Surfaces, program: Program) -> Callable:
     """
     still, count = jax.lax.stop_gradient, len(surfaces.directions)
 
-    def moved(k, taken, t, y, numbers):
+    def move_to_zero(k, taken, t, y, numbers):
         def rates(t, y):
             n, at = y.shape[0] // 2, (jnp.append(y, t), numbers)
             return outputs(surfaces.complete, 2 * count, *at)[count + k], jnp.append(y[n:], outputs(program, n, *at))
@@ -140,4 +140,4 @@ def crossing_variation(surfaces: Surfaces, program: Program) -> Callable:
         there = t + later, y + slope * later + 0.5 * turn * later**2
         return tuple(differentiable_where(crosses, x, t, y, numbers) for x in there)
 
-    return moved
+    return move_to_zero

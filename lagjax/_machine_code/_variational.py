@@ -44,16 +44,16 @@ def tangent_programs(
 
     def accelerations(q, v, t, p):
         scalars = lambda q, v, p: jnp.stack(program(*q, *v, t, *p)[:size])  # noqa: E731
-        return _in_rows(scalars, q, v, p), program(*q[0], *v[0], t, *p[0])[size]
+        return _differentiate_rows(scalars, q, v, p), program(*q[0], *v[0], t, *p[0])[size]
 
     outputs = [(i, row) for row in every for i in range(size)] + [(size, None)]
-    larger = _with_tangents(program, size, rows, numbers, outputs, accelerations)
+    larger = _build_tangent_program(program, size, rows, numbers, outputs, accelerations)
     if projection is None:
         return larger, None
     state, scale = cast(Program, projection.state), cast(Program, projection.velocity_scale)
 
-    def projected(q, v, t, p):
-        both = _in_rows(lambda q, v, p: jnp.stack(state(*q, *v, t, *p)), q, v, p)
+    def project_rows(q, v, t, p):
+        both = _differentiate_rows(lambda q, v, p: jnp.stack(state(*q, *v, t, *p)), q, v, p)
         return both[:, :size], both[:, size:]
 
     def velocity_scale(q, v, t, p):
@@ -62,12 +62,12 @@ def tangent_programs(
     outputs = [(first + i, row) for first in (0, size) for row in every for i in range(size)]
     scales = [(i, None) for i in range(len(scale.line.outputs))]  # of the motion, also where it has tangents
     return larger, Projection(
-        _with_tangents(state, size, rows, numbers, outputs, projected),
-        _with_tangents(scale, size, rows, numbers, scales, velocity_scale),
+        _build_tangent_program(state, size, rows, numbers, outputs, project_rows),
+        _build_tangent_program(scale, size, rows, numbers, scales, velocity_scale),
     )
 
 
-def _with_tangents(program: Program, n: int, rows: int, numbers: int, outputs, function: Callable) -> Program:
+def _build_tangent_program(program: Program, n: int, rows: int, numbers: int, outputs, function: Callable) -> Program:
     """A program of (1 + D) rows of q, q̇ and params, which in JAX is `function`."""
     first_of_params = 2 * rows * n + 1
     of_rows = [
@@ -83,7 +83,7 @@ def _with_tangents(program: Program, n: int, rows: int, numbers: int, outputs, f
     return Program(*line, len(line.nodes), lambda *xs: jax.tree.leaves(function(*xs)), structs, budget)
 
 
-def _in_rows(function: Callable, q, v, p):
+def _differentiate_rows(function: Callable, q, v, p):
     """`function(q, v, p)` at the first rows, and its derivative along each of the others, in JAX."""
 
     def derivative(*direction):

@@ -48,7 +48,7 @@ from lagjax._native._constants import (
     STEP_TOO_SMALL,
 )
 from lagjax._native._derivative_handler import DerivativePlan, derivative_handler
-from lagjax._native._guards import Guards, watched
+from lagjax._native._guards import Guards, append_guards
 from lagjax._native._handler import Plan, handler, unavailable
 from lagjax._native._ir import lanes
 from lagjax._native._kernel import (
@@ -85,6 +85,7 @@ __all__ = [
     "Outcome",
     "Plan",
     "Projection",
+    "append_guards",
     "cores",
     "derivative_handler",
     "floor_of",
@@ -98,5 +99,4 @@ __all__ = [
     "recurrences",
     "require_recurrences",
     "unavailable",
-    "watched",
 ]  # fmt: skip

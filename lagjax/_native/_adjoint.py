@@ -74,7 +74,7 @@ class Adjoint:
         # All but the time and the pieces.
         moving = dtypes[: len(dtypes) - self.motion.pieces]
         self.varied = [i for i, dtype in enumerate(moving) if dtype.kind == "f" and i != states]
-        self.zeroth_order, self.tables, self.order_recursion = self._transposed(dtypes)
+        self.zeroth_order, self.tables, self.order_recursion = self._transpose_programs(dtypes)
         self.replay = Replay(self.motion)
         self.start_next = self.replay.start_next(self._begin_lane, self._take_member)
         steps = [
@@ -94,7 +94,7 @@ class Adjoint:
         self._begin()
         self.motion.finish()
 
-    def _transposed(self, dtypes):
+    def _transpose_programs(self, dtypes):
         """The transposes of the zeroth order and of the order recursion."""
         series, n = self.series, self.n
         outputs = [*range(n), *range(n + 1, n + 1 + series.values)]
@@ -177,13 +177,13 @@ class Adjoint:
         """The outputs of one lane that lie after the beginning of its step."""
         code, member, t, h = frame.code, lane["member"], lane["t"], lane["h"]
 
-        def after_begin():
+        def follows_begin():
             index = lane["output"]
             there = (member >= 0) & (index > 0)
             at = frame.time(code.select(there, member, 0), code.select(there, index, 0))
             return there & ((at - t) * h > 0.0)
 
-        with code.repeat_while(after_begin):
+        with code.repeat_while(follows_begin):
             index = lane["output"]
             s, power = frame.time(member, index) - t, code.variable(double(code, 1.0))
             row = (member * frame.job("times") + index) * self.states
@@ -295,7 +295,7 @@ class Adjoint:
             _add(frame, frame["y_ct", i, k + 1] * inverse, "y_ct", i + n, k)
         accelerations_ct = Vectors(n, lambda i: frame["y_ct", i + n, k + 1] * inverse)
         rows_ct, rows = frame.vectors("rows_ct", series.rows), Vectors(series.rows, lambda i: frame["rows", i, k])
-        inputs = self.motion.at_order(frame, k)
+        inputs = self.motion.recursion_inputs(frame, k)
         sums_ct = frame.vectors_at("sums", len(series.cauchy_products), k, by_row=True)
         out = form.run(frame, self.order_recursion, *inputs, accelerations_ct, rows_ct, rows, to=sums_ct)
         for i in form.each(code, self.states):

@@ -31,13 +31,13 @@ class Digits(NamedTuple):
     largest_unit: float
 
     @classmethod
-    def of(cls, eps: float, largest_unit: float) -> "Digits":
+    def from_rounding(cls, eps: float, largest_unit: float) -> "Digits":
         """The rounding of numbers whose unit in the last place is `eps`."""
         return cls(eps, 256 * eps, 16 * eps, largest_unit)
 
 
 # In single precision q may move by a ten-thousandth of itself in a step and still be what varies an acceleration.
-DIGITS, SINGLE_DIGITS = Digits.of(EPS, 1e-6), Digits.of(2.0**-23, 2e-2)
+DIGITS, SINGLE_DIGITS = Digits.from_rounding(EPS, 1e-6), Digits.from_rounding(2.0**-23, 2e-2)
 
 # ---- how a member ended ----------------------------------------------------------------------------------------------
 

@@ -79,7 +79,7 @@ class SweepHandler:
     def __init__(self, kind: str):
         module = ir.Module(kind)
         module.triple = ""
-        handler_function(module, _Sweep(module, KINDS[kind]).code, len(ARGUMENTS), len(RESULTS))
+        handler_function(module, _SweepCode(module, KINDS[kind]).code, len(ARGUMENTS), len(RESULTS))
         self._engine, places = compile_module(module, ("handler",))
         self.address = places["handler"]
 
@@ -90,15 +90,15 @@ _lock = threading.Lock()
 def derivative_handler(kind: str) -> SweepHandler:
     """The one of this process, of "jvp" or "vjp"."""
     with _lock:
-        return _made(kind)
+        return _make_handler(kind)
 
 
 @functools.cache
-def _made(kind: str) -> SweepHandler:
+def _make_handler(kind: str) -> SweepHandler:
     return SweepHandler(kind)
 
 
-class _Sweep:
+class _SweepCode:
     """Writes down `sweep(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
 
     def __init__(self, module: ir.Module, kind: Kind):
@@ -108,26 +108,26 @@ class _Sweep:
         self.data = dict(zip((*ARGUMENTS, *RESULTS), pointers, strict=True))
         self.strides = dict(
             ts_stride=self.code.select(rows_of_ts > 1, self.times, 0),
-            params_stride=self.code.select(rows_of_params > 1, self.of_plan("numbers"), 0),
+            params_stride=self.code.select(rows_of_params > 1, self.read_plan("numbers"), 0),
         )
         self._carve()
         self._write()
         self.code.finish()
 
-    def of_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
+    def read_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
         """A field of the plan."""
         return load_at(self.plan, getattr(DerivativePlan, name).offset, kind)
 
     def _carve(self) -> None:
         """Give every array of the scratch its place: the memories of both kernels first, on cache lines, of zeros."""
-        code, members, states = self.code, self.members, self.of_plan("states")
+        code, members, states = self.code, self.members, self.read_plan("states")
         address = Value(code, code.builder.ptrtoint(self.data["scratch"].it, INTEGER))
         mask = ir.Constant(INTEGER, 8 * CACHE_LINE - 1)
         end = code.element(self.data["scratch"], Value(code, code.builder.and_((0 - address).it, mask)) / 8)
-        rows = self.of_plan("room") * (states + RECORDED)
+        rows = self.read_plan("room") * (states + RECORDED)
         sizes = {
-            **{name: self.of_plan(name) for name in ("memory", "memory_of_sweep")},
-            **{name: self.of_plan(name) for name in ("lane_integers", "lane_integers_of_sweep")},
+            **{name: self.read_plan(name) for name in ("memory", "memory_of_sweep")},
+            **{name: self.read_plan(name) for name in ("lane_integers", "lane_integers_of_sweep")},
             "counters": code.as_value(_COUNTERS, INTEGER),
             **dict.fromkeys(("first_step", "counts"), members),
             "path": members * self.times * states,
@@ -161,14 +161,14 @@ class _Sweep:
         code, data, place = self.code, self.data, self.at
         fields = {name: data[name] for name in ("ts", "y0", "params")} | self.strides
         fields |= {name: place[name] for name in ("path", "y_end", "t_end", "code", "steps", "rejected")}
-        fields |= {name: self.of_plan(name) for name in ("order", "max_steps", "room")}
-        fields |= {name: self.of_plan(name, DOUBLE) for name in ("rtol", "atol")}
+        fields |= {name: self.read_plan(name) for name in ("order", "max_steps", "room")}
+        fields |= {name: self.read_plan(name, DOUBLE) for name in ("rtol", "atol")}
         fields |= dict(members=self.members, times=self.times, record=place["rows"])
         fields |= dict(next_member=self._counter(0), next_row=self._counter(1))
         job = job_of(code, _integrator.JOB, fields)
         given = job, place["memory"], place["lane_integers"]
-        call(code, self.of_plan("begin"), ir.VoidType(), *given)
-        more = call(code, self.of_plan("run"), INTEGER, *given, self._counter(2), self.of_plan("rounds"))
+        call(code, self.read_plan("begin"), ir.VoidType(), *given)
+        more = call(code, self.read_plan("run"), INTEGER, *given, self._counter(2), self.read_plan("rounds"))
         well = code.variable(code.select(code.compare("==", more, 0), code.as_value(1, INTEGER), 0))
         with code.only_if(well.value > 0), code.loop(self.members) as i:
             ended = code.load(code.element(place["code"], i), DOUBLE)
@@ -178,7 +178,7 @@ class _Sweep:
 
     def _order(self) -> None:
         """The rows of the steps, member by member."""
-        code, place, width = self.code, self.at, self.of_plan("states") + RECORDED
+        code, place, width = self.code, self.at, self.read_plan("states") + RECORDED
         first = code.variable(code.as_value(0, INTEGER))
         with code.loop(self.members) as i:
             count = code.as_integer(code.load(code.element(place["steps"], i), DOUBLE))
@@ -196,9 +196,9 @@ class _Sweep:
 
     def _begin_results(self) -> None:
         code, data, members = self.code, self.data, self.members
-        with code.loop(members * self.of_plan("directions") * self.of_plan("states")) as i:
+        with code.loop(members * self.read_plan("directions") * self.read_plan("states")) as i:
             code.store(code.load(code.element(data["start"], i), DOUBLE), code.element(data["first"], i))
-        with code.loop(members * self.of_plan("others")) as i:
+        with code.loop(members * self.read_plan("others")) as i:
             code.store(code.as_value(self.kind.begin, DOUBLE), code.element(data["second"], i))
         with code.loop(members) as i:
             code.store(code.as_value(0.0, DOUBLE), code.element(data["excess"], i))
@@ -209,11 +209,11 @@ class _Sweep:
         fields = {name: data[name] for name in ("ts", "params", "excess")} | self.strides
         fields |= {kind.argument: data["argument"], kind.first: data["first"], kind.second: data["second"]}
         fields |= dict(record=place["record"], first_step=place["first_step"], steps=place["counts"])
-        fields |= dict(members=self.members, times=self.times, order=self.of_plan("order"))
-        fields |= dict(directions=self.of_plan("directions"), floor=self.of_plan("floor", DOUBLE))
+        fields |= dict(members=self.members, times=self.times, order=self.read_plan("order"))
+        fields |= dict(directions=self.read_plan("directions"), floor=self.read_plan("floor", DOUBLE))
         fields |= dict(next_member=self._counter(3))
         job = job_of(code, kind.job, fields)
         given = job, place["memory_of_sweep"], place["lane_integers_of_sweep"]
-        call(code, self.of_plan("begin_sweep"), ir.VoidType(), *given)
-        rounds = self.of_plan("room") + self.members  # a step a round, and more where a lane takes a member
-        return call(code, self.of_plan("run_sweep"), INTEGER, *given, rounds)
+        call(code, self.read_plan("begin_sweep"), ir.VoidType(), *given)
+        rounds = self.read_plan("room") + self.members  # a step a round, and more where a lane takes a member
+        return call(code, self.read_plan("run_sweep"), INTEGER, *given, rounds)

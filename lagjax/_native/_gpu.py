@@ -104,7 +104,7 @@ def one_lane(motion: TaylorSeries) -> OneLane:
     require_room(motion.layout.size)
     if motion.look_up.numbers is not None:
         raise Unlowerable("its tables of numbers (samples, jnp.interp, …) are not brought to a GPU; make them params")
-    return OneLane.of(motion)
+    return OneLane.from_motion(motion)
 
 
 def motion_for_gpus(lane: OneLane, form: GpuForm) -> str:
@@ -131,11 +131,11 @@ def transpose_for_gpus(lane: OneLane, back: OneLane, form: GpuForm) -> str:
 def _assembly(entry: str, parts: Sequence[tuple[str, GpuForm]]) -> str:
     """The PTX of an entry, linked with the modules that it calls."""
     machine, external = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3), set()
-    texts = [_with_unrolled_loops(text) if form.unrolled else text for text, form in parts]
+    texts = [_unroll_loops(text) if form.unrolled else text for text, form in parts]
     for text in texts:
         external |= {*re.findall(r'^declare (?:double|float) @"?(\w+)"?\(', text, re.MULTILINE)}
     external -= {*_FAR_ANGLES, "llvm"}
-    modules = [_parsed(text, external, machine) for text in (entry, *map(_without_far_angles, texts))]
+    modules = [_parse_module(text, external, machine) for text in (entry, *map(_refuse_far_angles, texts))]
     if external:
         if (library := libdevice()) is None:
             raise Unlowerable(
@@ -151,10 +151,10 @@ def _assembly(entry: str, parts: Sequence[tuple[str, GpuForm]]) -> str:
         if not function.is_declaration and function.name != "integrate":
             function.linkage = "internal"  # else all of the library stays
     whole.verify()
-    return machine.emit_assembly(_optimised(whole, machine))
+    return machine.emit_assembly(_optimise(whole, machine))
 
 
-def _parsed(text: str, external: Iterable[str], machine: llvm.TargetMachine) -> llvm.ModuleRef:
+def _parse_module(text: str, external: Iterable[str], machine: llvm.TargetMachine) -> llvm.ModuleRef:
     """The module of a text for the machine; its `external` functions are those of libdevice."""
     text = text.replace('target triple = ""', f'target triple = "{machine.triple}"')
     text = text.replace('target datalayout = ""', f'target datalayout = "{machine.target_data}"')
@@ -163,7 +163,7 @@ def _parsed(text: str, external: Iterable[str], machine: llvm.TargetMachine) -> 
     return llvm.parse_assembly(text)
 
 
-def _without_far_angles(text: str) -> str:
+def _refuse_far_angles(text: str) -> str:
     """The text of a module in which the sine of an angle beyond 2**20 is NaN.
 
     A step to there is refused, so that the motion ends and says so. libdevice has such sines, with a reduction that
@@ -175,7 +175,7 @@ def _without_far_angles(text: str) -> str:
     return text
 
 
-def _with_unrolled_loops(text: str) -> str:
+def _unroll_loops(text: str) -> str:
     """The text of a module in which the branches that close its counted loops ask for these to be unrolled."""
     entered, lines = set(), []
     for line in text.splitlines():
@@ -188,7 +188,7 @@ def _with_unrolled_loops(text: str) -> str:
     return "\n".join([*lines, "!0 = distinct !{!0, !1}", '!1 = !{!"llvm.loop.unroll.full"}', ""])
 
 
-def _optimised(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> llvm.ModuleRef:
+def _optimise(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> llvm.ModuleRef:
     """The module with its functions in one another, and its loops as they are but for those that ask to be unrolled."""
     for function in module.functions:
         if not function.is_declaration and function.name != "integrate":

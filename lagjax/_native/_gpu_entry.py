@@ -86,7 +86,7 @@ class OneLane(NamedTuple):
     single: bool = False
 
     @classmethod
-    def of(cls, motion: TaylorSeries) -> "OneLane":
+    def from_motion(cls, motion: TaylorSeries) -> "OneLane":
         """The module of an integrator or of an adjoint, whose motion is finished."""
         states, text = motion.states, str(motion.module)
         row, series = states + RECORDED + motion.recorded_pieces, states + motion.series.rows
@@ -215,23 +215,23 @@ class _Transpose(_Thread):
         """The results of a member."""
         code, number = self.code, self.number
 
-        def of_member(name: str, stride: Value | int) -> Value:
+        def member_address(name: str, stride: Value | int) -> Value:
             return code.element(self.at[name], member * stride)
 
-        ts, params = of_member("ts", number("ts_stride")), of_member("params", number("params_stride"))
-        y_ct, params_ct = of_member("y_ct", self.states), of_member("params_ct", self.numbers)
-        self._follow(ts, of_member("y0", self.states), params)
+        ts, params = member_address("ts", number("ts_stride")), member_address("params", number("params_stride"))
+        y_ct, params_ct = member_address("y_ct", self.states), member_address("params_ct", self.numbers)
+        self._follow(ts, member_address("y0", self.states), params)
         with code.loop(self.whole(self.states)) as i:
-            code.store(code.load(code.element(of_member("end_ct", self.states), i), DOUBLE), code.element(y_ct, i))
+            code.store(code.load(code.element(member_address("end_ct", self.states), i), DOUBLE), code.element(y_ct, i))
         with code.loop(self.whole(self.numbers)) as i:
             code.store(code.as_value(0.0, DOUBLE), code.element(params_ct, i))
-        code.store(code.as_value(0.0, DOUBLE), of_member("excess", 1))
+        code.store(code.as_value(0.0, DOUBLE), member_address("excess", 1))
         fits = code.load(self.own["next_row"], INTEGER) <= number("room")
-        code.store(code.flag(fits), of_member("done", 1))
+        code.store(code.flag(fits), member_address("done", 1))
         with code.only_if(fits):
-            path_ct = of_member("path_ct", number("times") * self.states)
+            path_ct = member_address("path_ct", number("times") * self.states)
             self._go_back(ts=ts, params=params, path_ct=path_ct, y_ct=y_ct, params_ct=params_ct,
-                          excess=of_member("excess", 1))  # fmt: skip
+                          excess=member_address("excess", 1))  # fmt: skip
 
     def _follow(self, ts: Value, y0: Value, params: Value) -> None:
         """The motion from the first output time to the last one, with its steps written down."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from lagjax._native._lanes import INTEGERS
 from lagjax._program._borders import Borders, borders, with_outputs
 from lagjax._program._graph import Unlowerable
-from lagjax._program._memory import without_collections
+from lagjax._program._memory import pause_collections
 from lagjax._program._series import Recurrent, Series, StraightLine, series
 
 
@@ -43,21 +43,21 @@ class Watched(NamedTuple):
 
 
 @functools.lru_cache(maxsize=32)
-def watched(program: Recurrent, size: int, values: Recurrent, slides: bool) -> Watched:
+def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool) -> Watched:
     """A program of q̈ with guards behind it. Raises `Unlowerable` where one of them has no series."""
-    with without_collections():
+    with pause_collections():
         count = len(values.line.outputs)
         whole = with_outputs(program, values.line, 2 * size + 1)
         require_lanes(whole.line)
         try:
             if (found := borders(whole, size, slides, count)) is not None:
-                return Watched(found.program, _followed(found.program, size, found.followed, count), found)
+                return Watched(found.program, _series_of_guards(found.program, size, found.followed, count), found)
         except Unlowerable:  # a switching number without a series, or more operations than that takes
             pass
-        return Watched(whole, _followed(whole, size, (), count), None)
+        return Watched(whole, _series_of_guards(whole, size, (), count), None)
 
 
-def along_pieces(found: Borders, size: int) -> tuple[Recurrent, Series]:
+def drop_guards(found: Borders, size: int) -> tuple[Recurrent, Series]:
     """The program along the pieces that were found, without the guards, and its series: for derivatives over steps."""
     line = found.program.line
     program = found.program._replace(line=line._replace(outputs=line.outputs[: size + 1]))
@@ -71,6 +71,6 @@ def require_lanes(line: StraightLine) -> None:
             raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")
 
 
-def _followed(program: Recurrent, size: int, nodes: tuple[int, ...], count: int) -> Series:
+def _series_of_guards(program: Recurrent, size: int, nodes: tuple[int, ...], count: int) -> Series:
     guards = program.line.outputs[len(program.line.outputs) - count :]
     return series(program, size, moving=2 * size + 1, followed=(*nodes, *guards))

@@ -108,11 +108,11 @@ class Rest(NamedTuple):
         return layout.size + CACHE_LINE + _INTEGERS
 
     @classmethod
-    def of(cls, array: np.ndarray, layout: Memory) -> "Rest":
+    def from_array(cls, array: np.ndarray, layout: Memory) -> "Rest":
         """A copy of the rest that a handler wrote."""
         integers = array[-_INTEGERS:].view(np.int64).copy()
         lanes, (skipped, *_) = np.split(integers, [-_OTHERS])
-        memory = aligned(layout.size)
+        memory = allocate_aligned(layout.size)
         memory[: layout.size] = array[skipped : skipped + layout.size]
         return cls(memory, lanes, integers[-3:-2], integers[-2:-1])
 
@@ -131,7 +131,7 @@ _OTHERS = 4  # integers after those of the lanes
 _INTEGERS = len(LANE) * lanes() + _OTHERS  # also where a kernel has fewer lanes
 
 
-def aligned(size: int) -> np.ndarray:
+def allocate_aligned(size: int) -> np.ndarray:
     """Zeros on the boundary of a cache line, which vectors need."""
     memory = np.zeros(size + CACHE_LINE)
     return memory[(-memory.ctypes.data // 8) % CACHE_LINE :]
@@ -155,7 +155,7 @@ class Handler:
     def __init__(self):
         module = ir.Module("handler")
         module.triple = ""
-        handler_function(module, _Run(module).code, len(ARGUMENTS), len(RESULTS))
+        handler_function(module, _RunCode(module).code, len(ARGUMENTS), len(RESULTS))
         self._engine, places = compile_module(module, ("handler", "begin_run"))
         self.address, pointers = places["handler"], 1 + len(ARGUMENTS) + len(RESULTS)
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_int64] * 4)
@@ -168,11 +168,11 @@ _lock = threading.Lock()
 def handler() -> Handler:
     """The one of this process."""
     with _lock:
-        return _made()
+        return _make_handler()
 
 
 @functools.cache
-def _made() -> Handler:
+def _make_handler() -> Handler:
     return Handler()
 
 
@@ -226,7 +226,7 @@ def element(array: Value, index: int) -> Value:
 # ---- the run ---------------------------------------------------------------------------------------------------------
 
 
-class _Run:
+class _RunCode:
     """Writes down `begin_run(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
 
     def __init__(self, module: ir.Module):
@@ -238,28 +238,28 @@ class _Run:
         self.code.finish()
 
     def _run(self, data: dict[str, Value], members: Value, times: Value, rows_of_ts: Value, rows_of_params: Value):
-        code, of_plan = self.code, self._of_plan
-        states, numbers = of_plan("states"), of_plan("numbers")
+        code, read_plan = self.code, self._read_plan
+        states, numbers = read_plan("states"), read_plan("numbers")
         with code.loop(members * times * states) as i:
             code.store(code.as_value(float("nan"), DOUBLE), code.element(data["path"], i))
         memory, integers = self._rest(data.pop("rest"))
         idle, next_member, more = (code.element(integers, _INTEGERS - _OTHERS + i, INTEGER) for i in (1, 2, 3))
         fields: dict[str, Any] = dict(data)
-        fields |= {name: of_plan(name) for name in ("order", "max_steps")}
-        fields |= {name: of_plan(name, DOUBLE) for name in ("rtol", "atol")}
+        fields |= {name: read_plan(name) for name in ("order", "max_steps")}
+        fields |= {name: read_plan(name, DOUBLE) for name in ("rtol", "atol")}
         fields |= dict(members=members, times=times, next_member=next_member)
         fields |= dict(ts_stride=code.select(rows_of_ts > 1, times, 0))
         fields |= dict(params_stride=code.select(rows_of_params > 1, numbers, 0))
         job = job_of(code, JOB, fields)
-        call(code, of_plan("begin"), ir.VoidType(), job, memory, integers)
-        code.store(call(code, of_plan("run"), INTEGER, job, memory, integers, idle, of_plan("rounds")), more)
+        call(code, read_plan("begin"), ir.VoidType(), job, memory, integers)
+        code.store(call(code, read_plan("run"), INTEGER, job, memory, integers, idle, read_plan("rounds")), more)
 
-    def _of_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
+    def _read_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
         return load_at(self.plan, getattr(Plan, name).offset, kind)
 
     def _rest(self, rest: Value) -> tuple[Value, Value]:
         """The memory of the thread, of zeros and on the boundary of a cache line, and the integers, of zeros."""
-        code, size_of_memory = self.code, self._of_plan("memory")
+        code, size_of_memory = self.code, self._read_plan("memory")
         address = Value(code, code.builder.ptrtoint(rest.it, INTEGER))
         bytes_left = Value(code, code.builder.and_((0 - address).it, ir.Constant(INTEGER, 8 * CACHE_LINE - 1)))
         skipped = bytes_left / 8

@@ -225,7 +225,7 @@ class Code:
         """A Python number, or a value, in the type `like`; a scalar becomes a vector of equal lanes."""
         if not isinstance(x, Value):
             return Value(self, self._constant(x, like))
-        x = self._rounded(x, element_of(like))
+        x = self._round(x, element_of(like))
         if isinstance(like, ir.VectorType) and not isinstance(x.it.type, ir.VectorType):
             undefined, begin, zeros = _splat(x.it.type, self.lanes)
             first = self.builder.insert_element(undefined, x.it, begin)
@@ -238,7 +238,7 @@ class Code:
             return ir.Constant(like, [ir.Constant(like.element, scalar(x))] * like.count)
         return ir.Constant(like, int(x) if isinstance(like, ir.IntType) else float(x))
 
-    def _rounded(self, x: Value, number: ir.Type) -> Value:
+    def _round(self, x: Value, number: ir.Type) -> Value:
         """Floating-point numbers in another precision; others as they are."""
         kind, before = x.it.type, element_of(x.it.type)
         if before == number or not {before, number} <= {DOUBLE, FLOAT}:

@@ -23,12 +23,12 @@ from lagjax._native._constants import (
 from lagjax._native._derivative_handler import DerivativePlan
 from lagjax._native._frame import LANE, Memory
 from lagjax._native._guards import Guards
-from lagjax._native._handler import Plan, Rest, aligned, handler
+from lagjax._native._handler import Plan, Rest, allocate_aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import DOUBLE, FLOAT, compile_module, lanes
 from lagjax._native._output import RECORDED
 from lagjax._native._packs import forget_stages
-from lagjax._native._parts import MotionParts, Projection, parameters_chosen
+from lagjax._native._parts import MotionParts, Projection, choose_parameters
 from lagjax._native._schedule import forget_joined
 from lagjax._native._single_member import fills_lanes
 from lagjax._native._table_reads import SET_NUMBERS
@@ -37,7 +37,7 @@ from lagjax._native._taylor import TaylorSeries, is_large, order_for, size_of_se
 from lagjax._native._threads import SLICE, run_in_slices, run_on_threads
 from lagjax._program._borders import Borders
 from lagjax._program._jump import Nesting
-from lagjax._program._memory import without_collections
+from lagjax._program._memory import pause_collections
 from lagjax._program._series import Recurrent
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
@@ -117,33 +117,33 @@ class Kernel:
             program=program, size=size, projection=projection, guards=guards, error_groups=error_groups,
             nesting=nesting, motion=motion,
         )  # fmt: skip
-        program, projection, self._guards, motion, chosen = parameters_chosen(
+        program, projection, self._guards, motion, chosen = choose_parameters(
             program, projection, guards, motion, nesting
         )
-        self._smooth = MotionParts.of_smooth(program, size, projection, chosen)
-        self._parts = self._smooth.of_run(nesting, self._guards, motion)
+        self._smooth = MotionParts.from_program(program, size, projection, chosen)
+        self._parts = self._smooth.append_guards(nesting, self._guards, motion)
         self._error_groups = error_groups
         self.width = lanes() if width is None else width
-        self._tangents = functools.cache(self._tangents_of)
-        self.for_gpus = functools.cache(self._for_gpus)
+        self._tangents = functools.cache(self._compile_tangents)
+        self.for_gpus = functools.cache(self._gpu_programs)
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
-    def for_members(self, members: int) -> "Kernel":
+    def select_width(self, members: int) -> "Kernel":
         """The kernel for this many members: for one alone without lanes, which would be idle."""
-        return self._alone if members == 1 < self.width else self
+        return self._single_member_kernel if members == 1 < self.width else self
 
-    def to_run(self, members: int) -> "Kernel":
+    def select_kernel(self, members: int) -> "Kernel":
         """The kernel that integrates this many members: one after the other where lanes would not fit in a cache."""
-        return self.for_members(1 if self._one_by_one else members)
+        return self.select_width(1 if self._runs_singles else members)
 
     @functools.cached_property
-    def _one_by_one(self) -> bool:
+    def _runs_singles(self) -> bool:
         series = self._parts.series
         shared = series.rows * MAX_ORDER * self.width * 8 <= LARGEST_SHARED
         return is_large(self._parts.program) and not shared and fills_lanes(series)
 
     @functools.cached_property
-    def _alone(self) -> "Kernel":
+    def _single_member_kernel(self) -> "Kernel":
         return Kernel(**self._given, width=1)
 
     @property
@@ -152,19 +152,19 @@ class Kernel:
         return self._parts.borders
 
     def _integrator(self, number: ir.Type = DOUBLE) -> Integrator:
-        with without_collections():
+        with pause_collections():
             integrator = Integrator(self._parts, self._guards, self._error_groups, width=self.width, number=number)
         forget_joined()
         forget_stages()
         return integrator
 
-    def _for_gpus(self, single: bool) -> "_gpu.GpuPrograms":
+    def _gpu_programs(self, single: bool) -> "_gpu.GpuPrograms":
         """The programs for GPUs; those in `single` precision of a kernel that `allows_singles`."""
         number = FLOAT if single else DOUBLE
 
         def motion() -> TaylorSeries:
             _gpu.require_room(size_of_series(self._parts.series))  # before what is larger than that is written down
-            return self.for_members(1)._integrator(number).motion
+            return self.select_width(1)._integrator(number).motion
 
         return _gpu.GpuPrograms(motion, lambda: self._adjoint(width=1, number=number).motion)
 
@@ -217,7 +217,7 @@ class Kernel:
         if begun is not None:
             begun = Begun(*(np.array(x, np.float64) for x in begun))
         elif room == 0 and self.threads(members) == 1 and not self._notes:
-            begun = self._begun(ts, y0, params, self.plan(rtol, atol, max_steps))
+            begun = self._begin_run(ts, y0, params, self.plan(rtol, atol, max_steps))
         if begun is None:
             shape = (times, self.states)
             if self._notes and (guards := self._guards) is not None:
@@ -228,7 +228,7 @@ class Kernel:
             path, y_end, t_end, code, steps, rejected, rest = begun
             if not Rest.more(rest):
                 return _outcome(path, y_end, t_end, code, steps, rejected, Rest.idle_lanes(rest))
-        rest = None if begun is None else Rest.of(begun.rest, self._forward.layout)
+        rest = None if begun is None else Rest.from_array(begun.rest, self._forward.layout)
         table, rows = None, np.zeros(1, np.int64)
         if room:  # the system provides pages when they are written to
             table = np.empty((room, self.states + RECORDED + self._forward.more))
@@ -245,7 +245,7 @@ class Kernel:
         table = None if table is None else table[: rows[0]]
         return _outcome(path, y_end, t_end, code, steps, rejected, idle, table)
 
-    def _begun(self, ts, y0, params, plan: Plan) -> Begun:
+    def _begin_run(self, ts, y0, params, plan: Plan) -> Begun:
         """Run few members for a slice of time, by one call of machine code."""
         members, times, states = len(y0), ts.shape[1], self.states
         block, ends = np.empty(members * (times * states + states + 4) + self.rest_size), [0]
@@ -283,7 +283,7 @@ class Kernel:
 
     def _transpose_kernel(self, members: int) -> "tuple[_Compiled, int]":
         """The transpose for this many members, and on how many threads."""
-        kernel = self.for_members(1 if members < self.width / 2 else members)  # few are as fast one after the other
+        kernel = self.select_width(1 if members < self.width / 2 else members)  # few are as fast one after the other
         # A vector of members is as much work as the motions of several, and worth a thread the sooner.
         return kernel._backward, min(kernel.threads(members * MOTIONS_PER_ADJOINT), -(-members // kernel.width))
 
@@ -319,13 +319,13 @@ class Kernel:
         """The tangents of this many members along this many directions, and on how many threads."""
         if directions > 1 and members < self.width / 2:
             return self._tangents(True), min(cores(), members)
-        kernel = self.for_members(members)
+        kernel = self.select_width(members)
         # A vector of members is as much work as there are directions, and worth a thread the sooner.
         return kernel._tangents(False), min(kernel.threads(members * directions), -(-members // kernel.width))
 
-    def _tangents_of(self, side_by_side: bool) -> "_Compiled":
+    def _compile_tangents(self, side_by_side: bool) -> "_Compiled":
         """The kernel of tangents, whose directions stand side by side or members do; compiled on first use."""
-        with without_collections():
+        with pause_collections():
             tangent = Tangent(self._derivative_parts, width=1 if side_by_side else self.width, lanes=self.width)
         forget_joined()
         forget_stages()
@@ -352,7 +352,7 @@ class Kernel:
         self, kind: str, members: int, times: int, directions: int, rtol: float, atol: float, max_steps: int
     ) -> DerivativePlan:
         """The plan of derivatives of this many members; it lives as long as this kernel."""
-        motion = self.for_members(members)._forward
+        motion = self.select_width(members)._forward
         sweep, _ = self._tangent_kernel(members, directions) if kind == "jvp" else self._transpose_kernel(members)
         rounds, others = self.rounds_of_sweep, self.numbers if kind == "vjp" else directions * times * self.states
         sizes = (size for of in (motion, sweep) for size in (of.layout.size, len(LANE) * of.layout.width))
@@ -368,7 +368,7 @@ class Kernel:
         """The parts of derivatives over steps that have been taken: features do not matter to these."""
         if not self._parts.pieces:
             return self._smooth
-        return self._parts if self._guards is None else self._parts.without_guards
+        return self._parts if self._guards is None else self._parts.drop_guards
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
@@ -377,7 +377,7 @@ class Kernel:
         return _Compiled(adjoint.motion, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
 
     def _adjoint(self, width: int, number: ir.Type = DOUBLE) -> Adjoint:
-        with without_collections():
+        with pause_collections():
             adjoint = Adjoint(self._derivative_parts, width=width, number=number)
         forget_joined()
         forget_stages()
@@ -422,7 +422,7 @@ class _Compiled:
 
         def work(stopped, _arrays=arrays) -> int:  # whose memory must live as long as somebody works on it
             if rest is None:
-                memory = aligned(self.layout.size)
+                memory = allocate_aligned(self.layout.size)
                 integers, idle = np.zeros(len(LANE) * self.layout.width, np.int64), np.zeros(1, np.int64)
             else:
                 memory, integers, idle, _ = rest

@@ -141,7 +141,7 @@ def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str],
     if op == "convert":
         return _convert(code, xs[0], kinds[0], kind)
     if kind not in ("float", "bool"):
-        return _of_integers(code, op, xs, kind)
+        return _apply_to_integers(code, op, xs, kind)
     how = OPERATIONS[op].llvm
     if how is None:
         raise Unlowerable(f"`{op}` has no machine code here")
@@ -157,7 +157,7 @@ def _convert(code, x, before, after):
         return code.compare("!=", x, 0.0)
     if after == "float":
         return x
-    return _in_range(code, code.intrinsic("trunc", x) if before == "float" else x, after)
+    return _check_range(code, code.intrinsic("trunc", x) if before == "float" else x, after)
 
 
 # What is done with integers, which are whole doubles. Where the result is not listed it may leave their range.
@@ -171,15 +171,15 @@ INTEGERS = {
 }
 
 
-def _of_integers(code: Code, op: str, xs: list[Value], kind: str) -> Value:
+def _apply_to_integers(code: Code, op: str, xs: list[Value], kind: str) -> Value:
     """An operation whose result is an integer: NaN, and not another number, where that leaves the range of its type."""
     how = INTEGERS.get(op)
     if how is None:
         raise Unlowerable(f"`{op}` of integers has no machine code here")
-    return _in_range(code, code.library(how, *xs) if isinstance(how, str) else how(code, *xs), kind)
+    return _check_range(code, code.library(how, *xs) if isinstance(how, str) else how(code, *xs), kind)
 
 
-def _in_range(code: Code, x: Value, kind: str) -> Value:
+def _check_range(code: Code, x: Value, kind: str) -> Value:
     """An integer, or NaN where its type does not hold it, or no double holds it exactly."""
     limits = np.iinfo(kind)
     low, high = max(int(limits.min), -(2**53)), min(int(limits.max), 2**53)
@@ -224,7 +224,7 @@ def _polynomials(code: Code, x: Value) -> tuple[Value, Value]:
     half = 0.5 * z
     one_less = 1.0 - half
     cosine = one_less + (((1.0 - one_less) - half) + (z * z * _horner(z, COS) - r * tail))
-    return _turned(code, k, sine, cosine)
+    return _rotate_quarters(code, k, sine, cosine)
 
 
 def _short_polynomials(code: Code, x: Value) -> tuple[Value, Value]:
@@ -232,10 +232,10 @@ def _short_polynomials(code: Code, x: Value) -> tuple[Value, Value]:
     k = code.intrinsic("rint", x * (1 / PI_2_ROUNDED[0]))
     r, k = code.lanes_of((x - k * PI_2[0]) - k * PI_2[1]), code.lanes_of(k)
     z = r * r
-    return _turned(code, k, r + r * z * _horner(z, SIN[:4]), 1.0 - (0.5 * z - z * z * _horner(z, COS[:4])))
+    return _rotate_quarters(code, k, r + r * z * _horner(z, SIN[:4]), 1.0 - (0.5 * z - z * z * _horner(z, COS[:4])))
 
 
-def _turned(code: Code, k: Value, sine: Value, cosine: Value) -> tuple[Value, Value]:
+def _rotate_quarters(code: Code, k: Value, sine: Value, cosine: Value) -> tuple[Value, Value]:
     """Sine and cosine of an angle that is k quarters of a turn larger."""
     quadrant = k - 4.0 * code.intrinsic("floor", 0.25 * k)  # 0, 1, 2, 3
     odd = code.compare("==", quadrant, 1.0) | code.compare("==", quadrant, 3.0)

@@ -56,7 +56,7 @@ def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
     made = make()
     with contextlib.suppress(OSError):
         _write(file, made)
-        _bound(place)
+        _remove_oldest(place)
     return made
 
 
@@ -88,7 +88,7 @@ def _write(file: Path, body: bytes) -> None:
         raise
 
 
-def _bound(place: Path) -> None:
+def _remove_oldest(place: Path) -> None:
     """Remove the files that were not used for longest where all together are too large."""
     files = []
     for file in place.iterdir():

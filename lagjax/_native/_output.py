@@ -70,7 +70,7 @@ class Output:
             for i in form.each(frame.code, states):
                 frame["between", i] = values[i]
             return
-        projected, off = self.projector.projected(frame, values, increments, s)
+        projected, off = self.projector.project_state(frame, values, increments, s)
         for i in form.each(frame.code, states):
             frame["between", i] = frame.code.select(off <= 1.0, projected[i], values[i])
 

@@ -36,7 +36,7 @@ from lagjax._program._series import StraightLine
 _COPY, _STORE = (OperationKind(op, None, ("float",), "float", (None,)) for op in ("copy", "store"))
 
 
-class _Program(NamedTuple):
+class _StoredProgram(NamedTuple):
     """A program with the kinds of its operations, in stages; its last outputs, this many, are stored somewhere else."""
 
     line: StraightLine
@@ -54,7 +54,7 @@ class Packed(Tables):
     def __init__(self, function, wide, sincos: Code, lanes: int):
         self.lanes = lanes
         self._numbers: dict[tuple[OperationKind, tuple[int, ...]], int] = {}
-        self._programs: dict[int, _Program] = {}  # by the program, which lives as long
+        self._programs: dict[int, _StoredProgram] = {}  # by the program, which lives as long
         self._arranged: dict[tuple, tuple[Arranged, str]] = {}
         super().__init__(function, sincos, wide)
 
@@ -133,7 +133,7 @@ class Packed(Tables):
 
     def _program(self, line: StraightLine, stored: int) -> list[Stage]:
         if id(line) not in self._programs:
-            self._programs[id(line)] = _Program(line, *program_stages(Same(line)), stored)
+            self._programs[id(line)] = _StoredProgram(line, *program_stages(Same(line)), stored)
         return self._programs[id(line)].stages
 
     # ---- the table of a program ----

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._native._constants import LEAST_FILLED, LEAST_RUN, LONG_RUN, OFTEN_PACKED
-from lagjax._native._schedule import OperationKind, Same, ScheduledOperation, joined
+from lagjax._native._schedule import OperationKind, Same, ScheduledOperation, join_operations
 from lagjax._program._series import StraightLine
 
 # How an operand of a run lies in memory: consecutive numbers, one number, or anywhere.
@@ -75,7 +75,7 @@ def stages(operations: Sequence[ScheduledOperation], nodes: int, kept: Sequence[
 @functools.lru_cache(maxsize=4)  # used where the form of a motion is chosen, and where it is compiled
 def program_stages(same: Same) -> tuple[list[OperationKind], list[Stage]]:
     """A program in stages, and the kinds of their operations."""
-    kinds, operations = joined(same.line)
+    kinds, operations = join_operations(same.line)
     return kinds, stages(operations, len(same.line.nodes), same.line.outputs)
 
 
@@ -182,7 +182,7 @@ def product_runs(at: np.ndarray, kind: int) -> Iterator[tuple[Run, np.ndarray]]:
     """N products of rows `at` (2, N), or squares (1, N), in runs as long as they come, and the products of each."""
     left, searching = np.arange(at.shape[1]), True
     while left.size:
-        orders = _in_orders(at[:, left], kind)
+        orders = _order_runs(at[:, left], kind)
         some = min(orders, key=lambda some: sum(run.count for run, _ in some if not _is_long(run)))
         later = [left[members] for run, members in some if searching and not _is_long(run)]
         yield from ((run, left[members]) for run, members in some if not searching or _is_long(run))
@@ -194,7 +194,7 @@ def _is_long(run: Run) -> bool:
     return ANYWHERE not in run.modes and run.count >= LONG_RUN
 
 
-def _in_orders(at: np.ndarray, kind: int) -> Iterator[list[tuple[Run, np.ndarray]]]:
+def _order_runs(at: np.ndarray, kind: int) -> Iterator[list[tuple[Run, np.ndarray]]]:
     """The runs of products in several orders: by one row and then the other, and by their distance."""
     for keys in [at[::-1], at, np.array([at[0], at[1] - at[0]])] if len(at) == 2 else [at]:
         order = np.lexsort(keys)
@@ -267,10 +267,10 @@ def limit_modes(runs: list[Run], width: int) -> list[Run]:
     for run in runs:
         key = run.kind, run.modes
         counts[key] = counts.get(key, 0) - (-run.count // width)
-    return [run if counts[run.kind, run.modes] >= OFTEN_PACKED else _anywhere(run) for run in runs]
+    return [run if counts[run.kind, run.modes] >= OFTEN_PACKED else _scatter_run(run) for run in runs]
 
 
-def _anywhere(run: Run) -> Run:
+def _scatter_run(run: Run) -> Run:
     lanes = np.arange(run.count)
     operands = tuple(
         x if mode == ANYWHERE else x + lanes if mode == SIDE_BY_SIDE else np.full(run.count, x)

@@ -4,12 +4,12 @@ import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from lagjax._native._guards import Guards, along_pieces, require_lanes, watched
+from lagjax._native._guards import Guards, append_guards, drop_guards, require_lanes
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
 from lagjax._program._jump import Jump, Nesting, jump_at_border, with_borders_of_tangents
 from lagjax._program._look_ups import BESIDE, shifted
-from lagjax._program._memory import without_collections
+from lagjax._program._memory import pause_collections
 from lagjax._program._operations import LOOK_UPS
 from lagjax._program._series import Recurrent, Series, StraightLine, series
 
@@ -79,20 +79,20 @@ class MotionParts(NamedTuple):
         return jump_at_border(self.borders.motion or self.borders, *nesting, self.numbers_of_motion, over_steps)
 
     @classmethod
-    def of_smooth(
+    def from_program(
         cls, program: Recurrent, size: int, projection: Projection | None = None, chosen: Chosen | None = None
     ) -> "MotionParts":
         """The parts of a motion over this many coordinates without borders, or whose borders do not matter."""
         return cls(program, recurrences(program, size), Nesting(size), projection, chosen=chosen)
 
-    def of_run(self, nesting: Nesting, guards: Guards | None, motion: Recurrent | None) -> "MotionParts":
+    def append_guards(self, nesting: Nesting, guards: Guards | None, motion: Recurrent | None) -> "MotionParts":
         """The parts of a run, from those of the smooth motion: along its pieces, with guards behind q̈.
 
         `motion` is the program of the motion without its tangents, of the same numbers of a member.
         """
         size, whole = nesting.size, self._replace(nesting=nesting)
         if guards is not None:
-            program, series, found = watched(self.program, size, guards.values, not nesting.directions)
+            program, series, found = append_guards(self.program, size, guards.values, not nesting.directions)
             return whole._replace(program=program, series=series, borders=found)
         if (pieces := pieces_of(self.program, nesting, motion, whole.numbers_of_motion)) is None:
             return whole
@@ -100,15 +100,15 @@ class MotionParts(NamedTuple):
         return whole._replace(program=found.program, series=series, borders=found)
 
     @property
-    def without_guards(self) -> "MotionParts":
+    def drop_guards(self) -> "MotionParts":
         """The parts of a piecewise motion without the guards behind q̈."""
         assert self.borders is not None
-        program, series = along_pieces(self.borders, self.nesting.size)
+        program, series = drop_guards(self.borders, self.nesting.size)
         return self._replace(program=program, series=series)
 
 
 @dataclass(frozen=True, eq=False)
-class _Fewer:
+class _ChosenProgram:
     """A program of those numbers of a member that it computes with (`Recurrent`); others are only looked up."""
 
     line: StraightLine
@@ -119,7 +119,7 @@ class _Fewer:
 
 
 @functools.lru_cache(maxsize=16)
-def parameters_chosen(
+def choose_parameters(
     program: Recurrent,
     projection: Projection | None,
     guards: Guards | None,
@@ -145,21 +145,21 @@ def parameters_chosen(
     columns = sorted({i % own for i in read if i >= 0}) if own else []
     positions = tuple(row * own + i for row in range(rows) for i in columns)
 
-    def fewer(one, first=first, positions=positions):
+    def reduce_program(one, first=first, positions=positions):
         place = {first + i: first + k for k, i in enumerate(positions)}
         nodes = tuple(
             (op, xs, place.get(a, a) if op == "input" else shifted(a, BESIDE - first) if op in LOOK_UPS else a)
             for op, xs, a in one.line.nodes
         )
         dtypes = (*one.dtypes[:first], *(one.dtypes[first + i] for i in positions))
-        return _Fewer(one.line._replace(nodes=nodes), first + len(positions), dtypes, one.linear, one.budget)
+        return _ChosenProgram(one.line._replace(nodes=nodes), first + len(positions), dtypes, one.linear, one.budget)
 
-    done = iter([fewer(one) for one in programs])
+    done = iter([reduce_program(one) for one in programs])
     return (
         next(done),
         projection and Projection(next(done), next(done)),
         guards and guards._replace(values=next(done), program=next(done)),
-        None if motion is None else fewer(motion, 2 * nesting.base + 1, columns),
+        None if motion is None else reduce_program(motion, 2 * nesting.base + 1, columns),
         Chosen(positions, of),
     )
 
@@ -184,7 +184,7 @@ def require_recurrences(program: Recurrent, size: int) -> None:
 def recurrences(program: Recurrent, size: int) -> Series:
     """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
     require_lanes(program.line)
-    with without_collections():
+    with pause_collections():
         return series(program, size, moving=2 * size + 1)
 
 
@@ -205,11 +205,11 @@ def pieces_of(
         found = of_motion[0]
         for inner, directions in nesting.levels:
             found = with_borders_of_tangents(found, inner, directions, member * (inner // nesting.base))
-        with without_collections():
+        with pause_collections():
             return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
     try:
         if (found := borders(program, size)) is not None:
-            with without_collections():
+            with pause_collections():
                 return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
     except Unlowerable:  # a switching number without a series, or more operations than that takes
         pass

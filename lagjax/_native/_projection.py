@@ -35,7 +35,7 @@ class Projector:
         """True if coordinate i may have a velocity scale; where i is not known, it may."""
         return not isinstance(i, int) or i < self.base_size
 
-    def projected(self, frame: Frame, values: Numbers, increments: Numbers, s: Value) -> tuple[Numbers, Value]:
+    def project_state(self, frame: Frame, values: Numbers, increments: Numbers, s: Value) -> tuple[Numbers, Value]:
         """The projection of a state of the series at t + s, and its distance in `PROJECTION_TOLERANCES`.
 
         The series ends within the tolerance of the constraints. If it is much farther to the state that the projection
@@ -61,7 +61,7 @@ class Projector:
         sums = form.room(frame, states)
         for i in form.each(code, states):
             sums[i] = end_of_step(frame, i)[0]
-        projected, off = self.projected(frame, sums, frame.vectors("increment", states), h)
+        projected, off = self.project_state(frame, sums, frame.vectors("increment", states), h)
         for i in form.each(code, states):
             frame["projected", i] = projected[i]
         scales = self.motion.evaluate(frame, self.velocity_scale, projected, h)

@@ -75,10 +75,10 @@ def schedule(line: StraightLine, stored: int) -> Schedule:
     The last outputs, this many, are `stored` somewhere else as soon as they are there.
     """
     nodes, uses = line.nodes, count_uses(line.nodes, line.outputs)
-    kinds, operations = _joined_of(Same(line))
+    kinds, operations = _join_same(Same(line))
     staying = len(line.outputs) - stored
     outputs, copies = _outputs(line, operations, kinds, staying)
-    groups = _grouped(_in_order(operations, copies))
+    groups = _group_operations(_insert_copies(operations, copies))
     slots, size = _slots(groups, outputs, staying, len(nodes))
     live = [i for i, count in enumerate(uses) if count]
     inputs = {i: nodes[i][2] for i in live if nodes[i][0] == "input"}
@@ -99,21 +99,21 @@ class Same:
         return isinstance(other, Same) and self.line is other.line
 
 
-def joined(line: StraightLine) -> tuple[list[OperationKind], list[ScheduledOperation]]:
+def join_operations(line: StraightLine) -> tuple[list[OperationKind], list[ScheduledOperation]]:
     """The operations that the outputs of a program need, each after those that it reads, and their kinds."""
-    kinds, operations = _joined_of(Same(line))
+    kinds, operations = _join_same(Same(line))
     return kinds.all, operations
 
 
 @functools.lru_cache(maxsize=4)  # used where the form of a motion is chosen, and where it is compiled
-def _joined_of(same: Same) -> tuple["_Kinds", list[ScheduledOperation]]:
+def _join_same(same: Same) -> tuple["_Kinds", list[ScheduledOperation]]:
     uses, kinds = count_uses(same.line.nodes, same.line.outputs), _Kinds()
-    return kinds, _joined(_operations(same.line, uses, kinds), uses, kinds)
+    return kinds, _join_pairs(_operations(same.line, uses, kinds), uses, kinds)
 
 
 def forget_joined() -> None:
     """Forget what was kept of programs for their compilation: it is large, and of no use afterwards."""
-    _joined_of.cache_clear()
+    _join_same.cache_clear()
 
 
 # ---- operations ------------------------------------------------------------------------------------------------------
@@ -132,11 +132,11 @@ class _Kinds:
         """The number of a kind that consists of one operation."""
         return self._number(OperationKind(op, attribute, kinds, result, (None,) * len(kinds)))
 
-    def joined(self, kind: int, place: int, part: int) -> int:
+    def join(self, kind: int, place: int, part: int) -> int:
         """The kind whose operand at this place, counted over all that it reads, is made by another."""
         key = kind, place, part
         if key not in self._joined:
-            self._joined[key] = self._number(_with_part(self.all[kind], place, self.all[part]))
+            self._joined[key] = self._number(_insert_part(self.all[kind], place, self.all[part]))
         return self._joined[key]
 
     def _number(self, kind: OperationKind) -> int:
@@ -147,12 +147,12 @@ class _Kinds:
         return number
 
 
-def _with_part(kind: OperationKind, place: int, part: OperationKind) -> OperationKind:
+def _insert_part(kind: OperationKind, place: int, part: OperationKind) -> OperationKind:
     parts = list(kind.parts)
     for k, inner in enumerate(parts):
         width = 1 if inner is None else inner.operands
         if place < width:
-            parts[k] = part if inner is None else _with_part(inner, place, part)
+            parts[k] = part if inner is None else _insert_part(inner, place, part)
             break
         place -= width
     return kind._replace(parts=tuple(parts))
@@ -209,7 +209,7 @@ def _outputs(
     return outputs, copies
 
 
-def _in_order(operations: list[ScheduledOperation], copies: list[ScheduledOperation]) -> list[ScheduledOperation]:
+def _insert_copies(operations: list[ScheduledOperation], copies: list[ScheduledOperation]) -> list[ScheduledOperation]:
     """The operations, each followed by the copies of its results."""
     of: dict[int, list[ScheduledOperation]] = {}
     for copy in copies:
@@ -225,7 +225,7 @@ def _in_order(operations: list[ScheduledOperation], copies: list[ScheduledOperat
 # ---- what often comes together ---------------------------------------------------------------------------------------
 
 
-def _joined(operations: list[ScheduledOperation], uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
+def _join_pairs(operations: list[ScheduledOperation], uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
     """The operations, with a result that only one other reads computed inside that one, where such a pair comes often.
 
     Pairs of pairs come often too, and so on: byte-pair encoding, with trees for strings. A product that only one sum
@@ -234,7 +234,7 @@ def _joined(operations: list[ScheduledOperation], uses: list[int], kinds: _Kinds
     work = _Work(operations, uses, kinds)
     work.join_products()
     for _ in range(ROUNDS):
-        chosen = work.often()
+        chosen = work.find_frequent_pairs()
         if not chosen:
             break
         work.join(chosen)
@@ -269,7 +269,7 @@ class _Work:
                         self._put(i, place)
                         break
 
-    def often(self) -> dict[int, tuple[int, int]]:
+    def find_frequent_pairs(self) -> dict[int, tuple[int, int]]:
         """The pairs that come most often: for kinds of operations the operand that is joined, and its kind."""
         pairs: Counter = Counter()
         still = []
@@ -315,13 +315,13 @@ class _Work:
         assert inner is not None
         self.by_node[x] = None
         operands = operands[:place] + inner.operands + operands[place + 1 :]
-        self.by_node[i] = ScheduledOperation(self._kinds.joined(kind, place, inner.kind), operands, results)
+        self.by_node[i] = ScheduledOperation(self._kinds.join(kind, place, inner.kind), operands, results)
 
 
 # ---- order -----------------------------------------------------------------------------------------------------------
 
 
-def _grouped(operations: list[ScheduledOperation]) -> list[list[ScheduledOperation]]:
+def _group_operations(operations: list[ScheduledOperation]) -> list[list[ScheduledOperation]]:
     """Operations of one kind that do not wait for each other, in an order that respects all others.
 
     Of the next `WINDOW` operations, in the order in which the program has them, the kind goes first that fills a step

@@ -59,10 +59,10 @@ class SingleMember(TaylorSeries):
     @functools.cached_property
     def _value_ranks(self) -> np.ndarray:
         """The place of every value of the zeroth order among them."""
-        inputs = [self.layout.place(*at) for at in self._now()]
+        inputs = [self.layout.place(*at) for at in self._state_places()]
         return self.form.ranks(self.series.zeroth_order, inputs, self.series.values)
 
-    def _now(self) -> list[tuple]:
+    def _state_places(self) -> list[tuple]:
         return [*(("y", i, 0) for i in range(self.states)), ("t",), *(("params", i) for i in range(self.numbers))]
 
     @functools.cached_property
@@ -176,23 +176,23 @@ class SingleMember(TaylorSeries):
     def followed_value(self, frame: Frame, j: Value) -> Value:
         """The value of number j of those that are followed."""
         first = self.layout.place("values", 0)
-        return self._followed(frame, first + self._value_ranks, j)
+        return self._load_followed(frame, first + self._value_ranks, j)
 
     def followed_coefficient(self, frame: Frame, j: Value, k: Index) -> Value:
         """The coefficient of order k > 0 of followed number j."""
         first = self.layout.place("rows", 0, 0)
-        return self._followed(frame, first + self._row_ranks, j, k * self._stride)
+        return self._load_followed(frame, first + self._row_ranks, j, k * self._stride)
 
-    def _followed(self, frame: Frame, places: np.ndarray, j: Value, more: Index = 0) -> Value:
+    def _load_followed(self, frame: Frame, places: np.ndarray, j: Value, more: Index = 0) -> Value:
         """A vector `more` doubles behind the j-th of the last of these places, one for each number that is followed."""
         code = frame.code
         table = integers(self.module, places[len(places) - self.series.followed :].astype(np.int64))
         place = code.load(code.element(Value(code, table), j, INTEGER), INTEGER)
         return code.load(frame.memory_at(place + more), frame.vector)
 
-    def at_order(self, frame: Frame, k: Value) -> list:
+    def recursion_inputs(self, frame: Frame, k: Value) -> list:
         """The inputs of the order recursion: the coefficients of order k, k, 1/k, the values and the sums."""
-        coefficients, scalars, values, sums = super().at_order(frame, k)
+        coefficients, scalars, values, sums = super().recursion_inputs(frame, k)
         for i in self.form.each(frame.code, self.states):
             frame["order", i] = coefficients[i]
         for i, x in enumerate(scalars):

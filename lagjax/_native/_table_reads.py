@@ -52,14 +52,14 @@ class LookUps:
         for lane, (begin, number) in enumerate(zip(self._whole(code, first), _lanes(code, x), strict=True)):
             constants = (code.as_value(n, INTEGER) for n in (table.stride, table.count, attribute.closed))
             piece = code.call(self._locate, code.element(base, begin), *constants, number)
-            found = _with_lane(code, found, lane, piece)
+            found = _insert_lane(code, found, lane, piece)
         return found
 
     def take(self, frame: Frame, table: Table, x: Value) -> Value:
         """The entries with these numbers."""
         code, (base, first), found = frame.code, self._base(frame, table), frame.constant(0.0)
-        for lane, place in enumerate(self._whole(code, self._clipped(code, table, x) * float(table.stride) + first)):
-            found = _with_lane(code, found, lane, code.load(code.element(base, place), DOUBLE))
+        for lane, place in enumerate(self._whole(code, self._clip(code, table, x) * float(table.stride) + first)):
+            found = _insert_lane(code, found, lane, code.load(code.element(base, place), DOUBLE))
         return found
 
     def increases(self, frame: Frame, table: Table, first: Value) -> Value:
@@ -71,11 +71,11 @@ class LookUps:
 
     def places(self, frame: Frame, table: Table, x: Value) -> list[Value]:
         """The places of entries with these numbers among the numbers of a member, lane by lane."""
-        x = self._clipped(frame.code, table, x) * float(table.stride) + float(table.first - BESIDE)
+        x = self._clip(frame.code, table, x) * float(table.stride) + float(table.first - BESIDE)
         return self._whole(frame.code, x)
 
     @staticmethod
-    def _clipped(code: Code, table: Table, x: Value) -> Value:
+    def _clip(code: Code, table: Table, x: Value) -> Value:
         """A number that the table has; of what is NaN the first."""
         x, last = code.select(x > 0.0, x, 0.0), float(table.count - 1)
         return code.select(x < last, x, last)
@@ -141,5 +141,5 @@ def lane_of(code: Code, x: Value, lane: int) -> Value:
     return Value(code, code.builder.extract_element(x.it, ir.Constant(INTEGER, lane)))
 
 
-def _with_lane(code: Code, x: Value, lane: int, number: Value) -> Value:
+def _insert_lane(code: Code, x: Value, lane: int, number: Value) -> Value:
     return Value(code, code.builder.insert_element(x.it, number.it, ir.Constant(INTEGER, lane)))

@@ -86,7 +86,7 @@ class Tangent:
         self.cauchy_products, self.recursion = self._cauchy_products(), self._recursion()
         steps = [self._take(), self._series(), self._end(), self._measure(), self._outputs(), self._leave()]
         if projection is not None:
-            steps.insert(4, self._projected())
+            steps.insert(4, self._project())
         self._run(steps)
         self._begin()
         if self.form is not self.motion.form:
@@ -275,7 +275,7 @@ class Tangent:
                     place = i + (part * n + row * base)
                     frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
 
-    def _now(self, frame: Frame, state: Vectors, t: Value, tangents: Vectors) -> list:
+    def _tangent_inputs(self, frame: Frame, state: Vectors, t: Value, tangents: Vectors) -> list:
         """The inputs of a program at a state, and their tangents: those of the state, and of the parameters."""
         params = self.numbers_of(frame, "params", self.motion.numbers, in_place=True)
         of_params = [i - self.states - 1 for i in self.varied[self.states :]]
@@ -292,7 +292,7 @@ class Tangent:
         accelerations = self.numbers_of(frame, "y", n, lambda i: (i + n, 1))
         values = self.numbers_of(frame, "values", self.series.values, in_place=True)
         tangents = frame.vectors("dy", self.states, lambda i: (i, 0))
-        inputs = self._now(frame, state, self.number_of(frame, "t"), tangents)
+        inputs = self._tangent_inputs(frame, state, self.number_of(frame, "t"), tangents)
         to = frame.vectors("dvalues", self.series.values)
         out = form.run(frame, self.zeroth_order, *inputs, accelerations, values, to=to)
         for i in form.each(code, n):
@@ -452,13 +452,13 @@ class Tangent:
                     frame.write("path_dot", row + i, lane["between", i])
             lane["next_output"] = lane["next_output"] + 1.0
 
-    def _projected(self) -> Code:
+    def _project(self) -> Code:
         """`(group)`: the tangents of the state on the constraints, from those of the end of the series."""
         assert self.projection is not None
         frame, code, _ = self._step("projected")
         moved = self.numbers_of(frame, "moved", self.states, in_place=True)
         t = self.number_of(frame, "t") + self.number_of(frame, "h")
-        inputs = self._now(frame, moved, t, frame.vectors("end", self.states))
+        inputs = self._tangent_inputs(frame, moved, t, frame.vectors("end", self.states))
         out = self.form.run(frame, self.projection, *inputs)
         for i in self.form.each(code, self.states):
             frame["between", i] = out[i]

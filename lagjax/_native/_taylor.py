@@ -166,7 +166,7 @@ class TaylorSeries:
             with code.only_if(k > 1):
                 frame.call(self._sums, k)
             inverse = 1.0 / code.as_number(k + 1)
-            out = form.run(frame, series.order_recursion, *self.at_order(frame, k), to=self.rows_at(frame, k))
+            out = form.run(frame, series.order_recursion, *self.recursion_inputs(frame, k), to=self.rows_at(frame, k))
             for i in form.each(code, n):
                 frame["y", i, k + 1] = frame["y", i + n, k] * inverse
                 frame["y", i + n, k + 1] = out[i] * inverse
@@ -206,7 +206,7 @@ class TaylorSeries:
         state = frame.vectors("y", self.states, lambda i: (i, 0))
         return [state, frame.vectors("t", 1), frame.vectors("params", self.numbers)]
 
-    def at_order(self, frame: Frame, k: Value) -> list:
+    def recursion_inputs(self, frame: Frame, k: Value) -> list:
         """The inputs of the order recursion: the coefficients of order k, k, 1/k, the values and the sums."""
         code, number, products = frame.code, frame.code.as_number(k), len(self.series.cauchy_products)
         time = code.select(code.compare("==", k, 1), number, 0.0)

@@ -187,7 +187,7 @@ class Arcs:
 
     def rate(self, t, y: np.ndarray) -> np.ndarray:
         """ẏ = (q̇, q̈), (R, 2n), at states (R, 2n) and times () or (R,)."""
-        values = self.flow.anywhere.evaluate(*y.T, np.asarray(t), *self.numbers)[: self.size]
+        values = self.flow.general_program.evaluate(*y.T, np.asarray(t), *self.numbers)[: self.size]
         qddot = np.stack([np.broadcast_to(value, (len(y),)) for value in values], axis=-1)
         return np.concatenate([y[:, self.size :], qddot], axis=1)
 

@@ -41,26 +41,26 @@ from lagjax._program import _complex, _eigenvalues, _special  # noqa: F401  (the
 from lagjax._program import _scalars as scalars
 from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders
 from lagjax._program._differentiation import Derivatives, copied, pullback, pushforward, with_tangents
-from lagjax._program._emit import Rows, emit, emit_rows, in_jax, plain_elementary
+from lagjax._program._emit import Rows, apply_in_jax, emit, emit_rows, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
 from lagjax._program._groups import Groups, groups_of
 from lagjax._program._look_ups import look_up, table_of
-from lagjax._program._matrices import orthogonalized, row_weights, solve_orthogonalized
-from lagjax._program._memory import machine_memory, operations_that_fit, without_collections
+from lagjax._program._matrices import orthogonalize, row_weights, solve_orthogonalized
+from lagjax._program._memory import machine_memory, operations_that_fit, pause_collections
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
-from lagjax._program._rules import LARGEST_UNFOLDED, Expansion, has_own_rules, inputs_of, written_out
-from lagjax._program._scalars import Scalars, applied, joined, spread, stacked
+from lagjax._program._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of
+from lagjax._program._scalars import Scalars, apply_function, concatenate, scatter, stack
 from lagjax._program._series import LinearSystem, Series, StraightLine, series
 
 __all__ = [
     "BELOW", "CLOCK", "FLOOR", "OPERATIONS", "SIGN", "TABLE", "TRUNC", "Borders", "Derivatives", "Expansion", "Graph",
-    "Program", "Scalars", "Series", "StraightLine", "Tape", "Unlowerable", "applied", "borders", "copied", "emit",
-    "evaluate", "has_own_rules", "in_jax", "inputs_of", "joined", "live", "lower", "lower_formula", "lower_scalars",
-    "lower_solution", "machine_memory", "operations_that_fit", "orthogonalized", "plain_elementary", "pullback",
-    "pushforward", "row_weights", "scalars", "series", "solve_orthogonalized", "spread", "stacked", "steps_of",
-    "table_of", "traced", "with_tangents", "without_collections", "written_out",
+    "Program", "Scalars", "Series", "StraightLine", "Tape", "Unlowerable", "apply_function", "apply_in_jax", "borders",
+    "concatenate", "copied", "emit", "evaluate", "expand_primitive", "has_own_rules", "inputs_of", "live", "lower",
+    "lower_formula", "lower_scalars", "lower_solution", "machine_memory", "operations_that_fit", "orthogonalize",
+    "pause_collections", "plain_elementary", "pullback", "pushforward", "row_weights", "scalars", "scatter", "series",
+    "solve_orthogonalized", "stack", "steps_of", "table_of", "trace_jaxpr", "with_tangents",
 ]  # fmt: skip
 
 
@@ -75,14 +75,14 @@ def lower(function: Callable, *examples, budget: int = 20_000) -> "Program":
     return _lower_leaves(lambda *xs: jax.tree.leaves(function(*jax.tree.unflatten(structure, xs))), shapes, budget)
 
 
-def traced(function: Callable, *shapes) -> core.ClosedJaxpr:
+def trace_jaxpr(function: Callable, *shapes) -> core.ClosedJaxpr:
     """The jaxpr of a function, with programs in it as they are to be lowered."""
     with plain_elementary():
         return jax.make_jaxpr(function)(*shapes)
 
 
 def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int) -> "Program":
-    jaxpr = traced(function, *shapes)
+    jaxpr = trace_jaxpr(function, *shapes)
     return lower_scalars(lambda expansion, arguments: expansion.run_closed(jaxpr, arguments), function, shapes, budget)
 
 
@@ -140,19 +140,19 @@ def lower_solution(
     """
     counts: list = []
 
-    def whole(expansion, arguments):
+    def expand_system(expansion, arguments):
         places, entries, right, factors, number = system(*(Scalars(expansion, x) for x in arguments))
         leaves = jax.tree.leaves(factors)
         z = solve(factors, right)
         counts.append((places, [x.ids.size for x in (z, entries, right)], [x.shape for x in leaves], factors))
         return [z.ids[:size], _ids_of(expansion, number), z.ids[size:], *(x.ids for x in (entries, right, *leaves))]
 
-    def solved(*arguments):
+    def solve_system(*arguments):
         _, _, right, factors, number = system(*arguments)
         return [*solve(factors, right)[:size], jnp.asarray(number)]
 
-    in_jax = in_jax or solved
-    program = lower_scalars(whole, in_jax, tuple(shapes), budget, graph)
+    in_jax = in_jax or solve_system
+    program = lower_scalars(expand_system, in_jax, tuple(shapes), budget, graph)
     places, (of_z, of_entries, of_right), of_factors, factors = counts[0]
     ends = np.cumsum([size, 1, of_z - size, of_entries, of_right])
     z, _, others, entries, right, leaves = np.split(np.array(program.outputs), ends)
@@ -237,7 +237,7 @@ class Program:
             return jnp.stack(self(*scalars))
         if (own := self.own_outputs(*scalars)) is not None:
             return own
-        graph, ids = first.expansion.graph, stacked(scalars).ids.tolist()
+        graph, ids = first.expansion.graph, stack(scalars).ids.tolist()
         nodes = copied(graph, self.line, ids, [graph.position(i) for i in ids] if self.looks_up else None)
         first.expansion.traced_operations += self.operations
         return Scalars(first.expansion, np.array([nodes[i] for i in self.outputs], dtype=np.int64))
@@ -247,13 +247,13 @@ class Program:
         """True if it reads tables (see `_look_ups`)."""
         return any(op in LOOK_UPS for op, _, _ in self.nodes)
 
-    def at(self, first, numbers) -> tuple:
+    def compute_outputs(self, first, numbers) -> tuple:
         """The outputs for the first inputs, a vector, and the others (P,), which are not taken apart where many are."""
         if self.looks_up or self.size > LARGEST_UNFOLDED:
-            return self.of_rows(first, numbers)
+            return self.compute_rows(first, numbers)
         return self(*first, *numbers)
 
-    def of_rows(self, first, numbers) -> tuple:
+    def compute_rows(self, first, numbers) -> tuple:
         """The outputs for the first inputs, an array (…, m), and the others (…, P), where most are only looked up.
 
         Its derivatives are those of the operations as they stand.
@@ -328,20 +328,20 @@ class Program:
         first = next((x for x in scalars if isinstance(x, Scalars)), None)
         if self.origin is None or first is None or self.origin.graph is not first.expansion.graph:
             return None
-        same = [self.origin.graph.position(i) for i in stacked(scalars).ids.tolist()] == list(range(self.size))
+        same = [self.origin.graph.position(i) for i in stack(scalars).ids.tolist()] == list(range(self.size))
         return Scalars(first.expansion, np.array(self.origin.outputs, dtype=np.int64)) if same else None
 
-    def with_inputs(self, count: int) -> "Program":
+    def append_inputs(self, count: int) -> "Program":
         """The program with this many more floats behind its own inputs, none of which it reads."""
         more, other = jax.ShapeDtypeStruct((count,), jnp.result_type(float)), self.otherwise
         return replace(
             self,
             function=lambda *leaves: self.function(*leaves[:-1]),
             shapes=(*self.shapes, more),
-            otherwise=None if other is None else functools.cache(lambda: other().with_inputs(count)),
+            otherwise=None if other is None else functools.cache(lambda: other().append_inputs(count)),
         )
 
-    def only(self, positions: Sequence[int], function: Callable) -> "Program":
+    def select_outputs(self, positions: Sequence[int], function: Callable) -> "Program":
         """The program of some of the outputs; `function` is the JAX function that gives just these, leaf by leaf."""
         nodes, kinds, outputs = live(self.nodes, self.kinds, [self.outputs[i] for i in positions])
         origin = self.origin and self.origin._replace(outputs=tuple(self.origin.outputs[i] for i in positions))
@@ -358,7 +358,7 @@ class Program:
         op, _, attribute = self.nodes[self.outputs[output]]
         return attribute if op == "constant" else None
 
-    def read_by(self, outputs: Sequence[int]) -> frozenset[int]:
+    def find_inputs(self, outputs: Sequence[int]) -> frozenset[int]:
         """The positions of the inputs that any of some outputs depends on."""
         seen, stack = set(), [self.outputs[k] for k in outputs]
         while stack:
@@ -411,13 +411,13 @@ class Program:
         try:
             return list(self._tangent_programs(active)(*primals, *moving))
         except Unlowerable:
-            function = jnp.vectorize(lambda *scalars: tuple(_floats(self._on_scalars(*scalars))))
+            function = jnp.vectorize(lambda *scalars: tuple(_floats(self._call_function(*scalars))))
 
-            def along(*some):
+            def evaluate_moved(*some):
                 replaced = dict(zip(active, some, strict=True))
                 return function(*(replaced.get(i, x) for i, x in enumerate(primals)))
 
-            return list(jax.jvp(along, tuple(primals[i] for i in active), moving)[1])
+            return list(jax.jvp(evaluate_moved, tuple(primals[i] for i in active), moving)[1])
 
     @functools.cached_property
     def _tangent_programs(self) -> Callable:
@@ -443,13 +443,13 @@ class Program:
                 tangents.append(jnp.stack(parts).reshape(leaf.shape) if parts else jnp.zeros_like(leaf))
             start += leaf.size
 
-        def along(*floats):
+        def evaluate_floats(*floats):
             floats = iter(floats)
             return _floats(self.function(*(next(floats) if _is_float(leaf) else leaf for leaf in leaves)))
 
-        return jax.jvp(along, tuple(leaf for leaf in leaves if _is_float(leaf)), tuple(tangents))[1]
+        return jax.jvp(evaluate_floats, tuple(leaf for leaf in leaves if _is_float(leaf)), tuple(tangents))[1]
 
-    def _on_scalars(self, *scalars) -> list:
+    def _call_function(self, *scalars) -> list:
         """The function as it was given, on scalars: what the program must agree with."""
         leaves, start = [], 0
         for shape in self.shapes:

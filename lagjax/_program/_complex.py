@@ -58,20 +58,20 @@ class Pair(NamedTuple):
         return Pair(self.re, -self.im)
 
     @property
-    def turned(self) -> "Pair":
+    def multiply_by_i(self) -> "Pair":
         """i z."""
         return Pair(-self.im, self.re)
 
     @property
-    def turned_back(self) -> "Pair":
+    def divide_by_i(self) -> "Pair":
         """−i z."""
         return Pair(self.im, -self.re)
 
-    def scaled(self, factor) -> "Pair":
+    def scale(self, factor) -> "Pair":
         """The product with a real number."""
         return Pair(self.re * factor, self.im * factor)
 
-    def shifted(self, number: float) -> "Pair":
+    def shift(self, number: float) -> "Pair":
         """The sum with a real number."""
         return Pair(self.re + number, self.im)
 
@@ -125,7 +125,7 @@ def _logarithm(z: Pair) -> Pair:
 
 
 def _log1p(z: Pair) -> Pair:
-    return Pair(0.5 * _f("log1p", z.re * (2.0 + z.re) + z.im * z.im), z.shifted(1.0).angle)
+    return Pair(0.5 * _f("log1p", z.re * (2.0 + z.re) + z.im * z.im), z.shift(1.0).angle)
 
 
 def _expm1(z: Pair) -> Pair:
@@ -183,29 +183,29 @@ def _tangent(z: Pair) -> Pair:
 
 def _arcsine(z: Pair) -> Pair:
     """The arcsine by roots of 1 ± z, without loss (Kahan, *Branch cuts for complex elementary functions* (1987))."""
-    less, more = _square_root((-z).shifted(1.0)), _square_root(z.shifted(1.0))
+    less, more = _square_root((-z).shift(1.0)), _square_root(z.shift(1.0))
     product = less * more
     return Pair(_f("atan2", z.re, product.re), _f("asinh", (less.conjugate * more).im))
 
 
 def _arccosine(z: Pair) -> Pair:
-    less, more = _square_root((-z).shifted(1.0)), _square_root(z.shifted(1.0))
+    less, more = _square_root((-z).shift(1.0)), _square_root(z.shift(1.0))
     return Pair(2.0 * _f("atan2", less.re, more.re), _f("asinh", (more.conjugate * less).im))
 
 
 def _inverse_hyperbolic_cosine(z: Pair) -> Pair:
-    less, more = _square_root(z.shifted(-1.0)), _square_root(z.shifted(1.0))
+    less, more = _square_root(z.shift(-1.0)), _square_root(z.shift(1.0))
     return Pair(_f("asinh", (less.conjugate * more).re), 2.0 * _f("atan2", less.im, more.re))
 
 
 def _inverse_hyperbolic_tangent(z: Pair) -> Pair:
     """½ (log(1 + z) − log(1 − z))."""
-    return (_log1p(z) - _log1p(-z)).scaled(0.5)
+    return (_log1p(z) - _log1p(-z)).scale(0.5)
 
 
-def _about_i(function: Callable) -> Callable:
+def _derive_circular(function: Callable) -> Callable:
     """The circular function of a hyperbolic one, or the other way about: f(z) = −i F(i z)."""
-    return lambda z: function(z.turned).turned_back
+    return lambda z: function(z.multiply_by_i).divide_by_i
 
 
 _FUNCTIONS: dict[str, Callable] = {
@@ -222,21 +222,21 @@ _FUNCTIONS: dict[str, Callable] = {
     "sqrt": _square_root,
     "rsqrt": lambda z: _inverse(_square_root(z)),
     "exp": _exponential,
-    "exp2": lambda z: _exponential(z.scaled(math.log(2.0))),
+    "exp2": lambda z: _exponential(z.scale(math.log(2.0))),
     "expm1": _expm1,
     "log": _logarithm,
     "log1p": _log1p,
-    "logistic": lambda z: _inverse(_exponential(-z).shifted(1.0)),
+    "logistic": lambda z: _inverse(_exponential(-z).shift(1.0)),
     "sin": _sine,
     "cos": _cosine,
     "tan": _tangent,
     "asin": _arcsine,
     "acos": _arccosine,
-    "atan": _about_i(_inverse_hyperbolic_tangent),
-    "sinh": _about_i(_sine),
-    "cosh": lambda z: _cosine(z.turned),
-    "tanh": _about_i(_tangent),
-    "asinh": _about_i(_arcsine),
+    "atan": _derive_circular(_inverse_hyperbolic_tangent),
+    "sinh": _derive_circular(_sine),
+    "cosh": lambda z: _cosine(z.multiply_by_i),
+    "tanh": _derive_circular(_tangent),
+    "asinh": _derive_circular(_arcsine),
     "acosh": _inverse_hyperbolic_cosine,
     "atanh": _inverse_hyperbolic_tangent,
     "eq": lambda a, b: _f("and", _f("eq", a.re, b.re), _f("eq", a.im, b.im)),
@@ -270,7 +270,7 @@ def _elementwise(name: str, function: Callable) -> Callable:
 def _partwise(name: str) -> Callable:
     def rule(expansion, params, *arguments):
         parts = [expansion.parts(x) if expansion.has_pairs(x) else (x, x) for x in arguments]
-        return expansion.pair(*(expansion.lowered(name, params, xs) for xs in zip(*parts, strict=True)))
+        return expansion.pair(*(expansion.lower_primitive(name, params, xs) for xs in zip(*parts, strict=True)))
 
     return rule
 
@@ -300,7 +300,7 @@ def _convert_element_type(expansion, params, x):
             if expansion.has_pairs(x)
             else expansion.pair(*expansion.parts(expansion.map("convert", x, attribute="float")))
         )
-    return expansion.lowered("convert_element_type", params, [expansion.parts(x)[0]])
+    return expansion.lower_primitive("convert_element_type", params, [expansion.parts(x)[0]])
 
 
 @_lowers("integer_pow")
@@ -321,7 +321,7 @@ def _product(expansion, params, x):
 def _dot_general(expansion, params, x, y):
     params = {**params, "preferred_element_type": None}
     a, b = expansion.parts(x), expansion.parts(y)
-    products = {(i, j): expansion.lowered("dot_general", params, [a[i], b[j]]) for i in (0, 1) for j in (0, 1)}
+    products = {(i, j): expansion.lower_primitive("dot_general", params, [a[i], b[j]]) for i in (0, 1) for j in (0, 1)}
     return expansion.pair(
         expansion.map("sub", products[0, 0], products[1, 1]), expansion.map("add", products[0, 1], products[1, 0])
     )
@@ -336,13 +336,13 @@ def _fourier(expansion, params, x):
     kind, lengths = params["fft_type"].name, params["fft_lengths"]
     axes, turn = [x.ndim - len(lengths) + k for k in range(len(lengths))], 1 if kind.startswith("I") else -1
     if kind == "RFFT":
-        x = _map_rows(expansion, x, axes[-1], lambda rows: _transformed(rows, turn)[: lengths[-1] // 2 + 1])
+        x = _map_rows(expansion, x, axes[-1], lambda rows: _transform_rows(rows, turn)[: lengths[-1] // 2 + 1])
         axes = axes[:-1]
     for axis in axes[:-1] if kind == "IRFFT" else axes:
-        x = _map_rows(expansion, x, axis, lambda rows: _transformed(rows, turn))
+        x = _map_rows(expansion, x, axis, lambda rows: _transform_rows(rows, turn))
     if kind == "IRFFT":
         x = expansion.parts(
-            _map_rows(expansion, x, axes[-1], lambda rows: _transformed(_completed(rows, lengths[-1]), turn))
+            _map_rows(expansion, x, axes[-1], lambda rows: _transform_rows(_complete_spectrum(rows, lengths[-1]), turn))
         )[0]
     if turn < 0:
         return x
@@ -356,7 +356,7 @@ def _map_rows(expansion: Expansion, x: np.ndarray, axis: int, transform: Callabl
     return np.stack([_ids_of(expansion, row) for row in rows], axis)
 
 
-def _completed(rows: list[Pair], n: int) -> list[Pair]:
+def _complete_spectrum(rows: list[Pair], n: int) -> list[Pair]:
     """All n coefficients of a real function, from those of frequencies that are not negative."""
     first = Pair(rows[0].re, 0.0 * rows[0].im)
     half = [first, *rows[1:]]
@@ -365,25 +365,25 @@ def _completed(rows: list[Pair], n: int) -> list[Pair]:
     return half + [half[n - k].conjugate for k in range(len(half), n)]
 
 
-def _transformed(rows: list[Pair], turn: int) -> list[Pair]:
+def _transform_rows(rows: list[Pair], turn: int) -> list[Pair]:
     """Σⱼ rowsⱼ e^(turn 2πi jk/n) for every k."""
     n = len(rows)
     if n % 2 or n == 0:
         return [
-            functools.reduce(lambda a, b: a + b, (_turned(x, turn, j * k, n) for j, x in enumerate(rows)))
+            functools.reduce(lambda a, b: a + b, (_rotate(x, turn, j * k, n) for j, x in enumerate(rows)))
             for k in range(n)
         ]
-    even, odd = _transformed(rows[::2], turn), _transformed(rows[1::2], turn)
-    odd = [_turned(x, turn, k, n) for k, x in enumerate(odd)]
+    even, odd = _transform_rows(rows[::2], turn), _transform_rows(rows[1::2], turn)
+    odd = [_rotate(x, turn, k, n) for k, x in enumerate(odd)]
     return [a + b for a, b in zip(even, odd, strict=True)] + [a - b for a, b in zip(even, odd, strict=True)]
 
 
-def _turned(z: Pair, turn: int, k: int, n: int) -> Pair:
+def _rotate(z: Pair, turn: int, k: int, n: int) -> Pair:
     """z e^(turn 2πi k/n)."""
     k %= n
     if 4 * k % n == 0:
         quarter = turn * (4 * k // n) % 4
-        return (z, z.turned, -z, z.turned_back)[quarter]
+        return (z, z.multiply_by_i, -z, z.divide_by_i)[quarter]
     angle = 2 * math.pi * k / n
     cosine, sine = math.cos(angle), turn * math.sin(angle)
     return Pair(z.re * cosine - z.im * sine, z.re * sine + z.im * cosine)

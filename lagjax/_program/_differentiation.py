@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lagjax._program._graph import INPUTS, Graph, Node, Tape
-from lagjax._program._look_ups import Table, moved
+from lagjax._program._look_ups import Table, move_look_up
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, replace_by_inputs, sink_negations
 from lagjax._program._series import StraightLine
@@ -46,7 +46,7 @@ def copied(graph: Graph, line, inputs: Sequence[int], places: Sequence[int] | No
         elif op == "integer_pow":
             nodes.append(graph.power(nodes[operands[0]], attribute))
         else:
-            here = moved(attribute, places) if op in LOOK_UPS and places is not None else attribute
+            here = move_look_up(attribute, places) if op in LOOK_UPS and places is not None else attribute
             nodes.append(graph.apply(op, *[nodes[i] for i in operands], attribute=here))
     return nodes
 
@@ -74,7 +74,7 @@ class Derivatives:
         """
         first: dict[int, int] = {}
         same = [first.setdefault(i, k) if together else k for k, i in enumerate(nodes)]
-        varied, once_more = (self._varied(tape, nodes, frozenset(inputs)) for inputs in (by, again))
+        varied, once_more = (self._find_varying(tape, nodes, frozenset(inputs)) for inputs in (by, again))
         cotangents, results = {same[output]: self._number(1.0)}, {}
         for k in range(output, -1, -1):
             if not varied[k] or (g := cotangents.pop(k, None)) is None:
@@ -98,13 +98,13 @@ class Derivatives:
         for i in reversed(list(through)):
             if i in ends or (g := cotangents.pop(i, None)) is None:
                 continue
-            op, operands, attribute = self.as_derived(i)
+            op, operands, attribute = self.node_to_differentiate(i)
             for x, rule in zip(operands, self._rules(i, op, operands, attribute), strict=False):
                 if rule is not None and self.graph.value(x) is None:
                     self._add(cotangents, x, rule(g))
         return [cotangents.get(i, self._number(0.0)) for i in by]
 
-    def _varied(self, tape: Tape, nodes: list[int], by: frozenset[int]) -> list[bool]:
+    def _find_varying(self, tape: Tape, nodes: list[int], by: frozenset[int]) -> list[bool]:
         """True for every scalar of a tape that depends on the inputs `by` and has a derivative."""
         varied: list[bool] = []
         for k, (op, operands, attribute) in enumerate(tape.nodes):
@@ -114,38 +114,38 @@ class Derivatives:
 
     # ---- forward mode ----
 
-    def along(self, outputs: Sequence[int], directions: Sequence[Tangents]) -> list[Tangents]:
+    def directional_derivatives(self, outputs: Sequence[int], directions: Sequence[Tangents]) -> list[Tangents]:
         """The derivatives of some nodes along directions, each the tangents of some inputs."""
         tangents: dict[int, Tangents] = {}
         for k, direction in enumerate(directions):
             for i, tangent in direction.items():
                 if self.graph.value(tangent) != 0:
                     tangents.setdefault(i, {})[k] = tangent
-        for i in self.below(outputs) if tangents else ():
+        for i in self.find_ancestors(outputs) if tangents else ():
             if self.graph.kinds[i] == "float" and i not in tangents:
-                moved = not tangents.keys().isdisjoint(self.as_derived(i)[1])
+                moved = not tangents.keys().isdisjoint(self.node_to_differentiate(i)[1])
                 if moved and (of_node := self._tangents(i, tangents)):
                     tangents[i] = of_node
         return [tangents.get(i, {}) for i in outputs]
 
-    def along_one(self, outputs: Sequence[int], direction: Tangents) -> list[int]:
+    def directional_derivative(self, outputs: Sequence[int], direction: Tangents) -> list[int]:
         """The derivatives of some nodes along one direction, the tangents of some inputs."""
-        return [t.get(0, self._number(0.0)) for t in self.along(outputs, [direction])]
+        return [t.get(0, self._number(0.0)) for t in self.directional_derivatives(outputs, [direction])]
 
     def _tangents(self, i: int, tangents: dict[int, Tangents]) -> Tangents:
         """The tangents of a node, from those of its operands."""
-        (op, operands, attribute), result = self.as_derived(i), {}
+        (op, operands, attribute), result = self.node_to_differentiate(i), {}
         if op == "div" and all(x in tangents for x in operands):
             (u, v), found = operands, tangents
             directions = [*found[v], *(k for k in found[u] if k not in found[v])]
-            return {k: self.of_quotient(i, v, found[u].get(k), found[v].get(k)) for k in directions}
+            return {k: self.quotient_tangent(i, v, found[u].get(k), found[v].get(k)) for k in directions}
         for operand, rule in zip(operands, self._rules(i, op, operands, attribute), strict=False):
             if rule is not None:
                 for k, tangent in tangents.get(operand, {}).items():
                     self._add(result, k, rule(tangent))
         return {k: tangent for k, tangent in result.items() if self.graph.value(tangent) != 0}
 
-    def of_quotient(self, w: int, v: int, of_u: int | None, of_v: int | None) -> int:
+    def quotient_tangent(self, w: int, v: int, of_u: int | None, of_v: int | None) -> int:
         """(u′ − w v′)/v, the tangent of w = u / v: one division, where the two rules have two."""
         if of_v is None:
             assert of_u is not None
@@ -158,15 +158,15 @@ class Derivatives:
     def rules(self, w: int, op: str, operands: Sequence[int]) -> list[_Rule | None]:
         """The rules that take a cotangent, or a tangent, of each operand past w = op(operands); None: there is none."""
 
-        def passed(rule):
+        def bind_rule(rule):
             return None if rule is None else lambda g: rule(self._apply, self._number, g, w, *operands)
 
-        return [passed(rule) for rule in OPERATIONS[op].transpose()] if operands else []
+        return [bind_rule(rule) for rule in OPERATIONS[op].transpose()] if operands else []
 
     def _rules(self, w: int, op: str, operands: Sequence[int], attribute: Any = None) -> Sequence[_Rule | None]:
         """`rules`, where a power is one operation."""
         if op == "integer_pow":
-            return [lambda g: self._of_power(operands[0], attribute, g)]
+            return [lambda g: self._power_derivative(operands[0], attribute, g)]
         return self.rules(w, op, operands)
 
     def _rules_once(self, w: int, op: str, operands: Sequence[int], attribute: Any) -> Sequence[_Rule | None]:
@@ -174,24 +174,24 @@ class Derivatives:
         if op == "sqrt":
             return [lambda g: self._apply("mul", self._number(0.5), self._apply("div", g, w))]
         if op == "mul" and operands[0] == operands[1]:
-            return [lambda g: self._of_power(operands[0], 2, g)]
+            return [lambda g: self._power_derivative(operands[0], 2, g)]
         return self._rules(w, op, operands, attribute)
 
-    def _of_power(self, base: int, exponent: float, g: int) -> int:
+    def _power_derivative(self, base: int, exponent: float, g: int) -> int:
         """p uᵖ⁻¹ g, which is finite at u = 0 where the products and roots that make up uᵖ have no derivative."""
         lower = base if exponent == 2 else self._apply("pow", base, self._number(exponent - 1))
         return self._apply("mul", g, self._apply("mul", self._number(exponent), lower))
 
     # ---- the graph ----
 
-    def as_derived(self, i: int) -> Node:
+    def node_to_differentiate(self, i: int) -> Node:
         """A node as it is differentiated: a power is one operation, not the products that it consists of."""
         if i in self.graph.powers:
             base, exponent = self.graph.powers[i]
             return "integer_pow", (base,), exponent
         return self.graph.nodes[i]
 
-    def below(self, outputs: Sequence[int]) -> list[int]:
+    def find_ancestors(self, outputs: Sequence[int]) -> list[int]:
         """The nodes that some nodes are derived from, and these, in order."""
         return self.graph.below(outputs, as_derived=True)
 
@@ -220,12 +220,12 @@ def pushforward(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Seq
     values of the outputs `known`, which are not computed once more.
     """
     places = {i: len(dtypes) + k for k, i in enumerate(by)}
-    placed = _PlacedLine.in_new_graph(line, dtypes, len(by))
+    placed = _PlacedLine.from_line(line, dtypes, len(by))
     with np.errstate(all="ignore"):
         tangents = {i: placed.graph.input(place, "float") for i, place in places.items()}
         moved = placed.tangents(tangents, places, lambda table: table._replace(tangents=True))
         zero = placed.graph.constant(0.0, "float")
-        return placed.finished([moved.get(line.outputs[i], zero) for i in of], known, len(dtypes) + len(by))
+        return placed.finish_line([moved.get(line.outputs[i], zero) for i in of], known, len(dtypes) + len(by))
 
 
 def pullback(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=()) -> StraightLine:
@@ -251,14 +251,14 @@ def pullback_and_entries(
     For each of the tables two outputs come behind those of the inputs: the index of an entry, and its cotangent. Only
     entries of tables for which `varies` is true have cotangents.
     """
-    placed, tables = _PlacedLine.in_new_graph(line, dtypes), []
+    placed, tables = _PlacedLine.from_line(line, dtypes), []
     with np.errstate(all="ignore"):
         cotangents: dict[int, int] = {}
         for k, output in enumerate(of):
             placed._add(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
         results = placed.cotangents(cotangents, by, tables, varies)
         results += [i for _, *entry in tables for i in entry]
-        done = placed.finished(results, known, len(dtypes) + len(of))
+        done = placed.finish_line(results, known, len(dtypes) + len(of))
     return done, tuple(table for table, *_ in tables)
 
 
@@ -320,14 +320,14 @@ class _PlacedLine(Derivatives):
         self.line, self.nodes = line, nodes
 
     @classmethod
-    def in_new_graph(cls, line: StraightLine, dtypes: Sequence, more: int = 0) -> "_PlacedLine":
+    def from_line(cls, line: StraightLine, dtypes: Sequence, more: int = 0) -> "_PlacedLine":
         """The line in a graph of its own, with inputs of these types and this many more floats."""
         graph = Graph(_LARGEST * len(line.nodes) + 1000)
         inputs = [graph.input(i, kind) for i, kind in enumerate([*map(_kind, dtypes), *["float"] * more])]
         with np.errstate(all="ignore"):
             return cls(graph, line, copied(graph, line, inputs))
 
-    def finished(self, results: list[int], known: Sequence[int], first: int) -> StraightLine:
+    def finish_line(self, results: list[int], known: Sequence[int], first: int) -> StraightLine:
         """The line of some results, which reads the outputs `known` of the line as inputs from `first` on."""
         results, count = results + [self.nodes[self.line.outputs[i]] for i in known], len(results)
         done = StraightLine(*eliminate_dead_code(*sink_negations(*factor(self.graph, results))))
@@ -355,7 +355,7 @@ class _PlacedLine(Derivatives):
             here, parts = [nodes[i] for i in operands], {}
             if op == "div" and operands[1] in tangents:
                 u, v = operands
-                parts[k] = self.of_quotient(nodes[k], nodes[v], tangents.get(u), tangents[v])
+                parts[k] = self.quotient_tangent(nodes[k], nodes[v], tangents.get(u), tangents[v])
             else:
                 for i, rule in zip(operands, self.rules(nodes[k], op, here), strict=False):
                     if rule is not None and i in tangents:
@@ -377,7 +377,7 @@ class _PlacedLine(Derivatives):
         where the table consists of inputs `by`, to each of these.
         """
         line, nodes, inputs, results = self.line, self.nodes, frozenset(by), {}
-        varied = self._varied_by(inputs, varies)
+        varied = self._find_varying_nodes(inputs, varies)
         for k in range(len(line.nodes) - 1, -1, -1):
             (op, operands, attribute), g = line.nodes[k], cotangents.get(k)
             if g is None or not varied[k]:
@@ -398,7 +398,7 @@ class _PlacedLine(Derivatives):
                         self._add(cotangents, i, self._zero_where_zero(k, g, rule(g)))
         return [results[i] if i in results else self._number(0.0) for i in by]
 
-    def _varied_by(self, inputs: frozenset[int], varies: Callable[[Table], bool]) -> list[bool]:
+    def _find_varying_nodes(self, inputs: frozenset[int], varies: Callable[[Table], bool]) -> list[bool]:
         """True for every node that depends on some inputs, or on entries of a table that `varies`."""
         varied: list[bool] = []
         for (op, operands, attribute), kind in zip(self.line.nodes, self.line.kinds, strict=True):

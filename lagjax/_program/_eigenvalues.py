@@ -63,7 +63,7 @@ def eigen_3(a) -> list[Pair]:
     entries = [a[0, 0] - mean, a[1, 1] - mean, a[2, 2] - mean, a[1, 0], a[2, 0], a[2, 1]]
     squares = [x * x for x in entries]
     scale = xp.root((squares[0] + squares[1] + squares[2] + 2.0 * (squares[3] + squares[4] + squares[5])) / 6.0)
-    xx, yy, zz, xy, xz, yz = (_divided(x, scale) for x in entries)
+    xx, yy, zz, xy, xz, yz = (_divide_or_zero(x, scale) for x in entries)
     ratio = 0.5 * (xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
     is_low = xp.prefers(0.0, ratio)
     root = _far_root(xp.where(is_low, -ratio, ratio))
@@ -71,43 +71,43 @@ def eigen_3(a) -> list[Pair]:
     # The adjugate of what is left is the projection on the vector times its trace, 3 (far² − 1) > 0. The axis with the
     # largest component becomes the first one.
     x, y, z = xx - far, yy - far, zz - far
-    axis = _Axis(y * z - yz * yz, x * z - xz * xz, x * y - xy * xy)
-    xx, yy, zz = axis.first(xx, yy, zz), axis.first(yy, xx, yy), axis.first(zz, zz, xx)
-    xy, xz, yz = axis.first(xy, xy, yz), axis.first(xz, yz, xz), axis.first(yz, xz, xy)
+    axis = _AxisExchange(y * z - yz * yz, x * z - xz * xz, x * y - xy * xy)
+    xx, yy, zz = axis.pick(xx, yy, zz), axis.pick(yy, xx, yy), axis.pick(zz, zz, xx)
+    xy, xz, yz = axis.pick(xy, xy, yz), axis.pick(xz, yz, xz), axis.pick(yz, xz, xy)
     y, z = yy - far, zz - far
     column = [y * z - yz * yz, xz * yz - xy * z, xy * yz - xz * y]
     length = xp.root(_dot(column, column))
-    u, v, w = (_divided(x, length) for x in column)
+    u, v, w = (_divide_or_zero(x, length) for x in column)
     # The reflection that takes the first axis to −(u, v, w) takes the others to two vectors beside it.
     share = 1.0 / (1.0 + u)
     beside = [[-v, 1.0 - share * v * v, -share * v * w], [-w, -share * v * w, 1.0 - share * w * w]]
     images = [[xx * p + xy * q + xz * r, xy * p + yy * q + yz * r, xz * p + yz * q + zz * r] for p, q, r in beside]
     low, high = eigen_2(_dot(beside[0], images[0]), _dot(beside[0], images[1]), _dot(beside[1], images[1]))
     others = [
-        (value, axis.back([s * p + t * q for p, q in zip(*beside, strict=True)])) for value, (s, t) in (low, high)
+        (value, axis.restore([s * p + t * q for p, q in zip(*beside, strict=True)])) for value, (s, t) in (low, high)
     ]
-    alone = far, axis.back([x / length for x in column])
+    alone = far, axis.restore([x / length for x in column])
     return [
         (mean + scale * xp.where(is_low, a, b), [xp.where(is_low, s, t) for s, t in zip(of_a, of_b, strict=True)])
         for (a, of_a), (b, of_b) in zip([alone, *others], [*others, alone], strict=True)
     ]
 
 
-class _Axis:
+class _AxisExchange:
     """The exchange of the first axis with that of the largest of three numbers."""
 
     def __init__(self, first, second, third):
         self._is_second = xp.prefers(second, first)
         self._is_third = xp.prefers(third, xp.where(self._is_second, second, first))
 
-    def first(self, kept, with_second, with_third):
+    def pick(self, kept, with_second, with_third):
         """The one of three numbers that belongs to the axis."""
         return xp.where(self._is_third, with_third, xp.where(self._is_second, with_second, kept))
 
-    def back(self, vector: list) -> list:
+    def restore(self, vector: list) -> list:
         """A vector with its components in their places."""
         x, y, z = vector
-        return [self.first(x, y, z), self.first(y, x, y), self.first(z, z, x)]
+        return [self.pick(x, y, z), self.pick(y, x, y), self.pick(z, z, x)]
 
 
 def _far_root(ratio):
@@ -119,7 +119,7 @@ def _far_root(ratio):
     return x
 
 
-def _divided(x, by):
+def _divide_or_zero(x, by):
     """The quotient, and 0 for 0 / 0, whose derivative is then not to be trusted: that of `by` is NaN there."""
     return x / xp.where(xp.equal(by, 0.0), 1.0, by)
 
@@ -152,20 +152,20 @@ def _eigh(expansion: Expansion, params, a: np.ndarray) -> list[np.ndarray]:
     if not params["lower"]:
         a = np.swapaxes(a, -1, -2)
     batch = a.shape[:-2]
-    done = [_ordered(expansion, a[at]) for at in np.ndindex(*batch)]
+    done = [_order_eigenpairs(expansion, a[at]) for at in np.ndindex(*batch)]
     values = np.array([[value for value, _ in pairs] for pairs in done], dtype=np.int64).reshape(*batch, n)
     vectors = np.array([[vector for _, vector in pairs] for pairs in done], dtype=np.int64).reshape(*batch, n, n)
     return [np.swapaxes(vectors, -1, -2), values]
 
 
-def _ordered(expansion: Expansion, a: np.ndarray) -> list[tuple[int, list[int]]]:
+def _order_eigenpairs(expansion: Expansion, a: np.ndarray) -> list[tuple[int, list[int]]]:
     """The eigenpairs of a matrix of ids, block by block, in order."""
     n, zero = len(a), expansion.graph.constant(0.0, "float")
     values, vectors, blocks = [], [], _blocks(expansion, a)
     for block in blocks:
         for value, parts in eigen(Scalars(expansion, a[np.ix_(block, block)])):
             vector = np.full(n, zero)
-            vector[block] = _signed(expansion, parts)
+            vector[block] = _fix_sign(expansion, parts)
             values.append(value.ids)
             vectors.append(vector)
     for end in range(n - 1 if len(blocks) > 1 else 0, 0, -1):
@@ -187,7 +187,7 @@ def _blocks(expansion: Expansion, a: np.ndarray) -> list[list[int]]:
     return [sorted(block) for block in blocks]
 
 
-def _signed(expansion: Expansion, vector: list) -> np.ndarray:
+def _fix_sign(expansion: Expansion, vector: list) -> np.ndarray:
     """A vector as ids, with its sign."""
     if len(vector) == 1:
         return expansion.constants(np.array(vector))

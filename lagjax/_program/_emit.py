@@ -44,15 +44,15 @@ def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ..
     def entries(table):
         return jnp.stack(jnp.broadcast_arrays(*(scalars[i] for i in table.positions)), axis=-1)
 
-    return _emitted(nodes, kinds, outputs, scalars, shape, entries)
+    return _emit_outputs(nodes, kinds, outputs, scalars, shape, entries)
 
 
-def _emitted(nodes, kinds, outputs, scalars, shape: tuple[Any, ...], entries: Callable) -> tuple:
+def _emit_outputs(nodes, kinds, outputs, scalars, shape: tuple[Any, ...], entries: Callable) -> tuple:
     """The outputs, of this shape."""
     fast = frozenset() if getattr(_state, "plain", False) else _elementary.FAST.keys()
     precision = _precision(nodes, kinds, scalars)
     dtypes = [precision if kind == "float" else np.dtype(kind) for kind in kinds]
-    paired = _paired(nodes) if fast else frozenset()
+    paired = _find_paired_angles(nodes) if fast else frozenset()
     values: list = [None] * len(nodes)
     pairs: dict[int, tuple] = {}
 
@@ -64,13 +64,13 @@ def _emitted(nodes, kinds, outputs, scalars, shape: tuple[Any, ...], entries: Ca
         elif op == "convert":
             values[i] = lax.convert_element_type(values[operands[0]], dtypes[i])
         elif op in LOOK_UPS:
-            values[i] = _looked_up(op, attribute, entries, precision, values[operands[0]])
+            values[i] = _emit_look_up(op, attribute, entries, precision, values[operands[0]])
         elif op in ("sin", "cos") and operands[0] in paired:
             if operands[0] not in pairs:
                 pairs[operands[0]] = _fast_function("sincos")(values[operands[0]])
             values[i] = pairs[operands[0]][op == "cos"]
         else:
-            xs = _aligned([values[operand] for operand in operands])
+            xs = _align_shapes([values[operand] for operand in operands])
             values[i] = _fast_function(op)(*xs) if op in fast else _apply(op, xs, attribute)
     return tuple(jnp.broadcast_to(jnp.asarray(values[i]), shape) for i in outputs)
 
@@ -94,14 +94,14 @@ class Rows(NamedTuple):
 def emit_rows(line: StraightLine, rows: Rows) -> tuple:
     """`emit` for inputs of which most are looked up in tables: none of these is taken apart."""
     shape = jnp.broadcast_shapes(rows.first.shape[:-1], rows.numbers.shape[:-1])
-    return _emitted(line.nodes, line.kinds, line.outputs, rows, shape, rows.entries)
+    return _emit_outputs(line.nodes, line.kinds, line.outputs, rows, shape, rows.entries)
 
 
-def _looked_up(op: str, attribute, entries: Callable, precision, x) -> jax.Array:
+def _emit_look_up(op: str, attribute, entries: Callable, precision, x) -> jax.Array:
     """An entry of a table, or the piece of one that x is on; `entries(table)` has shape (…, count)."""
     table = table_of(attribute)
     known = table.numbers is not None
-    values = jnp.asarray(table.known if known else entries(table)).astype(precision)
+    values = jnp.asarray(table.entries if known else entries(table)).astype(precision)
     if op == "take":
         x = jnp.clip(jnp.where(jnp.isnan(x), 0, x), 0, table.count - 1).astype(int)
         return jnp.vectorize(lambda of, i: jnp.asarray(of)[i], signature="(k),()->()")(values, x)
@@ -121,7 +121,7 @@ def _precision(nodes, kinds, scalars):
     return jnp.result_type(float, *(scalars[i] for i in positions))
 
 
-def _paired(nodes) -> frozenset[int]:
+def _find_paired_angles(nodes) -> frozenset[int]:
     """The angles whose sine and cosine are both wanted."""
     sines, cosines = ({operands[0] for op, operands, _ in nodes if op == name} for name in ("sin", "cos"))
     return frozenset(sines & cosines)
@@ -141,10 +141,10 @@ def _apply(op: str, xs: list, attribute) -> jax.Array:
     return function(*xs) if attribute is None else function(*xs, lax.RoundingMethod(attribute))
 
 
-def in_jax(op: str, *xs, attribute=None) -> jax.Array:
+def apply_in_jax(op: str, *xs, attribute=None) -> jax.Array:
     """The operation on arrays that broadcast: `f` of the formulas of `_operations`, in JAX."""
     dtype = jnp.result_type(*xs)
-    return _apply(op, _aligned([jnp.asarray(x, dtype) for x in xs]), attribute)
+    return _apply(op, _align_shapes([jnp.asarray(x, dtype) for x in xs]), attribute)
 
 
 @functools.cache
@@ -157,7 +157,7 @@ def _fast_function(op: str) -> Callable:
     """
     function = jax.jit(_elementary.sincos if op == "sincos" else _elementary.FAST[op])
 
-    def on_lanes(*xs):
+    def call_on_lanes(*xs):
         with set_xla_metadata(inlineable="false"):
             return function(*xs)
 
@@ -167,7 +167,7 @@ def _fast_function(op: str) -> Callable:
     @of_number.def_vmap
     def lanes_of(size, batched, *xs):
         whole = [x if has else jnp.broadcast_to(x, (size, *jnp.shape(x))) for x, has in zip(xs, batched, strict=True)]
-        return on_lanes(*whole), (True, True) if op == "sincos" else True
+        return call_on_lanes(*whole), (True, True) if op == "sincos" else True
 
     # `custom_vmap` has no derivative of every order of its own.
     single = jax.custom_jvp(of_number)
@@ -182,7 +182,7 @@ def _fast_function(op: str) -> Callable:
     def call(*xs):
         if default_platform() != "cpu":
             return function(*xs)
-        return on_lanes(*xs) if any(jnp.ndim(x) for x in xs) else single(*xs)
+        return call_on_lanes(*xs) if any(jnp.ndim(x) for x in xs) else single(*xs)
 
     return call
 
@@ -191,7 +191,7 @@ def _sine_and_cosine(x):
     return lax.sin(x), lax.cos(x)
 
 
-def _aligned(values: list) -> list:
+def _align_shapes(values: list) -> list:
     """Operands of one shape: `lax` does not broadcast, which is why it is quick to trace."""
     shapes = {value.shape for value in values}
     if len(shapes) == 1:

@@ -11,7 +11,7 @@ import numpy as np
 from lagjax._program._groups import MOST_HELD, MOST_STATES, Groups
 from lagjax._program._look_ups import cotangents as of_entries
 from lagjax._program._look_ups import look_up, table_of
-from lagjax._program._operations import LOOK_UPS, OPERATIONS, in_numpy
+from lagjax._program._operations import LOOK_UPS, OPERATIONS, apply_in_numpy
 
 # States looked at together. A value of 2048 states has 16 KB, so that some tens of live values stay in a core's second
 # cache, and the microsecond that NumPy takes to begin an operation is no more than what the operation takes itself.
@@ -26,7 +26,7 @@ def evaluate(line, columns: Sequence, steps: Callable | None = None, groups: Gro
     `columns` holds one entry for each input: a number, or one number for each of S states, shape (S,). Floats have the
     precision of the float columns. Values are dropped as soon as nothing needs them.
     """
-    columns, precision, count = _prepared(line, columns, groups)
+    columns, precision, count = _prepare_columns(line, columns, groups)
     results = np.empty((len(line.outputs), count), precision)
     if groups is not None and count <= MOST_STATES:
         for part in _parts(groups, count):
@@ -56,7 +56,7 @@ def _cut(x, part: slice):
     return x if x is None or np.size(x) == 1 else x[part]
 
 
-def _prepared(line, columns, groups: Groups | None = None) -> tuple[list[np.ndarray], np.dtype, int]:
+def _prepare_columns(line, columns, groups: Groups | None = None) -> tuple[list[np.ndarray], np.dtype, int]:
     """The columns as arrays of their kinds, the precision of floats, and the number of states."""
     of_input = _kinds_of_inputs(line) if groups is None else groups.kinds_of_inputs()
     read = {i: np.asarray(columns[i]) for i in of_input}  # unused columns are passed on as they are
@@ -108,7 +108,7 @@ def steps_of(line, precision) -> list[tuple[Callable | None, tuple, object, tupl
     return steps
 
 
-def _converted(x, dtype):
+def _convert(x, dtype):
     return np.asarray(x).astype(dtype)
 
 
@@ -116,7 +116,7 @@ def _LOOK_UP(x, attribute):
     raise AssertionError
 
 
-_BESIDE: dict[str, Callable | None] = {"input": None, "constant": None, "convert": _converted}
+_BESIDE: dict[str, Callable | None] = {"input": None, "constant": None, "convert": _convert}
 
 
 def _values(steps, columns) -> list:
@@ -146,7 +146,7 @@ def round_off(line, columns: Sequence) -> np.ndarray:
     Every operation adds one unit in the last place of its result to what its operands bring along: terms that cancel
     leave theirs behind. Source: Higham, *Accuracy and Stability of Numerical Algorithms*, §3.3 (running errors).
     """
-    (nodes, kinds, outputs), (columns, precision, count) = line, _prepared(line, columns)
+    (nodes, kinds, outputs), (columns, precision, count) = line, _prepare_columns(line, columns)
     eps, errors = float(np.finfo(precision).eps), []
     with np.errstate(all="ignore"):
         values = _values(steps_of((nodes, kinds, range(len(nodes))), precision), columns)
@@ -155,7 +155,7 @@ def round_off(line, columns: Sequence) -> np.ndarray:
             error = 0.0 if kind != "float" or exact else eps * np.abs(value)
             for i, partial in zip(operands, _transpose(op), strict=False):
                 if partial is not None and kind == "float" and np.any(errors[i]):
-                    moved = np.abs(partial(in_numpy, float, errors[i], value, *(values[j] for j in operands)))
+                    moved = np.abs(partial(apply_in_numpy, float, errors[i], value, *(values[j] for j in operands)))
                     error = error + np.where(errors[i] == 0, 0.0, moved)
             errors.append(error)
     return np.stack([np.broadcast_to(errors[i], count) for i in outputs])
@@ -172,7 +172,7 @@ def vjp(line, columns: Sequence, cotangents: Sequence, groups: Groups | None = N
     straight line. A cotangent is a number, an array that broadcasts with the columns, or None. Of large lines the
     `groups` are evaluated.
     """
-    (nodes, kinds, outputs), (columns, precision, count) = line, _prepared(line, columns, groups)
+    (nodes, kinds, outputs), (columns, precision, count) = line, _prepare_columns(line, columns, groups)
     if groups is not None:
         return _vjp_of_groups(groups, columns, precision, count, cotangents)
     with np.errstate(all="ignore"):
@@ -196,7 +196,7 @@ def vjp(line, columns: Sequence, cotangents: Sequence, groups: Groups | None = N
                         of_nodes,
                         kinds,
                         i,
-                        partial(in_numpy, float, of_nodes[k], values[k], *(values[j] for j in operands)),
+                        partial(apply_in_numpy, float, of_nodes[k], values[k], *(values[j] for j in operands)),
                     )
             of_nodes[k] = None
     return inputs
@@ -209,7 +209,7 @@ def _vjp_of_groups(groups: Groups, columns, precision, count: int, cotangents) -
         size, here = part.stop - part.start, [_cut(x, part) for x in cotangents]
         with np.errstate(all="ignore"):
             values = groups.values([_cut(x, part) for x in columns], precision, size if count > 1 else 1)
-            for i, flow in groups.transposed(values, here, size):
+            for i, flow in groups.transpose(values, here, size):
                 if inputs[i] is None:
                     inputs[i] = np.zeros(states, precision)
                 inputs[i][part] += flow

@@ -241,12 +241,12 @@ class Graph:
 
     def _fold(self, op: str, operands: tuple[int, ...], attribute: Any) -> int:
         if op in LOOK_UPS:
-            return self._looked_up(op, operands[0], attribute)
+            return self._fold_look_up(op, operands[0], attribute)
         values = [np.dtype(self.kinds[i]).type(self.nodes[i][2]) for i in operands]
         extra = () if attribute is None else (attribute,)
         return self.constant(OPERATIONS[op].value(*values, *extra), self._kind(op, operands, attribute))
 
-    def _looked_up(self, op: str, x: int, attribute: Any) -> int:
+    def _fold_look_up(self, op: str, x: int, attribute: Any) -> int:
         """A look-up at a number: an entry is that input, or a number."""
         value, table = self.nodes[x][2], table_of(attribute)
         if table.numbers is not None:
@@ -329,19 +329,19 @@ class Graph:
         if len(terms) > LONGEST:
             return self._signed_sum(a, b, sign)
         if 2 * len(terms) <= len(left) + len(right):  # worth writing anew, though the old sums may live on elsewhere
-            return self._written_out(terms)
-        return self._known_sum(terms, a, b, sign)
+            return self._add_terms(terms)
+        return self._find_sum(terms, a, b, sign)
 
-    def _written_out(self, terms: dict[int, float]) -> int:
+    def _add_terms(self, terms: dict[int, float]) -> int:
         """The terms added one by one, positive ones first."""
         (base, coefficient), *rest = sorted(terms.items(), key=lambda term: term[1] < 0)
         total, done = self.scale(coefficient, base), {base: coefficient}
         for base, coefficient in rest:
             done = {**done, base: coefficient}
-            total = self._known_sum(done, total, self.scale(coefficient, base), 1)
+            total = self._find_sum(done, total, self.scale(coefficient, base), 1)
         return total
 
-    def _known_sum(self, terms: dict[int, float], a: int, b: int, sign: int) -> int:
+    def _find_sum(self, terms: dict[int, float], a: int, b: int, sign: int) -> int:
         """`a + sign*b`, which is the sum of `terms`: an earlier node, or its negative, if there is one."""
         first = -1.0 if terms[min(terms)] < 0 else 1.0  # a sum and its negative are known by one key
         key = frozenset(terms.items() if first > 0 else [(x, -c) for x, c in terms.items()])
@@ -394,7 +394,7 @@ class Tape(Graph):
         """The scalar `op(*operands)`; a number, where all operands are."""
         if all(self.nodes[i][0] == "constant" for i in operands):
             return self._fold(op, operands, attribute)
-        return self._written(op, operands, attribute, self._kind(op, operands, attribute))
+        return self._append_operation(op, operands, attribute, self._kind(op, operands, attribute))
 
     def apply_all(self, op: str, *columns: list[int], attribute=None) -> list[int]:
         """`apply` for many operands."""
@@ -404,9 +404,9 @@ class Tape(Graph):
         """The scalar `a**exponent`, as one node."""
         if self.value(a) is not None or self.kinds[a] != "float":
             return super().power(a, exponent)
-        return self._written("integer_pow", (a,), exponent, "float")
+        return self._append_operation("integer_pow", (a,), exponent, "float")
 
-    def _written(self, op: str, operands: tuple[int, ...], attribute: Any, kind: str) -> int:
+    def _append_operation(self, op: str, operands: tuple[int, ...], attribute: Any, kind: str) -> int:
         self.nodes.append((op, operands, attribute))
         self.kinds.append(kind)
         return len(self.nodes) - 1

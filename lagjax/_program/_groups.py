@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._program._operations import LOOK_UPS, OPERATIONS, in_numpy
+from lagjax._program._operations import LOOK_UPS, OPERATIONS, apply_in_numpy
 
 # Nodes from which groups are tried, and how many times fewer groups there must be: one costs as much as ten nodes.
 _LEAST, _FEWER = 2000, 20
@@ -71,7 +71,7 @@ class Groups(NamedTuple):
             values[group.kind][group.rows] = found
         return values
 
-    def transposed(
+    def transpose(
         self, values: dict[str, np.ndarray], cotangents: Sequence, states: int
     ) -> Iterator[tuple[int, np.ndarray]]:
         """The positions of the inputs to which something flows from the outputs, each with what does, (states,).
@@ -99,7 +99,7 @@ class Groups(NamedTuple):
             for (kind, of), partial in zip(group.operands, OPERATIONS[group.op].transpose(), strict=False):
                 if partial is None or kind != "float" or still[of[some]].all():
                     continue
-                part = partial(in_numpy, float, here, value, *operands)
+                part = partial(apply_in_numpy, float, here, value, *operands)
                 if part is not None:
                     _add(found, of[some], np.broadcast_to(part, here.shape))
                     flows[of[some]] = True

@@ -23,12 +23,12 @@ Ids = np.ndarray
 _WHOLE = ("locate", "floor", "ceil", "round")  # operations whose result is a whole number
 
 
-def known(expansion: Any, ids: Ids) -> bool:
+def are_numbers(expansion: Any, ids: Ids) -> bool:
     """True if all of these scalars are numbers."""
     return all(expansion.graph.value(i) is not None for i in ids.ravel().tolist())
 
 
-def located(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None:
+def locate_knots(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None:
     """The number of the increasing `knots` that are at most x, less one, as integers; see `_look_ups.Located`.
 
     None where the knots are no table from its first entry to its last.
@@ -41,7 +41,7 @@ def located(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None:
     return expansion.map("convert", np.array(found, dtype=np.int64).reshape(x.shape), attribute="int32")
 
 
-def looked_up(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any, missing: float | None) -> Ids:
+def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any, missing: float | None) -> Ids:
     """The windows (*sizes) of an array that begin at `indices` (…, axes) along some axes, shape (…, *sizes).
 
     A window that sticks out begins where it fits; or is `missing`, where that is a number.
@@ -154,11 +154,11 @@ def _as_float(graph: Graph, i: int) -> int:
     if kind != "bool" and op in ("add", "sub", "mul", "neg", "max", "min"):
         return graph.apply(op, *(_as_float(graph, x) for x in operands))
     if kind != "bool" and op == "select":
-        return graph.apply(op, _of_floats(graph, operands[0]), *(_as_float(graph, x) for x in operands[1:]))
+        return graph.apply(op, _compare_floats(graph, operands[0]), *(_as_float(graph, x) for x in operands[1:]))
     return graph.constant(attribute, "float") if op == "constant" else graph.apply("convert", i, attribute="float")
 
 
-def _of_floats(graph: Graph, i: int) -> int:
+def _compare_floats(graph: Graph, i: int) -> int:
     """A comparison of integers as one of floats."""
     op, operands, _ = graph.nodes[i]
     if op in ("lt", "le", "gt", "ge", "eq", "ne") and graph.kinds[operands[0]] not in ("float", "bool"):

@@ -32,7 +32,7 @@ class Table(NamedTuple):
     tangents: bool = False
 
     @property
-    def known(self) -> np.ndarray:
+    def entries(self) -> np.ndarray:
         """The entries of a table of numbers, (count,)."""
         assert self.numbers is not None
         numbers = np.frombuffer(self.numbers)
@@ -71,7 +71,7 @@ def shifted(attribute: "Table | Located", by: int) -> "Table | Located":
     return attribute._replace(table=table) if isinstance(attribute, Located) else table
 
 
-def moved(attribute: "Table | Located", places: Sequence[int]) -> "Table | Located":
+def move_look_up(attribute: "Table | Located", places: Sequence[int]) -> "Table | Located":
     """A look-up in a program whose input `places[i]` is what input i was; numbers of a member stay what they are."""
     table = table_of(attribute)
     if table.numbers is not None or table.first >= BESIDE:
@@ -86,7 +86,7 @@ def look_up(op: str, attribute: Any, columns: Sequence, x) -> np.ndarray:
     """The result of `take` or `locate` at many states, (S,); `columns` holds a number or (S,) for every input."""
     table, x = table_of(attribute), np.asarray(x)
     if table.numbers is not None:
-        entries = table.known
+        entries = table.entries
     else:
         entries = np.stack(np.broadcast_arrays(*[columns[i] for i in table.positions]))
     if op == "take":

@@ -50,8 +50,8 @@ def solution(a, b):
     if n == 2:
         inverse = 1.0 / (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0])
         rows = a[1, 1] * b[0] - a[0, 1] * b[1], a[0, 0] * b[1] - a[1, 0] * b[0]
-        return xp.stacked([row * inverse for row in rows])
-    return solve_orthogonalized(orthogonalized(a), b)
+        return xp.stack([row * inverse for row in rows])
+    return solve_orthogonalized(orthogonalize(a), b)
 
 
 class Orthogonalized(NamedTuple):
@@ -68,7 +68,7 @@ class Orthogonalized(NamedTuple):
     squares: Any
 
 
-def orthogonalized(a) -> Orthogonalized:
+def orthogonalize(a) -> Orthogonalized:
     """Q and R, by the modified Gram–Schmidt process without square roots."""
     weights, columns, duals, ratios, squares = row_weights(a), [], [], [], []
     for _ in range(a.shape[0]):
@@ -79,7 +79,7 @@ def orthogonalized(a) -> Orthogonalized:
         duals.append(weighted / squares[-1])
         ratios.append(_sum(duals[-1][:, None] * a))
         a = a - column[:, None] * ratios[-1]
-    return Orthogonalized(xp.stacked(columns), xp.stacked(duals), xp.joined(ratios), xp.stacked(squares))
+    return Orthogonalized(xp.stack(columns), xp.stack(duals), xp.concatenate(ratios), xp.stack(squares))
 
 
 def solve_orthogonalized(factors: Orthogonalized, b):
@@ -96,7 +96,7 @@ def solve_orthogonalized(factors: Orthogonalized, b):
         for j in range(k + 1, n):
             parts[k] = parts[k] - factors.ratios[start + j - k - 1] * parts[j]
         end = start
-    return xp.stacked(parts)
+    return xp.stack(parts)
 
 
 def row_weights(a):
@@ -118,7 +118,7 @@ def determinant(a):
     """
     n = a.shape[0]
     if n > 3:
-        a = orthogonalized(a).columns  # as rows: the determinant is the same
+        a = orthogonalize(a).columns  # as rows: the determinant is the same
     minors: dict[tuple[int, ...], Any] = {(j,): a[0, j] for j in range(n)}
     for k in range(1, n):
         longer: dict[tuple[int, ...], Any] = {}
@@ -139,7 +139,7 @@ def _alternating(terms: list):
 
 def log_determinant(a):
     """log |det A| for A (n, n)."""
-    return 0.5 * (_sum(xp.logarithm(orthogonalized(a).squares)) - _sum(xp.logarithm(row_weights(a))))
+    return 0.5 * (_sum(xp.logarithm(orthogonalize(a).squares)) - _sum(xp.logarithm(row_weights(a))))
 
 
 def cholesky(a):
@@ -154,7 +154,7 @@ def cholesky(a):
         for i in range(k + 1, n):
             for j in range(k + 1, i + 1):
                 left[i, j] = left[i, j] - rows[i][k] * rows[j][k]
-    return xp.stacked([xp.stacked(row) for row in rows])
+    return xp.stack([xp.stack(row) for row in rows])
 
 
 def substitute(a, b, lower: bool, unit_diagonal: bool):
@@ -166,7 +166,7 @@ def substitute(a, b, lower: bool, unit_diagonal: bool):
         for j, known in unknowns.items():
             row = row - a[k, j] * known
         unknowns[k] = row if unit_diagonal else row / a[k, k]
-    return xp.stacked([unknowns[k] for k in range(n)])
+    return xp.stack([unknowns[k] for k in range(n)])
 
 
 # ---- primitives -----------------------------------------------------------------------------------------------------
@@ -203,7 +203,9 @@ def _matrix_of(expansion: Expansion, matvec, constants) -> np.ndarray:
     outputs = np.concatenate([apart.real(x).ravel() for x in apart.run_closed(matvec, inputs)]).tolist()
     one, zero = (apart.graph.constant(x, "float") for x in (1.0, 0.0))
     entries = np.full((len(outputs), len(vector)), zero)
-    for row, tangents in zip(entries, Derivatives(apart.graph).along(outputs, [{i: one} for i in vector]), strict=True):
+    for row, tangents in zip(
+        entries, Derivatives(apart.graph).directional_derivatives(outputs, [{i: one} for i in vector]), strict=True
+    ):
         for j, entry in tangents.items():
             row[j] = entry
     line = StraightLine(*eliminate_dead_code(apart.graph, entries.ravel().tolist()))

@@ -29,7 +29,7 @@ def operations_that_fit(bytes_each: int) -> int:
 
 
 @contextlib.contextmanager
-def without_collections() -> Iterator[None]:
+def pause_collections() -> Iterator[None]:
     """Inside, Python does not look for cycles of references.
 
     A graph consists of tuples, none of which is part of a cycle. To walk over all of them again and again while they

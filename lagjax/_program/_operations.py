@@ -81,7 +81,7 @@ class Operation:
         )  # fmt: skip
 
 
-def in_numpy(op: str, *xs, attribute=None):
+def apply_in_numpy(op: str, *xs, attribute=None):
     """The operation on numbers or arrays: `f` of the formulas below, in NumPy."""
     return OPERATIONS[op].value(*xs) if attribute is None else OPERATIONS[op].value(*xs, attribute)
 
@@ -102,7 +102,7 @@ def _divide(x, y):
     return np.where(y == 0, -1, np.trunc(np.divide(x, np.where(y == 0, 1, y))))[()].astype(np.result_type(x))
 
 
-def _unfolded(x, attribute):
+def _refuse_look_up(x, attribute):
     raise TypeError("a look-up has no value without its table")
 
 
@@ -360,15 +360,15 @@ _ROWS = (
 
 # Look-ups in tables (`_look_ups`): their operand is a number, and a whole array stands in their attribute.
 LOOK_UPS = {
-    name: Operation(name, 1, _unfolded, None, is_step=True, exact=True) for name in ("take", "locate")
+    name: Operation(name, 1, _refuse_look_up, None, is_step=True, exact=True) for name in ("take", "locate")
 }  # fmt: skip
 
 
-class _Rows(dict):
+class _OperationTable(dict):
     """The elementwise operations by their names; look-ups are known, but are none of them."""
 
     def __missing__(self, name: str) -> Operation:
         return LOOK_UPS[name]
 
 
-OPERATIONS: dict[str, Operation] = _Rows({row.name: row for row in _ROWS})
+OPERATIONS: dict[str, Operation] = _OperationTable({row.name: row for row in _ROWS})

@@ -19,7 +19,7 @@ from jax.core import Tracer
 from jax.extend import core
 
 from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
-from lagjax._program._indexing import known, located, looked_up
+from lagjax._program._indexing import are_numbers, locate_knots, look_up_windows
 from lagjax._program._operations import OPERATIONS
 
 # Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
@@ -50,7 +50,9 @@ class Expansion:
 
         for equation in live_equations(jaxpr):
             scope |= zip(
-                equation.outvars, self._equation(equation, [read(atom) for atom in read_by(equation)]), strict=True
+                equation.outvars,
+                self._equation(equation, [read(atom) for atom in find_variables(equation)]),
+                strict=True,
             )
         return [read(atom) for atom in jaxpr.outvars]
 
@@ -111,7 +113,7 @@ class Expansion:
             total = self.map(op, total, row)
         return total
 
-    def known(self, array: np.ndarray, what: str) -> np.ndarray:
+    def require_numbers(self, array: np.ndarray, what: str) -> np.ndarray:
         """The numbers behind an array of constants."""
         values = [self.graph.value(i) for i in array.ravel().tolist()]
         if None in values:
@@ -142,10 +144,10 @@ class Expansion:
                 raise Unlowerable(f"the primitive `{name}` of complex numbers has no scalar form here")
             result = COMPLEX[name](self, equation.params, *arguments)
         else:
-            result = self.lowered(name, equation.params, arguments)
+            result = self.lower_primitive(name, equation.params, arguments)
         return list(result) if equation.primitive.multiple_results else [result]
 
-    def lowered(self, name: str, params, arguments):
+    def lower_primitive(self, name: str, params, arguments):
         """The result of a primitive of real numbers, or of one that has other functions in it or only moves numbers."""
         if name not in MOVES and name not in _PASSING_ON:
             arguments = [self.real(x) for x in arguments]
@@ -205,11 +207,11 @@ def live_equations(jaxpr) -> list:
     for equation in reversed(jaxpr.eqns):
         if needed.intersection(equation.outvars):
             equations.append(equation)
-            needed.update(v for v in read_by(equation) if isinstance(v, core.Var))
+            needed.update(v for v in find_variables(equation) if isinstance(v, core.Var))
     return equations[::-1]
 
 
-def read_by(equation) -> list:
+def find_variables(equation) -> list:
     """The operands of a lowered equation: of a linear system the matrix and the right-hand side, not JAX's factors."""
     if equation.primitive.name != "custom_linear_solve":
         return equation.invars
@@ -570,16 +572,16 @@ def _sort(expansion, params, *operands):
 @lowers("dynamic_slice")
 def _dynamic_slice(expansion, params, x, *starts):
     sizes, starts = params["slice_sizes"], expansion.real(np.array(starts[: x.ndim]))
-    if not known(expansion, starts):
-        return looked_up(expansion, x, starts, range(x.ndim), sizes, None)
-    starts = expansion.known(starts, "the start of a slice")
+    if not are_numbers(expansion, starts):
+        return look_up_windows(expansion, x, starts, range(x.ndim), sizes, None)
+    starts = expansion.require_numbers(starts, "the start of a slice")
     starts = [min(max(start, 0), n - size) for start, n, size in zip(starts, x.shape, sizes, strict=True)]
     return x[tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))]
 
 
 @lowers("dynamic_update_slice")
 def _dynamic_update_slice(expansion, params, x, update, *starts):
-    starts = expansion.known(np.array(starts), "the start of a slice")
+    starts = expansion.require_numbers(np.array(starts), "the start of a slice")
     starts = [min(max(start, 0), n - size) for start, n, size in zip(starts, x.shape, update.shape, strict=True)]
     result = x.copy()
     result[tuple(slice(start, start + size) for start, size in zip(starts, update.shape, strict=True))] = update
@@ -616,7 +618,7 @@ def _clips(mode) -> bool:
 
 @lowers("lagjax_locate")
 def _locate(expansion, params, knots, x):
-    if (found := located(expansion, knots, x, params["closed"])) is not None:
+    if (found := locate_knots(expansion, knots, x, params["closed"])) is not None:
         return found
     at_most = expansion.map("le", knots.reshape(-1, *[1] * x.ndim), np.broadcast_to(x, (len(knots), *x.shape)))
     counted = expansion.fold("add", expansion.map("convert", at_most, attribute="int32"))
@@ -630,14 +632,14 @@ def _locate(expansion, params, knots, x):
 @lowers("gather")
 def _gather(expansion, params, x, indices):
     d, indices = params["dimension_numbers"], expansion.real(indices)
-    if not known(expansion, indices) and not d.operand_batching_dims:
+    if not are_numbers(expansion, indices) and not d.operand_batching_dims:
         missing = np.nan if params["fill_value"] is None else params["fill_value"]
-        found = looked_up(
+        found = look_up_windows(
             expansion, x, indices, d.start_index_map, params["slice_sizes"], None if _clips(params["mode"]) else missing
         )
         found = np.squeeze(found, tuple(indices.ndim - 1 + axis for axis in d.collapsed_slice_dims))
         return np.moveaxis(found, range(indices.ndim - 1, found.ndim), d.offset_dims)
-    indices = expansion.known(indices, "an index")
+    indices = expansion.require_numbers(indices, "an index")
     places = _places(
         indices, x.shape, d.offset_dims, d.collapsed_slice_dims, d.start_index_map, d.operand_batching_dims,
         d.start_indices_batching_dims, params["slice_sizes"], _clips(params["mode"]),
@@ -652,7 +654,7 @@ def _gather(expansion, params, x, indices):
 
 def _scatter(op):
     def rule(expansion, params, x, indices, updates):
-        indices, d = expansion.known(indices, "an index"), params["dimension_numbers"]
+        indices, d = expansion.require_numbers(indices, "an index"), params["dimension_numbers"]
         window = iter(updates.shape[axis] for axis in d.update_window_dims)
         fixed = (*d.inserted_window_dims, *d.operand_batching_dims)
         sizes = [1 if axis in fixed else next(window) for axis in range(x.ndim)]
@@ -679,7 +681,7 @@ LOWER.update({name: _scatter(op) for name, op in {**SCATTERS, "scatter-min": "mi
 def _call(expansion, params, *arguments):
     body = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
     if params.get("name") == "searchsorted" and _searches_from_the_right(body, arguments):
-        if (found := located(expansion, *arguments, closed=False)) is not None:
+        if (found := locate_knots(expansion, *arguments, closed=False)) is not None:
             return [expansion.map("add", found, expansion.constants(np.int32(1)))]
     if isinstance(body, core.ClosedJaxpr):
         return expansion.run_closed(body, arguments)
@@ -687,17 +689,17 @@ def _call(expansion, params, *arguments):
 
 
 @lowers("call_hi_primitive")
-def _expanded(expansion, params, *arguments):
-    return expansion.run_closed(written_out(params["_prim"]), arguments)
+def _expand_primitive(expansion, params, *arguments):
+    return expansion.run_closed(expand_primitive(params["_prim"]), arguments)
 
 
-def written_out(primitive) -> core.ClosedJaxpr:
+def expand_primitive(primitive) -> core.ClosedJaxpr:
     """An operation that JAX itself writes in others, such as `searchsorted` since 0.12, in these."""
 
-    def by_others(*flat):
+    def call_expansion(*flat):
         return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, flat)))
 
-    return jax.make_jaxpr(by_others)(*primitive.in_avals_flat)
+    return jax.make_jaxpr(call_expansion)(*primitive.in_avals_flat)
 
 
 def _searches_from_the_right(body, arguments) -> bool:
@@ -717,7 +719,9 @@ def _searches_from_the_right(body, arguments) -> bool:
     for x in (-1.0, 0.5, float(count // 2), count + 1.0):
         given = [trial.constants(np.arange(count, dtype=float)), trial.constants(np.full(shapes[1].shape, x))]
         (found,) = trial.run_closed(body, given)
-        if not (trial.known(trial.real(found), "it") == np.searchsorted(np.arange(count), x, side="right")).all():
+        if not (
+            trial.require_numbers(trial.real(found), "it") == np.searchsorted(np.arange(count), x, side="right")
+        ).all():
             return False
     return True
 
@@ -752,7 +756,7 @@ def _while(expansion, params, *arguments):
     while True:
         expansion.work(1)
         (go_on,) = expansion.run_closed(params["cond_jaxpr"], [*condition, *state])
-        if not expansion.known(go_on, "when a `while` loop ends"):
+        if not expansion.require_numbers(go_on, "when a `while` loop ends"):
             return state
         state = expansion.run_closed(params["body_jaxpr"], [*body, *state])
 

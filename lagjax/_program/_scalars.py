@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._program._emit import in_jax
+from lagjax._program._emit import apply_in_jax
 
 
 class Scalars:
@@ -92,7 +92,7 @@ def _function(op: str, in_jax: Callable) -> Callable:
     return function
 
 
-binade = _function("binade", lambda x: in_jax("binade", x))
+binade = _function("binade", lambda x: apply_in_jax("binade", x))
 prefers, equal = _function("prefers", jnp.greater), _function("eq", jnp.equal)
 exponential, logarithm, root = _function("exp", jnp.exp), _function("log", jnp.log), _function("sqrt", jnp.sqrt)
 minimum, maximum, absolute = _function("min", jnp.minimum), _function("max", jnp.maximum), _function("abs", jnp.abs)
@@ -104,14 +104,14 @@ def where(condition, yes, no):
     return jnp.where(condition, yes, no) if scalars is None else scalars.map("select", condition, no, yes)
 
 
-def folded(op: str, x):
+def fold(op: str, x):
     """The sum ("add"), smallest ("min"), largest ("max") or disjunction ("or") of a vector that is not empty."""
     if isinstance(x, Scalars):
         return Scalars(x.expansion, x.expansion.fold(op, x.ids))
     return {"add": jnp.sum, "min": jnp.min, "max": jnp.max, "or": jnp.any}[op](x)
 
 
-def joined(parts: Sequence):
+def concatenate(parts: Sequence):
     """Vectors end to end, some of which may be of numbers."""
     scalars = _scalars(*parts)
     if scalars is None:
@@ -119,7 +119,7 @@ def joined(parts: Sequence):
     return Scalars(scalars.expansion, np.concatenate([scalars._ids(part) for part in parts]))
 
 
-def replaced(x, index, values):
+def replace_entries(x, index, values):
     """A vector with other values at these places."""
     if not isinstance(x, Scalars):
         return jnp.asarray(x).at[index].set(values)
@@ -128,17 +128,17 @@ def replaced(x, index, values):
     return Scalars(x.expansion, ids)
 
 
-def spread(x, index, size: int):
+def scatter(x, index, size: int):
     """A vector of `size` numbers, zero but for those of x at these places."""
     zeros = (
         Scalars(x.expansion, np.full(size, x.expansion.graph.constant(0.0, "float")))
         if isinstance(x, Scalars)
         else jnp.zeros(size, x.dtype)
     )
-    return replaced(zeros, index, x)
+    return replace_entries(zeros, index, x)
 
 
-def stacked(parts: Sequence) -> Any:
+def stack(parts: Sequence) -> Any:
     """Scalars as a vector, or vectors as the rows of a matrix."""
     first = _scalars(*parts)
     if first is None:
@@ -146,7 +146,7 @@ def stacked(parts: Sequence) -> Any:
     return Scalars(first.expansion, np.stack([first._ids(x) for x in parts]))
 
 
-def applied(function: Callable, *arguments):
+def apply_function(function: Callable, *arguments):
     """A function of JAX arrays on arrays of scalars."""
     scalars = _scalars(*arguments)
     if scalars is None:

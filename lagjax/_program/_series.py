@@ -108,7 +108,7 @@ def series(program: Recurrent, size: int, moving: int, followed: Sequence[int] =
     operation whose series is not known here.
     """
     with np.errstate(all="ignore"):  # a constant may be 1/0, where the mass matrix is singular: that is found later
-        return _Recurrences(program, size, moving, tuple(followed)).finished()
+        return _Recurrences(program, size, moving, tuple(followed)).finish()
 
 
 class _Recurrences:
@@ -129,7 +129,7 @@ class _Recurrences:
         self._rows: dict[tuple[int | _Component, bool], int] = {}
         self._coefficients: dict[int, int | _Unknown | None] = {}  # None: constant along the motion
         # Of an elimination no coefficient is needed: it is most of a large program.
-        self._find(self._needed(program.linear))
+        self._find(self._find_required(program.linear))
         self._find_added(len(program.line.nodes))
         self.solution = [] if program.linear is None else self._solution(program.linear)
         if program.linear is not None:  # what is followed may depend on it
@@ -144,7 +144,7 @@ class _Recurrences:
                 if not isinstance(of, _Component):
                     self.coefficient(of)
 
-    def _needed(self, linear) -> list[int]:
+    def _find_required(self, linear) -> list[int]:
         """The nodes whose coefficients are required: of the linear system, or of the outputs themselves."""
         if linear is None:
             return self.outputs[: self.size]
@@ -210,9 +210,9 @@ class _Recurrences:
             return unknown[0]
         if rule := OPERATIONS[op].recurrence:
             return rule(self, i, operands, of)
-        return self._by_slopes(i, operands, of) if OPERATIONS[op].slopes else _Unknown(op)
+        return self._apply_slopes(i, operands, of) if OPERATIONS[op].slopes else _Unknown(op)
 
-    def _by_slopes(self, i, operands, of):
+    def _apply_slopes(self, i, operands, of):
         """w = f(u, …) by its partial derivatives."""
         row = OPERATIONS[self.zeroth_order.nodes[i][0]]
         total, apply = None, self.order_recursion.apply
@@ -241,22 +241,22 @@ class _Recurrences:
     def _solution(self, system) -> list[int]:
         """The coefficients zₖ where A z = r: A₀ zₖ = rₖ − Aₖ z₀ − Σ' Aⱼ zₖ₋ⱼ, solved with the factors of A₀."""
         apply = self.order_recursion.apply
-        residual = [self._of_output(node) for node in system.right]
+        residual = [self._output_coefficient(node) for node in system.right]
         entries = [(dict.fromkeys([(i, j), (j, i)]), node) for (i, j), node in system.entries.items()]
         for places, node in [*entries, *(([place], node) for place, node in system.others.items())]:
             if self.coefficient(node) is not None:
-                c = self._of_output(node)
+                c = self._output_coefficient(node)
                 for row, column in places:
                     taken = apply("mul", c, self.value(system.z[column]))
                     taken = apply("add", taken, self.cauchy_product(node, _Component(column)))
                     residual[row] = apply("sub", residual[row], taken)
-        return self._inlined(system.solve(), system.factors, residual)
+        return self._inline(system.solve(), system.factors, residual)
 
-    def _inlined(self, program, factors, right: list[int]) -> list[int]:
+    def _inline(self, program, factors, right: list[int]) -> list[int]:
         """The outputs of a program of factors (order zero) and a right-hand side (order k), as recursion nodes."""
         places: list[tuple[bool, int]] = []  # whether of the zeroth order, and which node
 
-        def in_recursion(place):
+        def recursion_node(place):
             return self.value(place[1]) if place[0] else place[1]
 
         for (op, operands, attribute), kind in zip(program.nodes, program.kinds, strict=True):
@@ -270,21 +270,21 @@ class _Recurrences:
                 places.append((True, self.zeroth_order.apply(op, *(node for _, node in of), attribute=attribute)))
             elif op == "div":
                 inverse = self.zeroth_order.apply("div", self.number(1.0), of[1][1])
-                places.append((False, self.order_recursion.apply("mul", in_recursion(of[0]), self.value(inverse))))
+                places.append((False, self.order_recursion.apply("mul", recursion_node(of[0]), self.value(inverse))))
             else:
-                places.append((False, self.order_recursion.apply(op, *map(in_recursion, of), attribute=attribute)))
-        return [in_recursion(places[i]) for i in program.outputs]
+                places.append((False, self.order_recursion.apply(op, *map(recursion_node, of), attribute=attribute)))
+        return [recursion_node(places[i]) for i in program.outputs]
 
     # ---- the end: only what the outputs need ----
 
-    def finished(self) -> Series:
+    def finish(self) -> Series:
         """Both graphs, without the products and values that nothing needs."""
-        rates = self.solution[: self.size] or [self._of_output(i) for i in self.outputs[: self.size]]
-        followed = [self._of_output(i) for i in self.followed]
+        rates = self.solution[: self.size] or [self._output_coefficient(i) for i in self.outputs[: self.size]]
+        followed = [self._output_coefficient(i) for i in self.followed]
         rows = list(self._rows)
         needed: set[int] = set()
         while True:
-            wanted = self._reached([*rates, *followed, *(self._of_row(*rows[r]) for r in needed)])
+            wanted = self._find_reached([*rates, *followed, *(self._row_coefficient(*rows[r]) for r in needed)])
             read = {row for kind, *which in wanted if kind == "product" for row in which}
             if read == needed:
                 break
@@ -296,7 +296,7 @@ class _Recurrences:
         # Nobody reads the values of what is followed in the recursion.
         order = [("value", node) for node in values] + [None] * len(followed) + products
         self._renumber({self._given[key]: self.moving + 2 + k for k, key in enumerate(order) if key is not None})
-        kept = [self._of_row(*rows[r]) for r in sorted(needed)] + followed
+        kept = [self._row_coefficient(*rows[r]) for r in sorted(needed)] + followed
         values += self.followed
         return Series(
             self.size,
@@ -309,17 +309,17 @@ class _Recurrences:
             len(followed),
         )
 
-    def _of_output(self, node: int) -> int:
+    def _output_coefficient(self, node: int) -> int:
         c = self.coefficient(node)
         if isinstance(c, _Unknown):
             raise Unlowerable(f"`{c.op}` has no Taylor series here")
         return self.order_recursion.constant(0.0, "float") if c is None else c
 
-    def _of_row(self, node: "int | _Component", by_order: bool) -> int:
-        c = self.solution[node.i] if isinstance(node, _Component) else self._of_output(node)
+    def _row_coefficient(self, node: "int | _Component", by_order: bool) -> int:
+        c = self.solution[node.i] if isinstance(node, _Component) else self._output_coefficient(node)
         return self.order_recursion.apply("mul", self.k, c) if by_order else c
 
-    def _reached(self, roots: list[int]) -> list[tuple]:
+    def _find_reached(self, roots: list[int]) -> list[tuple]:
         """The keys of `_given` that these nodes of the recursion depend on, in the order of their first use."""
         reached = set(self.order_recursion.below(roots))
         return [key for key, node in self._given.items() if node in reached]

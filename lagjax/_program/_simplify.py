@@ -82,7 +82,7 @@ def raise_to_power(graph, op, a, b):
         result = graph.apply("mul", result, graph.apply("sqrt", a))
     if exponent < 0:
         result = graph.apply("div", graph.constant(1, "float"), result)
-    return _noted(graph, a, exponent, result)
+    return _note_power(graph, a, exponent, result)
 
 
 def whole_power(graph, a: int, exponent: int) -> int:
@@ -90,10 +90,10 @@ def whole_power(graph, a: int, exponent: int) -> int:
     result = _positive_power(graph, a, abs(exponent))
     if exponent < 0:
         result = graph.apply("div", graph.constant(1.0, graph.kinds[a]), result)
-    return _noted(graph, a, exponent, result)
+    return _note_power(graph, a, exponent, result)
 
 
-def _noted(graph, a: int, exponent: float, result: int) -> int:
+def _note_power(graph, a: int, exponent: float, result: int) -> int:
     """The node of a power, kept in mind as one: its derivative is not that of the products that it consists of.
 
     An earlier node, which was written as another product, is not a power of a later one: derivatives go in order.

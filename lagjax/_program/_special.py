@@ -47,7 +47,7 @@ def _polynomial(coefficients: Sequence[float], x: Any) -> Any:
     return total
 
 
-def _reflected(x: Scalars) -> tuple[Any, Any, Any]:
+def _reflect(x: Scalars) -> tuple[Any, Any, Any]:
     """A flag that x is negative, the positive one of x and 1 − x, and x where it is negative, else ½."""
     negative = x.map("lt", x, 0.0)
     return negative, xp.where(negative, 1.0 - x, x), xp.where(negative, x, 0.5)
@@ -55,7 +55,7 @@ def _reflected(x: Scalars) -> tuple[Any, Any, Any]:
 
 def log_gamma(x: Scalars) -> Any:
     """log |Γ(x)|, to 1e-14 of its largest term; for x < 0 by Γ(x) Γ(1 − x) = π / sin πx."""
-    negative, z, reflected = _reflected(x)
+    negative, z, reflected = _reflect(x)
     y = z + float(_SHIFT)
     inverse = 1.0 / y
     series = _polynomial([float(b / (2 * k * (2 * k - 1))) for k, b in enumerate(_BERNOULLI, 1)], inverse * inverse)
@@ -75,7 +75,7 @@ def polygamma(order: int, x: Scalars) -> Any:
     first term left out stays below 1e-17.
     """
     n, factorial, shift = order, float(math.factorial(order)), _SHIFT + 5 * order
-    negative, z, reflected = _reflected(x)
+    negative, z, reflected = _reflect(x)
     y = z + float(shift)
     inverse = 1.0 / y
     series = [float(b * math.factorial(2 * k + n - 1) / math.factorial(2 * k)) for k, b in enumerate(_BERNOULLI, 1)]
@@ -183,7 +183,7 @@ _register("bessel_i1e", lambda x: scaled_bessel(1, x))
 
 @lowers("polygamma")
 def _polygamma(expansion, params, order: np.ndarray, x: np.ndarray) -> np.ndarray:
-    orders = set(expansion.known(order, "the order of a polygamma function").ravel().tolist())
+    orders = set(expansion.require_numbers(order, "the order of a polygamma function").ravel().tolist())
     if len(orders) != 1 or not 0 <= (n := orders.pop()) <= _MOST_DERIVATIVES:
         raise Unlowerable(
             f"polygamma functions of several orders, or of one beyond {_MOST_DERIVATIVES}, are not written out"
@@ -193,7 +193,7 @@ def _polygamma(expansion, params, order: np.ndarray, x: np.ndarray) -> np.ndarra
 
 @lowers("expn")
 def _exponential_integral(expansion, params, order: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
-    orders = set(expansion.known(order, "the order of an exponential integral").ravel().tolist())
+    orders = set(expansion.require_numbers(order, "the order of an exponential integral").ravel().tolist())
     if len(orders) != 1 or not 0 <= (n := orders.pop()) <= _LARGEST_ORDER:
         raise Unlowerable(
             f"exponential integrals of several orders, or of one beyond {_LARGEST_ORDER}, are not written out"

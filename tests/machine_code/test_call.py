@@ -105,7 +105,7 @@ def eagerly(function, monkeypatch):
     """What a derivative is on the host, over steps that were kept."""
     with monkeypatch.context() as patch:
         patch.setattr(_call, "NO_HANDLER", "this test says so")
-        _primitives._compiled.cache_clear()
+        _primitives._compile_run.cache_clear()
         return function()
 
 
@@ -296,9 +296,9 @@ def in_many_programs():
     jax.clear_caches()
     from lagjax import _derivation, _machine_code
 
-    _machine_code._made.cache_clear()
+    _machine_code._make_flow.cache_clear()
     _derivation._derived_once.cache_clear()
-    _primitives._compiled.cache_clear()
+    _primitives._compile_run.cache_clear()
     import gc
 
     gc.collect()

@@ -54,7 +54,7 @@ def lanewise(body, *columns):
     padded = np.zeros((len(columns), -(-count // WIDTH) * WIDTH))
     padded[:, :count] = columns
     found = np.empty((len(out), padded.shape[1]))
-    x, y = _kernel.aligned(len(columns) * WIDTH), _kernel.aligned(len(out) * WIDTH)
+    x, y = _kernel.allocate_aligned(len(columns) * WIDTH), _kernel.allocate_aligned(len(out) * WIDTH)
     for k in range(0, padded.shape[1], WIDTH):
         x[: len(columns) * WIDTH] = padded[:, k : k + WIDTH].ravel()
         function(x.ctypes.data, y.ctypes.data)
@@ -130,7 +130,7 @@ FAMILIES = {  # functions of two doubles and an integer; exact ones, and those o
     "of the library's": lambda a, b, n: (jax.nn.sigmoid(a), lax.rsqrt(a)),
     "circular": lambda a, b, n: (jnp.sin(a), jnp.cos(a), jnp.sin(b), jnp.cos(a + b)),
     "constants": lambda a, b, n: (1.5, True, a),
-    "weights": lambda a, b, n: xp.stacked(  # a formula: these come from no primitive
+    "weights": lambda a, b, n: xp.stack(  # a formula: these come from no primitive
         [xp.binade(a), xp.binade(b), xp.where(xp.prefers(a, b), a, b)]
     ),
 }  # fmt: skip
@@ -682,14 +682,14 @@ def test_a_member_alone_is_bit_for_bit_the_member_of_a_batch(make):
     ).kernel
     numbers = np.concatenate([np.zeros(0), *(np.ravel(x) for x in jax.tree.leaves(scene.params))])[None]
     states, ts = np.tile(np.concatenate(y0), (3, 1)), TWO_TIMES[None]
-    runs = [kernel.for_members(len(y))(ts, y, numbers, 1e-9, 1e-12, 1000, 3000) for y in (states[:1], states)]
+    runs = [kernel.select_width(len(y))(ts, y, numbers, 1e-9, 1e-12, 1000, 3000) for y in (states[:1], states)]
     alone, together = runs
     for one, all_ in zip(alone[:6], together[:6], strict=True):
         np.testing.assert_array_equal(one[0], all_[1])
-    assert kernel.for_members(1).width == 1 and kernel.for_members(2) is kernel
+    assert kernel.select_width(1).width == 1 and kernel.select_width(2) is kernel
     order, cotangents = _kernel.order_for(1e-9), (np.ones_like(together.path), np.ones_like(together.y_end))
     back = [
-        kernel.for_members(len(run.steps)).vjp(
+        kernel.select_width(len(run.steps)).vjp(
             ts, numbers, run.table, run.steps.cumsum() - run.steps, run.steps,
             *(c[: len(run.steps)] for c in cotangents), order,
         )

@@ -58,7 +58,7 @@ def results(kind, operands):
 
 def computed(line, numbers, few_modes):
     """The outputs of a program by its runs, vector by vector, in a memory that is used again; and the runs."""
-    kinds, operations = _schedule.joined(line)
+    kinds, operations = _schedule.join_operations(line)
     program = _packs.stages(operations, len(line.nodes), line.outputs)
     memory, places, after = np.full(100_000, np.nan), np.full(len(line.nodes), -1), itertools.count(10)
     for node, (op, _, attribute) in enumerate(line.nodes):
@@ -132,11 +132,11 @@ def test_members_of_a_large_scene_are_integrated_one_after_the_other(monkeypatch
     monkeypatch.setattr(_packs, "LEAST_FILLED", 0)
     program = cluster(5)
     kernel = _native.Kernel(program, 10)
-    assert kernel.to_run(8) is kernel
+    assert kernel.select_kernel(8) is kernel
     monkeypatch.setattr(_kernel, "LARGEST_SHARED", 0)
     kernel = _native.Kernel(program, 10)
-    alone = kernel.to_run(8)
-    assert alone.width == 1 and kernel.for_members(8) is kernel
+    alone = kernel.select_kernel(8)
+    assert alone.width == 1 and kernel.select_width(8) is kernel
     y0, ts = np.random.default_rng(1).normal(size=(3, 20)), np.linspace(0.0, 1.0, 5)[None]
     runs = [k(ts, y0, np.zeros((1, 0)), 1e-9, 1e-12, 1000) for k in (kernel, alone)]
     for side_by_side, one_by_one in zip(*(run[:6] for run in runs), strict=True):
@@ -147,11 +147,11 @@ def test_the_choice_is_made_once_and_nothing_stays_of_the_compilation(monkeypatc
     monkeypatch.setattr(_taylor, "LARGEST_LINE", -1)
     monkeypatch.setattr(_kernel, "LARGEST_SHARED", 0)
     kernel = _native.Kernel(cluster(9), 18)
-    alone = kernel.to_run(8)
-    kernel.to_run(8)._forward  # noqa: B018
+    alone = kernel.select_kernel(8)
+    kernel.select_kernel(8)._forward  # noqa: B018
     monkeypatch.setattr(_kernel, "fills_lanes", None)
-    assert kernel.to_run(3) is alone is kernel.for_members(1)
-    assert not _packs.program_stages.cache_info().currsize and not _schedule._joined_of.cache_info().currsize
+    assert kernel.select_kernel(3) is alone is kernel.select_width(1)
+    assert not _packs.program_stages.cache_info().currsize and not _schedule._join_same.cache_info().currsize
 
 
 def test_a_scene_in_which_everything_waits_for_what_comes_before_keeps_members_in_lanes(monkeypatch):
@@ -165,8 +165,8 @@ def test_a_scene_in_which_everything_waits_for_what_comes_before_keeps_members_i
         return jnp.stack(x), False
 
     states = jax.ShapeDtypeStruct((40,), float)
-    assert _native.Kernel(lower(row, states, states, 1.0), 40).to_run(8).width > 1
-    assert _native.Kernel(cluster(16), 32).to_run(8).width == 1
+    assert _native.Kernel(lower(row, states, states, 1.0), 40).select_kernel(8).width > 1
+    assert _native.Kernel(cluster(16), 32).select_kernel(8).width == 1
 
 
 def test_the_code_does_not_grow_with_the_scene(monkeypatch):
@@ -174,7 +174,7 @@ def test_the_code_does_not_grow_with_the_scene(monkeypatch):
     from lagjax._native._parts import MotionParts
 
     def instructions(count):
-        module = Integrator(MotionParts.of_smooth(cluster(count), 2 * count), width=1).motion.module
+        module = Integrator(MotionParts.from_program(cluster(count), 2 * count), width=1).motion.module
         return sum(len(block.instructions) for function in module.functions for block in function.blocks)
 
     monkeypatch.setattr(_taylor, "LARGEST_LINE", -1)

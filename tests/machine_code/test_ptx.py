@@ -25,7 +25,7 @@ import lagjax
 from benchmarks._ptx import PtxOnCpu, outputs_of
 from lagjax import scenes
 from lagjax._machine_code import _gpu_launch, _primitives
-from lagjax._machine_code._call import on_host
+from lagjax._machine_code._call import call_host
 from lagjax._native._gpu import MOTION, TRANSPOSE, GpuForm, OneLane, form_for, grid, libdevice
 
 TS, MACHINE_CODE = np.linspace(0.0, 1.0, 5), lagjax.MachineCode()
@@ -34,7 +34,7 @@ translated = functools.lru_cache(maxsize=64)(PtxOnCpu)
 
 def transforms_are_new():
     """What was lowered by other rules is forgotten."""
-    _primitives._compiled.cache_clear()
+    _primitives._compile_run.cache_clear()
     jax.clear_caches()
 
 
@@ -54,7 +54,7 @@ def on_the_ptx(monkeypatch):
             return outputs[1:]
 
         results = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
-        return on_host(host, results, *(arrays[name] for name in entry.arguments))
+        return call_host(host, results, *(arrays[name] for name in entry.arguments))
 
     def run(function, *args):
         places = {
@@ -65,7 +65,9 @@ def on_the_ptx(monkeypatch):
 
         def register(for_gpus):
             for primitive, (on_gpus, on_cpus) in places.items():
-                rule = mlir.lower_fun(on_gpus, multiple_results=True) if for_gpus else _primitives._for_cpus(on_cpus)
+                rule = (
+                    mlir.lower_fun(on_gpus, multiple_results=True) if for_gpus else _primitives._lowering_rule(on_cpus)
+                )
                 mlir.register_lowering(primitive, rule, platform="cpu")
             transforms_are_new()
 

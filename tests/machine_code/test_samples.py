@@ -232,7 +232,7 @@ def test_samples_are_no_inputs_of_a_program():
 
     program = lower(force, 0.0, {"u": jax.ShapeDtypeStruct((count,), float), "gain": 1.0})
     assert program.operations < 100 and sum(op in LOOK_UPS for op, *_ in program.nodes) < 16
-    assert program.read_by([0]) == frozenset(range(count + 2))
+    assert program.find_inputs([0]) == frozenset(range(count + 2))
     values, t = np.sin(knots), np.array([0.5, 20.1234])
     found = program.evaluate_many([t, 2.0, *values])[0]
     np.testing.assert_allclose(found, 2 * np.sin(t), atol=1e-9)

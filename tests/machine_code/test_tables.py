@@ -172,7 +172,7 @@ def instructions(acceleration, size):
     """How many instructions the kernel of q̈ = `acceleration(q, v, t)` has, as tables."""
     states = jax.ShapeDtypeStruct((size,), float)
     program = lower(lambda q, v, t: (acceleration(q, v, t), False), states, states, 1.0)
-    parts = MotionParts.of_smooth(program, size).of_run(_native.Nesting(size), None, program)
+    parts = MotionParts.from_program(program, size).append_guards(_native.Nesting(size), None, program)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_taylor, "LARGEST_LINE", -1)
         functions = Integrator(parts, width=8).motion.module.functions

@@ -26,7 +26,7 @@ from lagjax._program import (
     pullback,
     series,
 )
-from lagjax._program._scalars import applied, stacked
+from lagjax._program._scalars import apply_function, stack
 
 ORDER = 10
 NAN = float("nan")
@@ -344,7 +344,7 @@ def test_a_linear_system_of_any_entries():
         return jnp.stack([*entries, -k * q[0], v[0] * v[1], jnp.sin(t)])
 
     def system(*scalars):
-        x = applied(numbers_of, stacked(scalars))
+        x = apply_function(numbers_of, stack(scalars))
         a, b, c, d, e = (x[i] for i in range(5))
         places = np.array([[0, 0], [1, 0], [1, 1], [2, 1], [2, 2]])
         return places, x[:5], x[5:], (x[:5], a * c * e - a * d * d - b * b * e), a > 0.0
@@ -357,7 +357,7 @@ def test_a_linear_system_of_any_entries():
             a * (r[1] * e - d * r[2]) - b * e * r[0],
             a * (c * r[2] - d * r[1]) - b * (b * r[2] - d * r[0]),
         ]
-        return stacked(solution) / determinant
+        return stack(solution) / determinant
 
     q, v, t, k = [0.3, -0.2, 0.5], [0.4, 0.1, -0.3], 0.2, 1.5
     scalar = jax.ShapeDtypeStruct((), float)

@@ -12,7 +12,7 @@ import scipy.linalg
 from jax import lax
 
 import lagjax
-from lagjax._program import OPERATIONS, in_jax, lower
+from lagjax._program import OPERATIONS, apply_in_jax, lower
 from lagjax._program._matrices import determinant, solution
 
 
@@ -175,7 +175,7 @@ def test_large_matrices_are_left_to_diffrax():
 def test_weights_jump_without_a_border():
     for x in (0.0, 1.0, -3.0, 0.7, 1e-300, 5e300):
         expected = 2.0 ** np.floor(np.log2(abs(x))) if x else 1.0
-        assert OPERATIONS["binade"].value(np.float64(x)) == in_jax("binade", x) == expected
+        assert OPERATIONS["binade"].value(np.float64(x)) == apply_in_jax("binade", x) == expected
 
 
 # ---- eigenvalues ----------------------------------------------------------------------------------------------------
