@@ -112,7 +112,7 @@ def _has_ended_well(begun: _native.Begun):
 
 
 def _register() -> None:
-    """Tell XLA about the handler; once."""
+    """Register the handlers with XLA, at the first call."""
     with _lock:
         _register_once()
 

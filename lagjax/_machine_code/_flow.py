@@ -190,7 +190,7 @@ class Flow:
         """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the motions of N members.
 
         With a `store` the steps are kept there, up to `room` of all members: by default as many as may be kept. Results
-        tell what stopped a member, and not only that its steps became too small, or too many. A run that a handler has
+        say what stopped a member, and not only that its steps became too small, or too many. A run that a handler has
         `begun` is continued.
         """
         solution = self.follow(ts, y0, params, tolerances, store, room, begun)

@@ -12,7 +12,7 @@ and their own derivatives are these again, of other lines, so that there are der
     d forward = forward(x, dv) + forward of the line (x, v) ↦ D(x) v, along dx
     d back    = back(x, dw)    + forward of the line (x, w) ↦ D(x)ᵀ w, along dx
 
-A line is differentiated on its graph (`_program._pushforward`, `_program._transpose`), which takes milliseconds.
+A line is differentiated on its graph (`_program._differentiation`), which takes milliseconds.
 """
 
 import functools

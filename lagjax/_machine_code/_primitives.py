@@ -563,7 +563,10 @@ def _vjp_for_gpus(*args, flow, tolerances):
 
 
 def _sweep_on_gpu(ts, y0, params, path_ct, result, end_ct, *, flow, tolerances):
-    """The cotangents that m ones of each member lead to, a row each, and whether these are right; None: it cannot."""
+    """The cotangents of starts and parameters, a row for each of m cotangents of a member, and whether a row is right.
+
+    None where the GPU cannot compute them.
+    """
     members, m = end_ct.shape[:2]
     ts, params = (x if len(x) == 1 else jnp.repeat(x, m, axis=0) for x in (ts, params))
     end_ct = end_ct + jnp.where((result == SUCCESSFUL)[:, None, None], path_ct[:, :, -1], 0.0)

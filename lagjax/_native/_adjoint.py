@@ -121,7 +121,7 @@ class Adjoint:
         with self.replay.rounds(frame, frame.arguments[0], self._leave_step):
             for step in steps:
                 frame.call(step)
-        frame.finish(self.motion.more(frame))
+        frame.finish(self.motion.is_unfinished(frame))
 
     # ---- members and their steps ----
 
@@ -149,7 +149,7 @@ class Adjoint:
             for i in self.motion.form.each(code, self.states):
                 frame.write("y_ct", member * self.states + i, lane["state_ct", i])
             with code.loop(self.motion.parameters) as i:
-                place = member * self.motion.of_member + self.motion.place_of_number(code, i)
+                place = member * self.motion.member_stride + self.motion.place_of_number(code, i)
                 before = frame.read("params_ct", place)  # it may be an entry of a table, too
                 frame.write("params_ct", place, lane["params_ct", i] + before)
             frame.write("excess", member, lane["excess"])
@@ -378,7 +378,7 @@ class Adjoint:
                 lane = frame.lane(integer(code, j))
                 member = lane["member"]
                 with code.only_if(member >= 0):
-                    address = code.element(frame.job("params_ct"), member * motion.of_member + place)
+                    address = code.element(frame.job("params_ct"), member * motion.member_stride + place)
                     code.store(code.load(address, DOUBLE) + lane_of(code, cotangent, j), address)
 
 

@@ -88,7 +88,7 @@ _lock = threading.Lock()
 
 
 def derivative_handler(kind: str) -> SweepHandler:
-    """The one of this process, of "jvp" or "vjp"."""
+    """The handler of this process for the `kind` "jvp" or "vjp", made at the first call."""
     with _lock:
         return _make_handler(kind)
 

@@ -122,7 +122,7 @@ class Memory:
 class Vectors:
     """A number of vectors in a row, as a list of them would be: `read(i)` gives one, and `write(i, x)` sets it.
 
-    `place(i)` tells where vector i lies, counted in doubles from the beginning of the thread's memory, if it is known;
+    `place(i)` is the place of vector i, counted in doubles from the beginning of the thread's memory, if it is known;
     or where it would lie if `shift` were zero.
     """
 
@@ -225,7 +225,7 @@ class Frame:
         return Lane(self, index)
 
     def view(self, layout: Memory) -> "Frame":
-        """The same function, which sees the fields of another layout of the same memory."""
+        """The frame of this function over the fields of another `layout` of its memory."""
         other = copy.copy(self)
         other.layout, other.width = layout, layout.width
         return other

@@ -91,7 +91,7 @@ class OneLane(NamedTuple):
         states, text = motion.states, str(motion.module)
         row, series = states + RECORDED + motion.recorded_pieces, states + motion.series.rows
         single = motion.layout.number == FLOAT
-        return cls(text, motion.layout.size, states, motion.of_member, row, series, motion.large, single)
+        return cls(text, motion.layout.size, states, motion.member_stride, row, series, motion.large, single)
 
 
 def motion_entry(motion: OneLane, order: int) -> str:

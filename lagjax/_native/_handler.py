@@ -2,8 +2,8 @@
 
 XLA calls a handler with a frame, in which are the addresses of the arguments, of the results and of one attribute: that
 of a `Plan`, which says whose machine code is to run, how and how far. One handler serves all kernels. It never waits:
-it begins a run, does as many rounds as take a slice of time, and leaves behind what is needed to go on (`Rest`). Who
-asked for it looks at that, and at how members ended; all that is rare stays in Python. Outside of XLA a `Kernel` begins
+it begins a run, does as many rounds as take a slice of time, and leaves behind what is needed to go on (`Rest`). The
+caller looks at the rest, and at how members ended; all that is rare stays in Python. Outside of XLA a `Kernel` begins
 in the same way, with one call.
 
 Layouts of structures are those of `xla/ffi/api/c_api.h`, on 64 bits. `unavailable` compares them with the header that
@@ -117,8 +117,8 @@ class Rest(NamedTuple):
         return cls(memory, lanes, integers[-3:-2], integers[-2:-1])
 
     @staticmethod
-    def more(array: np.ndarray) -> bool:
-        """True if more is to be done, from what a handler wrote."""
+    def has_more(array: np.ndarray) -> bool:
+        """True if members are left to be integrated, by the rest that a handler wrote."""
         return bool(array[-1:].view(np.int64)[0])
 
     @staticmethod
@@ -166,7 +166,7 @@ _lock = threading.Lock()
 
 
 def handler() -> Handler:
-    """The one of this process."""
+    """The handler of this process, made at the first call."""
     with _lock:
         return _make_handler()
 
@@ -214,7 +214,7 @@ def _address(base: Value, offset: int) -> Value:
 
 
 def load_at(base: Value, offset: int, kind: ir.Type) -> Value:
-    """The value there."""
+    """The value `offset` bytes after the address `base`."""
     return base.code.load(_address(base, offset), kind)
 
 

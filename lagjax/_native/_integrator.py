@@ -197,7 +197,7 @@ class Integrator:
             if self.projector is not None:
                 _rank_drops.shorten(frame)
             self._finish_members(frame, idle)
-        frame.finish(self.motion.more(frame))
+        frame.finish(self.motion.is_unfinished(frame))
 
     def _finish_members(self, frame: Frame, idle) -> None:
         """Write down the members that have ended, and take the next ones."""

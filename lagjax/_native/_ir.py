@@ -48,7 +48,7 @@ def _target() -> llvm.Target:
 
 @functools.cache
 def _link(name: str) -> None:
-    """Tell LLVM where a function of the C library is."""
+    """Give LLVM the address of a function of the C library."""
     if os.name == "nt":
         library = ctypes.CDLL("ucrtbase")
     else:
@@ -252,7 +252,7 @@ class Code:
 
     def arithmetic(self, op: str, a, b) -> Value:
         """a op b for doubles, vectors or integers; a mixed pair becomes vectors."""
-        a, b = self._alike(a, b)
+        a, b = self._match_types(a, b)
         if isinstance(a.it.type, ir.IntType):
             return Value(self, getattr(self.builder, {"div": "sdiv"}.get(op, op))(a.it, b.it))
         flags = _CONTRACT if op != "div" else ()
@@ -260,7 +260,7 @@ class Code:
 
     def compare(self, op: str, a, b) -> Value:
         """False where a NaN is compared (except `!=`)."""
-        a, b = self._alike(a, b)
+        a, b = self._match_types(a, b)
         if isinstance(a.it.type, ir.IntType):
             return Value(self, self.builder.icmp_signed(op, a.it, b.it))
         if isinstance(a.it.type, ir.VectorType) and a.it.type.element == BIT:
@@ -268,7 +268,7 @@ class Code:
         ordered = self.builder.fcmp_unordered if op == "!=" else self.builder.fcmp_ordered
         return Value(self, ordered(op, a.it, b.it))
 
-    def _alike(self, a, b) -> tuple[Value, Value]:
+    def _match_types(self, a, b) -> tuple[Value, Value]:
         types = [x.it.type for x in (a, b) if isinstance(x, Value)]
         types = [t for t in types if isinstance(t, ir.VectorType)] or types
         like = next((t for t in types if element_of(t) == DOUBLE), types[0])
@@ -279,7 +279,7 @@ class Code:
         if not isinstance(yes, Value) and not isinstance(no, Value):
             vector = isinstance(condition.it.type, ir.VectorType)
             yes = self.as_value(yes, self.vector if vector else DOUBLE)
-        yes, no = self._alike(yes, no)
+        yes, no = self._match_types(yes, no)
         return Value(self, self.builder.select(condition.it, yes.it, no.it))
 
     def flag(self, condition: Value) -> Value:
@@ -288,7 +288,7 @@ class Code:
 
     def maximum(self, a, b) -> Value:
         """The larger; `b` where they cannot be compared."""
-        a, b = self._alike(a, b)
+        a, b = self._match_types(a, b)
         return self.select(a > b, a, b)
 
     def total(self, terms: Iterable[Value], start: "Value | float" = 0.0) -> Value:
@@ -455,7 +455,7 @@ class Code:
 
     def intrinsic(self, name: str, *xs: Value) -> Value:
         """One of LLVM's own functions, on scalars or on whole vectors."""
-        xs = self._alike(*xs) if len(xs) == 2 else xs
+        xs = self._match_types(*xs) if len(xs) == 2 else xs
         kind = xs[0].it.type
         bits = "f32" if element_of(kind) == FLOAT else "f64"
         full = f"llvm.{name}." + (f"v{self.lanes}{bits}" if isinstance(kind, ir.VectorType) else bits)
@@ -463,7 +463,7 @@ class Code:
 
     def library(self, name: str, *xs: Value) -> Value:
         """A function of the C library, on scalars or lane by lane: one evaluation a step serves all orders."""
-        xs = self._alike(*xs) if len(xs) == 2 else xs
+        xs = self._match_types(*xs) if len(xs) == 2 else xs
         kind, number = xs[0].it.type, element_of(xs[0].it.type)
         name += "f" if number == FLOAT else ""
         _link(name)

@@ -129,11 +129,11 @@ class Kernel:
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
     def select_width(self, members: int) -> "Kernel":
-        """The kernel for this many members: for one alone without lanes, which would be idle."""
+        """The kernel for `members` members: that for a single one has no lanes, which would be idle."""
         return self._single_member_kernel if members == 1 < self.width else self
 
     def select_kernel(self, members: int) -> "Kernel":
-        """The kernel that integrates this many members: one after the other where lanes would not fit in a cache."""
+        """The kernel that integrates `members` members: one after the other where lanes would not fit in a cache."""
         return self.select_width(1 if self._runs_singles else members)
 
     @functools.cached_property
@@ -226,7 +226,7 @@ class Kernel:
             t_end, code, steps, rejected = np.empty((4, members))
         else:
             path, y_end, t_end, code, steps, rejected, rest = begun
-            if not Rest.more(rest):
+            if not Rest.has_more(rest):
                 return _outcome(path, y_end, t_end, code, steps, rejected, Rest.idle_lanes(rest))
         rest = None if begun is None else Rest.from_array(begun.rest, self._forward.layout)
         table, rows = None, np.zeros(1, np.int64)

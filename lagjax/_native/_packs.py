@@ -109,7 +109,7 @@ def arrangement(program: list[Stage], places: np.ndarray, first: int, width: int
     ends: dict[int, list[tuple[int, int]]] = {}
     for s, stage in enumerate(program):
         at = places[stage.operands]
-        order = side_by_side(at)
+        order = order_by_adjacency(at)
         at, results = at[:, order], stage.results[:, order]
         count = results.shape[1]
         size = -(-(count + width - 1) // width) * width
@@ -162,7 +162,7 @@ class _Room:
         return None
 
 
-def side_by_side(at: np.ndarray) -> np.ndarray:
+def order_by_adjacency(at: np.ndarray) -> np.ndarray:
     """An order of N operations whose operands lie at `at` (m, N): most of these lie next to those before."""
     operands, count = at.shape
     if count <= 2 or not operands:
@@ -246,7 +246,7 @@ def _stretches(at: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _pieces(sound: np.ndarray, begin: int, end: int) -> list[tuple[int, int]]:
-    """The operations from `begin` to `end` in runs; `sound` (m, N − 1) tells what lies next to the one before."""
+    """Runs of the operations from `begin` to `end`; `sound` (m, N − 1): an operand lies next to the one before it."""
     if end - begin < 2 * LEAST_RUN:
         return [(begin, end)] if end > begin else []
     jumps = (~sound[:, begin : end - 1]).sum(axis=0)

@@ -82,7 +82,7 @@ class MotionParts(NamedTuple):
     def from_program(
         cls, program: Recurrent, size: int, projection: Projection | None = None, chosen: Chosen | None = None
     ) -> "MotionParts":
-        """The parts of a motion over this many coordinates without borders, or whose borders do not matter."""
+        """The parts of a motion over `size` coordinates without borders, or whose borders do not matter."""
         return cls(program, recurrences(program, size), Nesting(size), projection, chosen=chosen)
 
     def append_guards(self, nesting: Nesting, guards: Guards | None, motion: Recurrent | None) -> "MotionParts":

@@ -180,7 +180,7 @@ class Tangent:
                     frame.call(step, group)
             if self.saltation is not None:
                 frame.call(self.note_border)
-        frame.finish(self.motion.more(frame))
+        frame.finish(self.motion.is_unfinished(frame))
 
     def _move(self, frame: Frame) -> None:
         """The end of the series before it is put on the constraints."""
@@ -244,7 +244,7 @@ class Tangent:
             lane, (place, there) = frame.lane(index), self._place(frame, group, index)
             lane["next_output"] = code.as_double(self.lane_of_motion(frame, index)["output"])
             lane["first_number"] = self.lane_of_motion(frame, index)["first_number"]
-            first = place * self.motion.of_member
+            first = place * self.motion.member_stride
             lane["first_dot"] = code.select(there, code.as_double(first), 0.0)
             with code.only_if(there):
                 for i in self.form.each(code, self.states):

@@ -61,7 +61,7 @@ class TaylorSeries:
         self.module = ir.Module(name)
         self.module.triple = ""
         self.look_up = LookUps(self.module)
-        self.of_member = self.parameters if chosen is None else chosen.of
+        self.member_stride = self.parameters if chosen is None else chosen.of
         self._chosen = None if chosen is None else integers(self.module, np.array(chosen.positions, np.int64))
         self.layout = Memory(width, self._fields() | fields, number=number)
         self.width, self.vector = self.layout.width, ir.VectorType(number, self.layout.width)
@@ -270,7 +270,7 @@ class TaylorSeries:
         with frame.code.repeat_while(lambda: self._any_active(frame), at_most=count):
             yield
 
-    def more(self, frame: Frame) -> Value:
+    def is_unfinished(self, frame: Frame) -> Value:
         """1 if a lane is active, else 0."""
         return frame.code.select(self._any_active(frame), integer(frame.code, 1), 0)
 

@@ -248,13 +248,13 @@ class Program:
         return any(op in LOOK_UPS for op, _, _ in self.nodes)
 
     def compute_outputs(self, first, numbers) -> tuple:
-        """The outputs for the first inputs, a vector, and the others (P,), which are not taken apart where many are."""
+        """The outputs at inputs `first` (m,), then `numbers` (P,), which stay one array where they are many."""
         if self.looks_up or self.size > LARGEST_UNFOLDED:
             return self.compute_rows(first, numbers)
         return self(*first, *numbers)
 
     def compute_rows(self, first, numbers) -> tuple:
-        """The outputs for the first inputs, an array (…, m), and the others (…, P), where most are only looked up.
+        """The outputs at the inputs `first` (…, m), then `numbers` (…, P), most of which are only looked up.
 
         Its derivatives are those of the operations as they stand.
         """
@@ -332,7 +332,7 @@ class Program:
         return Scalars(first.expansion, np.array(self.origin.outputs, dtype=np.int64)) if same else None
 
     def append_inputs(self, count: int) -> "Program":
-        """The program with this many more floats behind its own inputs, none of which it reads."""
+        """The program with `count` more floats after its inputs; it reads none of them."""
         more, other = jax.ShapeDtypeStruct((count,), jnp.result_type(float)), self.otherwise
         return replace(
             self,
@@ -450,7 +450,7 @@ class Program:
         return jax.jvp(evaluate_floats, tuple(leaf for leaf in leaves if _is_float(leaf)), tuple(tangents))[1]
 
     def _call_function(self, *scalars) -> list:
-        """The function as it was given, on scalars: what the program must agree with."""
+        """The outputs of the lowered function itself, at scalars: the program must agree with them."""
         leaves, start = [], 0
         for shape in self.shapes:
             parts = scalars[start : start + shape.size]

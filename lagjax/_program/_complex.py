@@ -59,12 +59,12 @@ class Pair(NamedTuple):
 
     @property
     def multiply_by_i(self) -> "Pair":
-        """i z."""
+        """The product i z."""
         return Pair(-self.im, self.re)
 
     @property
     def divide_by_i(self) -> "Pair":
-        """−i z."""
+        """The quotient z / i = −i z."""
         return Pair(self.im, -self.re)
 
     def scale(self, factor) -> "Pair":

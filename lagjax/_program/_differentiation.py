@@ -115,7 +115,7 @@ class Derivatives:
     # ---- forward mode ----
 
     def directional_derivatives(self, outputs: Sequence[int], directions: Sequence[Tangents]) -> list[Tangents]:
-        """The derivatives of some nodes along directions, each the tangents of some inputs."""
+        """The tangents of the nodes `outputs` along each of `directions`, which maps inputs to their tangents."""
         tangents: dict[int, Tangents] = {}
         for k, direction in enumerate(directions):
             for i, tangent in direction.items():
@@ -129,7 +129,7 @@ class Derivatives:
         return [tangents.get(i, {}) for i in outputs]
 
     def directional_derivative(self, outputs: Sequence[int], direction: Tangents) -> list[int]:
-        """The derivatives of some nodes along one direction, the tangents of some inputs."""
+        """The tangents of the nodes `outputs` along one direction, which maps inputs to their tangents."""
         return [t.get(0, self._number(0.0)) for t in self.directional_derivatives(outputs, [direction])]
 
     def _tangents(self, i: int, tangents: dict[int, Tangents]) -> Tangents:
@@ -321,7 +321,7 @@ class _PlacedLine(Derivatives):
 
     @classmethod
     def from_line(cls, line: StraightLine, dtypes: Sequence, more: int = 0) -> "_PlacedLine":
-        """The line in a graph of its own, with inputs of these types and this many more floats."""
+        """The line in a new graph, whose inputs have the types `dtypes`; `more` floats follow them."""
         graph = Graph(_LARGEST * len(line.nodes) + 1000)
         inputs = [graph.input(i, kind) for i, kind in enumerate([*map(_kind, dtypes), *["float"] * more])]
         with np.errstate(all="ignore"):

@@ -101,7 +101,7 @@ class _AxisExchange:
         self._is_third = xp.prefers(third, xp.where(self._is_second, second, first))
 
     def pick(self, kept, with_second, with_third):
-        """The one of three numbers that belongs to the axis."""
+        """The number that belongs to the axis, of three."""
         return xp.where(self._is_third, with_third, xp.where(self._is_second, with_second, kept))
 
     def restore(self, vector: list) -> list:

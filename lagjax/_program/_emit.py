@@ -48,7 +48,7 @@ def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ..
 
 
 def _emit_outputs(nodes, kinds, outputs, scalars, shape: tuple[Any, ...], entries: Callable) -> tuple:
-    """The outputs, of this shape."""
+    """The outputs of the operations `nodes`, each broadcast to `shape`."""
     fast = frozenset() if getattr(_state, "plain", False) else _elementary.FAST.keys()
     precision = _precision(nodes, kinds, scalars)
     dtypes = [precision if kind == "float" else np.dtype(kind) for kind in kinds]

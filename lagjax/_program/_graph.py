@@ -35,8 +35,8 @@ class Unlowerable(Exception):
 
 
 LONGEST = 16  # terms of a sum, or factors of a product, that are compared with others
-# Nodes of a graph beyond which sums and products are not compared any more, but for equal operands: among so many that
-# takes most of the time and saves less than a hundredth of the operations.
+# Nodes of a graph beyond which sums and products are no longer compared, but for equal operands: in a larger graph the
+# comparison takes most of the time and saves less than a hundredth of the operations.
 MANY = 20_000
 
 # Ids from here on are inputs by their positions, and those from `NUMBERS` on numbers of long arrays, as long as nothing

@@ -63,7 +63,7 @@ def shifted(attribute: Table, by: int) -> Table: ...
 @overload
 def shifted(attribute: Located, by: int) -> Located: ...
 def shifted(attribute: "Table | Located", by: int) -> "Table | Located":
-    """A look-up in a program whose inputs come so much later."""
+    """The look-up of a program whose inputs have positions larger by `by`."""
     table = table_of(attribute)
     if table.numbers is not None:
         return attribute

@@ -124,12 +124,12 @@ def determinant(a):
         longer: dict[tuple[int, ...], Any] = {}
         for columns in itertools.combinations(range(n), k + 1):
             terms = [a[k, j] * minors[(*columns[:i], *columns[i + 1 :])] for i, j in enumerate(columns)]
-            longer[columns] = _alternating(terms)
+            longer[columns] = _alternate_signs(terms)
         minors = longer
     return minors[tuple(range(n))]
 
 
-def _alternating(terms: list):
+def _alternate_signs(terms: list):
     """The last term, less the one before it, plus the one before that, and so on."""
     total = terms[-1]
     for i, term in enumerate(reversed(terms[:-1])):
@@ -240,7 +240,7 @@ def _require_small(what: str, size: int) -> None:
         raise Unlowerable(f"{what} of {size} rows is larger than the {LARGEST_MATRIX} that are written out as scalars")
 
 
-def _each(what: str, function: Callable, expansion: Expansion, *arrays: np.ndarray) -> list[np.ndarray]:
+def _map_matrices(what: str, function: Callable, expansion: Expansion, *arrays: np.ndarray) -> list[np.ndarray]:
     """The results of a formula for each of the matrices in some arrays, (…, n, m), in arrays (…, *)."""
     _require_small(what, arrays[0].shape[-1])
     batch = arrays[0].shape[:-2]
@@ -258,7 +258,7 @@ def _lu(expansion, params, a):
 
 @lowers("cholesky")
 def _cholesky(expansion, params, a):
-    return _each("a Cholesky factor", lambda a: [cholesky(a)], expansion, a)[0]
+    return _map_matrices("a Cholesky factor", lambda a: [cholesky(a)], expansion, a)[0]
 
 
 @lowers("triangular_solve")
@@ -267,13 +267,13 @@ def _triangular_solve(expansion, params, a, b):
     if params["transpose_a"] == params["left_side"]:  # X A = B is Aᵀ Xᵀ = Bᵀ
         a, lower = np.swapaxes(a, -1, -2), not lower
     turned = b if params["left_side"] else np.swapaxes(b, -1, -2)
-    (x,) = _each("a triangular system", lambda a, b: [substitute(a, b, lower, unit)], expansion, a, turned)
+    (x,) = _map_matrices("a triangular system", lambda a, b: [substitute(a, b, lower, unit)], expansion, a, turned)
     return x if params["left_side"] else np.swapaxes(x, -1, -2)
 
 
 @lowers("det")
 def _determinant(expansion, params, a):
-    return _each("a determinant", lambda a: [determinant(a)], expansion, a)
+    return _map_matrices("a determinant", lambda a: [determinant(a)], expansion, a)
 
 
 @lowers("slogdet")
@@ -282,4 +282,4 @@ def _log_determinant(expansion, params, a):
         value = determinant(a)
         return [value.map("sign", value), log_determinant(a)]
 
-    return _each("a determinant", sign_and_logarithm, expansion, a)
+    return _map_matrices("a determinant", sign_and_logarithm, expansion, a)

@@ -30,7 +30,7 @@ def operations_that_fit(bytes_each: int) -> int:
 
 @contextlib.contextmanager
 def pause_collections() -> Iterator[None]:
-    """Inside, Python does not look for cycles of references.
+    """A context in which Python does not look for cycles of references.
 
     A graph consists of tuples, none of which is part of a cycle. To walk over all of them again and again while they
     become more takes a third of the time of a lowering. Whoever stopped it lets it go on, also among several threads.

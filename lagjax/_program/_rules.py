@@ -251,12 +251,12 @@ def has_own_rules(jaxpr) -> bool:
     """True if a jaxpr, or one that it calls, asks for other derivatives than those of its operations."""
     return any(
         not is_formula(equation)
-        and (equation.primitive.name in _OWN_RULES or any(has_own_rules(inner) for inner in _inner(equation)))
+        and (equation.primitive.name in _OWN_RULES or any(has_own_rules(inner) for inner in _inner_jaxprs(equation)))
         for equation in live_equations(jaxpr)
     )
 
 
-def _inner(equation) -> list:
+def _inner_jaxprs(equation) -> list:
     params = equation.params
     if equation.primitive.name == "custom_linear_solve":  # how JAX solves it is not what is lowered
         params = {"matvec": params["jaxprs"].matvec}
@@ -280,7 +280,7 @@ def _determinant(name: str, shape: tuple[int, ...], dtype) -> tuple[str, ...]:
 # ---- primitives that only move data ---------------------------------------------------------------------------------
 
 
-def _same(params, x):
+def _return_operand(params, x):
     return x
 
 
@@ -312,7 +312,7 @@ def _pad(params, x, value):
 
 
 MOVES: dict[str, Callable] = {
-    **dict.fromkeys(("copy", "copy_p", "stop_gradient", "reduce_precision", "sharding_constraint"), _same),
+    **dict.fromkeys(("copy", "copy_p", "stop_gradient", "reduce_precision", "sharding_constraint"), _return_operand),
     "optimization_barrier": lambda params, *xs: xs,
     "slice": _slice,
     "broadcast_in_dim": _broadcast_in_dim,

@@ -293,7 +293,7 @@ class _Recurrences:
         # Distinct factors first, squares last: a square needs half the work.
         products = sorted((key for key in wanted if key[0] == "product"), key=lambda key: (key[1] == key[2], key[1:]))
         place = {row: k for k, row in enumerate(sorted(needed))}
-        # Nobody reads the values of what is followed in the recursion.
+        # The recursion does not read the values of the nodes that are followed.
         order = [("value", node) for node in values] + [None] * len(followed) + products
         self._renumber({self._given[key]: self.moving + 2 + k for k, key in enumerate(order) if key is not None})
         kept = [self._row_coefficient(*rows[r]) for r in sorted(needed)] + followed
