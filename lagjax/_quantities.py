@@ -13,7 +13,7 @@ import numpy as np
 
 from lagjax._constraints import Constraints
 from lagjax._motion import Motion
-from lagjax._program import Derivatives, Expansion, Tape, copied, has_own_rules, inputs_of, trace_jaxpr
+from lagjax._program import Derivatives, Expansion, Tape, copy_nodes, has_own_rules, inputs_of, trace_jaxpr
 from lagjax._recursion import Recursion, RecursiveElimination, recursion_of
 from lagjax._saddle import SaddleElimination
 
@@ -66,7 +66,7 @@ class _ScalarState:
         arguments = inputs_of(tape, jax.tree.leaves(list(self.shapes.values())))
         (output,) = written.run_closed(self._traced(function, *self.ids), arguments)
         self.expansion.traced_operations += written.traced_operations
-        nodes = copied(self.expansion.graph, tape, inputs)
+        nodes = copy_nodes(self.expansion.graph, tape, inputs)
         return _Taped(tape, nodes, int(output), {i: k for k, i in enumerate(inputs)})
 
     def gradient(self, of: "_Taped", *by: str, together: bool = True) -> list[Ids]:

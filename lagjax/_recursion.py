@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._linear import singular_threshold
-from lagjax._program import Derivatives, Expansion, Graph, Scalars, copied
+from lagjax._program import Derivatives, Expansion, Graph, Scalars, copy_nodes
 
 Form = dict[int, int]  # a linear combination of unknowns: the node of the factor of each
 
@@ -140,7 +140,7 @@ def _hessian(derivatives: Derivatives, value: int, curved: Iterable[int], fronti
     second, one = Derivatives(apart), apart.constant(1.0, "float")
     slopes = second.slopes(nodes[value], second.find_ancestors([nodes[value]]), varied)
     rows = second.directional_derivatives(slopes, [{i: one} for i in varied])
-    places = copied(derivatives.graph, apart, inputs)
+    places = copy_nodes(derivatives.graph, apart, inputs)
     return {(frontier[a], frontier[b]): places[node] for a, row in enumerate(rows) for b, node in row.items() if b <= a}
 
 

@@ -311,7 +311,7 @@ class Adjoint:
             _add(frame, frame["y_ct", i, 1], "y_ct", i + self.n, 0)
         accelerations_ct = Vectors(self.n, lambda i: frame["y_ct", i + self.n, 1])
         values_ct = frame.vectors("values_ct", self.series.values)
-        out = form.run(frame, self.zeroth_order, *self.motion.now(frame), accelerations_ct, values_ct)
+        out = form.run(frame, self.zeroth_order, *self.motion.state_inputs(frame), accelerations_ct, values_ct)
         self._store(frame, out, frame.vectors("y_ct", self.states, lambda i: (i, 0)))
         self._store_entries(frame, self.tables, out, len(self.varied))
         return frame.finish()
@@ -320,8 +320,8 @@ class Adjoint:
         """The transpose of the projection: to the end of the series, from the state on the constraints."""
         frame = self.motion.function("back_projection")
         h, motion = frame["h"], self.motion
-        moved = motion.moved(frame, motion.increments(frame, frame.job("order"), h)[0])
-        _, _, params = motion.now(frame)
+        moved = motion.move_state(frame, motion.increments(frame, frame.job("order"), h)[0])
+        _, _, params = motion.state_inputs(frame)
         state_ct = frame.vectors("state_ct", self.states)
         out = motion.form.run(frame, self.projection_line, moved, [frame["t"] + h], params, state_ct)
         self._store(frame, out)

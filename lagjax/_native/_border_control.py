@@ -146,7 +146,7 @@ class BorderControl:
         frame = self.motion.function("decide")
         code, undecided = frame.code, frame["undecided"] > 0.0
         with code.only_if(code.any_lane(undecided)):
-            inputs = [*self.motion.now(frame), frame.vectors("stays", self.pieces)]
+            inputs = [*self.motion.state_inputs(frame), frame.vectors("stays", self.pieces)]
             pieces = self.motion.form.run(frame, self.borders.decide, *inputs)
             for j in self.motion.form.each(code, self.pieces):
                 place = j + self.motion.parameters
@@ -498,7 +498,7 @@ class BorderControl:
         ends = self.table.crosses_guard(frame) & (frame["stepped"] > 0.0)
         with code.only_if(code.any_lane(ends)):
             self.table.note_hit(frame, ends)
-            state = motion.moved(frame, motion.increments(frame, order, frame["h"])[0])
+            state = motion.move_state(frame, motion.increments(frame, order, frame["h"])[0])
             inputs = state, [frame["t"] + frame["h"]], frame.vectors("params", motion.numbers)
             slopes = motion.form.run(frame, line, *inputs, frame.vectors("hit", self.pieces))
             error, rtol, atol = code.variable(frame.constant(0.0)), frame.job("rtol"), absolute_tolerance(frame)

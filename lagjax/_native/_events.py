@@ -110,7 +110,7 @@ class Events:
         """`(order, s)`: the guards at that time after the present one, lane by lane, into `guard`."""
         frame = self.motion.function("guard", INTEGER, self.motion.vector)
         order, s = frame.arguments
-        moved = self.motion.moved(frame, self.motion.increments(frame, order, s)[0])
+        moved = self.motion.move_state(frame, self.motion.increments(frame, order, s)[0])
         guards = self.motion.evaluate(frame, self.values, moved, s)
         for i in range(self.count):
             frame["guard", i] = guards[i]

@@ -8,7 +8,7 @@ from lagjax._native._guards import Guards, append_guards, drop_guards, require_l
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
 from lagjax._program._jump import Jump, Nesting, jump_at_border, with_borders_of_tangents
-from lagjax._program._look_ups import BESIDE, shifted
+from lagjax._program._look_ups import BESIDE, shift_look_up
 from lagjax._program._memory import pause_collections
 from lagjax._program._operations import LOOK_UPS
 from lagjax._program._series import Recurrent, Series, StraightLine, series
@@ -148,7 +148,7 @@ def choose_parameters(
     def reduce_program(one, first=first, positions=positions):
         place = {first + i: first + k for k, i in enumerate(positions)}
         nodes = tuple(
-            (op, xs, place.get(a, a) if op == "input" else shifted(a, BESIDE - first) if op in LOOK_UPS else a)
+            (op, xs, place.get(a, a) if op == "input" else shift_look_up(a, BESIDE - first) if op in LOOK_UPS else a)
             for op, xs, a in one.line.nodes
         )
         dtypes = (*one.dtypes[:first], *(one.dtypes[first + i] for i in positions))

@@ -228,7 +228,7 @@ class Saltation:
         motion, code = self.motion, frame.code
         self.table.note_hit(frame)
         self.table.note_knot(frame, frame["crossed"] > 0.0)
-        moved = motion.moved(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
+        moved = motion.move_state(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
         for i in motion.form.each(code, motion.states):
             frame["edge", i] = moved[i]
         frame["edge_t"] = frame["t"] + frame["h"]

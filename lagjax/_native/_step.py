@@ -166,7 +166,7 @@ class StepControl:
         increments, slopes = motion.increments(frame, order, s)
         for i in motion.form.each(code, motion.states):
             frame["increment", i] = increments[i]
-        moved = motion.moved(frame, increments)
+        moved = motion.move_state(frame, increments)
         acceleration = motion.evaluate(frame, motion.acceleration, moved, s)
         noise = self._noise(frame, acceleration, increments, moved)
         defect, size = code.variable(frame["defect"]), code.lanes_of(code.intrinsic("fabs", h))

@@ -185,7 +185,7 @@ class Tangent:
     def _move(self, frame: Frame) -> None:
         """The end of the series before it is put on the constraints."""
         motion = self.motion
-        moved = motion.moved(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
+        moved = motion.move_state(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
         for i in motion.form.each(frame.code, self.states):
             frame["moved", i] = moved[i]
 

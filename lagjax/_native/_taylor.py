@@ -151,7 +151,7 @@ class TaylorSeries:
         """`(order)`: the series of the state, to that order, from its values."""
         frame = self.function("coefficients", INTEGER)
         code, (order,), series, n, form = frame.code, frame.arguments, self.series, self.n, self.form
-        out = form.run(frame, series.zeroth_order, *self.now(frame), to=self.values(frame))
+        out = form.run(frame, series.zeroth_order, *self.state_inputs(frame), to=self.values(frame))
         frame["singular"] = out[n]
         for i in range(self.kept):
             frame["kept", i] = out[n + 1 + i]
@@ -201,7 +201,7 @@ class TaylorSeries:
     def _last_order(self, code: Code, order: Value) -> Value:
         return code.select(order < MAX_ORDER, order + 1, MAX_ORDER)
 
-    def now(self, frame: Frame) -> list[Vectors]:
+    def state_inputs(self, frame: Frame) -> list[Vectors]:
         """The inputs of the program at the present time: q, q̇, t, parameters."""
         state = frame.vectors("y", self.states, lambda i: (i, 0))
         return [state, frame.vectors("t", 1), frame.vectors("params", self.numbers)]
@@ -249,9 +249,9 @@ class TaylorSeries:
 
     def evaluate_now(self, frame: Frame, line: StraightLine) -> Numbers:
         """The outputs of a program of (q, q̇, t, parameters) at the present state."""
-        return self.form.run(frame, line, *self.now(frame))
+        return self.form.run(frame, line, *self.state_inputs(frame))
 
-    def moved(self, frame: Frame, increments: Numbers) -> Numbers:
+    def move_state(self, frame: Frame, increments: Numbers) -> Numbers:
         """The state at the end of these increments."""
         moved = self.form.room(frame, self.states)
         for i in self.form.each(frame.code, self.states):

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._program._differentiation import copied, gradient_in, pullback
+from lagjax._program._differentiation import copy_nodes, gradient_in, pullback
 from lagjax._program._graph import Graph
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS
@@ -170,7 +170,7 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
         return None  # most scenes, and the largest ones, at no cost
     with np.errstate(all="ignore"):
         rewriting = _Rewriting(program, size, slides, watched)
-        return rewriting.finished() if rewriting.switches or rewriting.features else None
+        return rewriting.build() if rewriting.switches or rewriting.features else None
 
 
 class _Rewriting:
@@ -276,7 +276,7 @@ class _Rewriting:
         if op == "constant":
             return self.graph.constant(attribute, kind)
         of = [self.places[x] for x in operands]
-        if i in self.decisive and (decided := self._of_piece(i, op, of, attribute)) is not None:
+        if i in self.decisive and (decided := self._replace_by_piece(i, op, of, attribute)) is not None:
             return decided
         if op in ("eq", "ne") and (sign := self._known_sign(i, *of)) is not None:
             return self.graph.apply(op, sign, self.graph.constant(0.0, "float"))
@@ -309,7 +309,7 @@ class _Rewriting:
                 return self.graph.apply("mul", self.graph.constant(a / (b * c), "float"), piece)
         return None
 
-    def _of_piece(self, i: int, op: str, of: list[int], attribute) -> int | None:
+    def _replace_by_piece(self, i: int, op: str, of: list[int], attribute) -> int | None:
         """The result of a node by its piece; None where it has none."""
         if i in self.moduli:
             op, of = "mod", [self.places[x] for x in self.moduli[i]]
@@ -433,7 +433,7 @@ class _Rewriting:
 
     # ---- the end ----
 
-    def finished(self) -> Borders:
+    def build(self) -> Borders:
         """The parts of the result."""
         program, features = self.program, dict(sorted(self.features.items(), key=lambda item: item[1]))
         line = StraightLine(
@@ -586,10 +586,10 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int) -> Pieced:
 
     Before these stands how far rounding may move each of them (`rounding`); zero for a line that is long.
     """
-    graph = Graph.of(program.line, program.budget + 2 * _LARGEST * len(more.nodes) + 1000)
+    graph = Graph.from_line(program.line, program.budget + 2 * _LARGEST * len(more.nodes) + 1000)
     kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in program.dtypes]
     with np.errstate(all="ignore"):
-        places = copied(graph, more, [graph.input(i, kind) for i, kind in enumerate(kinds)])
+        places = copy_nodes(graph, more, [graph.input(i, kind) for i, kind in enumerate(kinds)])
         errors = [graph.constant(0.0, "float")] * len(more.outputs)
         if len(more.nodes) <= LARGEST_WITH_ROUNDING:
             errors = rounding(graph, more, places, moving)

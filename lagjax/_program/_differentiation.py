@@ -32,7 +32,7 @@ TangentTable = Callable[[Table], Table]  # the table of the tangents of the entr
 _LARGEST = 100  # operations of a derivative for one of a line: a bound for errors, three are usual
 
 
-def copied(graph: Graph, line, inputs: Sequence[int], places: Sequence[int] | None = None) -> list[int]:
+def copy_nodes(graph: Graph, line, inputs: Sequence[int], places: Sequence[int] | None = None) -> list[int]:
     """The nodes of a line, of a tape or of another graph in a graph, where `inputs` are its inputs.
 
     Tables begin at other inputs where `places` says what input i has become.
@@ -193,11 +193,11 @@ class Derivatives:
 
     def find_ancestors(self, outputs: Sequence[int]) -> list[int]:
         """The nodes that some nodes are derived from, and these, in order."""
-        return self.graph.below(outputs, as_derived=True)
+        return self.graph.find_ancestors(outputs, as_derived=True)
 
     def size(self, outputs: Sequence[int]) -> int:
         """The number of operations of some nodes together."""
-        return sum(bool(self.graph.nodes[i][1]) for i in self.graph.below(outputs))
+        return sum(bool(self.graph.nodes[i][1]) for i in self.graph.find_ancestors(outputs))
 
     def _apply(self, op: str, *operands: int, attribute=None) -> int:
         self.operations += 1
@@ -282,7 +282,7 @@ def with_tangents(
             place + INPUTS if kind == "float" else graph.input(place, kind)
             for place, kind in zip(places, kinds, strict=True)
         ]
-        placed = _PlacedLine(graph, line, copied(graph, line, ids, places))
+        placed = _PlacedLine(graph, line, copy_nodes(graph, line, ids, places))
         moved = []
         for direction, table in zip(directions, tables or [None] * len(directions), strict=True):
             tangents = {i: place + INPUTS for i, place in direction.items() if kinds[i] == "float"}
@@ -325,7 +325,7 @@ class _PlacedLine(Derivatives):
         graph = Graph(_LARGEST * len(line.nodes) + 1000)
         inputs = [graph.input(i, kind) for i, kind in enumerate([*map(_kind, dtypes), *["float"] * more])]
         with np.errstate(all="ignore"):
-            return cls(graph, line, copied(graph, line, inputs))
+            return cls(graph, line, copy_nodes(graph, line, inputs))
 
     def finish_line(self, results: list[int], known: Sequence[int], first: int) -> StraightLine:
         """The line of some results, which reads the outputs `known` of the line as inputs from `first` on."""

@@ -72,7 +72,7 @@ class Graph:
         self._ends = [NUMBERS]
 
     @classmethod
-    def of(cls, line, budget: int) -> "Graph":
+    def from_line(cls, line, budget: int) -> "Graph":
         """A graph of the nodes of a straight line, which have their positions as ids."""
         graph = cls(budget)
         graph.nodes, graph.kinds, ids = list(line.nodes), list(line.kinds), graph._ids
@@ -91,7 +91,7 @@ class Graph:
         graph._require_room()
         return graph
 
-    def below(self, outputs: Iterable[int], as_derived: bool = False) -> list[int]:
+    def find_ancestors(self, outputs: Iterable[int], as_derived: bool = False) -> list[int]:
         """The nodes that some nodes depend on, and these, in order; `as_derived`, powers depend on their base."""
         marks, nodes, order = bytearray(len(self.nodes)), self.nodes, []
         powers = self.powers if as_derived else {}

@@ -25,9 +25,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._program._borders import Borders, Pieced
-from lagjax._program._differentiation import TangentTable, copied, pullback_and_entries, tangents_in, with_tangents
+from lagjax._program._differentiation import TangentTable, copy_nodes, pullback_and_entries, tangents_in, with_tangents
 from lagjax._program._graph import Graph, Unlowerable
-from lagjax._program._look_ups import Table, shifted
+from lagjax._program._look_ups import Table, shift_look_up
 from lagjax._program._passes import eliminate_dead_code, live
 from lagjax._program._series import StraightLine
 
@@ -144,7 +144,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     line = line._replace(outputs=line.outputs[: rows * n + 1])
     return borders._replace(
         program=Pieced(line, len(dtypes), dtypes, None, max(program.budget, len(line.nodes))),
-        switches=switches[:pieces], arguments=switches[pieces:], decide=_renumbered(borders.decide, decided),
+        switches=switches[:pieces], arguments=switches[pieces:], decide=_renumber_inputs(borders.decide, decided),
         motion=borders.motion or borders,
     )  # fmt: skip
 
@@ -160,10 +160,10 @@ def _places(n: int, numbers: int, rows: int, row: int) -> list[int]:
 
 def _table_of_row(shift: int) -> TangentTable:
     """The table of a row of tangents, which stands this many numbers of a member behind that of the motion."""
-    return lambda table: shifted(table, shift)
+    return lambda table: shift_look_up(table, shift)
 
 
-def _renumbered(line: StraightLine, places: dict[int, int]) -> StraightLine:
+def _renumber_inputs(line: StraightLine, places: dict[int, int]) -> StraightLine:
     """The line with other numbers of its inputs."""
     return line._replace(nodes=tuple((op, of, places[x]) if op == "input" else (op, of, x) for op, of, x in line.nodes))
 
@@ -184,7 +184,7 @@ def jump_at_border(
             f"derivatives of order {len(directions)} over a border are not known, of {len(_STAGES)} they are"
         )
     with np.errstate(all="ignore"):
-        return _OverBorder(borders, size, directions, member, over_steps).finished()
+        return _OverBorder(borders, size, directions, member, over_steps).build()
 
 
 class _OverBorder:
@@ -208,7 +208,7 @@ class _OverBorder:
         self.stages = _STAGES[len(directions) - 1]
         dtypes = [*program.dtypes[: self.moving], *[np.dtype(float)] * (self.pieces + self.chosen)]
         line = StraightLine(*live(program.line.nodes, program.line.kinds, program.line.outputs[:size]))
-        self.switch = _chosen(borders, program.size)
+        self.switch = _switching_number(borders, program.size)
         self.field, self.switches = (self._with_rows(line, dtypes) for line in (line, self.switch))
         largest = len(self.field.nodes) + len(self.switches.nodes) + len(line.nodes)
         self.graph = Graph(_LARGEST * largest + 10_000)
@@ -228,7 +228,9 @@ class _OverBorder:
         outputs, rows, first = len(line.outputs), 1, self.rows * self.moving
         kinds = [np.dtype(float)] * (first + self.pieces + self.chosen)
         kinds[: self.moving] = dtypes[: self.moving]
-        line = _renumbered(line, {i: i if i < self.moving else i - self.moving + first for i in range(len(dtypes))})
+        line = _renumber_inputs(
+            line, {i: i if i < self.moving else i - self.moving + first for i in range(len(dtypes))}
+        )
         for level, count in enumerate(self.directions):
             tables = [_table_of_row(row * rows * self.member) for row in range(1, 1 + count)]
             if self.over_steps and level == len(self.directions) - 1:
@@ -269,7 +271,7 @@ class _OverBorder:
         """The outputs of one of the lines with rows at a place; `fixed` are the inputs that do not move."""
         zero = self.graph.constant(0.0, "float")
         inputs = [zero if jet[row] is None else jet[row] for row in range(self.rows) for jet in place]
-        nodes = copied(self.graph, line, [*inputs, *fixed])
+        nodes = copy_nodes(self.graph, line, [*inputs, *fixed])
         count = len(line.outputs) // self.rows
         return [[nodes[line.outputs[row * count + i]] for row in range(self.rows)] for i in range(count)]
 
@@ -307,14 +309,14 @@ class _OverBorder:
                     delay[row] = self.graph.apply("neg", self.graph.apply("div", left[row], rate))
         return delay
 
-    def finished(self) -> Jump:
+    def build(self) -> Jump:
         graph, n, zero = self.graph, self.n, self.graph.constant(0.0, "float")
         place, before, behind, hit = self._inputs()
         base = [jet[0] for jet in place]
         first = self._rates(place, before)
         a_before = [first[n + i][0] for i in range(n)]
         a_behind = [jet[0] for jet in self._rates(place, behind)[n : 2 * n]]
-        nodes = copied(graph, self.switch, [*base, *before, *hit])
+        nodes = copy_nodes(graph, self.switch, [*base, *before, *hit])
         rates = [*base[n : 2 * n], *a_before, graph.constant(1.0, "float")]
         rate = tangents_in(graph, self.switch, nodes, dict(enumerate(rates)), {}).get(self.switch.outputs[0], zero)
         delay = self._delay(place, before, hit, rate)
@@ -346,7 +348,7 @@ class _OverBorder:
         return jets, before, behind, hit
 
 
-def _chosen(borders: Borders, size: int) -> StraightLine:
+def _switching_number(borders: Borders, size: int) -> StraightLine:
     """Σ hⱼ (uⱼ − levelⱼ), with the numbers hⱼ behind the inputs of the program.
 
     Levels that are parameters are entries of tables, whose numbers are inputs behind these. Others do not matter.
@@ -355,7 +357,7 @@ def _chosen(borders: Borders, size: int) -> StraightLine:
     line = StraightLine(*live(program.line.nodes, program.line.kinds, borders.switches))
     graph = Graph(10 * len(line.nodes) + 1000)
     kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
-    nodes = copied(graph, line, [graph.input(i, kinds.get(i, "float")) for i in range(size)])
+    nodes = copy_nodes(graph, line, [graph.input(i, kinds.get(i, "float")) for i in range(size)])
     total = graph.constant(0.0, "float")
     for j, node in enumerate(line.outputs):
         weight, number = graph.input(size + j, "float"), nodes[node]

@@ -59,10 +59,10 @@ def table_of(attribute: "Table | Located") -> Table:
 
 
 @overload
-def shifted(attribute: Table, by: int) -> Table: ...
+def shift_look_up(attribute: Table, by: int) -> Table: ...
 @overload
-def shifted(attribute: Located, by: int) -> Located: ...
-def shifted(attribute: "Table | Located", by: int) -> "Table | Located":
+def shift_look_up(attribute: Located, by: int) -> Located: ...
+def shift_look_up(attribute: "Table | Located", by: int) -> "Table | Located":
     """The look-up of a program whose inputs have positions larger by `by`."""
     table = table_of(attribute)
     if table.numbers is not None:

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._program import _scalars as xp
-from lagjax._program._differentiation import Derivatives, copied
+from lagjax._program._differentiation import Derivatives, copy_nodes
 from lagjax._program._graph import Graph, Unlowerable
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._rules import Expansion, inputs_of, lowers
@@ -210,7 +210,7 @@ def _matrix_of(expansion: Expansion, matvec, constants) -> np.ndarray:
             row[j] = entry
     line = StraightLine(*eliminate_dead_code(apart.graph, entries.ravel().tolist()))
     given = [i for x in constants for i in x.ravel().tolist()]
-    nodes = copied(expansion.graph, line, given)
+    nodes = copy_nodes(expansion.graph, line, given)
     return np.array([nodes[i] for i in line.outputs], dtype=np.int64).reshape(entries.shape)
 
 

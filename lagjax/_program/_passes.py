@@ -122,7 +122,7 @@ def _negative(graph, i) -> int | None:
 
 def eliminate_dead_code(graph: Graph, outputs: list[int]) -> Line:
     """The nodes that the outputs depend on, renumbered."""
-    kept = graph.below(outputs)
+    kept = graph.find_ancestors(outputs)
     if len(kept) == len(graph.nodes):
         return tuple(graph.nodes), tuple(graph.kinds), tuple(outputs)
     position = dict(zip(kept, range(len(kept)), strict=True))

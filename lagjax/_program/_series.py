@@ -120,7 +120,7 @@ class _Recurrences:
 
     def __init__(self, program: Recurrent, size: int, moving: int, followed: tuple[int, ...]):
         self.size, self.moving, self.followed = size, moving, followed
-        self.zeroth_order = Graph.of(program.line, 10 * program.budget)
+        self.zeroth_order = Graph.from_line(program.line, 10 * program.budget)
         self.order_recursion = Graph(20 * program.budget)
         self.outputs = list(program.line.outputs)
         self.order_k = [self.order_recursion.input(i, "float") for i in range(self.moving)]
@@ -321,7 +321,7 @@ class _Recurrences:
 
     def _find_reached(self, roots: list[int]) -> list[tuple]:
         """The keys of `_given` that these nodes of the recursion depend on, in the order of their first use."""
-        reached = set(self.order_recursion.below(roots))
+        reached = set(self.order_recursion.find_ancestors(roots))
         return [key for key, node in self._given.items() if node in reached]
 
     def _renumber(self, positions: dict[int, int]) -> None:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._program._differentiation import copied, gradient_in
+from lagjax._program._differentiation import copy_nodes, gradient_in
 from lagjax._program._graph import Graph
 from lagjax._program._series import LinearSystem, StraightLine
 
@@ -58,7 +58,7 @@ def with_sliding(
     if not slides:
         return None
     if linear is not None and len(slides) <= MOST_SLIDING:
-        done = _SlidingForces(line, n, first, switches, slides, linear).finished()
+        done = _SlidingForces(line, n, first, switches, slides, linear).build()
         if done is not None:
             return done
     if len(slides) > MOST_COPIES or len(line.nodes) > LARGEST_COPIED or any(slide.order > 1 for slide in slides):
@@ -74,7 +74,7 @@ class _SlidingForces:
 
     def __init__(self, line, n, first, switches, slides, linear):
         self.line, self.n, self.slides, self.linear = line, n, slides, linear
-        self.graph = Graph.of(line, _LARGEST)
+        self.graph = Graph.from_line(line, _LARGEST)
         self.f, self.zero, self.one = self.graph.apply, self.number(0.0), self.number(1.0)
         self.pieces = [self.graph.input(first + slide.piece, "float") for slide in slides]
         flags = [self.graph.input(first + len(switches) + k, "float") for k in range(len(slides))]
@@ -88,7 +88,7 @@ class _SlidingForces:
         """Zero where nothing slides along border k."""
         return self.f("select", self.flags[k], self.zero, x)
 
-    def finished(self) -> Sliding | None:
+    def build(self) -> Sliding | None:
         """The program; None where pieces act on more than the right side, or not each for itself."""
         acts = self._acts()
         if acts is None:
@@ -107,7 +107,7 @@ class _SlidingForces:
             for p, d, rate in zip(pushed, normals, rates, strict=True)
         ]
         unknown = self._unknown(equations, missing)
-        z = self._solved(self._pushed(self.linear.right, acts, unknown))
+        z = self._solve(self._push_right_side(self.linear.right, acts, unknown))
         shares = [self._share(k, pushed[k], unknown[k], slopes[k], rates[k], z) for k in range(len(acts))]
         ends = [self.f("select", p, self.zero, rate) for p, rate in zip(pushed, rates, strict=True)]
         linear = self._system(z, unknown, acts, normals, ends, equations)
@@ -115,16 +115,16 @@ class _SlidingForces:
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), outputs)
         return Sliding(line, range(len(self.line.nodes)), shares, linear)
 
-    def _solved(self, right: Sequence[int]) -> list[int]:
+    def _solve(self, right: Sequence[int]) -> list[int]:
         """z of A z = r."""
         line = self.linear.solve().line
-        nodes = copied(self.graph, line, [*self.linear.factors, *right])
+        nodes = copy_nodes(self.graph, line, [*self.linear.factors, *right])
         return [nodes[i] for i in line.outputs]
 
     def _effects(self, acts: Sequence[dict[int, int]], slopes: Sequence[list[int]]) -> list[list[int]]:
         """The slopes ∂u̇/∂p of the rate of each border by each piece; zeros where nothing slides."""
         size = len(self.linear.right)
-        responses = [self._solved([act.get(i, self.zero) for i in range(size)])[: self.n] for act in acts]
+        responses = [self._solve([act.get(i, self.zero) for i in range(size)])[: self.n] for act in acts]
         return [[dot(self.graph, d, response) for response in responses] for d in slopes]
 
     def _equations(self, effects: list[list[int]], pushed: Sequence[int], slopes: Sequence[list[int]]) -> "_Equations":
@@ -148,10 +148,10 @@ class _SlidingForces:
     def _unknown(self, equations: "_Equations", missing: list[int]) -> list[int]:
         """μ; where borders share what they hold, the pieces p + μ are to be small, and not how far they are from p."""
         if not equations.whole:
-            return equations.solved(self.graph, missing)
+            return equations.solve(self.graph, missing)
         f, rows = self.f, equations.whole
         there = [f("add", x, dot(self.graph, row, self.pieces)) for x, row in zip(missing, rows, strict=True)]
-        return [f("sub", x, p) for x, p in zip(equations.solved(self.graph, there), self.pieces, strict=True)]
+        return [f("sub", x, p) for x, p in zip(equations.solve(self.graph, there), self.pieces, strict=True)]
 
     def _are_dependent(self, slopes: Sequence[list[int]]) -> bool:
         """True if the rates of some borders are combinations of others, so that these can share what they hold."""
@@ -170,7 +170,9 @@ class _SlidingForces:
         moves = f("sub", dot(self.graph, slopes, z[: self.n]), rate)
         return f("select", pushed, f("add", half, f("mul", self.number(FAR), moves)), own)
 
-    def _pushed(self, right: Sequence[int], acts: Sequence[dict[int, int]], unknown: Sequence[int]) -> list[int]:
+    def _push_right_side(
+        self, right: Sequence[int], acts: Sequence[dict[int, int]], unknown: Sequence[int]
+    ) -> list[int]:
         """r + Σ μₖ ∂r/∂pₖ."""
         pushed = list(right)
         for act, mu in zip(acts, unknown, strict=True):
@@ -180,7 +182,7 @@ class _SlidingForces:
 
     def _acts(self) -> list[dict[int, int]] | None:
         """∂r/∂pₖ, entry by entry: half of the difference of both sides."""
-        of_sides = self._of_sides()
+        of_sides = self._values_on_both_sides()
         if of_sides is None:
             return None
         half, acts = self.number(0.5), []
@@ -193,15 +195,15 @@ class _SlidingForces:
             acts.append(act)
         return acts
 
-    def _of_sides(self) -> dict[int, dict[int, tuple[int, int]]] | None:
+    def _values_on_both_sides(self) -> dict[int, dict[int, tuple[int, int]]] | None:
         """The nodes that depend on pieces, and for each piece their values below and above, the others as they are."""
         graph, system = self.graph, self.linear
         pieces = {node: k for k, node in enumerate(self.pieces)}
-        if not pieces.keys().isdisjoint(graph.below([*system.entries.values(), *system.factors])):
+        if not pieces.keys().isdisjoint(graph.find_ancestors([*system.entries.values(), *system.factors])):
             return None
         sides: dict[int, dict[int, tuple[int, int]]] = {}
         both = self.number(-1.0), self.one
-        for i in graph.below(system.right):
+        for i in graph.find_ancestors(system.right):
             if i in pieces:
                 sides[i] = {pieces[i]: both}
                 continue
@@ -255,19 +257,19 @@ class _SlidingForces:
             right, ends = inputs[len(factors) : len(factors) + count], inputs[len(factors) + count :]
             inner = system.solve().line
 
-            def solved(right):
-                nodes = copied(graph, inner, [*inputs[: len(system.factors)], *right])
+            def apply_inverse(right):
+                nodes = copy_nodes(graph, inner, [*inputs[: len(system.factors)], *right])
                 return [nodes[i] for i in inner.outputs]
 
-            y = solved(right)
+            y = apply_inverse(right)
             for (row, column), d in others.items():
                 if row >= count:
                     ends[row - count] = graph.apply("sub", ends[row - count], graph.apply("mul", at[d], y[column]))
-            mu = _Equations(*([[at[x] for x in row] for row in table] for table in equations)).solved(graph, ends)
+            mu = _Equations(*([[at[x] for x in row] for row in table] for table in equations)).solve(graph, ends)
             for (row, column), c in others.items():
                 if column >= count:
                     right[row] = graph.apply("sub", right[row], graph.apply("mul", at[c], mu[column - count]))
-            outputs = (*solved(right), *mu)
+            outputs = (*apply_inverse(right), *mu)
             return StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
 
         return LinearSystem(
@@ -305,7 +307,7 @@ def _with_copies(
             side = one if k == upper else number(-1.0)
             given[first + j] = f("select", flags[k], graph.input(first + j, "float"), side)
         size = max(given) + 1
-        return copied(graph, line, [given.get(i, zero) for i in range(size)])
+        return copy_nodes(graph, line, [given.get(i, zero) for i in range(size)])
 
     base = copy(None)
     a = [base[i] for i in line.outputs]
@@ -347,7 +349,7 @@ class _Equations(NamedTuple):
     lower: list[list[int]]
     whole: list[list[int]]
 
-    def solved(self, graph: Graph, right: Sequence[int]) -> list[int]:
+    def solve(self, graph: Graph, right: Sequence[int]) -> list[int]:
         """Their solution."""
         x = substitute(graph, self.upper, self.lower, right)
         for _ in range(MENDED if self.whole else 0):
