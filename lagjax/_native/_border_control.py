@@ -256,7 +256,7 @@ class BorderControl:
         inside = (index >= 0.0) & (index <= float(located.table.count - 1))
         return self.motion.look_up.take(frame, located.table, index), inside
 
-    def _until_next_knot(self, frame: Frame, j: int) -> tuple[Value, Value]:
+    def _time_to_next_knot(self, frame: Frame, j: int) -> tuple[Value, Value]:
         """The time to the next entry of the table that the time is on, and the lanes where there is one."""
         code, forward = frame.code, frame["forward"]
         index = self._piece(frame, integer(code, j)) + code.flag(forward > 0.0)
@@ -266,7 +266,7 @@ class BorderControl:
     def _look_at_clock(self, frame: Frame, c: int, j: int, h: Value) -> None:
         """The step ends at the next entry of a table that the time is on, which is known."""
         code = frame.code
-        left, inside = self._until_next_knot(frame, j)
+        left, inside = self._time_to_next_knot(frame, j)
         left = code.maximum(left, frame.constant(0.0))
         size = code.intrinsic("fabs", h)
         sooner = inside & (left < frame["nearest"] * size)
@@ -280,7 +280,7 @@ class BorderControl:
         count, moves = frame.constant(0.0), frame.constant(0.0)
         movable = [j for _, j in self.table.knots]
         for j in self.borders.clocks:
-            left, inside = self._until_next_knot(frame, j)
+            left, inside = self._time_to_next_knot(frame, j)
             distance = code.intrinsic("fabs", left - frame["nearest"] * size)
             at_once = inside & (frame["crossed"] > 0.0) & (distance <= self._instant(frame))
             count = count + code.flag(at_once)
@@ -344,7 +344,7 @@ class BorderControl:
     def _pass_knots(self, frame: Frame, going: Value) -> None:
         """The pieces of tables whose next entry the time has come to: all that are there at one instant."""
         for j in self.borders.clocks:
-            left, inside = self._until_next_knot(frame, j)
+            left, inside = self._time_to_next_knot(frame, j)
             passes = going & inside & (left <= self._instant(frame))
             with frame.where(passes):
                 place = self.motion.parameters + j

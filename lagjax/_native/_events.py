@@ -293,7 +293,7 @@ class Events:
         frame["unsure"] = code.intrinsic("fabs", frame["poly", 1]) * frame["instant"] + rounding
         ahead = code.variable(side)
         self._follow_roots(frame, order, g, degree, ahead, moving & sound)
-        self._without_series(frame, order, g, ahead, moving & ~sound)
+        self._bisect_change(frame, order, g, ahead, moving & ~sound)
         with frame.where(moving):
             frame["side", g] = ahead.value
 
@@ -409,7 +409,7 @@ class Events:
             frame["passed_at", g] = now
         return goes_on
 
-    def _without_series(self, frame: Frame, order: Value, g: Value, ahead: Variable, where: Value) -> None:
+    def _bisect_change(self, frame: Frame, order: Value, g: Value, ahead: Variable, where: Value) -> None:
         """A part of the step, at whose end the guard is looked at; a change before that is found by bisection."""
         code, side, h = frame.code, ahead.value, frame["h"]
         with code.only_if(code.any_lane(where)):

@@ -250,7 +250,7 @@ class Saltation:
         """The numbers that choose the switching number, as inputs of the jump."""
         return [numbers("hit", self.pieces), *([numbers("entry", self.pieces)] if self.chosen > self.pieces else [])]
 
-    def at_edge(self, numbers: Callable, behind: Vectors) -> list:
+    def edge_inputs(self, numbers: Callable, behind: Vectors) -> list:
         """The inputs of the jump but for its upper rows; `numbers(name, count)` gives vectors of the motion."""
         return [
             numbers("edge", self.motion.states), numbers("edge_t", 1), numbers("params", self.motion.parameters),
@@ -263,7 +263,7 @@ class Saltation:
         Of `state_ct`, with the pieces `behind` the border. And tables, with the numbers of entries and their gains.
         """
         n, rows, motion, code = self.base, self.jump.lower, self.motion, frame.code
-        inputs = self.at_edge(lambda name, count: frame.vectors(name, count), behind)
+        inputs = self.edge_inputs(lambda name, count: frame.vectors(name, count), behind)
         out = motion.form.run(frame, self.jump.accelerations(n), *inputs)
         jumps = self._jumps(code, _some(out, 0, n), _some(out, n, n))
         cotangents, sum = motion.form.room(frame, rows * 2 * n), code.variable(frame.constant(0.0))

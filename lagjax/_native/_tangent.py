@@ -266,7 +266,7 @@ class Tangent:
             return self.numbers_of(frame, name, count, lambda i: (i + first,), in_place=True)
 
         tangents = [frame.vectors("dy", n, lambda i: (i, 0)), frame.vectors("dy", n, lambda i: (i + n, 0))]
-        inputs = saltation.at_edge(numbers, numbers("params", self.motion.pieces, behind))
+        inputs = saltation.edge_inputs(numbers, numbers("params", self.motion.pieces, behind))
         out = form.run(frame, jump.line, *inputs, *tangents, frame.vectors("dparams", self.numbers))
         added = saltation.tangent_jumps(frame, out, self.number_of(frame, "is_hit"), self.number_of(frame, "grazes"))
         for row in range(jump.lower):

@@ -214,10 +214,10 @@ class _Rewriting:
         needed = _below(line, roots, instead)
         if self.watched:  # which may read the solution of a linear system, but not decide on its elimination
             needed |= _below(line, self.watched, instead) - (_below(line, line.outputs[: self.size]) - needed)
-        self.abrupt = self._without_series(needed)
+        self.abrupt = self._find_abrupt(needed)
         return needed - self.abrupt
 
-    def _without_series(self, needed: set[int]) -> set[int]:
+    def _find_abrupt(self, needed: set[int]) -> set[int]:
         """The decisions at whose border a root has no series."""
         nodes, singular = self.program.line.nodes, set()
         for i in needed:

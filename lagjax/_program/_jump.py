@@ -209,7 +209,7 @@ class _OverBorder:
         dtypes = [*program.dtypes[: self.moving], *[np.dtype(float)] * (self.pieces + self.chosen)]
         line = StraightLine(*live(program.line.nodes, program.line.kinds, program.line.outputs[:size]))
         self.switch = _switching_number(borders, program.size)
-        self.field, self.switches = (self._with_rows(line, dtypes) for line in (line, self.switch))
+        self.field, self.switches = (self._add_rows(line, dtypes) for line in (line, self.switch))
         largest = len(self.field.nodes) + len(self.switches.nodes) + len(line.nodes)
         self.graph = Graph(_LARGEST * largest + 10_000)
 
@@ -223,7 +223,7 @@ class _OverBorder:
             terms.append([(place[a], place[b]) for a, b in pairs])
         return terms
 
-    def _with_rows(self, line: StraightLine, dtypes: Sequence) -> StraightLine:
+    def _add_rows(self, line: StraightLine, dtypes: Sequence) -> StraightLine:
         """A line of inputs that move, and of some that do not, with all rows of its outputs; rows of inputs alike."""
         outputs, rows, first = len(line.outputs), 1, self.rows * self.moving
         kinds = [np.dtype(float)] * (first + self.pieces + self.chosen)

@@ -63,7 +63,7 @@ def with_sliding(
             return done
     if len(slides) > MOST_COPIES or len(line.nodes) > LARGEST_COPIED or any(slide.order > 1 for slide in slides):
         return None
-    return _with_copies(line, n, first, switches, slides)
+    return _copy_for_slides(line, n, first, switches, slides)
 
 
 # ---- as unknowns of the linear system --------------------------------------------------------------------------------
@@ -290,7 +290,7 @@ def _adds_up(op: str, operands: Sequence[int], sides: dict) -> bool:
 # ---- with a copy for each of them ------------------------------------------------------------------------------------
 
 
-def _with_copies(
+def _copy_for_slides(
     line: StraightLine, n: int, first: int, switches: Sequence[int], slides: Sequence[Slide]
 ) -> Sliding | None:
     """a = a⁻ + Σ αₖ (aₖ⁺ − a⁻); what one piece does to a is not to depend on the others."""

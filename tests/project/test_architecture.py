@@ -206,3 +206,18 @@ def test_files_and_classes_have_names_of_their_own():
     ]
     for names in (files, classes):
         assert sorted(names) == sorted(set(names)), [name for name in set(names) if names.count(name) > 1]
+
+
+PREPOSITIONS = (
+    "of at along in on by for after before behind beside apart around beyond under over through until within without "
+    "across told asked seen"
+)
+
+
+def test_functions_are_no_prepositions():
+    """A name says what a function does, or what it returns; `from_`, `to_`, `as_` and `with_` are Python's idioms."""
+    begins = re.compile(rf"_?({'|'.join(PREPOSITIONS.split())})(_|$)")
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                assert not begins.match(node.name), f"{path}: {node.name} is not verb + object, nor a noun"
