@@ -26,6 +26,7 @@ from lagjax._native._constants import (
     MAX_ORDER,
     MOST_CROSSINGS,
     MOST_LOOKS,
+    MOST_TURNS,
     NEARBY,
     NEGLIGIBLE,
     NO_TIME,
@@ -221,6 +222,7 @@ class BorderControl:
         # A move of less than a part of atol does not count as leaving a border that the motion touches. Where borders
         # hold together what moves by rounding, they are left and met in turn at one instant: then more is rounding.
         turns = 1.0 + code.maximum(frame["idle_crossings"] - float(len(self.guards)), frame.constant(0.0))
+        turns = code.select(turns < MOST_TURNS, turns, MOST_TURNS)
         patience = (turns * turns) * (turns * turns) * turns
         nothing = self.roots.size(frame, degree) <= NEGLIGIBLE * code.lanes_of(absolute_tolerance(frame)) * patience
         touches = frame["touch", g] > Touch.NONE

@@ -145,6 +145,10 @@ AT_ONCE = 2.0**-36
 MOST_CROSSINGS = 4
 # Of atol: by what a motion along a border may leave it in a step, which rounding of what holds it there does.
 NEGLIGIBLE = 1e-3
+# Once every border was met at one instant, and some are met again, it is more with each turn, by the fifth power of
+# their number: rounding grows with the forces, whose size is not known here. A million times as much is 1e-9 by the
+# default tolerances; blocks held by forces of 1000 need some ten turns.
+MOST_TURNS = 16.0
 # A border that is reached within this part of the smallest step from another one is bounced off without end: the
 # motion rests on it. What is left of its velocity is as small as that.
 NO_TIME = 0.25
