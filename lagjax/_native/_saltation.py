@@ -158,10 +158,10 @@ class Saltation:
         code, n = frame.code, self.base
         first = (len(self.jump.orders) - 1) * 2 * n
         jumps = self._jumps(code, *(_some(out, first + k * n, n) for k in range(2)))
-        is_hit, existing = hit > 0.0, self._existing(code, hit, grazes > 0.0)
+        is_hit, jump_or_nan = hit > 0.0, self._jump_or_nan(code, hit, grazes > 0.0)
 
         def added(row: int, i: Index, part: int) -> Value:
-            step = existing(out[i + ((row - 1) * 2 + part) * n])
+            step = jump_or_nan(out[i + ((row - 1) * 2 + part) * n])
             moves = is_hit & jumps(i) if self.jump.orders[row] == 1 else is_hit
             if self.jump.orders[row] == 1 and not part:
                 return frame.constant(0.0)
@@ -169,16 +169,16 @@ class Saltation:
 
         return added
 
-    def _existing(self, code: Code, hit: Value, grazes: Value) -> Callable[[Value], Value]:
+    def _jump_or_nan(self, code: Code, hit: Value, grazes: Value) -> Callable[[Value], Value]:
         """`(jump)`: the jump, or NaN where there is none: at a border that is grazed, and where knots coincide."""
         several = hit > float(Hit.BORDER) if self.several else None
 
-        def existing(jump: Value) -> Value:
+        def jump_or_nan(jump: Value) -> Value:
             if several is not None:
                 jump = code.select(several & code.compare("!=", jump, 0.0), float("nan"), jump)
             return code.select(grazes, float("nan"), jump)
 
-        return existing
+        return jump_or_nan
 
     # ---- in a run: the motion with its tangents ----
 
@@ -278,10 +278,10 @@ class Saltation:
         line, tables = self.jump.transposed(n, self.parameters)
         gains = motion.form.run(frame, line, *inputs, cotangents)
         moves = (frame["is_hit"] > 0.0) & ~(sum.value <= 0.0)
-        existing = self._existing(code, frame["is_hit"], frame["grazes"] > 0.0)
+        jump_or_nan = self._jump_or_nan(code, frame["is_hit"], frame["grazes"] > 0.0)
 
         def gain_at(place: Index) -> Value:
-            return code.select(moves, existing(gains[place]), 0.0)
+            return code.select(moves, jump_or_nan(gains[place]), 0.0)
 
         def gain(row: int, i: Index) -> Value:
             return gain_at(i + row * (2 * n + self.parameters))

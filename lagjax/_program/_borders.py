@@ -295,18 +295,30 @@ class _Rewriting:
         """
         op, operands, _ = self.graph.nodes[size]
         if op == "select":
-            branches = [self._direction(x, y) for y in operands[1:]]
-            if branches == [None, None]:
+            quotients = [self._sign_of_quotient(x, y) for y in operands[1:]]
+            if quotients == [None, None]:
                 return None
-            quotients = [b or self.graph.apply("div", x, y) for b, y in zip(branches, operands[1:], strict=True)]
-            return self.graph.apply("select", operands[0], *quotients)
-        (a, x), (b, size) = self.graph.term(x), self.graph.term(size)
-        operands = self.graph.nodes[size][1]
-        for piece, y in (operands, operands[::-1]) if self.graph.nodes[size][0] == "mul" else ():
-            c, y = self.graph.term(y)
-            if x == y and self._known.get((SIGN, x)) == piece:
-                self._jumping.add(piece)
-                return self.graph.apply("mul", self.graph.constant(a / (b * c), "float"), piece)
+            branches = [q or self.graph.apply("div", x, y) for q, y in zip(quotients, operands[1:], strict=True)]
+            return self.graph.apply("select", operands[0], *branches)
+        return self._sign_of_quotient(x, size)
+
+    def _sign_of_quotient(self, x: int, size: int) -> int | None:
+        """x / size, where the size is a multiple of |x|: a multiple of the piece of x."""
+        (a, x), magnitude = self.graph.term(x), self._magnitude(size)
+        if magnitude is None or magnitude[1] != x:
+            return None
+        b, _, piece = magnitude
+        self._jumping.add(piece)
+        return self.graph.apply("mul", self.graph.constant(a / b, "float"), piece)
+
+    def _magnitude(self, x: int) -> tuple[float, int, int] | None:
+        """c, y and the piece of the sign of y, where x is c |y|, the product of y and this piece; None elsewhere."""
+        b, size = self.graph.term(x)
+        op, operands, _ = self.graph.nodes[size]
+        for piece, y in (operands, operands[::-1]) if op == "mul" else ():
+            c, base = self.graph.term(y)
+            if self._known.get((SIGN, base)) == piece:
+                return b * c, base, piece
         return None
 
     def _replace_by_piece(self, i: int, op: str, of: list[int], attribute) -> int | None:
@@ -384,19 +396,13 @@ class _Rewriting:
 
         That of |x| is 1 but at the border of x, where it is 0: the square of the piece of x, and no border of its own.
         """
-        coefficient, base = self.graph.term(u)
-        piece = self._sign_of_size(base) or self._piece(SIGN, base)
+        if (magnitude := self._magnitude(u)) is not None:
+            coefficient, _, piece = magnitude
+            piece = self.graph.apply("mul", piece, piece)
+        else:
+            coefficient, base = self.graph.term(u)
+            piece = self._piece(SIGN, base)
         return piece if piece is None or coefficient > 0 else self.graph.apply("neg", piece)
-
-    def _sign_of_size(self, x: int) -> int | None:
-        """The sign of what is |y|, the product of a number and the piece of its sign; None of another number."""
-        op, operands, _ = self.graph.nodes[x]
-        for piece, y in (operands, operands[::-1]) if op == "mul" else ():
-            coefficient, base = self.graph.term(y)
-            if self._known.get((SIGN, base)) == piece:
-                square = self.graph.apply("mul", piece, piece)
-                return square if coefficient > 0 else self.graph.apply("neg", square)
-        return None
 
     def _piece(self, kind: int, x: int, table: Located | None = None) -> int | None:
         """The input that says which piece a number is on; None where the number stays as it is along the motion."""
