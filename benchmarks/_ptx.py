@@ -202,6 +202,8 @@ class PtxOnCpu:
     def _write(self, x, value):
         place, b = self.registers[x], self.b
         t = place.allocated_type
+        if t == I64 and isinstance(value.type, ir.IntType) and value.type.width < 64:  # the upper half becomes zero
+            value = b.zext(value, I64)
         b.store(b.bitcast(value, t) if value.type != t else value, place)
 
     def _address(self, x):

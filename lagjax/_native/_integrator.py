@@ -49,7 +49,7 @@ class Integrator:
 
     Coordinates of one of the `error_groups` are measured by the largest of them. The first coordinates of a `nesting`
     are the motion, the others derivatives of it, which follow where the projection takes it. The state is of the type
-    `number`.
+    `number`. A thread `for_gpus` has no vector registers, in which alike operations of one member could stand.
     """
 
     job = JOB
@@ -62,6 +62,7 @@ class Integrator:
         *,
         width: int,
         number: ir.Type = DOUBLE,
+        for_gpus: bool = False,
     ):
         program, series, nesting, projection, borders, chosen = parts
         n = series.size
@@ -77,7 +78,7 @@ class Integrator:
             fields |= BorderControl.fields(borders)
         jump = parts.jump
         large = is_large(program, projection, guards, more=() if jump is None else [jump.line])
-        alone = large and width == 1 and borders is None and chosen is None
+        alone = large and width == 1 and borders is None and chosen is None and not for_gpus
         kind = SingleMember if alone and fills_lanes(series) else TaylorSeries
         self.motion = motion = kind(
             "motion", parts, JOB, fields, large, width, kept=self.guards, number=number

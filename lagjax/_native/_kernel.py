@@ -151,9 +151,11 @@ class Kernel:
         """The borders between the pieces of the motion."""
         return self._parts.borders
 
-    def _integrator(self, number: ir.Type = DOUBLE) -> Integrator:
+    def _integrator(self, number: ir.Type = DOUBLE, for_gpus: bool = False) -> Integrator:
         with pause_collections():
-            integrator = Integrator(self._parts, self._guards, self._error_groups, width=self.width, number=number)
+            integrator = Integrator(
+                self._parts, self._guards, self._error_groups, width=self.width, number=number, for_gpus=for_gpus
+            )  # fmt: skip
         forget_joined()
         forget_stages()
         return integrator
@@ -164,7 +166,7 @@ class Kernel:
 
         def motion() -> TaylorSeries:
             _gpu.require_room(size_of_series(self._parts.series))  # before what is larger than that is written down
-            return self.select_width(1)._integrator(number).motion
+            return self.select_width(1)._integrator(number, for_gpus=True).motion
 
         return _gpu.GpuPrograms(motion, lambda: self._adjoint(width=1, number=number).motion)
 
