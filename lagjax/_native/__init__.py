@@ -22,8 +22,10 @@ one Taylor series, of the order that the tolerance asks for.
     _roots               the zeros of a polynomial: borders and guards have series
     _output              the outputs, and the record of steps
     _integrator          all of these, round by round
-    _replay              recorded steps once more, for derivatives;  _tangent, _adjoint: forward and back
-    _saltation           the jump of derivatives at a border, and at a knot of samples
+    _maps                what a step is composed of, each map with its pushforward and its pullback
+    _saltation           one more such map: the jump of derivatives at a border, and at a knot of samples
+    _directions          the memory of tangents;  _cotangents: that of cotangents
+    _replay              recorded steps once more;  _tangent, _adjoint: their maps forward and back
     _kernel              motions and derivatives as functions of arrays;  _threads: on several cores, interruptible
     _handler             the motion as a call of XLA;  _derivative_handler: derivatives of short motions
     _gpu                 the modules of one lane as programs for NVIDIA GPUs;  _gpu_entry: what a thread of these does

@@ -59,6 +59,13 @@ class MotionParts(NamedTuple):
         return 0 if self.borders is None else len(self.borders.switches)
 
     @property
+    def varied(self) -> list[int]:
+        """The inputs of the program that derivatives are taken by: all floats but the time and the pieces."""
+        dtypes, time = self.program.dtypes, 2 * self.series.size
+        moving = dtypes[: len(dtypes) - self.pieces]
+        return [i for i, dtype in enumerate(moving) if dtype.kind == "f" and i != time]
+
+    @property
     def numbers_of_motion(self) -> int:
         """The count of those numbers of a member that the motion itself has, where tables look up some; else 0."""
         return 0 if self.chosen is None else self.chosen.of * self.nesting.base // self.nesting.size

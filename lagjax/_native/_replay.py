@@ -8,18 +8,55 @@ the next member that has any.
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from llvmlite import ir
+
 from lagjax._native._frame import Frame, Lane
-from lagjax._native._ir import INTEGER, Code, Value
+from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._output import RECORDED
-from lagjax._native._taylor import TaylorSeries
+from lagjax._native._parts import MotionParts
+from lagjax._native._saltation import GuardTable, Saltation
+from lagjax._native._taylor import TaylorSeries, is_large
 
 
 class Replay:
-    """The members and the recorded steps of a motion; a lane's `step` numbers the one that it is at."""
+    """The members and the recorded steps of a motion; a lane's `step` numbers the one that it is at.
 
-    def __init__(self, motion: TaylorSeries):
-        self.motion = motion
+    `fields` are those of a derivative in a thread's memory, `at_borders` more of them where the motion has borders. The
+    kernel has the jump there `jumps` times.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        parts: MotionParts,
+        job: type,
+        fields: dict,
+        at_borders: dict,
+        width: int,
+        jumps: int,
+        number: ir.Type = DOUBLE,
+    ):
+        self.parts, self._jump = parts, parts.jump_over_steps
+        more = () if self._jump is None else [self._jump.line] * jumps
+        large = is_large(parts.program, parts.projection, times=2, more=more)
+        if parts.borders is not None:
+            fields = fields | Saltation.fields(parts.borders) | at_borders | {"crossed": 1, "grazes": 1}
+        number = DOUBLE if large else number  # tables do not tell the time from the state
+        self.motion = motion = TaylorSeries(
+            name, parts, job, fields, large, width, keep_sums=True, number=number
+        )  # fmt: skip
         self._size = motion.states + RECORDED + motion.recorded_pieces  # of what is recorded of a step
+
+    def saltation(self) -> Saltation | None:
+        """The map at the borders that steps end at; None without any."""
+        parts = self.parts
+        if parts.borders is None or self._jump is None:
+            return None
+        saltation = Saltation(
+            self.motion, GuardTable(self.motion, parts.borders), parts.nesting.base, self._jump
+        )  # fmt: skip
+        self.motion.layout.extend_by(saltation.fields_along())
+        return saltation
 
     def start_next(self, begin: Callable[[Frame, Value], None], take: Callable[[Frame, Lane, Value], None]) -> Code:
         """`(lane)`: the lane takes the next member with steps, or none is left.

@@ -13,6 +13,8 @@ from enum import IntEnum
 import numpy as np
 
 from lagjax._native._constants import JUMP_NOISE
+from lagjax._native._cotangents import Cotangents, add
+from lagjax._native._directions import Directions
 from lagjax._native._frame import Frame, Index, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries
@@ -153,7 +155,7 @@ class Saltation:
 
         return jumps
 
-    def tangent_jumps(self, frame: Frame, out: Numbers, hit: Value, grazes: Value) -> Callable:
+    def _tangent_jumps(self, frame: Frame, out: Numbers, hit: Value, grazes: Value) -> Callable:
         """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
         code, n = frame.code, self.base
         first = (len(self.jump.orders) - 1) * 2 * n
@@ -207,7 +209,7 @@ class Saltation:
                 _field(frame, "params", motion.parameters - numbers, numbers),
             ]  # fmt: skip
             out = motion.form.run(frame, self.jump.line, *parts)
-            added = self.tangent_jumps(frame, out, frame["is_hit"], frame["grazes"])
+            added = self._tangent_jumps(frame, out, frame["is_hit"], frame["grazes"])
             for row in range(1, len(self.jump.orders)):
                 for part in range(2):
                     for i in motion.form.each(code, base):
@@ -223,7 +225,7 @@ class Saltation:
         """The fields that a thread keeps from one step to the next: the state at the border."""
         return {"edge": self.motion.states, "edge_t": 1}
 
-    def note_edge(self, frame: Frame) -> None:
+    def _note_edge(self, frame: Frame) -> None:
         """The state at the end of a step, and what is to be known of the border there."""
         motion, code = self.motion, frame.code
         self.table.note_hit(frame)
@@ -234,14 +236,14 @@ class Saltation:
         frame["edge_t"] = frame["t"] + frame["h"]
 
     def note_end(self) -> Code:
-        """`()`: note the state at the border that a step ends at."""
+        """`()`: note the state at the border that a step ends at, for tangents at the beginning of the next one."""
         frame = self.motion.function("note_end")
         frame["is_hit"] = Hit.NONE
-        with frame.code.only_if(frame.code.any_lane(self.crosses(frame))):
-            self.note_edge(frame)
+        with frame.code.only_if(frame.code.any_lane(self._crosses(frame))):
+            self._note_edge(frame)
         return frame.finish()
 
-    def crosses(self, frame: Frame) -> Value:
+    def _crosses(self, frame: Frame) -> Value:
         """True if a step ends at a border whose instant varies."""
         crosses = self.table.crosses_guard(frame)
         return crosses | self.table.crosses_knot(frame) if self.table.knots else crosses
@@ -250,20 +252,70 @@ class Saltation:
         """The numbers that choose the switching number, as inputs of the jump."""
         return [numbers("hit", self.pieces), *([numbers("entry", self.pieces)] if self.chosen > self.pieces else [])]
 
-    def edge_inputs(self, numbers: Callable, behind: Vectors) -> list:
+    def _edge_inputs(self, numbers: Callable, behind: Vectors) -> list:
         """The inputs of the jump but for its upper rows; `numbers(name, count)` gives vectors of the motion."""
         return [
             numbers("edge", self.motion.states), numbers("edge_t", 1), numbers("params", self.motion.parameters),
             numbers("pieces_before", self.pieces), behind, *self._choice(numbers),
         ]  # fmt: skip
 
-    def cotangent_jumps(self, frame: Frame, behind: Vectors) -> tuple[Callable, tuple[Table, ...], list[Value]]:
+    def push(self, directions: Directions, frame: Frame) -> None:
+        """The tangents behind a border, at the beginning of the step from there."""
+        is_hit = directions.number_of(frame, "is_hit") > 0.0
+        with frame.code.only_if(frame.code.any_lane(is_hit)):
+            self._add_jumps(directions, frame)
+
+    def _add_jumps(self, directions: Directions, frame: Frame) -> None:
+        form, n, behind, jump = directions.form, directions.n, self.motion.parameters, self.jump
+
+        def numbers(name, count, first=0):
+            return directions.numbers_of(frame, name, count, lambda i: (i + first,), in_place=True)
+
+        tangents = [frame.vectors("dy", n, lambda i: (i, 0)), frame.vectors("dy", n, lambda i: (i + n, 0))]
+        inputs = self._edge_inputs(numbers, numbers("params", self.motion.pieces, behind))
+        out = form.run(frame, jump.line, *inputs, *tangents, frame.vectors("dparams", directions.numbers))
+        added = self._tangent_jumps(
+            frame, out, directions.number_of(frame, "is_hit"), directions.number_of(frame, "grazes")
+        )  # fmt: skip
+        for row in range(jump.lower):
+            for part in range(2):
+                for i in form.each(frame.code, self.base):
+                    place = i + (part * n + row * self.base)
+                    frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
+
+    def pull(self, cotangents: Cotangents) -> Code:
+        """`()`: from the state beyond the border that a step ends at to that before it, and to the parameters."""
+        motion, base = self.motion, self.base
+        frame = motion.function("back_border")
+        code = frame.code
+        frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], 0.0)
+        with code.only_if(code.any_lane(self._crosses(frame))):
+            self._note_edge(frame)
+            gain, tables, entries = self._cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))
+            for row in range(self.jump.lower):
+                for part in range(2):
+                    for i in motion.form.each(code, base):
+                        add(frame, gain(row, i + part * base), "state_ct", i + (part * motion.n + row * base))
+                for k in motion.form.each(code, self.parameters):
+                    add(frame, gain(row, k + 2 * base), "params_ct", k + row * self.parameters)
+            cotangents.store_entries(frame, tables, entries, 0)
+        return frame.finish()
+
+    def note_after(self) -> Code:
+        """`()`: note the pieces of a step, for cotangents at the end of the one before."""
+        frame = self.motion.function("note_after")
+        with frame.code.loop(self.motion.pieces) as j:
+            frame["pieces_after", j] = frame["params", j + self.motion.parameters]
+        frame["has_after"] = 1.0
+        return frame.finish()
+
+    def _cotangent_jumps(self, frame: Frame, behind: Vectors) -> tuple[Callable, tuple[Table, ...], list[Value]]:
         """`(row, i)`: the gain of the cotangent of number i of a row, q, q̇ and then the parameters, at the `edge`.
 
         Of `state_ct`, with the pieces `behind` the border. And tables, with the numbers of entries and their gains.
         """
         n, rows, motion, code = self.base, self.jump.lower, self.motion, frame.code
-        inputs = self.edge_inputs(lambda name, count: frame.vectors(name, count), behind)
+        inputs = self._edge_inputs(lambda name, count: frame.vectors(name, count), behind)
         out = motion.form.run(frame, self.jump.accelerations(n), *inputs)
         jumps = self._jumps(code, _some(out, 0, n), _some(out, n, n))
         cotangents, sum = motion.form.room(frame, rows * 2 * n), code.variable(frame.constant(0.0))
