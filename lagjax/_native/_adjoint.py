@@ -63,7 +63,7 @@ class Adjoint:
     def _begin(self) -> None:
         """`begin(job, memory, lanes)`: every lane takes a member."""
         frame = self.motion.function("begin", public=True)
-        self.replay.begin(frame, self.start_next)
+        self.motion.begin(frame, self.start_next)
         frame.finish()
 
     def _run(self, steps: list[Code]) -> None:

@@ -145,10 +145,7 @@ class Integrator:
             if not self.notes:
                 frame.write("path", self.output.place(frame, member, 0, i), x)
             lane["low", i] = 0.0
-        first = member * frame.job("params_stride")
-        lane["first_number"] = code.as_double(first)
-        with code.loop(motion.parameters) as i:
-            lane["params", i] = frame.read("params", first + motion.place_of_number(code, i))
+        motion.take_numbers(frame, lane, member)
         if self.borders is not None:
             self.borders.begin(frame, lane)
         if self.events is not None:
@@ -157,9 +154,7 @@ class Integrator:
     def _begin(self) -> None:
         """`begin(job, memory, lanes)`: every lane takes a member."""
         frame = self.motion.function("begin", public=True)
-        self.motion.form.prepare(frame)
-        with frame.code.loop(self.motion.width) as lane:
-            frame.call(self.start_next, lane)
+        self.motion.begin(frame, self.start_next)
         frame.finish()
 
     # ---- rounds ----

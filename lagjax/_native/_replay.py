@@ -79,17 +79,8 @@ class Replay:
         begin(frame, index)
         with code.only_if(there):
             take(frame, lane, member)
-            first = member * frame.job("params_stride")
-            lane["first_number"] = code.as_double(first)
-            with code.loop(self.motion.parameters) as i:
-                lane["params", i] = frame.read("params", first + self.motion.place_of_number(code, i))
+            self.motion.take_numbers(frame, lane, member)
         return frame.finish()
-
-    def begin(self, frame: Frame, start_next: Code) -> None:
-        """Every lane takes a member."""
-        self.motion.form.prepare(frame)
-        with frame.code.loop(self.motion.width) as lane:
-            frame.call(start_next, lane)
 
     @contextmanager
     def rounds(self, frame: Frame, rounds: Value, leave: Callable[[Frame, Lane, Value], None]) -> Iterator[None]:

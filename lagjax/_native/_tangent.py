@@ -67,7 +67,7 @@ class Tangent:
         frame = self.motion.function("begin", public=True)
         if self.form is not self.motion.form:
             self.form.prepare(frame)
-        self.replay.begin(frame, self.start_next)
+        self.motion.begin(frame, self.start_next)
         frame.finish()
 
     def _run(self, steps: list[Code]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._constants import LARGEST_LINE, LEAST_ORDER, MAX_ORDER, OPERATIONS_PER_COORDINATE
-from lagjax._native._frame import Frame, Index, Memory, Numbers, Vectors, integers
+from lagjax._native._frame import Frame, Index, Lane, Memory, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
 from lagjax._native._parts import MotionParts
@@ -262,7 +262,20 @@ class TaylorSeries:
         """The outputs of a program of (q, q̇, t, parameters) at a state, a time s after the present one."""
         return self.form.run(frame, line, state, [frame["t"] + s], frame.vectors("params", self.numbers))
 
-    # ---- rounds ----
+    # ---- members and rounds ----
+
+    def begin(self, frame: Frame, start_next: Code) -> None:
+        """Every lane takes a member."""
+        self.form.prepare(frame)
+        with frame.code.loop(self.width) as lane:
+            frame.call(start_next, lane)
+
+    def take_numbers(self, frame: Frame, lane: Lane, member: Value) -> None:
+        """The numbers of a member, in the lane that has taken it."""
+        first = member * frame.job("params_stride")
+        lane["first_number"] = frame.code.as_double(first)
+        with frame.code.loop(self.parameters) as i:
+            lane["params", i] = frame.read("params", first + self.place_of_number(frame.code, i))
 
     @contextmanager
     def rounds(self, frame: Frame, count: Value) -> Iterator[None]:
