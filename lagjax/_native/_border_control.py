@@ -12,7 +12,6 @@ does not decide on which side the next step begins.
 
 import itertools
 from collections.abc import Iterator
-from enum import IntEnum
 
 from lagjax._native._constants import (
     ABRUPT,
@@ -37,7 +36,7 @@ from lagjax._native._constants import (
 )
 from lagjax._native._frame import Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
-from lagjax._native._roots import Roots
+from lagjax._native._roots import Roots, Touch
 from lagjax._native._saltation import NUMBERS, GuardTable, Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, double, integer
@@ -46,19 +45,6 @@ from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
 from lagjax._program._jump import Jump, Nesting
 
 NOWHERE = 1e300  # a level that no switching number comes to
-
-
-class Touch(IntEnum):
-    """The contact of a guard with its border where a step begins: none, of its value, of its rates too, for good.
-
-    Numbers between count the rates that are zero, and one for the value.
-    """
-
-    NONE = 0
-    VALUE = 1
-    RATE = 2
-    SECOND_RATE = 3
-    SLIDING = 4
 
 
 class BorderControl:

@@ -32,7 +32,7 @@ from lagjax._native._constants import (
 from lagjax._native._frame import Frame, Lane, integers
 from lagjax._native._ir import INTEGER, Code, Value, Variable
 from lagjax._native._output import Output
-from lagjax._native._roots import Roots
+from lagjax._native._roots import Roots, Touch
 from lagjax._native._step import StepControl
 from lagjax._native._taylor import TaylorSeries, double
 from lagjax._program._series import StraightLine
@@ -43,14 +43,6 @@ class Change(IntEnum):
 
     FALLS = 1
     RISES = 2
-
-
-class Start(IntEnum):
-    """The place where a motion begins: off the surface of a guard, on it, or on it and with a rate of zero."""
-
-    OFF = 0
-    ON = 1
-    ALONG = 2
 
 
 class Events:
@@ -88,12 +80,12 @@ class Events:
     def fields(guards: int) -> dict:
         """The fields of a thread's memory.
 
-        For every guard its value, the side before the step and at its end, whether a motion begins on it, how it
-        changes where the motion begins, where it changes on the way and how; how often it has been noted, when it was
-        last gone through, and whether it was zero at the border where the step before ended. For all of them the step
-        before it was cut, how far they can be seen, as a part of it, the first change, and the event.
+        For every guard its value, the side before the step and at its end, its `Touch` where a motion begins, how it
+        changes there, where it changes on the way and how; how often it has been noted, when it was last gone through,
+        and whether it was zero at the border where the step before ended. For all of them the step before it was cut,
+        how far they can be seen, as a part of it, the first change, and the event.
         """
-        each = ("guard", "side", "side_begin", "resting", "met", "root_at", "change", "noted", "noted_begin")
+        each = ("guard", "side", "side_begin", "contact", "met", "root_at", "change", "noted", "noted_begin")
         each = (*each, "passed_at", "waits", "waited")
         return dict.fromkeys(each, guards) | dict.fromkeys(("planned", "seen", "is_cut", "first_at", "event"), 1)
 
@@ -101,7 +93,7 @@ class Events:
         """A lane has taken a member."""
         with frame.code.loop(self.count) as g:
             lane["passed_at", g] = float("inf")
-            for name in ("noted", "resting", "met", "waits"):
+            for name in ("noted", "contact", "met", "waits"):
                 lane[name, g] = 0.0
 
     # ---- the guards ----
@@ -133,7 +125,7 @@ class Events:
         code, (order,), count = frame.code, frame.arguments, self.count
         fresh = code.compare("==", frame["steps"], 0.0)
         with code.loop(count) as g:
-            frame["resting", g] = frame["met", g] = 0.0
+            frame["contact", g] = frame["met", g] = 0.0
         with code.only_if(code.any_lane(fresh)):
             frame.call(self.guard, order, LITTLE * frame["h"])
             instant = INSTANT * frame["smallest"]
@@ -160,8 +152,8 @@ class Events:
                 side = code.select(on_it, code.select(stays, before, going), value)
                 with frame.where(fresh):
                     frame["side", i] = self._sign(frame, side)
-                rests = code.select(on_it, code.select(leaves, Start.ON, Start.ALONG), Start.OFF)
-                frame["resting", i] = code.select(fresh, rests, Start.OFF)
+                contact = code.select(on_it, code.select(leaves, Touch.VALUE, Touch.RATE), Touch.NONE)
+                frame["contact", i] = code.select(fresh, contact, Touch.NONE)
         return frame.finish()
 
     def _side_before(self, frame: Frame, i: int) -> Value:
@@ -288,7 +280,7 @@ class Events:
         frame["instant"] = instant / (code.intrinsic("fabs", h) * frame["part"])
         rounding = (ROOT_NOISE * EPS) * frame["kept", g]
         rounding = code.select(
-            (rounding < float("inf")) & code.compare("!=", frame["resting", g], Start.ON), rounding, 0.0
+            (rounding < float("inf")) & code.compare("!=", frame["contact", g], Touch.VALUE), rounding, 0.0
         )
         frame["unsure"] = code.intrinsic("fabs", frame["poly", 1]) * frame["instant"] + rounding
         ahead = code.variable(side)
@@ -303,14 +295,14 @@ class Events:
 
     def _leave_surface(self, frame: Frame, g: Value, size: Value) -> None:
         """A motion that begins on the surface, or has just gone through it, is not to do so by rounding."""
-        code, rests = frame.code, frame["resting", g]
+        code, contact = frame.code, frame["contact", g]
         since = code.intrinsic("fabs", frame["t"] - frame["passed_at", g])
         known = (since <= INSTANT * frame["smallest"]) | (frame["waited", g] > 0.0)
-        on = (rests > Start.OFF) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= CONTINUOUS * size))
+        on = (contact > Touch.NONE) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= CONTINUOUS * size))
         with frame.where(on):
             frame["poly", 0] = 0.0
         rate = frame["poly", 1]
-        frame["poly", 1] = code.select((rests >= Start.ALONG) & (rate < 0.0), 0.0, rate)
+        frame["poly", 1] = code.select((contact >= Touch.RATE) & (rate < 0.0), 0.0, rate)
 
     def _follow_roots(self, frame: Frame, order: Value, g: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""
@@ -379,7 +371,7 @@ class Events:
             far = code.intrinsic("fabs", after - here) > INSTANT * frame["smallest"]
             going.value = code.flag(far & moves())
         at = at.value
-        lost = (frame["resting", g] > 0.0) & (code.intrinsic("fabs", at) <= 0.25 * INSTANT * frame["smallest"])
+        lost = (frame["contact", g] > 0.0) & (code.intrinsic("fabs", at) <= 0.25 * INSTANT * frame["smallest"])
         return code.select(lost, 0.0, at)  # time does not move
 
     def _take(self, frame: Frame, order: Value, g: Value, changes: Value, s: Value, ahead: Variable) -> Value:

@@ -11,11 +11,26 @@ there, and a step that ends there, too, has a series that knows.
 """
 
 from collections.abc import Callable
+from enum import IntEnum
 
 from lagjax._native._constants import EPS, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE
 from lagjax._native._frame import Frame
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries, integer
+
+
+class Touch(IntEnum):
+    """The contact of a watched number with zero where a step begins: none, of its value, of its rates too, for good.
+
+    Numbers between count the rates that are zero, and one for the value. A root that is there already is none to be
+    found, and rounding must not make one of it.
+    """
+
+    NONE = 0
+    VALUE = 1
+    RATE = 2
+    SECOND_RATE = 3
+    SLIDING = 4
 
 
 class Roots:
