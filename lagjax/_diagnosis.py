@@ -142,7 +142,7 @@ _QUANTITIES = (
 )
 
 
-def _ahead(ended: Ended, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _states_ahead(ended: Ended, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """States (S, 2n) and times (S,): at the end, some smallest steps on along the motion, and then in time alone."""
     smallest = 4 * np.finfo(ended.y.dtype).eps * max(abs(ended.t_first), abs(ended.t_last))
     steps = np.array([0.0, *AHEAD]) * np.copysign(smallest, ended.t_last - ended.t_first)
@@ -156,7 +156,7 @@ def _undefined(derivation: Derivation, ended: Ended) -> Undefined | None:
     """The first of the scene's quantities that is not finite at the end or just ahead; None where all are."""
     try:
         rate = np.concatenate([halves(ended.y)[1], _acceleration(derivation, ended)])
-        y, t = _ahead(ended, rate)
+        y, t = _states_ahead(ended, rate)
         values = Sample.from_states(derivation, y, t, ended.numbers).quantities(*(name for name, *_ in _QUANTITIES))
     except Unlowerable:
         return None
@@ -170,7 +170,7 @@ def _undefined_by_jax(derivation: Derivation, params, ended: Ended) -> Undefined
     motion, numbers = derivation.motion, jax.tree.map(jnp.asarray, eqx.filter(params, eqx.is_array_like))
     slope = jax.grad(motion.lagrangian)
     functions: dict[str, Callable | None] = {"given_force": motion.forces, "lagrangian_by_q": slope}
-    states, times = _ahead(ended, np.concatenate([halves(ended.y)[1], np.zeros(derivation.layout.size)]))
+    states, times = _states_ahead(ended, np.concatenate([halves(ended.y)[1], np.zeros(derivation.layout.size)]))
     values = {
         name: np.stack(
             [function(*halves(jnp.asarray(y)), jnp.asarray(t), numbers) for y, t in zip(states, times, strict=True)]

@@ -175,7 +175,7 @@ class Batches:
         try:
             return *self._keep_members(motions, None), {}
         except jax.errors.JaxRuntimeError:
-            complaints = self._find_raising(motions, everyone)
+            complaints = self._find_members_that_raise(motions, everyone)
             well = np.setdiff1d(everyone, list(complaints))
             if not complaints or not well.size:  # too little memory; or it always raises
                 raise
@@ -197,7 +197,7 @@ class Batches:
             drift
         )
 
-    def _find_raising(self, motions: "_BatchMotions", everyone: np.ndarray) -> dict[int, str]:
+    def _find_members_that_raise(self, motions: "_BatchMotions", everyone: np.ndarray) -> dict[int, str]:
         """The members for which `keep` raises in a callback, with the errors: by halves, in equal batches."""
         found, waiting = {}, [everyone]
         while waiting and len(found) <= _MOST_RAISE:
