@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import lagrangians
 import numpy as np
 import pytest
 
@@ -12,8 +13,8 @@ def names(system, q, qdot, params=None, **options):
     return [c.name for c in lagjax.conserved_quantities(system, q, qdot, params, **options)]
 
 
-KEPLER = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) + 1 / jnp.sqrt(jnp.sum(q**2)))
-FREE = lagjax.System(lambda q, v: 0.5 * v**2)
+KEPLER = lagjax.System(lagrangians.kepler)
+FREE = lagjax.System(lagrangians.free_particle)
 TOP = lagjax.System(
     lambda q, v: (
         0.5 * (v["th"] ** 2 + v["ph"] ** 2 * jnp.sin(q["th"]) ** 2)
@@ -81,7 +82,7 @@ def test_bodies_have_ten_galilean_charges():
     np.testing.assert_allclose(found[7].gauge(q, 0.0, masses), -masses @ q[:, 0], rtol=1e-13)
     centre = found[7].charge(q, v, 2.0, masses)  # M X − P t
     np.testing.assert_allclose(centre, masses @ q[:, 0] - 2 * masses @ v[:, 0], rtol=1e-12)
-    assert names(lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2)), jnp.ones((1, 3)), jnp.ones((1, 3)))[0] == "energy"
+    assert names(lagjax.System(lagrangians.free_particles), jnp.ones((1, 3)), jnp.ones((1, 3)))[0] == "energy"
 
 
 @pytest.mark.slow
@@ -151,7 +152,7 @@ def test_forces_with_a_potential_conserve_what_l_would():
         return -params * q / jnp.sum(q**2) ** 1.5
 
     state = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.2])
-    kepler = lagjax.System(lambda q, v: 0.5 * v @ v, forces=force)
+    kepler = lagjax.System(lagrangians.free_particles, forces=force)
     found = {c.name: c for c in lagjax.conserved_quantities(kepler, *state, 1.3)}
     assert list(found) == ["energy", "angular momentum in the plane 01"]
     run = lagjax.simulate(kepler, *state, jnp.linspace(0.0, 20.0, 50), 1.3)
@@ -160,7 +161,7 @@ def test_forces_with_a_potential_conserve_what_l_would():
     np.testing.assert_allclose(energy - energy[0], exact - exact[0], atol=1e-9)
     by_params = jax.grad(lambda k: found["energy"].charge(run.q[7], run.qdot[7], params=k))(1.3)
     np.testing.assert_allclose(by_params, 1.0 - 1 / np.linalg.norm(run.q[7]), rtol=1e-9)
-    curl = lagjax.System(lambda q, v: 0.5 * v @ v, forces=lambda q, v: jnp.array([q[1], -q[0]]))
+    curl = lagjax.System(lagrangians.free_particles, forces=lambda q, v: jnp.array([q[1], -q[0]]))
     assert "energy" not in names(curl, *state)
 
 
@@ -194,7 +195,7 @@ def test_a_gauge_that_is_no_polynomial():
 
 @pytest.mark.slow
 def test_forces_and_constraints_are_respected():
-    drag = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], forces=lambda q, v: jnp.array([0.0, -v[1]]))
+    drag = lagjax.System(lagrangians.weight, forces=lambda q, v: jnp.array([0.0, -v[1]]))
     found = lagjax.conserved_quantities(drag, jnp.ones(2), jnp.ones(2))
     assert "momentum of q[0]" in [c.name for c in found] and "energy" not in [c.name for c in found]
     assert "not conserved: energy, by a symmetry of L that a force or a constraint breaks" in found.notes

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import free_particle, ramp
 
 import lagjax
 
@@ -36,7 +37,7 @@ def test_columns_are_named_as_messages_name_them(run):
     np.testing.assert_array_equal(table["q['x']"], run.q["x"])
     np.testing.assert_array_equal(table["qdot['y'][1]"], run.qdot["y"][:, 1])
     assert table.attrs == {} and table.index.name == "t"
-    one = lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v**2), 0.0, 1.0, TS).to_pandas()
+    one = lagjax.simulate(lagjax.System(free_particle), 0.0, 1.0, TS).to_pandas()
     assert list(one.columns) == ["q", "qdot"]
 
 
@@ -63,7 +64,7 @@ def test_units(run):
 
 
 def test_batches_of_batches_and_times_of_their_own():
-    free = lagjax.System(lambda q, v: 0.5 * v**2)
+    free = lagjax.System(free_particle)
     run = jax.vmap(lambda size: lagjax.simulate_batch(free, jnp.zeros(3), jnp.ones(3), TS * size))(jnp.arange(1.0, 3.0))
     table, arrays = run.to_pandas(), run.to_xarray()
     assert table.index.names == ["member_0", "member_1", "t"] and len(table) == 30
@@ -75,7 +76,7 @@ def test_batches_of_batches_and_times_of_their_own():
 @pytest.mark.slow
 def test_hybrid_motions_have_their_modes_by_name():
     bounce = lagjax.Transition("fall", "rest", guard=lambda q, v: q, direction=-1, reset=lambda q, v: (q, 0 * v))
-    modes = {"fall": lagjax.System(lambda q, v: 0.5 * v**2 - q), "rest": lagjax.System(lambda q, v: 0.5 * v**2)}
+    modes = {"fall": lagjax.System(ramp), "rest": lagjax.System(free_particle)}
     run = lagjax.simulate_hybrid(modes, [bounce], "fall", 0.25, 0.0, TS)
     assert list(run.to_pandas()["mode"]) == ["fall"] * 3 + ["rest"] * 2
 

@@ -3,12 +3,13 @@
 import jax
 import numpy as np
 import pytest
+from lagrangians import spring
 
 import lagjax
 
 TS = np.linspace(0.0, 3.0, 61)
 Q = np.cos(2.0 * TS)
-SPRING = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
+SPRING = lagjax.System(spring)
 DATES = np.datetime64("2020-01-01") + np.arange(61) * np.timedelta64(50, "ms")
 
 

@@ -4,15 +4,16 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import lagrangians
 import numpy as np
 import pytest
 from scipy.special import ellipk
 
 import lagjax
 
-OSCILLATOR = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params * q**2)
-FREE = lagjax.System(lambda q, v: 0.5 * v**2)
-PENDULUM = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+OSCILLATOR = lagjax.System(lagrangians.spring_k)
+FREE = lagjax.System(lagrangians.free_particle)
+PENDULUM = lagjax.System(lagrangians.pendulum)
 
 
 def position(q, v):
@@ -50,7 +51,7 @@ def test_the_period_of_a_pendulum():
 @pytest.mark.slow
 def test_apses_of_an_orbit():
     # Where r r' changes sign: at the pericentre it rises, at the apocentre it falls. Back in time the other way round.
-    kepler = lagjax.System(lambda q, v: 0.5 * v @ v + 1 / jnp.sqrt(q @ q))
+    kepler = lagjax.System(lagrangians.kepler)
     e = 0.6
     start = jnp.array([1 - e, 0.0]), jnp.array([0.0, np.sqrt((1 + e) / (1 - e))])
     sections = {"near": lambda q, v: q @ v, "far": lambda q, v: q @ v}
@@ -209,7 +210,7 @@ def test_derivatives_by_the_times_and_of_what_is_not_there():
 @pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
 def test_at_a_border_derivatives_are_those_before_it_on_both_sides(mode):
     # The force is 2 left of 0 and 0 right of it: from −1 at rest, t = 1 and v = 2 at 0; by the start −1/2 and −1.
-    scene = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: jnp.where(q < 0, 2.0, 0.0))
+    scene = lagjax.System(lagrangians.free_particle, forces=lambda q, v: jnp.where(q < 0, 2.0, 0.0))
 
     def at(q0):
         found = lagjax.crossings(scene, position, q0, 0.0, jnp.array([0.0, 3.0]), count=1)

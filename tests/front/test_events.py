@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from lagrangians import ball_g, free_particle, pendulum
 
 import lagjax
 
-FALL = lagjax.System(lambda q, v, params: 0.5 * v**2 - params * q)
-FREE = lagjax.System(lambda q, v: 0.5 * v**2)
+FALL = lagjax.System(ball_g)
+FREE = lagjax.System(free_particle)
 TS = jnp.linspace(0.0, 2.0, 9)
 
 
@@ -74,7 +75,7 @@ def test_how_the_end_varies():
 @pytest.mark.slow
 def test_second_derivatives_of_the_end():
     # A pendulum to the bottom: the time is K(sin(q⁰/2)).
-    scene = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+    scene = lagjax.System(pendulum)
 
     def bottom(q0):
         return lagjax.simulate(scene, q0, 0.0, jnp.array([0.0, 5.0]), event=floor, rtol=1e-13).end.t

@@ -3,12 +3,13 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import oscillator, oscillators
 
 import lagjax
 from lagjax import scenes
 
-OSCILLATOR = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2)
-TWICE = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q)
+OSCILLATOR = lagjax.System(oscillator)
+TWICE = lagjax.System(oscillators)
 
 
 def test_the_oscillator_and_its_conjugate_point():
