@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import lagrangians
 import numpy as np
 import pytest
 from scipy.special import roots_laguerre
@@ -50,7 +51,7 @@ def hoop_rest(speed):
     return lagjax.equilibrium(HOOP, 1.0, speed).q
 
 
-ROD = lagjax.System(lambda q, v, params: 0.5 * v @ v - params * q[1], constraints=lambda q: {"rod": q @ q - 1.0})
+ROD = lagjax.System(lagrangians.weight_g, constraints=lambda q: {"rod": q @ q - 1.0})
 
 
 # ---- the heart -------------------------------------------------------------------------------------------------------
@@ -205,9 +206,7 @@ def test_gyroscopic_and_damped_modes():
     np.testing.assert_allclose(
         lagjax.normal_modes(field, jnp.zeros(2)).frequencies, np.sqrt(2) + np.array([-1, 1]), rtol=1e-13
     )
-    damped = lagjax.System(
-        lambda q, v: 0.5 * v @ v - 0.5 * q @ q, dissipation=lambda q, v, params: 0.5 * params * v @ v
-    )
+    damped = lagjax.System(lagrangians.oscillators, dissipation=lambda q, v, params: 0.5 * params * v @ v)
 
     def modes(c):
         return lagjax.normal_modes(damped, jnp.zeros(2), c)
@@ -246,7 +245,7 @@ def test_what_has_no_modes_is_said():
     with pytest.raises(ValueError, match="mass matrix is singular or not positive definite"):
         lagjax.normal_modes(sliding, jnp.zeros(2))
     down, twice = jnp.array([0.0, -1.0]), lambda q: [q @ q - 1.0, 2 * (q @ q) - 2.0]
-    redundant = lagjax.System(lambda q, v, params: 0.5 * v @ v - params * q[1], constraints=twice)
+    redundant = lagjax.System(lagrangians.weight_g, constraints=twice)
     with pytest.raises(ValueError, match="Drop the redundant ones"):
         jax.jit(lambda g: lagjax.normal_modes(redundant, down, g).frequencies)(G)
 
@@ -302,7 +301,7 @@ def test_more_coordinates_in_one_array_than_are_unfolded():
 
 
 def test_a_structure_that_the_lagrangian_does_not_read():
-    pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+    pendulum = lagjax.System(lagrangians.pendulum)
     with pytest.raises(TypeError, match=r"lagrangian was called with q\['th'\] of shape \(\)"):
         lagjax.equilibrium(pendulum, {"th": 1.0})
 
@@ -355,7 +354,7 @@ def test_borders_that_linearization_does_not_mind(force, frequency):
 
 
 def test_a_pendulum_comes_to_rest_below():
-    pendulum = lagjax.System(lambda q, v, params: 0.5 * v**2 + params * jnp.cos(q))
+    pendulum = lagjax.System(lagrangians.pendulum_g)
     np.testing.assert_allclose(lagjax.equilibrium(pendulum, np.pi, 9.81).q, np.pi)  # where it is, upright
     np.testing.assert_allclose(jnp.cos(lagjax.equilibrium(pendulum, np.pi, 9.81, stable=True).q), 1.0)
     with pytest.raises(ValueError, match="leave qdot out"):
@@ -363,7 +362,7 @@ def test_a_pendulum_comes_to_rest_below():
     with pytest.raises(ValueError, match="cannot be traced"):
         jax.jit(lambda q: lagjax.equilibrium(pendulum, q, 9.81, stable=True).q)(0.1)
     with pytest.raises(ValueError, match="not come to rest"):
-        lagjax.equilibrium(lagjax.System(lambda q, v: 0.5 * v**2 - q), 0.3, stable=True)
+        lagjax.equilibrium(lagjax.System(lagrangians.ramp), 0.3, stable=True)
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
+from lagrangians import radial_fall, ramp
 
 import lagjax
 from lagjax._display import _animation
@@ -52,7 +53,7 @@ def test_members_of_a_batch_have_their_own_parameters():
 
 
 def test_a_motion_that_fails_is_shown_as_far_as_it_came():
-    fall = lagjax.System(lambda q, v: 0.5 * v**2 + 1 / q)  # into the centre at π/√8
+    fall = lagjax.System(radial_fall)  # into the centre at π/√8
     batch = lagjax.simulate_batch(fall, jnp.array([1.0, jnp.nan]), jnp.zeros(2), jnp.linspace(0.0, 2.0, 41))
     film = batch.animate(lambda q: jnp.stack([q, 0 * q]))
     assert film.span == (0.0, pytest.approx(1.1))
@@ -91,7 +92,7 @@ def test_videos_and_space(run, tmp_path):
 @pytest.mark.slow
 def test_a_bounce_is_sharp():
     bounce = lagjax.Transition("flight", "flight", guard=lambda q, v: q, direction=-1, reset=lambda q, v: (q, -v))
-    ball = lagjax.System(lambda q, v: 0.5 * v**2 - q)
+    ball = lagjax.System(ramp)
     run = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 0.5, 0.0, jnp.linspace(0.0, 3.0, 4))
     times = np.linspace(0.0, 3.0, 61)  # it bounces at 1 and 3; two outputs lie on bounces
     height = run.animate(lambda q: jnp.stack([q, q])).positions(times)[""][0, :, 0, 0]

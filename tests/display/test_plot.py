@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from lagrangians import oscillator
 from matplotlib.axes import Axes
 
 import lagjax
@@ -185,7 +186,7 @@ def test_shapes_of_modes():
 
 @pytest.mark.slow
 def test_members_are_drawn_at_times_of_their_own():
-    spring = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2)
+    spring = lagjax.System(oscillator)
     ends, ts = jnp.arange(1.0, 4.0), jnp.linspace(0.0, 1.0, 9)
     runs = jax.vmap(lambda end: lagjax.simulate(spring, 1.0, 0.0, end * ts))(ends)
     ax = lagjax.plot.trajectory(runs)
@@ -208,7 +209,7 @@ def test_modes_tell_what_grows_and_are_drawn_at_their_largest():
     for one, other in zip(lagjax.plot.modes(modes), lagjax.plot.modes(turned), strict=True):
         heights = [[bar.get_height() for bar in ax.patches] for ax in (one, other)]
         np.testing.assert_allclose(np.abs(heights[1]), np.abs(heights[0]), atol=1e-12)
-    rubbing = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, dissipation=lambda q, v: 0.1 * v**2)
+    rubbing = lagjax.System(oscillator, dissipation=lambda q, v: 0.1 * v**2)
     assert lagjax.plot.modes(lagjax.normal_modes(rubbing, 0.0))[0].get_title() == "ω = 0.995, ζ = 0.1"
 
 

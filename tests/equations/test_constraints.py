@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from lagrangians import free_particles, weight
 from sweeps import sweep
 
 import lagjax
@@ -38,10 +39,6 @@ def code(function):
 def rebuilt(system, path="auto", **changed):
     parts = {name: code(getattr(system, name)) for name in ("constraints", "velocity_constraints")} | changed
     return lagjax.System(code(system.lagrangian), path=path, **parts)
-
-
-def weight(q, qdot):
-    return 0.5 * jnp.sum(qdot**2) - 9.81 * q[1]
 
 
 def rod(q):
@@ -741,10 +738,6 @@ def test_projection_is_differentiated_as_the_function_it_is(derivative):
     np.testing.assert_allclose(derivative(project)(state), np.stack(central, axis=1), atol=1e-8)
 
 
-def free(q, qdot):
-    return 0.5 * jnp.sum(qdot**2)
-
-
 def circle(q):
     return q @ q - 1
 
@@ -769,7 +762,7 @@ def derivatives_of(function):
 @pytest.mark.slow
 @pytest.mark.parametrize("reverse", [False, True])
 def test_projection_has_the_derivatives_of_its_closed_form(reverse):
-    system = lagjax.System(free, constraints=circle)
+    system = lagjax.System(free_particles, constraints=circle)
     found, exact = (
         jax.jit(derivatives_of(of)[reverse])(0.0)
         for of in (lambda x: jnp.concatenate(system.project(x[:2], x[2:])), nearest_on_circle)
@@ -779,7 +772,7 @@ def test_projection_has_the_derivatives_of_its_closed_form(reverse):
 
 
 def test_velocities_that_cannot_be_met_have_nan_for_derivatives():
-    torn = lagjax.System(free, velocity_constraints=lambda q, v: jnp.stack([v[0], v[0] - q[0]]))
+    torn = lagjax.System(free_particles, velocity_constraints=lambda q, v: jnp.stack([v[0], v[0] - q[0]]))
     velocity, slope = jax.jvp(jax.jit(lambda q: torn.project(q, jnp.zeros(2))[1]), (jnp.ones(2),), (jnp.ones(2),))
     assert np.isnan(velocity).all() and np.isnan(slope).all()
 
@@ -788,7 +781,7 @@ def test_velocities_that_cannot_be_met_have_nan_for_derivatives():
 def test_a_state_without_a_nearest_one_has_nan_for_derivatives_and_leaves_its_neighbours_alone():
     root = lambda q: jnp.sqrt(q[0] - 1.0) + q[1]
     states = jnp.array([[1.3, -0.4, 0.2, -0.4], [0.5, 0.2, 0.2, -0.4]])
-    system = lagjax.System(free, constraints=root)
+    system = lagjax.System(free_particles, constraints=root)
     slopes = jax.jit(jax.vmap(jax.jacfwd(lambda x: jnp.concatenate(system.project(x[:2], x[2:])))))(states)
     assert np.isfinite(slopes[0]).all() and np.isnan(slopes[1]).all()
 

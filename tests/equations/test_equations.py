@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import free_particle, free_particles
 from sweeps import KINDS, sweep
 
 import lagjax
@@ -106,7 +107,7 @@ def test_forcing_a_path():
     ):
         lagjax.simulate(special, jnp.zeros(2), jnp.zeros(2), jnp.array([0.0, 1.0]))
     with pytest.raises(ValueError, match="path must be"):
-        lagjax.System(lambda q, v: 0.5 * v**2, path="fast")
+        lagjax.System(free_particle, path="fast")
 
 
 def closed(k, **options):
@@ -158,7 +159,7 @@ def test_explain_names_borders_and_says_whether_they_are_located():
     def forces(q, v, t):
         return jnp.where(t > 5, 1.0, 0.0) - 0.2 * jnp.sign(v) + jnp.floor(q) * jnp.exp(-((t / 0.01) ** 2))
 
-    system = lagjax.System(lambda q, v: 0.5 * v**2, forces=forces)
+    system = lagjax.System(free_particle, forces=forces)
     facts = system.explain(0.0, 1.0)
     assert sorted(facts.borders) == ["the sign of dq", "the sign of t", "the whole part of q"]
     assert facts.narrow == ("a function of t",) and facts.borders_located and "steps end there" in str(facts)
@@ -167,14 +168,14 @@ def test_explain_names_borders_and_says_whether_they_are_located():
     assert "borders" not in str(smooth)
     single = system.explain(np.float32(0.0), np.float32(1.0))
     assert single.borders == facts.borders and single.borders_located
-    arrays = lagjax.System(lambda q, v: 0.5 * v**2, forces=forces, path="array").explain(0.0, 1.0)
+    arrays = lagjax.System(free_particle, forces=forces, path="array").explain(0.0, 1.0)
     assert not arrays.borders_located
 
 
 def test_explain_prints():
     text = str(explained(scenes.double_pendulum))
     assert "varying, dense; depends on q[0], q[1]" in text and "path              scalar" in text
-    large = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2)).explain(jnp.zeros(80), jnp.zeros(80))
+    large = lagjax.System(free_particles).explain(jnp.zeros(80), jnp.zeros(80))
     assert large.path == "scalar" and large.cyclic == large.coordinates and "(68 more)" in str(large)
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import free_particle, free_particles
 
 import lagjax
 
@@ -143,7 +144,7 @@ def test_accepted_signatures():
             return 0.5 * velocity**2 + t
 
     for lagrangian in (
-        lambda x, v: 0.5 * v**2,
+        free_particle,
         lambda q, qdot, t, params: 0.5 * v_squared(qdot),
         lambda q, qdot, params, t: 0.5 * v_squared(qdot),
         lambda q, qdot, *, t: 0.5 * v_squared(qdot),
@@ -199,7 +200,7 @@ def test_refused_states_and_values(scene, q, qdot, error, sentence):
 
 
 def test_refused_forces_and_dissipation():
-    kinetic = lambda q, v: 0.5 * jnp.sum(v**2)
+    kinetic = free_particles
     with pytest.raises(TypeError, match="forces must return the structure of q"):
         lagjax.System(kinetic, forces=lambda q, v: 1.0).acceleration(jnp.ones(2), jnp.ones(2))
     with pytest.raises(TypeError, match="dissipation must return one scalar"):

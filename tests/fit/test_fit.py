@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import spring
 from scipy.optimize import least_squares
 
 import lagjax
@@ -597,7 +598,7 @@ def decaying(amplitude, seed, k=4.0, c=0.2):
 
 
 DECAYING = lagjax.System(
-    lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2,
+    spring,
     forces=lambda q, qdot, params: -params["c"] * qdot,
 )
 

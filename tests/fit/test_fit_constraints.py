@@ -3,15 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import weight_in_gravity
 
 import lagjax
 
 TRUTH = {"g": 9.81, "c": 0.2, "length": 0.8}
 TS = np.linspace(0.0, 3.0, 61)
-
-
-def lagrangian(q, qdot, params):
-    return 0.5 * jnp.sum(qdot**2) - params["g"] * q[1]
 
 
 def rod(q, params):
@@ -22,7 +19,7 @@ def air(q, qdot, params):
     return 0.5 * params["c"] * jnp.sum(qdot**2)
 
 
-SCENE = lagjax.System(lagrangian, dissipation=air, constraints=rod)
+SCENE = lagjax.System(weight_in_gravity, dissipation=air, constraints=rod)
 FREE = {"g": True, "c": True, "length": False}
 
 

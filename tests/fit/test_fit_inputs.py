@@ -6,6 +6,7 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import spring
 from scipy.signal import lsim
 
 import lagjax
@@ -21,7 +22,7 @@ def driven(q, qdot, params, inputs):
     return params["gain"] * inputs["u"] - params["c"] * qdot
 
 
-SCENE = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2, forces=driven)
+SCENE = lagjax.System(spring, forces=driven)
 
 
 def inputs_of(ts, seed=0):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import pendulum_in_gravity, weight_in_gravity
 from scipy.integrate import solve_ivp
 
 import lagjax
@@ -15,7 +16,7 @@ TS = np.linspace(0.0, 3.0, 91)
 SIGMA = 1e-3
 
 SINGLE = lagjax.System(
-    lambda q, qdot, params: 0.5 * qdot**2 + params["g"] * jnp.cos(q),
+    pendulum_in_gravity,
     dissipation=lambda q, qdot, params: 0.5 * params["bearing"] * qdot**2,
     forces=lambda q, qdot, inputs, params: params["motor"] * inputs,
 )
@@ -199,10 +200,8 @@ def test_profiles_reports_and_plots_know_of_several_systems(joint, tmp_path):
 
 @pytest.mark.slow
 def test_crossing_times_of_one_system_and_constraints_of_another():
-    gates = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 + params["g"] * jnp.cos(q))
-    rod = lagjax.System(
-        lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - params["g"] * q[1], constraints=lambda q: q @ q - 0.64
-    )
+    gates = lagjax.System(pendulum_in_gravity)
+    rod = lagjax.System(weight_in_gravity, constraints=lambda q: q @ q - 0.64)
     sections, span = {"bottom": lambda q, qdot: q}, jnp.array([0.0, 6.0])
     times = lagjax.crossings(gates, sections, 1.0, 0.0, span, {"g": 9.81})["bottom"]
     passed = np.asarray(times.t)[: int(times.count)]

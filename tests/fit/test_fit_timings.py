@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import damping, pendulum_in_gravity
 
 import lagjax
 
@@ -22,10 +23,7 @@ def gate(q, qdot, params):
     return q - 0.3
 
 
-SCENE = lagjax.System(
-    lambda q, qdot, params: 0.5 * qdot**2 + params["g"] * jnp.cos(q),
-    dissipation=lambda q, qdot, params: 0.5 * params["c"] * qdot**2,
-)
+SCENE = lagjax.System(pendulum_in_gravity, dissipation=damping)
 SECTIONS = {"bottom": bottom, "gate": gate}
 DIRECTIONS = {"bottom": 0, "gate": 1}
 FIRST = {"g": 9.0, "c": 0.02}

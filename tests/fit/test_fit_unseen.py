@@ -5,6 +5,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import damping
 
 import lagjax
 
@@ -23,7 +24,7 @@ SCENES = {
     ),
     "scale of mass, friction and stiffness": (
         spring(lambda p: p["k"], lambda p: p["m"]), {"c": 0.3, "k": 4.0, "m": 1.5},
-        {"dissipation": lambda q, v, params: 0.5 * params["c"] * v**2}, None,
+        {"dissipation": damping}, None,
         ["A common factor of params['c'], params['k'] and params['m']"], ["k"],
     ),
     "mass and length of a pendulum": (
@@ -145,7 +146,7 @@ FLAT, BOTH = (1.0, 0.3), ([1.0, 0.0], [0.1, 0.8])  # starts (q, q̇) of one and 
 SEEN = {
     "friction and stiffness": (
         spring(lambda p: p["k"]), {"c": 0.3, "k": 4.0},
-        {"dissipation": lambda q, v, params: 0.5 * params["c"] * v**2}, None, FLAT,
+        {"dissipation": damping}, None, FLAT,
     ),
     "length of a pendulum in known gravity": (
         lambda q, v, p: p["m"] * (0.5 * p["l"] ** 2 * v**2 + 9.8 * p["l"] * jnp.cos(q)) / p["m"], {"l": 0.9, "m": 2.0},

@@ -8,6 +8,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import damping
 
 import lagjax
 from lagjax._fit._sensors import wrap_residuals
@@ -18,7 +19,7 @@ TS = np.linspace(0.0, 8.0, 401)
 TRUTH = {"w2": 9.0, "c": 0.1}
 SCENE = lagjax.System(
     lambda q, v, params: 0.5 * v**2 + params["w2"] * jnp.cos(q),
-    dissipation=lambda q, v, params: 0.5 * params["c"] * v**2,
+    dissipation=damping,
 )
 
 

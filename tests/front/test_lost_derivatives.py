@@ -3,6 +3,7 @@
 import diffrax
 import jax
 import jax.numpy as jnp
+import lagrangians
 import numpy as np
 import pytest
 
@@ -17,10 +18,6 @@ HEUN = {"solver": diffrax.Heun(), "dt": 0.01}
 def _float64():
     with jax.enable_x64(True):
         yield
-
-
-def free(q, qdot):
-    return 0.5 * qdot**2
 
 
 # Forces beside −q, and whether the acceleration jumps on the way, at a place that moves with the state.
@@ -42,7 +39,7 @@ FORCES = {
 
 def scene(name):
     force = FORCES[name][0]
-    return lagjax.System(free, forces=lambda q, qdot, t, params: force(q, qdot, t, params) - q)
+    return lagjax.System(lagrangians.free_particle, forces=lambda q, qdot, t, params: force(q, qdot, t, params) - q)
 
 
 def end(system, params, **options):
@@ -94,7 +91,7 @@ def test_the_default_solver_and_other_adjoints_lose_them_too():
 
 def test_a_guard_that_only_jumps_has_no_derivatives():
     """In machine code: the place of the jump is found, but a guard that is flat on both sides says not how it moves."""
-    oscillator = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2)
+    oscillator = lagjax.System(lagrangians.oscillator)
 
     def time(p):
         flat = lambda q, v, params: jnp.where(q < params, 1.0, -1.0)

@@ -5,17 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import ball_in_gravity, mass_on_a_spring, spring_k
 from sweeps import sweep
 
 import lagjax
 from lagjax import _problem
 
-
-def oscillator(q, qdot, params):
-    return 0.5 * params["m"] * qdot**2 - 0.5 * params["k"] * q**2
-
-
-SCENE = lagjax.System(oscillator)
+SCENE = lagjax.System(mass_on_a_spring)
 PARAMS = {"m": 2.0, "k": 8.0}  # ω = 2
 TS = jnp.linspace(0.0, 3.0, 31)
 
@@ -111,12 +107,10 @@ def test_progress_is_printed(capsys):
 # ---- events ---------------------------------------------------------------------------------------------------------
 
 
-def falling(q, qdot, params):
-    return 0.5 * qdot**2 - params["g"] * q
-
-
 def fall(g):
-    return lagjax.simulate(lagjax.System(falling), 2.0, 0.0, jnp.linspace(0, 5, 11), {"g": g}, event=floor, rtol=1e-12)
+    return lagjax.simulate(
+        lagjax.System(ball_in_gravity), 2.0, 0.0, jnp.linspace(0, 5, 11), {"g": g}, event=floor, rtol=1e-12
+    )
 
 
 def test_event_stops_where_the_guard_changes_sign():
@@ -357,7 +351,7 @@ def test_a_misspelt_parameter_is_a_key_error():
 
 def test_sensitivities_of_second_order():
     # q = cos √k t from rest at 1: d²q/dk² by sensitivities of sensitivities.
-    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params * q**2)
+    scene = lagjax.System(spring_k)
     end = lambda k: lagjax.simulate(scene, 1.0, 0.0, jnp.array([0.0, 3.0]), k, rtol=1e-11).q[-1]
     exact = jax.grad(jax.grad(lambda k: jnp.cos(3.0 * jnp.sqrt(k))))(2.0)
     np.testing.assert_allclose(jax.grad(jax.grad(end))(2.0), exact, rtol=1e-8)

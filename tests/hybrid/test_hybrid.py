@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import ball_in_gravity, free_particle, oscillator
 from sweeps import sweep
 
 import lagjax
@@ -13,12 +14,12 @@ from lagjax._hybrid._families import families
 from lagjax._layout import Layout
 
 G = 9.81
-BALL = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q)
+BALL = lagjax.System(ball_in_gravity)
 BOUNCE = lagjax.Transition(
     "flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v, params: (q, -params["e"] * v)
 )
-FREE = lagjax.System(lambda q, v: 0.5 * v**2)
-OSCILLATOR = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2)
+FREE = lagjax.System(free_particle)
+OSCILLATOR = lagjax.System(oscillator)
 
 
 def bouncing(h, e, g=G, v=0.0, ts=None, **options):
@@ -914,7 +915,7 @@ def test_derivatives_through_modes_of_one_program():
 def test_modes_of_a_family_keep_their_targets_and_constraints():
     modes = {"0": stair(0), "1": stair(1), "2": stair(2), "3": stair(3)}
     edges = [edge(0, target=2), edge(2, target=3), edge(1, target=0)]
-    modes |= {"line": lagjax.System(lambda q, v: 0.5 * v**2, constraints=lambda q: q - 2.5)}
+    modes |= {"line": lagjax.System(free_particle, constraints=lambda q: q - 2.5)}
     edges += [edge(3, target="line")]
     edges += [lagjax.Transition("line", "1", lambda q, v: q - 9.0)]  # never: it stands still
     run = hybrid(modes, edges, v0=0.2, ts=(0.0, 1.0, 6.0), params=1.3, rtol=1e-12, throw=False)

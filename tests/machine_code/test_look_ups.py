@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import free_particle, free_particles
 
 import lagjax
 
@@ -102,7 +103,7 @@ def test_knots_that_do_not_increase_are_said():
 def test_second_derivatives_by_knots_of_a_force():
     """The force is continuous at its knots: second derivatives exist, and are those of differences."""
     force = lambda q, qdot, params: -2 * q - jnp.interp(q, params["x"], params["u"])
-    scene, params = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=force), table(8)
+    scene, params = lagjax.System(free_particle, forces=force), table(8)
     slope = jax.grad(lambda p: end_of(scene, p, solver=MACHINE))
     along = {"x": jnp.cos(jnp.arange(8.0)), "u": jnp.sin(jnp.arange(8.0))}
     curved = jax.jvp(slope, (params,), (along,))[1]
@@ -139,7 +140,7 @@ def test_second_and_third_derivatives_by_knots_of_a_potential():
 def test_where_a_knot_is_grazed_there_are_no_derivatives():
     """A motion that turns where its force changes: whether it comes there, a change within the tolerance decides."""
     force = lambda q, qdot, params: jnp.where(jnp.searchsorted(params["x"], q, side="right") > 1, -2.0, -1.0)
-    scene, ts = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=force), jnp.array([0.0, 3.0])
+    scene, ts = lagjax.System(free_particle, forces=force), jnp.array([0.0, 3.0])
     end = lambda x: lagjax.simulate(scene, 0.0, 1.0, ts, {"x": x}, solver=MACHINE).q[-1]
     touched, passed = (jnp.array([-10.0, x, 10.0]) for x in (0.5 - 1e-12, 0.4))
     # It passes x after 1 − v with v = √(1 − 2x), comes back after v more, and has two seconds left.
@@ -187,7 +188,7 @@ def test_tables_that_are_computed(name):
 def test_a_step_by_digitize(right):
     """A force that is another one between any two edges, to the right; the closed form is that of the potential."""
     force = lambda q, qdot, params: -params["f"][jnp.digitize(q, params["x"], right=right) - 1]
-    scene, params = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=force), table(8)
+    scene, params = lagjax.System(free_particle, forces=force), table(8)
     slopes = (params["u"][1:] - params["u"][:-1]) / (params["x"][1:] - params["x"][:-1])
 
     def closed(f, x):
@@ -215,7 +216,7 @@ def test_a_field_on_a_grid():
     def force(q, qdot, params):
         return -q - jnp.stack([height(params["x"], params["y"], g, *q) for g in (params["g"], params["g"].T)])
 
-    scene = lagjax.System(lambda q, qdot: 0.5 * jnp.sum(qdot**2), forces=force)
+    scene = lagjax.System(free_particles, forces=force)
     params = {"x": jnp.asarray(KNOTS), "y": jnp.asarray(KNOTS + 0.03), "g": jnp.outer(VALUES, VALUES**2)}
 
     def end(p):

@@ -7,14 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import oscillator
 
 import lagjax
 import lagjax._engine as engine
 import lagjax._machine_code as machine_code
 from lagjax._machine_code import _gpu_launch
 
-OSCILLATOR = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
-BY_ARRAYS = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, path="array")
+OSCILLATOR = lagjax.System(oscillator)
+BY_ARRAYS = lagjax.System(oscillator, path="array")
 TS = jnp.linspace(0.0, 10.0, 21)
 INSIST = {"solver": lagjax.MachineCode()}
 

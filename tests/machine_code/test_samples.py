@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import free_particle, oscillator, weight
 from scipy.interpolate import CubicHermiteSpline
 
 import lagjax
@@ -25,10 +26,6 @@ MACHINE = lagjax.MachineCode()
 def _float64():
     with jax.enable_x64(True):
         yield
-
-
-def oscillator(q, qdot):
-    return 0.5 * qdot**2 - 0.5 * q**2
 
 
 @functools.cache
@@ -364,7 +361,7 @@ def test_interpolation_of_jax_is_known():
 def test_terrain_by_the_floor_of_a_place():
     heights, width = 0.2 * RNG.normal(size=40), 0.1
     force = lambda q, qdot, t, params: params[jnp.floor(q / width).astype(int)]
-    scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=force)
+    scene = lagjax.System(free_particle, forces=force)
 
     def exact_end(heights):
         q, v, t = 0.05, 1.0, 0.0
@@ -407,7 +404,7 @@ def test_a_block_on_a_belt_whose_speed_is_sampled():
     # It sticks from the first knot on at which the belt is slow enough to be followed, and slips where the speed jumps.
     knots, speeds = np.array([0.0, 1.0, 2.0]), np.array([0.5, -0.5, 0.25])
     force = lambda q, qdot, t, params: -2.0 * jnp.sign(qdot - lagjax.samples(knots, params)(t))
-    block = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=force)
+    block = lagjax.System(free_particle, forces=force)
     ts = jnp.array([0.0, 0.25, 0.75, 1.5, 1.75, 3.0])
     run = lagjax.simulate(block, 0.0, 0.0, ts, speeds, solver=MACHINE)
     np.testing.assert_allclose(run.qdot, [0.0, 0.5, 0.5, -0.5, -0.5, 0.25], atol=1e-9)
@@ -426,7 +423,7 @@ def test_a_constraint_that_samples_drive():
     def pivot(q, t, params):
         return jnp.sum((q - jnp.stack([lagjax.samples(KNOTS, params, "cubic")(t), 0.0])) ** 2) - 1.0
 
-    scene = lagjax.System(lambda q, qdot: 0.5 * jnp.sum(qdot**2) - 9.81 * q[1], constraints=pivot)
+    scene = lagjax.System(weight, constraints=pivot)
 
     def middle(values):
         ts = jnp.linspace(0.0, KNOTS[-1], 4)

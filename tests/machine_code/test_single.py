@@ -12,6 +12,7 @@ import sys
 import diffrax
 import jax
 import jax.numpy as jnp
+import lagrangians
 import numpy as np
 import pytest
 from sweeps import sweep
@@ -28,11 +29,7 @@ def pendulum(q, qdot, params):
     return 0.5 * params["m"] * (params["l"] * qdot) ** 2 + params["m"] * 9.81 * params["l"] * jnp.cos(q)
 
 
-def falling(q, qdot):
-    return 0.5 * qdot**2 - 9.81 * q
-
-
-SCENE, BALL = lagjax.System(pendulum), lagjax.System(falling)
+SCENE, BALL = lagjax.System(pendulum), lagjax.System(lagrangians.ball)
 BOUNCE = lagjax.Transition("flight", "flight", lambda q, v: q, -1, lambda q, v, params: (q, (params - 1.2) * v))
 
 
@@ -84,7 +81,7 @@ def agrees(found, truth, ulps):
 def test_an_oscillator_is_right_to_the_last_digit(off):
     """From the closed form: half a unit of rounding, and what the error of 1e-9 per step adds."""
     ts = np.linspace(0, 60, 61, dtype=np.float32)
-    run = lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2), 1.0, 0.25, ts)
+    run = lagjax.simulate(lagjax.System(lagrangians.oscillator), 1.0, 0.25, ts)
     t = ts.astype(np.float64)
     agrees(run.q, np.cos(t) + 0.25 * np.sin(t), 0.6)
     agrees(run.qdot, 0.25 * np.cos(t) - np.sin(t), 0.6)
@@ -135,7 +132,7 @@ def test_constraints_and_failures(off):
     def rod(q):
         return jnp.sum(q**2) - 1.0
 
-    system = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * q[1], constraints=rod)
+    system = lagjax.System(lagrangians.weight, constraints=rod)
     run = lagjax.simulate(system, np.float32([0.6, -0.8]), np.zeros(2, np.float32), TS)
     assert np.abs(run.constraint_residual()).max() <= 2 * EPS and run.multipliers.dtype == np.float32
     falls = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) + 1.0 / jnp.sqrt(jnp.sum(q**2)))
@@ -233,7 +230,7 @@ def test_what_is_computed_in_doubles_is_differentiated_and_batched(off):
     ],
 )
 def test_the_state_decides_about_the_precision(q0, qdot0, ts, params, dtype):
-    system = lagjax.System(lambda q, v, params: 0.5 * v**2 - params * q)
+    system = lagjax.System(lagrangians.ball_g)
     run = lagjax.simulate(system, q0, qdot0, ts, params)
     kinds = {x.dtype for x in jax.tree.leaves((run.q, run.qdot, run.ts, run.end.q, run.end.t))}
     assert kinds == {np.dtype(dtype)} and run.engine == "MachineCode"
@@ -269,7 +266,7 @@ def test_what_a_scene_does(off):
     assert rest.q.dtype == np.float32 and abs(rest.q) < 1e-7 and rest.ok
     flat = lagjax.linearize(SCENE, 0.0, params=params)
     agrees(flat.A, np.array([[0, 1], [-9.81 / float(LENGTH), 0]]), 1)
-    kepler = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) + 1 / jnp.sqrt(jnp.sum(q**2)))
+    kepler = lagjax.System(lagrangians.kepler)
     found = lagjax.conserved_quantities(kepler, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.2]))
     assert [charge.name for charge in found] == ["energy", "angular momentum in the plane 01"]
     orbit = lagjax.periodic_orbit(SCENE, 1.0, 0.0, 1.2, params)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import ball_in_gravity, pendulum_g, weight, weight_g
 from sweeps import sweep
 
 import lagjax
@@ -92,9 +93,8 @@ def test_a_hundred_parameters():
 @pytest.mark.slow
 def test_second_derivatives_on_a_constraint_are_those_of_the_angle():
     # By gravity and speed: a family of starts that stay on the circle.
-    bead = lambda q, v, params: 0.5 * jnp.sum(v**2) - params * q[1]
-    circle = lagjax.System(bead, constraints=lambda q: jnp.sum(q**2) - 1.0)
-    pendulum = lagjax.System(lambda q, v, params: 0.5 * v**2 + params * jnp.cos(q))
+    circle = lagjax.System(weight_g, constraints=lambda q: jnp.sum(q**2) - 1.0)
+    pendulum = lagjax.System(pendulum_g)
     ts = jnp.linspace(0, 1.5, 4)
 
     def on_circle(x):
@@ -111,7 +111,7 @@ def test_second_derivatives_on_a_constraint_are_those_of_the_angle():
 
 @pytest.mark.slow
 def test_second_and_third_derivatives_by_a_start_that_moves_along_a_curved_constraint():
-    circle = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], constraints=lambda q: q @ q - 1.0)
+    circle = lagjax.System(weight, constraints=lambda q: q @ q - 1.0)
     pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + 9.81 * jnp.cos(q))
     ts = jnp.array([0.0, 1.3, 2.0])
 
@@ -160,7 +160,7 @@ def test_second_derivatives_of_the_cartesian_double_pendulum_are_those_of_its_an
 @pytest.mark.slow
 def test_second_derivatives_through_a_bounce():
     # By the height, g, the restitution and the speed, of what comes after the first bounce.
-    ball = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q)
+    ball = lagjax.System(ball_in_gravity)
     bounce = lagjax.Transition(
         "flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v, params: (q, -params["e"] * v)
     )

@@ -4,12 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import pendulum, pendulum_in_gravity
 from scipy.special import ellipk
 
 import lagjax
 from lagjax._orbits import _floquet, _orbit
 
-PENDULUM = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+PENDULUM = lagjax.System(pendulum)
 
 
 def _henon_heiles(q, v):
@@ -197,7 +198,7 @@ def test_nonlinear_normal_modes_of_a_double_pendulum():
 
 @pytest.mark.slow
 def test_a_family_by_a_parameter():
-    swing = lagjax.System(lambda q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+    swing = lagjax.System(pendulum_in_gravity)
     begin = lagjax.periodic_orbit(swing, 1.0, 0.0, 6.5, {"g": 1.0})
     swings = lagjax.family(swing, begin, {"g": 1.0}, by="g", until=1.3, step=0.1)
     np.testing.assert_allclose(swings.period, begin.period)

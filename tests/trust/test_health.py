@@ -5,6 +5,7 @@ import dataclasses
 import diffrax
 import jax
 import jax.numpy as jnp
+import lagrangians
 import numpy as np
 import pytest
 from sweeps import KINDS, sweep
@@ -12,7 +13,7 @@ from sweeps import KINDS, sweep
 import lagjax
 from lagjax import scenes
 
-OSCILLATOR = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
+OSCILLATOR = lagjax.System(lagrangians.spring)
 TS = jnp.linspace(0.0, 10.0, 41)
 
 
@@ -138,7 +139,7 @@ def test_coarse_outputs_cry_no_wolf_and_hide_no_wrong_force():
 def test_a_power_balance_that_so_few_outputs_cannot_tell():
     # Three outputs in twenty periods of a force that pumps and drains: the work between them is anybody's guess.
     driven = lagjax.System(
-        lambda q, v: 0.5 * v**2 - 0.5 * q**2,
+        lagrangians.oscillator,
         forces=lambda q, v, t: jnp.sin(7 * t),
         dissipation=lambda q, v: 0.05 * v**2,
     )
@@ -171,7 +172,7 @@ def test_work_of_constraints_that_move():
     # A bead on a rod that turns at a given rate: the rod does work; r = cosh(ω t) from rest at 1.
     omega = 0.7
     bead = lagjax.System(
-        lambda q, v: 0.5 * jnp.sum(v**2), constraints=lambda q, t: q[0] * jnp.sin(omega * t) - q[1] * jnp.cos(omega * t)
+        lagrangians.free_particles, constraints=lambda q, t: q[0] * jnp.sin(omega * t) - q[1] * jnp.cos(omega * t)
     )
     ts = jnp.linspace(0.0, 2.0, 41)
     trajectory = lagjax.simulate(bead, jnp.array([1.0, 0.0]), jnp.array([0.0, omega]), ts)
@@ -181,7 +182,7 @@ def test_work_of_constraints_that_move():
     assert health.works and health.energy.value < 1e-9 * gained
     # A platform that carries a skater along: its constraint asks for a velocity, and pays for the friction.
     carried = lagjax.System(
-        lambda q, v: 0.5 * jnp.sum(v**2), dissipation=lambda q, v: 0.1 * jnp.sum(v**2),
+        lagrangians.free_particles, dissipation=lambda q, v: 0.1 * jnp.sum(v**2),
         velocity_constraints=lambda q, v, t: v[0] - jnp.sin(t),
     )  # fmt: skip
     skating = lagjax.simulate(carried, jnp.zeros(2), jnp.array([0.0, 1.0]), ts).health()
@@ -199,7 +200,7 @@ def test_momenta_known_to_be_conserved():
     spoilt = moved(trajectory, qdot=faster).health()
     assert "momentum" in flagged(spoilt) and spoilt.momentum.t == trajectory.ts[7]
     # A force on the coordinate, be it that of a constraint, and its momentum is no constant any more.
-    free = lambda q, v: 0.5 * jnp.sum(v**2)
+    free = lagrangians.free_particles
     start = jnp.array([1.0, 0.5, 0.0]), jnp.array([0.0, 0.0, 1.0])
     pushed = lagjax.System(free, forces=lambda q, v: jnp.array([1.0, 0.0, 0.0]) * q[1])
     assert lagjax.simulate(pushed, *start, TS).health().momentum_names == ("q[1]", "q[2]")
@@ -265,7 +266,7 @@ def test_gradients_that_are_not_finite():
     def force(q, v):
         return -jnp.where(q > 0, jnp.sqrt(q) ** 9, 0.0)
 
-    trap = lagjax.System(lambda q, v: 0.5 * v**2, forces=force)
+    trap = lagjax.System(lagrangians.free_particle, forces=force)
     trajectory = lagjax.simulate(trap, 1.0, -1.0, TS[:9], solver=diffrax.Tsit5(), rtol=1e-6)
     health = trajectory.health()
     assert trajectory.ok and flagged(health) == {"gradients"}
@@ -301,7 +302,7 @@ def test_references_that_cannot_be_compared():
         (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS[:-1], params, **tight), "shapes"),
         (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS + 1e-3, params, **tight), "times"),
         (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS, {"k": 1.4}, **tight), "params"),
-        (dataclasses.replace(given, system=lagjax.System(lambda q, v: 0.5 * v**2)), "another system"),
+        (dataclasses.replace(given, system=lagjax.System(lagrangians.free_particle)), "another system"),
         (swinging(rtol=2e-7), "at most 1e-07"),
     ):
         with pytest.raises(ValueError, match=sentence):
@@ -359,12 +360,12 @@ def test_batch_vmap_and_jit_agree():
 def test_numbers_and_traced_values_are_measured_alike():
     # By programs in NumPy, and in JAX: with constraints, forces, a conserved momentum, and modes.
     held = lagjax.System(
-        lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * q[1],
+        lagrangians.weight,
         constraints=lambda q, t: q[0] ** 2 + q[1] ** 2 - (1 + 0.1 * jnp.sin(t)) ** 2,
         dissipation=lambda q, v: 0.05 * v[0] ** 2,
     )
     start = jnp.array([1.0, 0.0, 0.3]), jnp.array([0.1, 0.0, 1.0])
-    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q, dissipation=lambda q, v: 0.1 * v**2)
+    ball = lagjax.System(lagrangians.ball, dissipation=lambda q, v: 0.1 * v**2)
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.8 * v))
     for run in (
         lagjax.simulate(held, *start, jnp.linspace(0.0, 2.0, 21)),
@@ -404,7 +405,7 @@ def test_a_new_value_never_recompiles():
 
 def test_energy_between_bounces():
     # Every bounce takes 0.36 of the energy; between them none is lost.
-    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+    ball = lagjax.System(lagrangians.ball)
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.8 * v))
     bouncing = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, jnp.linspace(0.0, 1.5, 31))
     health = bouncing.health()
@@ -419,8 +420,8 @@ def test_energy_between_bounces():
 @pytest.mark.slow
 def test_constraints_of_one_mode_and_not_of_another():
     # Down the inside of a circle to its lowest place, then straight on.
-    held = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * q[1], constraints=lambda q: {"rail": q @ q - 1.0})
-    free = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * q[1])
+    held = lagjax.System(lagrangians.weight, constraints=lambda q: {"rail": q @ q - 1.0})
+    free = lagjax.System(lagrangians.weight)
     off = lagjax.Transition("rail", "air", lambda q, v: q[0])
     modes, start = {"rail": held, "air": free}, (jnp.array([-1.0, 0.0]), jnp.zeros(2))
     fallen = lagjax.simulate_hybrid(modes, [off], "rail", *start, jnp.linspace(0.0, 1.0, 21))
@@ -438,7 +439,7 @@ BY_DIFFRAX = {"solver": lagjax.FineOutput(diffrax.Dopri8()), "throw": False}
 
 
 def held(constraint, q0, v0, end, **options):
-    system = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2), constraints=constraint)
+    system = lagjax.System(lagrangians.free_particles, constraints=constraint)
     ts = jnp.linspace(0.0, end, 5)
     return lagjax.simulate(system, jnp.array(q0), jnp.array(v0), ts, **(BY_DIFFRAX | options))
 

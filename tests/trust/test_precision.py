@@ -4,11 +4,12 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lagrangians import oscillator, radial_fall
 
 import lagjax
 from lagjax import _precision
 
-OSCILLATOR = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+OSCILLATOR = lagjax.System(oscillator)
 TS = jnp.linspace(0.0, 10.0, 21)
 TOLERANCES = (1e-4, 1e-7, 1e-10)
 DEFAULT = "default: Taylor (machine code)"
@@ -80,7 +81,7 @@ def test_the_engine_that_runs_by_default_is_taken_by_name_or_by_insisting():
 
 
 def test_where_diffrax_runs_by_default_it_is_named_so_and_measured_once():
-    by_arrays = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, path="array")
+    by_arrays = lagjax.System(oscillator, path="array")
     for scene, names in (
         (by_arrays, ["default: Dopri8", "Tsit5"]),
         (OSCILLATOR, ["default: Taylor (machine code)", "Dopri8", "Tsit5"]),
@@ -149,7 +150,7 @@ def test_bad_arguments_are_answered_with_a_sentence(arguments, error, sentence):
 
 
 def test_a_reference_that_does_not_arrive_is_an_error():
-    falling = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 1 / q)
+    falling = lagjax.System(radial_fall)
     ts = jnp.linspace(0.0, 2.0, 3)
     with pytest.raises(lagjax.SimulationError, match="could not be followed"):
         lagjax.work_precision(falling, 1.0, 0.0, ts)
