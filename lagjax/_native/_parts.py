@@ -4,6 +4,8 @@ import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from lagjax._native._guards import Guards, append_guards, drop_guards, require_lanes
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
@@ -158,7 +160,8 @@ def choose_parameters(
             (op, xs, place.get(a, a) if op == "input" else shift_look_up(a, BESIDE - first) if op in LOOK_UPS else a)
             for op, xs, a in one.line.nodes
         )
-        dtypes = (*one.dtypes[:first], *(one.dtypes[first + i] for i in positions))
+        kinds = (*one.dtypes, *[np.dtype(float)] * program.size)  # guards do not read the sides that they have beside
+        dtypes = (*one.dtypes[:first], *(kinds[first + i] for i in positions))
         return _ChosenProgram(one.line._replace(nodes=nodes), first + len(positions), dtypes, one.linear, one.budget)
 
     done = iter([reduce_program(one) for one in programs])

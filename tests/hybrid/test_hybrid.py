@@ -145,6 +145,21 @@ def bounce_times(h, e, g, count):
     return first * np.concatenate([[1.0], 1 + 2 * np.cumsum(e ** np.arange(1.0, count))])
 
 
+def test_a_force_read_off_samples_of_parameters_in_a_mode():
+    """q̈ = a t to a wall that returns the speed: roots of a cubic. The values of the samples are parameters."""
+    a, knots = 0.6, np.linspace(0.0, 4.0, 9)
+
+    def force(q, v, t, params):
+        return lagjax.samples(knots, params["u"], "linear")(t)
+
+    wall = lagjax.Transition("free", "free", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -v))
+    modes = {"free": lagjax.System(free_particle, forces=force)}
+    run = lagjax.simulate_hybrid(modes, [wall], "free", 1.0, -1.0, jnp.array([0.0, 3.0]), {"u": a * knots})
+    met = min(root.real for root in np.roots([a / 6, 0.0, -1.0, 1.0]) if abs(root.imag) < 1e-12 and root.real > 0)
+    back, left = 1.0 - 0.5 * a * met**2, 3.0 - met
+    np.testing.assert_allclose(run.q[-1], (back - 0.5 * a * met**2) * left + a / 6 * (27.0 - met**3), rtol=1e-8)
+
+
 def test_every_bounce_of_a_ball():
     h, e = np.array([1.0, 0.4, 2.5]), np.array([0.9, 1.0, 0.5])
     ts = jnp.linspace(0.0, 2.0, 45)
