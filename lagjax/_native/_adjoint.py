@@ -4,7 +4,7 @@ The transpose of a step takes a cotangent λ of the state at its end to one at i
 of the parameters: the pullbacks of its maps (`_maps`), from the last to the first:
 
     saltation      to the near side of the border that the step ends at;  the projection, to the end of the series
-    polynomial     ȳₖ = hᵏ λ, and sᵏ times the cotangent of every output within the step, at t + s
+    sum            ȳₖ = hᵏ λ, and sᵏ times the cotangent of every output within the step, at t + s
     orders         from the last to the first: the Cauchy products, then the recursion
     zeroth order   to λ = ȳ₀
 
@@ -20,7 +20,7 @@ from lagjax._native._constants import NEAR_ZERO
 from lagjax._native._cotangents import Cotangents
 from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
-from lagjax._native._maps import CauchyProducts, OrderRecursion, Polynomial, ProjectedEnd, ZerothOrder
+from lagjax._native._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
 from lagjax._native._parts import MotionParts
 from lagjax._native._replay import Replay
 
@@ -44,9 +44,9 @@ class Adjoint:
         self.motion = motion = self.replay.motion
         self.start_next = self.replay.start_next(self._begin_lane, self._take_member)
         cotangents = Cotangents(motion, parts)
-        polynomial, products, recursion = Polynomial(motion), CauchyProducts(motion), OrderRecursion(motion, parts)
+        series_sum, products, recursion = SeriesSum(motion), CauchyProducts(motion), OrderRecursion(motion, parts)
         steps = [
-            polynomial.pull(),
+            series_sum.pull(),
             self._transpose_orders(products.pull(), recursion.pull()),
             ZerothOrder(motion, parts).pull(cotangents),
         ]

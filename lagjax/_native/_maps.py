@@ -5,7 +5,7 @@ A step y(t + h) = Σ yₖ hᵏ is a composition of maps of the state y₀ and th
     ZerothOrder       y₀, p ↦ the acceleration, and what the recursion reads of the zeroth order
     CauchyProducts    rows of the orders before ↦ Σ' aⱼ bₖ₋ⱼ
     OrderRecursion    yₖ, values and sums ↦ the rows of order k, and yₖ₊₁
-    Polynomial        all yₖ ↦ Σ yₖ hᵏ, at the end of the step and at outputs within it
+    SeriesSum         all yₖ ↦ Σ yₖ hᵏ, at the end of the step and at outputs within it
     ProjectedEnd      the end of the series ↦ that on the constraints
     Saltation         a state at a border ↦ that on the piece beyond it (`_saltation`)
 
@@ -226,7 +226,7 @@ class OrderRecursion:
         return frame.finish()
 
 
-class Polynomial:
+class SeriesSum:
     """The state at a time within a step, Σ yₖ sᵏ."""
 
     def __init__(self, motion: TaylorSeries):

@@ -4,8 +4,6 @@ import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from lagjax._native._guards import Guards, append_guards, drop_guards, require_lanes
 from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
@@ -146,7 +144,7 @@ def choose_parameters(
     if not any(op in LOOK_UPS for one in programs for op, _, _ in one.line.nodes):
         return program, projection, guards, motion, None
     read = {node[2] - first for one in programs for node in one.line.nodes if node[0] == "input"}
-    of = program.size - first
+    of, kinds = program.size - first, program.dtypes[first:]  # a guard's own program ends before the sides
     read |= set() if guards is None else set(range(of - guards.inputs, of))
     if motion is not None:
         read |= {node[2] - 2 * nesting.base - 1 for node in motion.line.nodes if node[0] == "input"}
@@ -160,8 +158,7 @@ def choose_parameters(
             (op, xs, place.get(a, a) if op == "input" else shift_look_up(a, BESIDE - first) if op in LOOK_UPS else a)
             for op, xs, a in one.line.nodes
         )
-        kinds = (*one.dtypes, *[np.dtype(float)] * program.size)  # guards do not read the sides that they have beside
-        dtypes = (*one.dtypes[:first], *(kinds[first + i] for i in positions))
+        dtypes = (*one.dtypes[:first], *(kinds[i] for i in positions))
         return _ChosenProgram(one.line._replace(nodes=nodes), first + len(positions), dtypes, one.linear, one.budget)
 
     done = iter([reduce_program(one) for one in programs])

@@ -13,7 +13,7 @@ of a tangent does not. So the last two terms of their series are measured, and `
 from lagjax._native._directions import Directions
 from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._ir import INTEGER, Code, Value
-from lagjax._native._maps import CauchyProducts, OrderRecursion, Polynomial, ProjectedEnd, ZerothOrder
+from lagjax._native._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
 from lagjax._native._parts import MotionParts
 from lagjax._native._replay import Replay
 from lagjax._native._taylor import double
@@ -43,7 +43,7 @@ class Tangent:
         self.saltation = self.replay.saltation()
         self.note_border = self.saltation and self.saltation.note_end()
         self.directions = directions = Directions(motion, parts, lanes)
-        self.form, self.polynomial = directions.form, Polynomial(motion)
+        self.form, self.series_sum = directions.form, SeriesSum(motion)
         self.start_next = self.replay.start_next(self._begin_lane, lambda frame, lane, member: None)
         products, recursion = CauchyProducts(motion), OrderRecursion(motion, parts)
         self.products, self.recursion = products.push(directions), recursion.push(directions)
@@ -164,7 +164,7 @@ class Tangent:
     def _end(self) -> Code:
         """`(group)`: the tangents of the state at the end of the series."""
         frame, _, _ = self._step("end")
-        self.polynomial.push(self.directions, frame, "end", self.directions.number_of(frame, "h"), powers=True)
+        self.series_sum.push(self.directions, frame, "end", self.directions.number_of(frame, "h"), powers=True)
         return frame.finish()
 
     def _measure(self) -> Code:
@@ -199,7 +199,7 @@ class Tangent:
             with code.loop(self.directions.lanes) as index:
                 self._await_output(frame, index)
             with code.only_if(code.any_lane(frame["is_due"] > 0.0)):
-                self.polynomial.push(self.directions, frame, "between", frame["s"])
+                self.series_sum.push(self.directions, frame, "between", frame["s"])
                 with code.loop(self.directions.lanes) as index:
                     self._write_output(frame, index, group)
         return frame.finish()
