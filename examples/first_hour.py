@@ -24,7 +24,7 @@ import numpy as np
 
 import lagjax
 
-# 64-bit numbers, before any others are made: lagjax's machine code is for them.
+# 64-bit numbers, before any others are made: float32 has seven digits.
 jax.config.update("jax_enable_x64", True)
 plt.style.use("lagjax.figures")
 SIDE = 160  # pixels along each side of the map in station 3
@@ -56,8 +56,8 @@ print(swing.health())
 
 # %% [markdown]
 """
-Numbers that you may want to change belong into `params`. What else a function sees, as 9.81 here or a name defined
-outside, is fixed when the scene is first used: change it, and define the scene again.
+Numbers that you may want to change belong into `params`: a new value there costs nothing. What else a function sees, a
+name defined outside, may change as well, and the scene is then compiled again.
 
 *Try:* let it go at 3.1; push it with 6.5 rad/s instead of 0, so that it goes over the top; take it to the Moon.
 

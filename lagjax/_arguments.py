@@ -14,7 +14,10 @@ does not ask for `t` never receives it: such a Lagrangian is autonomous by const
 import difflib
 import functools
 import inspect
+import linecache
+import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -58,7 +61,7 @@ class Function(eqx.Module):
         try:
             with self.code.traced():
                 return function(*roles, **{name: extras[name] for name in self.extras})
-        except (AttributeError, TypeError) as reason:
+        except (AttributeError, IndexError, TypeError) as reason:
             if isinstance(reason, jax.errors.TracerIntegerConversionError):
                 _note(reason, self.name, _NO_COUNT)
                 raise
@@ -70,6 +73,9 @@ class Function(eqx.Module):
                     f"{self.name} asks for `params`, and none were given ({reason}): pass params in the structure that "
                     "it reads."
                 ) from reason
+            if expression := find_params_expression(reason):
+                given = jax.tree.structure(extras["params"])
+                _note(reason, self.name, f"it reads `{expression}`, and the params that it is given are {given}.")
             raise
         except KeyError as reason:
             _note(reason, self.name, _keys_of(roles, extras))
@@ -98,6 +104,7 @@ _NO_COUNT = (
 
 
 _OF_A_SCENE = "a function of a scene"
+_NOT_USERS = str(Path(__file__).parent), str(Path(jax.__file__).parent)
 
 
 def _keys_of(roles: tuple, extras: dict[str, Any]) -> str:
@@ -108,6 +115,19 @@ def _keys_of(roles: tuple, extras: dict[str, Any]) -> str:
         return "it reads a key that is not there."
     keys = "; ".join(f"{name} has {', '.join(map(repr, list(value)[:12]))}" for name, value in dicts.items())
     return f"it reads a key that is not there: {keys}."
+
+
+def find_params_expression(reason: Exception) -> str | None:
+    """The expression that read `params` where a function of the user failed; None where something else failed."""
+    if reason.__traceback__ is None:
+        return None
+    frames = traceback.extract_tb(reason.__traceback__)
+    theirs = [frame for frame in frames if not frame.filename.startswith(_NOT_USERS)]
+    if not theirs or theirs[-1].lineno is None:
+        return None
+    last = theirs[-1]
+    text = linecache.getline(last.filename, last.lineno or 0).encode()[last.colno : last.end_colno].decode()
+    return text if text.startswith(("params", "(params")) else None
 
 
 def _note(error: Exception, name: str, text: str) -> None:

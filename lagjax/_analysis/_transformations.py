@@ -37,7 +37,7 @@ class Fields(NamedTuple):
 
     @property
     def count(self) -> int:
-        """K, how many there are."""
+        """K, the number of transformations."""
         return len(self.names)
 
     def split_weights(self, weights):

@@ -203,7 +203,7 @@ class _RecordedSteps(diffrax.AbstractStepSizeController):
     jumps: "Jumps | None"
 
     def wrap(self, direction):
-        """diffrax integrates backward motion with its time reversed."""
+        """The controller of steps in a time that is multiplied by `direction`, 1 or −1: that of backward motion."""
         times = jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction)
         if self.jumps is None:
             return _RecordedSteps(times, None)
@@ -278,7 +278,7 @@ class WithJumps(AdaptiveWrapper):
         self.controller, self.jumps = controller, jumps
 
     def wrap(self, direction):
-        """diffrax integrates backward motion with its time reversed."""
+        """The controller of steps in a time that is multiplied by `direction`, 1 or −1: that of backward motion."""
         return WithJumps(self.controller.wrap(direction), self.jumps.reversed(direction))
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):

@@ -131,7 +131,7 @@ class Noting(diffrax.AbstractStepSizeController):
     direction: Any = 1
 
     def wrap(self, direction):
-        """diffrax integrates backward motion with its time reversed."""
+        """The controller of steps in a time that is multiplied by `direction`, 1 or −1: that of backward motion."""
         return type(self)(self.controller.wrap(direction), self.field, self.varied, direction)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):

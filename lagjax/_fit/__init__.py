@@ -38,12 +38,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._arguments import find_params_expression
 from lagjax._consistent import has_constraints
 from lagjax._doubles import DOUBLE, with_doubles
 from lagjax._fit._descent import Descent
 from lagjax._fit._motions import Manifold, choose_motions
 from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
-from lagjax._fit._parameters import Parameters, angle, between, find_params_expression, inertia, positive, simplex
+from lagjax._fit._parameters import Parameters, angle, between, inertia, positive, simplex
 from lagjax._fit._prediction import Prediction
 from lagjax._fit._profile import Comparison, Profile
 from lagjax._fit._records import (

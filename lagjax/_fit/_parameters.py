@@ -1,7 +1,6 @@
 """Parameters: the numbers that are fitted, their names, and the transforms that keep them in a set.
 
-It holds `find_params_expression` (errors of functions that read a parameter which is not there), the transforms and
-`Parameters`.
+It holds the transforms and `Parameters`.
 
 **Transforms.** The search moves numbers u that may be any real, the scene gets x = x(u):
 
@@ -21,10 +20,7 @@ are free, and the search moves these through their transforms.
 
 import abc
 import functools
-import linecache
-import traceback
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -35,22 +31,6 @@ from lagjax._layout import labelled_leaves
 from lagjax._validate import as_arrays, require_finite
 
 PyTree = Any
-
-
-_OURS = str(Path(__file__).parents[1]), str(Path(jax.__file__).parent)
-
-
-def find_params_expression(reason: Exception) -> str | None:
-    """The expression that read `params` where a function of the user failed; None where something else failed."""
-    if reason.__traceback__ is None:
-        return None
-    frames = traceback.extract_tb(reason.__traceback__)
-    theirs = [frame for frame in frames if not frame.filename.startswith(_OURS)]
-    if not theirs or theirs[-1].lineno is None:
-        return None
-    last = theirs[-1]
-    text = linecache.getline(last.filename, last.lineno or 0).encode()[last.colno : last.end_colno].decode()
-    return text if text.startswith(("params", "(params")) else None
 
 
 class AbstractTransform(abc.ABC):
@@ -793,8 +773,8 @@ def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:
         return tree.flatten_up_to(spread)
     except ValueError:
         raise ValueError(
-            f"{name} must be one value for all parameters, or have the structure of params0 down to some depth; got "
-            f"{prefix!r} for {jax.tree.unflatten(tree, ['*'] * len(leaves))}."
+            f"{name} must be one value for all parameters, or name every one of them as params0 does; got {prefix!r}. "
+            f"The parameters are {', '.join(labelled_leaves(whole, 'params')[0])}."
         ) from None
 
 

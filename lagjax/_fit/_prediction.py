@@ -20,7 +20,7 @@ from lagjax._fit._records import Guess, Record, known_start, require_interpolati
 from lagjax._fit._residuals import LostTrial, Residuals, SystemPart, SystemResiduals, Trial
 from lagjax._fit._search import build_reader
 from lagjax._fit._sensors import UNCLEAR, wrap_residuals
-from lagjax._fit._uncertainty import covariance_of_one_start, signal_deviations
+from lagjax._fit._uncertainty import LEVEL, covariance_of_one_start, require_level, signal_deviations
 from lagjax._hybrid import follow
 from lagjax._trajectory import Trajectory
 
@@ -43,7 +43,7 @@ class Prediction(NamedTuple):
     deviation: PyTree
     widths: NoiseScale
 
-    def bands(self, level: float = 0.95) -> tuple[PyTree, PyTree]:
+    def bands(self, level: float = LEVEL) -> tuple[PyTree, PyTree]:
         """(low, high) between which a new sample of weight one falls with probability `level`, noise included.
 
         Raises `ValueError` for a level that is not between 0 and 1.
@@ -52,11 +52,6 @@ class Prediction(NamedTuple):
         columns = iter(range(len(self.widths.sigma)))
         half = jax.tree.map(lambda leaf: _half_widths(leaf, self.widths, level, columns), self.deviation)
         return jax.tree.map(np.subtract, self.values, half), jax.tree.map(np.add, self.values, half)
-
-
-def require_level(level) -> None:
-    if not (np.ndim(level) == 0 and 0 < level < 1):
-        raise ValueError(f"level must be between 0 and 1, as 0.95 is; got {level!r}.")
 
 
 def _half_widths(deviation: np.ndarray, widths: NoiseScale, level: float, columns) -> np.ndarray:

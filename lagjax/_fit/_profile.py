@@ -30,7 +30,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import stdtrit
 
 from lagjax._fit._descent import minimise
 from lagjax._fit._noise import KnownNoise, NoiseScale, log_likelihood
@@ -272,8 +271,7 @@ def profile(question: Residuals, u, starts, widths: NoiseScale, known: Informati
     """The profile of the free number called `name`."""
     parameters = question.parameters
     line = _ProfileLine(question, u, starts, widths, known, parameters.unknown(name))
-    dof = max(float(known.effective.sum()) - len(u), 1.0)
-    threshold = float(stdtrit(dof, 0.5 + 0.5 * level) ** 2)
+    threshold = known.quantile(level) ** 2
     ends = [_find_end(line, side, threshold, parameters.room[line.which]) for side in (-1.0, 1.0)]
     minima = _minima(line, threshold)
     row = parameters.row(name)

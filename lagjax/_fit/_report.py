@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from lagjax._fit._records import Record
+from lagjax._fit._uncertainty import LEVEL
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.55"
 _MOST = 4000  # samples in one curve: more do not show
@@ -225,8 +226,8 @@ def build_title(fit) -> str:
 
 
 def cells_of_parameters(fit) -> list[list[str]]:
-    low, high = fit._ends(0.95)
-    rows = [["parameter", "value", "from", "to (95 %)", "± relative"]]
+    low, high = fit._ends(LEVEL)
+    rows = [["parameter", "value", "from", f"to ({100 * LEVEL:g} %)", "± relative"]]
     for name, x, a, b in zip(fit.parameters.names, fit.parameters.values(fit.u), low, high, strict=True):
         half = 50 * (b - a) / abs(x) if x else np.inf
         rows.append([name, f"{x:.6g}", f"{a:.6g}", f"{b:.6g}", f"{half:.2g} %" if np.isfinite(half) else "not seen"])
@@ -244,10 +245,10 @@ def cells_of_noise(fit) -> list[list[str]]:
 def _table_of_parameters(fit) -> list[str]:
     if not fit.parameters.names:
         return ["All parameters are kept: starts and noise were fitted."]
-    low, high = fit._ends(0.95)
+    low, high = fit._ends(LEVEL)
     values = fit.parameters.values(fit.u)
     width = max(len(name) for name in (*fit.parameters.names, "parameter"))
-    rows = [f"{'parameter':<{width}}  {'value':>12}  {'95 % interval':>27}  relative"]
+    rows = [f"{'parameter':<{width}}  {'value':>12}  {f'{100 * LEVEL:g} % interval':>27}  relative"]
     owners = [part.label for part in fit.parameters.parts for _ in part.places]
     many = {label: count for label, count in Counter(owners).items() if count > _LISTED}
     for label, count in many.items():

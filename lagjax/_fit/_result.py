@@ -10,14 +10,13 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from lagjax._display import cell, intervals
 from lagjax._doubles import with_doubles
 from lagjax._fit._density import Density
 from lagjax._fit._noise import AbstractNoise, NoiseScale
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._prediction import Prediction, planned_rows, predict_record, require_level
+from lagjax._fit._prediction import Prediction, planned_rows, predict_record
 from lagjax._fit._profile import Comparison, Profile, comparison, profile
 from lagjax._fit._records import Record
 from lagjax._fit._report import (
@@ -34,7 +33,7 @@ from lagjax._fit._report import (
 from lagjax._fit._residuals import Residuals, SystemPart, Trial
 from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._search import Waterfall
-from lagjax._fit._uncertainty import Experiments, Information, rank_experiments, start_covariances
+from lagjax._fit._uncertainty import LEVEL, Experiments, Information, rank_experiments, start_covariances
 
 PyTree = Any
 
@@ -120,7 +119,7 @@ class Fit:
         axes = figure.subplots(2, min(2, len(drawn.names)), squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
         draw_record(axes, drawn.records[0], drawn.residuals[0], drawn.names[:2], drawn.sigma)
 
-    def to_pandas(self, level: float = 0.95):
+    def to_pandas(self, level: float = LEVEL):
         """A `pandas.DataFrame` with a row per free number, by its name: value, and low and high of its interval.
 
         The interval contains the number with probability `level`; where the data do not determine the number, the
@@ -141,12 +140,13 @@ class Fit:
             count[columns] += np.isfinite(matrix).sum(axis=0)
         return dict(zip(self.question.names, np.sqrt(squares / count).tolist(), strict=True))
 
-    def intervals(self, level: float = 0.95) -> tuple[PyTree, PyTree]:
+    def intervals(self, level: float = LEVEL) -> tuple[PyTree, PyTree]:
         """The ends (low, high) of the intervals that hold each free number with probability `level`, as two pytrees.
 
-        They stay inside the sets of the transforms, relative to the bounds; one that does not exclude a bound is that
-        of the number itself, and ends at the bound. The interval of a parameter that the data do not determine is the
-        whole set. A parameter that is not free is both ends of its own interval.
+        They are made in the transformed numbers, so that they stay inside the sets of the transforms. Where such an
+        interval would not exclude a bound of its set, it is made in the number itself, and ends at the bound. The
+        interval of a parameter that the data do not determine is the whole set. A parameter that is not free is both
+        ends of its own interval.
 
         Raises `ValueError` for a level that is not between 0 and 1.
         """
@@ -159,7 +159,7 @@ class Fit:
         return ends[0], ends[1]
 
     @with_doubles
-    def start_intervals(self, level: float = 0.95) -> tuple[Any, Any]:
+    def start_intervals(self, level: float = LEVEL) -> tuple[Any, Any]:
         """The ends (low, high) of the intervals of the starts, each in the structure of `starts`.
 
         Each contains its number with probability `level`; the uncertainty of the parameters is included. A start that
@@ -167,7 +167,7 @@ class Fit:
 
         Raises `ValueError` for a level that is not between 0 and 1.
         """
-        wide = self._quantile(level) * np.sqrt(
+        wide = self.information.quantile(level) * np.sqrt(
             np.diagonal(
                 start_covariances(self.question, self._point, self.widths, self.information).covariance,
                 axis1=1,
@@ -179,7 +179,7 @@ class Fit:
         return low, high
 
     @with_doubles
-    def profile(self, name: str, level: float = 0.95) -> Profile:
+    def profile(self, name: str, level: float = LEVEL) -> Profile:
         """The profile likelihood of the parameter called `name`: "params['dry']", or "dry" where that is the only one.
 
         It says how much likelihood is lost where the parameter is kept at another value and all other free parameters
@@ -190,7 +190,6 @@ class Fit:
 
         Source: Venzon & Moolgavkar, Applied Statistics 37 (1988) 87; Raue et al., Bioinformatics 25 (2009) 1923.
         """
-        require_level(level)
         return profile(self.question, self.u, self.states, self.widths, self.information, name, level)
 
     def log_density(self, prior: Callable | None = None) -> Density:
@@ -241,14 +240,8 @@ class Fit:
         assert isinstance(point, Trial)  # it was computed before
         return point
 
-    def _quantile(self, level: float) -> float:
-        """Student's t of a level, for the effective number of samples less that of parameters."""
-        require_level(level)
-        dof = max(float(np.sum(self.information.effective)) - len(self.u), 1.0)
-        return float(stdtrit(dof, 0.5 + 0.5 * level))
-
     def _ends(self, level: float) -> tuple[np.ndarray, np.ndarray]:
-        wide = self._quantile(level) * np.sqrt(np.diag(self.covariance.matrix))
+        wide = self.information.quantile(level) * np.sqrt(np.diag(self.covariance.matrix))
         return self.parameters.ends(self.u, wide)
 
     @with_doubles

@@ -54,10 +54,13 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from lagjax._fit._noise import NoiseScale
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._residuals import LostTrial, Residuals, Trial, compress_rows
+
+LEVEL = 0.95  # the probability with which an interval holds its number, where no other one is given
 
 
 class Correlation(NamedTuple):
@@ -194,6 +197,17 @@ class Information(NamedTuple):
     correlation: np.ndarray
     white: np.ndarray
     lost: float
+
+    def quantile(self, level: float) -> float:
+        """Student's t of a level, for the effective number of samples less that of parameters."""
+        require_level(level)
+        dof = max(float(self.effective.sum()) - len(self.covariance), 1.0)
+        return float(stdtrit(dof, 0.5 + 0.5 * level))
+
+
+def require_level(level) -> None:
+    if not (np.ndim(level) == 0 and 0 < level < 1):
+        raise ValueError(f"level must be between 0 and 1, as {LEVEL} is; got {level!r}.")
 
 
 def information(question: Residuals, point: Trial, widths: NoiseScale) -> Information:

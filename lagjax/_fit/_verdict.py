@@ -339,7 +339,7 @@ def _describe_end(name: str, transform: Positive | Between, x: float, step: floa
             )
         if abs(x - end) < error and side * (x - end) <= 0 and side * step >= -error:
             if end == 0.0:
-                return f"{name} goes to zero, {x:.2g} ± {error:.2g}: the data do not need it."
+                return f"{name} is {x:.2g} ± {error:.2g}: the data do not tell it from zero."
             return f"{name} goes to its bound {end:g}, which is within its standard error {error:.2g}."
     return None
 

@@ -9,7 +9,7 @@ A motion has laws that the numbers must obey whatever integrated them. At every 
     ∂(M, F, G)           by the state, the time and every parameter: whether it is finite
 
 The first two are compared with what the tolerances allow. A step may put the error rtol|yᵢ| + atol into each component
-of the state y = (q, q̇), and a conserved quantity c does not forget it: after N steps c may be off by
+of the state y = (q, q̇), and in a conserved quantity c such errors add up: after N steps c may be off by
 
     N maxₜ Σᵢ |∂c/∂yᵢ| (rtol|yᵢ| + atol),
 
@@ -256,7 +256,7 @@ class Health(eqx.Module):
         rows = [("result", self._results()), ("steps", self._steps())]
         known = f"; the work between outputs is known to {_greatest(self.work_error):.1e}" if self.works else ""
         law = "power balance" if self.works else "energy"
-        rows.append((law, f"off by {_worst(self.energy, self.energy_allowed)}{known}"))
+        rows.append((law, f"off by {_worst(self.energy, self.energy_allowed + SLACK * self.work_error)}{known}"))
         if self.momentum_names is None:
             rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
         rows += [("borders", text) for text in self._border_contacts()]
@@ -361,14 +361,14 @@ _RESULT_NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.
 _SENTENCES = {
     "result": "The motion did not reach its end{0}.",
     "energy": (
-        "Energy: off by more than the tolerances allow{0}. Something is not smooth within a step (a force that jumps, "
+        "Energy: off by more than accurate steps leave{0}. Something is not smooth within a step (a force that jumps, "
         "a contact), or the steps are too long: tighten rtol or shorten dt."
     ),
     "amplitude": (
         "Amplitude: the motion{0} is so small beside atol that the errors it allows add up to a hundredth of it within "
         "a hundred steps. Use units in which the motion is of order one, or pass atol="
     ),
-    "momentum": "Momentum: what is conserved is off by more than the tolerances allow{0}: tighten rtol or shorten dt.",
+    "momentum": "Momentum: what is conserved is off by more than accurate steps leave{0}: tighten rtol or shorten dt.",
     "constraints": "Constraints: the motion has left them{0}: tighten rtol or shorten dt.",
     "mass_matrix": (
         "Mass matrix: so near to singular{0} that round-off in the acceleration exceeds the tolerance. Use other "

@@ -591,7 +591,7 @@ class BorderControl:
                 frame["stays", j] = 1
 
     def _leave(self, frame: Frame, g: Value, hit: Value, again: Value) -> None:
-        """Let a sliding motion whose share comes to 0 or 1 go on along one side.
+        """Let a sliding motion go on along one side, where its share of that side comes to 0 or 1.
 
         The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all.
         """

@@ -340,7 +340,7 @@ class Events:
             frame["seen"] = seen
 
     def _waits(self, frame: Frame, g: Value) -> Value:
-        """True if what a guard does is for the next step to say: its own border is where this one ends."""
+        """True if the next step decides what guard g does: this step ends at the guard's own border."""
         code = frame.code
         if not self.can_jump:
             return frame.constant(0.0) > 1.0

@@ -91,10 +91,11 @@ def _write(file: Path, body: bytes) -> None:
 def _remove_oldest(place: Path) -> None:
     """Remove the files that were not used for longest where all together are too large."""
     files = []
-    for file in place.iterdir():
-        with contextlib.suppress(OSError):  # another process removed it
-            status = file.stat()
-            files.append((status.st_mtime, status.st_size, file))
+    with os.scandir(place) as entries:  # there may be thousands, and each object that is written looks at all
+        for entry in entries:
+            with contextlib.suppress(OSError):  # another process removed it
+                status = entry.stat()
+                files.append((status.st_mtime, status.st_size, entry.path))
     total = sum(size for _, size, _ in files)
     if total <= LARGEST_CACHE:
         return
@@ -102,5 +103,5 @@ def _remove_oldest(place: Path) -> None:
         if total <= 0.75 * LARGEST_CACHE:
             break
         with contextlib.suppress(OSError):
-            file.unlink()
+            os.unlink(file)
         total -= size

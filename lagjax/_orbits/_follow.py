@@ -147,7 +147,7 @@ class Follower:
         return FamilyUnknowns(dy, first[states : states + 1] if self.period_is_free else np.zeros(1), by)
 
     def move(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
-        """The point after a change (2n + F,) of what is free, and of the inner states with it."""
+        """The point after a change (2n + F,) of its free numbers; the states of its inner arcs follow."""
         return self.rebuild(point, FamilyUnknowns.from_point(point).plus(self.complete_change(point, first, right)))
 
     def rebuild(self, point: FamilyPoint, whole: "FamilyUnknowns") -> FamilyPoint:

@@ -212,7 +212,7 @@ class Walk:
                 yield name, CHANGING if self.read(kind, name, value) is CHANGING else inner
 
     def _state(self, thing: Any) -> list[tuple[str, Any]]:
-        """The content of an object; where it is of a library's class, what that shows."""
+        """The attributes of an object by name; of what converts to an array, its values."""
         try:
             if hasattr(type(thing), "__array__") and not _is_users(type(thing).__module__):
                 return [("values", self.read(thing, None, np.asarray(thing)))]

@@ -21,6 +21,16 @@ def test_a_key_that_is_not_there_is_told_with_those_that_are():
     )
 
 
+@pytest.mark.parametrize("params", [9.81, [9.81]])
+def test_params_of_another_structure_are_told_with_what_reads_them(params):
+    def pendulum(q, qdot, params):
+        return 0.5 * qdot**2 + params["g"] * jnp.cos(q)
+
+    with pytest.raises(TypeError) as error:
+        lagjax.simulate(lagjax.System(pendulum), 1.0, 0.0, jnp.arange(3.0), params)
+    assert "it reads `params[\"g\"]`, and the params that it is given are PyTreeDef(" in error.value.__notes__[0]
+
+
 @pytest.mark.parametrize("height", [lambda q: math.cos(q), lambda q: np.cos(q), lambda q: q if q > 0 else 0.0])
 def test_functions_that_ask_for_values_are_told_what_to_write(height):
     with pytest.raises(TypeError) as error:
