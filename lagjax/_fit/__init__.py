@@ -15,7 +15,7 @@ Files, from the lowest floor up:
     _sensors       signals of a motion with their derivatives; delays, wrapped angles
     _residuals     the residuals of one trial with their derivatives, for one system or several
     _density       the posterior density, coordinates in which it is round, its expansion
-    _uncertainty   autocorrelation of residuals, covariance, identifiability, experiment design
+    _uncertainty   autocorrelation of residuals, covariance, the level of intervals, identifiability, experiment design
     _descent       Gauss–Newton with eliminated starts; Adam for networks
     _sample        draws from the posterior
     _profile       profile likelihood, and comparison of fits by AIC, BIC, cross-validation
@@ -23,7 +23,7 @@ Files, from the lowest floor up:
     _search        multiple shooting over growing segments, weak form, multistart
     _prediction    records that were not fitted, or are planned
     _report        a fit in words, figures, pages of HTML
-    _result        Fit
+    _result        Fit, with its intervals
 """
 
 import functools

@@ -28,7 +28,7 @@ def test_params_of_another_structure_are_told_with_what_reads_them(params):
 
     with pytest.raises(TypeError) as error:
         lagjax.simulate(lagjax.System(pendulum), 1.0, 0.0, jnp.arange(3.0), params)
-    assert "it reads `params[\"g\"]`, and the params that it is given are PyTreeDef(" in error.value.__notes__[0]
+    assert 'it reads `params["g"]`, and the params that it is given are PyTreeDef(' in error.value.__notes__[0]
 
 
 @pytest.mark.parametrize("height", [lambda q: math.cos(q), lambda q: np.cos(q), lambda q: q if q > 0 else 0.0])

@@ -258,7 +258,7 @@ def test_derivatives_of_each_family(family):
     values = derivation.evaluate(["momentum", "lagrangian_by_q", "mass_matrix"], [*scalars(*q, *v), 0.0])
     y, unravel = jax.flatten_util.ravel_pytree((q, v))
     flat_lagrangian, n = lambda y: lagrangian(*unravel(y)), y.size // 2
-    slopes, bend = jax.jacfwd(flat_lagrangian)(y), jax.jacfwd(jax.jacfwd(flat_lagrangian))(y)
+    slopes, bend = jax.jit(lambda y: (jax.jacfwd(flat_lagrangian)(y), jax.jacfwd(jax.jacfwd(flat_lagrangian))(y)))(y)
     for name, expected in (("lagrangian_by_q", slopes[:n]), ("momentum", slopes[n:]), ("mass_matrix", bend[n:, n:])):
         size = 1 + np.max(np.abs(expected), initial=0.0, where=np.isfinite(expected))
         np.testing.assert_allclose(values[name][0], expected, rtol=1e-13, atol=1e-13 * size, err_msg=name)
