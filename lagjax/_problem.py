@@ -342,14 +342,20 @@ def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTr
         try:
             axes[name] = jax.tree.broadcast(prefix, value, is_leaf=lambda axis: axis is None)
         except ValueError:
-            raise ValueError(f"batch_axes for {name} is {prefix!r}, which does not fit its structure.") from None
+            raise ValueError(
+                f"batch_axes for {name} is {prefix!r}, which does not fit its structure, {jax.tree.structure(value)}: "
+                "give one axis for all of it, or one for every leaf, None for those that all members share."
+            ) from None
         leaves, tree = jax.tree_util.tree_flatten_with_path(value)
         for (path, leaf), axis in zip(leaves, tree.flatten_up_to(axes[name]), strict=True):
             label = name + jax.tree_util.keystr(path)
             if axis is not None:
                 require_numbers(leaf, label)
                 if not -jnp.ndim(leaf) <= axis < jnp.ndim(leaf):
-                    raise ValueError(f"{label} has shape {jnp.shape(leaf)}: it has no axis {axis} for the batch.")
+                    raise ValueError(
+                        f"{label} has shape {jnp.shape(leaf)}: it has no axis {axis} for the batch. Where all members "
+                        "share it, let batch_axes have None in its place."
+                    )
                 sizes[label] = jnp.shape(leaf)[axis]
     if not sizes:
         raise ValueError("batch_axes maps over nothing: name the axis of the members in q0, qdot0 or params.")

@@ -166,8 +166,8 @@ def simulate_batch(
 
     `batch_axes` says for (q0, qdot0, params) which axis runs over the members, as `in_axes` of `jax.vmap` does: an
     integer, None for an argument that all members share, or a pytree of these. The default is a batch of initial
-    states; a sweep over parameters from one initial state is `batch_axes=(None, None, 0)`. In the result the members
-    are the first axis.
+    states; a sweep over parameters from one initial state is `batch_axes=(None, None, 0)`, and over one of them
+    `batch_axes=(None, None, {"m": 0, "l": None})`. In the result the members are the first axis.
 
     A member that fails, or starts from NaN, never raises and does not affect the others: look at `trajectory.ok` and
     `trajectory.result`. The other arguments, their errors, and the source are those of `simulate`.
@@ -185,10 +185,17 @@ def simulate_batch(
     values = {"q0": q0, "qdot0": qdot0, "params": params}
     axes, size = axes_per_leaf(values, batch_axes)
     given = Batch.from_values(system, values, axes, size, ts, rtol, atol, max_steps, event)
-    batch = lift_batch(given)
+    try:
+        batch = lift_batch(given)
+        engine = choose(batch.member, requested).engine
+    except (IndexError, TypeError) as reason:
+        reason.add_note(
+            f"By batch_axes this is a batch of {size} members: it says for (q0, qdot0, params) which axis runs over them, "
+            "and None for what they share. The default is (0, 0, None)."
+        )
+        raise
     values = {name: as_arrays(value, batch.member.layout.dtype) for name, value in values.items()}
     inconsistent = inconsistent_members(system, batch.member.ts, values, axes)
-    engine = choose(batch.member, requested).engine
     solution = engine.solve_batch(batch)
     trajectory = trajectory_of(given.member, engine, solution, given.y0, values["params"], batch_axes[2])
     return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)

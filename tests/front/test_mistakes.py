@@ -31,6 +31,13 @@ def test_params_of_another_structure_are_told_with_what_reads_them(params):
     assert 'it reads `params["g"]`, and the params that it is given are PyTreeDef(' in error.value.__notes__[0]
 
 
+def test_a_sweep_over_a_parameter_without_its_batch_axis_is_told_of_batch_axes():
+    scene = lagjax.System(lambda q, v, params: 0.5 * params["m"] * v @ v - q @ q)
+    with pytest.raises(TypeError) as error:
+        lagjax.simulate_batch(scene, jnp.ones((3, 2)), jnp.zeros((3, 2)), jnp.arange(3.0), {"m": jnp.ones(3)})
+    assert "By batch_axes this is a batch of 3 members" in error.value.__notes__[-1]
+
+
 @pytest.mark.parametrize("height", [lambda q: math.cos(q), lambda q: np.cos(q), lambda q: q if q > 0 else 0.0])
 def test_functions_that_ask_for_values_are_told_what_to_write(height):
     with pytest.raises(TypeError) as error:

@@ -162,7 +162,8 @@ def test_a_name_is_imported_when_it_is_used():
         "import lagjax, sys; assert 'lagjax._simulate' not in sys.modules, 'it has not been used';"
         "assert set(lagjax.__all__) <= set(dir(lagjax)) and not {'Orbit', 'sobol'} & set(dir(lagjax));"
         "assert not hasattr(lagjax, 'System2') and lagjax.simulate is lagjax.simulate;"
-        "assert not {'scipy.optimize', 'scipy.special', 'lagjax._fit', 'lagjax._sweep'} & set(sys.modules);"
+        "early = {'scipy.optimize', 'scipy.special', 'lagjax._fit', 'lagjax._sweep'} & set(sys.modules);"
+        "assert not early, f'import lagjax imports {early}: import them in the functions that need them';"
         "from lagjax import *; assert sweep is lagjax.sweep and plot.__name__ == 'lagjax.plot';"
         "assert {*lagjax._places(), 'System'} == {*lagjax.__all__, *results.__all__}"
     )
