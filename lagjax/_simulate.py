@@ -190,8 +190,8 @@ def simulate_batch(
         engine = choose(batch.member, requested).engine
     except (IndexError, TypeError) as reason:
         reason.add_note(
-            f"By batch_axes this is a batch of {size} members: it says for (q0, qdot0, params) which axis runs over them, "
-            "and None for what they share. The default is (0, 0, None)."
+            f"By batch_axes this is a batch of {size} members: it says for (q0, qdot0, params) which axis runs over "
+            "them, and None for what they share. The default is (0, 0, None)."
         )
         raise
     values = {name: as_arrays(value, batch.member.layout.dtype) for name, value in values.items()}

@@ -199,9 +199,8 @@ def smooth_record(count, ts, **more):
     return lagjax.Record(ts, values, {"u": smooth(at)}, input_ts=at, **more)
 
 
-@pytest.mark.parametrize(
-    ("hold", "count", "error"), [pytest.param("cubic", 321, 2e-4, marks=pytest.mark.slow), ("band", 81, 2e-4)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("hold", "count", "error"), [("cubic", 321, 2e-4), ("band", 81, 2e-4)])
 def test_smooth_inputs_on_times_of_their_own(hold, count, error):
     ts = np.sort(np.random.default_rng(0).uniform(0.0, 4.0, 120))
     record = smooth_record(count, ts, start=None)

@@ -338,6 +338,7 @@ def test_the_time_of_single_precision_is_a_double(on_the_ptx, slow_doubles):
     agree(on_the_ptx(driven, np.float32(0.0)), jax.jit(driven)(np.float32(0.0)), 1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_of_single_precision(on_the_ptx, slow_doubles):
     scene = scenes.pendulum()
 
@@ -350,6 +351,7 @@ def test_derivatives_of_single_precision(on_the_ptx, slow_doubles):
     assert on_the_ptx.launches == [3, 3, 3]  # the motion, there and back; and the motion with its tangents
 
 
+@pytest.mark.slow
 def test_borders_and_events_are_found_in_doubles(on_the_ptx, slow_doubles):
     wedge = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
     wedge = SimpleNamespace(system=wedge, qdot0=0.0, params=None)

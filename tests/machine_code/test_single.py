@@ -128,6 +128,7 @@ def test_constants_keep_their_digits_and_times_do_not_drift(off):
     assert end == np.float32(0.05)
 
 
+@pytest.mark.slow
 def test_constraints_and_failures(off):
     def rod(q):
         return jnp.sum(q**2) - 1.0
