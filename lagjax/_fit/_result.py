@@ -73,7 +73,7 @@ class Fit:
 
     - `params`: the parameters in the user's pytree; the free ones are those of maximum likelihood.
     - `starts`: one (q0, qdot0) per record. For several systems `starts` and `residuals` are dicts by their names.
-    - `covariance`: of the free numbers, by name (`Covariance`). Intervals are computed in the transformed numbers.
+    - `covariance`: of the free numbers, by name (`Covariance`).
     - `noise`: the scatter of each signal, by name (`SignalNoise`).
     - `residuals`: fitted minus measured values per record, in the structure of `values`; NaN where a sample is missing.
     - `unseen`: a sentence for each free parameter or combination of them that the data do not determine, and one for
