@@ -339,16 +339,15 @@ def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTr
         raise ValueError(f"batch_axes must be a tuple of three, for (q0, qdot0, params); got {batch_axes!r}.")
     axes, sizes = {}, {}
     for (name, value), prefix in zip(values.items(), batch_axes, strict=True):
+        labels, leaves, tree = labelled_leaves(value, name)
         try:
             axes[name] = jax.tree.broadcast(prefix, value, is_leaf=lambda axis: axis is None)
         except ValueError:
             raise ValueError(
-                f"batch_axes for {name} is {prefix!r}, which does not fit its structure, {jax.tree.structure(value)}: "
-                "give one axis for all of it, or one for every leaf, None for those that all members share."
+                f"batch_axes for {name} is {prefix!r}, which does not fit its structure: give one axis for all of it, "
+                f"or one for each of {', '.join(labels[:12])}, None for what all members share."
             ) from None
-        leaves, tree = jax.tree_util.tree_flatten_with_path(value)
-        for (path, leaf), axis in zip(leaves, tree.flatten_up_to(axes[name]), strict=True):
-            label = name + jax.tree_util.keystr(path)
+        for label, leaf, axis in zip(labels, leaves, tree.flatten_up_to(axes[name]), strict=True):
             if axis is not None:
                 require_numbers(leaf, label)
                 if not -jnp.ndim(leaf) <= axis < jnp.ndim(leaf):

@@ -774,7 +774,7 @@ def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:
     except ValueError:
         raise ValueError(
             f"{name} must be one value for all parameters, or name every one of them as params0 does; got {prefix!r}. "
-            f"The parameters are {', '.join(labelled_leaves(whole, 'params')[0])}."
+            f"The parameters are {', '.join(labelled_leaves(whole, 'params')[0][:12])}."
         ) from None
 
 
