@@ -68,12 +68,13 @@ class Function(eqx.Module):
             if isinstance(reason, _NO_VALUES):
                 _note(reason, self.name, _USE_JAX)
                 raise
-            if "params" in self.extras and extras["params"] is None:
+            asks = "params" in self.extras
+            if asks and extras["params"] is None and not isinstance(reason, IndexError):  # None has no index to miss
                 raise TypeError(
                     f"{self.name} asks for `params`, and none were given ({reason}): pass params in the structure that "
                     "it reads."
                 ) from reason
-            if expression := find_params_expression(reason):
+            if asks and (expression := find_params_expression(reason)):
                 given = jax.tree.structure(extras["params"])
                 _note(reason, self.name, f"it reads `{expression}`, and the params that it is given are {given}.")
             raise

@@ -187,17 +187,21 @@ class Health(eqx.Module):
         """The suspicions, by name: a Boolean for each member. A NaN at a state that was reached is."""
         return {name: jnp.asarray(flag) for name, flag in self._flags()[0].items()}
 
+    @property
+    def _energy_limit(self):
+        """The imbalance of energy beyond which it is suspicious: what is allowed, and what the outputs leave open."""
+        return self.energy_allowed + SLACK * self.work_error
+
     def _flags(self) -> tuple[dict, Any]:
         """`checks`, and the library they are computed in: NumPy where nothing is being traced."""
         concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves(self))
         xp = np if concrete else jnp
         of = jax.tree.map(np.asarray, self) if concrete else self
-        energy = of.energy_allowed + SLACK * of.work_error
         tries = of.accepted_steps + of.rejected_steps
         with np.errstate(invalid="ignore"):
             flags = {
                 "result": ~of.ok,
-                "energy": _exceeds(xp, of.energy, energy) & ~(of.outputs_needed > of.outputs),
+                "energy": _exceeds(xp, of.energy, of._energy_limit) & ~(of.outputs_needed > of.outputs),
                 "amplitude": of.amplitude < of.amplitude_needed,
                 "momentum": _exceeds(xp, of.momentum, of.momentum_allowed).any(axis=-1),
                 "constraints": _exceeds(xp, of.constraint_distance, of.constraint_allowed[..., :1]).any(axis=-1)
@@ -256,7 +260,7 @@ class Health(eqx.Module):
         rows = [("result", self._results()), ("steps", self._steps())]
         known = f"; the work between outputs is known to {_greatest(self.work_error):.1e}" if self.works else ""
         law = "power balance" if self.works else "energy"
-        rows.append((law, f"off by {_worst(self.energy, self.energy_allowed + SLACK * self.work_error)}{known}"))
+        rows.append((law, f"off by {_worst(self.energy, self._energy_limit)}{known}"))
         if self.momentum_names is None:
             rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
         rows += [("borders", text) for text in self._border_contacts()]
