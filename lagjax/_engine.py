@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 from lagjax._diffrax import Diffrax
 from lagjax._machine_code import MachineCode
-from lagjax._platform import default_platform
 from lagjax._problem import AbstractEngine, Problem
 
 
@@ -49,8 +48,7 @@ def choose(problem: Problem, requested: AbstractEngine | None = None) -> Choice:
     if isinstance(requested, Diffrax):
         choice = Choice(requested, "diffrax was asked for")
     else:
-        # On a GPU it is not the default: its results there have not been verified on one.
-        refusal = _MACHINE_CODE.refuses(problem) if requested is None else _MACHINE_CODE.lacks(problem)
+        refusal = _MACHINE_CODE.declines(problem) if requested is None else _MACHINE_CODE.lacks(problem)
         if refusal is None:
             return Choice(_MACHINE_CODE, None)
         if requested is not None:
@@ -59,17 +57,6 @@ def choose(problem: Problem, requested: AbstractEngine | None = None) -> Choice:
     if refusal := choice.engine.refuses(problem):
         raise ValueError(f"{refusal}.")
     return choice
-
-
-def explain_refusal(problem: Problem) -> str | None:
-    """The reason why the default engine is not machine code, and the outlook for that on a GPU; None where it is.
-
-    It writes a program for GPUs down, which a run that only asks which engine it has does not wait for.
-    """
-    refusal = choose(problem).refusal
-    if refusal is not None and default_platform() == "gpu" and _MACHINE_CODE.lacks(problem) is None:
-        return f"{refusal}; {_MACHINE_CODE.outlook_on_gpus(problem)}"
-    return refusal
 
 
 def _refusal(reason: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from lagjax._blame import pieces_of_motion
 from lagjax._diffrax import ArrayEquations, form_of
-from lagjax._engine import choose, explain_refusal
+from lagjax._engine import choose
 from lagjax._linear import dependent_rows
 from lagjax._native import Nesting, is_large, pieces_of
 from lagjax._problem import Problem
@@ -142,7 +142,7 @@ def explain(problem: Problem) -> Explanation:
 
 def _engine(problem: Problem) -> dict[str, Any]:
     """The default solver of a motion, the form in which it evaluates the equations, and the cost of that."""
-    derivation, refusal = problem.derivation, explain_refusal(problem)
+    derivation, refusal = problem.derivation, choose(problem).refusal
     if refusal is None:
         solver, reason = "Taylor series in machine code", ""
         if is_large(derivation.acceleration, derivation.projection):

@@ -15,6 +15,16 @@ def default_platform() -> str:
     return device if isinstance(device, str) else device.platform
 
 
+def has_nvidia_gpu() -> bool:
+    """True if the default device is a GPU that JAX runs by CUDA."""
+    if default_platform() != "gpu":
+        return False
+    try:
+        return bool(jax.devices("cuda"))
+    except RuntimeError:
+        return False
+
+
 def is_known(x: Any) -> bool:
     """True if the values of an array can be read here: it is neither traced, nor a shape alone, nor deleted."""
     if isinstance(x, Tracer):

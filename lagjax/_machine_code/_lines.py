@@ -160,14 +160,21 @@ def _register(primitive, host, width) -> None:
 
     def evaluate(*arrays, line: Line):
         with jax.enable_x64(True):
-            return jax.device_put(host(*map(np.asarray, arrays), line=line)[0])
+            return jax.device_put(compute(*arrays, line=line))
+
+    def compute(*arrays, line: Line):
+        return host(*map(np.asarray, arrays), line=line)[0]
 
     def call_back(*arrays, line: Line):
         return call_host(functools.partial(host, line=line), [shape(*arrays, line=line)], *arrays)[0]
 
+    def call_from_gpu(*arrays, line: Line):
+        return jax.pure_callback(functools.partial(compute, line=line), shape(*arrays, line=line), *arrays)
+
     primitive.def_abstract_eval(shape)
     primitive.def_impl(evaluate)
-    mlir.register_lowering(primitive, mlir.lower_fun(call_back, multiple_results=False), platform="cpu")
+    for platform, form in (("cpu", call_back), ("cuda", call_from_gpu)):
+        mlir.register_lowering(primitive, mlir.lower_fun(form, multiple_results=False), platform=platform)
     batching.primitive_batchers[primitive] = _batch_rule(primitive)
 
 

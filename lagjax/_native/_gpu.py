@@ -10,7 +10,7 @@ A program has one of two forms. Where the coefficients of a motion are few, the 
 order that is lower than a CPU's if that keeps them few: no array is left, and the coefficients are registers, some of
 which the assembler spills. Otherwise they stand in the memory of the thread.
 
-What is here needs no GPU: it is assembled and checked on CPUs, and has not run on a GPU yet.
+What is here needs no GPU: it is assembled and checked on CPUs. `benchmarks.gpu` runs it on one.
 """
 
 import functools
