@@ -7,13 +7,19 @@ short or damaged is not what its first bytes say, and is made anew. Where files 
 kept, and nothing fails.
 
 They lie in the user's folder for caches. The environment variable `LAGJAX_CACHE` names another one; `off` keeps none.
+What is read is run. So a folder is used only if it is the user's own and nobody else may write to it; in another one,
+such as /tmp, a folder of its own is made, and without that nothing is kept, which one warning says. A file is read only
+if it is a regular one of the user's, with no link followed.
 """
 
 import contextlib
+import functools
 import hashlib
 import os
+import stat
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,13 +28,15 @@ from pathlib import Path
 LARGEST_CACHE = 2**28
 _MAGIC = b"lagjax object 1\n"
 _DIGEST = hashlib.sha256
+# A link may lead to another file than the one that is looked at, and a named pipe waits for a writer for ever.
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 def folder() -> Path | None:
     """The folder of kept objects; None where none are kept."""
     chosen = os.environ.get("LAGJAX_CACHE", "")
     if chosen:
-        return None if chosen.lower() in ("off", "0", "no", "false") else Path(chosen)
+        return None if chosen.lower() in ("off", "0", "no", "false") else Path(chosen).expanduser()
     try:
         if sys.platform == "win32":
             base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
@@ -41,9 +49,39 @@ def folder() -> Path | None:
     return base / "lagjax" / "objects"
 
 
+def private_folder(place: Path) -> Path | None:
+    """This folder, made if need be, where it is the user's alone; else one inside of it; None where neither can be."""
+    inside = place / f"lagjax-{os.geteuid() if hasattr(os, 'geteuid') else 'user'}"
+    for candidate in (place, inside):
+        with contextlib.suppress(OSError):
+            candidate.mkdir(mode=0o700, parents=True, exist_ok=True)
+            status = os.lstat(candidate)
+            if stat.S_ISDIR(status.st_mode) and _is_private(status):
+                return candidate
+    _warn_once(place)
+    return None
+
+
+def _is_private(status: os.stat_result) -> bool:
+    """True if a file or folder is the user's own, and nobody else may write to it."""
+    if not hasattr(os, "geteuid"):  # Windows, where the folder for caches is the user's
+        return True
+    return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
+@functools.cache
+def _warn_once(place: Path) -> None:
+    warnings.warn(
+        f"Machine code is not kept: {place} is no folder that only you can write to. Set LAGJAX_CACHE to one of your "
+        "own, or to 'off'.",
+        stacklevel=2,
+    )
+
+
 def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
     """The object that `make` returns, or the one that it returned for the same texts in this or another process."""
-    place = folder()
+    chosen = folder()
+    place = None if chosen is None else private_folder(chosen)
     if place is None:
         return make()
     digest = _DIGEST()
@@ -61,9 +99,14 @@ def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
 
 
 def _read(file: Path) -> bytes | None:
-    """The bytes that were written to a file; None where there is none, or it is damaged."""
+    """The bytes that were written to a file; None where there is none, it is damaged, or may be somebody else's."""
     try:
-        content = file.read_bytes()
+        number = os.open(file, os.O_RDONLY | _NO_LINK)
+        with os.fdopen(number, "rb") as opened:
+            status = os.fstat(number)
+            if not (stat.S_ISREG(status.st_mode) and _is_private(status)):
+                return None
+            content = opened.read()
     except OSError:
         return None
     begin = len(_MAGIC) + _DIGEST().digest_size
@@ -76,7 +119,6 @@ def _read(file: Path) -> bytes | None:
 
 
 def _write(file: Path, body: bytes) -> None:
-    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     number, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
     try:
         with os.fdopen(number, "wb") as part:

@@ -82,6 +82,72 @@ def test_a_folder_that_cannot_be_written_is_no_failure(cache, monkeypatch, tmp_p
     assert len(made) == 2
 
 
+OWN = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="owners and modes are those of POSIX")
+
+
+def kept(text="a") -> bytes:
+    """The object that was kept for a text, or one that is made now, which is another one each time."""
+    return _objects.load_or_make(lambda: os.urandom(8), text)
+
+
+def give_to_another_user(monkeypatch, path) -> None:
+    if os.geteuid() == 0:
+        os.chown(path, 12345, -1)
+    else:  # whoever runs the tests is another user from now on
+        monkeypatch.setattr(os, "geteuid", lambda: 12345)
+
+
+@OWN
+def test_what_another_user_has_written_is_not_read(cache, monkeypatch):
+    mine = kept()
+    assert kept() == mine
+    (file,) = cache.iterdir()
+    give_to_another_user(monkeypatch, file)
+    assert kept() != mine
+
+
+@OWN
+@pytest.mark.parametrize("mode", [0o777, 0o1777, 0o770])
+def test_in_a_folder_that_others_may_write_to_there_is_one_of_the_users_own(cache, mode):
+    cache.mkdir()
+    cache.chmod(mode)
+    mine = kept()
+    assert kept() == mine and [path.name for path in cache.iterdir()] == [f"lagjax-{os.geteuid()}"]
+    assert next(cache.iterdir()).stat().st_mode & 0o777 == 0o700
+
+
+@OWN
+def test_without_a_folder_of_the_users_own_nothing_is_kept_and_one_warning_says_so(cache, monkeypatch):
+    inside = cache / f"lagjax-{os.geteuid()}"
+    inside.mkdir(parents=True)
+    cache.chmod(0o777)
+    inside.chmod(0o777)
+    with pytest.warns(UserWarning, match="is no folder that only you can write to. Set LAGJAX_CACHE") as warned:
+        assert kept() != kept()
+    assert len(warned) == 1 and not list(inside.iterdir())
+
+
+@OWN
+def test_links_and_pipes_are_no_objects(cache, tmp_path):
+    mine = kept()
+    (file,) = cache.iterdir()
+    elsewhere = tmp_path / "elsewhere"
+    file.rename(elsewhere)
+    file.symlink_to(elsewhere)
+    assert kept() != mine
+    file.unlink(missing_ok=True)
+    os.mkfifo(file)  # to read it would wait for ever
+    again = kept()
+    assert again != mine and kept() == again
+
+
+@OWN
+def test_the_home_of_a_user_is_found_in_a_path(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("LAGJAX_CACHE", "~/kept")
+    assert _objects.folder() == tmp_path / "kept"
+
+
 def test_what_was_not_used_for_longest_goes_first(cache, monkeypatch):
     monkeypatch.setattr(_objects, "LARGEST_CACHE", 10_000)
     for k in range(9):  # of 1000 bytes and some, of which a tenth does not fit
