@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from lagjax._custom import VaryingPrimitive
 from lagjax._layout import dtype_of
 from lagjax._validate import is_concrete
 
@@ -188,7 +188,7 @@ class _Map:
         return _Map(self.transposed, count, self.function, results)
 
 
-computed_p = Primitive("lagjax_in_doubles")
+computed_p = VaryingPrimitive("lagjax_in_doubles")
 computed_p.multiple_results = True
 
 

@@ -13,10 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
 from jax.experimental.buffer_callback import buffer_callback
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from lagjax._custom import attach_derivative, batch_in_front
+from lagjax._custom import VaryingPrimitive, attach_derivative, batch_in_front, cond_alike
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, advice, code_of, result_from
 
 
@@ -71,7 +70,7 @@ def _raise(result, t_end, t_last, y_end, *, names) -> None:
         raise SimulationError(text, None)
 
 
-check_p = Primitive("lagjax_check")
+check_p = VaryingPrimitive("lagjax_check")
 check_p.def_abstract_eval(lambda result, t_end, *_, **__: ShapedArray(result.shape, t_end.dtype))
 
 
@@ -90,7 +89,7 @@ def _lower_with(on_host):
 
         shape = jax.ShapeDtypeStruct(result.shape, values[0].dtype)
         well = jnp.isin(result, jnp.asarray(ENDED_WELL, result.dtype)).all()
-        return jax.lax.cond(well, lambda *_: jnp.zeros(shape.shape, shape.dtype), on_host(host, shape), result, *values)
+        return cond_alike(well, lambda *_: jnp.zeros(shape.shape, shape.dtype), on_host(host, shape), result, *values)
 
     return mlir.lower_fun(check, multiple_results=False)
 
@@ -156,7 +155,7 @@ def _nan_unless_jvp(primals, tangents):
     return nan_unless_p.bind(*primals), nan_unless_p.bind(reached, ad.instantiate_zeros(tangents[1]))
 
 
-nan_unless_p = Primitive("lagjax_nan_unless")
+nan_unless_p = VaryingPrimitive("lagjax_nan_unless")
 nan_unless_p.def_abstract_eval(lambda reached, x: ShapedArray(x.shape, x.dtype))
 nan_unless_p.def_impl(_nan_unless)
 mlir.register_lowering(nan_unless_p, mlir.lower_fun(_nan_unless, multiple_results=False))

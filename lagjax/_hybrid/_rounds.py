@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._custom import vary_alike
 from lagjax._failures import lost_unless
 from lagjax._hybrid._families import SystemFamily, families
 from lagjax._hybrid._mode import Mode, Transition, state_after
@@ -147,6 +148,8 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
         result=jnp.where(inconsistent, INCONSISTENT, SUCCESSFUL), path=jnp.full((ts.size, y0.size), jnp.nan),
         modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), memory=rounds.no_memory(0.0),
     )  # fmt: skip
+    leaves, structure = jax.tree.flatten(first)
+    first = jax.tree.unflatten(structure, vary_alike(leaves, like=(ts, y0, rounds.groups[0].first.vector)))
     ending, record = jax.lax.scan(rounds.run_round, first, jnp.arange(plan.max_transitions + 1))
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
     piled_up = (ending.result == TOO_MANY) & _pile_up(record.t, ts[-1])

@@ -20,6 +20,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from lagjax import _native
+from lagjax._custom import cond_alike, vary_alike
 from lagjax._machine_code._flow import Flow, Tolerances
 from lagjax._results import EVENT_OCCURRED, SUCCESSFUL
 
@@ -71,7 +72,8 @@ def run_by_handler(
     rows, size = (members,), (kernel.rest_size,)
     of_handler = [(members, ts.shape[1], states), (members, states), *[rows] * 4, size]
     call = jax.ffi.ffi_call(_TARGET, [jax.ShapeDtypeStruct(shape, np.float64) for shape in of_handler])
-    begun = _native.Begun(*call(ts, y0, params, plan=np.int64(ctypes.addressof(plan))))
+    begun = call(ts, y0, params, plan=np.int64(ctypes.addressof(plan)))
+    begun = _native.Begun(*vary_alike(begun, like=(ts, y0, params)))
 
     def convert_results(ts, y0, params, path, y_end, t_end, code, steps, rejected, rest):
         happened = code >= _native.EVENT
@@ -85,7 +87,7 @@ def run_by_handler(
         return call_host(functools.partial(host, needed=(plan, kernel)), shapes, *arrays)
 
     well = _has_ended_well(begun)
-    return tuple(jax.lax.cond(well, convert_results, continue_on_host, ts, y0, params, *begun))
+    return tuple(cond_alike(well, convert_results, continue_on_host, ts, y0, params, *begun))
 
 
 def sweep_by_handler(kind: str, flow: Flow, tolerances: Tolerances, ts, y0, params, argument, start) -> tuple:
@@ -100,7 +102,8 @@ def sweep_by_handler(kind: str, flow: Flow, tolerances: Tolerances, ts, y0, para
     second = (members, directions, times, states) if kind == "jvp" else (members, flow.numbers)
     shapes = start.shape, second, (members,), (1,), (plan.scratch(members, times),)
     call = jax.ffi.ffi_call(f"lagjax_{kind}", [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes])
-    *results, done, _ = call(ts, y0, params, argument, start, plan=np.int64(ctypes.addressof(plan)))
+    given = ts, y0, params, argument, start
+    *results, done, _ = vary_alike(call(*given, plan=np.int64(ctypes.addressof(plan))), like=given)
     return *results, done[0] > 0, (plan, flow.kernel)
 
 

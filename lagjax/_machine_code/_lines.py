@@ -22,10 +22,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from lagjax._custom import batch_in_front
+from lagjax._custom import VaryingPrimitive, batch_in_front
 from lagjax._machine_code._call import call_host
 from lagjax._program import Program, StraightLine, evaluate, pullback, pushforward, steps_of
 
@@ -122,7 +121,7 @@ def _back(x, w, *, line: Line):
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
 
-value_p, forward_p, back_p = (Primitive(f"lagjax_line_{name}") for name in ("value", "forward", "back"))
+value_p, forward_p, back_p = (VaryingPrimitive(f"lagjax_line_{name}") for name in ("value", "forward", "back"))
 
 
 def _derivative_of_value(primals, tangents, *, line: Line):

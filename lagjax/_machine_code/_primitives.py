@@ -29,9 +29,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from lagjax._custom import VaryingPrimitive, cond_alike
 from lagjax._machine_code import _derivatives
 from lagjax._machine_code._call import call_host, has_handler, has_sweep, run_by_handler, sweep_by_handler
 from lagjax._machine_code._flow import Flow, Tolerances
@@ -110,7 +110,7 @@ def _vjp_on_host(ts, y0, params, path, result, accepted, ticket, path_ct, end_ct
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
 
-run_p, jvp_p, vjp_p, curvature_p = (Primitive(f"lagjax_{name}") for name in ("run", "jvp", "vjp", "curvature"))
+run_p, jvp_p, vjp_p, curvature_p = (VaryingPrimitive(f"lagjax_{name}") for name in ("run", "jvp", "vjp", "curvature"))
 # Of run: a `Solution` but for the last field, which is that of a batch. jvp and vjp take of a run its ts, y0,
 # params, path, result, accepted, ticket.
 _OUTPUTS, _GIVEN = len(Solution._fields) - 1, 7
@@ -471,13 +471,13 @@ def _compile_sweep(sweep_rows, run_on_host, shapes_of, inner, args, settings):
     def call_handler(*args):
         *results, done, needed = sweep_rows(ts, y0, params, a, b)
         host = functools.partial(call_host, functools.partial(function, needed=needed), shapes)
-        return jax.lax.cond(done, lambda *_: tuple(_restore_batch(results, batch)), host, *args)
+        return cond_alike(done, lambda *_: tuple(_restore_batch(results, batch)), host, *args)
 
     with jax.enable_x64(True):  # where kernels are made, and whatever was set where this is lowered
         host = functools.partial(call_host, function, shapes)
         if not has_sweep(settings["flow"], math.prod(batch)):
             return host(*args)
-        return jax.lax.cond(jnp.all(args[6] < 0), call_handler, host, *args)  # there are no steps that were kept
+        return cond_alike(jnp.all(args[6] < 0), call_handler, host, *args)  # there are no steps that were kept
 
 
 def _jvp_compiled(*args, **settings):
@@ -558,7 +558,7 @@ def _vjp_for_gpus(*args, flow, tolerances):
             others = _vjp_by_tangents(times, y0, params, *rows[3:], **settings)
             return tuple(jnp.where(done[:, None, None], a, b) for a, b in zip(found, others, strict=True))
 
-        found = jax.lax.cond(jnp.all(done), lambda *found: found, replace_unfinished, *found)
+        found = cond_alike(jnp.all(done), lambda *found: found, replace_unfinished, *found)
         return _restore_batch([jnp.where(lost[..., None], jnp.nan, x) for x in found], batch)
 
 

@@ -5,6 +5,7 @@ on several threads and devices, after a fork, and with what fails.
 """
 
 import ctypes
+import functools
 import os
 import re
 import signal
@@ -258,6 +259,57 @@ def on_two_devices():
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)  # other members side by side, to the last digits
 
 
+def over_devices():
+    """Each device has its own members, all share a parameter, whose cotangents are summed over the devices.
+
+    `derivative(shard_map(…))` and `shard_map(derivative(…))`, with the types that JAX checks by default and without.
+    """
+    from jax.sharding import PartitionSpec as P
+
+    mesh = jax.make_mesh((4,), ("members",), axis_types=(jax.sharding.AxisType.Auto,))
+
+    def lagrangian(q, v, params):
+        return 0.5 * v**2 - 0.5 * params * q**2
+
+    spring = lagjax.System(lagrangian)
+    rubbed = lagjax.System(lagrangian, forces=lambda q, v, params: -0.1 * params * jnp.sign(v))
+    ring = lagjax.System(
+        lambda q, v, params: 0.5 * v @ v - params * q[1], constraints=lambda q: q[0] ** 2 + q[1] ** 2 - 1.0
+    )
+    wall = lagjax.Transition("f", "f", lambda q, v: q - 0.1, -1, lambda q, v: (q, -v))
+
+    def end(system, q, params):
+        return lagjax.simulate(system, q, 0.0 * q, jnp.array([0.0, 1.0]), params).end.q
+
+    functions = {
+        "simulate": lambda q, k: end(spring, q, k),
+        "with a border": lambda q, k: end(rubbed, q, k),
+        "with a constraint": lambda q, k: end(ring, jnp.stack([jnp.cos(q), jnp.sin(q)]), k)[1],
+        "crossings": lambda q, k: lagjax.crossings(spring, lambda q, v: q - 0.3, q, 0.0, (0.0, 2.0), k, count=2).t[0],
+        "simulate_hybrid": lambda q, k: (
+            lagjax.simulate_hybrid(
+                {"f": spring}, [wall], "f", q, 0.0, jnp.array([0.0, 2.0]), k, max_transitions=3
+            ).end.q
+        ),
+    }
+    starts, stiffness = jnp.linspace(0.5, 1.2, 8), 2.0
+    for name, function in functions.items():
+        members = jax.vmap(function, (0, None))
+        both = jax.vmap(jax.value_and_grad(function, (0, 1)), (0, None))
+        value, slopes = jax.jit(both)(starts, stiffness)
+        for checked in (True, False):
+            over = functools.partial(
+                jax.shard_map, mesh=mesh, in_specs=(P("members"), P()), out_specs=P("members"), check_vma=checked
+            )
+            outside = jax.grad(lambda *given, over=over, members=members: over(members)(*given).sum(), (0, 1))
+            found = jax.jit(over(members))(starts, stiffness), jax.jit(outside)(starts, stiffness)
+            expected = value, (slopes[0], slopes[1].sum())
+            for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11, err_msg=name)
+        inside = over(jax.vmap(jax.grad(function), (0, None)))
+        np.testing.assert_allclose(jax.jit(inside)(starts, stiffness), slopes[0], rtol=1e-11, atol=1e-11)
+
+
 def on_many_threads():
     compiled, found = jax.jit(lambda q: (run(q)[0], derivatives(q))), [None] * 8
     expected = [compiled(q) for q in Q]
@@ -312,6 +364,17 @@ def test_on_devices_threads_and_after_a_fork():
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", start + call], cwd=os.path.dirname(__file__), timeout=200,
+        env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_under_shard_map():
+    start = "import jax; jax.config.update('jax_enable_x64', True); import test_call as t; t.over_devices()"
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", start], cwd=os.path.dirname(__file__), timeout=300,
         env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
